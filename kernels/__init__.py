@@ -1,0 +1,1 @@
+"""The OpenCL sources, carried as package data."""

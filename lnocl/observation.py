@@ -1,0 +1,207 @@
+"""Several images of one sky with what is known of each: the door where input is checked."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lnocl.errors import InputError, LnoclWarning
+
+Array = NDArray[np.float64]
+
+
+class Observation:
+    """Images of one sky, each with its point spread function, background and bad pixels.
+
+    Everything is checked and copied here, once, and held in float64. The data follow
+    ``images[j] ~ Poisson(psfs[j] * sky + background[j]) + Normal(0, read_noise[j])``.
+
+    Parameters
+    ----------
+    images : array_like, shape (p, ny, nx) or (ny, nx)
+        Counts in electrons per pixel. A pixel that is not finite, or that is masked in a
+        `numpy.ma` array, counts as bad. Counts that are negative after the read noise was
+        added are set to zero, and their number is announced.
+    psfs : array_like, shape (p, ky, kx) or (ky, kx)
+        Point spread functions, peak at ``(ky // 2, kx // 2)``, of any positive sum: they are
+        normalised here. One serves all images. Negative pixels are kept and announced.
+    background : float or array_like, shape (p,) or (p, ny, nx), optional
+        Known background, electrons per pixel, zero or more.
+    read_noise : float or array_like, shape (p,), optional
+        Standard deviation of the read noise, electrons, zero or more. Its square is added to
+        images and background (Snyder's approximation of Gaussian noise by Poisson noise).
+    mask : array_like of bool, shape (p, ny, nx) or (ny, nx), optional
+        True where a pixel is bad, as in `numpy.ma`. One serves all images.
+
+    Attributes
+    ----------
+    images, background : ndarray of float64
+        Shapes (p, ny, nx), and (p,) or (p, ny, nx); `read_noise` squared is included in both.
+        Bad pixels hold 0.
+    psfs : ndarray of float64, shape (p, ky, kx)
+        Of unit sum.
+    mask : ndarray of bool, shape (p, ny, nx)
+        True where a pixel is bad.
+
+    Raises
+    ------
+    InputError
+        Where an array has the wrong shape or type, is empty, or holds values out of range;
+        where a PSF has no positive sum or is not finite; where no good pixel is left.
+
+    Warns
+    -----
+    LnoclWarning
+        Non-finite pixels that were masked, negative counts set to zero, negative PSF pixels.
+
+    References
+    ----------
+    D. L. Snyder, A. M. Hammoud, R. L. White, J. Opt. Soc. Am. A 10, 1014 (1993), for the read
+    noise; La Camera et al. (2012), Eq. 1 and 7, for the model.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> obs = lnocl.Observation(np.full((2, 8, 8), 5.0), np.ones((3, 3)), background=1.0)
+    >>> obs.n_images, obs.shape, obs.psfs[0].sum()
+    (2, (8, 8), np.float64(1.0))
+    """
+
+    def __init__(
+        self,
+        images: ArrayLike,
+        psfs: ArrayLike,
+        background: ArrayLike = 0.0,
+        read_noise: ArrayLike = 0.0,
+        mask: ArrayLike | None = None,
+    ) -> None:
+        self.mask = np.ma.getmaskarray(np.ma.asanyarray(images)).copy()
+        self.images = _stack("images", np.ma.getdata(images))
+        self.mask = self.mask.reshape(self.images.shape)
+        self.psfs = _check_psfs(psfs, self.n_images)
+        self._apply_mask(mask)
+        self.background = self._check_background(background)
+        self._add_read_noise(read_noise)
+        self._clip_negative()
+
+    @property
+    def n_images(self) -> int:
+        """Number of images, p."""
+        return self.images.shape[0]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (ny, nx) of each image."""
+        return self.images.shape[1], self.images.shape[2]
+
+    def _apply_mask(self, mask: ArrayLike | None) -> None:
+        if mask is not None:
+            given = np.asarray(mask)
+            if given.dtype != np.bool_:
+                raise InputError(
+                    f"mask is of type {given.dtype}; give booleans, True where a pixel is bad"
+                )
+            if given.shape not in (self.images.shape, self.shape):
+                raise InputError(
+                    f"mask has shape {given.shape}; the images have {self.images.shape}"
+                )
+            self.mask |= given
+        non_finite = ~np.isfinite(self.images) & ~self.mask
+        if n_non_finite := int(non_finite.sum()):
+            self.mask |= non_finite
+            warnings.warn(
+                f"{n_non_finite} image pixels are not finite and were masked",
+                LnoclWarning,
+                stacklevel=4,
+            )
+        if self.mask.all():
+            raise InputError("all pixels are masked; there is nothing to reconstruct from")
+        self.images[self.mask] = 0.0
+
+    def _check_background(self, background: ArrayLike) -> Array:
+        values = _numbers("background", background)
+        if values.ndim == 3:
+            if values.shape != self.images.shape:
+                raise InputError(
+                    f"background has shape {values.shape}; the images have {self.images.shape}"
+                )
+            values[self.mask] = 0.0
+        else:
+            values = _one_each("background", values, self.n_images)
+        _refuse_unless("background", values, "finite and not negative", values >= 0)
+        return values
+
+    def _add_read_noise(self, read_noise: ArrayLike) -> None:
+        sigma = _one_each("read_noise", _numbers("read_noise", read_noise), self.n_images)
+        _refuse_unless("read_noise", sigma, "finite and not negative", sigma >= 0)
+        variance = sigma[:, None, None] ** 2
+        self.images += np.where(self.mask, 0.0, variance)
+        self.background += variance if self.background.ndim == 3 else variance[:, 0, 0]
+
+    def _clip_negative(self) -> None:
+        negative = self.images < 0
+        if n_negative := int(negative.sum()):
+            self.images[negative] = 0.0
+            warnings.warn(
+                f"{n_negative} image pixels are negative and were set to 0; if the images are "
+                "background-subtracted, add the background back and give it as background",
+                LnoclWarning,
+                stacklevel=4,
+            )
+
+
+def _numbers(name: str, values: ArrayLike) -> Array:
+    """Return a float64 copy of real numbers."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{name} holds {array.dtype}; give real numbers")
+    return array.astype(np.float64)
+
+
+def _stack(name: str, values: ArrayLike) -> Array:
+    """Return a float64 copy of one or several two-dimensional arrays, as a stack."""
+    array = _numbers(name, values)
+    if array.ndim not in (2, 3):
+        raise InputError(
+            f"{name} has {array.ndim} dimensions; give two, or three for several {name}"
+        )
+    if array.size == 0:
+        raise InputError(f"{name} is empty: its shape is {array.shape}")
+    return array.reshape((-1, *array.shape[-2:]))
+
+
+def _one_each(name: str, values: Array, n_images: int) -> Array:
+    if values.ndim > 1 or values.size not in (1, n_images):
+        raise InputError(
+            f"{name} has shape {values.shape}; give one number, or one for each of the "
+            f"{n_images} images"
+        )
+    return np.array(np.broadcast_to(values, (n_images,)))
+
+
+def _refuse_unless(name: str, values: Array, requirement: str, holds: NDArray[np.bool_]) -> None:
+    good = holds & np.isfinite(values)
+    if not good.all():
+        raise InputError(f"{name} must be {requirement}; {values[~good].flat[0]:g} was given")
+
+
+def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
+    stack = _stack("psfs", psfs)
+    if stack.shape[0] not in (1, n_images):
+        raise InputError(
+            f"{stack.shape[0]} psfs for {n_images} images; give one, or one for each image"
+        )
+    if not np.isfinite(stack).all():
+        raise InputError("psfs hold values that are not finite; repair them first")
+    sums = stack.sum(axis=(1, 2), keepdims=True)
+    if (sums <= 0).any():
+        raise InputError(f"psf {int(np.argmax(sums <= 0))} has the sum {sums.min():g}; "
+                         "it must be positive")
+    if n_negative := int((stack < 0).sum()):
+        warnings.warn(
+            f"{n_negative} psf pixels are negative and were kept", LnoclWarning, stacklevel=4
+        )
+    return np.array(np.broadcast_to(stack / sums, (n_images, *stack.shape[1:])))

@@ -1,0 +1,197 @@
+"""The plain NumPy twin of every kernel, in float64, and the engine they make together.
+
+Each function here has the name of the kernel whose equation it writes down; it takes and returns
+arrays in their natural order, where the kernel keeps its own layout (`lnocl.fft`). Row spectra
+are half spectra along x alone, shape (..., Ny, Nx // 2 + 1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import kl_div
+
+from lnocl.observation import Array
+from lnocl.scene import Scene
+
+ComplexArray = NDArray[np.complex128]
+
+# The one division guard: where the model is not above this (images have unit mean) the ratio is
+# taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
+LEAST_MODEL = 2.0**-64
+
+
+def rfft_rows(pixels: Array) -> ComplexArray:
+    """Return twice the half spectrum of each row: ``2 sum_x f(x) exp(-2 pi i k x / Nx)``."""
+    return 2.0 * np.fft.rfft(pixels, axis=-1)
+
+
+def fft_columns(spectra: ComplexArray) -> ComplexArray:
+    """Return the spectrum of each column: ``sum_y F(y) exp(-2 pi i k y / Ny)``."""
+    return np.fft.fft(spectra, axis=-2)
+
+
+def ifft_columns(spectra: ComplexArray) -> ComplexArray:
+    """Return ``sum_k F(k) exp(+2 pi i k y / Ny)`` of each column, not divided by Ny."""
+    return np.fft.ifft(spectra, axis=-2, norm="forward")
+
+
+def irfft_rows(row_spectra: ComplexArray) -> Array:
+    """Return ``sum_k F(k) exp(+2 pi i k x / Nx)`` of each row, not divided by Nx."""
+    nx = 2 * (row_spectra.shape[-1] - 1)
+    return np.fft.irfft(row_spectra, n=nx, axis=-1, norm="forward")
+
+
+def otf(psf: Array) -> ComplexArray:
+    """Return the optical transfer function that makes `convolve_columns` a convolution.
+
+    The spectrum of the PSF (peak at the origin), divided by what the transforms leave in:
+    Ny Nx of the two inverse ones, 2 of each of the two forward ones.
+    """
+    return fft_columns(rfft_rows(psf)) / (4.0 * psf.size)
+
+
+def convolve_columns(row_spectrum: ComplexArray, otfs: ComplexArray) -> ComplexArray:
+    """Return the row spectra of ``A_j f``, shape (p, Ny, Nx // 2 + 1), from that of f."""
+    return ifft_columns(otfs * fft_columns(row_spectrum))
+
+
+def correlate_columns(row_spectra: ComplexArray, otfs: ComplexArray) -> ComplexArray:
+    """Return the row spectrum of ``sum_j A_j^T r_j`` from those of the r_j."""
+    return ifft_columns((np.conj(otfs) * fft_columns(row_spectra)).sum(axis=0))
+
+
+def ratio_rows(
+    row_spectra: ComplexArray,
+    images: Array,
+    weights: NDArray[np.bool_] | None,
+    background: Array,
+    star_images: Array,
+    star_fluxes: Array,
+) -> tuple[ComplexArray, float, Array]:
+    """Return the row spectra of the ratio, the objective's data term, and the star sums.
+
+    ``m_j = A_j f + sum_s c_s P_js + b_j``, ``r_j = w_j g_j / m_j``, ``sum_j <P_js, r_j>`` and
+    ``J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j)``; La Camera et al. (2012), Eq. 7 and 9.
+    """
+    model = irfft_rows(row_spectra) + background
+    model += np.einsum("s,sjyx->jyx", star_fluxes, star_images)
+    guarded = model > LEAST_MODEL
+    ratio = np.divide(images, model, out=np.zeros_like(model), where=guarded)
+    divergence = np.where(images > 0, np.inf, model)
+    divergence[guarded] = kl_div(images[guarded], model[guarded])
+    if weights is not None:
+        ratio = np.where(weights, ratio, 0.0)
+        divergence = np.where(weights, divergence, 0.0)
+    star_sums = np.einsum("sjyx,jyx->s", star_images, ratio)
+    return rfft_rows(ratio), float(divergence.sum()), star_sums
+
+
+def collect_sums(
+    objective: float, squares: float, star_sums: Array, star_weights: Array, mu: float
+) -> tuple[float, Array]:
+    """Return the objective ``J_0 + mu / 2 sum f^2`` and the star corrections.
+
+    A star's correction is ``sum_j <P_js, r_j> / sum_j <P_js, w_j>``.
+    """
+    return objective + 0.5 * mu * squares, star_sums / star_weights
+
+
+def scale_rows(
+    row_spectrum: ComplexArray, extended: Array, inverse_weight: Array | float, mu: float
+) -> tuple[Array, ComplexArray, float]:
+    """Return the scaled extended source, its row spectrum, and the sum of its squares.
+
+    ``f <- f a sum_j A_j^T r_j / (1 + mu f a)`` with ``a = 1 / sum_j A_j^T w_j``, 0 where nothing
+    was observed; La Camera et al. (2012), Eq. 9. A correction that rounding has made negative
+    counts as 0.
+    """
+    correction = np.maximum(irfft_rows(row_spectrum), 0.0)
+    scaled = extended * inverse_weight
+    scaled = scaled * correction / (1.0 + mu * scaled)
+    return scaled, rfft_rows(scaled), float((scaled**2).sum())
+
+
+def scale_stars(star_fluxes: Array, star_corrections: Array) -> Array:
+    """Return ``c_s`` times its correction; La Camera et al. (2012), Eq. 9."""
+    return star_fluxes * star_corrections
+
+
+class ReferenceEngine:
+    """The iteration's verbs in plain NumPy, float64: the engine ``"numpy"``.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is modelled.
+    """
+
+    name = "numpy"
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._images = scene.images()
+        background = scene.background()
+        self._background = background if background.ndim == 3 else background[:, None, None]
+        self._otfs = np.array([otf(scene.psf(j)) for j in range(scene.n_images)])
+        self._star_images = np.array(
+            [
+                [scene.star_image(j, s) for j in range(scene.n_images)]
+                for s in range(scene.n_stars)
+            ]
+        ).reshape(scene.n_stars, *self._images.shape)
+        self._inverse_weight = self._invert_weight()
+        self._objectives: list[float] = []
+
+    def _invert_weight(self) -> Array | float:
+        if self.scene.weights is None:
+            return 1.0 / self.scene.n_images
+        row_spectra = rfft_rows(self.scene.weights.astype(np.float64))
+        total = irfft_rows(correlate_columns(row_spectra, self._otfs))
+        observed = self.scene.observed(total)
+        return np.divide(1.0, total, out=np.zeros_like(total), where=observed)
+
+    def start(self, extended: Array, star_fluxes: Array) -> None:
+        """Begin from this estimate, on the grid and scaled; unobserved pixels are set to 0."""
+        self._extended = np.where(np.asarray(self._inverse_weight) > 0, extended, 0.0)
+        self._star_fluxes = star_fluxes.copy()
+        self._row_spectrum = rfft_rows(self._extended)
+        self._squares = float((self._extended**2).sum())
+
+    def ratio(self) -> None:
+        """Make the ratios of the estimate; record its objective."""
+        self._ratio_row_spectra, objective, star_sums = ratio_rows(
+            convolve_columns(self._row_spectrum, self._otfs),
+            self._images,
+            self.scene.weights,
+            self._background,
+            self._star_images,
+            self._star_fluxes,
+        )
+        objective, self._star_corrections = collect_sums(
+            objective, self._squares, star_sums, self.scene.star_weights, self.scene.mu
+        )
+        self._objectives.append(objective)
+
+    def correct(self) -> None:
+        """Back-project the ratios to the correction."""
+        self._row_spectrum = correlate_columns(self._ratio_row_spectra, self._otfs)
+
+    def scale(self) -> None:
+        """Scale the estimate by its correction."""
+        self._extended, self._row_spectrum, self._squares = scale_rows(
+            self._row_spectrum, self._extended, self._inverse_weight, self.scene.mu
+        )
+        self._star_fluxes = scale_stars(self._star_fluxes, self._star_corrections)
+
+    def extended(self) -> Array:
+        """Return the extended source, on the grid and scaled."""
+        return self._extended.copy()
+
+    def star_fluxes(self) -> Array:
+        """Return the star fluxes, scaled."""
+        return self._star_fluxes.copy()
+
+    def objectives(self) -> Array:
+        """Return the objectives recorded so far, scaled."""
+        return np.array(self._objectives)

@@ -1,0 +1,253 @@
+"""An observation laid on the grid of the transform, at unit mean: what an engine is given."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lnocl.errors import InputError, LnoclWarning
+from lnocl.observation import Array, Observation
+
+MAX_AXIS = 8192
+
+# Below this share of its maximum the total weight of a pixel of the extended source is taken as
+# "not observed" (the threshold of Bertero & Boccacci 2005, A&A 437, 369, for boundary effects).
+OBSERVED_SHARE = 0.01
+
+
+class Scene:
+    """What is modelled, on a grid of powers of two, scaled to images of about unit mean.
+
+    The scale is a power of two, so that it changes no digit: images, background, star fluxes
+    and the extended source are divided by it, mu is multiplied by it.
+
+    Parameters
+    ----------
+    observation : Observation
+        The images and what is known of them.
+    stars : sequence of (x, y)
+        Positions of the point sources in pixels, 0-based, x along columns; whole numbers.
+    mu : float
+        Weight of the Tikhonov term on the extended source, per electron, zero or more.
+    pad : int
+        Unobserved pixels kept round the images, at least.
+
+    Attributes
+    ----------
+    grid : tuple of int
+        Shape (Ny, Nx) of the grid, powers of two; the images lie at its origin.
+    scale : float
+        Electrons per unit.
+    mu : float
+        Scaled.
+    weights : ndarray of bool, shape (p, Ny, Nx), or None
+        True where a pixel was observed; None where all were.
+    star_weights : ndarray of float64, shape (n,)
+        ``sum_j <P_js, w_j>``, the share of each star's light that was observed, summed.
+
+    Raises
+    ------
+    InputError
+        A star outside the images, between pixels or unobserved; mu or pad out of range; images
+        too large for the transform.
+
+    Warns
+    -----
+    LnoclWarning
+        A PSF that is larger than the grid, whose wings wrap round.
+    """
+
+    def __init__(
+        self,
+        observation: Observation,
+        stars: Sequence[tuple[float, float]] = (),
+        mu: float = 0.0,
+        pad: int = 0,
+    ) -> None:
+        self.observation = observation
+        self.stars = _check_stars(stars, observation.shape)
+        if not (np.isscalar(mu) and math.isfinite(mu) and mu >= 0):
+            raise InputError(f"mu must be finite and not negative; {mu} was given")
+        self.grid = _grid(observation.shape, pad)
+        self._warn_of_large_psf()
+        good = observation.images[~observation.mask]
+        self.scale = 2.0 ** math.frexp(good.mean())[1] if good.any() else 1.0
+        self.mu = float(mu) * self.scale
+        observed = ~observation.mask
+        self.weights = (
+            None if observed.all() and self.grid == observation.shape else self._on_grid(observed)
+        )
+        self.star_weights = self._weigh_stars()
+
+    @property
+    def n_images(self) -> int:
+        """Number of images, p."""
+        return self.observation.n_images
+
+    @property
+    def n_stars(self) -> int:
+        """Number of point sources."""
+        return len(self.stars)
+
+    def images(self) -> Array:
+        """Return the images on the grid, scaled, shape (p, Ny, Nx); 0 where not observed."""
+        return self._on_grid(self.observation.images / self.scale)
+
+    def background(self) -> Array:
+        """Return the background, scaled, shape (p,) or (p, Ny, Nx); 1 where not observed."""
+        background = self.observation.background / self.scale
+        return background if background.ndim == 1 else self._on_grid(background, fill=1.0)
+
+    def psf(self, j: int) -> Array:
+        """Return the PSF of image j on the grid, shape (Ny, Nx), its peak at the origin."""
+        psf = self.observation.psfs[j]
+        rows, columns = (
+            (np.arange(k) - k // 2) % n for k, n in zip(psf.shape, self.grid, strict=True)
+        )
+        folded = np.zeros(self.grid)
+        np.add.at(folded, (rows[:, None], columns), psf)
+        return folded
+
+    def star_image(self, j: int, s: int) -> Array:
+        """Return P_js, the PSF of image j centred on star s, shape (Ny, Nx)."""
+        x, y = self.stars[s]
+        return np.roll(self.psf(j), (y, x), axis=(0, 1))
+
+    def observed(self, total_weight: Array) -> NDArray[np.bool_]:
+        """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""
+        return total_weight >= OBSERVED_SHARE * total_weight.max()
+
+    def start(
+        self, extended: ArrayLike | None, star_fluxes: ArrayLike | None
+    ) -> tuple[Array, Array]:
+        """Return the estimate to begin with, on the grid and scaled.
+
+        Parameters
+        ----------
+        extended : array_like, shape (ny, nx), optional
+            Extended source, electrons per pixel, finite and not negative. Beyond the images the
+            grid is filled with its mean. By default flat, with the flux that the stars leave.
+        star_fluxes : array_like, shape (n,), optional
+            Electrons, finite and not negative. By default a least-squares fit of the star
+            images and one constant to the images.
+
+        Raises
+        ------
+        InputError
+            Where either has the wrong shape, a negative or non-finite value.
+        """
+        if extended is None or star_fluxes is None:
+            default_fluxes, level = self._read_off()
+        if star_fluxes is None:
+            fluxes = default_fluxes
+        else:
+            fluxes = _check_start("initial_star_fluxes", star_fluxes, (self.n_stars,)) / self.scale
+        if extended is None:
+            return np.full(self.grid, level), fluxes
+        given = _check_start("initial_extended", extended, self.observation.shape) / self.scale
+        return self._on_grid(given, fill=given.mean()), fluxes
+
+    def _read_off(self) -> tuple[Array, float]:
+        """Read star fluxes and the level of a flat extended source off the data."""
+        images, background = self.images(), self.background()
+        if background.ndim == 1:
+            background = background[:, None, None]
+        weights = np.ones(images.shape, bool) if self.weights is None else self.weights
+        excess = np.where(weights, images - background, 0.0)
+        n_observed = weights.sum()
+        mean = excess.sum() / n_observed
+        normal = np.zeros((self.n_stars, self.n_stars))
+        moment = np.zeros(self.n_stars)
+        for j in range(self.n_images):
+            stars = np.array([self.star_image(j, s)[weights[j]] for s in range(self.n_stars)])
+            if self.n_stars:
+                centred = stars - stars.mean(axis=1, keepdims=True)
+                normal += centred @ centred.T
+                moment += centred @ excess[j][weights[j]]
+        # A star or a sky that starts at zero stays there, so each keeps a small share.
+        least = max(1e-3 * mean, np.finfo(np.float32).eps)
+        fluxes = np.maximum(
+            np.linalg.lstsq(normal, moment, rcond=None)[0], least * math.prod(self.grid) / 100
+        )
+        level = mean - float(fluxes @ self.star_weights) / n_observed
+        return fluxes, max(level, least)
+
+    def _weigh_stars(self) -> Array:
+        if self.weights is None:
+            return np.full(self.n_stars, float(self.n_images))
+        shares = np.array(
+            [
+                [self.star_image(j, s)[self.weights[j]].sum() for s in range(self.n_stars)]
+                for j in range(self.n_images)
+            ]
+        ).reshape(self.n_images, self.n_stars)
+        total = shares.sum(axis=0)
+        for (x, y), weight in zip(self.stars, total, strict=True):
+            if weight < OBSERVED_SHARE * self.n_images:
+                raise InputError(
+                    f"the star at ({x}, {y}) lies where all images are masked; "
+                    "leave it out or mend the mask"
+                )
+        return total
+
+    def _on_grid(self, array: NDArray, fill: float = 0.0) -> NDArray:
+        ny, nx = self.observation.shape
+        laid = np.full((*array.shape[:-2], *self.grid), fill, dtype=array.dtype)
+        laid[..., :ny, :nx] = array
+        return laid
+
+    def _warn_of_large_psf(self) -> None:
+        psf_shape = self.observation.psfs.shape[1:]
+        if any(k > n for k, n in zip(psf_shape, self.grid, strict=True)):
+            warnings.warn(
+                f"the psf {psf_shape} is larger than the grid {self.grid}: its wings wrap "
+                "round; crop it, or give pad to enlarge the grid",
+                LnoclWarning,
+                stacklevel=4,
+            )
+
+
+def _grid(shape: tuple[int, int], pad: int) -> tuple[int, int]:
+    if not (isinstance(pad, (int, np.integer)) and pad >= 0):
+        raise InputError(f"pad must be a whole number, 0 or more; {pad} was given")
+    ny, nx = (max(2, 1 << (n + 2 * int(pad) - 1).bit_length()) for n in shape)
+    if max(ny, nx) > MAX_AXIS:
+        raise InputError(
+            f"images of {shape} with pad={pad} need a grid of {(ny, nx)}; "
+            f"the largest axis is {MAX_AXIS}: cut the images or pad less"
+        )
+    return ny, nx
+
+
+def _check_stars(
+    stars: Sequence[tuple[float, float]], shape: tuple[int, int]
+) -> list[tuple[int, int]]:
+    ny, nx = shape
+    positions = np.asarray(stars, dtype=np.float64).reshape(-1, 2) if len(stars) else []
+    checked = []
+    for x, y in positions:
+        if not (0 <= x <= nx - 1 and 0 <= y <= ny - 1):
+            raise InputError(
+                f"the star at ({x:g}, {y:g}) lies outside the images: x must be in "
+                f"[0, {nx - 1}] and y in [0, {ny - 1}]"
+            )
+        if x != round(x) or y != round(y):
+            raise InputError(
+                f"the star at ({x:g}, {y:g}) lies between pixels; give the nearest whole pixel "
+                f"({round(x)}, {round(y)})"
+            )
+        checked.append((round(x), round(y)))
+    return checked
+
+
+def _check_start(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != shape:
+        raise InputError(f"{name} has shape {array.shape}; it must have {shape}")
+    if not (np.isfinite(array).all() and (array >= 0).all()):
+        raise InputError(f"{name} must be finite and not negative")
+    return array
