@@ -42,13 +42,14 @@ def irfft_rows(row_spectra: ComplexArray) -> Array:
     return np.fft.irfft(row_spectra, n=nx, axis=-1, norm="forward")
 
 
-def otf(psf: Array) -> ComplexArray:
-    """Return the optical transfer function that makes `convolve_columns` a convolution.
+def otf_columns(row_spectra: ComplexArray) -> ComplexArray:
+    """Return the optical transfer function, from the row spectra of a PSF (peak at the origin).
 
-    The spectrum of the PSF (peak at the origin), divided by what the transforms leave in:
-    Ny Nx of the two inverse ones, 2 of each of the two forward ones.
+    The spectrum divided by what the transforms leave in: Ny Nx of the two inverse ones, 2 of
+    each of the two forward ones.
     """
-    return fft_columns(rfft_rows(psf)) / (4.0 * psf.size)
+    ny, nx = row_spectra.shape[-2], 2 * (row_spectra.shape[-1] - 1)
+    return fft_columns(row_spectra) / (4.0 * ny * nx)
 
 
 def convolve_columns(row_spectrum: ComplexArray, otfs: ComplexArray) -> ComplexArray:
@@ -98,23 +99,24 @@ def collect_sums(
 
 
 def scale_rows(
-    row_spectrum: ComplexArray, extended: Array, inverse_weight: Array | float, mu: float
-) -> tuple[Array, ComplexArray, float]:
-    """Return the scaled extended source, its row spectrum, and the sum of its squares.
+    row_spectrum: ComplexArray,
+    extended: Array,
+    inverse_weight: Array | float,
+    mu: float,
+    star_fluxes: Array,
+    star_corrections: Array,
+) -> tuple[Array, ComplexArray, float, Array]:
+    """Return the scaled extended source, its row spectrum and sum of squares, and star fluxes.
 
-    ``f <- f a sum_j A_j^T r_j / (1 + mu f a)`` with ``a = 1 / sum_j A_j^T w_j``, 0 where nothing
-    was observed; La Camera et al. (2012), Eq. 9. A correction that rounding has made negative
-    counts as 0.
+    ``f <- f a c / (1 + mu f a)`` with ``c = sum_j A_j^T r_j`` and ``a = 1 / sum_j A_j^T w_j``,
+    0 where nothing was observed; ``c_s`` is multiplied by its correction; La Camera et al.
+    (2012), Eq. 9. A correction that rounding has made negative counts as 0.
     """
     correction = np.maximum(irfft_rows(row_spectrum), 0.0)
     scaled = extended * inverse_weight
     scaled = scaled * correction / (1.0 + mu * scaled)
-    return scaled, rfft_rows(scaled), float((scaled**2).sum())
-
-
-def scale_stars(star_fluxes: Array, star_corrections: Array) -> Array:
-    """Return ``c_s`` times its correction; La Camera et al. (2012), Eq. 9."""
-    return star_fluxes * star_corrections
+    squares = float((scaled**2).sum())
+    return scaled, rfft_rows(scaled), squares, star_fluxes * star_corrections
 
 
 class ReferenceEngine:
@@ -133,7 +135,9 @@ class ReferenceEngine:
         self._images = scene.images()
         background = scene.background()
         self._background = background if background.ndim == 3 else background[:, None, None]
-        self._otfs = np.array([otf(scene.psf(j)) for j in range(scene.n_images)])
+        self._otfs = np.array(
+            [otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)]
+        )
         self._star_images = np.array(
             [
                 [scene.star_image(j, s) for j in range(scene.n_images)]
@@ -179,10 +183,14 @@ class ReferenceEngine:
 
     def scale(self) -> None:
         """Scale the estimate by its correction."""
-        self._extended, self._row_spectrum, self._squares = scale_rows(
-            self._row_spectrum, self._extended, self._inverse_weight, self.scene.mu
+        self._extended, self._row_spectrum, self._squares, self._star_fluxes = scale_rows(
+            self._row_spectrum,
+            self._extended,
+            self._inverse_weight,
+            self.scene.mu,
+            self._star_fluxes,
+            self._star_corrections,
         )
-        self._star_fluxes = scale_stars(self._star_fluxes, self._star_corrections)
 
     def extended(self) -> Array:
         """Return the extended source, on the grid and scaled."""

@@ -1,0 +1,253 @@
+/* A power-of-two FFT from radix-2 butterflies, up to four deep in registers.
+ *
+ * Forward: decimation in frequency, natural order in, bit-reversed order out, exp(-2 pi i ...).
+ * Inverse: decimation in time, bit-reversed order in, natural order out, exp(+2 pi i ...), not
+ * divided by the length. So no bit reversal is ever done; spectra stay in reversed order.
+ *
+ * A transform of n points has an outer pass of radix OUTER(n) = min(8, n), which the kernels
+ * write themselves because it is where data come and go; then, over subtransforms of INNER(n)
+ * points, passes of radix 8; and a last pass of radix LAST(n) <= 16. All are in place. Where
+ * INNER(n) is more than CHUNK points, one middle pass goes over everything; what is left is done
+ * span by span, so that each SPAN(n) points stay in the nearest cache until they are done.
+ *
+ * Twiddles, for each pass over subtransforms of `length` points with radix R, in the order in
+ * which the forward transform needs them: [length / R][R - 1][2] reals, the root
+ * exp(-2 pi i j reversed(q) / length) for j and q = 1 .. R - 1. The last pass needs none.
+ */
+
+#define OUTER(n) ((n) < 8 ? (n) : 8)
+#define INNER(n) ((n) / OUTER(n))
+#define LAST(n)                      \
+    (INNER(n) == 1 ? 1               \
+     : INNER(n) == 2 ? 2             \
+     : INNER(n) == 4 ? 4             \
+     : INNER(n) == 8 ? 8             \
+     : INNER(n) == 16 ? 16           \
+     : INNER(n) == 32 ? 4            \
+     : INNER(n) == 64 ? 8            \
+     : INNER(n) == 128 ? 16          \
+     : INNER(n) == 256 ? 4           \
+     : INNER(n) == 512 ? 8 : 16)
+
+#define HAS_MIDDLE(n) (INNER(n) > 16 && INNER(n) > CHUNK)
+#define SPAN_LENGTH(n) (HAS_MIDDLE(n) ? INNER(n) / 8 : INNER(n))
+#define SPAN(n) (GROUP > 1 ? (n) : SPAN_LENGTH(n))
+
+#define HIGH_BIT(i) (1 << (31 - clz(i)))
+
+#define COS_PI_8 ((real)0.92387953251128675613)
+#define SIN_PI_8 ((real)0.38268343236508977173)
+#define SQRT_HALF ((real)0.70710678118654752440)
+
+static inline void butterfly(cvec *a, cvec *b)
+{
+    const cvec difference = subtract(*a, *b);
+    *a = add(*a, *b);
+    *b = difference;
+}
+
+static inline void dif(cvec *a, const int radix)
+{
+    if (radix == 16) {
+        for (int i = 0; i < 8; ++i)
+            butterfly(a + i, a + i + 8);
+        a[9] = rotate(a[9], COS_PI_8, -SIN_PI_8);
+        a[10] = rotate(a[10], SQRT_HALF, -SQRT_HALF);
+        a[11] = rotate(a[11], SIN_PI_8, -COS_PI_8);
+        a[12] = times_minus_i(a[12]);
+        a[13] = rotate(a[13], -SIN_PI_8, -COS_PI_8);
+        a[14] = rotate(a[14], -SQRT_HALF, -SQRT_HALF);
+        a[15] = rotate(a[15], -COS_PI_8, -SIN_PI_8);
+    }
+    if (radix >= 8) {
+        for (int s = 0; s < radix; s += 8) {
+            for (int i = 0; i < 4; ++i)
+                butterfly(a + s + i, a + s + i + 4);
+            a[s + 5] = rotate(a[s + 5], SQRT_HALF, -SQRT_HALF);
+            a[s + 6] = times_minus_i(a[s + 6]);
+            a[s + 7] = rotate(a[s + 7], -SQRT_HALF, -SQRT_HALF);
+        }
+    }
+    if (radix >= 4) {
+        for (int s = 0; s < radix; s += 4) {
+            butterfly(a + s, a + s + 2);
+            butterfly(a + s + 1, a + s + 3);
+            a[s + 3] = times_minus_i(a[s + 3]);
+        }
+    }
+    if (radix >= 2) {
+        for (int s = 0; s < radix; s += 2)
+            butterfly(a + s, a + s + 1);
+    }
+}
+
+/* The steps of dif backwards, with conjugate roots. */
+static inline void dit(cvec *a, const int radix)
+{
+    if (radix >= 2) {
+        for (int s = 0; s < radix; s += 2)
+            butterfly(a + s, a + s + 1);
+    }
+    if (radix >= 4) {
+        for (int s = 0; s < radix; s += 4) {
+            a[s + 3] = times_i(a[s + 3]);
+            butterfly(a + s, a + s + 2);
+            butterfly(a + s + 1, a + s + 3);
+        }
+    }
+    if (radix >= 8) {
+        for (int s = 0; s < radix; s += 8) {
+            a[s + 5] = rotate(a[s + 5], SQRT_HALF, SQRT_HALF);
+            a[s + 6] = times_i(a[s + 6]);
+            a[s + 7] = rotate(a[s + 7], -SQRT_HALF, SQRT_HALF);
+            for (int i = 0; i < 4; ++i)
+                butterfly(a + s + i, a + s + i + 4);
+        }
+    }
+    if (radix == 16) {
+        a[9] = rotate(a[9], COS_PI_8, SIN_PI_8);
+        a[10] = rotate(a[10], SQRT_HALF, SQRT_HALF);
+        a[11] = rotate(a[11], SIN_PI_8, COS_PI_8);
+        a[12] = times_i(a[12]);
+        a[13] = rotate(a[13], -SIN_PI_8, COS_PI_8);
+        a[14] = rotate(a[14], -SQRT_HALF, SQRT_HALF);
+        a[15] = rotate(a[15], -COS_PI_8, SIN_PI_8);
+        for (int i = 0; i < 8; ++i)
+            butterfly(a + i, a + i + 8);
+    }
+}
+
+static inline void twiddle_forward(cvec *a, const int radix, __global const real *roots)
+{
+    for (int q = 1; q < radix; ++q)
+        a[q] = rotate(a[q], roots[2 * q - 2], roots[2 * q - 1]);
+}
+
+static inline void twiddle_inverse(cvec *a, const int radix, __global const real *roots)
+{
+    for (int q = 1; q < radix; ++q)
+        a[q] = rotate(a[q], roots[2 * q - 2], -roots[2 * q - 1]);
+}
+
+/* The roots of the pass over subtransforms of `length` points; `roots` is the table for n. */
+static inline __global const real *roots_of(
+    __global const real *roots, const int n, const int length)
+{
+    if (length < n)
+        roots += 2 * INNER(n) * (OUTER(n) - 1);
+    for (int l = INNER(n); l > length; l /= 8)
+        roots += 14 * (l / 8);
+    return roots;
+}
+
+/* A pass of radix 8 over `total` points in subtransforms of `length`. */
+static inline void dif_pass(
+    SCRATCH vec *x, const int total, const int length, __global const real *roots)
+{
+    const int eighth = length / 8;
+    FOR_EACH(piece, total / 8 * SIDE) {
+        const int j = piece / SIDE % eighth;
+        SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE / eighth * length + j) + piece % SIDE;
+        cvec a[8];
+        for (int q = 0; q < 8; ++q)
+            a[q] = LOAD(leg, q * eighth);
+        dif(a, 8);
+        twiddle_forward(a, 8, roots + 14 * j);
+        for (int q = 0; q < 8; ++q)
+            STORE(leg, q * eighth, a[q]);
+    }
+    BARRIER;
+}
+
+static inline void dit_pass(
+    SCRATCH vec *x, const int total, const int length, __global const real *roots)
+{
+    const int eighth = length / 8;
+    FOR_EACH(piece, total / 8 * SIDE) {
+        const int j = piece / SIDE % eighth;
+        SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE / eighth * length + j) + piece % SIDE;
+        cvec a[8];
+        for (int q = 0; q < 8; ++q)
+            a[q] = LOAD(leg, q * eighth);
+        twiddle_inverse(a, 8, roots + 14 * j);
+        dit(a, 8);
+        for (int q = 0; q < 8; ++q)
+            STORE(leg, q * eighth, a[q]);
+    }
+    BARRIER;
+}
+
+static inline void dif_middle(SCRATCH vec *x, const int n, __global const real *roots)
+{
+    if (HAS_MIDDLE(n))
+        dif_pass(x, n, INNER(n), roots_of(roots, n, INNER(n)));
+}
+
+static inline void dit_middle(SCRATCH vec *x, const int n, __global const real *roots)
+{
+    if (HAS_MIDDLE(n))
+        dit_pass(x, n, INNER(n), roots_of(roots, n, INNER(n)));
+}
+
+/* The passes over one span, all but the last. */
+static inline void dif_span(SCRATCH vec *x, const int n, __global const real *roots)
+{
+    for (int length = SPAN_LENGTH(n); length > 16; length /= 8)
+        dif_pass(x, SPAN(n), length, roots_of(roots, n, length));
+}
+
+static inline void dit_span(SCRATCH vec *x, const int n, __global const real *roots)
+{
+    for (int length = 8 * LAST(n); length <= SPAN_LENGTH(n); length *= 8)
+        dit_pass(x, SPAN(n), length, roots_of(roots, n, length));
+}
+
+/* The last pass of the forward transform, over one span. */
+static inline void dif_last(SCRATCH vec *x, const int n)
+{
+    FOR_EACH(piece, SPAN(n) / LAST(n) * SIDE) {
+        SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE * LAST(n)) + piece % SIDE;
+        cvec a[16];
+        for (int q = 0; q < LAST(n); ++q)
+            a[q] = LOAD(leg, q);
+        dif(a, LAST(n));
+        for (int q = 0; q < LAST(n); ++q)
+            STORE(leg, q, a[q]);
+    }
+    BARRIER;
+}
+
+/* The first pass of the inverse transform, over one span. */
+static inline void dit_first(SCRATCH vec *x, const int n)
+{
+    FOR_EACH(piece, SPAN(n) / LAST(n) * SIDE) {
+        SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE * LAST(n)) + piece % SIDE;
+        cvec a[16];
+        for (int q = 0; q < LAST(n); ++q)
+            a[q] = LOAD(leg, q);
+        dit(a, LAST(n));
+        for (int q = 0; q < LAST(n); ++q)
+            STORE(leg, q, a[q]);
+    }
+    BARRIER;
+}
+
+/* Everything behind the outer pass of the forward transform. */
+static inline void dif_inner(SCRATCH vec *x, const int n, __global const real *roots)
+{
+    dif_middle(x, n, roots);
+    for (int start = 0; start < n; start += SPAN(n)) {
+        dif_span(x + 2 * SIDE * start, n, roots);
+        dif_last(x + 2 * SIDE * start, n);
+    }
+}
+
+/* Everything before the outer pass of the inverse transform. */
+static inline void dit_inner(SCRATCH vec *x, const int n, __global const real *roots)
+{
+    for (int start = 0; start < n; start += SPAN(n)) {
+        dit_first(x + 2 * SIDE * start, n);
+        dit_span(x + 2 * SIDE * start, n, roots);
+    }
+    dit_middle(x, n, roots);
+}

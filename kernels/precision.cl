@@ -1,0 +1,83 @@
+/* The one header for precision, and for what the host fixes when it builds.
+ *
+ * Constants given by the host (lnocl/program.py):
+ *   REAL, BITS      float and int, or double and long
+ *   LANES           reals in a vector: 16, 8, 4, 2 or 1
+ *   BLOCK           columns, or pairs of rows, transformed together; a multiple of LANES
+ *   GROUP           work-items that share a block
+ *   CHUNK           points of a transform that are finished before the next are begun
+ *   SCRATCH_IS_GLOBAL   0 or 1: where a block lies while it is transformed
+ *   NX, NY          the grid, powers of two from 2 to 8192; BLOCK divides NX / 2 and NY / 2
+ *   ROWS            rows that a block of spectra takes in memory: NY and some padding
+ *   N_IMAGES, N_STARS
+ *   HAS_MU, HAS_WEIGHTS, HAS_BACKGROUND_MAP     0 or 1: what the scene has
+ *   LEAST_MODEL     the division guard
+ *
+ * Layouts, in reals, the last index fastest:
+ *   pixels    [NY / 2 / BLOCK][NX][2][BLOCK]     lanes are pairs of rows: 2 y and 2 y + 1
+ *   spectra   [NX / 2 / BLOCK][ROWS][2][BLOCK]   lanes are columns; real part, imaginary part
+ *   otf       [NX / 2 / BLOCK][NY][2][BLOCK]     as spectra
+ * A block of BLOCK reals is SIDE vectors of LANES reals.
+ */
+
+#define PASTE_(a, b) a##b
+#define PASTE(a, b) PASTE_(a, b)
+
+#if LANES == 1
+#define WIDTH
+#define FIRST_LANE ((vec)1)
+#else
+#define WIDTH LANES
+#if LANES == 2
+#define FIRST_LANE ((vec)(1, 0))
+#elif LANES == 4
+#define FIRST_LANE ((vec)(1, 0, 0, 0))
+#elif LANES == 8
+#define FIRST_LANE ((vec)(1, 0, 0, 0, 0, 0, 0, 0))
+#else
+#define FIRST_LANE ((vec)(1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0))
+#endif
+#endif
+
+typedef REAL real;
+typedef PASTE(REAL, WIDTH) vec;
+typedef PASTE(BITS, WIDTH) ivec;
+#define as_vec PASTE(as_, PASTE(REAL, WIDTH))
+#define as_ivec PASTE(as_, PASTE(BITS, WIDTH))
+#define SIDE (BLOCK / LANES)
+#define ROW_BLOCKS (NY / 2 / BLOCK)
+#define COLUMN_BLOCKS (NX / 2 / BLOCK)
+#define PIXELS_SIZE (NX * NY / LANES)                       /* vectors */
+#define SPECTRA_SIZE (COLUMN_BLOCKS * ROWS * 2 * SIDE)      /* vectors */
+
+#define KERNEL __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+#define ITEM ((int)get_local_id(0))
+#if GROUP > 1
+#define BARRIER barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE)
+#else
+#define BARRIER
+#endif
+
+#if SCRATCH_IS_GLOBAL
+#define SCRATCH __global
+#define OWN_SCRATCH(scratch, points) (scratch + (size_t)get_group_id(0) * (2 * SIDE * (points)))
+#else
+#define SCRATCH __local
+#define OWN_SCRATCH(scratch, points) (scratch)
+#endif
+
+/* Shares n blocks among however many work-groups were launched. */
+#define FOR_EACH_BLOCK(block, n) \
+    for (int block = get_group_id(0); block < (n); block += get_num_groups(0))
+
+/* Shares n pieces of work among the work-items of a group. All items do the same number of rounds:
+ * PoCL 3 miscompiles loops round barriers whose bounds differ between the items.
+ */
+#if GROUP > 1
+#define FOR_EACH(piece, n)                                                    \
+    for (int round_ = 0, piece = ITEM; round_ < ((n) + GROUP - 1) / GROUP;    \
+         ++round_, piece += GROUP)                                            \
+        if (piece < (n))
+#else
+#define FOR_EACH(piece, n) for (int piece = 0; piece < (n); ++piece)
+#endif

@@ -1,0 +1,124 @@
+/* Model, ratio and objective, inside the transforms along the rows. */
+
+#define LN_2 ((real)0.69314718055994530942)
+#define INTEGER_SHIFT ((real)(sizeof(real) == 8 ? 0x1.8p52 : 0x1.8p23))
+#define MANTISSA_BITS (sizeof(real) == 8 ? 52 : 23)
+#define SQRT_HALF_BITS as_ivec((vec)SQRT_HALF)
+
+/* Small integers as reals, by way of the mantissa: PoCL 3 has no working convert_ for vectors. */
+static inline vec to_vec(const ivec i)
+{
+    return as_vec(i + as_ivec((vec)INTEGER_SHIFT)) - INTEGER_SHIFT;
+}
+
+/* m (r ln r - r + 1), which is g ln(g / m) + m - g for r = g / m, without its cancellation.
+ *
+ * r = 2^e v with v in [sqrt(1/2), sqrt(2)), w = v - 1, and w - ln(1 + w) from the series of
+ * 2 artanh z, z = w / (2 + w). Where e = 0 the terms of first order in w cancel exactly.
+ */
+static inline vec divergence(const vec m, const vec r)
+{
+    const ivec bits = as_ivec(r);
+    const ivec e = (bits - SQRT_HALF_BITS) >> MANTISSA_BITS;
+    const vec w = as_vec(bits - (e << MANTISSA_BITS)) - 1;
+    const vec z = w / (2 + w);
+    const vec z2 = z * z;
+    vec series = (real)1 / 9;
+    if (sizeof(real) == 8) {
+        series = (real)1 / 21;
+        for (int k = 19; k >= 9; k -= 2)
+            series = series * z2 + (real)1 / k;
+    }
+    series = ((series * z2 + (real)1 / 7) * z2 + (real)1 / 5) * z2 + (real)1 / 3;
+    const vec excess = w * z - 2 * z * z2 * series; /* w - ln(1 + w) */
+    const vec first = e == 0 ? w * w : r * (to_vec(e) * LN_2 + w) - (r - 1);
+    return m * (first - r * excess);
+}
+
+/* The ratio g / m, guarded, and the data term of the objective. g < 0: not observed. */
+static inline vec ratio(vec g, const vec m, vec *term)
+{
+#if HAS_WEIGHTS
+    const ivec observed = g >= 0;
+    g = observed ? g : (vec)0;
+#endif
+    const ivec guarded = m > (real)LEAST_MODEL;
+    const vec r = guarded ? g / m : (vec)0;
+    *term = divergence(m, r);
+    *term = guarded || g == 0 ? *term : (vec)INFINITY;
+#if HAS_WEIGHTS
+    *term = observed ? *term : (vec)0;
+#endif
+    return r;
+}
+
+/* m_j = A_j f + sum_s c_s P_js + b_j;  r_j = w_j g_j / m_j;  spectra <- row spectra of r_j;
+ * sums: J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j) and <P_js, r_j>.
+ * spectra: N_IMAGES arrays, in: row spectra of A_j f, out: twice the row spectra of r_j.
+ * images: N_IMAGES arrays of pixels, negative where not observed (HAS_WEIGHTS).
+ * background: [N_IMAGES], or N_IMAGES arrays of pixels (HAS_BACKGROUND_MAP).
+ * star_images: N_STARS x N_IMAGES arrays of pixels. star_fluxes: [N_STARS].
+ * sums: [ROW_BLOCKS][N_IMAGES][GROUP][N_SUMS][2].
+ * Launch: up to ROW_BLOCKS N_IMAGES groups. In place. Scratch: NX points.
+ * Twin: reference.ratio_rows.
+ */
+KERNEL void ratio_rows(
+    __global vec *restrict spectra, __global real *restrict sums,
+    __global const vec *restrict images, __global const real *restrict background,
+    __global const vec *restrict star_images, __global const real *restrict star_fluxes,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+{
+    SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    FOR_EACH_BLOCK(unit, ROW_BLOCKS * N_IMAGES) {
+        const int block = unit / N_IMAGES, image = unit % N_IMAGES;
+        __global vec *row_spectra = spectra + (size_t)image * SPECTRA_SIZE;
+        const size_t at = (size_t)image * PIXELS_SIZE + (size_t)block * NX * 2 * SIDE;
+        vec_sum total[N_SUMS];
+        for (int s = 0; s < N_SUMS; ++s)
+            total[s] = (vec_sum){0, 0};
+
+        read_tiles(z, row_spectra, block);
+        dit_inner(z, NX, row_roots);
+        FOR_EACH(piece, INNER(NX) * SIDE) {
+            const int x = piece / SIDE, lane = piece % SIDE;
+            cvec a[8];
+            load_inverse(a, z + lane, x, NX, row_roots);
+            vec part[N_SUMS];
+            for (int s = 0; s < N_SUMS; ++s)
+                part[s] = 0;
+            for (int q = 0; q < OUTER(NX); ++q) {
+                const int pixel = q * INNER(NX) + x;
+                const cvec g = LOAD(images + at + lane, pixel);
+#if HAS_BACKGROUND_MAP
+                a[q] = add(a[q], LOAD((__global const vec *)background + at + lane, pixel));
+#else
+                a[q].re += background[image];
+                a[q].im += background[image];
+#endif
+                for (int s = 0; s < N_STARS; ++s) {
+                    const cvec p = LOAD(
+                        star_images + (size_t)s * N_IMAGES * PIXELS_SIZE + at + lane, pixel);
+                    a[q].re += star_fluxes[s] * p.re;
+                    a[q].im += star_fluxes[s] * p.im;
+                }
+                cvec term;
+                a[q].re = ratio(g.re, a[q].re, &term.re);
+                a[q].im = ratio(g.im, a[q].im, &term.im);
+                part[0] += term.re + term.im;
+                for (int s = 0; s < N_STARS; ++s) {
+                    const cvec p = LOAD(
+                        star_images + (size_t)s * N_IMAGES * PIXELS_SIZE + at + lane, pixel);
+                    part[1 + s] += p.re * a[q].re + p.im * a[q].im;
+                }
+            }
+            for (int s = 0; s < N_SUMS; ++s)
+                ACCUMULATE(total[s], part[s]);
+            store_forward(z + lane, a, x, NX, row_roots);
+        }
+        BARRIER;
+        dif_inner(z, NX, row_roots);
+        write_tiles(row_spectra, z, block);
+        for (int s = 0; s < N_SUMS; ++s)
+            store_sum(sums + 2 * (((size_t)unit * GROUP + ITEM) * N_SUMS + s), total[s]);
+    }
+}

@@ -1,0 +1,208 @@
+/* Transforms along the rows: pixels to and from half spectra along x, two rows at a time.
+ *
+ * Row pair (a, b) is transformed as the complex row z = a + i b. Its spectrum Z holds both: with
+ * X, Y the half spectra of a and b, Z(k) = X(k) + i Y(k) and Z(-k) = conj(X(k)) + i conj(Y(k)).
+ * Half spectra keep one of each pair (k, -k), column h of them that at position POSITION(h) of
+ * the bit-reversed order; its opposite lies at OPPOSITE(h). X(0) and X(Nx / 2) are real and share
+ * column 0 as its real and imaginary part.
+ */
+
+#define POSITION(h) ((h) == 0 ? 0 : (h) + HIGH_BIT(h))
+#define OPPOSITE(h) ((h) == 0 ? 1 : POSITION(h) ^ (2 * HIGH_BIT(h) - 1))
+
+static inline vec zip_low(const vec a, const vec b)
+{
+#if LANES == 1
+    return a;
+#else
+    vec zipped;
+    zipped.even = a.lo;
+    zipped.odd = b.lo;
+    return zipped;
+#endif
+}
+
+static inline vec zip_high(const vec a, const vec b)
+{
+#if LANES == 1
+    return a;
+#else
+    vec zipped;
+    zipped.even = a.hi;
+    zipped.odd = b.hi;
+    return zipped;
+#endif
+}
+
+/* Transposes LANES x LANES: log2(LANES) rounds that interleave rows i and i + LANES / 2. */
+static inline void transpose(vec *a)
+{
+    for (int round = 1; round < LANES; round *= 2) {
+        vec b[LANES];
+        for (int i = 0; i < LANES / 2; ++i) {
+            b[2 * i] = zip_low(a[i], a[i + LANES / 2]);
+            b[2 * i + 1] = zip_high(a[i], a[i + LANES / 2]);
+        }
+        for (int i = 0; i < LANES; ++i)
+            a[i] = b[i];
+    }
+}
+
+/* Where rows 2 BLOCK block + ... of the spectra begin in column block c. */
+static inline size_t tile_start(const int block, const int column_block)
+{
+    return ((size_t)column_block * ROWS + 2 * BLOCK * block) * 2 * SIDE;
+}
+
+/* Half spectra of one block of row pairs -> Z in the scratch, in bit-reversed order. */
+static inline void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int block)
+{
+    FOR_EACH(piece, COLUMN_BLOCKS * SIDE * SIDE) {
+        const int column = piece % SIDE, pair = piece / SIDE % SIDE, tile = piece / SIDE / SIDE;
+        __global const vec *x = spectra + tile_start(block, tile) + 4 * LANES * pair * SIDE + column;
+        const int h = tile * BLOCK + column * LANES;
+        vec a[LANES];
+        for (int l = 0; l < LANES; ++l)
+            a[l] = x[4 * l * SIDE] - x[(4 * l + 3) * SIDE];
+        transpose(a);
+        for (int i = 0; i < LANES; ++i)
+            z[2 * POSITION(h + i) * SIDE + pair] = a[i];
+        for (int l = 0; l < LANES; ++l)
+            a[l] = x[(4 * l + 1) * SIDE] + x[(4 * l + 2) * SIDE];
+        transpose(a);
+        for (int i = 0; i < LANES; ++i)
+            z[(2 * POSITION(h + i) + 1) * SIDE + pair] = a[i];
+        for (int l = 0; l < LANES; ++l)
+            a[l] = x[4 * l * SIDE] + x[(4 * l + 3) * SIDE];
+        transpose(a);
+        for (int i = 0; i < LANES; ++i)
+            z[2 * OPPOSITE(h + i) * SIDE + pair] = a[i];
+        for (int l = 0; l < LANES; ++l)
+            a[l] = x[(4 * l + 2) * SIDE] - x[(4 * l + 1) * SIDE];
+        transpose(a);
+        for (int i = 0; i < LANES; ++i)
+            z[(2 * OPPOSITE(h + i) + 1) * SIDE + pair] = a[i];
+    }
+    BARRIER;
+    FOR_EACH(pair, BLOCK) {
+        __global const real *x =
+            (__global const real *)(spectra + tile_start(block, 0)) + 4 * pair * BLOCK;
+        SCRATCH real *first = (SCRATCH real *)z + pair;
+        first[0] = x[0];
+        first[BLOCK] = x[2 * BLOCK];
+        first[2 * BLOCK] = x[BLOCK];
+        first[3 * BLOCK] = x[3 * BLOCK];
+    }
+    BARRIER;
+}
+
+/* Z in the scratch, in bit-reversed order -> twice the half spectra of its row pairs. */
+static inline void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int block)
+{
+    FOR_EACH(piece, COLUMN_BLOCKS * SIDE * SIDE) {
+        const int column = piece % SIDE, pair = piece / SIDE % SIDE, tile = piece / SIDE / SIDE;
+        __global vec *x = spectra + tile_start(block, tile) + 4 * LANES * pair * SIDE + column;
+        const int h = tile * BLOCK + column * LANES;
+        vec a[LANES];
+        for (int i = 0; i < LANES; ++i)
+            a[i] = z[2 * POSITION(h + i) * SIDE + pair] + z[2 * OPPOSITE(h + i) * SIDE + pair];
+        transpose(a);
+        for (int l = 0; l < LANES; ++l)
+            x[4 * l * SIDE] = a[l];
+        for (int i = 0; i < LANES; ++i)
+            a[i] = z[(2 * POSITION(h + i) + 1) * SIDE + pair]
+                 - z[(2 * OPPOSITE(h + i) + 1) * SIDE + pair];
+        transpose(a);
+        for (int l = 0; l < LANES; ++l)
+            x[(4 * l + 1) * SIDE] = a[l];
+        for (int i = 0; i < LANES; ++i)
+            a[i] = z[(2 * POSITION(h + i) + 1) * SIDE + pair]
+                 + z[(2 * OPPOSITE(h + i) + 1) * SIDE + pair];
+        transpose(a);
+        for (int l = 0; l < LANES; ++l)
+            x[(4 * l + 2) * SIDE] = a[l];
+        for (int i = 0; i < LANES; ++i)
+            a[i] = z[2 * OPPOSITE(h + i) * SIDE + pair] - z[2 * POSITION(h + i) * SIDE + pair];
+        transpose(a);
+        for (int l = 0; l < LANES; ++l)
+            x[(4 * l + 3) * SIDE] = a[l];
+    }
+    BARRIER;
+    FOR_EACH(pair, BLOCK) {
+        __global real *x = (__global real *)(spectra + tile_start(block, 0)) + 4 * pair * BLOCK;
+        SCRATCH const real *first = (SCRATCH const real *)z + pair;
+        x[0] = 2 * first[0];
+        x[2 * BLOCK] = 2 * first[BLOCK];
+        x[BLOCK] = 2 * first[2 * BLOCK];
+        x[3 * BLOCK] = 2 * first[3 * BLOCK];
+    }
+    BARRIER;
+}
+
+/* The outer pass over n points of a block: leg q of butterfly x is point x + q INNER(n). */
+
+static inline void load_inverse(
+    cvec *a, SCRATCH const vec *z, const int x, const int n, __global const real *roots)
+{
+    for (int q = 0; q < OUTER(n); ++q)
+        a[q] = LOAD(z, q * INNER(n) + x);
+    twiddle_inverse(a, OUTER(n), roots + 2 * (OUTER(n) - 1) * x);
+    dit(a, OUTER(n));
+}
+
+static inline void store_forward(
+    SCRATCH vec *z, cvec *a, const int x, const int n, __global const real *roots)
+{
+    dif(a, OUTER(n));
+    twiddle_forward(a, OUTER(n), roots + 2 * (OUTER(n) - 1) * x);
+    for (int q = 0; q < OUTER(n); ++q)
+        STORE(z, q * INNER(n) + x, a[q]);
+}
+
+/* spectra = 2 sum_x pixels(x) exp(-2 pi i k x / NX), k = 0 .. NX / 2.
+ * pixels: one array, const. spectra: one array, all of it but its padding is written.
+ * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.rfft_rows.
+ */
+KERNEL void rfft_rows(
+    __global vec *restrict spectra, __global const vec *restrict pixels,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+{
+    SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+        __global const vec *from = pixels + (size_t)block * NX * 2 * SIDE;
+        FOR_EACH(piece, INNER(NX) * SIDE) {
+            const int x = piece / SIDE, lane = piece % SIDE;
+            cvec a[8];
+            for (int q = 0; q < OUTER(NX); ++q)
+                a[q] = LOAD(from + lane, q * INNER(NX) + x);
+            store_forward(z + lane, a, x, NX, row_roots);
+        }
+        BARRIER;
+        dif_inner(z, NX, row_roots);
+        write_tiles(spectra, z, block);
+    }
+}
+
+/* pixels = sum_k spectra(k) exp(+2 pi i k x / NX) over all k, the half spectra completed.
+ * spectra: one array, const. pixels: one array, all of it is written.
+ * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.irfft_rows.
+ */
+KERNEL void irfft_rows(
+    __global vec *restrict pixels, __global const vec *restrict spectra,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+{
+    SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+        __global vec *to = pixels + (size_t)block * NX * 2 * SIDE;
+        read_tiles(z, spectra, block);
+        dit_inner(z, NX, row_roots);
+        FOR_EACH(piece, INNER(NX) * SIDE) {
+            const int x = piece / SIDE, lane = piece % SIDE;
+            cvec a[8];
+            load_inverse(a, z + lane, x, NX, row_roots);
+            for (int q = 0; q < OUTER(NX); ++q)
+                STORE(to + lane, q * INNER(NX) + x, a[q]);
+        }
+        BARRIER;
+    }
+}

@@ -1,0 +1,65 @@
+/* The SGM scalings, inside the transforms along the rows. */
+
+/* f <- f a c / (1 + mu f a), c = sum_j A_j^T r_j not below 0, a = 1 / sum_j A_j^T w_j;
+ * spectrum <- row spectrum of the new f; sums: sum f^2; c_s <- c_s star_corrections_s.
+ * spectrum: one array, in: row spectrum of c, out: twice the row spectrum of f.
+ * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; where
+ * there are none a = 1 / N_IMAGES). sums: [ROW_BLOCKS][GROUP][2] (HAS_MU).
+ * star_fluxes, star_corrections: [N_STARS].
+ * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.scale_rows.
+ */
+KERNEL void scale_rows(
+    __global vec *restrict spectrum, __global vec *restrict extended,
+    __global real *restrict sums, __global real *restrict star_fluxes,
+    __global const vec *restrict inverse_weight, __global const real *restrict star_corrections,
+    const real mu, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+{
+    SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+        const size_t at = (size_t)block * NX * 2 * SIDE;
+        __global vec *source = extended + at;
+        vec_sum total = {0, 0};
+        read_tiles(z, spectrum, block);
+        dit_inner(z, NX, row_roots);
+        FOR_EACH(piece, INNER(NX) * SIDE) {
+            const int x = piece / SIDE, lane = piece % SIDE;
+            cvec a[8];
+            load_inverse(a, z + lane, x, NX, row_roots);
+            vec part = 0;
+            for (int q = 0; q < OUTER(NX); ++q) {
+                const int pixel = q * INNER(NX) + x;
+                cvec f = LOAD(source + lane, pixel);
+#if HAS_WEIGHTS
+                const cvec weight = LOAD(inverse_weight + at + lane, pixel);
+                f.re *= weight.re;
+                f.im *= weight.im;
+#else
+                f.re *= (real)1 / N_IMAGES;
+                f.im *= (real)1 / N_IMAGES;
+#endif
+                a[q].re = f.re * (a[q].re < 0 ? (vec)0 : a[q].re);
+                a[q].im = f.im * (a[q].im < 0 ? (vec)0 : a[q].im);
+#if HAS_MU
+                a[q].re /= 1 + mu * f.re;
+                a[q].im /= 1 + mu * f.im;
+                part += a[q].re * a[q].re + a[q].im * a[q].im;
+#endif
+                STORE(source + lane, pixel, a[q]);
+            }
+#if HAS_MU
+            ACCUMULATE(total, part);
+#endif
+            store_forward(z + lane, a, x, NX, row_roots);
+        }
+        BARRIER;
+        dif_inner(z, NX, row_roots);
+        write_tiles(spectrum, z, block);
+#if HAS_MU
+        store_sum(sums + 2 * (block * GROUP + ITEM), total);
+#endif
+    }
+    if (get_group_id(0) == 0) {
+        FOR_EACH(s, N_STARS)
+            star_fluxes[s] *= star_corrections[s];
+    }
+}

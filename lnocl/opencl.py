@@ -1,0 +1,288 @@
+"""The iteration's verbs on an OpenCL device: buffers and launches; the engine ``"opencl"``."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from lnocl.device import choose, describe
+from lnocl.errors import DeviceError
+from lnocl.fft import READ_WRITE, Launcher, Layout
+from lnocl.observation import Array
+from lnocl.program import Program, Tuning
+from lnocl.reference import LEAST_MODEL
+from lnocl.scene import Scene
+
+# Iterations that may wait in the queue: enough to keep the device busy, few enough that an
+# interrupt is answered soon.
+ITERATIONS_AHEAD = 8
+
+
+class OpenCLEngine:
+    """A scene on a device.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is modelled.
+    precision : {"single", "double"}
+        Arithmetic.
+    device : str, optional
+        As for `lnocl.device.choose`.
+    n_iter : int
+        Most iterations that will be done: objectives are recorded for one more.
+    tuning : Tuning, optional
+        By default that of `lnocl.program.tune`.
+
+    Raises
+    ------
+    InputError
+        No such device.
+    DeviceError
+        No device, no double precision where it is asked for, or too little memory.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        precision: str,
+        device: str | None,
+        n_iter: int,
+        tuning: Tuning | None = None,
+    ) -> None:
+        chosen = choose(device).device
+        self.name = describe(chosen)
+        self.scene = scene
+        self._context = cl.Context([chosen])
+        observation = scene.observation
+        # Weights travel with the images, as negative counts; so they do not show up by themselves.
+        self.program = Program(
+            self._context,
+            scene.grid,
+            np.dtype(np.float64 if precision == "double" else np.float32),
+            tuning,
+            n_images=scene.n_images,
+            n_stars=scene.n_stars,
+            has_mu=scene.mu > 0,
+            has_weights=scene.weights is not None,
+            has_background_map=observation.background.ndim == 3,
+            least_model=LEAST_MODEL,
+        )
+        self.layout = Layout(self.program)
+        self.bytes_needed = self._refuse_if_too_large(n_iter)
+        self._launcher = Launcher(self.program)
+        self._queue = self._launcher.queue
+        self._n_objectives = 0
+        self._pending: deque[cl.Event] = deque()
+        self._real = self.program.dtype.type
+        self._allocate(n_iter)
+        self._upload_scene()
+
+    def _sizes(self, n_iter: int) -> dict[str, int]:
+        """Return the bytes of each buffer, by name."""
+        program, layout = self.program, self.layout
+        p, n, item = program.n_images, program.n_stars, program.dtype.itemsize
+        groups = program.row_blocks * program.tuning.group
+        has_map = self.scene.observation.background.ndim == 3
+        return {
+            "images": p * layout.pixels_bytes,
+            "otfs": p * layout.pixels_bytes,
+            "otf_edges": p * program.grid[0] * 2 * item,
+            "spectra": p * layout.spectra_bytes,
+            "spectrum": layout.spectra_bytes,
+            "extended": layout.pixels_bytes,
+            "inverse_weight": layout.pixels_bytes if self.scene.weights is not None else item,
+            "background": p * (layout.pixels_bytes if has_map else item),
+            "star_images": max(n * p * layout.pixels_bytes, item),
+            "star_fluxes": max(n, 1) * item,
+            "star_weights": max(n, 1) * item,
+            "star_corrections": max(n, 1) * item,
+            "ratio_sums": groups * p * (1 + n) * 2 * item,
+            "square_sums": groups * 2 * item,
+            "objectives": (n_iter + 1) * 2 * item,
+        }
+
+    def _refuse_if_too_large(self, n_iter: int) -> int:
+        """Return the bytes that the scene takes on the device, all buffers together."""
+        sizes = self._sizes(n_iter)
+        device = self._context.devices[0]
+        total = sum(sizes.values())
+        largest = max(sizes, key=lambda name: sizes[name])
+        if total > device.global_mem_size or sizes[largest] > device.max_mem_alloc_size:
+            raise DeviceError(
+                f"the scene needs {total / 2**20:.0f} MiB, {sizes[largest] / 2**20:.0f} MiB of it "
+                f"for {largest}; {self.name} has {device.global_mem_size / 2**20:.0f} MiB and "
+                f"gives {device.max_mem_alloc_size / 2**20:.0f} MiB at once: take fewer or "
+                "smaller images, fewer stars, precision single, or another device"
+            )
+        return total
+
+    def _allocate(self, n_iter: int) -> None:
+        self._buffers = {
+            name: cl.Buffer(self._context, READ_WRITE, size)
+            for name, size in self._sizes(n_iter).items()
+        }
+
+    def _upload_scene(self) -> None:
+        scene = self.scene
+        images = scene.images()
+        if scene.weights is not None:
+            images[~scene.weights] = -1.0
+        self._upload_pixels("images", images)
+        background = scene.background()
+        if background.ndim == 3:
+            self._upload_pixels("background", background)
+        else:
+            self._upload("background", background)
+        self._make_otfs()
+        if scene.n_stars:
+            self._upload_pixels(
+                "star_images",
+                (
+                    scene.star_image(j, s)
+                    for s in range(scene.n_stars)
+                    for j in range(scene.n_images)
+                ),
+            )
+            self._upload("star_weights", scene.star_weights)
+        self._observed: NDArray[np.bool_] | None = None
+        if scene.weights is not None:
+            self._invert_weights(scene.weights)
+
+    def _make_otfs(self) -> None:
+        edges = 2 * self.program.grid[0]
+        otfs = self._parts("otfs", self.layout.pixels_bytes)
+        otf_edges = self._parts("otf_edges", edges * self.program.dtype.itemsize)
+        for j, (otf, edge) in enumerate(zip(otfs, otf_edges, strict=True)):
+            self._upload_pixels("extended", [self.scene.psf(j)])
+            self._launcher.rows("rfft_rows", self._buffers["spectrum"], self._buffers["extended"])
+            self._launcher.columns("otf_columns", otf, edge, self._buffers["spectrum"])
+
+    def _invert_weights(self, weights: NDArray[np.bool_]) -> None:
+        """Make 1 / sum_j A_j^T w_j, 0 where nothing was observed."""
+        for spectra, weight in zip(
+            self._parts("spectra", self.layout.spectra_bytes), weights, strict=True
+        ):
+            self._upload_pixels("extended", [weight])
+            self._launcher.rows("rfft_rows", spectra, self._buffers["extended"])
+        self.correct()
+        self._launcher.rows("irfft_rows", self._buffers["extended"], self._buffers["spectrum"])
+        total = self.extended()
+        self._observed = self.scene.observed(total)
+        inverse = np.divide(1.0, total, out=np.zeros_like(total), where=self._observed)
+        self._upload_pixels("inverse_weight", [inverse])
+
+    def start(self, extended: Array, star_fluxes: Array) -> None:
+        """Begin from this estimate, on the grid and scaled; unobserved pixels are set to 0."""
+        if self._observed is not None:
+            extended = np.where(self._observed, extended, 0.0)
+        self._upload_pixels("extended", [extended])
+        self._launcher.rows("rfft_rows", self._buffers["spectrum"], self._buffers["extended"])
+        if self.scene.n_stars:
+            self._upload("star_fluxes", star_fluxes)
+        squares = np.zeros(self._buffers["square_sums"].size // self.program.dtype.itemsize)
+        squares[0] = (extended**2).sum()
+        self._upload("square_sums", squares)
+
+    def ratio(self) -> None:
+        """Make the ratios of the estimate; record its objective."""
+        buffers = self._buffers
+        self._launcher.columns(
+            "convolve_columns",
+            buffers["spectra"],
+            buffers["spectrum"],
+            buffers["otfs"],
+            buffers["otf_edges"],
+        )
+        self._launcher.rows(
+            "ratio_rows",
+            buffers["spectra"],
+            buffers["ratio_sums"],
+            buffers["images"],
+            buffers["background"],
+            buffers["star_images"],
+            buffers["star_fluxes"],
+            blocks=self.program.row_blocks * self.program.n_images,
+        )
+        self._launcher.single(
+            "collect_sums",
+            buffers["objectives"],
+            buffers["star_corrections"],
+            buffers["ratio_sums"],
+            buffers["square_sums"],
+            buffers["star_weights"],
+            self._real(self.scene.mu),
+            np.int32(self._n_objectives),
+        )
+        self._n_objectives += 1
+
+    def correct(self) -> None:
+        """Back-project the ratios to the correction."""
+        buffers = self._buffers
+        self._launcher.columns(
+            "correlate_columns",
+            buffers["spectrum"],
+            buffers["spectra"],
+            buffers["otfs"],
+            buffers["otf_edges"],
+        )
+
+    def scale(self) -> None:
+        """Scale the estimate by its correction."""
+        buffers = self._buffers
+        event = self._launcher.rows(
+            "scale_rows",
+            buffers["spectrum"],
+            buffers["extended"],
+            buffers["square_sums"],
+            buffers["star_fluxes"],
+            buffers["inverse_weight"],
+            buffers["star_corrections"],
+            self._real(self.scene.mu),
+        )
+        self._pending.append(event)
+        if len(self._pending) > ITERATIONS_AHEAD:
+            self._pending.popleft().wait()
+
+    def extended(self) -> Array:
+        """Return the extended source, on the grid and scaled."""
+        packed = np.empty(self.layout.pixels_shape, self.program.dtype)
+        cl.enqueue_copy(self._queue, packed, self._buffers["extended"])
+        return self.layout.unpack_pixels(packed)
+
+    def star_fluxes(self) -> Array:
+        """Return the star fluxes, scaled."""
+        return self._download("star_fluxes", self.scene.n_stars)
+
+    def objectives(self) -> Array:
+        """Return the objectives recorded so far, scaled."""
+        pairs = self._download("objectives", 2 * self._n_objectives)
+        return pairs.reshape(-1, 2).sum(axis=1)
+
+    def _parts(self, name: str, size: int) -> list[cl.Buffer]:
+        """Return the arrays that lie one behind the other in a buffer."""
+        buffer = self._buffers[name]
+        return [buffer[start : start + size] for start in range(0, buffer.size, size)]
+
+    def _upload(self, name: str, values: Array) -> None:
+        cl.enqueue_copy(self._queue, self._buffers[name], values.astype(self.program.dtype))
+
+    def _upload_pixels(self, name: str, arrays: Iterable[NDArray]) -> None:
+        """Upload arrays of pixels, one behind the other."""
+        for i, array in enumerate(arrays):
+            cl.enqueue_copy(
+                self._queue,
+                self._buffers[name],
+                self.layout.pack_pixels(array),
+                dst_offset=i * self.layout.pixels_bytes,
+            )
+
+    def _download(self, name: str, count: int) -> Array:
+        values = np.empty(count, self.program.dtype)
+        if count:
+            cl.enqueue_copy(self._queue, values, self._buffers[name])
+        return values.astype(np.float64)

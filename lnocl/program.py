@@ -1,0 +1,178 @@
+"""Building the kernels for a device and a scene, with the tuning that the device calls for."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from importlib import resources
+
+import numpy as np
+import pyopencl as cl
+
+from lnocl.device import describe, has_double
+from lnocl.errors import DeviceError
+
+SOURCES = (
+    "precision.cl",
+    "complex.cl",
+    "fft.cl",
+    "rows.cl",
+    "columns.cl",
+    "sums.cl",
+    "ratio.cl",
+    "scale.cl",
+)
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """How the kernels are cut to a device; kernels/precision.cl says what each constant is.
+
+    Attributes
+    ----------
+    lanes, block, group, chunk : int
+        Reals in a vector; columns transformed together; work-items that share a block; points
+        of a transform finished before the next are begun.
+    padding : int
+        Rows of padding behind a block of spectra, which keep neighbouring blocks from falling
+        on the same cache sets.
+    """
+
+    lanes: int
+    block: int
+    group: int = 1
+    chunk: int = 128
+    padding: int = 16
+
+
+def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
+    """Return the tuning for this kind of device.
+
+    A CPU takes a block as one vector in one work-item; other devices take scalars in a group of
+    work-items. Small grids have smaller blocks, so that no block is ever filled in part.
+    """
+    most = min(grid) // 2
+    if device.type & cl.device_type.CPU:
+        lanes = min(64 // dtype.itemsize, most)
+        return Tuning(lanes=lanes, block=lanes)
+    group = max(1, min(128, min(grid) // 8, device.max_work_group_size))
+    return Tuning(lanes=1, block=min(8, most), group=group)
+
+
+class Program:
+    """The kernels built for one device, grid and scene; each is fetched once.
+
+    Parameters
+    ----------
+    context : pyopencl.Context
+        Of one device.
+    grid : tuple of int
+        Shape (Ny, Nx), powers of two from 2 to 8192.
+    dtype : numpy.dtype
+        float32 or float64.
+    tuning : Tuning, optional
+        By default that of `tune`.
+    n_images, n_stars : int, optional
+        What the scene has.
+    has_mu, has_weights, has_background_map : bool, optional
+        What the scene has.
+    least_model : float, optional
+        The division guard.
+
+    Attributes
+    ----------
+    kernels : dict of str to pyopencl.Kernel
+        Every kernel of the program by name.
+    options : list of str
+        The build options.
+    scratch_points : int
+        Points of a block that a work-group keeps while it transforms.
+
+    Raises
+    ------
+    DeviceError
+        Where the device has no double precision and float64 is asked of it, or where the
+        device's compiler fails.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        grid: tuple[int, int],
+        dtype: np.dtype,
+        tuning: Tuning | None = None,
+        *,
+        n_images: int = 1,
+        n_stars: int = 0,
+        has_mu: bool = False,
+        has_weights: bool = False,
+        has_background_map: bool = False,
+        least_model: float = 0.0,
+    ) -> None:
+        device = context.devices[0]
+        self.context, self.grid, self.dtype = context, grid, dtype
+        self.n_images, self.n_stars = n_images, n_stars
+        if dtype == np.float64 and not has_double(device):
+            raise DeviceError(
+                f"{describe(device)} has no double precision; take precision single, or another "
+                "device"
+            )
+        self.tuning = tuning or tune(device, dtype, grid)
+        self.rows = grid[0] + self.tuning.padding
+        self.scratch_points = max(grid[1], 2 * grid[0])
+        self.scratch_is_global = self.scratch_bytes > device.local_mem_size
+        constants = {
+            "REAL": "double" if dtype == np.float64 else "float",
+            "BITS": "long" if dtype == np.float64 else "int",
+            "LANES": self.tuning.lanes,
+            "BLOCK": self.tuning.block,
+            "GROUP": self.tuning.group,
+            "CHUNK": self.tuning.chunk,
+            "SCRATCH_IS_GLOBAL": int(self.scratch_is_global),
+            "NX": grid[1],
+            "NY": grid[0],
+            "ROWS": self.rows,
+            "N_IMAGES": n_images,
+            "N_STARS": n_stars,
+            "HAS_MU": int(has_mu),
+            "HAS_WEIGHTS": int(has_weights),
+            "HAS_BACKGROUND_MAP": int(has_background_map),
+            "LEAST_MODEL": f"{least_model!r}",
+        }
+        self.options = ["-cl-std=CL1.2", *(f"-D{name}={value}" for name, value in constants.items())]
+        built = _build(context, self.options)
+        self.kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
+
+    @property
+    def row_blocks(self) -> int:
+        """Blocks of row pairs in an array of pixels."""
+        return self.grid[0] // 2 // self.tuning.block
+
+    @property
+    def column_blocks(self) -> int:
+        """Blocks of columns in an array of spectra."""
+        return self.grid[1] // 2 // self.tuning.block
+
+    @property
+    def scratch_bytes(self) -> int:
+        """Bytes that a work-group needs for its block."""
+        return self.scratch_points * 2 * self.tuning.block * self.dtype.itemsize
+
+
+def source() -> str:
+    """Return the OpenCL source of all kernels, in the order in which they build on each other."""
+    folder = resources.files("lnocl.kernels")
+    return "".join(
+        f'#line 1 "{name}"\n{(folder / name).read_text(encoding="ascii")}' for name in SOURCES
+    )
+
+
+def _build(context: cl.Context, options: list[str]) -> cl.Program:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+            return cl.Program(context, source()).build(options)
+    except cl.RuntimeError as error:
+        device = context.devices[0]
+        log = " ".join(str(error).split())
+        raise DeviceError(f"the kernels do not build on {describe(device)}: {log}") from error
