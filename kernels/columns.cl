@@ -10,7 +10,7 @@
 #define MIRROR(t) ((t) < 2 ? (t) : (t) ^ (HIGH_BIT(t) - 1))
 
 /* a plus what column 0 gets from its opposite point: (re + i im) conj(p(MIRROR(t))). */
-static inline cvec add_edge(
+INLINE cvec add_edge(
     const cvec a, const real re, const real im, SCRATCH const vec *p, const int t)
 {
     SCRATCH const real *opposite = (SCRATCH const real *)p + 2 * MIRROR(t) * BLOCK;
@@ -19,7 +19,7 @@ static inline cvec add_edge(
 }
 
 /* Outer and all inner passes of the forward transform of a block of columns. */
-static inline void forward_columns(
+INLINE void forward_columns(
     SCRATCH vec *z, __global const vec *from, __global const real *column_roots)
 {
     FOR_EACH(piece, INNER(NY) * SIDE) {
@@ -34,7 +34,7 @@ static inline void forward_columns(
 }
 
 /* The outer pass of the inverse transform of a block of columns. */
-static inline void finish_columns(
+INLINE void finish_columns(
     __global vec *to, SCRATCH const vec *z, __global const real *column_roots)
 {
     FOR_EACH(piece, INNER(NY) * SIDE) {

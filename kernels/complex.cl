@@ -12,38 +12,38 @@ typedef struct {
         (x)[(2 * (i) + 1) * SIDE] = (value).im; \
     } while (0)
 
-static inline cvec add(const cvec a, const cvec b)
+INLINE cvec add(const cvec a, const cvec b)
 {
     return (cvec){a.re + b.re, a.im + b.im};
 }
 
-static inline cvec subtract(const cvec a, const cvec b)
+INLINE cvec subtract(const cvec a, const cvec b)
 {
     return (cvec){a.re - b.re, a.im - b.im};
 }
 
-static inline cvec multiply(const cvec a, const cvec b)
+INLINE cvec multiply(const cvec a, const cvec b)
 {
     return (cvec){a.re * b.re - a.im * b.im, a.re * b.im + a.im * b.re};
 }
 
-static inline cvec multiply_conjugate(const cvec a, const cvec b) /* a conj(b) */
+INLINE cvec multiply_conjugate(const cvec a, const cvec b) /* a conj(b) */
 {
     return (cvec){a.re * b.re + a.im * b.im, a.im * b.re - a.re * b.im};
 }
 
 /* The same with one scalar root of unity for all lanes. */
-static inline cvec rotate(const cvec a, const real re, const real im)
+INLINE cvec rotate(const cvec a, const real re, const real im)
 {
     return (cvec){a.re * re - a.im * im, a.re * im + a.im * re};
 }
 
-static inline cvec times_i(const cvec a)
+INLINE cvec times_i(const cvec a)
 {
     return (cvec){-a.im, a.re};
 }
 
-static inline cvec times_minus_i(const cvec a)
+INLINE cvec times_minus_i(const cvec a)
 {
     return (cvec){a.im, -a.re};
 }

@@ -39,14 +39,14 @@
 #define SIN_PI_8 ((real)0.38268343236508977173)
 #define SQRT_HALF ((real)0.70710678118654752440)
 
-static inline void butterfly(cvec *a, cvec *b)
+INLINE void butterfly(cvec *a, cvec *b)
 {
     const cvec difference = subtract(*a, *b);
     *a = add(*a, *b);
     *b = difference;
 }
 
-static inline void dif(cvec *a, const int radix)
+INLINE void dif(cvec *a, const int radix)
 {
     if (radix == 16) {
         for (int i = 0; i < 8; ++i)
@@ -82,7 +82,7 @@ static inline void dif(cvec *a, const int radix)
 }
 
 /* The steps of dif backwards, with conjugate roots. */
-static inline void dit(cvec *a, const int radix)
+INLINE void dit(cvec *a, const int radix)
 {
     if (radix >= 2) {
         for (int s = 0; s < radix; s += 2)
@@ -117,20 +117,20 @@ static inline void dit(cvec *a, const int radix)
     }
 }
 
-static inline void twiddle_forward(cvec *a, const int radix, __global const real *roots)
+INLINE void twiddle_forward(cvec *a, const int radix, __global const real *roots)
 {
     for (int q = 1; q < radix; ++q)
         a[q] = rotate(a[q], roots[2 * q - 2], roots[2 * q - 1]);
 }
 
-static inline void twiddle_inverse(cvec *a, const int radix, __global const real *roots)
+INLINE void twiddle_inverse(cvec *a, const int radix, __global const real *roots)
 {
     for (int q = 1; q < radix; ++q)
         a[q] = rotate(a[q], roots[2 * q - 2], -roots[2 * q - 1]);
 }
 
 /* The roots of the pass over subtransforms of `length` points; `roots` is the table for n. */
-static inline __global const real *roots_of(
+INLINE __global const real *roots_of(
     __global const real *roots, const int n, const int length)
 {
     if (length < n)
@@ -141,7 +141,7 @@ static inline __global const real *roots_of(
 }
 
 /* A pass of radix 8 over `total` points in subtransforms of `length`. */
-static inline void dif_pass(
+INLINE void dif_pass(
     SCRATCH vec *x, const int total, const int length, __global const real *roots)
 {
     const int eighth = length / 8;
@@ -159,7 +159,7 @@ static inline void dif_pass(
     BARRIER;
 }
 
-static inline void dit_pass(
+INLINE void dit_pass(
     SCRATCH vec *x, const int total, const int length, __global const real *roots)
 {
     const int eighth = length / 8;
@@ -177,33 +177,33 @@ static inline void dit_pass(
     BARRIER;
 }
 
-static inline void dif_middle(SCRATCH vec *x, const int n, __global const real *roots)
+INLINE void dif_middle(SCRATCH vec *x, const int n, __global const real *roots)
 {
     if (HAS_MIDDLE(n))
         dif_pass(x, n, INNER(n), roots_of(roots, n, INNER(n)));
 }
 
-static inline void dit_middle(SCRATCH vec *x, const int n, __global const real *roots)
+INLINE void dit_middle(SCRATCH vec *x, const int n, __global const real *roots)
 {
     if (HAS_MIDDLE(n))
         dit_pass(x, n, INNER(n), roots_of(roots, n, INNER(n)));
 }
 
 /* The passes over one span, all but the last. */
-static inline void dif_span(SCRATCH vec *x, const int n, __global const real *roots)
+INLINE void dif_span(SCRATCH vec *x, const int n, __global const real *roots)
 {
     for (int length = SPAN_LENGTH(n); length > 16; length /= 8)
         dif_pass(x, SPAN(n), length, roots_of(roots, n, length));
 }
 
-static inline void dit_span(SCRATCH vec *x, const int n, __global const real *roots)
+INLINE void dit_span(SCRATCH vec *x, const int n, __global const real *roots)
 {
     for (int length = 8 * LAST(n); length <= SPAN_LENGTH(n); length *= 8)
         dit_pass(x, SPAN(n), length, roots_of(roots, n, length));
 }
 
 /* The last pass of the forward transform, over one span. */
-static inline void dif_last(SCRATCH vec *x, const int n)
+INLINE void dif_last(SCRATCH vec *x, const int n)
 {
     FOR_EACH(piece, SPAN(n) / LAST(n) * SIDE) {
         SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE * LAST(n)) + piece % SIDE;
@@ -218,7 +218,7 @@ static inline void dif_last(SCRATCH vec *x, const int n)
 }
 
 /* The first pass of the inverse transform, over one span. */
-static inline void dit_first(SCRATCH vec *x, const int n)
+INLINE void dit_first(SCRATCH vec *x, const int n)
 {
     FOR_EACH(piece, SPAN(n) / LAST(n) * SIDE) {
         SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE * LAST(n)) + piece % SIDE;
@@ -233,7 +233,7 @@ static inline void dit_first(SCRATCH vec *x, const int n)
 }
 
 /* Everything behind the outer pass of the forward transform. */
-static inline void dif_inner(SCRATCH vec *x, const int n, __global const real *roots)
+INLINE void dif_inner(SCRATCH vec *x, const int n, __global const real *roots)
 {
     dif_middle(x, n, roots);
     for (int start = 0; start < n; start += SPAN(n)) {
@@ -243,7 +243,7 @@ static inline void dif_inner(SCRATCH vec *x, const int n, __global const real *r
 }
 
 /* Everything before the outer pass of the inverse transform. */
-static inline void dit_inner(SCRATCH vec *x, const int n, __global const real *roots)
+INLINE void dit_inner(SCRATCH vec *x, const int n, __global const real *roots)
 {
     for (int start = 0; start < n; start += SPAN(n)) {
         dit_first(x + 2 * SIDE * start, n);

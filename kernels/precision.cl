@@ -50,6 +50,8 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define PIXELS_SIZE (NX * NY / LANES)                       /* vectors */
 #define SPECTRA_SIZE (COLUMN_BLOCKS * ROWS * 2 * SIDE)      /* vectors */
 
+/* Without it PoCL leaves calls behind, and registers go through memory. */
+#define INLINE static inline __attribute__((always_inline))
 #define KERNEL __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 #define ITEM ((int)get_local_id(0))
 #if GROUP > 1

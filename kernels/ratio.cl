@@ -6,7 +6,7 @@
 #define SQRT_HALF_BITS as_ivec((vec)SQRT_HALF)
 
 /* Small integers as reals, by way of the mantissa: PoCL 3 has no working convert_ for vectors. */
-static inline vec to_vec(const ivec i)
+INLINE vec to_vec(const ivec i)
 {
     return as_vec(i + as_ivec((vec)INTEGER_SHIFT)) - INTEGER_SHIFT;
 }
@@ -16,7 +16,7 @@ static inline vec to_vec(const ivec i)
  * r = 2^e v with v in [sqrt(1/2), sqrt(2)), w = v - 1, and w - ln(1 + w) from the series of
  * 2 artanh z, z = w / (2 + w). Where e = 0 the terms of first order in w cancel exactly.
  */
-static inline vec divergence(const vec m, const vec r)
+INLINE vec divergence(const vec m, const vec r)
 {
     const ivec bits = as_ivec(r);
     const ivec e = (bits - SQRT_HALF_BITS) >> MANTISSA_BITS;
@@ -36,7 +36,7 @@ static inline vec divergence(const vec m, const vec r)
 }
 
 /* The ratio g / m, guarded, and the data term of the objective. g < 0: not observed. */
-static inline vec ratio(vec g, const vec m, vec *term)
+INLINE vec ratio(vec g, const vec m, vec *term)
 {
 #if HAS_WEIGHTS
     const ivec observed = g >= 0;

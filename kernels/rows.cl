@@ -2,15 +2,26 @@
  *
  * Row pair (a, b) is transformed as the complex row z = a + i b. Its spectrum Z holds both: with
  * X, Y the half spectra of a and b, Z(k) = X(k) + i Y(k) and Z(-k) = conj(X(k)) + i conj(Y(k)).
- * Half spectra keep one of each pair (k, -k), column h of them that at position POSITION(h) of
- * the bit-reversed order; its opposite lies at OPPOSITE(h). X(0) and X(Nx / 2) are real and share
+ * Half spectra keep one of each pair (k, -k), column h of them that at position(h) of the
+ * bit-reversed order; its opposite lies at opposite(h). X(0) and X(Nx / 2) are real and share
  * column 0 as its real and imaginary part.
  */
 
-#define POSITION(h) ((h) == 0 ? 0 : (h) + HIGH_BIT(h))
-#define OPPOSITE(h) ((h) == 0 ? 1 : POSITION(h) ^ (2 * HIGH_BIT(h) - 1))
+/* The highest bit of h + i, i < LANES, where `high_bit` is that of h, a multiple of LANES. */
+#define BIT(i) ((i) < 2 ? 1 : (i) < 4 ? 2 : (i) < 8 ? 4 : 8)
+#define COLUMN_BIT(h, i, high_bit) ((h) == 0 ? BIT(i) : (high_bit))
 
-static inline vec zip_low(const vec a, const vec b)
+INLINE int position(const int h, const int i, const int high_bit)
+{
+    return h + i == 0 ? 0 : h + i + COLUMN_BIT(h, i, high_bit);
+}
+
+INLINE int opposite(const int h, const int i, const int high_bit)
+{
+    return h + i == 0 ? 1 : position(h, i, high_bit) ^ (2 * COLUMN_BIT(h, i, high_bit) - 1);
+}
+
+INLINE vec zip_low(const vec a, const vec b)
 {
 #if LANES == 1
     return a;
@@ -22,7 +33,7 @@ static inline vec zip_low(const vec a, const vec b)
 #endif
 }
 
-static inline vec zip_high(const vec a, const vec b)
+INLINE vec zip_high(const vec a, const vec b)
 {
 #if LANES == 1
     return a;
@@ -35,7 +46,7 @@ static inline vec zip_high(const vec a, const vec b)
 }
 
 /* Transposes LANES x LANES: log2(LANES) rounds that interleave rows i and i + LANES / 2. */
-static inline void transpose(vec *a)
+INLINE void transpose(vec *a)
 {
     for (int round = 1; round < LANES; round *= 2) {
         vec b[LANES];
@@ -49,39 +60,40 @@ static inline void transpose(vec *a)
 }
 
 /* Where rows 2 BLOCK block + ... of the spectra begin in column block c. */
-static inline size_t tile_start(const int block, const int column_block)
+INLINE size_t tile_start(const int block, const int column_block)
 {
     return ((size_t)column_block * ROWS + 2 * BLOCK * block) * 2 * SIDE;
 }
 
 /* Half spectra of one block of row pairs -> Z in the scratch, in bit-reversed order. */
-static inline void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int block)
+INLINE void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int block)
 {
     FOR_EACH(piece, COLUMN_BLOCKS * SIDE * SIDE) {
         const int column = piece % SIDE, pair = piece / SIDE % SIDE, tile = piece / SIDE / SIDE;
         __global const vec *x = spectra + tile_start(block, tile) + 4 * LANES * pair * SIDE + column;
         const int h = tile * BLOCK + column * LANES;
+        const int bit = HIGH_BIT(h);
         vec a[LANES];
         for (int l = 0; l < LANES; ++l)
             a[l] = x[4 * l * SIDE] - x[(4 * l + 3) * SIDE];
         transpose(a);
         for (int i = 0; i < LANES; ++i)
-            z[2 * POSITION(h + i) * SIDE + pair] = a[i];
+            z[2 * position(h, i, bit) * SIDE + pair] = a[i];
         for (int l = 0; l < LANES; ++l)
             a[l] = x[(4 * l + 1) * SIDE] + x[(4 * l + 2) * SIDE];
         transpose(a);
         for (int i = 0; i < LANES; ++i)
-            z[(2 * POSITION(h + i) + 1) * SIDE + pair] = a[i];
+            z[(2 * position(h, i, bit) + 1) * SIDE + pair] = a[i];
         for (int l = 0; l < LANES; ++l)
             a[l] = x[4 * l * SIDE] + x[(4 * l + 3) * SIDE];
         transpose(a);
         for (int i = 0; i < LANES; ++i)
-            z[2 * OPPOSITE(h + i) * SIDE + pair] = a[i];
+            z[2 * opposite(h, i, bit) * SIDE + pair] = a[i];
         for (int l = 0; l < LANES; ++l)
             a[l] = x[(4 * l + 2) * SIDE] - x[(4 * l + 1) * SIDE];
         transpose(a);
         for (int i = 0; i < LANES; ++i)
-            z[(2 * OPPOSITE(h + i) + 1) * SIDE + pair] = a[i];
+            z[(2 * opposite(h, i, bit) + 1) * SIDE + pair] = a[i];
     }
     BARRIER;
     FOR_EACH(pair, BLOCK) {
@@ -97,32 +109,33 @@ static inline void read_tiles(SCRATCH vec *z, __global const vec *spectra, const
 }
 
 /* Z in the scratch, in bit-reversed order -> twice the half spectra of its row pairs. */
-static inline void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int block)
+INLINE void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int block)
 {
     FOR_EACH(piece, COLUMN_BLOCKS * SIDE * SIDE) {
         const int column = piece % SIDE, pair = piece / SIDE % SIDE, tile = piece / SIDE / SIDE;
         __global vec *x = spectra + tile_start(block, tile) + 4 * LANES * pair * SIDE + column;
         const int h = tile * BLOCK + column * LANES;
+        const int bit = HIGH_BIT(h);
         vec a[LANES];
         for (int i = 0; i < LANES; ++i)
-            a[i] = z[2 * POSITION(h + i) * SIDE + pair] + z[2 * OPPOSITE(h + i) * SIDE + pair];
+            a[i] = z[2 * position(h, i, bit) * SIDE + pair] + z[2 * opposite(h, i, bit) * SIDE + pair];
         transpose(a);
         for (int l = 0; l < LANES; ++l)
             x[4 * l * SIDE] = a[l];
         for (int i = 0; i < LANES; ++i)
-            a[i] = z[(2 * POSITION(h + i) + 1) * SIDE + pair]
-                 - z[(2 * OPPOSITE(h + i) + 1) * SIDE + pair];
+            a[i] = z[(2 * position(h, i, bit) + 1) * SIDE + pair]
+                 - z[(2 * opposite(h, i, bit) + 1) * SIDE + pair];
         transpose(a);
         for (int l = 0; l < LANES; ++l)
             x[(4 * l + 1) * SIDE] = a[l];
         for (int i = 0; i < LANES; ++i)
-            a[i] = z[(2 * POSITION(h + i) + 1) * SIDE + pair]
-                 + z[(2 * OPPOSITE(h + i) + 1) * SIDE + pair];
+            a[i] = z[(2 * position(h, i, bit) + 1) * SIDE + pair]
+                 + z[(2 * opposite(h, i, bit) + 1) * SIDE + pair];
         transpose(a);
         for (int l = 0; l < LANES; ++l)
             x[(4 * l + 2) * SIDE] = a[l];
         for (int i = 0; i < LANES; ++i)
-            a[i] = z[2 * OPPOSITE(h + i) * SIDE + pair] - z[2 * POSITION(h + i) * SIDE + pair];
+            a[i] = z[2 * opposite(h, i, bit) * SIDE + pair] - z[2 * position(h, i, bit) * SIDE + pair];
         transpose(a);
         for (int l = 0; l < LANES; ++l)
             x[(4 * l + 3) * SIDE] = a[l];
@@ -141,7 +154,7 @@ static inline void write_tiles(__global vec *spectra, SCRATCH const vec *z, cons
 
 /* The outer pass over n points of a block: leg q of butterfly x is point x + q INNER(n). */
 
-static inline void load_inverse(
+INLINE void load_inverse(
     cvec *a, SCRATCH const vec *z, const int x, const int n, __global const real *roots)
 {
     for (int q = 0; q < OUTER(n); ++q)
@@ -150,7 +163,7 @@ static inline void load_inverse(
     dit(a, OUTER(n));
 }
 
-static inline void store_forward(
+INLINE void store_forward(
     SCRATCH vec *z, cvec *a, const int x, const int n, __global const real *roots)
 {
     dif(a, OUTER(n));

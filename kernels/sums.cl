@@ -20,7 +20,7 @@ typedef struct {
     } while (0)
 
 /* Sums the lanes and writes the pair to out[0], out[1]. */
-static inline void store_sum(__global real *out, const vec_sum total)
+INLINE void store_sum(__global real *out, const vec_sum total)
 {
     union { vec v; real lanes[LANES]; } sum = {total.sum}, lost = {total.lost};
     real_sum all = {0, 0};
@@ -33,7 +33,7 @@ static inline void store_sum(__global real *out, const vec_sum total)
 }
 
 /* The sum of n pairs, `stride` reals apart. */
-static inline real_sum sum_pairs(__global const real *pairs, const int n, const int stride)
+INLINE real_sum sum_pairs(__global const real *pairs, const int n, const int stride)
 {
     real_sum all = {0, 0};
     for (int i = 0; i < n; ++i) {
