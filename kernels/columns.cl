@@ -85,19 +85,20 @@ KERNEL void ifft_columns(
 /* otf = FFT(spectra) / (4 NX NY) along the columns, made from the row spectra of a PSF: 1 / (NX NY)
  * for the inverse transforms, 1 / 4 for the two factors 2 that rfft_rows leaves. Column 0 and
  * otf_edge get (K_A + K_B) / 2 and (K_A - K_B) / 2.
- * spectra: one array, const. otf: one array, written. otf_edge: [NY][2], written.
+ * spectra: one array, const. otf: N_IMAGES arrays, that of `image` is written, and so is its part
+ * of otf_edge, [N_IMAGES][NY][2].
  * Launch: up to COLUMN_BLOCKS groups. Out of place. Scratch: NY points.
  * Twin: reference.otf_columns.
  */
 KERNEL void otf_columns(
     __global vec *restrict otf, __global real *restrict otf_edge,
-    __global const vec *restrict spectra, __global const real *restrict column_roots,
-    SCRATCH vec *restrict scratch)
+    __global const vec *restrict spectra, const int image,
+    __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
 {
     const real norm = (real)1 / 4 / NX / NY;
     SCRATCH vec *z = OWN_SCRATCH(scratch, NY);
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
-        __global vec *k = otf + (size_t)block * NY * 2 * SIDE;
+        __global vec *k = otf + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
         forward_columns(z, spectra + (size_t)block * ROWS * 2 * SIDE, column_roots);
         FOR_EACH(i, NY * 2 * SIDE)
             k[i] = z[i] * norm;
@@ -111,8 +112,8 @@ KERNEL void otf_columns(
                 __global real *column_0 = (__global real *)k + 2 * t * BLOCK;
                 column_0[0] = (a_re + b_re) * norm / 4;
                 column_0[BLOCK] = (a_im + b_im) * norm / 4;
-                otf_edge[2 * t] = (a_re - b_re) * norm / 4;
-                otf_edge[2 * t + 1] = (a_im - b_im) * norm / 4;
+                otf_edge[2 * (image * NY + t)] = (a_re - b_re) * norm / 4;
+                otf_edge[2 * (image * NY + t) + 1] = (a_im - b_im) * norm / 4;
             }
         }
         BARRIER;

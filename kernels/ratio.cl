@@ -73,12 +73,11 @@ KERNEL void ratio_rows(
         const int block = unit / N_IMAGES, image = unit % N_IMAGES;
         __global vec *row_spectra = spectra + (size_t)image * SPECTRA_SIZE;
         const size_t at = (size_t)image * PIXELS_SIZE + (size_t)block * NX * 2 * SIDE;
+        read_tiles(z, row_spectra, block);
+        dit_inner(z, NX, row_roots);
         vec_sum total[N_SUMS];
         for (int s = 0; s < N_SUMS; ++s)
             total[s] = (vec_sum){0, 0};
-
-        read_tiles(z, row_spectra, block);
-        dit_inner(z, NX, row_roots);
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[8];
@@ -115,10 +114,10 @@ KERNEL void ratio_rows(
                 ACCUMULATE(total[s], part[s]);
             store_forward(z + lane, a, x, NX, row_roots);
         }
+        for (int s = 0; s < N_SUMS; ++s)
+            store_sum(sums + 2 * (((size_t)unit * GROUP + ITEM) * N_SUMS + s), total[s]);
         BARRIER;
         dif_inner(z, NX, row_roots);
         write_tiles(row_spectra, z, block);
-        for (int s = 0; s < N_SUMS; ++s)
-            store_sum(sums + 2 * (((size_t)unit * GROUP + ITEM) * N_SUMS + s), total[s]);
     }
 }

@@ -65,35 +65,36 @@ INLINE size_t tile_start(const int block, const int column_block)
     return ((size_t)column_block * ROWS + 2 * BLOCK * block) * 2 * SIDE;
 }
 
+/* The four arrays that a tile is made of, on either side: real and imaginary part of X and Y, in
+ * memory 0 to 3; real and imaginary part of Z(k) and Z(-k). Each of one side is the sum or the
+ * difference of two of the other, tabled here as (first, second, sign of the second).
+ */
+__constant int READ_FIRST[4] = {0, 1, 0, 2}, READ_SECOND[4] = {3, 2, 3, 1};
+__constant real READ_SIGN[4] = {-1, 1, 1, -1};
+__constant int WRITE_FIRST[4] = {0, 1, 1, 2}, WRITE_SECOND[4] = {2, 3, 3, 0};
+__constant real WRITE_SIGN[4] = {1, -1, 1, -1};
+
 /* Half spectra of one block of row pairs -> Z in the scratch, in bit-reversed order. */
 INLINE void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int block)
 {
     FOR_EACH(piece, COLUMN_BLOCKS * SIDE * SIDE) {
         const int column = piece % SIDE, pair = piece / SIDE % SIDE, tile = piece / SIDE / SIDE;
-        __global const vec *x = spectra + tile_start(block, tile) + 4 * LANES * pair * SIDE + column;
         const int h = tile * BLOCK + column * LANES;
         const int bit = HIGH_BIT(h);
-        vec a[LANES];
-        for (int l = 0; l < LANES; ++l)
-            a[l] = x[4 * l * SIDE] - x[(4 * l + 3) * SIDE];
-        transpose(a);
-        for (int i = 0; i < LANES; ++i)
-            z[2 * position(h, i, bit) * SIDE + pair] = a[i];
-        for (int l = 0; l < LANES; ++l)
-            a[l] = x[(4 * l + 1) * SIDE] + x[(4 * l + 2) * SIDE];
-        transpose(a);
-        for (int i = 0; i < LANES; ++i)
-            z[(2 * position(h, i, bit) + 1) * SIDE + pair] = a[i];
-        for (int l = 0; l < LANES; ++l)
-            a[l] = x[4 * l * SIDE] + x[(4 * l + 3) * SIDE];
-        transpose(a);
-        for (int i = 0; i < LANES; ++i)
-            z[2 * opposite(h, i, bit) * SIDE + pair] = a[i];
-        for (int l = 0; l < LANES; ++l)
-            a[l] = x[(4 * l + 2) * SIDE] - x[(4 * l + 1) * SIDE];
-        transpose(a);
-        for (int i = 0; i < LANES; ++i)
-            z[(2 * opposite(h, i, bit) + 1) * SIDE + pair] = a[i];
+        __global const vec *x = spectra + tile_start(block, tile) + 4 * LANES * pair * SIDE + column;
+        for (int part = 0; part < 4; ++part) {
+            __global const vec *first = x + READ_FIRST[part] * SIDE;
+            __global const vec *second = x + READ_SECOND[part] * SIDE;
+            vec a[LANES];
+            for (int l = 0; l < LANES; ++l)
+                a[l] = first[4 * l * SIDE] + READ_SIGN[part] * second[4 * l * SIDE];
+            transpose(a);
+            SCRATCH vec *to = z + part % 2 * SIDE + pair;
+            for (int i = 0; i < LANES; ++i) {
+                const int at = part < 2 ? position(h, i, bit) : opposite(h, i, bit);
+                to[2 * at * SIDE] = a[i];
+            }
+        }
     }
     BARRIER;
     FOR_EACH(pair, BLOCK) {
@@ -113,32 +114,23 @@ INLINE void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int b
 {
     FOR_EACH(piece, COLUMN_BLOCKS * SIDE * SIDE) {
         const int column = piece % SIDE, pair = piece / SIDE % SIDE, tile = piece / SIDE / SIDE;
-        __global vec *x = spectra + tile_start(block, tile) + 4 * LANES * pair * SIDE + column;
         const int h = tile * BLOCK + column * LANES;
         const int bit = HIGH_BIT(h);
-        vec a[LANES];
-        for (int i = 0; i < LANES; ++i)
-            a[i] = z[2 * position(h, i, bit) * SIDE + pair] + z[2 * opposite(h, i, bit) * SIDE + pair];
-        transpose(a);
-        for (int l = 0; l < LANES; ++l)
-            x[4 * l * SIDE] = a[l];
-        for (int i = 0; i < LANES; ++i)
-            a[i] = z[(2 * position(h, i, bit) + 1) * SIDE + pair]
-                 - z[(2 * opposite(h, i, bit) + 1) * SIDE + pair];
-        transpose(a);
-        for (int l = 0; l < LANES; ++l)
-            x[(4 * l + 1) * SIDE] = a[l];
-        for (int i = 0; i < LANES; ++i)
-            a[i] = z[(2 * position(h, i, bit) + 1) * SIDE + pair]
-                 + z[(2 * opposite(h, i, bit) + 1) * SIDE + pair];
-        transpose(a);
-        for (int l = 0; l < LANES; ++l)
-            x[(4 * l + 2) * SIDE] = a[l];
-        for (int i = 0; i < LANES; ++i)
-            a[i] = z[2 * opposite(h, i, bit) * SIDE + pair] - z[2 * position(h, i, bit) * SIDE + pair];
-        transpose(a);
-        for (int l = 0; l < LANES; ++l)
-            x[(4 * l + 3) * SIDE] = a[l];
+        __global vec *x = spectra + tile_start(block, tile) + 4 * LANES * pair * SIDE + column;
+        for (int part = 0; part < 4; ++part) {
+            const int first = WRITE_FIRST[part], second = WRITE_SECOND[part];
+            SCRATCH const vec *from_first = z + first % 2 * SIDE + pair;
+            SCRATCH const vec *from_second = z + second % 2 * SIDE + pair;
+            vec a[LANES];
+            for (int i = 0; i < LANES; ++i) {
+                const int k = 2 * position(h, i, bit) * SIDE, minus_k = 2 * opposite(h, i, bit) * SIDE;
+                a[i] = from_first[first < 2 ? k : minus_k]
+                     + WRITE_SIGN[part] * from_second[second < 2 ? k : minus_k];
+            }
+            transpose(a);
+            for (int l = 0; l < LANES; ++l)
+                x[(4 * l + part) * SIDE] = a[l];
+        }
     }
     BARRIER;
     FOR_EACH(pair, BLOCK) {

@@ -18,9 +18,9 @@ KERNEL void scale_rows(
     FOR_EACH_BLOCK(block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         __global vec *source = extended + at;
-        vec_sum total = {0, 0};
         read_tiles(z, spectrum, block);
         dit_inner(z, NX, row_roots);
+        vec_sum total = {0, 0};
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[8];
@@ -51,12 +51,12 @@ KERNEL void scale_rows(
 #endif
             store_forward(z + lane, a, x, NX, row_roots);
         }
-        BARRIER;
-        dif_inner(z, NX, row_roots);
-        write_tiles(spectrum, z, block);
 #if HAS_MU
         store_sum(sums + 2 * (block * GROUP + ITEM), total);
 #endif
+        BARRIER;
+        dif_inner(z, NX, row_roots);
+        write_tiles(spectrum, z, block);
     }
     if (get_group_id(0) == 0) {
         FOR_EACH(s, N_STARS)

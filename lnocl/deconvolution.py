@@ -207,9 +207,7 @@ def _check_choices(solver: str, precision: str, engine: str, stop: None) -> None
         raise InputError(f"stop {stop!r} is not known; give None")
 
 
-def _make_engine(
-    engine: str, scene: Scene, precision: str, device: str | None, n_iter: int
-) -> Any:
+def _make_engine(engine: str, scene: Scene, precision: str, device: str | None, n_iter: int) -> Any:
     # Imported where it is chosen: the reference runs where no OpenCL is installed.
     if engine == "numpy":
         return importlib.import_module("lnocl.reference").ReferenceEngine(scene)

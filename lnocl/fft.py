@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
@@ -29,10 +31,11 @@ def roots(n: int) -> NDArray[np.float64]:
     tables = []
     while length == n or length > 16:
         j, q = np.arange(length // radix)[:, None], bit_reversed(radix)[None, 1:]
-        angle = -2.0 * np.pi * (j * q) / length
+        # In long double, where there is one: a rounded angle would cost a digit in double.
+        angle = -8.0 * np.arctan(np.longdouble(1.0)) * (j * q) / length
         tables.append(np.stack([np.cos(angle), np.sin(angle)], axis=-1).ravel())
         length, radix = length // radix, 8
-    return np.concatenate(tables)
+    return np.concatenate(tables).astype(np.float64)
 
 
 class Layout:
@@ -130,7 +133,7 @@ class Layout:
 
     def pack_columns(self, columns: NDArray) -> NDArray:
         """Return complex columns (Ny, Nx / 2) in the kernels' order, as they are."""
-        column_blocks, rows, _, block = self.spectra_shape
+        column_blocks, _, _, block = self.spectra_shape
         ny = self.grid[0]
         packed = np.zeros(self.spectra_shape, self.dtype)
         blocks = columns.reshape(ny, column_blocks, block).transpose(1, 0, 2)
@@ -177,21 +180,21 @@ class Launcher:
             self._most_groups = 2**31
             self._scratch = cl.LocalMemory(program.scratch_bytes)
 
-    def rows(self, name: str, *arguments: object, blocks: int | None = None) -> cl.Event:
+    def rows(self, name: str, *arguments: Any, blocks: int | None = None) -> cl.Event:
         """Launch a kernel over blocks of rows, all of one array or as many as given."""
         arguments = (*arguments, self._row_roots, self._scratch)
         return self._launch(name, blocks or self.program.row_blocks, arguments)
 
-    def columns(self, name: str, *arguments: object) -> cl.Event:
+    def columns(self, name: str, *arguments: Any) -> cl.Event:
         """Launch a kernel over all blocks of columns."""
         arguments = (*arguments, self._column_roots, self._scratch)
         return self._launch(name, self.program.column_blocks, arguments)
 
-    def single(self, name: str, *arguments: object) -> cl.Event:
+    def single(self, name: str, *arguments: Any) -> cl.Event:
         """Launch a kernel on one work-item."""
         return self.program.kernels[name](self.queue, (1,), (1,), *arguments)
 
-    def _launch(self, name: str, blocks: int, arguments: tuple[object, ...]) -> cl.Event:
+    def _launch(self, name: str, blocks: int, arguments: tuple[Any, ...]) -> cl.Event:
         group = self.program.tuning.group
         groups = min(blocks, self._most_groups)
         return self.program.kernels[name](self.queue, (groups * group,), (group,), *arguments)

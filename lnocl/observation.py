@@ -155,7 +155,10 @@ class Observation:
 
 def _numbers(name: str, values: ArrayLike) -> Array:
     """Return a float64 copy of real numbers."""
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise InputError(f"{name} is ragged; give arrays of one shape") from None
     if array.dtype.kind not in "biuf":
         raise InputError(f"{name} holds {array.dtype}; give real numbers")
     return array.astype(np.float64)
@@ -198,8 +201,9 @@ def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
         raise InputError("psfs hold values that are not finite; repair them first")
     sums = stack.sum(axis=(1, 2), keepdims=True)
     if (sums <= 0).any():
-        raise InputError(f"psf {int(np.argmax(sums <= 0))} has the sum {sums.min():g}; "
-                         "it must be positive")
+        raise InputError(
+            f"psf {int(np.argmax(sums <= 0))} has the sum {sums.min():g}; it must be positive"
+        )
     if n_negative := int((stack < 0).sum()):
         warnings.warn(
             f"{n_negative} psf pixels are negative and were kept", LnoclWarning, stacklevel=4

@@ -59,7 +59,6 @@ class OpenCLEngine:
         self.scene = scene
         self._context = cl.Context([chosen])
         observation = scene.observation
-        # Weights travel with the images, as negative counts; so they do not show up by themselves.
         self.program = Program(
             self._context,
             scene.grid,
@@ -131,7 +130,7 @@ class OpenCLEngine:
         scene = self.scene
         images = scene.images()
         if scene.weights is not None:
-            images[~scene.weights] = -1.0
+            images[~scene.weights] = -1.0  # how the kernels know an unobserved pixel
         self._upload_pixels("images", images)
         background = scene.background()
         if background.ndim == 3:
@@ -154,21 +153,27 @@ class OpenCLEngine:
             self._invert_weights(scene.weights)
 
     def _make_otfs(self) -> None:
-        edges = 2 * self.program.grid[0]
-        otfs = self._parts("otfs", self.layout.pixels_bytes)
-        otf_edges = self._parts("otf_edges", edges * self.program.dtype.itemsize)
-        for j, (otf, edge) in enumerate(zip(otfs, otf_edges, strict=True)):
+        buffers = self._buffers
+        for j in range(self.scene.n_images):
             self._upload_pixels("extended", [self.scene.psf(j)])
-            self._launcher.rows("rfft_rows", self._buffers["spectrum"], self._buffers["extended"])
-            self._launcher.columns("otf_columns", otf, edge, self._buffers["spectrum"])
+            self._launcher.rows("rfft_rows", buffers["spectrum"], buffers["extended"])
+            self._launcher.columns(
+                "otf_columns",
+                buffers["otfs"],
+                buffers["otf_edges"],
+                buffers["spectrum"],
+                np.int32(j),
+            )
 
     def _invert_weights(self, weights: NDArray[np.bool_]) -> None:
         """Make 1 / sum_j A_j^T w_j, 0 where nothing was observed."""
-        for spectra, weight in zip(
-            self._parts("spectra", self.layout.spectra_bytes), weights, strict=True
-        ):
+        buffers, size = self._buffers, self.layout.spectra_bytes
+        for j, weight in enumerate(weights):
             self._upload_pixels("extended", [weight])
-            self._launcher.rows("rfft_rows", spectra, self._buffers["extended"])
+            self._launcher.rows("rfft_rows", buffers["spectrum"], buffers["extended"])
+            cl.enqueue_copy(
+                self._queue, buffers["spectra"], buffers["spectrum"], dst_offset=j * size
+            )
         self.correct()
         self._launcher.rows("irfft_rows", self._buffers["extended"], self._buffers["spectrum"])
         total = self.extended()
@@ -262,11 +267,6 @@ class OpenCLEngine:
         """Return the objectives recorded so far, scaled."""
         pairs = self._download("objectives", 2 * self._n_objectives)
         return pairs.reshape(-1, 2).sum(axis=1)
-
-    def _parts(self, name: str, size: int) -> list[cl.Buffer]:
-        """Return the arrays that lie one behind the other in a buffer."""
-        buffer = self._buffers[name]
-        return [buffer[start : start + size] for start in range(0, buffer.size, size)]
 
     def _upload(self, name: str, values: Array) -> None:
         cl.enqueue_copy(self._queue, self._buffers[name], values.astype(self.program.dtype))

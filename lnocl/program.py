@@ -139,7 +139,8 @@ class Program:
             "HAS_BACKGROUND_MAP": int(has_background_map),
             "LEAST_MODEL": f"{least_model!r}",
         }
-        self.options = ["-cl-std=CL1.2", *(f"-D{name}={value}" for name, value in constants.items())]
+        definitions = [f"-D{name}={value}" for name, value in constants.items()]
+        self.options = ["-cl-std=CL1.2", *definitions]
         built = _build(context, self.options)
         self.kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
 

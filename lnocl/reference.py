@@ -135,14 +135,9 @@ class ReferenceEngine:
         self._images = scene.images()
         background = scene.background()
         self._background = background if background.ndim == 3 else background[:, None, None]
-        self._otfs = np.array(
-            [otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)]
-        )
+        self._otfs = np.array([otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)])
         self._star_images = np.array(
-            [
-                [scene.star_image(j, s) for j in range(scene.n_images)]
-                for s in range(scene.n_stars)
-            ]
+            [[scene.star_image(j, s) for j in range(scene.n_images)] for s in range(scene.n_stars)]
         ).reshape(scene.n_stars, *self._images.shape)
         self._inverse_weight = self._invert_weight()
         self._objectives: list[float] = []

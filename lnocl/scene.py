@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,8 +71,8 @@ class Scene:
     ) -> None:
         self.observation = observation
         self.stars = _check_stars(stars, observation.shape)
-        if not (np.isscalar(mu) and math.isfinite(mu) and mu >= 0):
-            raise InputError(f"mu must be finite and not negative; {mu} was given")
+        if not (_is_real(mu) and math.isfinite(mu) and mu >= 0):
+            raise InputError(f"mu must be a number, finite and not negative; {mu!r} was given")
         self.grid = _grid(observation.shape, pad)
         self._warn_of_large_psf()
         good = observation.images[~observation.mask]
@@ -211,6 +212,10 @@ class Scene:
             )
 
 
+def _is_real(value: object) -> bool:
+    return isinstance(value, Real)
+
+
 def _grid(shape: tuple[int, int], pad: int) -> tuple[int, int]:
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
         raise InputError(f"pad must be a whole number, 0 or more; {pad} was given")
@@ -226,9 +231,11 @@ def _grid(shape: tuple[int, int], pad: int) -> tuple[int, int]:
 def _check_stars(
     stars: Sequence[tuple[float, float]], shape: tuple[int, int]
 ) -> list[tuple[int, int]]:
+    try:
+        positions = np.asarray(stars, dtype=np.float64).reshape(len(stars), 2)
+    except (TypeError, ValueError):
+        raise InputError(f"stars must be pairs of numbers (x, y); {stars!r} was given") from None
     ny, nx = shape
-    positions = np.asarray(stars, dtype=np.float64).reshape(-1, 2) if len(stars) else []
-    checked = []
     for x, y in positions:
         if not (0 <= x <= nx - 1 and 0 <= y <= ny - 1):
             raise InputError(
@@ -240,12 +247,14 @@ def _check_stars(
                 f"the star at ({x:g}, {y:g}) lies between pixels; give the nearest whole pixel "
                 f"({round(x)}, {round(y)})"
             )
-        checked.append((round(x), round(y)))
-    return checked
+    return [(round(x), round(y)) for x, y in positions]
 
 
 def _check_start(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.asarray(values, dtype=np.float64)
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must hold numbers, in the shape {shape}") from None
     if array.shape != shape:
         raise InputError(f"{name} has shape {array.shape}; it must have {shape}")
     if not (np.isfinite(array).all() and (array >= 0).all()):

@@ -1,0 +1,137 @@
+"""Choosing a device, and what is said where there is none or it cannot do what is asked."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import lnocl
+from lnocl import device, opencl, program
+
+GPU = SimpleNamespace(name="Fast GPU", type=cl.device_type.GPU)
+CPU = SimpleNamespace(name="Slow CPU", type=cl.device_type.CPU)
+SECOND_CPU = SimpleNamespace(name="Other CPU", type=cl.device_type.CPU)
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """A machine with two platforms: one with two CPUs, one with a GPU."""
+    platforms = [
+        SimpleNamespace(name="Portable", get_devices=lambda: [CPU, SECOND_CPU]),
+        SimpleNamespace(name="Vendor", get_devices=lambda: [GPU]),
+    ]
+    for platform in platforms:
+        for each in platform.get_devices():
+            monkeypatch.setattr(each, "platform", platform, raising=False)
+            monkeypatch.setattr(each, "driver_version", "1", raising=False)
+    monkeypatch.setattr(cl, "get_platforms", lambda: platforms)
+    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+    return platforms
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        (None, GPU),
+        ("0", CPU),
+        ("0:1", SECOND_CPU),
+        ("portable", CPU),
+        ("PORT:other", SECOND_CPU),
+        ("1:0", GPU),
+        ("vendor:gpu", GPU),
+    ],
+)
+def test_choose(machine, spec, expected):
+    assert device.choose(spec).device is expected
+
+
+def test_first_cpu_where_there_is_no_gpu(machine):
+    machine.pop()
+    assert device.choose().device is CPU
+    assert device.choose().reason == "the first CPU"
+
+
+def test_environment_decides_where_nothing_is_asked_for(machine, monkeypatch):
+    monkeypatch.setenv("PYOPENCL_CTX", "0:1")
+    assert device.choose().device is SECOND_CPU
+    assert "PYOPENCL_CTX" in device.choose().reason
+    assert device.choose("1").device is GPU
+
+
+@pytest.mark.parametrize("spec", ["2", "0:2", "nosuch", "vendor:cpu", "", ":0"])
+def test_unknown_device_is_refused_with_what_there_is(machine, spec):
+    with pytest.raises(lnocl.InputError, match=r"fits no OpenCL device; 0:0 is Slow CPU") as error:
+        device.choose(spec)
+    assert "\n" not in str(error.value)
+
+
+def test_specification_finds_the_device_again(machine):
+    for each in (CPU, SECOND_CPU, GPU):
+        assert device.choose(device.spec_of(each)).device is each
+
+
+def test_no_platform(monkeypatch):
+    def none():
+        raise cl.LogicError("clGetPlatformIDs", -1001, "")
+
+    monkeypatch.setattr(cl, "get_platforms", none)
+    with pytest.raises(lnocl.DeviceError, match=r"no OpenCL device was found; install a runtime"):
+        device.choose()
+
+
+def test_no_double_precision(monkeypatch):
+    monkeypatch.setattr(program, "has_double", lambda device: False)
+    observation = lnocl.Observation(np.ones((8, 8)), np.ones((1, 1)))
+    with pytest.raises(lnocl.DeviceError, match="has no double precision; take precision single"):
+        lnocl.deconvolve(observation, precision="double", n_iter=1)
+    lnocl.deconvolve(observation, precision="single", n_iter=1)
+
+
+def scene(p, n, stars=0):
+    observation = lnocl.Observation(np.ones((p, n, n)), np.ones((1, 1)))
+    return opencl.Scene(observation, [(i, i) for i in range(stars)], 0.0, 0)
+
+
+@pytest.mark.parametrize("limit", ["global_mem_size", "max_mem_alloc_size"])
+def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, limit):
+    found = device.choose().device
+    monkeypatch.setattr(opencl.OpenCLEngine, "_allocate", lambda *_: pytest.fail("allocated"))
+    monkeypatch.setattr(cl.Device, limit, 100_000)
+    with pytest.raises(lnocl.DeviceError, match=r"the scene needs \d+ MiB, .* for star_images"):
+        opencl.OpenCLEngine(scene(2, 64, stars=9), "single", device.spec_of(found), 10)
+
+
+def test_memory_estimate_is_what_the_buffers_hold():
+    engine = opencl.OpenCLEngine(scene(2, 64, stars=1), "single", None, 10)
+    held = sum(buffer.size for buffer in engine._buffers.values())
+    assert engine.bytes_needed == held
+
+
+def test_failing_compiler_is_named(monkeypatch):
+    monkeypatch.setattr(program, "source", lambda: "this is no OpenCL")
+    with pytest.raises(lnocl.DeviceError, match="the kernels do not build on") as error:
+        opencl.OpenCLEngine(scene(1, 8), "single", None, 1)
+    assert "\n" not in str(error.value)
+
+
+def test_the_reference_engine_needs_no_opencl():
+    code = (
+        "import sys; sys.modules['pyopencl'] = None\n"
+        "import numpy, lnocl\n"
+        "obs = lnocl.Observation(numpy.ones((8, 8)), numpy.ones((1, 1)))\n"
+        "print(lnocl.deconvolve(obs, n_iter=1, engine='numpy').device)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "numpy\n"
+
+
+def test_build_options_are_recorded_and_kernels_fetched_once():
+    engine = opencl.OpenCLEngine(scene(1, 32), "single", None, 1)
+    assert "-DREAL=float" in engine.program.options
+    assert "-DNX=32" in engine.program.options
+    kernel = engine.program.kernels["scale_rows"]
+    engine.ratio()
+    assert engine.program.kernels["scale_rows"] is kernel

@@ -1,0 +1,58 @@
+"""The layers of the package: which module may import which."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import lnocl
+
+# Each module with those of lnocl that it may import; errors is open to all.
+LAYERS = {
+    "__init__": {"deconvolution", "observation"},
+    "__main__": {"cli"},
+    "cli": {"deconvolution", "device", "fitsio", "observation", "simulate", "plots", "demo"},
+    "demo": {"deconvolution", "fitsio", "metrics", "observation", "plots", "simulate"},
+    "deconvolution": {"observation", "scene", "solvers", "reference", "opencl"},
+    "solvers": {"observation"},
+    "scene": {"observation"},
+    "observation": set(),
+    "reference": {"observation", "scene"},
+    "opencl": {"device", "fft", "observation", "program", "reference", "scene"},
+    "fft": {"program"},
+    "program": {"device"},
+    "device": set(),
+    "errors": set(),
+    "fitsio": set(),
+    "metrics": set(),
+    "plots": {"metrics"},
+    "simulate": set(),
+}
+KNOWS_OPENCL = {"opencl", "fft", "program", "device"}
+PACKAGE = Path(lnocl.__file__).parent
+MODULES = sorted(path.stem for path in PACKAGE.glob("*.py"))
+
+
+def imports(module):
+    """Return the dotted names that a module imports, import_module calls included."""
+    tree = ast.parse((PACKAGE / f"{module}.py").read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "import_module":
+            yield node.args[0].value
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_module_imports_only_what_its_layer_may(module):
+    own = {name.split(".")[1] for name in imports(module) if name.startswith("lnocl.")}
+    assert own & set(MODULES) <= LAYERS[module] | {"errors"}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_only_the_opencl_layers_know_pyopencl(module):
+    knows = any(name.split(".")[0] == "pyopencl" for name in imports(module))
+    assert knows == (module in KNOWS_OPENCL)
