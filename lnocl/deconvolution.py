@@ -160,7 +160,7 @@ def deconvolve(
     Raises
     ------
     InputError
-        A parameter out of its range, or a star outside the images.
+        A parameter out of its range, a star outside the images, or a device for the reference.
     DeviceError
         No such device, too little memory on it, or no double precision.
 
@@ -183,7 +183,7 @@ def deconvolve(
     >>> (result.extended.sum() + result.star_fluxes.sum()).round(6)
     np.float64(612.0)
     """
-    _check_choices(solver=solver, precision=precision, engine=engine, stop=stop)
+    _check_choices(solver, precision, engine, stop, device)
     if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
         raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")
     scene = Scene(observation, stars, mu, pad)
@@ -194,7 +194,9 @@ def deconvolve(
     return _wrap_up(running, scene, done, stop_reason)
 
 
-def _check_choices(solver: str, precision: str, engine: str, stop: None) -> None:
+def _check_choices(
+    solver: str, precision: str, engine: str, stop: None, device: str | None
+) -> None:
     choices = {
         "solver": (solver, tuple(SOLVERS)),
         "precision": (precision, PRECISIONS),
@@ -205,6 +207,8 @@ def _check_choices(solver: str, precision: str, engine: str, stop: None) -> None
             raise InputError(f"{name} {value!r} is not known; choose from {', '.join(known)}")
     if stop is not None:
         raise InputError(f"stop {stop!r} is not known; give None")
+    if engine == "numpy" and device is not None:
+        raise InputError(f"engine numpy uses no device; leave device {device!r} out")
 
 
 def _make_engine(engine: str, scene: Scene, precision: str, device: str | None, n_iter: int) -> Any:

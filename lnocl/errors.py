@@ -12,6 +12,9 @@ class LnoclError(Exception):
 
     exit_status = 1
 
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))
+
 
 class InputError(LnoclError, ValueError):
     """A value that cannot be used: an argument, an image, a PSF, a mask."""

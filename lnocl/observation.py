@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,7 +40,7 @@ class Observation:
     ----------
     images, background : ndarray of float64
         Shapes (p, ny, nx), and (p,) or (p, ny, nx); `read_noise` squared is included in both.
-        Bad pixels hold 0.
+        Bad pixels of the images hold 0.
     psfs : ndarray of float64, shape (p, ky, kx)
         Of unit sum.
     mask : ndarray of bool, shape (p, ny, nx)
@@ -78,9 +79,9 @@ class Observation:
         read_noise: ArrayLike = 0.0,
         mask: ArrayLike | None = None,
     ) -> None:
-        self.mask = np.ma.getmaskarray(np.ma.asanyarray(images)).copy()
-        self.images = _stack("images", np.ma.getdata(images))
-        self.mask = self.mask.reshape(self.images.shape)
+        given = _as_array("images", images, np.ma.asanyarray)
+        self.images = _stack("images", np.ma.getdata(given))
+        self.mask = np.ma.getmaskarray(given).copy().reshape(self.images.shape)
         self.psfs = _check_psfs(psfs, self.n_images)
         self._apply_mask(mask)
         self.background = self._check_background(background)
@@ -99,7 +100,7 @@ class Observation:
 
     def _apply_mask(self, mask: ArrayLike | None) -> None:
         if mask is not None:
-            given = np.asarray(mask)
+            given = _as_array("mask", mask)
             if given.dtype != np.bool_:
                 raise InputError(
                     f"mask is of type {given.dtype}; give booleans, True where a pixel is bad"
@@ -115,14 +116,14 @@ class Observation:
             warnings.warn(
                 f"{n_non_finite} image pixels are not finite and were masked",
                 LnoclWarning,
-                stacklevel=4,
+                stacklevel=3,
             )
         if self.mask.all():
             raise InputError("all pixels are masked; there is nothing to reconstruct from")
         self.images[self.mask] = 0.0
 
     def _check_background(self, background: ArrayLike) -> Array:
-        values = _numbers("background", background)
+        values = numbers("background", background)
         if values.ndim == 3:
             if values.shape != self.images.shape:
                 raise InputError(
@@ -135,7 +136,7 @@ class Observation:
         return values
 
     def _add_read_noise(self, read_noise: ArrayLike) -> None:
-        sigma = _one_each("read_noise", _numbers("read_noise", read_noise), self.n_images)
+        sigma = _one_each("read_noise", numbers("read_noise", read_noise), self.n_images)
         _refuse_unless("read_noise", sigma, "finite and not negative", sigma >= 0)
         variance = sigma[:, None, None] ** 2
         self.images += np.where(self.mask, 0.0, variance)
@@ -149,16 +150,22 @@ class Observation:
                 f"{n_negative} image pixels are negative and were set to 0; if the images are "
                 "background-subtracted, add the background back and give it as background",
                 LnoclWarning,
-                stacklevel=4,
+                stacklevel=3,
             )
 
 
-def _numbers(name: str, values: ArrayLike) -> Array:
-    """Return a float64 copy of real numbers."""
+def _as_array(
+    name: str, values: ArrayLike, convert: Callable[[ArrayLike], NDArray] = np.asarray
+) -> NDArray:
     try:
-        array = np.asarray(values)
-    except ValueError:
-        raise InputError(f"{name} is ragged; give arrays of one shape") from None
+        return convert(values)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} cannot be read as an array: its rows differ") from None
+
+
+def numbers(name: str, values: ArrayLike) -> Array:
+    """Return a float64 copy of real numbers."""
+    array = _as_array(name, values)
     if array.dtype.kind not in "biuf":
         raise InputError(f"{name} holds {array.dtype}; give real numbers")
     return array.astype(np.float64)
@@ -166,7 +173,7 @@ def _numbers(name: str, values: ArrayLike) -> Array:
 
 def _stack(name: str, values: ArrayLike) -> Array:
     """Return a float64 copy of one or several two-dimensional arrays, as a stack."""
-    array = _numbers(name, values)
+    array = numbers(name, values)
     if array.ndim not in (2, 3):
         raise InputError(
             f"{name} has {array.ndim} dimensions; give two, or three for several {name}"
@@ -201,11 +208,10 @@ def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
         raise InputError("psfs hold values that are not finite; repair them first")
     sums = stack.sum(axis=(1, 2), keepdims=True)
     if (sums <= 0).any():
-        raise InputError(
-            f"psf {int(np.argmax(sums <= 0))} has the sum {sums.min():g}; it must be positive"
-        )
+        j = int(np.argmax(sums <= 0))
+        raise InputError(f"psf {j} has the sum {sums.flat[j]:g}; it must be positive")
     if n_negative := int((stack < 0).sum()):
         warnings.warn(
-            f"{n_negative} psf pixels are negative and were kept", LnoclWarning, stacklevel=4
+            f"{n_negative} psf pixels are negative and were kept", LnoclWarning, stacklevel=3
         )
     return np.array(np.broadcast_to(stack / sums, (n_images, *stack.shape[1:])))

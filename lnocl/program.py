@@ -140,7 +140,7 @@ class Program:
             "LEAST_MODEL": f"{least_model!r}",
         }
         definitions = [f"-D{name}={value}" for name, value in constants.items()]
-        self.options = ["-cl-std=CL1.2", *definitions]
+        self.options = ["-cl-std=CL1.2", "-w", *definitions]
         built = _build(context, self.options)
         self.kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, LnoclWarning
-from lnocl.observation import Array, Observation
+from lnocl.observation import Array, Observation, numbers
 
 MAX_AXIS = 8192
 
@@ -231,10 +231,11 @@ def _grid(shape: tuple[int, int], pad: int) -> tuple[int, int]:
 def _check_stars(
     stars: Sequence[tuple[float, float]], shape: tuple[int, int]
 ) -> list[tuple[int, int]]:
-    try:
-        positions = np.asarray(stars, dtype=np.float64).reshape(len(stars), 2)
-    except (TypeError, ValueError):
-        raise InputError(f"stars must be pairs of numbers (x, y); {stars!r} was given") from None
+    positions = numbers("stars", stars)
+    if positions.size == 0:
+        return []
+    if positions.ndim != 2 or positions.shape[1] != 2:
+        raise InputError(f"stars has shape {positions.shape}; give pairs (x, y)")
     ny, nx = shape
     for x, y in positions:
         if not (0 <= x <= nx - 1 and 0 <= y <= ny - 1):
@@ -251,10 +252,7 @@ def _check_stars(
 
 
 def _check_start(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must hold numbers, in the shape {shape}") from None
+    array = numbers(name, values)
     if array.shape != shape:
         raise InputError(f"{name} has shape {array.shape}; it must have {shape}")
     if not (np.isfinite(array).all() and (array >= 0).all()):

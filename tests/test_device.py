@@ -106,6 +106,7 @@ def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, 
 
 def test_memory_estimate_is_what_the_buffers_hold():
     engine = opencl.OpenCLEngine(scene(2, 64, stars=1), "single", None, 10)
+    engine.extended()  # waits for the device
     held = sum(buffer.size for buffer in engine._buffers.values())
     assert engine.bytes_needed == held
 
@@ -133,5 +134,6 @@ def test_build_options_are_recorded_and_kernels_fetched_once():
     assert "-DREAL=float" in engine.program.options
     assert "-DNX=32" in engine.program.options
     kernel = engine.program.kernels["scale_rows"]
-    engine.ratio()
+    engine.scale()
+    engine.extended()  # waits for the device
     assert engine.program.kernels["scale_rows"] is kernel

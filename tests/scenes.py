@@ -1,0 +1,133 @@
+"""Scenes that the tests share: asymmetric, off-centre PSFs and Poisson data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lnocl
+
+# Every engine at every precision; the reference always computes in double.
+ENGINES = [
+    pytest.param({"engine": "numpy", "precision": "double"}, id="numpy"),
+    pytest.param({"engine": "opencl", "precision": "double"}, id="opencl-double"),
+    pytest.param({"engine": "opencl", "precision": "single"}, id="opencl-single"),
+]
+
+
+def make_psfs(n_images, shape):
+    """Return PSFs that have no symmetry and no two of which are equal, centroids off centre."""
+    y, x = np.indices(shape)
+    y, x = y - shape[0] // 2, x - shape[1] // 2
+    psfs = []
+    for j in range(n_images):
+        cos, sin = np.cos(0.4 + 1.1 * j), np.sin(0.4 + 1.1 * j)
+        u, v = cos * x + sin * y - 0.6, cos * y - sin * x + 0.4
+        core = np.exp(-0.5 * ((u / 1.9) ** 2 + (v / 0.9) ** 2))
+        ghost = np.exp(-0.5 * ((x - 2 * cos) ** 2 + (y + 2 * sin) ** 2))
+        psfs.append(core + 0.3 * ghost)
+    return np.array(psfs)
+
+
+def blur(sky, psf):
+    """Return the sky through a PSF, periodic, as a plain sum over the PSF's pixels."""
+    blurred = np.zeros(sky.shape)
+    cy, cx = psf.shape[0] // 2, psf.shape[1] // 2
+    for (y, x), value in np.ndenumerate(psf / psf.sum()):
+        blurred += value * np.roll(sky, (y - cy, x - cx), axis=(0, 1))
+    return blurred
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a scene is made of; `make` turns it into the arguments of an observation and a run."""
+
+    shape: tuple[int, int]
+    n_images: int = 1
+    n_stars: int = 0
+    mu: float = 0.0
+    pad: int = 0
+    psf_shape: tuple[int, int] = (7, 8)
+    background: str = "scalar"  # or "zero", "each", "map"
+    read_noise: Any = 0.0
+    masked: float = 0.0  # share of the pixels, different in each image
+    n_iter: int = 1000
+
+    def make(self):
+        return Made(self)
+
+
+class Made:
+    """A recipe's arrays: the input of `lnocl.Observation` and of `lnocl.deconvolve`."""
+
+    def __init__(self, recipe):
+        self.recipe = recipe
+        ny, nx = recipe.shape
+        p = recipe.n_images
+        rng = np.random.default_rng([ny, nx, p, recipe.n_stars])
+        y, x = np.indices(recipe.shape)
+        ridge = y - 0.45 * ny - 0.15 * ny * np.sin(5.0 * x / nx)
+        sky = 90.0 * np.exp(-0.5 * (ridge / (0.08 * ny + 0.5)) ** 2) * (1.2 + np.cos(9.0 * x / nx))
+        # Far from the ridge the sky is dark: without a background, pixels there are empty.
+        self.psfs = make_psfs(p, recipe.psf_shape)
+        self.stars = [(int(nx * u), int(ny * v)) for u, v in [(0.3, 0.55), (0.75, 0.2), (0, 0.99)]]
+        self.stars = self.stars[: recipe.n_stars]
+        fluxes = np.array([3e3, 9e2, 4e3])[: recipe.n_stars]
+        object_ = sky.copy()
+        for (sx, sy), flux in zip(self.stars, fluxes, strict=True):
+            object_[sy, sx] += flux
+        each = np.linspace(6.0, 11.0, p)
+        self.background = {
+            "zero": 0.0,
+            "scalar": 8.0,
+            "each": each,
+            "map": each[:, None, None] * (1.0 + 0.3 * np.cos(6.0 * (x + 0.5) / nx + y / ny)),
+        }[recipe.background]
+        level = np.asarray(self.background)
+        level = level[:, None, None] if level.ndim == 1 else level
+        means = np.array([blur(object_, psf) for psf in self.psfs]) + level
+        self.images = rng.poisson(np.maximum(means, 0.0)).astype(float)
+        sigma = np.broadcast_to(recipe.read_noise, (p,))[:, None, None]
+        self.images += sigma * rng.standard_normal(self.images.shape)
+        self.images = np.maximum(self.images, -(sigma**2))  # still positive once that is added
+        self.mask = rng.random(self.images.shape) < recipe.masked if recipe.masked else None
+        # A start away from the answer, never flat.
+        self.initial_extended = sky.mean() * rng.uniform(0.5, 1.5, recipe.shape)
+        self.initial_star_fluxes = fluxes * np.array([0.6, 1.5, 0.9])[: recipe.n_stars]
+
+    def observation(self, **changes):
+        given = {
+            "images": self.images,
+            "psfs": self.psfs,
+            "background": self.background,
+            "read_noise": self.recipe.read_noise,
+            "mask": self.mask,
+        }
+        return lnocl.Observation(**(given | changes))
+
+    def deconvolve(self, observation=None, **changes):
+        given = {
+            "stars": self.stars,
+            "mu": self.recipe.mu,
+            "pad": self.recipe.pad,
+            "initial_extended": self.initial_extended,
+            "initial_star_fluxes": self.initial_star_fluxes,
+        }
+        return lnocl.deconvolve(observation or self.observation(), **(given | changes))
+
+
+def worst(values, expected):
+    """Return the largest difference, as a share of the largest expected value."""
+    if np.size(expected) == 0:
+        return 0.0
+    return float(np.abs(values - expected).max() / np.abs(expected).max())
+
+
+def same(result, other):
+    """Assert that two results agree bit for bit."""
+    np.testing.assert_array_equal(result.extended, other.extended)
+    np.testing.assert_array_equal(result.star_fluxes, other.star_fluxes)
+    np.testing.assert_array_equal(result.history, other.history)

@@ -1,0 +1,303 @@
+"""The door: what an observation makes of its input, what it refuses and what it announces."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import lnocl
+
+PSF = np.array([[0.0, 1.0, 0.0], [1.0, 4.0, 2.0]])
+IMAGES = np.arange(1.0, 49.0).reshape(3, 4, 4)
+
+
+def observe(**changes):
+    return lnocl.Observation(**({"images": IMAGES, "psfs": PSF} | changes))
+
+
+# --- What it holds
+
+
+def test_one_image_becomes_a_stack():
+    observation = observe(images=IMAGES[0], background=2)
+    assert observation.n_images == 1
+    assert observation.shape == (4, 4)
+    np.testing.assert_array_equal(observation.images, IMAGES[:1])
+    np.testing.assert_array_equal(observation.psfs, PSF[None] / 8)
+    np.testing.assert_array_equal(observation.background, [2.0])
+    np.testing.assert_array_equal(observation.mask, np.zeros((1, 4, 4), bool))
+
+
+@pytest.mark.parametrize("sum_", [1e-30, 1.0, 3.0, 1e30])
+def test_psfs_are_normalised(sum_):
+    psfs = np.array([PSF, PSF[::-1], PSF[:, ::-1]])
+    observation = observe(psfs=sum_ * psfs)
+    np.testing.assert_allclose(observation.psfs, psfs / 8, rtol=3e-16, atol=0)
+
+
+def test_each_psf_is_normalised_by_its_own_sum():
+    observation = observe(psfs=[PSF, 2 * PSF, 4 * PSF])
+    np.testing.assert_array_equal(observation.psfs, [PSF / 8] * 3)
+
+
+@pytest.mark.parametrize("psfs", [PSF, PSF[None]])
+def test_one_psf_serves_all_images(psfs):
+    np.testing.assert_array_equal(observe(psfs=psfs).psfs, [PSF / 8] * 3)
+
+
+@pytest.mark.parametrize(
+    ("background", "held"),
+    [
+        (2, [2.0, 2.0, 2.0]),
+        ([2], [2.0, 2.0, 2.0]),
+        ((1, 2, 3), [1.0, 2.0, 3.0]),
+        (np.float32(0.0), [0.0, 0.0, 0.0]),
+        (2 * IMAGES, 2 * IMAGES),
+    ],
+)
+def test_background(background, held):
+    np.testing.assert_array_equal(observe(background=background).background, held)
+
+
+@pytest.mark.parametrize("background", [5.0, [5.0, 6.0, 7.0], 0.5 * IMAGES])
+@pytest.mark.parametrize("read_noise", [3.0, [0.0, 1.0, 4.0]])
+def test_read_noise_squared_is_added_to_images_and_background(read_noise, background):
+    mask = IMAGES % 5 == 0
+    observation = observe(read_noise=read_noise, background=background, mask=mask)
+    variance = np.broadcast_to(np.square(read_noise), (3,))[:, None, None]
+    np.testing.assert_array_equal(observation.images, np.where(mask, 0.0, IMAGES + variance))
+    background = np.asarray(background)
+    background = background[:, None, None] if background.ndim == 1 else background
+    expected = np.broadcast_to(background + variance, IMAGES.shape)
+    held = observation.background
+    held = held[:, None, None] if held.ndim == 1 else held
+    held = np.broadcast_to(held, IMAGES.shape)
+    np.testing.assert_array_equal(held[~mask], expected[~mask])
+
+
+MASK = IMAGES[0] % 3 == 0
+
+
+@pytest.mark.parametrize(
+    ("images", "mask", "held"),
+    [
+        (IMAGES, np.array([MASK, ~MASK, MASK]), [MASK, ~MASK, MASK]),
+        (IMAGES, MASK, [MASK] * 3),
+        (IMAGES[0], MASK, [MASK]),
+        (np.ma.array(IMAGES, mask=[MASK, ~MASK, MASK]), None, [MASK, ~MASK, MASK]),
+        (np.ma.array(IMAGES[0], mask=MASK), None, [MASK]),
+        ([np.ma.array(IMAGES[0], mask=MASK), IMAGES[1]], None, [MASK, MASK & False]),
+        (np.ma.array(IMAGES), None, [MASK & False] * 3),
+        (np.ma.array(IMAGES, mask=[MASK] * 3), IMAGES[0] > 9, [MASK | (IMAGES[0] > 9)] * 3),
+    ],
+)
+def test_masks(images, mask, held):
+    observation = observe(images=images, mask=mask)
+    np.testing.assert_array_equal(observation.mask, held)
+    data = np.reshape(np.ma.getdata(images), observation.images.shape)
+    np.testing.assert_array_equal(observation.images, np.where(held, 0.0, data))
+
+
+@pytest.mark.parametrize("dtype", ["f4", ">f8", ">i2", "u1", "?", "f2"])
+def test_everything_is_held_in_double(dtype):
+    observation = observe(
+        images=IMAGES.astype(dtype),
+        psfs=PSF.astype(dtype),
+        background=np.ones(3, dtype),
+        read_noise=np.ones(3, dtype),
+    )
+    for array in (observation.images, observation.psfs, observation.background):
+        assert array.dtype == np.float64
+        assert array.dtype.isnative
+    np.testing.assert_array_equal(observation.images, IMAGES.astype(dtype).astype(float) + 1)
+
+
+def test_input_is_copied_and_never_modified():
+    given = {
+        "images": np.where(IMAGES == 7, np.nan, IMAGES - 3.0),
+        "psfs": np.array([PSF, PSF - 0.1, PSF]),
+        "background": np.ones_like(IMAGES),
+        "read_noise": np.array([0.0, 0.5, 1.0]),
+        "mask": IMAGES > 40,
+    }
+    before = {name: array.copy() for name, array in given.items()}
+    with pytest.warns(lnocl.LnoclWarning):
+        observation = lnocl.Observation(**given)
+    start = {"initial_extended": np.ones((4, 4)), "initial_star_fluxes": np.array([2.0])}
+    held = {name: array.copy() for name, array in vars(observation).items()}
+    lnocl.deconvolve(observation, stars=[(1, 2)], n_iter=3, engine="numpy", **start)
+    for name, array in before.items():
+        np.testing.assert_array_equal(given[name], array)
+        assert not any(np.shares_memory(given[name], own) for own in vars(observation).values())
+    for name, array in held.items():
+        np.testing.assert_array_equal(getattr(observation, name), array)
+    np.testing.assert_array_equal(start["initial_extended"], np.ones((4, 4)))
+    np.testing.assert_array_equal(start["initial_star_fluxes"], [2.0])
+
+
+def test_masked_array_is_never_modified():
+    images = np.ma.array(IMAGES, mask=IMAGES > 40)
+    observation = observe(images=images, mask=IMAGES < 5)
+    np.testing.assert_array_equal(images.data, IMAGES)
+    np.testing.assert_array_equal(images.mask, IMAGES > 40)
+    assert not np.shares_memory(images.data, observation.images)
+    assert not np.shares_memory(images.mask, observation.mask)
+
+
+# --- What it refuses
+
+RAGGED = [[1.0, 2.0], [3.0]]
+REFUSED = {
+    "images of one dimension": ({"images": IMAGES[0, 0]}, "images has 1 dimensions"),
+    "images of four dimensions": ({"images": IMAGES[None]}, "images has 4 dimensions"),
+    "no image": ({"images": IMAGES[:0]}, "images is empty: its shape is (0, 4, 4)"),
+    "images without pixels": ({"images": IMAGES[:, :, :0]}, "images is empty"),
+    "complex images": ({"images": IMAGES + 0j}, "images holds complex128"),
+    "text for images": ({"images": [["1", "2"]]}, "images holds <U1"),
+    "objects for images": ({"images": [[None, 1.0]]}, "images holds object"),
+    "ragged images": ({"images": RAGGED}, "images"),
+    "one PSF too few": ({"psfs": [PSF, PSF]}, "2 psfs for 3 images"),
+    "one PSF too many": ({"psfs": [PSF] * 4}, "4 psfs for 3 images"),
+    "several PSFs for one image": ({"images": IMAGES[0], "psfs": [PSF] * 2}, "2 psfs for 1 image"),
+    "PSF of one dimension": ({"psfs": PSF[0]}, "psfs has 1 dimensions"),
+    "PSF of four dimensions": ({"psfs": PSF[None, None]}, "psfs has 4 dimensions"),
+    "PSF without pixels": ({"psfs": PSF[:0]}, "psfs is empty"),
+    "PSF that sums to zero": ({"psfs": [PSF, PSF, 0 * PSF]}, "psf 2 has the sum 0;"),
+    "PSF with a negative sum": ({"psfs": [PSF, -PSF, PSF]}, "psf 1 has the sum -8;"),
+    "two such PSFs": ({"psfs": [PSF, 0 * PSF, -PSF]}, "psf 1 has the sum 0;"),
+    "NaN in a PSF": ({"psfs": [PSF, PSF, PSF * np.nan]}, "psfs hold values that are not finite"),
+    "infinite PSF": ({"psfs": np.where(PSF == 4, np.inf, PSF)}, "psfs hold values that are not"),
+    "complex PSF": ({"psfs": PSF + 0j}, "psfs holds complex128"),
+    "text for PSFs": ({"psfs": "psf.fits"}, "psfs holds <U8"),
+    "ragged PSFs": ({"psfs": RAGGED}, "psfs"),
+    "two numbers of background": ({"background": [1, 2]}, "background has shape (2,)"),
+    "background of another shape": (
+        {"background": IMAGES[:, 1:]},
+        "background has shape (3, 3, 4)",
+    ),
+    "negative background": (
+        {"background": [1, -2.5, 3]},
+        "background must be finite and not negative; -2.5",
+    ),
+    "negative map": ({"background": IMAGES - 10}, "background must be finite and not negative; -9"),
+    "NaN background": ({"background": np.nan}, "background must be finite and not negative; nan"),
+    "infinite background": (
+        {"background": np.inf},
+        "background must be finite and not negative; inf",
+    ),
+    "complex background": ({"background": 1j}, "background holds complex128"),
+    "text for a background": ({"background": "1"}, "background holds <U1"),
+    "None for a background": ({"background": None}, "background holds object"),
+    "ragged background": ({"background": RAGGED}, "background"),
+    "two numbers of read noise": ({"read_noise": [1, 2]}, "read_noise has shape (2,)"),
+    "map of read noise": ({"read_noise": IMAGES}, "read_noise has shape (3, 4, 4)"),
+    "negative read noise": ({"read_noise": -1}, "read_noise must be finite and not negative; -1"),
+    "NaN read noise": (
+        {"read_noise": [0, 0, np.nan]},
+        "read_noise must be finite and not negative; nan",
+    ),
+    "infinite read noise": (
+        {"read_noise": np.inf},
+        "read_noise must be finite and not negative; inf",
+    ),
+    "complex read noise": ({"read_noise": 1j}, "read_noise holds complex128"),
+    "text for read noise": ({"read_noise": "1"}, "read_noise holds <U1"),
+    "ragged read noise": ({"read_noise": RAGGED}, "read_noise"),
+    "mask of numbers": ({"mask": np.zeros((4, 4))}, "mask is of type float64"),
+    "mask of another shape": ({"mask": np.zeros((4, 5), bool)}, "mask has shape (4, 5)"),
+    "too few masks": ({"mask": np.zeros((2, 4, 4), bool)}, "mask has shape (2, 4, 4)"),
+    "ragged mask": ({"mask": [[True, False], [True]]}, "mask"),
+    "all masked": ({"mask": np.ones((4, 4), bool)}, "all pixels are masked"),
+    "all masked by numpy.ma": ({"images": np.ma.masked_all((3, 4, 4))}, "all pixels are masked"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused(case):
+    changes, message = REFUSED[case]
+    with pytest.raises(lnocl.InputError) as caught:
+        observe(**changes)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_status == 2
+
+
+def test_nothing_but_non_finite_pixels_is_refused():
+    with (
+        pytest.warns(lnocl.LnoclWarning, match="^48 image pixels are not finite"),
+        pytest.raises(lnocl.InputError, match="all pixels are masked"),
+    ):
+        observe(images=IMAGES * np.nan)
+
+
+def test_an_image_may_be_masked_as_a_whole():
+    assert observe(mask=IMAGES > 32).mask[2].all()
+
+
+# --- What it announces
+
+
+def announced(**changes):
+    """Return the observation, what was announced, and the files at which it points."""
+    given = {"images": IMAGES, "psfs": PSF} | changes
+    names = {"Observation": lnocl.Observation, "given": given}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        # Compiled, so that the line which calls is the only one in its file.
+        exec(compile("observation = Observation(**given)", "caller.py", "exec"), names)
+    for warning in caught:
+        assert warning.category is lnocl.LnoclWarning
+        assert "\n" not in str(warning.message)
+    return names["observation"], [str(w.message) for w in caught], {w.filename for w in caught}
+
+
+def test_good_input_is_taken_in_silence():
+    _, messages, _ = announced(background=IMAGES, read_noise=1, mask=MASK)
+    assert messages == []
+
+
+def test_non_finite_pixels_are_masked_and_counted():
+    images = IMAGES.copy()
+    images[0, 0, :3] = np.nan, np.inf, -np.inf
+    images[1, 1, 1] = np.nan
+    images[2, 2, 2] = np.nan  # known to be bad
+    mask = np.zeros(IMAGES.shape, bool)
+    mask[2, 2, 2:] = True
+    observation, messages, files = announced(images=images, mask=mask)
+    assert messages == ["4 image pixels are not finite and were masked"]
+    assert files == {"caller.py"}
+    np.testing.assert_array_equal(observation.mask, ~np.isfinite(images) | mask)
+    assert (observation.images[observation.mask] == 0).all()
+
+
+@pytest.mark.parametrize(("read_noise", "count"), [(0, 5), (1, 4), ([1, 2, 1], 1)])
+def test_negative_counts_are_set_to_zero_and_counted(read_noise, count):
+    images = IMAGES.copy()
+    images[0, 0, 0] = -1.0
+    images[1, 0] = -2.0, -2.5, -3.0, -5.0
+    images[2, 3, 3] = -1e9  # known to be bad
+    observation, messages, files = announced(
+        images=images, read_noise=read_noise, mask=IMAGES == 48
+    )
+    assert len(messages) == 1
+    assert messages[0].startswith(f"{count} image pixels are negative and were set to 0")
+    assert files == {"caller.py"}
+    variance = np.broadcast_to(np.square(read_noise), (3,))[:, None, None]
+    expected = np.where(IMAGES == 48, 0.0, np.maximum(images + variance, 0.0))
+    np.testing.assert_array_equal(observation.images, expected)
+
+
+def test_counts_that_read_noise_lifts_above_zero_are_kept_in_silence():
+    observation, messages, _ = announced(images=np.full((4, 4), -1.0), read_noise=1.5)
+    assert messages == []
+    np.testing.assert_array_equal(observation.images, np.full((1, 4, 4), 1.25))
+
+
+def test_negative_psf_pixels_are_kept_and_counted():
+    psfs = np.array([PSF, PSF, PSF])
+    psfs[1:, 0, 0] = -0.5
+    observation, messages, files = announced(psfs=psfs)
+    assert messages == ["2 psf pixels are negative and were kept"]
+    assert files == {"caller.py"}
+    np.testing.assert_allclose(observation.psfs[1:], psfs[1:] / 7.5, rtol=3e-16)
+    np.testing.assert_array_equal(observation.psfs[0], PSF / 8)
