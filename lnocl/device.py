@@ -28,7 +28,7 @@ def find_devices() -> list[cl.Device]:
     DeviceError
         Where there is no platform, or no device on any.
     """
-    devices = [device for platform in _platforms() for device in _devices_of(platform)]
+    devices = [device for platform in _usable_platforms() for device in _devices_of(platform)]
     if not devices:
         raise DeviceError(
             "no OpenCL device was found; install a runtime, such as pip install 'pyopencl[pocl]'"
@@ -72,7 +72,7 @@ def describe(device: cl.Device) -> str:
 
 def spec_of(device: cl.Device) -> str:
     """Return the ``PLATFORM:DEVICE`` indices of a device, by which `choose` finds it again."""
-    for p, platform in enumerate(_platforms()):
+    for p, platform in enumerate(_usable_platforms()):
         for d, candidate in enumerate(_devices_of(platform)):
             if candidate == device:
                 return f"{p}:{d}"
@@ -84,11 +84,13 @@ def has_double(device: cl.Device) -> bool:
     return bool(device.double_fp_config)
 
 
-def _platforms() -> list[cl.Platform]:
+def _usable_platforms() -> list[cl.Platform]:
+    """Return the platforms that have a device; indices in a specification count these."""
     try:
-        return list(cl.get_platforms())
+        platforms = cl.get_platforms()
     except cl.Error:  # the loader's word for "none"
         return []
+    return [platform for platform in platforms if _devices_of(platform)]
 
 
 def _devices_of(platform: cl.Platform) -> list[cl.Device]:
@@ -100,8 +102,7 @@ def _devices_of(platform: cl.Platform) -> list[cl.Device]:
 
 def _by_spec(spec: str, source: str) -> cl.Device:
     platform_part, _, device_part = spec.partition(":")
-    platforms = [platform for platform in _platforms() if _devices_of(platform)]
-    platform = _pick(platforms, platform_part, lambda candidate: candidate.name)
+    platform = _pick(_usable_platforms(), platform_part, lambda candidate: candidate.name)
     device = None
     if platform is not None:
         device = _pick(_devices_of(platform), device_part or "0", lambda candidate: candidate.name)

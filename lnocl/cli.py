@@ -1,0 +1,389 @@
+"""The command line: parse, load, run, write; nothing numerical."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, NoReturn, TextIO
+
+from lnocl import __version__
+from lnocl.deconvolution import ENGINES, PRECISIONS, SOLVERS, Result, deconvolve
+from lnocl.errors import InputError, LnoclError, LnoclWarning
+from lnocl.observation import Observation
+
+FAILED = 1
+INTERRUPTED = 130
+
+
+class Command(NamedTuple):
+    """A subcommand: its line in the help, what adds its arguments, and what runs it."""
+
+    summary: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], None]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Arguments without the program's name; by default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", LnoclWarning)
+        warnings.showwarning = _show_warning
+        try:
+            parsed = _make_parser().parse_args(arguments)
+            parsed.command.run(parsed)
+        except LnoclError as error:
+            return _fail(str(error), error.exit_status)
+        except MemoryError:
+            return _fail("not enough memory; cut the images, or give fewer at a time", FAILED)
+        except KeyboardInterrupt:
+            return _fail("interrupted", INTERRUPTED)
+        except OSError as error:
+            return _fail(str(error), FAILED)
+    return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are ours, and that takes ``-1,3`` and ``-inf`` for values."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(allow_abbrev=False, **kwargs)
+        self._negative_number_matcher = re.compile(r"-(\d|\.\d|inf|nan)[\d.,eainf+-]*$", re.I)
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message}; see {self.prog} --help")
+
+
+def _make_parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="lnocl",
+        description="Multi-component Richardson-Lucy deconvolution of astronomical images.",
+        epilog="Exit status: 0 done, 1 failed, 2 wrong use.",
+    )
+    parser.add_argument("--version", action="version", version=f"lnocl {__version__}")
+    subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
+    for name, command in COMMANDS.items():
+        subparser = subparsers.add_parser(name, help=command.summary, description=command.summary)
+        command.add_arguments(subparser)
+        subparser.set_defaults(command=command)
+    return parser
+
+
+def _add_deconvolve_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "images",
+        nargs="+",
+        metavar="IMAGE",
+        help="FITS file with an image, in electrons per pixel, or one file with a cube of them",
+    )
+    parser.add_argument(
+        "--psf",
+        nargs="+",
+        action="extend",
+        required=True,
+        dest="psfs",
+        metavar="PSF",
+        help="FITS file with a PSF, its peak at (ky // 2, kx // 2): one for all images or one "
+        "for each, or one file with a cube of them",
+    )
+    parser.add_argument(
+        "--background",
+        nargs="+",
+        action="extend",
+        type=float,
+        metavar="B",
+        help="electrons per pixel, one for all images or one for each (default: 0)",
+    )
+    parser.add_argument(
+        "--read-noise",
+        nargs="+",
+        action="extend",
+        type=float,
+        metavar="S",
+        help="standard deviation in electrons, one for all images or one for each (default: 0)",
+    )
+    parser.add_argument(
+        "--star",
+        action="append",
+        default=[],
+        type=_position,
+        dest="stars",
+        metavar="X,Y",
+        help="position of a point source in pixels, 0-based, x along columns; may be repeated",
+    )
+    parser.add_argument(
+        "--mu",
+        type=float,
+        default=0.0,
+        help="weight of the Tikhonov term on the extended source, per electron "
+        "(default: %(default)s)",
+    )
+    parser.add_argument(
+        "--solver", choices=tuple(SOLVERS), default="sgm", help="iteration (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--n-iter",
+        type=int,
+        default=1000,
+        metavar="N",
+        help="iterations to do (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--pad",
+        type=int,
+        default=0,
+        metavar="N",
+        help="unobserved pixels kept round the images, at least (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--precision",
+        choices=PRECISIONS,
+        default="single",
+        help="arithmetic on the OpenCL device (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--engine",
+        choices=ENGINES,
+        default="opencl",
+        help="OpenCL, or the plain NumPy reference, which computes in double "
+        "(default: %(default)s)",
+    )
+    parser.add_argument(
+        "--device",
+        metavar="SPEC",
+        help="OpenCL device as PLATFORM[:DEVICE], each an index or a part of the name; see "
+        "lnocl devices (default: that of PYOPENCL_CTX, else the first GPU, else the first CPU)",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="OUT.fits",
+        help="file for the extended source, the stars and the history of the objective",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace OUT.fits if it exists")
+    parser.add_argument("--quiet", action="store_true", help="show no progress bar and no summary")
+
+
+def _deconvolve(arguments: argparse.Namespace) -> None:
+    from lnocl import fitsio
+
+    fitsio.check_output(arguments.output, arguments.overwrite, [*arguments.images, *arguments.psfs])
+    folder = os.getcwd()
+    device = _device_spec(arguments)
+    images = fitsio.read_stack(arguments.images)
+    psfs = fitsio.read_stack(arguments.psfs)
+    wcs = fitsio.wcs_cards(images.header)
+    background = arguments.background or [0.0]
+    read_noise = arguments.read_noise or [0.0]
+    result = deconvolve(
+        Observation(images.data, psfs.data, background, read_noise),
+        stars=arguments.stars,
+        mu=arguments.mu,
+        solver=arguments.solver,
+        n_iter=arguments.n_iter,
+        precision=arguments.precision,
+        engine=arguments.engine,
+        device=device,
+        pad=arguments.pad,
+        progress=not arguments.quiet,
+    )
+    fitsio.write_result(
+        arguments.output,
+        result.extended,
+        arguments.stars,
+        result.star_fluxes,
+        result.history,
+        wcs=wcs,
+        cards=_cards(arguments, result, background, read_noise, images.sha256, psfs.sha256),
+        commands=[["cd", folder], _repeating_command(arguments, background, read_noise, device)],
+        overwrite=arguments.overwrite,
+    )
+    if not arguments.quiet:
+        _say(_summary(arguments, result))
+
+
+def _device_spec(arguments: argparse.Namespace) -> str | None:
+    """Return the OpenCL device as indices, so that the run can be repeated on the same."""
+    if arguments.engine != "opencl":
+        return arguments.device
+    from lnocl import device
+
+    return device.spec_of(device.choose(arguments.device).device)
+
+
+def _cards(
+    arguments: argparse.Namespace,
+    result: Result,
+    background: Sequence[float],
+    read_noise: Sequence[float],
+    image_sums: Sequence[str],
+    psf_sums: Sequence[str],
+) -> list[tuple[str, str | int | float, str]]:
+    """Return the cards that say what was run; a checksum leaves no room for a comment."""
+    return [
+        ("CREATOR", f"lnocl {__version__}", "program that wrote this file"),
+        ("SOLVER", arguments.solver, "iteration"),
+        ("NITER", result.n_iter, "iterations done"),
+        ("STOPPED", result.stop_reason, "why it stopped"),
+        ("MU", arguments.mu, "weight of the Tikhonov term, per electron"),
+        ("PAD", arguments.pad, "least unobserved pixels round the images"),
+        ("PRECISIO", _precision(arguments), "precision of the arithmetic"),
+        ("ENGINE", arguments.engine, "engine"),
+        ("DEVICE", result.device, "device"),
+        *((f"BKG{j}", b, "background, electrons") for j, b in enumerate(background, 1)),
+        *((f"RON{j}", s, "read noise, electrons") for j, s in enumerate(read_noise, 1)),
+        *((f"ISUM{j}", digest, "") for j, digest in enumerate(image_sums, 1)),
+        *((f"PSUM{j}", digest, "") for j, digest in enumerate(psf_sums, 1)),
+    ]
+
+
+def _repeating_command(
+    arguments: argparse.Namespace,
+    background: Sequence[float],
+    read_noise: Sequence[float],
+    device: str | None,
+) -> list[str]:
+    """Return the words of the command that makes the same result, every parameter spelled out."""
+    return [
+        "lnocl",
+        "deconvolve",
+        *map(_as_path, arguments.images),
+        "--psf",
+        *map(_as_path, arguments.psfs),
+        "--background",
+        *map(repr, background),
+        "--read-noise",
+        *map(repr, read_noise),
+        *(word for x, y in arguments.stars for word in ("--star", f"{x!r},{y!r}")),
+        *("--mu", repr(arguments.mu)),
+        *("--solver", arguments.solver),
+        *("--n-iter", str(arguments.n_iter)),
+        *("--pad", str(arguments.pad)),
+        *("--precision", _precision(arguments)),
+        *("--engine", arguments.engine),
+        *(() if device is None else ("--device", device)),
+        *("-o", _as_path(arguments.output)),
+    ]
+
+
+def _precision(arguments: argparse.Namespace) -> str:
+    return arguments.precision if arguments.engine == "opencl" else "double"
+
+
+def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
+    objective = result.history["objective"][-1]
+    stars = (
+        f"star at ({x:g}, {y:g}): {flux:.6g} electrons"
+        for (x, y), flux in zip(arguments.stars, result.star_fluxes, strict=True)
+    )
+    return [
+        f"{result.n_iter} iterations on {result.device}, objective {objective:.6g}",
+        *stars,
+        f"extended source: {result.extended.sum():.6g} electrons",
+        f"written to {arguments.output}",
+    ]
+
+
+def _add_no_arguments(parser: argparse.ArgumentParser) -> None:
+    pass
+
+
+def _devices(arguments: argparse.Namespace) -> None:
+    from lnocl import device
+
+    found = device.find_devices()
+    choice = device.choose(None)
+    _say(
+        [
+            *(f"{device.spec_of(each)} {device.describe(each)}" for each in found),
+            f"lnocl uses {device.spec_of(choice.device)} unless told otherwise: {choice.reason}",
+        ]
+    )
+
+
+COMMANDS = {
+    "deconvolve": Command(
+        "reconstruct the sky from images of it, as stars plus an extended source",
+        _add_deconvolve_arguments,
+        _deconvolve,
+    ),
+    "devices": Command(
+        "list the OpenCL devices, and say which one is used and why", _add_no_arguments, _devices
+    ),
+}
+
+
+def _position(text: str) -> tuple[float, float]:
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not X,Y") from None
+    return x, y
+
+
+def _as_path(path: str) -> str:
+    """Return a path that is not taken for an option."""
+    return f"./{path}" if path.startswith("-") else path
+
+
+def _say(lines: Iterable[str]) -> None:
+    """Write lines to stdout; a reader that has left early is no error."""
+    try:
+        for line in lines:
+            sys.stdout.write(_one_line(line, sys.stdout) + "\n")
+        sys.stdout.flush()
+    except OSError as error:
+        # What is still buffered would fail again when the interpreter ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            raise
+
+
+def _fail(message: str, exit_status: int) -> int:
+    _complain("error", message)
+    return exit_status
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    _complain("warning", str(message))
+
+
+def _complain(kind: str, message: str) -> None:
+    with contextlib.suppress(OSError):
+        sys.stderr.write(_one_line(f"lnocl: {kind}: {message}", sys.stderr) + "\n")
+        sys.stderr.flush()
+
+
+def _one_line(text: str, stream: TextIO) -> str:
+    """Return text in one line, with escapes for what a terminal should not or cannot show."""
+    joined = " ".join(part.strip() for part in text.splitlines())
+    shown = "".join(c if c.isprintable() else _escape(c) for c in joined)
+    encoding = stream.encoding or "ascii"
+    return shown.encode(encoding, "backslashreplace").decode(encoding)
+
+
+def _escape(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")

@@ -1,0 +1,478 @@
+"""FITS in and out: images and PSFs, and the result with what is needed to repeat the run."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import re
+import secrets
+import shlex
+import stat
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+import astropy
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS
+from numpy.typing import ArrayLike, NDArray
+
+from lnocl.errors import FileError, InputError, LnoclWarning
+
+# A HISTORY card holds 72 characters; the last one may be needed for a backslash and a space.
+HISTORY_WIDTH = 70
+
+COMPRESSED = (".gz", ".bz2", ".xz", ".zip", ".z", ".fz")
+
+_WCS_KEYWORD = re.compile(r"(?:CTYPE|CRPIX|CRVAL|CDELT)1([A-Z]?)")
+
+Card = tuple[str, str | int | float, str]
+
+
+class Stack(NamedTuple):
+    """Images that were read.
+
+    Attributes
+    ----------
+    data : ndarray of float64, shape (p, ny, nx)
+        Pixels, in the units of the files.
+    header : astropy.io.fits.Header
+        Header of the first image.
+    sha256 : list of str
+        SHA-256 checksum of each file, in hexadecimal.
+    """
+
+    data: NDArray[np.float64]
+    header: fits.Header
+    sha256: list[str]
+
+
+def read_stack(paths: Sequence[str]) -> Stack:
+    """Read images: one FITS file each, or one file with a cube.
+
+    The image of a file is the first HDU that is an image and has pixels: the primary HDU or an
+    image extension. BSCALE, BZERO and BLANK are applied (a blank pixel is NaN). A file may be
+    compressed as a whole (gzip, bzip2 and what else astropy opens), but not in tiles.
+
+    Parameters
+    ----------
+    paths : sequence of str
+        One file with an image (ny, nx) or a cube (p, ny, nx), or p files with an image each.
+
+    Returns
+    -------
+    Stack
+        The images, the first one's header, and the checksums of the files.
+
+    Raises
+    ------
+    FileError
+        A file that is missing, no FITS, damaged, truncated or tile-compressed, or that holds no
+        image or one that is larger than the memory.
+    InputError
+        An image of another dimension or shape than the others.
+
+    Warns
+    -----
+    LnoclWarning
+        What astropy found wrong with a file and could mend; data that do not match their
+        DATASUM.
+    """
+    images, headers, sha256 = zip(*(_read_file(path) for path in paths), strict=True)
+    for path, image in zip(paths, images, strict=True):
+        _check_shape(path, image.shape, paths[0], images[0].shape, alone=len(paths) == 1)
+    ny, nx = images[0].shape[-2:]
+    data = images[0] if len(images) == 1 else np.stack(images)
+    return Stack(data.reshape(-1, ny, nx), headers[0], list(sha256))
+
+
+def wcs_cards(header: fits.Header) -> fits.Header:
+    """Return the cards of every coordinate system of an image, as astropy writes them.
+
+    Parameters
+    ----------
+    header : astropy.io.fits.Header
+        Header of a two-dimensional image or of a cube of them.
+
+    Returns
+    -------
+    astropy.io.fits.Header
+        The primary and the alternate systems of the first two axes, with SIP and other
+        distortions that cards can describe. Empty where the image has no coordinates.
+
+    Warns
+    -----
+    LnoclWarning
+        A system that astropy cannot read or that needs tables besides the header (``-TAB``,
+        lookup tables of distortions); it is left out.
+    """
+    cards = fits.Header()
+    for key in sorted({match[1] for match in map(_WCS_KEYWORD.fullmatch, header) if match}):
+        try:
+            with warnings.catch_warnings(), _quiet_log():
+                # What astropy mends on reading it writes mended.
+                warnings.simplefilter("ignore")
+                wcs = WCS(header, key=key or " ", naxis=2)
+                if key and not wcs.wcs.ctype[0].endswith("-SIP"):
+                    wcs.sip = None  # that of the primary system, which astropy gives to all
+                cards.update(wcs.to_header(relax=True))
+        except Exception as error:
+            warnings.warn(
+                f"the coordinates (WCS{key and ' ' + key}) of the first image cannot be kept "
+                f"and are left out: {error}",
+                LnoclWarning,
+                stacklevel=2,
+            )
+    return cards
+
+
+def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None:
+    """Check that a result can be written, before any work is done for it.
+
+    Parameters
+    ----------
+    path : str
+        File to write.
+    overwrite : bool
+        Whether it may exist already.
+    inputs : iterable of str, optional
+        Files that it must not replace.
+
+    Raises
+    ------
+    FileError
+        The file exists and must not be overwritten, is a folder or a device, or its folder
+        does not exist or cannot be written to.
+    InputError
+        The file is one of the inputs, or its name asks for compression.
+    """
+    if path.lower().endswith(COMPRESSED):
+        raise InputError(f"the output {path} is not compressed; give it a name ending in .fits")
+    target = os.path.realpath(path)
+    _check_replaceable(path, overwrite)
+    for source in inputs:
+        if os.path.exists(target) and os.path.exists(source) and os.path.samefile(source, target):
+            raise InputError(f"the output {path} is one of the inputs; give it another name")
+    if not os.path.isdir(os.path.dirname(target)):
+        raise FileError(f"the folder of the output {path} does not exist; create it first")
+    try:
+        temporary = _temporary_beside(target)
+        os.close(_create(temporary))
+        os.unlink(temporary)
+    except OSError as error:
+        raise FileError(
+            f"the output {path} cannot be written to its folder: {error.strerror}"
+        ) from error
+
+
+def write_result(
+    path: str,
+    extended: ArrayLike,
+    stars: Sequence[tuple[float, float]],
+    star_fluxes: ArrayLike,
+    history: NDArray[np.void],
+    wcs: fits.Header | None = None,
+    cards: Iterable[Card] = (),
+    commands: Iterable[Sequence[str]] = (),
+    overwrite: bool = False,
+) -> None:
+    """Write a result: the file is there complete, or not at all.
+
+    The primary HDU holds the extended source, the table ``STARS`` the columns x, y and flux,
+    the table ``HISTORY`` the columns iteration and objective. All have CHECKSUM and DATASUM.
+
+    Parameters
+    ----------
+    path : str
+        File to write.
+    extended : array_like, shape (ny, nx)
+        Extended source, electrons per pixel.
+    stars : sequence of (x, y)
+        Positions in pixels, 0-based.
+    star_fluxes : array_like, shape (n,)
+        Electrons.
+    history : ndarray with fields ``iteration`` and ``objective``
+        The objective after each iteration.
+    wcs : astropy.io.fits.Header, optional
+        Cards of the coordinate systems, from `wcs_cards`.
+    cards : iterable of (keyword, value, comment), optional
+        Further cards of the primary header.
+    commands : iterable of sequence of str, optional
+        Shell commands that repeat the run, as words; the HISTORY lines spell them out.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written, or exists and must not be overwritten.
+    """
+    header = fits.Header() if wcs is None else wcs.copy()
+    header["BUNIT"] = ("electron", "per pixel")
+    header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
+    for keyword, value, comment in cards:
+        header[keyword] = (_ascii(value) if isinstance(value, str) else value, comment)
+    for words in commands:
+        for line in history_lines(words):
+            header.add_history(line)
+    hdus = fits.HDUList(
+        [
+            fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
+            _star_table(stars, star_fluxes),
+            _history_table(history),
+        ]
+    )
+    try:
+        _write_whole(path, hdus, overwrite)
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def history_lines(words: Sequence[str]) -> list[str]:
+    r"""Return a shell command in lines that fit HISTORY cards and can be pasted into a shell.
+
+    All but the last line end in a backslash. Long words are cut into pieces that the shell joins
+    again; bytes that FITS does not allow are written as ``$'\ooo'``, which bash, ksh and zsh
+    read.
+
+    Parameters
+    ----------
+    words : sequence of str
+        The command and its arguments, as the program gets them.
+
+    Returns
+    -------
+    list of str
+        Printable ASCII, 72 characters a line at most.
+
+    Examples
+    --------
+    >>> from lnocl.fitsio import history_lines
+    >>> history_lines(["lnocl", "deconvolve", "a star.fits", "-o", "naïve.fits"])
+    ["lnocl deconvolve 'a star.fits' -o $'na\\303\\257ve.fits'"]
+    """
+    lines, line = [], ""
+    for word in words:
+        for i, piece in enumerate(_shell_pieces(word)):
+            gap = " " if line and i == 0 else ""
+            if line and len(line + gap + piece) > HISTORY_WIDTH:
+                lines.append(line + gap + "\\")
+                line, gap = "", ""
+            line += gap + piece
+    return [*lines, line]
+
+
+def _read_file(path: str) -> tuple[NDArray[np.float64], fits.Header, str]:
+    """Return the image in a file, its header and the checksum of the file."""
+    try:
+        with open(path, "rb") as stream:
+            return _read_stream(stream, path)
+    except FileError:
+        raise
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise FileError(f"{path} cannot be opened: {reason}") from error
+
+
+def _read_stream(
+    stream: io.BufferedReader, path: str
+) -> tuple[NDArray[np.float64], fits.Header, str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            with fits.open(stream, memmap=False, disable_image_compression=True) as hdus:
+                hdu = _first_image(hdus, path)
+                if hdu is None:
+                    notes = "".join(f"; {warning.message}" for warning in caught)
+                    raise FileError(f"{path} holds no image{notes}")
+                header = hdu.header.copy()
+                data = _read_pixels(hdu, path, stream)
+                stream.seek(0)
+                sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+        except (FileError, MemoryError):
+            raise
+        except Exception as error:
+            # astropy raises whatever a damaged file leads it to; its advice is for programmers.
+            reason = str(error).partition(". ")[0]
+            raise FileError(f"{path} is no FITS file, or a damaged one: {reason}") from error
+    for warning in caught:
+        warnings.warn(f"{path}: {warning.message}", LnoclWarning, stacklevel=4)
+    return data, header, sha256
+
+
+def _first_image(hdus: fits.HDUList, path: str) -> fits.PrimaryHDU | None:
+    last = -1
+    for hdu in hdus:
+        begin = hdu.fileinfo()["hdrLoc"]
+        if begin <= last:
+            # A negative size in a damaged header sends astropy round in circles.
+            raise FileError(f"{path} is damaged: the size of an extension is negative")
+        last = begin
+        if hdu.header.get("ZIMAGE") is True:
+            # Decompressing damaged tiles corrupts the memory (seen with astropy 8.0).
+            raise FileError(f"{path} is tile-compressed; unpack it first, such as with funpack")
+        if hdu.is_image and len(getattr(hdu, "shape", ())) > 0 and 0 not in hdu.shape:
+            return hdu
+    return None
+
+
+def _read_pixels(hdu: fits.PrimaryHDU, path: str, stream: io.BufferedReader) -> NDArray[np.float64]:
+    _check_size(hdu, path, stream)
+    if "DATASUM" in hdu.header and hdu.verify_datasum() == 0:
+        warnings.warn("the data do not match their DATASUM; the file may be damaged", stacklevel=2)
+    return np.array(hdu.data, dtype=np.float64)
+
+
+def _check_size(hdu: fits.PrimaryHDU, path: str, stream: io.BufferedReader) -> None:
+    """Refuse pixels that are not there or that do not fit the memory, before they are read."""
+    # pread leaves the place where a decompressor reads.
+    uncompressed = os.pread(stream.fileno(), 6, 0) == b"SIMPLE"
+    if uncompressed:
+        promised = hdu.fileinfo()["datLoc"] + hdu.size
+        actual = os.fstat(stream.fileno()).st_size
+        if actual < promised:
+            raise FileError(
+                f"{path} is truncated: it should have {promised} bytes and has {actual}"
+            )
+    needed = 8 * int(np.prod([int(n) for n in hdu.shape], dtype=object))
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > memory:
+        raise FileError(
+            f"{path} has an image of shape {hdu.shape}, {needed / 2**30:.3g} GiB; "
+            f"this machine has {memory / 2**30:.3g} GiB of memory"
+        )
+
+
+@contextlib.contextmanager
+def _quiet_log() -> Iterator[None]:
+    """Keep astropy's notes, such as on SIP coefficients, from the terminal."""
+    level = astropy.log.level
+    astropy.log.setLevel("WARNING")
+    try:
+        yield
+    finally:
+        astropy.log.setLevel(level)
+
+
+def _check_shape(
+    path: str,
+    shape: tuple[int, ...],
+    first_path: str,
+    first_shape: tuple[int, ...],
+    alone: bool,
+) -> None:
+    if alone and len(shape) not in (2, 3):
+        raise InputError(
+            f"{path} has an image of {len(shape)} dimensions; two are needed, or three for a cube"
+        )
+    if not alone and len(shape) != 2:
+        raise InputError(
+            f"{path} has an image of {len(shape)} dimensions; several files need two each "
+            "(a cube goes alone)"
+        )
+    if shape != first_shape:
+        raise InputError(
+            f"{path} has the shape {shape} and {first_path} {first_shape}; they must be the same"
+        )
+
+
+def _check_replaceable(path: str, overwrite: bool) -> None:
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        if not os.path.basename(path):
+            raise FileError(f"the output {path!r} names no file") from None
+        return
+    except (OSError, ValueError) as error:
+        raise FileError(
+            f"the output {path} cannot be written: {getattr(error, 'strerror', None) or error}"
+        ) from error
+    if not stat.S_ISREG(mode):
+        raise FileError(f"the output {path} exists and is no regular file; give another name")
+    if not overwrite:
+        raise FileError(
+            f"the output {path} exists; give another name, or --overwrite to replace it"
+        )
+
+
+def _temporary_beside(target: str) -> str:
+    return os.path.join(os.path.dirname(target), f".lnocl-{secrets.token_hex(8)}.tmp")
+
+
+def _create(path: str) -> int:
+    """Create a file that must not exist, with the permissions of any new file."""
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+
+
+def _write_whole(path: str, hdus: fits.HDUList, overwrite: bool) -> None:
+    """Write a file under another name, and rename it when it is complete and on the disk."""
+    target = os.path.realpath(path)
+    temporary = _temporary_beside(target)
+    descriptor = _create(temporary)
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            hdus.writeto(stream, checksum=True)
+            stream.flush()
+            os.fsync(stream.fileno())
+        _check_replaceable(path, overwrite)
+        os.replace(temporary, target)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def _star_table(stars: Sequence[tuple[float, float]], fluxes: ArrayLike) -> fits.BinTableHDU:
+    x, y = np.asarray(stars, dtype=np.float64).reshape(-1, 2).T
+    table = fits.BinTableHDU.from_columns(
+        [
+            fits.Column("x", "D", unit="pix", array=x),
+            fits.Column("y", "D", unit="pix", array=y),
+            # FITS has no name for electrons, and astropy warns of units that FITS lacks.
+            fits.Column("flux", "D", unit="ct", array=np.asarray(fluxes, dtype=np.float64)),
+        ],
+        name="STARS",
+    )
+    table.header["TTYPE1"] = ("x", "column, 0-based")
+    table.header["TTYPE2"] = ("y", "row, 0-based")
+    table.header["TTYPE3"] = ("flux", "electrons")
+    return table
+
+
+def _history_table(history: NDArray[np.void]) -> fits.BinTableHDU:
+    return fits.BinTableHDU.from_columns(
+        [
+            fits.Column("iteration", "K", array=history["iteration"]),
+            fits.Column("objective", "D", array=history["objective"]),
+        ],
+        name="HISTORY",
+    )
+
+
+def _ascii(text: str) -> str:
+    """Return text with what FITS does not allow written as escapes, as in Python."""
+    return text.encode("unicode_escape").decode("ascii")
+
+
+def _shell_pieces(word: str) -> list[str]:
+    """Return a shell word in quoted pieces that fit a line; written together they are the word."""
+    pieces, start, raw = [], 0, os.fsencode(word)
+    for end in range(1, len(raw) + 1):
+        if end == len(raw) or len(_quote(raw[start : end + 1])) > HISTORY_WIDTH:
+            pieces.append(_quote(raw[start:end]))
+            start = end
+    return pieces or [_quote(raw)]
+
+
+def _quote(raw: bytes) -> str:
+    if all(32 <= byte < 127 for byte in raw):
+        return shlex.quote(raw.decode("ascii"))
+    escaped = (
+        chr(byte) if 32 <= byte < 127 and byte not in b"'\\" else f"\\{byte:03o}" for byte in raw
+    )
+    return f"$'{''.join(escaped)}'"
