@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from lnocl.program import Program, Tuning
+from lnocl.program import TRANSFORMS, Program, Tuning
 
 READ_WRITE = cl.mem_flags.READ_WRITE
 
@@ -222,7 +222,7 @@ class Transform:
         dtype: np.dtype,
         tuning: Tuning | None = None,
     ) -> None:
-        self.program = Program(context, grid, np.dtype(dtype), tuning)
+        self.program = Program(context, grid, np.dtype(dtype), tuning, TRANSFORMS)
         self.layout = Layout(self.program)
         self.launcher = Launcher(self.program)
         self._pixels = cl.Buffer(context, READ_WRITE, self.layout.pixels_bytes)

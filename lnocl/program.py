@@ -12,16 +12,9 @@ import pyopencl as cl
 from lnocl.device import describe, has_double
 from lnocl.errors import DeviceError
 
-SOURCES = (
-    "precision.cl",
-    "complex.cl",
-    "fft.cl",
-    "rows.cl",
-    "columns.cl",
-    "sums.cl",
-    "ratio.cl",
-    "scale.cl",
-)
+# In the order in which they build on each other: the transforms by themselves, and all.
+TRANSFORMS = ("precision.cl", "complex.cl", "fft.cl", "rows.cl", "columns.cl")
+SOURCES = (*TRANSFORMS, "convolve.cl", "sums.cl", "ratio.cl", "scale.cl")
 
 
 @dataclass(frozen=True)
@@ -72,6 +65,8 @@ class Program:
         float32 or float64.
     tuning : Tuning, optional
         By default that of `tune`.
+    sources : tuple of str, optional
+        Files of kernels to build, `SOURCES` or `TRANSFORMS`.
     n_images, n_stars : int, optional
         What the scene has.
     has_mu, has_weights, has_background_map : bool, optional
@@ -101,6 +96,7 @@ class Program:
         grid: tuple[int, int],
         dtype: np.dtype,
         tuning: Tuning | None = None,
+        sources: tuple[str, ...] = SOURCES,
         *,
         n_images: int = 1,
         n_stars: int = 0,
@@ -141,7 +137,7 @@ class Program:
         }
         definitions = [f"-D{name}={value}" for name, value in constants.items()]
         self.options = ["-cl-std=CL1.2", "-w", *definitions]
-        built = _build(context, self.options)
+        built = _build(context, source(sources), self.options)
         self.kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
 
     @property
@@ -160,19 +156,19 @@ class Program:
         return self.scratch_points * 2 * self.tuning.block * self.dtype.itemsize
 
 
-def source() -> str:
-    """Return the OpenCL source of all kernels, in the order in which they build on each other."""
+def source(names: tuple[str, ...] = SOURCES) -> str:
+    """Return the OpenCL source of some or all files of kernels."""
     folder = resources.files("lnocl.kernels")
     return "".join(
-        f'#line 1 "{name}"\n{(folder / name).read_text(encoding="ascii")}' for name in SOURCES
+        f'#line 1 "{name}"\n{(folder / name).read_text(encoding="ascii")}' for name in names
     )
 
 
-def _build(context: cl.Context, options: list[str]) -> cl.Program:
+def _build(context: cl.Context, text: str, options: list[str]) -> cl.Program:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)
-            return cl.Program(context, source()).build(options)
+            return cl.Program(context, text).build(options)
     except cl.RuntimeError as error:
         device = context.devices[0]
         log = " ".join(str(error).split())

@@ -113,7 +113,7 @@ def test_memory_estimate_is_what_the_buffers_hold():
 
 
 def test_failing_compiler_is_named(monkeypatch):
-    monkeypatch.setattr(program, "source", lambda: "this is no OpenCL")
+    monkeypatch.setattr(program, "source", lambda names: "this is no OpenCL")
     with pytest.raises(lnocl.DeviceError, match="the kernels do not build on") as error:
         opencl.OpenCLEngine(scene(1, 8), "single", None, 1)
     assert "\n" not in str(error.value)

@@ -358,13 +358,13 @@ def test_the_cases_take_both_kinds_of_scratch():
 @pytest.mark.parametrize("dtype", DTYPES.values())
 def test_adjoint_dot_product(dtype):
     """<A f, r> = <f, A^T r> for an asymmetric PSF whose peak is far from the origin."""
-    b = bench("last radix 8 and 16", dtype)
+    b = bench("radix 8, last 16", dtype)
     rng = np.random.default_rng(3)
     f, r, psf = rng.random(b.grid), rng.random(b.grid), np.zeros(b.grid)
     psf[5:9, 20:31] = rng.random((4, 11))
     spectrum, spectra = b.empty_spectra(), b.empty_spectra()
     pixels = b.put_pixels(psf[None])
-    otf = b.put(np.zeros((2, *b.grid))), b.put(np.zeros((2, b.grid[0], 2)))
+    otf = b.put(np.zeros((1, *b.grid))), b.put(np.zeros((1, b.grid[0], 2)))
     b.launcher.rows("rfft_rows", spectrum, pixels)
     b.launcher.columns("otf_columns", *otf, spectrum, np.int32(0))
 
