@@ -4,32 +4,21 @@
  * Inverse: decimation in time, bit-reversed order in, natural order out, exp(+2 pi i ...), not
  * divided by the length. So no bit reversal is ever done; spectra stay in reversed order.
  *
- * A transform of n points has an outer pass of radix OUTER(n) = min(8, n), which the kernels
- * write themselves because it is where data come and go; then, over subtransforms of INNER(n)
- * points, passes of radix 8; and a last pass of radix LAST(n) <= 16. All are in place. Where
- * INNER(n) is more than CHUNK points, one middle pass goes over everything; what is left is done
- * span by span, so that each SPAN(n) points stay in the nearest cache until they are done.
+ * A transform of n points has an outer pass of radix OUTER(n) <= 8, which the kernels write
+ * themselves because it is where data come and go; then, over subtransforms of INNER(n) points,
+ * passes of radix 8; and a last pass of radix LAST(n) <= 16. All are in place. Where INNER(n) is
+ * more than CHUNK points, one middle pass goes over everything; what is left is done span by
+ * span, so that each SPAN(n) points stay in the nearest cache until they are done.
  *
  * Twiddles, for each pass over subtransforms of `length` points with radix R, in the order in
  * which the forward transform needs them: [length / R][R - 1][2] reals, the root
  * exp(-2 pi i j reversed(q) / length) for j and q = 1 .. R - 1. The last pass needs none.
  */
 
-#define OUTER(n) ((n) < 8 ? (n) : 8)
+#define OUTER(n) ((n) == NX ? ROW_OUTER : COLUMN_OUTER)
+#define LAST(n) ((n) == NX ? ROW_LAST : COLUMN_LAST)
 #define INNER(n) ((n) / OUTER(n))
-#define LAST(n)                      \
-    (INNER(n) == 1 ? 1               \
-     : INNER(n) == 2 ? 2             \
-     : INNER(n) == 4 ? 4             \
-     : INNER(n) == 8 ? 8             \
-     : INNER(n) == 16 ? 16           \
-     : INNER(n) == 32 ? 4            \
-     : INNER(n) == 64 ? 8            \
-     : INNER(n) == 128 ? 16          \
-     : INNER(n) == 256 ? 4           \
-     : INNER(n) == 512 ? 8 : 16)
-
-#define HAS_MIDDLE(n) (INNER(n) > 16 && INNER(n) > CHUNK)
+#define HAS_MIDDLE(n) (INNER(n) > LAST(n) && INNER(n) > CHUNK)
 #define SPAN_LENGTH(n) (HAS_MIDDLE(n) ? INNER(n) / 8 : INNER(n))
 #define SPAN(n) (GROUP > 1 ? (n) : SPAN_LENGTH(n))
 
@@ -192,7 +181,7 @@ INLINE void dit_middle(SCRATCH vec *x, const int n, __global const real *roots)
 /* The passes over one span, all but the last. */
 INLINE void dif_span(SCRATCH vec *x, const int n, __global const real *roots)
 {
-    for (int length = SPAN_LENGTH(n); length > 16; length /= 8)
+    for (int length = SPAN_LENGTH(n); length > LAST(n); length /= 8)
         dif_pass(x, SPAN(n), length, roots_of(roots, n, length));
 }
 

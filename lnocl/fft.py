@@ -21,15 +21,16 @@ def bit_reversed(n: int) -> NDArray[np.int64]:
     return order
 
 
-def roots(n: int) -> NDArray[np.float64]:
+def roots(n: int, outer: int, last: int) -> NDArray[np.float64]:
     """Return the twiddles of all passes of a transform of n points, as kernels/fft.cl has them.
 
     A pass over subtransforms of length L with radix R has, for j < L / R and 0 < q < R, the root
-    ``exp(-2 pi i j reversed(q) / L)``, real and imaginary part.
+    ``exp(-2 pi i j reversed(q) / L)``, real and imaginary part. The passes have radix `outer`,
+    then 8; that of radix `last` has none.
     """
-    length, radix = n, min(8, n)
+    length, radix = n, outer
     tables = []
-    while length == n or length > 16:
+    while length == n or length > last:
         j, q = np.arange(length // radix)[:, None], bit_reversed(radix)[None, 1:]
         # In long double, where there is one: a rounded angle would cost a digit in double.
         angle = -8.0 * np.arctan(np.longdouble(1.0)) * (j * q) / length
@@ -168,8 +169,12 @@ class Launcher:
         self.queue = cl.CommandQueue(context)
         ny, nx = program.grid
         constant = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-        self._row_roots = cl.Buffer(context, constant, hostbuf=roots(nx).astype(program.dtype))
-        self._column_roots = cl.Buffer(context, constant, hostbuf=roots(ny).astype(program.dtype))
+        row_roots, column_roots = (
+            roots(n, *split).astype(program.dtype)
+            for n, split in ((nx, program.row_radices), (ny, program.column_radices))
+        )
+        self._row_roots = cl.Buffer(context, constant, hostbuf=row_roots)
+        self._column_roots = cl.Buffer(context, constant, hostbuf=column_roots)
         if program.scratch_is_global:
             self._most_groups = device.max_compute_units
             scratch_bytes = self._most_groups * program.scratch_bytes

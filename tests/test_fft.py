@@ -9,6 +9,7 @@ import scipy.fft
 
 from lnocl.device import choose
 from lnocl.fft import Transform, bit_reversed, roots
+from lnocl.program import radices
 
 SQUARES = [(n, n) for n in (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)]
 OBLONGS = [
@@ -144,7 +145,16 @@ def test_bit_reversed_order():
     assert bit_reversed(8).tolist() == [0, 4, 2, 6, 1, 5, 3, 7]
 
 
-def test_roots_have_unit_modulus_and_the_length_of_all_passes():
-    table = roots(1024).reshape(-1, 2)
-    assert len(table) == 128 * 7 + 16 * 7
+@pytest.mark.parametrize(
+    ("n", "deepest", "passes"),
+    [(2, 8, (2, 1)), (16, 8, (4, 4)), (512, 8, (8, 8)), (1024, 8, (4, 4)), (1024, 16, (8, 16))],
+)
+def test_radices_and_their_roots(n, deepest, passes):
+    assert radices(n, deepest) == passes
+    outer, last = passes
+    table = roots(n, outer, last).reshape(-1, 2)
+    count, length = n // outer * (outer - 1), n // outer
+    while length > last:
+        count, length = count + length // 8 * 7, length // 8
+    assert len(table) == count
     np.testing.assert_allclose(np.hypot(*table.T), 1.0, rtol=1e-15)
