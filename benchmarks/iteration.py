@@ -57,8 +57,8 @@ class SciPyIteration:
 class OpenCLIterations:
     """The engine's own iterations, with the objective recorded, several at a time."""
 
-    def __init__(self, scene, precision, device):
-        self.engine = OpenCLEngine(scene, precision, device, n_iter=100_000)
+    def __init__(self, scene, precision, device, tuning=None):
+        self.engine = OpenCLEngine(scene, precision, device, 100_000, tuning)
         self.engine.start(*scene.start(None, None))
 
     def __call__(self, count):

@@ -7,6 +7,7 @@ INLINE void forward_columns(
     FOR_EACH(piece, INNER(NY) * SIDE) {
         const int y = piece / SIDE, lane = piece % SIDE;
         cvec a[8];
+        UNROLL
         for (int q = 0; q < OUTER(NY); ++q)
             a[q] = LOAD(from + lane, q * INNER(NY) + y);
         store_forward(z + lane, a, y, NY, column_roots);
@@ -23,6 +24,7 @@ INLINE void finish_columns(
         const int y = piece / SIDE, lane = piece % SIDE;
         cvec a[8];
         load_inverse(a, z + lane, y, NY, column_roots);
+        UNROLL
         for (int q = 0; q < OUTER(NY); ++q)
             STORE(to + lane, q * INNER(NY) + y, a[q]);
     }

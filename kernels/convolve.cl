@@ -78,14 +78,17 @@ KERNEL void convolve_columns(
                 FOR_EACH(piece, SPAN(NY) / LAST(NY) * SIDE) {
                     const int t = start + piece / SIDE * LAST(NY), lane = piece % SIDE;
                     cvec a[16];
+                    UNROLL
                     for (int q = 0; q < LAST(NY); ++q)
                         a[q] = multiply(LOAD(source + lane, t + q), LOAD(k + lane, t + q));
                     if (block == 0 && lane == 0) {
                         __global const real *edge = otf_edge + 2 * (image * NY + t);
+                        UNROLL
                         for (int q = 0; q < LAST(NY); ++q)
                             a[q] = add_edge(a[q], edge[2 * q], edge[2 * q + 1], source, t + q);
                     }
                     dit(a, LAST(NY));
+                    UNROLL
                     for (int q = 0; q < LAST(NY); ++q)
                         STORE(z + lane, t + q, a[q]);
                 }

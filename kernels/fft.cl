@@ -38,6 +38,7 @@ INLINE void butterfly(cvec *a, cvec *b)
 INLINE void dif(cvec *a, const int radix)
 {
     if (radix == 16) {
+        UNROLL
         for (int i = 0; i < 8; ++i)
             butterfly(a + i, a + i + 8);
         a[9] = rotate(a[9], COS_PI_8, -SIN_PI_8);
@@ -49,7 +50,9 @@ INLINE void dif(cvec *a, const int radix)
         a[15] = rotate(a[15], -COS_PI_8, -SIN_PI_8);
     }
     if (radix >= 8) {
+        UNROLL
         for (int s = 0; s < radix; s += 8) {
+            UNROLL
             for (int i = 0; i < 4; ++i)
                 butterfly(a + s + i, a + s + i + 4);
             a[s + 5] = rotate(a[s + 5], SQRT_HALF, -SQRT_HALF);
@@ -58,6 +61,7 @@ INLINE void dif(cvec *a, const int radix)
         }
     }
     if (radix >= 4) {
+        UNROLL
         for (int s = 0; s < radix; s += 4) {
             butterfly(a + s, a + s + 2);
             butterfly(a + s + 1, a + s + 3);
@@ -65,6 +69,7 @@ INLINE void dif(cvec *a, const int radix)
         }
     }
     if (radix >= 2) {
+        UNROLL
         for (int s = 0; s < radix; s += 2)
             butterfly(a + s, a + s + 1);
     }
@@ -74,10 +79,12 @@ INLINE void dif(cvec *a, const int radix)
 INLINE void dit(cvec *a, const int radix)
 {
     if (radix >= 2) {
+        UNROLL
         for (int s = 0; s < radix; s += 2)
             butterfly(a + s, a + s + 1);
     }
     if (radix >= 4) {
+        UNROLL
         for (int s = 0; s < radix; s += 4) {
             a[s + 3] = times_i(a[s + 3]);
             butterfly(a + s, a + s + 2);
@@ -85,10 +92,12 @@ INLINE void dit(cvec *a, const int radix)
         }
     }
     if (radix >= 8) {
+        UNROLL
         for (int s = 0; s < radix; s += 8) {
             a[s + 5] = rotate(a[s + 5], SQRT_HALF, SQRT_HALF);
             a[s + 6] = times_i(a[s + 6]);
             a[s + 7] = rotate(a[s + 7], -SQRT_HALF, SQRT_HALF);
+            UNROLL
             for (int i = 0; i < 4; ++i)
                 butterfly(a + s + i, a + s + i + 4);
         }
@@ -101,6 +110,7 @@ INLINE void dit(cvec *a, const int radix)
         a[13] = rotate(a[13], -SIN_PI_8, COS_PI_8);
         a[14] = rotate(a[14], -SQRT_HALF, SQRT_HALF);
         a[15] = rotate(a[15], -COS_PI_8, SIN_PI_8);
+        UNROLL
         for (int i = 0; i < 8; ++i)
             butterfly(a + i, a + i + 8);
     }
@@ -108,12 +118,14 @@ INLINE void dit(cvec *a, const int radix)
 
 INLINE void twiddle_forward(cvec *a, const int radix, __global const real *roots)
 {
+    UNROLL
     for (int q = 1; q < radix; ++q)
         a[q] = rotate(a[q], roots[2 * q - 2], roots[2 * q - 1]);
 }
 
 INLINE void twiddle_inverse(cvec *a, const int radix, __global const real *roots)
 {
+    UNROLL
     for (int q = 1; q < radix; ++q)
         a[q] = rotate(a[q], roots[2 * q - 2], -roots[2 * q - 1]);
 }
@@ -124,6 +136,7 @@ INLINE __global const real *roots_of(
 {
     if (length < n)
         roots += 2 * INNER(n) * (OUTER(n) - 1);
+    UNROLL
     for (int l = INNER(n); l > length; l /= 8)
         roots += 14 * (l / 8);
     return roots;
@@ -138,10 +151,12 @@ INLINE void dif_pass(
         const int j = piece / SIDE % eighth;
         SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE / eighth * length + j) + piece % SIDE;
         cvec a[8];
+        UNROLL
         for (int q = 0; q < 8; ++q)
             a[q] = LOAD(leg, q * eighth);
         dif(a, 8);
         twiddle_forward(a, 8, roots + 14 * j);
+        UNROLL
         for (int q = 0; q < 8; ++q)
             STORE(leg, q * eighth, a[q]);
     }
@@ -156,10 +171,12 @@ INLINE void dit_pass(
         const int j = piece / SIDE % eighth;
         SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE / eighth * length + j) + piece % SIDE;
         cvec a[8];
+        UNROLL
         for (int q = 0; q < 8; ++q)
             a[q] = LOAD(leg, q * eighth);
         twiddle_inverse(a, 8, roots + 14 * j);
         dit(a, 8);
+        UNROLL
         for (int q = 0; q < 8; ++q)
             STORE(leg, q * eighth, a[q]);
     }
@@ -197,9 +214,11 @@ INLINE void dif_last(SCRATCH vec *x, const int n)
     FOR_EACH(piece, SPAN(n) / LAST(n) * SIDE) {
         SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE * LAST(n)) + piece % SIDE;
         cvec a[16];
+        UNROLL
         for (int q = 0; q < LAST(n); ++q)
             a[q] = LOAD(leg, q);
         dif(a, LAST(n));
+        UNROLL
         for (int q = 0; q < LAST(n); ++q)
             STORE(leg, q, a[q]);
     }
@@ -212,9 +231,11 @@ INLINE void dit_first(SCRATCH vec *x, const int n)
     FOR_EACH(piece, SPAN(n) / LAST(n) * SIDE) {
         SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE * LAST(n)) + piece % SIDE;
         cvec a[16];
+        UNROLL
         for (int q = 0; q < LAST(n); ++q)
             a[q] = LOAD(leg, q);
         dit(a, LAST(n));
+        UNROLL
         for (int q = 0; q < LAST(n); ++q)
             STORE(leg, q, a[q]);
     }

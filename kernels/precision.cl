@@ -53,6 +53,8 @@ typedef PASTE(BITS, WIDTH) ivec;
 
 /* Without it PoCL leaves calls behind, and registers go through memory. */
 #define INLINE static inline __attribute__((always_inline))
+/* For loops over registers: what is not unrolled early goes through memory. */
+#define UNROLL _Pragma("unroll")
 #define KERNEL __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 #define ITEM ((int)get_local_id(0))
 #if GROUP > 1

@@ -48,12 +48,15 @@ INLINE vec zip_high(const vec a, const vec b)
 /* Transposes LANES x LANES: log2(LANES) rounds that interleave rows i and i + LANES / 2. */
 INLINE void transpose(vec *a)
 {
+    UNROLL
     for (int round = 1; round < LANES; round *= 2) {
         vec b[LANES];
+        UNROLL
         for (int i = 0; i < LANES / 2; ++i) {
             b[2 * i] = zip_low(a[i], a[i + LANES / 2]);
             b[2 * i + 1] = zip_high(a[i], a[i + LANES / 2]);
         }
+        UNROLL
         for (int i = 0; i < LANES; ++i)
             a[i] = b[i];
     }
@@ -86,10 +89,12 @@ INLINE void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int bl
             __global const vec *first = x + READ_FIRST[part] * SIDE;
             __global const vec *second = x + READ_SECOND[part] * SIDE;
             vec a[LANES];
+            UNROLL
             for (int l = 0; l < LANES; ++l)
                 a[l] = first[4 * l * SIDE] + READ_SIGN[part] * second[4 * l * SIDE];
             transpose(a);
             SCRATCH vec *to = z + part % 2 * SIDE + pair;
+            UNROLL
             for (int i = 0; i < LANES; ++i) {
                 const int at = part < 2 ? position(h, i, bit) : opposite(h, i, bit);
                 to[2 * at * SIDE] = a[i];
@@ -122,12 +127,14 @@ INLINE void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int b
             SCRATCH const vec *from_first = z + first % 2 * SIDE + pair;
             SCRATCH const vec *from_second = z + second % 2 * SIDE + pair;
             vec a[LANES];
+            UNROLL
             for (int i = 0; i < LANES; ++i) {
                 const int k = 2 * position(h, i, bit) * SIDE, minus_k = 2 * opposite(h, i, bit) * SIDE;
                 a[i] = from_first[first < 2 ? k : minus_k]
                      + WRITE_SIGN[part] * from_second[second < 2 ? k : minus_k];
             }
             transpose(a);
+            UNROLL
             for (int l = 0; l < LANES; ++l)
                 x[(4 * l + part) * SIDE] = a[l];
         }
@@ -149,6 +156,7 @@ INLINE void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int b
 INLINE void load_inverse(
     cvec *a, SCRATCH const vec *z, const int x, const int n, __global const real *roots)
 {
+    UNROLL
     for (int q = 0; q < OUTER(n); ++q)
         a[q] = LOAD(z, q * INNER(n) + x);
     twiddle_inverse(a, OUTER(n), roots + 2 * (OUTER(n) - 1) * x);
@@ -160,6 +168,7 @@ INLINE void store_forward(
 {
     dif(a, OUTER(n));
     twiddle_forward(a, OUTER(n), roots + 2 * (OUTER(n) - 1) * x);
+    UNROLL
     for (int q = 0; q < OUTER(n); ++q)
         STORE(z, q * INNER(n) + x, a[q]);
 }
@@ -178,6 +187,7 @@ KERNEL void rfft_rows(
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[8];
+            UNROLL
             for (int q = 0; q < OUTER(NX); ++q)
                 a[q] = LOAD(from + lane, q * INNER(NX) + x);
             store_forward(z + lane, a, x, NX, row_roots);
@@ -205,6 +215,7 @@ KERNEL void irfft_rows(
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[8];
             load_inverse(a, z + lane, x, NX, row_roots);
+            UNROLL
             for (int q = 0; q < OUTER(NX); ++q)
                 STORE(to + lane, q * INNER(NX) + x, a[q]);
         }

@@ -24,6 +24,7 @@ INLINE void store_sum(__global real *out, const vec_sum total)
 {
     union { vec v; real lanes[LANES]; } sum = {total.sum}, lost = {total.lost};
     real_sum all = {0, 0};
+    UNROLL
     for (int l = 0; l < LANES; ++l) {
         ACCUMULATE(all, sum.lanes[l]);
         all.lost += lost.lanes[l];

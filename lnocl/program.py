@@ -59,7 +59,7 @@ def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
     """
     most = min(grid) // 2
     if device.type & cl.device_type.CPU:
-        lanes = min(64 // dtype.itemsize, most)
+        lanes = min(32 // dtype.itemsize, most)  # 256 bits, benchmarks/tune.py
         return Tuning(lanes=lanes, block=lanes)
     group = max(1, min(128, min(grid) // 8, device.max_work_group_size))
     return Tuning(lanes=1, block=min(8, most), group=group)
