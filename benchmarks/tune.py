@@ -29,9 +29,7 @@ def candidates(default):
     for chunk in (32, 1024):
         tried.append(Tuning(most, most, default.group, chunk, default.deepest, default.padding))
     for padding in (0, 8, 32):
-        tried.append(
-            Tuning(most, most, default.group, default.chunk, default.deepest, padding)
-        )
+        tried.append(Tuning(most, most, default.group, default.chunk, default.deepest, padding))
     return list(dict.fromkeys(tried))
 
 

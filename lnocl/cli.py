@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import os
 import re
+import shlex
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -163,12 +164,7 @@ def _add_deconvolve_arguments(parser: argparse.ArgumentParser) -> None:
         help="OpenCL, or the plain NumPy reference, which computes in double "
         "(default: %(default)s)",
     )
-    parser.add_argument(
-        "--device",
-        metavar="SPEC",
-        help="OpenCL device as PLATFORM[:DEVICE], each an index or a part of the name; see "
-        "lnocl devices (default: that of PYOPENCL_CTX, else the first GPU, else the first CPU)",
-    )
+    _add_device(parser)
     parser.add_argument(
         "-o",
         "--output",
@@ -300,6 +296,171 @@ def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
     ]
 
 
+def _add_simulate_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scene",
+        metavar="SCENE",
+        help="hh34, a jet like the paper's, or a FITS file whose first image is the extended "
+        "source; the header keywords STARX and STARY, 0-based, name its star",
+    )
+    _add_folder(parser, "images, PSFs, truth and record.json", required=True)
+    parser.add_argument(
+        "--size", type=int, metavar="N", help="pixels along each side of hh34 (default: 1024)"
+    )
+    parser.add_argument(
+        "--angle",
+        nargs="+",
+        type=float,
+        dest="angles",
+        metavar="DEG",
+        help="angles of the baseline from the x axis towards the y axis, one for each image "
+        "(default: 0 45 90 135)",
+    )
+    parser.add_argument(
+        "--exposure-time", metavar="TIME", help='of each image, with unit (default: "30 min")'
+    )
+    parser.add_argument(
+        "--strehl", type=float, metavar="S", help="Strehl ratio in (0, 1] (default: 0.7)"
+    )
+    parser.add_argument(
+        "--throughput",
+        type=float,
+        metavar="T",
+        help="electrons per photon that reaches the telescope, in (0, 1] (default: 0.3)",
+    )
+    parser.add_argument(
+        "--star",
+        action="append",
+        type=_star,
+        dest="stars",
+        metavar="X,Y,MAG",
+        help="whole pixels, 0-based, and magnitude of a star, instead of those of the scene; may "
+        "be repeated",
+    )
+    parser.add_argument(
+        "--extended-magnitude",
+        type=float,
+        metavar="M",
+        help="integrated magnitude of the extended source (default: 13)",
+    )
+    parser.add_argument(
+        "--sky",
+        type=float,
+        dest="sky_brightness",
+        metavar="MAG",
+        help="brightness of the sky, magnitude per square arcsecond (default: 13.5)",
+    )
+    parser.add_argument(
+        "--read-noise",
+        type=float,
+        metavar="S",
+        help="standard deviation in electrons (default: 10)",
+    )
+    parser.add_argument(
+        "--seed", type=int, metavar="N", help="of residual phases and noise (default: 0)"
+    )
+
+
+def _simulate(arguments: argparse.Namespace) -> None:
+    from astropy import units as u
+
+    from lnocl import demo, fitsio, simulate
+
+    stars = arguments.stars and [simulate.Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
+    target = simulate.load_target(arguments.scene, arguments.size, stars)
+    units = {
+        "angles": u.deg,
+        "extended_magnitude": u.mag,
+        "sky_brightness": simulate.MAG_PER_ARCSEC2,
+        "read_noise": u.electron,
+    }
+    names = (*units, "exposure_time", "strehl", "throughput", "seed")
+    given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
+    experiment = simulate.Experiment(
+        **{name: value * units[name] if name in units else value for name, value in given.items()}
+    )
+    fitsio.check_folder(arguments.output, arguments.overwrite)
+    simulation = simulate.simulate(target, experiment)
+    command = demo.write_simulation(
+        arguments.output, arguments.scene, simulation, arguments.overwrite
+    )
+    _say(
+        [
+            f"{len(simulation.images)} images, as many PSFs, truth.fits and record.json written "
+            f"to {arguments.output}; to deconvolve them run",
+            shlex.join(command),
+        ]
+    )
+
+
+def _add_demo_arguments(parser: argparse.ArgumentParser) -> None:
+    _add_folder(parser, "images, results and pictures", default="lnocl_demo")
+    parser.add_argument(
+        "--size",
+        type=int,
+        default=256,
+        metavar="N",
+        help="pixels along each side (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        metavar="N",
+        help="of residual phases and noise (default: %(default)s)",
+    )
+    _add_device(parser)
+
+
+def _demo(arguments: argparse.Namespace) -> None:
+    from lnocl import demo, device
+
+    spec = device.spec_of(device.choose(arguments.device).device)
+    for line in demo.run(
+        arguments.output, arguments.size, arguments.seed, spec, arguments.overwrite
+    ):
+        _say([line])
+
+
+def _add_plot_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "results",
+        nargs="+",
+        metavar="RESULT",
+        help="FITS file that lnocl deconvolve, lnocl demo or examples/hh34_table.py has written",
+    )
+    parser.add_argument(
+        "--truth", metavar="TRUTH", help="FITS file with the true source, of lnocl simulate"
+    )
+    _add_folder(parser, "the figures, PNG files", required=True)
+
+
+def _plot(arguments: argparse.Namespace) -> None:
+    from lnocl import demo
+
+    for line in demo.draw(
+        arguments.output, arguments.results, arguments.truth, arguments.overwrite
+    ):
+        _say([line])
+
+
+def _add_folder(parser: argparse.ArgumentParser, content: str, **keywords: Any) -> None:
+    default = " (default: %(default)s)" if "default" in keywords else ""
+    parser.add_argument(
+        "-o", "--output", metavar="DIR", help=f"folder for {content}{default}", **keywords
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace files in DIR")
+
+
+def _add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--device",
+        metavar="SPEC",
+        help="OpenCL device as PLATFORM[:DEVICE], each an index or a part of the name; see "
+        "lnocl devices (default: that of PYOPENCL_CTX, else the first GPU, else the first CPU)",
+    )
+
+
 def _add_no_arguments(parser: argparse.ArgumentParser) -> None:
     pass
 
@@ -318,10 +479,26 @@ def _devices(arguments: argparse.Namespace) -> None:
 
 
 COMMANDS = {
+    "demo": Command(
+        "simulate a jet and its star, reconstruct them with and without the star as a component, "
+        "and show the difference in a table and pictures",
+        _add_demo_arguments,
+        _demo,
+    ),
     "deconvolve": Command(
         "reconstruct the sky from images of it, as stars plus an extended source",
         _add_deconvolve_arguments,
         _deconvolve,
+    ),
+    "simulate": Command(
+        "simulate images of a scene as the paper's interferometer would take them",
+        _add_simulate_arguments,
+        _simulate,
+    ),
+    "plot": Command(
+        "draw the paper's figures from results: objects, errors, magnitude and profiles",
+        _add_plot_arguments,
+        _plot,
     ),
     "devices": Command(
         "list the OpenCL devices, and say which one is used and why", _add_no_arguments, _devices
@@ -335,6 +512,14 @@ def _position(text: str) -> tuple[float, float]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not X,Y") from None
     return x, y
+
+
+def _star(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, magnitude = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not X,Y,MAG") from None
+    return x, y, magnitude
 
 
 def _as_path(path: str) -> str:

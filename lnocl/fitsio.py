@@ -28,6 +28,12 @@ HISTORY_WIDTH = 70
 
 COMPRESSED = (".gz", ".bz2", ".xz", ".zip", ".z", ".fz")
 
+RESULT_TABLES = {
+    "STARS": ("x", "y", "flux"),
+    "HISTORY": ("iteration", "objective"),
+    "CURVE": ("iteration", "rho", "rho_star", "magnitude"),
+}
+
 _WCS_KEYWORD = re.compile(r"(?:CTYPE|CRPIX|CRVAL|CDELT)1([A-Z]?)")
 
 Card = tuple[str, str | int | float, str]
@@ -130,6 +136,113 @@ def wcs_cards(header: fits.Header) -> fits.Header:
     return cards
 
 
+class SavedResult(NamedTuple):
+    """A result, or a truth, that was read.
+
+    Attributes
+    ----------
+    extended : ndarray of float64, shape (ny, nx)
+        Extended source, electrons per pixel.
+    stars : list of (x, y)
+        Positions in pixels, 0-based.
+    star_fluxes : ndarray of float64, shape (n,)
+        Electrons.
+    history, curve : dict of str to ndarray of float64, or None
+        Columns of the tables ``HISTORY`` and ``CURVE``; None where there is no such table.
+    header : astropy.io.fits.Header
+        Header of the extended source.
+    """
+
+    extended: NDArray[np.float64]
+    stars: list[tuple[float, float]]
+    star_fluxes: NDArray[np.float64]
+    history: dict[str, NDArray[np.float64]] | None
+    curve: dict[str, NDArray[np.float64]] | None
+    header: fits.Header
+
+
+def read_result(path: str) -> SavedResult:
+    """Read what `write_result` has written.
+
+    Parameters
+    ----------
+    path : str
+        File with an image (ny, nx) and a table ``STARS`` with the columns x, y and flux.
+
+    Returns
+    -------
+    SavedResult
+        The extended source, the stars, and the tables that are there.
+
+    Raises
+    ------
+    FileError
+        A file that `read_stack` refuses, or whose tables are not those of a result.
+    """
+    extended, header, _ = _read_file(path)
+    try:
+        with fits.open(path, memmap=False) as hdus:
+            tables = {
+                hdu.name: {name: np.array(hdu.data[name], np.float64) for name in hdu.columns.names}
+                for hdu in hdus
+                if isinstance(hdu, fits.BinTableHDU) and hdu.name in RESULT_TABLES
+            }
+    except Exception as error:
+        # As in _read_stream: astropy raises whatever a damaged file leads it to.
+        raise FileError(f"{path} has tables that cannot be read: {error}") from error
+    lacking = [
+        f"{table} {name}"
+        for table, names in RESULT_TABLES.items()
+        for name in names
+        if (table in tables or table == "STARS") and name not in tables.get(table, ())
+    ]
+    if lacking or extended.ndim != 2:
+        what = f"there is no column {lacking[0]}" if lacking else "the image is a cube"
+        raise FileError(f"{path} is no result or truth that lnocl has written: {what}")
+    stars = tables["STARS"]
+    return SavedResult(
+        extended,
+        list(zip(stars["x"].tolist(), stars["y"].tolist(), strict=True)),
+        stars["flux"],
+        tables.get("HISTORY"),
+        tables.get("CURVE"),
+        header,
+    )
+
+
+def check_folder(path: str, overwrite: bool, names: Iterable[str] | None = None) -> None:
+    """Make the folder that files go to, and check that none is lost, before any work is done.
+
+    Parameters
+    ----------
+    path : str
+        Folder; made where it does not exist.
+    overwrite : bool
+        Whether files in it may be replaced.
+    names : iterable of str, optional
+        Files that will be written. By default the folder must be empty.
+
+    Raises
+    ------
+    FileError
+        The path is no folder, cannot be made or written to, or holds files that must not be
+        overwritten.
+    """
+    try:
+        os.makedirs(path, exist_ok=True)
+        there = os.listdir(path)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise FileError(f"the output folder {path} cannot be used: {reason}") from error
+    if names is None and there and not overwrite:
+        raise FileError(
+            f"the output folder {path} is not empty; give another, or --overwrite to replace "
+            "files in it"
+        )
+    for name in [".lnocl"] if names is None else names:
+        check_output(os.path.join(path, name), overwrite)
+
+
 def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None:
     """Check that a result can be written, before any work is done for it.
 
@@ -174,16 +287,18 @@ def write_result(
     extended: ArrayLike,
     stars: Sequence[tuple[float, float]],
     star_fluxes: ArrayLike,
-    history: NDArray[np.void],
+    history: NDArray[np.void] | None = None,
     wcs: fits.Header | None = None,
     cards: Iterable[Card] = (),
     commands: Iterable[Sequence[str]] = (),
     overwrite: bool = False,
+    curve: NDArray[np.void] | None = None,
 ) -> None:
-    """Write a result: the file is there complete, or not at all.
+    """Write a result, or a truth: the file is there complete, or not at all.
 
     The primary HDU holds the extended source, the table ``STARS`` the columns x, y and flux,
-    the table ``HISTORY`` the columns iteration and objective. All have CHECKSUM and DATASUM.
+    the table ``HISTORY`` the columns iteration and objective, the table ``CURVE`` the columns
+    iteration, rho, rho_star and magnitude. All have CHECKSUM and DATASUM.
 
     Parameters
     ----------
@@ -195,8 +310,8 @@ def write_result(
         Positions in pixels, 0-based.
     star_fluxes : array_like, shape (n,)
         Electrons.
-    history : ndarray with fields ``iteration`` and ``objective``
-        The objective after each iteration.
+    history : ndarray with fields ``iteration`` and ``objective``, optional
+        The objective after each iteration; none for a truth.
     wcs : astropy.io.fits.Header, optional
         Cards of the coordinate systems, from `wcs_cards`.
     cards : iterable of (keyword, value, comment), optional
@@ -205,6 +320,8 @@ def write_result(
         Shell commands that repeat the run, as words; the HISTORY lines spell them out.
     overwrite : bool, optional
         Whether an existing file may be replaced.
+    curve : ndarray with fields ``iteration``, ``rho``, ``rho_star`` and ``magnitude``, optional
+        Restoration errors and magnitude of the star, where the truth is known.
 
     Raises
     ------
@@ -214,8 +331,7 @@ def write_result(
     header = fits.Header() if wcs is None else wcs.copy()
     header["BUNIT"] = ("electron", "per pixel")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
-    for keyword, value, comment in cards:
-        header[keyword] = (_ascii(value) if isinstance(value, str) else value, comment)
+    _add_cards(header, cards)
     for words in commands:
         for line in history_lines(words):
             header.add_history(line)
@@ -223,15 +339,38 @@ def write_result(
         [
             fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
             _star_table(stars, star_fluxes),
-            _history_table(history),
+            *([] if history is None else [_table("HISTORY", history)]),
+            *([] if curve is None else [_table("CURVE", curve)]),
         ]
     )
-    try:
-        _write_whole(path, hdus, overwrite)
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
+    _write_whole(path, hdus, overwrite)
+
+
+def write_image(
+    path: str, image: ArrayLike, cards: Iterable[Card] = (), overwrite: bool = False
+) -> None:
+    """Write an image; the same image and cards give the same bytes.
+
+    Parameters
+    ----------
+    path : str
+        File to write.
+    image : array_like, shape (ny, nx)
+        Any image.
+    cards : iterable of (keyword, value, comment), optional
+        Cards of its header.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written, or exists and must not be overwritten.
+    """
+    hdu = fits.PrimaryHDU(np.asarray(image, dtype=np.float64))
+    _add_cards(hdu.header, cards)
+    hdu.add_checksum(when="")  # astropy would note the time
+    _write_whole(path, fits.HDUList([hdu]), overwrite, checksum=False)
 
 
 def history_lines(words: Sequence[str]) -> list[str]:
@@ -410,14 +549,28 @@ def _create(path: str) -> int:
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
 
 
-def _write_whole(path: str, hdus: fits.HDUList, overwrite: bool) -> None:
+def _add_cards(header: fits.Header, cards: Iterable[Card]) -> None:
+    for keyword, value, comment in cards:
+        header[keyword] = (_ascii(value) if isinstance(value, str) else value, comment)
+
+
+def _write_whole(path: str, hdus: fits.HDUList, overwrite: bool, checksum: bool = True) -> None:
     """Write a file under another name, and rename it when it is complete and on the disk."""
+    try:
+        _write_and_rename(path, hdus, overwrite, checksum)
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _write_and_rename(path: str, hdus: fits.HDUList, overwrite: bool, checksum: bool) -> None:
     target = os.path.realpath(path)
     temporary = _temporary_beside(target)
     descriptor = _create(temporary)
     try:
         with os.fdopen(descriptor, "wb") as stream:
-            hdus.writeto(stream, checksum=True)
+            hdus.writeto(stream, checksum=checksum)
             stream.flush()
             os.fsync(stream.fileno())
         _check_replaceable(path, overwrite)
@@ -444,14 +597,12 @@ def _star_table(stars: Sequence[tuple[float, float]], fluxes: ArrayLike) -> fits
     return table
 
 
-def _history_table(history: NDArray[np.void]) -> fits.BinTableHDU:
-    return fits.BinTableHDU.from_columns(
-        [
-            fits.Column("iteration", "K", array=history["iteration"]),
-            fits.Column("objective", "D", array=history["objective"]),
-        ],
-        name="HISTORY",
-    )
+def _table(name: str, rows: NDArray[np.void]) -> fits.BinTableHDU:
+    columns = [
+        fits.Column(field, "K" if rows[field].dtype.kind == "i" else "D", array=rows[field])
+        for field in rows.dtype.names or ()
+    ]
+    return fits.BinTableHDU.from_columns(columns, name=name)
 
 
 def _ascii(text: str) -> str:

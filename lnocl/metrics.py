@@ -1,0 +1,361 @@
+"""What the paper measures of a reconstruction: errors, star magnitude, profiles along the jet.
+
+The definitions are those of La Camera et al. (2012), sections 3.2 and 4. The axis of the jet lies
+along y, so a pixel line across it is a row. Positions are whole pixels (x, y), 0-based, x along
+columns.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lnocl.errors import InputError
+
+Array = NDArray[np.float64]
+
+N_STAR_ROWS = 24
+
+
+def star_rows(star: tuple[int, int], shape: tuple[int, int]) -> slice:
+    """Return the 24 rows around the star, from ``y - 12`` to ``y + 11``.
+
+    Parameters
+    ----------
+    star : (x, y)
+        Position of the star.
+    shape : tuple of int
+        Shape (ny, nx) of the image.
+
+    Returns
+    -------
+    slice
+        Of the first axis.
+
+    Raises
+    ------
+    InputError
+        Where one of the rows lies outside the image.
+
+    Examples
+    --------
+    >>> from lnocl.metrics import star_rows
+    >>> star_rows((128, 64), (256, 256))
+    slice(52, 76, None)
+    """
+    _, y = _check_star(star, shape)
+    start = y - N_STAR_ROWS // 2
+    if start < 0 or start + N_STAR_ROWS > shape[0]:
+        raise InputError(
+            f"the {N_STAR_ROWS} rows around the star at y = {y} do not fit in {shape[0]} rows"
+        )
+    return slice(start, start + N_STAR_ROWS)
+
+
+def mask_star(image: ArrayLike, star: tuple[int, int]) -> Array:
+    """Return a copy of the image with 0 in the 3 x 3 pixels around the star.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        Any image.
+    star : (x, y)
+        Position of the star, one pixel or more from the edge.
+
+    Returns
+    -------
+    ndarray of float64, shape (ny, nx)
+        The masked image.
+
+    Raises
+    ------
+    InputError
+        Where the image is not a plane of finite numbers, or the box leaves it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lnocl.metrics import mask_star
+    >>> mask_star(np.ones((4, 4)), (1, 2)).sum()
+    np.float64(7.0)
+    """
+    masked = _plane("image", image).copy()
+    masked[_box(star, masked.shape)] = 0.0
+    return masked
+
+
+def restoration_error(
+    reconstruction: ArrayLike,
+    truth: ArrayLike,
+    rows: slice | None = None,
+    star: tuple[int, int] | None = None,
+) -> float:
+    r"""Return the restoration error, the relative r.m.s. error of a reconstruction.
+
+    .. math:: \rho = \| f - \bar f \| \, / \, \| \bar f \|
+
+    The paper's :math:`\rho'` is over all rows, its :math:`\rho''` over `star_rows`. For stars
+    apart from the extended source (MC-RL) compare the extended sources, without `star`. For both
+    in one image (RLM) give `star`, and its mask is laid on reconstruction and truth; under it
+    the truth with the star is the truth without.
+
+    Parameters
+    ----------
+    reconstruction : array_like, shape (ny, nx)
+        f, the reconstructed source.
+    truth : array_like, shape (ny, nx)
+        The true source, in the same unit.
+    rows : slice, optional
+        Rows to compare; by default all.
+    star : (x, y), optional
+        Position of the star around which 3 x 3 pixels of both are set to 0.
+
+    Returns
+    -------
+    float
+        Zero or more; 0.1 is an error of 10 %.
+
+    Raises
+    ------
+    InputError
+        Where the shapes differ, a value is not finite, the mask leaves the image, or the truth
+        is zero on all that is compared.
+
+    References
+    ----------
+    La Camera et al. (2012), Eq. 10.
+
+    Examples
+    --------
+    >>> from lnocl.metrics import restoration_error
+    >>> restoration_error([[3.0, 0.0], [0.0, 5.0]], [[3.0, 0.0], [0.0, 4.0]])
+    0.2
+    """
+    found, true = _plane("reconstruction", reconstruction), _plane("truth", truth)
+    if found.shape != true.shape:
+        raise InputError(f"the reconstruction has shape {found.shape} and the truth {true.shape}")
+    if star is not None:
+        found, true = mask_star(found, star), mask_star(true, star)
+    if rows is not None:
+        found, true = found[rows], true[rows]
+    norm = np.linalg.norm(true)
+    if norm == 0:
+        raise InputError("the truth is zero on all that is compared; there is no relative error")
+    return float(np.linalg.norm(found - true) / norm)
+
+
+def box_flux(image: ArrayLike, star: tuple[int, int]) -> float:
+    """Return the flux in the 3 x 3 pixels around the star, the paper's measure of its flux.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        Reconstruction that holds the star.
+    star : (x, y)
+        Position of the star, one pixel or more from the edge.
+
+    Returns
+    -------
+    float
+        In the unit of the image.
+
+    Raises
+    ------
+    InputError
+        Where the image is not a plane of finite numbers, or the box leaves it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lnocl.metrics import box_flux
+    >>> box_flux(np.ones((4, 4)), (1, 2))
+    9.0
+    """
+    plane = _plane("image", image)
+    return float(plane[_box(star, plane.shape)].sum())
+
+
+def magnitude(flux: float, zero_magnitude_flux: float) -> float:
+    """Return the magnitude of a flux, ``-2.5 log10(flux / zero_magnitude_flux)``.
+
+    Parameters
+    ----------
+    flux : float
+        Zero or more: of the star component, or `box_flux`.
+    zero_magnitude_flux : float
+        Flux of magnitude 0 in the same unit, positive.
+
+    Returns
+    -------
+    float
+        In mag; infinite where the flux is 0.
+
+    Raises
+    ------
+    InputError
+        Where a flux is out of its range.
+
+    Examples
+    --------
+    >>> from lnocl.metrics import magnitude
+    >>> magnitude(1e4, 1e10)
+    15.0
+    """
+    if not (math.isfinite(zero_magnitude_flux) and zero_magnitude_flux > 0):
+        raise InputError(
+            f"zero_magnitude_flux must be positive and finite; {zero_magnitude_flux} was given"
+        )
+    if not (math.isfinite(flux) and flux >= 0):
+        raise InputError(f"flux must be finite and not negative; {flux} was given")
+    return -2.5 * math.log10(flux / zero_magnitude_flux) if flux > 0 else math.inf
+
+
+def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array:
+    """Return the flux profile along the jet, the sum of each row.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        Source whose axis lies along y.
+    star : (x, y), optional
+        Position of the star in the image of both (RLM); the 3 rows around it are masked.
+
+    Returns
+    -------
+    ndarray of float64, shape (ny,)
+        In the unit of the image; NaN where masked.
+
+    Raises
+    ------
+    InputError
+        Where the image is not a plane of finite numbers, or a masked row lies outside it.
+
+    References
+    ----------
+    La Camera et al. (2012), section 4, Fig. 6.
+
+    Examples
+    --------
+    >>> from lnocl.metrics import flux_profile
+    >>> flux_profile([[1, 2, 3], [0, 4, 0]])
+    array([6., 4.])
+    """
+    plane = _plane("image", image)
+    return _mask_rows(plane.sum(axis=1), star, plane.shape)
+
+
+def width_profile(image: ArrayLike, threshold: float, star: tuple[int, int] | None = None) -> Array:
+    """Return the width profile along the jet.
+
+    The width of a row is the number of pixels from the first to the last that are greater than
+    the threshold, both counted: ``last - first + 1``, and 0 where none is.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        Source whose axis lies along y.
+    threshold : float
+        In the unit of the image, finite.
+    star : (x, y), optional
+        Position of the star in the image of both (RLM); the 3 rows around it are masked.
+
+    Returns
+    -------
+    ndarray of float64, shape (ny,)
+        Pixels; NaN where masked.
+
+    Raises
+    ------
+    InputError
+        Where the image is not a plane of finite numbers, the threshold is not finite, or a
+        masked row lies outside the image.
+
+    References
+    ----------
+    La Camera et al. (2012), section 4, Fig. 7.
+
+    Examples
+    --------
+    >>> from lnocl.metrics import width_profile
+    >>> width_profile([[0, 5, 1, 5, 0], [0, 0, 2, 0, 0], [0, 0, 1, 0, 0]], threshold=1)
+    array([3., 1., 0.])
+    """
+    plane = _plane("image", image)
+    if not math.isfinite(threshold):
+        raise InputError(f"threshold must be finite; {threshold} was given")
+    above = plane > threshold
+    first = above.argmax(axis=1)
+    last = plane.shape[1] - 1 - above[:, ::-1].argmax(axis=1)
+    widths = np.where(above.any(axis=1), last - first + 1.0, 0.0)
+    return _mask_rows(widths, star, plane.shape)
+
+
+def relative_error(profile: ArrayLike, reference: ArrayLike) -> Array:
+    """Return the relative error of a profile, ``(profile - reference) / reference``.
+
+    Parameters
+    ----------
+    profile : array_like, shape (ny,)
+        Flux or width profile of a reconstruction.
+    reference : array_like, shape (ny,)
+        The same of the truth.
+
+    Returns
+    -------
+    ndarray of float64, shape (ny,)
+        Signed: positive where the profile is too high. NaN where either is masked, and where the
+        reference is 0, where there is no relative error.
+
+    Raises
+    ------
+    InputError
+        Where they are not two profiles of one length.
+
+    Examples
+    --------
+    >>> from lnocl.metrics import relative_error
+    >>> relative_error([5.0, 9.0, 1.0], [4.0, 10.0, 0.0])
+    array([ 0.25, -0.1 ,   nan])
+    """
+    found = np.asarray(profile, dtype=np.float64)
+    true = np.asarray(reference, dtype=np.float64)
+    if found.ndim != 1 or found.shape != true.shape:
+        raise InputError(f"the profile has shape {found.shape} and the reference {true.shape}")
+    error = np.full(found.shape, np.nan)
+    np.divide(found - true, true, out=error, where=true != 0)
+    return error
+
+
+def _plane(name: str, values: ArrayLike) -> Array:
+    array = np.asarray(values)
+    if array.ndim != 2 or array.dtype.kind not in "biuf":
+        raise InputError(
+            f"{name} has {array.ndim} dimensions of {array.dtype}; give two, of real numbers"
+        )
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} holds values that are not finite")
+    return array.astype(np.float64, copy=False)
+
+
+def _check_star(star: tuple[int, int], shape: tuple[int, ...]) -> tuple[int, int]:
+    x, y = star
+    if x != round(x) or y != round(y):
+        raise InputError(f"the star at ({x:g}, {y:g}) lies between pixels; give whole ones")
+    if not (0 <= x < shape[1] and 0 <= y < shape[0]):
+        raise InputError(f"the star at ({x:g}, {y:g}) lies outside the image of shape {shape}")
+    return round(x), round(y)
+
+
+def _box(star: tuple[int, int], shape: tuple[int, ...]) -> tuple[slice, slice]:
+    x, y = _check_star(star, shape)
+    if not (1 <= x < shape[1] - 1 and 1 <= y < shape[0] - 1):
+        raise InputError(f"the 3 x 3 pixels around the star at ({x}, {y}) leave the image")
+    return slice(y - 1, y + 2), slice(x - 1, x + 2)
+
+
+def _mask_rows(profile: Array, star: tuple[int, int] | None, shape: tuple[int, ...]) -> Array:
+    if star is not None:
+        profile[_box(star, shape)[0]] = np.nan
+    return profile

@@ -1,0 +1,185 @@
+"""The paper's measures, against values worked out by hand and against each other."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from lnocl.errors import InputError
+from lnocl.metrics import (
+    box_flux,
+    flux_profile,
+    magnitude,
+    mask_star,
+    relative_error,
+    restoration_error,
+    star_rows,
+    width_profile,
+)
+
+planes = arrays(np.float64, (6, 5), elements=st.floats(0, 100))
+
+
+def test_restoration_error_by_hand():
+    # Differences 1, 2, 2: norm 3. Truth 2, 4, 4: norm 6.
+    truth = np.array([[2.0, 4.0], [4.0, 0.0]])
+    found = np.array([[3.0, 2.0], [6.0, 0.0]])
+    assert restoration_error(found, truth) == 0.5
+    # The second row alone: 2 / 4.
+    assert restoration_error(found, truth, rows=slice(1, 2)) == 0.5
+    assert restoration_error(found, truth, rows=slice(0, 1)) == pytest.approx(math.sqrt(5 / 20))
+
+
+def test_restoration_error_is_not_symmetric():
+    assert restoration_error([[1.0]], [[2.0]]) == 0.5
+    assert restoration_error([[2.0]], [[1.0]]) == 1.0
+
+
+def test_restoration_error_masks_star_in_both():
+    truth = np.zeros((5, 5))
+    truth[0] = 3.0  # 5 pixels of 3 outside the mask
+    found = truth.copy()
+    found[0, 0] = 0.0  # wrong by 3 in one of them
+    truth[3, 2] = 1e6  # the star, as the truth of RLM has it
+    found[2:5, 1:4] = 7e5  # and spread over its box
+    assert restoration_error(found, truth, star=(2, 3)) == pytest.approx(3 / math.sqrt(45))
+    assert restoration_error(found, truth) > 1
+    without_star = np.where(truth == 1e6, 0.0, truth)
+    assert restoration_error(found, without_star, star=(2, 3)) == restoration_error(
+        found, truth, star=(2, 3)
+    )
+
+
+def test_restoration_error_known_answer_near_star():
+    """Right but for a factor of 1.25 in the 24 rows: 0.25 there, less over all rows."""
+    truth = np.ones((96, 8))
+    rows = star_rows((4, 40), truth.shape)
+    found = truth.copy()
+    found[rows] *= 1.25
+    assert restoration_error(found, truth, rows=rows) == pytest.approx(0.25)
+    assert restoration_error(found, truth) == pytest.approx(0.25 * math.sqrt(24 / 96))
+    error = relative_error(flux_profile(found), flux_profile(truth))
+    assert np.count_nonzero(error) == 24
+    assert error[rows] == pytest.approx(0.25)
+
+
+@settings(deadline=None)
+@given(planes, planes, st.floats(0.01, 100))
+def test_restoration_error_has_no_unit(found, truth, scale):
+    truth[0, 0] = 1.0
+    assert restoration_error(scale * found, scale * truth) == pytest.approx(
+        restoration_error(found, truth)
+    )
+
+
+@settings(deadline=None)
+@given(planes)
+def test_restoration_error_of_truth_and_of_nothing(truth):
+    truth[0, 0] = 1.0
+    assert restoration_error(truth, truth) == 0
+    assert restoration_error(np.zeros_like(truth), truth) == pytest.approx(1)
+
+
+def test_star_rows_are_24_with_12_below():
+    rows = star_rows((5, 12), (64, 10))
+    assert (rows.start, rows.stop) == (0, 24)
+    assert star_rows((5, 52), (64, 10)) == slice(40, 64)
+
+
+def test_mask_star_keeps_the_image_given():
+    image = np.arange(25.0).reshape(5, 5)
+    masked = mask_star(image, (1, 3))
+    assert image.sum() == 300
+    # Columns 0 to 2 of rows 2 to 4: 10 11 12, 15 16 17, 20 21 22.
+    assert masked.sum() == 300 - 144
+    assert not masked[2:, :3].any()
+    assert box_flux(image, (1, 3)) == 144
+
+
+def test_magnitude_by_hand():
+    assert magnitude(100.0, 1e7) == pytest.approx(12.5)
+    # A star of 9 equal pixels, measured in its box.
+    image = np.zeros((6, 6))
+    image[1:4, 2:5] = 1e3 / 9
+    assert magnitude(box_flux(image, (3, 2)), 1e10) == pytest.approx(17.5)
+    assert magnitude(0.0, 1e10) == math.inf
+
+
+@settings(deadline=None)
+@given(st.floats(-5, 30), st.floats(1e-3, 1e15))
+def test_magnitude_inverts_flux(mag, zero):
+    assert magnitude(zero * 10 ** (-0.4 * mag), zero) == pytest.approx(mag, abs=1e-9)
+
+
+def test_flux_profile_by_hand_and_masked():
+    image = np.arange(20.0).reshape(5, 4)
+    assert flux_profile(image).tolist() == [6, 22, 38, 54, 70]
+    masked = flux_profile(image, star=(1, 2))
+    assert np.isnan(masked).tolist() == [False, True, True, True, False]
+    assert masked[[0, 4]].tolist() == [6, 70]
+
+
+def test_width_profile_by_hand_and_masked():
+    image = np.array(
+        [
+            [0, 2, 0, 0, 2, 0],  # a gap between first and last counts
+            [2, 2, 2, 2, 2, 2],
+            [0, 0, 2, 0, 0, 0],
+            [1, 1, 1, 1, 1, 1],  # not greater than the threshold
+            [0, 0, 0, 0, 0, 2],
+        ]
+    )
+    assert width_profile(image, 1).tolist() == [4, 6, 1, 0, 1]
+    masked = width_profile(image, 1, star=(3, 1))
+    assert np.isnan(masked).tolist() == [True, True, True, False, False]
+
+
+def test_width_of_gaussian_known_answer():
+    """A Gaussian of sigma s is above exp(-8) of its peak within 4 s of it."""
+    x = np.arange(101) - 50
+    image = np.exp(-0.5 * (x / np.array([[2.2], [5.3], [9.1]])) ** 2)
+    assert width_profile(image, math.exp(-8)).tolist() == [17, 43, 73]
+
+
+@settings(deadline=None)
+@given(planes, st.floats(0, 100))
+def test_width_and_mirror(image, threshold):
+    width = width_profile(image, threshold)
+    assert (width == width_profile(image[:, ::-1], threshold)).all()
+    assert (width >= (image > threshold).sum(axis=1)).all()
+    assert ((width == 0) == (image <= threshold).all(axis=1)).all()
+
+
+def test_relative_error_is_nan_where_there_is_none():
+    error = relative_error([1.0, 2.0, np.nan, 3.0, 0.0], [0.0, 4.0, 1.0, np.nan, 0.0])
+    assert np.isnan(error).tolist() == [True, False, True, True, True]
+    assert error[1] == -0.5
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: restoration_error(np.ones((2, 2)), np.ones((2, 3))), "shape"),
+        (lambda: restoration_error(np.ones((2, 2)), np.zeros((2, 2))), "truth is zero"),
+        (lambda: restoration_error(np.ones(2), np.ones(2)), "1 dimensions"),
+        (lambda: restoration_error([[math.nan]], [[1.0]]), "not finite"),
+        (lambda: restoration_error([[1j]], [[1.0]]), "complex128"),
+        (lambda: mask_star(np.ones((4, 4)), (0, 2)), "leave the image"),
+        (lambda: box_flux(np.ones((4, 4)), (2, 3)), "leave the image"),
+        (lambda: mask_star(np.ones((4, 4)), (4, 2)), "outside"),
+        (lambda: mask_star(np.ones((4, 4)), (1.5, 2)), "between pixels"),
+        (lambda: star_rows((2, 11), (64, 64)), "do not fit"),
+        (lambda: star_rows((2, 53), (64, 64)), "do not fit"),
+        (lambda: magnitude(-1.0, 1.0), "flux"),
+        (lambda: magnitude(1.0, 0.0), "zero_magnitude_flux"),
+        (lambda: width_profile(np.ones((4, 4)), math.nan), "threshold"),
+        (lambda: relative_error([1.0], [1.0, 2.0]), "shape"),
+    ],
+)
+def test_refuses_in_one_line(call, message):
+    with pytest.raises(InputError, match=message) as caught:
+        call()
+    assert "\n" not in str(caught.value)
