@@ -8,14 +8,14 @@ A turn's order is random. A candidate's worth is in its ratio, not in its millis
 """
 
 import argparse
-import itertools
 import random
+from dataclasses import replace
 
 import numpy as np
 from iteration import OpenCLIterations, milliseconds, observation
 
 from lnocl.device import choose, describe
-from lnocl.program import Tuning, tune
+from lnocl.program import tune
 from lnocl.scene import Scene
 
 
@@ -23,13 +23,11 @@ def candidates(default):
     """Return tunings to try: the default with one or two of its constants changed."""
     most = default.block
     tried = [default]
-    for lanes, deepest in itertools.product((most, most // 2, most // 4), (8, 16)):
-        tried.append(Tuning(lanes, lanes, default.group, default.chunk, deepest, default.padding))
-        tried.append(Tuning(lanes, most, default.group, default.chunk, deepest, default.padding))
-    for chunk in (32, 1024):
-        tried.append(Tuning(most, most, default.group, chunk, default.deepest, default.padding))
-    for padding in (0, 8, 32):
-        tried.append(Tuning(most, most, default.group, default.chunk, default.deepest, padding))
+    for lanes in (2 * most, most, most // 2):
+        tried.append(replace(default, lanes=lanes, block=lanes))
+    tried.append(replace(default, block=2 * most))
+    tried += [replace(default, chunk=chunk) for chunk in (32, 1024)]
+    tried += [replace(default, padding=padding) for padding in (0, 8, 32)]
     return list(dict.fromkeys(tried))
 
 

@@ -77,7 +77,7 @@ KERNEL void convolve_columns(
             for (int start = 0; start < NY; start += SPAN(NY)) {
                 FOR_EACH(piece, SPAN(NY) / LAST(NY) * SIDE) {
                     const int t = start + piece / SIDE * LAST(NY), lane = piece % SIDE;
-                    cvec a[16];
+                    cvec a[8];
                     UNROLL
                     for (int q = 0; q < LAST(NY); ++q)
                         a[q] = multiply(LOAD(source + lane, t + q), LOAD(k + lane, t + q));

@@ -1,4 +1,4 @@
-/* A power-of-two FFT from radix-2 butterflies, up to four deep in registers.
+/* A power-of-two FFT from radix-2 butterflies, up to three deep in registers.
  *
  * Forward: decimation in frequency, natural order in, bit-reversed order out, exp(-2 pi i ...).
  * Inverse: decimation in time, bit-reversed order in, natural order out, exp(+2 pi i ...), not
@@ -6,7 +6,7 @@
  *
  * A transform of n points has an outer pass of radix OUTER(n) <= 8, which the kernels write
  * themselves because it is where data come and go; then, over subtransforms of INNER(n) points,
- * passes of radix 8; and a last pass of radix LAST(n) <= 16. All are in place. Where INNER(n) is
+ * passes of radix 8; and a last pass of radix LAST(n) <= 8. All are in place. Where INNER(n) is
  * more than CHUNK points, one middle pass goes over everything; what is left is done span by
  * span, so that each SPAN(n) points stay in the nearest cache until they are done.
  *
@@ -24,8 +24,6 @@
 
 #define HIGH_BIT(i) (1 << (31 - clz(i)))
 
-#define COS_PI_8 ((real)0.92387953251128675613)
-#define SIN_PI_8 ((real)0.38268343236508977173)
 #define SQRT_HALF ((real)0.70710678118654752440)
 
 INLINE void butterfly(cvec *a, cvec *b)
@@ -37,28 +35,13 @@ INLINE void butterfly(cvec *a, cvec *b)
 
 INLINE void dif(cvec *a, const int radix)
 {
-    if (radix == 16) {
+    if (radix == 8) {
         UNROLL
-        for (int i = 0; i < 8; ++i)
-            butterfly(a + i, a + i + 8);
-        a[9] = rotate(a[9], COS_PI_8, -SIN_PI_8);
-        a[10] = rotate(a[10], SQRT_HALF, -SQRT_HALF);
-        a[11] = rotate(a[11], SIN_PI_8, -COS_PI_8);
-        a[12] = times_minus_i(a[12]);
-        a[13] = rotate(a[13], -SIN_PI_8, -COS_PI_8);
-        a[14] = rotate(a[14], -SQRT_HALF, -SQRT_HALF);
-        a[15] = rotate(a[15], -COS_PI_8, -SIN_PI_8);
-    }
-    if (radix >= 8) {
-        UNROLL
-        for (int s = 0; s < radix; s += 8) {
-            UNROLL
-            for (int i = 0; i < 4; ++i)
-                butterfly(a + s + i, a + s + i + 4);
-            a[s + 5] = rotate(a[s + 5], SQRT_HALF, -SQRT_HALF);
-            a[s + 6] = times_minus_i(a[s + 6]);
-            a[s + 7] = rotate(a[s + 7], -SQRT_HALF, -SQRT_HALF);
-        }
+        for (int i = 0; i < 4; ++i)
+            butterfly(a + i, a + i + 4);
+        a[5] = rotate(a[5], SQRT_HALF, -SQRT_HALF);
+        a[6] = times_minus_i(a[6]);
+        a[7] = rotate(a[7], -SQRT_HALF, -SQRT_HALF);
     }
     if (radix >= 4) {
         UNROLL
@@ -91,28 +74,13 @@ INLINE void dit(cvec *a, const int radix)
             butterfly(a + s + 1, a + s + 3);
         }
     }
-    if (radix >= 8) {
+    if (radix == 8) {
+        a[5] = rotate(a[5], SQRT_HALF, SQRT_HALF);
+        a[6] = times_i(a[6]);
+        a[7] = rotate(a[7], -SQRT_HALF, SQRT_HALF);
         UNROLL
-        for (int s = 0; s < radix; s += 8) {
-            a[s + 5] = rotate(a[s + 5], SQRT_HALF, SQRT_HALF);
-            a[s + 6] = times_i(a[s + 6]);
-            a[s + 7] = rotate(a[s + 7], -SQRT_HALF, SQRT_HALF);
-            UNROLL
-            for (int i = 0; i < 4; ++i)
-                butterfly(a + s + i, a + s + i + 4);
-        }
-    }
-    if (radix == 16) {
-        a[9] = rotate(a[9], COS_PI_8, SIN_PI_8);
-        a[10] = rotate(a[10], SQRT_HALF, SQRT_HALF);
-        a[11] = rotate(a[11], SIN_PI_8, COS_PI_8);
-        a[12] = times_i(a[12]);
-        a[13] = rotate(a[13], -SIN_PI_8, COS_PI_8);
-        a[14] = rotate(a[14], -SQRT_HALF, SQRT_HALF);
-        a[15] = rotate(a[15], -COS_PI_8, SIN_PI_8);
-        UNROLL
-        for (int i = 0; i < 8; ++i)
-            butterfly(a + i, a + i + 8);
+        for (int i = 0; i < 4; ++i)
+            butterfly(a + i, a + i + 4);
     }
 }
 
@@ -213,7 +181,7 @@ INLINE void dif_last(SCRATCH vec *x, const int n)
 {
     FOR_EACH(piece, SPAN(n) / LAST(n) * SIDE) {
         SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE * LAST(n)) + piece % SIDE;
-        cvec a[16];
+        cvec a[8];
         UNROLL
         for (int q = 0; q < LAST(n); ++q)
             a[q] = LOAD(leg, q);
@@ -230,7 +198,7 @@ INLINE void dit_first(SCRATCH vec *x, const int n)
 {
     FOR_EACH(piece, SPAN(n) / LAST(n) * SIDE) {
         SCRATCH vec *leg = x + 2 * SIDE * (piece / SIDE * LAST(n)) + piece % SIDE;
-        cvec a[16];
+        cvec a[8];
         UNROLL
         for (int q = 0; q < LAST(n); ++q)
             a[q] = LOAD(leg, q);

@@ -26,8 +26,6 @@ class Tuning:
     lanes, block, group, chunk : int
         Reals in a vector; columns transformed together; work-items that share a block; points
         of a transform finished before the next are begun.
-    deepest : int
-        Largest radix of a pass, 8 or 16: more depth is fewer passes and more registers.
     padding : int
         Rows of padding behind a block of spectra, which keep neighbouring blocks from falling
         on the same cache sets.
@@ -37,16 +35,14 @@ class Tuning:
     block: int
     group: int = 1
     chunk: int = 128
-    deepest: int = 8
     padding: int = 16
 
 
-def radices(n: int, deepest: int) -> tuple[int, int]:
+def radices(n: int) -> tuple[int, int]:
     """Return the radices of the outer and the last pass of n points; those between are 8."""
-    bits = n.bit_length() - 1
-    outer = 4 if deepest == 8 and bits % 3 == 1 and n > 2 else min(8, n)
+    outer = 4 if n > 2 and n.bit_length() % 3 == 2 else min(8, n)
     last = n // outer
-    while last > (16 if deepest == 16 else 8):
+    while last > 8:
         last //= 8
     return outer, last
 
@@ -132,8 +128,8 @@ class Program:
         self.rows = grid[0] + self.tuning.padding
         self.scratch_points = max(grid[1], 2 * grid[0])
         self.scratch_is_global = self.scratch_bytes > device.local_mem_size
-        self.row_radices = radices(grid[1], self.tuning.deepest)
-        self.column_radices = radices(grid[0], self.tuning.deepest)
+        self.row_radices = radices(grid[1])
+        self.column_radices = radices(grid[0])
         constants = {
             "REAL": "double" if dtype == np.float64 else "float",
             "BITS": "long" if dtype == np.float64 else "int",

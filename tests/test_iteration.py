@@ -46,7 +46,6 @@ RECIPES = {
     ),
     "64x64 two stars, no background": Recipe((64, 64), 2, 2, background="zero", psf_shape=(9, 9)),
     "64x256 two stars, map": Recipe((64, 256), 3, 2, background="map", n_iter=100),
-    "4x2048": Recipe((4, 2048), 4, psf_shape=(3, 12), n_iter=100),
     "512x16 three stars": Recipe((512, 16), 1, 3, psf_shape=(11, 6), n_iter=100),
     "20x50 star, mu, mask, noise": Recipe(
         (20, 50), 3, 1, mu=1e-3, masked=0.03, background="map", read_noise=(0.5, 1.0, 1.5)

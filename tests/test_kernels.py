@@ -29,12 +29,10 @@ CASES = {
     "radices 8, 8, 8": ((8, 512), None, "plain", "s"),
     "radices 4, 8, 8, 4, middle pass": ((32, 1024), None, "plain", "sd"),
     "middle pass along y": ((2048, 4), None, "plain", "d"),
-    "radices 8, 16": ((128, 64), Tuning(8, 8, deepest=16), "plain", "s"),
-    "radices 8, 8, 16": ((4, 1024), Tuning(2, 2, deepest=16), "plain", "s"),
-    "global scratch": ((8192, 64), None, "plain", "s"),
+    "global scratch": ((8192, 64), Tuning(4, 16), "plain", "s"),
     "several vectors a block": ((64, 32), Tuning(4, 8), "mask, mu", "s"),
-    "group": ((64, 32), Tuning(1, 8, group=4), THREE_IMAGES, "sd"),
-    "group, middle pass": ((2048, 16), Tuning(1, 2, group=64), "plain", "s"),
+    "group": ((64, 32), Tuning(1, 8, group=4), THREE_IMAGES, "s"),
+    "group, middle pass": ((2048, 16), Tuning(1, 2, group=64), "plain", "d"),
     "group, global scratch": ((4096, 64), Tuning(4, 32, group=8), "mask, mu", "s"),
 }
 SCENES = {
