@@ -15,8 +15,9 @@ from lnocl.program import Program, Tuning
 CANARY = np.frombuffer(b"\xa5" * 64, np.uint8)
 LEAST_MODEL = reference.LEAST_MODEL
 
-# Name: (grid, tuning, scene, precisions). Each grid is the smallest that takes some path of
-# kernels/fft.cl; tunings other than the default share a block among work-items, as a GPU does.
+# Name: (grid, tuning, scene, precisions), a capital letter for one that only CI tests. Each grid
+# is the smallest that takes some path of kernels/fft.cl; tunings other than the default share a
+# block among work-items, as a GPU does.
 # (PoCL 3 miscompiles vectors of 2 in groups of several work-items; no tuning has them.)
 THREE_IMAGES = "three images, two stars, mask, background map"
 CASES = {
@@ -25,15 +26,15 @@ CASES = {
     "outer radix 8": ((8, 8), None, "mask, mu", "s"),
     "radices 4, 4 and 8, 4": ((16, 32), None, THREE_IMAGES, "sd"),
     "radices 8, 8 and 4, 8, 4": ((64, 128), None, "two images, star, mu", "sd"),
-    "radices 8, 8, 4": ((256, 16), None, "plain", "s"),
-    "radices 8, 8, 8": ((8, 512), None, "plain", "s"),
-    "radices 4, 8, 8, 4, middle pass": ((32, 1024), None, "plain", "sd"),
+    "radices 8, 8, 4": ((256, 16), None, "plain", "S"),
+    "radices 8, 8, 8": ((8, 512), None, "plain", "S"),
+    "radices 4, 8, 8, 4, middle pass": ((32, 1024), None, "plain", "sD"),
     "middle pass along y": ((2048, 4), None, "plain", "d"),
     "global scratch": ((8192, 64), Tuning(4, 16), "plain", "s"),
-    "several vectors a block": ((64, 32), Tuning(4, 8), "mask, mu", "s"),
-    "group": ((64, 32), Tuning(1, 8, group=4), THREE_IMAGES, "s"),
+    "several vectors a block": ((64, 32), Tuning(4, 8), "mask, mu", "S"),
+    "group": ((64, 32), Tuning(1, 8, group=4), THREE_IMAGES, "sD"),
     "group, middle pass": ((2048, 16), Tuning(1, 2, group=64), "plain", "d"),
-    "group, global scratch": ((4096, 64), Tuning(4, 32, group=8), "mask, mu", "s"),
+    "group, global scratch": ((4096, 64), Tuning(4, 32, group=8), "mask, mu", "S"),
 }
 SCENES = {
     "plain": {"n_images": 1},
@@ -47,7 +48,16 @@ SCENES = {
     "mask, mu": {"n_images": 1, "has_weights": True, "has_mu": True},
 }
 DTYPES = {"s": np.float32, "d": np.float64}
-RUNS = [(case, DTYPES[d]) for case, (*_, precisions) in CASES.items() for d in precisions]
+RUNS = [
+    pytest.param(
+        case,
+        DTYPES[d.lower()],
+        marks=[pytest.mark.exhaustive] if d.isupper() else [],
+        id=f"{case}-{d}",
+    )
+    for case, (*_, precisions) in CASES.items()
+    for d in precisions
+]
 KERNELS = (
     "rfft_rows",
     "irfft_rows",
