@@ -4,7 +4,7 @@
  * X, Y the half spectra of a and b, Z(k) = X(k) + i Y(k) and Z(-k) = conj(X(k)) + i conj(Y(k)).
  * Half spectra keep one of each pair (k, -k), column h of them that at position(h) of the
  * bit-reversed order; its opposite lies at opposite(h). X(0) and X(Nx / 2) are real and share
- * column 0 as its real and imaginary part.
+ * column 0 as its real and imaginary part; they lie at positions 0 and 1.
  */
 
 /* The highest bit of h + i, i < LANES, where `high_bit` is that of h, a multiple of LANES. */
@@ -13,12 +13,12 @@
 
 INLINE int position(const int h, const int i, const int high_bit)
 {
-    return h + i == 0 ? 0 : h + i + COLUMN_BIT(h, i, high_bit);
+    return h + i + COLUMN_BIT(h, i, high_bit);
 }
 
 INLINE int opposite(const int h, const int i, const int high_bit)
 {
-    return h + i == 0 ? 1 : position(h, i, high_bit) ^ (2 * COLUMN_BIT(h, i, high_bit) - 1);
+    return position(h, i, high_bit) ^ (2 * COLUMN_BIT(h, i, high_bit) - 1);
 }
 
 INLINE vec zip_low(const vec a, const vec b)

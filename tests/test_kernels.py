@@ -355,6 +355,62 @@ def test_every_kernel_is_tested_and_has_a_twin():
     assert all(callable(getattr(reference, name)) for name in KERNELS)
 
 
+def launch_ratio_rows(b, model, images, star_image):
+    """Return the ratio's row spectra and the sums, for one image of a model that is exact."""
+    background = b.put([1.0])
+    spectra, sums = (
+        b.put_spectra(np.fft.rfft(model - 1.0)[None] / b.grid[1]),
+        b.put(np.zeros((b.ratio_groups, 2, 2))),
+    )
+    b.launcher.rows(
+        "ratio_rows",
+        spectra,
+        sums,
+        b.put_pixels(images[None]),
+        background,
+        b.put_pixels(star_image[None]),
+        b.put([0.0]),
+        blocks=b.program.row_blocks,
+    )
+    return b.take_spectra(spectra)[0], b.take(sums, (-1, 2, 2)).astype(float)
+
+
+def with_star(dtype):
+    grid = (64, 128)
+    program = Program(
+        context(), grid, np.dtype(dtype), least_model=LEAST_MODEL, n_images=1, n_stars=1
+    )
+    return Bench(program)
+
+
+@pytest.mark.parametrize("dtype", DTYPES.values())
+def test_division_guard(dtype):
+    """Where the model is not positive the ratio is 0, and J is infinite if there are counts."""
+    b = with_star(dtype)
+    images, model = np.ones(b.grid), np.ones(b.grid)
+    flat, sums = launch_ratio_rows(b, model, images, np.zeros(b.grid))
+    assert np.isfinite(sums).all()
+    # One pixel of the model's Fourier series at -1, all others at or above 0.
+    model[3, :] = 1.0 - 2.0 * (np.arange(b.grid[1]) == 7)
+    dark, sums = launch_ratio_rows(b, model, images, np.zeros(b.grid))
+    expected = images.copy()
+    expected[3, 7] = 0.0
+    assert np.abs(dark - reference.rfft_rows(expected)).max() < 1e3 * np.finfo(dtype).eps
+    assert np.isinf(sums[:, 0]).any()
+    images[3, 7] = 0.0
+    _, sums = launch_ratio_rows(b, model, images, np.zeros(b.grid))
+    assert np.isfinite(sums).all()
+
+
+def test_sums_over_pixels_are_compensated():
+    """Sums of exact ratios in single precision are right to a double's digits, nearly."""
+    b = with_star(np.float32)
+    images = rounded(np.random.default_rng(11).uniform(0.5, 2.0, b.grid), np.float32)
+    _, sums = launch_ratio_rows(b, np.ones(b.grid), images, np.ones(b.grid))
+    assert sums[:, 1].sum() == pytest.approx(images.sum(), rel=3e-9)
+    assert sums[:, 1, 0].sum() != pytest.approx(images.sum(), rel=3e-9)
+
+
 def test_the_cases_take_both_kinds_of_scratch():
     assert bench("global scratch", np.float32).program.scratch_is_global
     assert not bench("radices 8, 8 and 4, 8, 4", np.float32).program.scratch_is_global
