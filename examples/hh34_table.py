@@ -102,8 +102,8 @@ def main():
     """Compute the rows that are missing and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scene", default="hh34")
-    parser.add_argument("--size", type=int, default=1024)
-    parser.add_argument("--mu", type=float, nargs="+", default=[1e-8, 3e-8, 8e-8, 2e-7])
+    parser.add_argument("--size", type=int, help="of hh34 (default: 1024); a file has its own")
+    parser.add_argument("--mu", type=float, nargs="+", default=[1e-8, 3e-8, 8e-8, 2e-7, 5e-7])
     parser.add_argument("--rlm-iterations", type=int, default=5000)
     parser.add_argument("--n-iter", type=int, default=40_000)
     parser.add_argument("--every", type=int, default=20)

@@ -148,13 +148,38 @@ class Layout:
         return (parts[:, :, 0] + 1j * parts[:, :, 1]).transpose(1, 0, 2).reshape(ny, nx // 2)
 
 
+class Launch:
+    """A kernel bound to its arguments, which each call launches; it costs the host little.
+
+    A kernel has one set of arguments at a time: binding it anew changes earlier launches of it.
+    """
+
+    def __init__(
+        self,
+        queue: cl.CommandQueue,
+        kernel: cl.Kernel,
+        arguments: tuple[Any, ...],
+        groups: int,
+        group: int,
+    ) -> None:
+        self._queue, self.kernel = queue, kernel
+        self._global_size, self._local_size = (groups * group,), (group,)
+        kernel.set_args(*arguments)
+
+    def __call__(self) -> cl.Event:
+        """Enqueue the kernel."""
+        return cl.enqueue_nd_range_kernel(
+            self._queue, self.kernel, self._global_size, self._local_size
+        )
+
+
 class Launcher:
-    """Launches kernels of a program: its queue, its roots of unity and its scratch.
+    """Binds the kernels of a program to arguments: its queue, roots of unity and scratch.
 
     Parameters
     ----------
     program : Program
-        Whose kernels are launched.
+        Whose kernels are bound.
 
     Attributes
     ----------
@@ -185,24 +210,24 @@ class Launcher:
             self._most_groups = 2**31
             self._scratch = cl.LocalMemory(program.scratch_bytes)
 
-    def rows(self, name: str, *arguments: Any, blocks: int | None = None) -> cl.Event:
-        """Launch a kernel over blocks of rows, all of one array or as many as given."""
+    def rows(self, name: str, *arguments: Any, blocks: int | None = None) -> Launch:
+        """Bind a kernel over blocks of rows, all of one array or as many as given."""
         arguments = (*arguments, self._row_roots, self._scratch)
-        return self._launch(name, blocks or self.program.row_blocks, arguments)
+        return self._bind(name, blocks or self.program.row_blocks, arguments)
 
-    def columns(self, name: str, *arguments: Any) -> cl.Event:
-        """Launch a kernel over all blocks of columns."""
+    def columns(self, name: str, *arguments: Any) -> Launch:
+        """Bind a kernel over all blocks of columns."""
         arguments = (*arguments, self._column_roots, self._scratch)
-        return self._launch(name, self.program.column_blocks, arguments)
+        return self._bind(name, self.program.column_blocks, arguments)
 
-    def single(self, name: str, *arguments: Any) -> cl.Event:
-        """Launch a kernel on one work-item."""
-        return self.program.kernels[name](self.queue, (1,), (1,), *arguments)
+    def single(self, name: str, *arguments: Any) -> Launch:
+        """Bind a kernel on one work-item."""
+        return Launch(self.queue, self.program.kernels[name], arguments, 1, 1)
 
-    def _launch(self, name: str, blocks: int, arguments: tuple[Any, ...]) -> cl.Event:
+    def _bind(self, name: str, blocks: int, arguments: tuple[Any, ...]) -> Launch:
         group = self.program.tuning.group
         groups = min(blocks, self._most_groups)
-        return self.program.kernels[name](self.queue, (groups * group,), (group,), *arguments)
+        return Launch(self.queue, self.program.kernels[name], arguments, groups, group)
 
 
 class Transform:
@@ -249,7 +274,7 @@ class Transform:
     def rfft2(self, pixels: NDArray) -> NDArray[np.complex128]:
         """Return the half spectrum (Ny, Nx // 2 + 1) of real pixels (Ny, Nx)."""
         self._upload(self._pixels, self.layout.pack_pixels(pixels))
-        self.launcher.rows("rfft_rows", self._spectra, self._pixels)
+        self.launcher.rows("rfft_rows", self._spectra, self._pixels)()
         self._fft_columns()
         ny = self.program.grid[0]
         columns = self._download_columns()[np.argsort(bit_reversed(ny))] / 2.0
@@ -261,16 +286,16 @@ class Transform:
         columns = self.layout.columns_of(spectrum)[bit_reversed(ny)]
         self._upload(self._spectra, self.layout.pack_columns(columns))
         self._ifft_columns()
-        self.launcher.rows("irfft_rows", self._pixels, self._spectra)
+        self.launcher.rows("irfft_rows", self._pixels, self._spectra)()
         packed = np.empty(self.layout.pixels_shape, self.layout.dtype)
         cl.enqueue_copy(self.launcher.queue, packed, self._pixels)
         return self.layout.unpack_pixels(packed) / (ny * nx)
 
     def _fft_columns(self) -> None:
-        self.launcher.columns("fft_columns", self._spectra)
+        self.launcher.columns("fft_columns", self._spectra)()
 
     def _ifft_columns(self) -> None:
-        self.launcher.columns("ifft_columns", self._spectra)
+        self.launcher.columns("ifft_columns", self._spectra)()
 
     def _upload(self, buffer: cl.Buffer, packed: NDArray) -> None:
         cl.enqueue_copy(self.launcher.queue, buffer, packed)

@@ -21,6 +21,9 @@ from lnocl.scene import Scene
 # interrupt is answered soon.
 ITERATIONS_AHEAD = 8
 
+# Which argument of collect_sums is the iteration, the only one that changes in a run.
+COLLECT_ITERATION = 6
+
 
 class OpenCLEngine:
     """A scene on a device.
@@ -77,8 +80,8 @@ class OpenCLEngine:
         self._queue = self._launcher.queue
         self._n_objectives = 0
         self._pending: deque[cl.Event] = deque()
-        self._real = self.program.dtype.type
         self._allocate(n_iter)
+        self._bind()
         self._upload_scene()
 
     def _sizes(self, n_iter: int) -> dict[str, int]:
@@ -126,6 +129,48 @@ class OpenCLEngine:
             for name, size in self._sizes(n_iter).items()
         }
 
+    def _bind(self) -> None:
+        """Bind the kernels of an iteration, in its order."""
+        buffers, launcher = self._buffers, self._launcher
+        otfs = buffers["otfs"], buffers["otf_edges"]
+        mu = self.program.dtype.type(self.scene.mu)
+        self._convolve = launcher.columns(
+            "convolve_columns", buffers["spectra"], buffers["spectrum"], *otfs
+        )
+        self._ratio = launcher.rows(
+            "ratio_rows",
+            buffers["spectra"],
+            buffers["ratio_sums"],
+            buffers["images"],
+            buffers["background"],
+            buffers["star_images"],
+            buffers["star_fluxes"],
+            blocks=self.program.row_blocks * self.program.n_images,
+        )
+        self._collect = launcher.single(
+            "collect_sums",
+            buffers["objectives"],
+            buffers["star_corrections"],
+            buffers["ratio_sums"],
+            buffers["square_sums"],
+            buffers["star_weights"],
+            mu,
+            np.int32(0),
+        )
+        self._correlate = launcher.columns(
+            "correlate_columns", buffers["spectrum"], buffers["spectra"], *otfs
+        )
+        self._scale = launcher.rows(
+            "scale_rows",
+            buffers["spectrum"],
+            buffers["extended"],
+            buffers["square_sums"],
+            buffers["star_fluxes"],
+            buffers["inverse_weight"],
+            buffers["star_corrections"],
+            mu,
+        )
+
     def _upload_scene(self) -> None:
         scene = self.scene
         images = scene.images()
@@ -156,26 +201,26 @@ class OpenCLEngine:
         buffers = self._buffers
         for j in range(self.scene.n_images):
             self._upload_pixels("extended", [self.scene.psf(j)])
-            self._launcher.rows("rfft_rows", buffers["spectrum"], buffers["extended"])
+            self._launcher.rows("rfft_rows", buffers["spectrum"], buffers["extended"])()
             self._launcher.columns(
                 "otf_columns",
                 buffers["otfs"],
                 buffers["otf_edges"],
                 buffers["spectrum"],
                 np.int32(j),
-            )
+            )()
 
     def _invert_weights(self, weights: NDArray[np.bool_]) -> None:
         """Make 1 / sum_j A_j^T w_j, 0 where nothing was observed."""
         buffers, size = self._buffers, self.layout.spectra_bytes
         for j, weight in enumerate(weights):
             self._upload_pixels("extended", [weight])
-            self._launcher.rows("rfft_rows", buffers["spectrum"], buffers["extended"])
+            self._launcher.rows("rfft_rows", buffers["spectrum"], buffers["extended"])()
             cl.enqueue_copy(
                 self._queue, buffers["spectra"], buffers["spectrum"], dst_offset=j * size
             )
         self.correct()
-        self._launcher.rows("irfft_rows", self._buffers["extended"], self._buffers["spectrum"])
+        self._launcher.rows("irfft_rows", self._buffers["extended"], self._buffers["spectrum"])()
         total = self.extended()
         self._observed = self.scene.observed(total)
         inverse = np.divide(1.0, total, out=np.zeros_like(total), where=self._observed)
@@ -186,7 +231,7 @@ class OpenCLEngine:
         if self._observed is not None:
             extended = np.where(self._observed, extended, 0.0)
         self._upload_pixels("extended", [extended])
-        self._launcher.rows("rfft_rows", self._buffers["spectrum"], self._buffers["extended"])
+        self._launcher.rows("rfft_rows", self._buffers["spectrum"], self._buffers["extended"])()
         if self.scene.n_stars:
             self._upload("star_fluxes", star_fluxes)
         squares = np.zeros(self._buffers["square_sums"].size // self.program.dtype.itemsize)
@@ -195,61 +240,19 @@ class OpenCLEngine:
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
-        buffers = self._buffers
-        self._launcher.columns(
-            "convolve_columns",
-            buffers["spectra"],
-            buffers["spectrum"],
-            buffers["otfs"],
-            buffers["otf_edges"],
-        )
-        self._launcher.rows(
-            "ratio_rows",
-            buffers["spectra"],
-            buffers["ratio_sums"],
-            buffers["images"],
-            buffers["background"],
-            buffers["star_images"],
-            buffers["star_fluxes"],
-            blocks=self.program.row_blocks * self.program.n_images,
-        )
-        self._launcher.single(
-            "collect_sums",
-            buffers["objectives"],
-            buffers["star_corrections"],
-            buffers["ratio_sums"],
-            buffers["square_sums"],
-            buffers["star_weights"],
-            self._real(self.scene.mu),
-            np.int32(self._n_objectives),
-        )
+        self._convolve()
+        self._ratio()
+        self._collect.kernel.set_arg(COLLECT_ITERATION, np.int32(self._n_objectives))
+        self._collect()
         self._n_objectives += 1
 
     def correct(self) -> None:
         """Back-project the ratios to the correction."""
-        buffers = self._buffers
-        self._launcher.columns(
-            "correlate_columns",
-            buffers["spectrum"],
-            buffers["spectra"],
-            buffers["otfs"],
-            buffers["otf_edges"],
-        )
+        self._correlate()
 
     def scale(self) -> None:
         """Scale the estimate by its correction."""
-        buffers = self._buffers
-        event = self._launcher.rows(
-            "scale_rows",
-            buffers["spectrum"],
-            buffers["extended"],
-            buffers["square_sums"],
-            buffers["star_fluxes"],
-            buffers["inverse_weight"],
-            buffers["star_corrections"],
-            self._real(self.scene.mu),
-        )
-        self._pending.append(event)
+        self._pending.append(self._scale())
         if len(self._pending) > ITERATIONS_AHEAD:
             self._pending.popleft().wait()
 

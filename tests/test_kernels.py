@@ -205,26 +205,26 @@ def inputs(b):
 
 def run_rfft_rows(b, i):
     out = b.empty_spectra()
-    b.launcher.rows("rfft_rows", out, b.put_pixels(i.pixels))
+    b.launcher.rows("rfft_rows", out, b.put_pixels(i.pixels))()
     yield b.take_spectra(out), reference.rfft_rows(i.pixels)
 
 
 def run_irfft_rows(b, i):
     out = b.empty_pixels()
-    b.launcher.rows("irfft_rows", out, b.put_spectra(i.spectrum))
+    b.launcher.rows("irfft_rows", out, b.put_spectra(i.spectrum))()
     yield b.take_pixels(out), reference.irfft_rows(i.spectrum)
 
 
 def run_fft_columns(b, i):
     out = b.put(b.layout.pack_columns(i.columns))
-    b.launcher.columns("fft_columns", out)
+    b.launcher.columns("fft_columns", out)()
     found = b.layout.unpack_columns(b.take(out, b.layout.spectra_shape))
     yield found, reference.fft_columns(i.columns)[bit_reversed(b.grid[0])]
 
 
 def run_ifft_columns(b, i):
     out = b.put(b.layout.pack_columns(i.columns[bit_reversed(b.grid[0])]))
-    b.launcher.columns("ifft_columns", out)
+    b.launcher.columns("ifft_columns", out)()
     found = b.layout.unpack_columns(b.take(out, b.layout.spectra_shape))
     yield found, reference.ifft_columns(i.columns)
 
@@ -234,7 +234,7 @@ def run_otf_columns(b, i):
     packed, edge = np.stack([packed] * i.p), np.stack([edge] * i.p)
     packed[:-1], edge[:-1] = 2.0, 2.0  # the other images' parts stay as they are
     out, out_edge = b.put(np.full(packed.shape, 2.0)), b.put(np.full(edge.shape, 2.0))
-    b.launcher.columns("otf_columns", out, out_edge, b.put_spectra(i.spectrum), np.int32(i.p - 1))
+    b.launcher.columns("otf_columns", out, out_edge, b.put_spectra(i.spectrum), np.int32(i.p - 1))()
     yield b.take(out, packed.shape)[-1], packed[-1]
     yield b.take(out, packed.shape)[:-1], packed[:-1]
     yield b.take(out_edge, edge.shape), edge
@@ -247,13 +247,13 @@ def put_otfs(b, i):
 
 def run_convolve_columns(b, i):
     out = b.empty_spectra(i.p)
-    b.launcher.columns("convolve_columns", out, b.put_spectra(i.spectrum), *put_otfs(b, i))
+    b.launcher.columns("convolve_columns", out, b.put_spectra(i.spectrum), *put_otfs(b, i))()
     yield b.take_spectra(out, i.p), real_edges(reference.convolve_columns(i.spectrum[0], i.otfs))
 
 
 def run_correlate_columns(b, i):
     out = b.empty_spectra()
-    b.launcher.columns("correlate_columns", out, b.put_spectra(i.spectra), *put_otfs(b, i))
+    b.launcher.columns("correlate_columns", out, b.put_spectra(i.spectra), *put_otfs(b, i))()
     yield b.take_spectra(out)[0], real_edges(reference.correlate_columns(i.spectra, i.otfs))
 
 
@@ -280,7 +280,7 @@ def run_ratio_rows(b, i):
         b.put_pixels(i.star_images.reshape(-1, *b.grid)),
         b.put(i.star_fluxes),
         blocks=b.program.row_blocks * i.p,
-    )
+    )()
     yield b.take_spectra(out, i.p), real_edges(spectra)
     found = b.take(sums, (-1, 1 + i.n, 2)).astype(float).sum(axis=(0, 2))
     yield found, np.array([objective, *star_sums])
@@ -301,7 +301,7 @@ def run_scale_rows(b, i):
         b.put_pixels(i.inverse_weight) if i.weights is not None else b.put(np.zeros(1)),
         b.put(i.star_corrections),
         b.dtype.type(i.mu),
-    )
+    )()
     yield b.take_pixels(extended), scaled
     yield b.take_spectra(out), spectrum
     yield b.take(star_fluxes, -1), fluxes
@@ -328,7 +328,7 @@ def run_collect_sums(b, i):
         b.put(i.star_weights),
         b.dtype.type(i.mu),
         np.int32(1),
-    )
+    )()
     found = b.take(objectives, (3, 2)).astype(float)
     yield found.sum(axis=1), np.array([-2.0, objective, -2.0])
     yield b.take(star_corrections, -1), corrections
@@ -371,7 +371,7 @@ def launch_ratio_rows(b, model, images, star_image):
         b.put_pixels(star_image[None]),
         b.put([0.0]),
         blocks=b.program.row_blocks,
-    )
+    )()
     return b.take_spectra(spectra)[0], b.take(sums, (-1, 2, 2)).astype(float)
 
 
@@ -388,9 +388,9 @@ def test_division_guard(dtype):
     """Where the model is not positive the ratio is 0, and J is infinite if there are counts."""
     b = with_star(dtype)
     images, model = np.ones(b.grid), np.ones(b.grid)
-    flat, sums = launch_ratio_rows(b, model, images, np.zeros(b.grid))
+    _, sums = launch_ratio_rows(b, model, images, np.zeros(b.grid))
     assert np.isfinite(sums).all()
-    # One pixel of the model's Fourier series at -1, all others at or above 0.
+    # One pixel of the model is negative, all others are as the images.
     model[3, :] = 1.0 - 2.0 * (np.arange(b.grid[1]) == 7)
     dark, sums = launch_ratio_rows(b, model, images, np.zeros(b.grid))
     expected = images.copy()
@@ -426,14 +426,14 @@ def test_adjoint_dot_product(dtype):
     spectrum, spectra = b.empty_spectra(), b.empty_spectra()
     pixels = b.put_pixels(psf[None])
     otf = b.put(np.zeros((1, *b.grid))), b.put(np.zeros((1, b.grid[0], 2)))
-    b.launcher.rows("rfft_rows", spectrum, pixels)
-    b.launcher.columns("otf_columns", *otf, spectrum, np.int32(0))
+    b.launcher.rows("rfft_rows", spectrum, pixels)()
+    b.launcher.columns("otf_columns", *otf, spectrum, np.int32(0))()
 
     def apply(name, image):
-        b.launcher.rows("rfft_rows", spectrum, b.put_pixels(image[None]))
-        b.launcher.columns(name, spectra, spectrum, *otf)
+        b.launcher.rows("rfft_rows", spectrum, b.put_pixels(image[None]))()
+        b.launcher.columns(name, spectra, spectrum, *otf)()
         # irfft_rows wants half of what rfft_rows gives; the OTF has taken care of that.
-        b.launcher.rows("irfft_rows", pixels, spectra)
+        b.launcher.rows("irfft_rows", pixels, spectra)()
         return b.take_pixels(pixels)[0]
 
     forward = (apply("convolve_columns", f) * r).sum()
