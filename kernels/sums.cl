@@ -19,6 +19,13 @@ typedef struct {
         (total).lost += (old_ - ((total).sum - part_)) + (value_ - part_);  \
     } while (0)
 
+/* An infinite sum has lost nothing: two-sum would make it NaN. */
+INLINE void store_pair(__global real *out, const real_sum total)
+{
+    out[0] = total.sum;
+    out[1] = isinf(total.sum) ? 0 : total.lost;
+}
+
 /* Sums the lanes and writes the pair to out[0], out[1]. */
 INLINE void store_sum(__global real *out, const vec_sum total)
 {
@@ -29,8 +36,7 @@ INLINE void store_sum(__global real *out, const vec_sum total)
         ACCUMULATE(all, sum.lanes[l]);
         all.lost += lost.lanes[l];
     }
-    out[0] = all.sum;
-    out[1] = all.lost;
+    store_pair(out, all);
 }
 
 /* The sum of n pairs, `stride` reals apart. */
@@ -47,7 +53,7 @@ INLINE real_sum sum_pairs(__global const real *pairs, const int n, const int str
 #define N_SUMS (1 + N_STARS)
 
 /* objective = sum of the data terms + mu / 2 sum f^2;
- * star_corrections_s = sum <P_js, r_j> / star_weights_s.
+ * star_corrections_s = sum <P_js, r_j> / star_weights_s, not below 0 (negative PSF pixels).
  * objectives: [iterations][2], a compensated pair each; entry `iteration` is written.
  * ratio_sums: [ROW_BLOCKS][N_IMAGES][GROUP][N_SUMS][2]; square_sums: [ROW_BLOCKS][GROUP][2].
  * star_corrections, star_weights: [N_STARS].
@@ -65,10 +71,10 @@ __kernel __attribute__((reqd_work_group_size(1, 1, 1))) void collect_sums(
     ACCUMULATE(objective, mu / 2 * squares.sum);
     objective.lost += mu / 2 * squares.lost;
 #endif
-    objectives[2 * iteration] = objective.sum;
-    objectives[2 * iteration + 1] = objective.lost;
+    store_pair(objectives + 2 * iteration, objective);
     for (int s = 0; s < N_STARS; ++s) {
         const real_sum star = sum_pairs(ratio_sums + 2 * (1 + s), n, 2 * N_SUMS);
-        star_corrections[s] = (star.sum + star.lost) / star_weights[s];
+        const real correction = (star.sum + star.lost) / star_weights[s];
+        star_corrections[s] = correction < 0 ? 0 : correction;
     }
 }

@@ -160,9 +160,16 @@ def deconvolve(
     Raises
     ------
     InputError
-        A parameter out of its range, a star outside the images, or a device for the reference.
+        A parameter out of its range or too large for the precision, a star outside the images,
+        no such device, or a device for the reference.
     DeviceError
-        No such device, too little memory on it, or no double precision.
+        No OpenCL device at all, too little memory on it, no double precision, or a compiler that
+        fails.
+
+    Warns
+    -----
+    LnoclWarning
+        A PSF that is larger than the grid, whose wings wrap round.
 
     References
     ----------

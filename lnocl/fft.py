@@ -189,7 +189,6 @@ class Launcher:
 
     def __init__(self, program: Program) -> None:
         context = program.context
-        device = context.devices[0]
         self.program = program
         self.queue = cl.CommandQueue(context)
         ny, nx = program.grid
@@ -200,15 +199,18 @@ class Launcher:
         )
         self._row_roots = cl.Buffer(context, constant, hostbuf=row_roots)
         self._column_roots = cl.Buffer(context, constant, hostbuf=column_roots)
-        if program.scratch_is_global:
-            self._most_groups = device.max_compute_units
-            scratch_bytes = self._most_groups * program.scratch_bytes
-            self._scratch: cl.Buffer | cl.LocalMemory = cl.Buffer(
-                context, READ_WRITE, scratch_bytes
-            )
-        else:
-            self._most_groups = 2**31
-            self._scratch = cl.LocalMemory(program.scratch_bytes)
+        self._scratch: cl.Buffer | cl.LocalMemory = (
+            cl.Buffer(context, READ_WRITE, program.most_groups * program.scratch_bytes)
+            if program.scratch_is_global
+            else cl.LocalMemory(program.scratch_bytes)
+        )
+
+    @staticmethod
+    def bytes_needed(program: Program) -> int:
+        """Return the bytes that a launcher takes on the device."""
+        ny, nx = program.grid
+        n_roots = len(roots(nx, *program.row_radices)) + len(roots(ny, *program.column_radices))
+        return n_roots * program.dtype.itemsize + program.most_groups * program.scratch_bytes
 
     def rows(self, name: str, *arguments: Any, blocks: int | None = None) -> Launch:
         """Bind a kernel over blocks of rows, all of one array or as many as given."""
@@ -226,7 +228,7 @@ class Launcher:
 
     def _bind(self, name: str, blocks: int, arguments: tuple[Any, ...]) -> Launch:
         group = self.program.tuning.group
-        groups = min(blocks, self._most_groups)
+        groups = min(blocks, self.program.most_groups or blocks)
         return Launch(self.queue, self.program.kernels[name], arguments, groups, group)
 
 

@@ -138,7 +138,9 @@ class Observation:
     def _add_read_noise(self, read_noise: ArrayLike) -> None:
         sigma = _one_each("read_noise", numbers("read_noise", read_noise), self.n_images)
         _refuse_unless("read_noise", sigma, "finite and not negative", sigma >= 0)
-        variance = sigma[:, None, None] ** 2
+        with np.errstate(over="ignore"):
+            variance = sigma[:, None, None] ** 2
+        _refuse_unless("the square of read_noise", variance, "finite", variance >= 0)
         self.images += np.where(self.mask, 0.0, variance)
         self.background += variance if self.background.ndim == 3 else variance[:, 0, 0]
 

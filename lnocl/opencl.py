@@ -10,7 +10,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from lnocl.device import choose, describe
-from lnocl.errors import DeviceError
+from lnocl.errors import DeviceError, InputError
 from lnocl.fft import READ_WRITE, Launcher, Layout
 from lnocl.observation import Array
 from lnocl.program import Program, Tuning
@@ -44,7 +44,7 @@ class OpenCLEngine:
     Raises
     ------
     InputError
-        No such device.
+        No such device, or values too large for the precision.
     DeviceError
         No device, no double precision where it is asked for, or too little memory.
     """
@@ -106,6 +106,7 @@ class OpenCLEngine:
             "ratio_sums": groups * p * (1 + n) * 2 * item,
             "square_sums": groups * 2 * item,
             "objectives": (n_iter + 1) * 2 * item,
+            "scratch and roots": Launcher.bytes_needed(program),
         }
 
     def _refuse_if_too_large(self, n_iter: int) -> int:
@@ -127,13 +128,14 @@ class OpenCLEngine:
         self._buffers = {
             name: cl.Buffer(self._context, READ_WRITE, size)
             for name, size in self._sizes(n_iter).items()
+            if name != "scratch and roots"  # the launcher's own
         }
 
     def _bind(self) -> None:
         """Bind the kernels of an iteration, in its order."""
         buffers, launcher = self._buffers, self._launcher
         otfs = buffers["otfs"], buffers["otf_edges"]
-        mu = self.program.dtype.type(self.scene.mu)
+        mu = self.program.dtype.type(self._rounded("mu", self.scene.mu))
         self._convolve = launcher.columns(
             "convolve_columns", buffers["spectra"], buffers["spectrum"], *otfs
         )
@@ -272,7 +274,7 @@ class OpenCLEngine:
         return pairs.reshape(-1, 2).sum(axis=1)
 
     def _upload(self, name: str, values: Array) -> None:
-        cl.enqueue_copy(self._queue, self._buffers[name], values.astype(self.program.dtype))
+        cl.enqueue_copy(self._queue, self._buffers[name], self._rounded(name, values))
 
     def _upload_pixels(self, name: str, arrays: Iterable[NDArray]) -> None:
         """Upload arrays of pixels, one behind the other."""
@@ -280,9 +282,20 @@ class OpenCLEngine:
             cl.enqueue_copy(
                 self._queue,
                 self._buffers[name],
-                self.layout.pack_pixels(array),
+                self.layout.pack_pixels(self._rounded(name, array)),
                 dst_offset=i * self.layout.pixels_bytes,
             )
+
+    def _rounded(self, name: str, values: NDArray | float) -> NDArray:
+        """Return values in the engine's precision, none of them too large for it."""
+        with np.errstate(over="ignore"):
+            rounded = np.asarray(values).astype(self.program.dtype)
+        if not np.isfinite(rounded).all():
+            raise InputError(
+                f"{name.replace('_', ' ')} as large as {np.abs(values).max() * self.scene.scale:g} "
+                f"cannot be held in {self.program.dtype}: scale the scene, or take precision double"
+            )
+        return rounded
 
     def _download(self, name: str, count: int) -> Array:
         values = np.empty(count, self.program.dtype)

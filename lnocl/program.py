@@ -91,8 +91,14 @@ class Program:
         The build options.
     row_radices, column_radices : tuple of int
         Radices of the outer and the last pass.
+    rows : int
+        Rows that a block of spectra takes in memory.
     scratch_points : int
         Points of a block that a work-group keeps while it transforms.
+    scratch_is_global : bool
+        Whether a block is too large for the device's local memory.
+    most_groups : int
+        Work-groups that have a scratch in global memory; 0 where it is local.
 
     Raises
     ------
@@ -128,6 +134,7 @@ class Program:
         self.rows = grid[0] + self.tuning.padding
         self.scratch_points = max(grid[1], 2 * grid[0])
         self.scratch_is_global = self.scratch_bytes > device.local_mem_size
+        self.most_groups = device.max_compute_units if self.scratch_is_global else 0
         self.row_radices = radices(grid[1])
         self.column_radices = radices(grid[0])
         constants = {

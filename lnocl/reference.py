@@ -93,9 +93,10 @@ def collect_sums(
 ) -> tuple[float, Array]:
     """Return the objective ``J_0 + mu / 2 sum f^2`` and the star corrections.
 
-    A star's correction is ``sum_j <P_js, r_j> / sum_j <P_js, w_j>``.
+    A star's correction is ``sum_j <P_js, r_j> / sum_j <P_js, w_j>``; one that negative PSF pixels
+    have made negative counts as 0.
     """
-    return objective + 0.5 * mu * squares, star_sums / star_weights
+    return objective + 0.5 * mu * squares, np.maximum(star_sums / star_weights, 0.0)
 
 
 def scale_rows(

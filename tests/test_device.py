@@ -105,11 +105,19 @@ def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, 
         opencl.OpenCLEngine(scene(2, 64, stars=9), "single", device.spec_of(found), 10)
 
 
-def test_memory_estimate_is_what_the_buffers_hold():
-    engine = opencl.OpenCLEngine(scene(2, 64, stars=1), "single", None, 10)
+@pytest.mark.parametrize("tuning", [None, program.Tuning(4, 16)])
+def test_memory_estimate_is_what_the_buffers_hold(tuning):
+    observation = lnocl.Observation(np.ones((2, 8192, 64)), np.ones((1, 1)))
+    engine = opencl.OpenCLEngine(
+        opencl.Scene(observation, [(1, 1)], 0.0, 0), "single", None, 10, tuning
+    )
+    assert engine.program.scratch_is_global == (tuning is not None)
     engine.extended()  # waits for the device
-    held = sum(buffer.size for buffer in engine._buffers.values())
-    assert engine.bytes_needed == held
+    launcher = engine._launcher
+    held = [*engine._buffers.values(), launcher._row_roots, launcher._column_roots]
+    if engine.program.scratch_is_global:
+        held.append(launcher._scratch)
+    assert engine.bytes_needed == sum(buffer.size for buffer in held)
 
 
 def test_failing_compiler_is_named(monkeypatch):
@@ -138,3 +146,39 @@ def test_build_options_are_recorded_and_kernels_fetched_once():
     engine.scale()
     engine.extended()  # waits for the device
     assert engine.program.kernels["scale_rows"] is kernel
+
+
+@pytest.mark.parametrize(
+    ("keywords", "name"),
+    [
+        ({"mu": 1e39}, "mu"),
+        ({"initial_extended": np.full((8, 8), 1e300)}, "extended"),
+        ({"stars": [(1, 1)], "initial_star_fluxes": [1e300]}, "star fluxes"),
+    ],
+)
+def test_values_too_large_for_single_precision_are_refused(keywords, name):
+    observation = lnocl.Observation(np.ones((8, 8)), np.ones((1, 1)))
+    with pytest.raises(lnocl.InputError, match=f"{name} as large as .* held in float32"):
+        lnocl.deconvolve(observation, n_iter=1, **keywords)
+
+
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.filterwarnings("ignore:.*psf pixels are negative")
+def test_objective_is_infinite_where_the_model_is_negative_and_there_are_counts(engine):
+    observation = lnocl.Observation(np.full((8, 8), 3.0), [[-1.0, 3.0, -1.0]])
+    start = np.ones((8, 8))
+    start[2, 5] = 50.0
+    result = lnocl.deconvolve(observation, n_iter=3, initial_extended=start, engine=engine)
+    assert np.isposinf(result.history["objective"][0])
+    assert not np.isnan(result.history["objective"]).any()
+    assert np.isfinite(result.extended).all()
+
+
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.filterwarnings("ignore:.*psf pixels are negative")
+def test_star_fluxes_stay_at_zero_or_above_under_negative_psf_pixels(engine):
+    images = np.full((8, 8), 0.5)
+    images[4, 3] = 1e4
+    observation = lnocl.Observation(images, [[-2.0, 5.0, -2.0]], background=1.0)
+    result = lnocl.deconvolve(observation, stars=[(4, 4)], n_iter=3, engine=engine)
+    assert (result.star_fluxes >= 0).all()

@@ -301,3 +301,8 @@ def test_negative_psf_pixels_are_kept_and_counted():
     assert files == {"caller.py"}
     np.testing.assert_allclose(observation.psfs[1:], psfs[1:] / 7.5, rtol=3e-16)
     np.testing.assert_array_equal(observation.psfs[0], PSF / 8)
+
+
+def test_read_noise_whose_square_overflows_is_refused():
+    with pytest.raises(lnocl.InputError, match="the square of read_noise must be finite"):
+        lnocl.Observation(np.ones((4, 4)), np.ones((1, 1)), read_noise=1e200)
