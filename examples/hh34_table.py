@@ -3,11 +3,13 @@
     python examples/hh34_table.py [--scene hh34|FILE.fits] [--size 1024] [--mu 1e-8 3e-8 ...] -o DIR
 
 Each row is written to DIR as soon as it is done and is not computed again, so that the script
-can be stopped and started; DIR/table.ecsv has the table, and lnocl plot draws the rest:
+can be stopped and started; a row of another scene or of other parameters is refused.
+DIR/table.ecsv has the table, and lnocl plot draws the rest:
 lnocl plot DIR/rlm_0.fits DIR/mc-rl_*.fits --truth DIR/truth.fits -o DIR. --quick is a small run.
 """
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
@@ -15,7 +17,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
-from lnocl import experiment, fitsio, metrics, simulate
+from lnocl import demo, experiment, fitsio, metrics, simulate
+from lnocl.errors import InputError, LnoclError
 
 # La Camera et al. (2012), Table 1: rho' and rho'' in percent, with their iterations.
 PAPER = {
@@ -25,50 +28,64 @@ PAPER = {
     ("MC-RL", 8e-8): (7.91, 3776, 24.42, 4198),
     ("MC-RL", 2e-7): (9.49, 1496, 25.34, 1630),
 }
+PERCENT = ("rho'", "rho''", "flux error", "width error", "paper rho'", "paper rho''")
 COLUMNS = (
     "method",
     "mu",
-    "rho [%]",
-    "at",
-    "rho'' [%]",
-    "at ",
+    "rho'",
+    "rho' at",
+    "rho''",
+    "rho'' at",
     "magnitude",
-    "flux error [%]",
-    "width error [%]",
-    "paper rho [%]",
-    "paper rho'' [%]",
+    "flux error",
+    "width error",
+    "paper rho'",
+    "paper rho''",
     "minutes",
 )
 
 
-def compute(path, simulation, observation, method, mu, n_iter, every, patience):
+def identity(scene, simulation, n_iter, every, patience):
+    """Return the cards that bind a row to its experiment."""
+    ny, nx = simulation.extended.shape
+    name = scene if scene in simulate.SCENES else Path(scene).name
+    return [
+        ("SCENE", name.encode("unicode_escape").decode("ascii"), "target"),
+        ("SIZEX", nx, "pixels along x"),
+        ("SIZEY", ny, "pixels along y"),
+        ("SEED", int(simulation.experiment.seed), "of residual phases and noise"),
+        ("EVERY", every, "iterations between two looks"),
+        ("MAXITER", n_iter, "iterations at most"),
+        ("PATIENCE", patience or 0.0, "of the best iteration, then stopped; 0 never"),
+    ]
+
+
+def compute(path, simulation, observation, method, mu, n_iter, every, patience, cards):
     """Compute one reconstruction and save it as a result that lnocl plot reads."""
     start = time.monotonic()
-    patience = None if method == "RLM" else patience
     found = experiment.reconstruct(
         simulation, observation, method, mu, n_iter, every, patience, progress=True
     )
-    is_mcrl = method == "MC-RL"
-    fitsio.write_result(
-        str(path),
-        found.extended,
-        simulation.stars if is_mcrl else [],
-        [found.star_flux] if is_mcrl else [],
-        found.history,
-        curve=found.curve,
-        cards=[
-            ("METHOD", method, "star in the image, or a component"),
-            ("MU", mu, "weight of the Tikhonov term, per electron"),
-            ("PIXSCALE", float(simulation.experiment.pixel_scale.value), "mas per pixel"),
-            ("DEVICE", found.device, "device"),
-            ("MINUTES", (time.monotonic() - start) / 60, "that it took"),
-        ],
-    )
+    minutes = ("MINUTES", (time.monotonic() - start) / 60, "that it took")
+    demo.write_reconstruction(str(path), simulation, found, [*cards, minutes])
 
 
-def row(simulation, path):
-    """Return the table's row of a saved reconstruction."""
+def read_row(path, method, mu, cards):
+    """Return a saved reconstruction; refuse one of another experiment."""
     saved = fitsio.read_result(str(path))
+    for keyword, value, _ in [("METHOD", method, ""), ("MU", mu, ""), *cards]:
+        if saved.header.get(keyword) != value:
+            raise InputError(
+                f"{path} is of another experiment: its {keyword} is {saved.header.get(keyword)} "
+                f"and {value} is asked for; give another folder"
+            )
+    if saved.curve is None or "MINUTES" not in saved.header:
+        raise InputError(f"{path} was not written by this script; give another folder")
+    return saved
+
+
+def row(simulation, saved):
+    """Return the table's row of a saved reconstruction."""
     method, mu = saved.header["METHOD"], saved.header["MU"]
     curve = np.zeros(len(saved.curve["iteration"]), experiment.CURVE_DTYPE)
     for name, values in saved.curve.items():
@@ -98,8 +115,79 @@ def row(simulation, path):
     )
 
 
-def main():
+def keep_truth(path, simulation):
+    """Write the truth, or check that the one that is there is the same."""
+    if not path.exists():
+        scale = float(simulation.experiment.pixel_scale.value)
+        fitsio.write_result(
+            str(path),
+            simulation.extended,
+            simulation.stars,
+            simulation.star_fluxes,
+            cards=[
+                ("MAGZERO", simulation.zero_magnitude_flux, "electrons of magnitude 0"),
+                ("PIXSCALE", scale, "mas per pixel"),
+            ],
+        )
+        return
+    saved = fitsio.read_result(str(path))
+    same = (
+        saved.extended.shape == simulation.extended.shape
+        and saved.stars == simulation.stars
+        and np.allclose(saved.extended, simulation.extended, rtol=1e-9, atol=0)
+        and np.allclose(saved.star_fluxes, simulation.star_fluxes, rtol=1e-9, atol=0)
+    )
+    if not same:
+        raise InputError(f"{path} is the truth of another experiment; give another folder")
+
+
+def make_table():
+    """Return the table without rows."""
+    table = Table(names=COLUMNS, dtype=[str, *[float] * 2, int, float, int, *[float] * 6])
+    table["mu"].format = ".0e"
+    table["magnitude"].format = ".4f"
+    table["minutes"].format = ".2f"
+    for name in PERCENT:
+        table[name].format = ".2f"
+        table[name].unit = u.percent
+    return table
+
+
+def run(given):
     """Compute the rows that are missing and print the table."""
+    if given.quick:
+        given.rlm_iterations, given.n_iter = 60, 60
+        given.size = 64 if given.scene in simulate.SCENES else given.size
+
+    # The jet and the star at magnitude 13: any scene is brought to the paper's photometry.
+    target = simulate.load_target(given.scene, given.size)
+    simulation = simulate.simulate(target, simulate.Experiment(extended_magnitude=13 * u.mag))
+    observation = experiment.observe(simulation)
+    fitsio.check_folder(str(given.output), overwrite=True)
+    keep_truth(given.output / "truth.fits", simulation)
+    jobs = []
+    for method, mu in [("RLM", 0.0), *(("MC-RL", mu) for mu in given.mu)]:
+        is_rlm = method == "RLM"
+        n_iter = given.rlm_iterations if is_rlm else given.n_iter
+        how = n_iter, given.every, None if is_rlm else given.patience
+        path = given.output / f"{method.lower()}_{mu:g}.fits"
+        cards = identity(given.scene, simulation, *how)
+        jobs.append((path, method, mu, how, cards))
+        if path.exists():  # refused now, not after hours of the rows before it
+            read_row(path, method, mu, cards)
+    table = make_table()
+    for path, method, mu, how, cards in jobs:
+        if not path.exists():
+            compute(path, simulation, observation, method, mu, *how, cards)
+        table.add_row(row(simulation, read_row(path, method, mu, cards)))
+        table[-1:].pprint(max_width=-1)
+    table.write(given.output / "table.ecsv", overwrite=True)
+    print()
+    table.pprint_all()
+
+
+def main(arguments=None):
+    """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scene", default="hh34")
     parser.add_argument("--size", type=int, help="of hh34 (default: 1024); a file has its own")
@@ -108,41 +196,15 @@ def main():
     parser.add_argument("--n-iter", type=int, default=40_000)
     parser.add_argument("--every", type=int, default=20)
     parser.add_argument("--patience", type=float, default=1.15)
-    parser.add_argument("--quick", action="store_true", help="64 x 64 and 60 iterations")
+    parser.add_argument("--quick", action="store_true", help="60 iterations, hh34 at 64 x 64")
     parser.add_argument("-o", "--output", type=Path, default=Path("hh34_table"))
-    given = parser.parse_args()
-    if given.quick:
-        given.size, given.rlm_iterations, given.n_iter = 64, 60, 60
-
-    # The jet and the star at magnitude 13: any scene is brought to the paper's photometry.
-    target = simulate.load_target(given.scene, given.size)
-    simulation = simulate.simulate(target, simulate.Experiment(extended_magnitude=13 * u.mag))
-    observation = experiment.observe(simulation)
-    given.output.mkdir(parents=True, exist_ok=True)
-    fitsio.write_result(
-        str(given.output / "truth.fits"),
-        simulation.extended,
-        simulation.stars,
-        simulation.star_fluxes,
-        cards=[("MAGZERO", simulation.zero_magnitude_flux, "electrons of magnitude 0")],
-        overwrite=True,
-    )
-    table = Table(names=COLUMNS, dtype=[str, *[float] * 2, int, float, int, *[float] * 6])
-    table["mu"].format = ".0e"
-    for name in (name for name in COLUMNS if "%" in name or name == "minutes"):
-        table[name].format = ".2f"
-    table["magnitude"].format = ".4f"
-    for method, mu in [("RLM", 0.0), *(("MC-RL", mu) for mu in given.mu)]:
-        path = given.output / f"{method.lower()}_{mu:g}.fits"
-        if not path.exists():
-            n_iter = given.rlm_iterations if method == "RLM" else given.n_iter
-            compute(path, simulation, observation, method, mu, n_iter, given.every, given.patience)
-        table.add_row(row(simulation, path))
-        table[-1:].pprint(max_width=-1, show_unit=False)
-    table.write(given.output / "table.ecsv", overwrite=True)
-    print()
-    table.pprint_all()
+    try:
+        run(parser.parse_args(arguments))
+    except (LnoclError, OSError) as error:
+        print(f"hh34_table: error: {error}", file=sys.stderr)
+        return getattr(error, "exit_status", 1)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

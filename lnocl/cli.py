@@ -379,8 +379,9 @@ def _simulate(arguments: argparse.Namespace) -> None:
     experiment = simulate.Experiment(
         **{name: value * units[name] if name in units else value for name, value in given.items()}
     )
-    fitsio.check_folder(arguments.output, arguments.overwrite)
+    fitsio.check_folder(arguments.output, arguments.overwrite, make=False)
     simulation = simulate.simulate(target, experiment)
+    fitsio.check_folder(arguments.output, arguments.overwrite)
     command = demo.write_simulation(
         arguments.output, arguments.scene, simulation, arguments.overwrite
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,9 +77,8 @@ def write_simulation(
         overwrite=overwrite,
     )
     record = {"lnocl": __version__, "scene": scene, **simulation.record()}
-    with open(os.path.join(folder, "record.json"), "w" if overwrite else "x") as stream:
-        json.dump(record, stream, indent=2)
-        stream.write("\n")
+    path = os.path.join(folder, "record.json")
+    fitsio.write_text(path, json.dumps(record, indent=2) + "\n", overwrite)
     return _command(folder, simulation, simulation.stars, "result")
 
 
@@ -107,16 +106,17 @@ def run(
     Raises
     ------
     InputError
-        A size or seed out of its range.
+        A size or seed out of its range, or a device that is not there.
     DeviceError
-        No such device.
+        No OpenCL device at all, or one that cannot do what was asked of it.
     FileError
         The folder holds files, or one cannot be written.
     """
     experiment_at = Experiment(seed=seed)
     target = load_target(SCENE, size)
-    fitsio.check_folder(folder, overwrite)
+    fitsio.check_folder(folder, overwrite, make=False)
     simulation = simulate(target, experiment_at)
+    fitsio.check_folder(folder, overwrite)
     write_simulation(folder, SCENE, simulation, overwrite)
     yield (
         f"simulated {SCENE}: {len(simulation.images)} images of {size} x {size} pixels, a star of "
@@ -129,13 +129,81 @@ def run(
         each = experiment.reconstruct(
             simulation, observation, method, mu, N_ITER, EVERY, device=device, progress=True
         )
-        _write_reconstruction(folder, simulation, each, device, overwrite)
+        name = method.lower()
+        n_iter, _ = each.best("rho_star")
+        options = ["--mu", repr(mu), "--n-iter", str(n_iter)]
+        options += [] if device is None else ["--device", device]
+        stars = [] if method == "RLM" else simulation.stars
+        command = _command(folder, simulation, stars, name, *options)
+        write_reconstruction(
+            _in(folder, name),
+            simulation,
+            each,
+            commands=[["cd", os.getcwd()], command],
+            overwrite=overwrite,
+        )
         found.append(each)
     yield f"{N_ITER} iterations each of RLM and MC-RL on {found[0].device}"
     yield from _table(simulation, found)
     yield from _conclusion(found)
     yield from _pictures(folder, simulation, found, overwrite)
     yield f"written to {folder}: images, PSFs, truth.fits, record.json, rlm.fits, mc-rl.fits"
+
+
+def write_reconstruction(
+    path: str,
+    simulation: Simulation,
+    found: Reconstruction,
+    cards: Iterable[fitsio.Card] = (),
+    commands: Iterable[Sequence[str]] = (),
+    overwrite: bool = False,
+) -> None:
+    """Write a reconstruction as `lnocl deconvolve` with as many iterations would, and its curve.
+
+    Parameters
+    ----------
+    path : str
+        File to write.
+    simulation : Simulation
+        What was reconstructed.
+    found : Reconstruction
+        At its smallest rho''.
+    cards : iterable of (keyword, value, comment), optional
+        Further cards of the primary header.
+    commands : iterable of sequence of str, optional
+        Shell commands that repeat the run, as words.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written, or exists and must not be overwritten.
+    """
+    stars = [] if found.method == "RLM" else simulation.stars
+    n_iter, _ = found.best("rho_star")
+    fitsio.write_result(
+        path,
+        found.extended,
+        stars,
+        [found.star_flux] if stars else [],
+        found.history[: n_iter + 1],
+        cards=[
+            ("CREATOR", f"lnocl {__version__}", "program that wrote this file"),
+            ("METHOD", found.method, "star in the image, or a component"),
+            ("SOLVER", "sgm", "iteration"),
+            ("NITER", n_iter, "iterations done, to the smallest rho''"),
+            ("MU", found.mu, "weight of the Tikhonov term, per electron"),
+            ("PRECISIO", "single", "precision of the arithmetic"),
+            ("ENGINE", "opencl", "engine"),
+            ("DEVICE", found.device, "device"),
+            ("PIXSCALE", float(simulation.experiment.pixel_scale.value), "mas per pixel"),
+            *cards,
+        ],
+        commands=commands,
+        overwrite=overwrite,
+        curve=found.curve,
+    )
 
 
 def draw(
@@ -166,10 +234,10 @@ def draw(
     FileError
         A file cannot be read or written, or a figure exists.
     InputError
-        Where the shapes of the files differ.
+        Where the shapes of the files differ, or one holds no flux or values that are not finite.
     """
     plots.check()
-    fitsio.check_folder(folder, overwrite, FIGURE_FILES)
+    fitsio.check_folder(folder, overwrite, FIGURE_FILES, make=False)
     results = list(dict.fromkeys(results))
     saved = [fitsio.read_result(path) for path in results]
     true = None if truth is None else fitsio.read_result(truth)
@@ -193,6 +261,7 @@ def draw(
     original = None if true is None else plots.Source("truth", true.extended)
     curves = _tables(names, [each.curve for each in saved])
     histories = _tables(names, [each.history for each in saved])
+    fitsio.check_folder(folder, overwrite, FIGURE_FILES)
     yield _draw(folder, "objects", plots.objects(original, sources, frame))
     if curves:
         yield _draw(folder, "errors", plots.errors(curves))
@@ -233,41 +302,6 @@ def _command(
     ]
 
 
-def _write_reconstruction(
-    folder: str,
-    simulation: Simulation,
-    found: Reconstruction,
-    device: str | None,
-    overwrite: bool,
-) -> None:
-    """Write a reconstruction as `lnocl deconvolve` with as many iterations would, and its curve."""
-    stars = [] if found.method == "RLM" else simulation.stars
-    n_iter, _ = found.best("rho_star")
-    options = ["--mu", repr(found.mu), "--n-iter", str(n_iter)]
-    options += [] if device is None else ["--device", device]
-    name = found.method.lower()
-    fitsio.write_result(
-        _in(folder, name),
-        found.extended,
-        stars,
-        [found.star_flux] if stars else [],
-        found.history[: n_iter + 1],
-        cards=[
-            ("CREATOR", f"lnocl {__version__}", "program that wrote this file"),
-            ("METHOD", found.method, "star in the image, or a component"),
-            ("SOLVER", "sgm", "iteration"),
-            ("NITER", n_iter, "iterations done, to the smallest rho''"),
-            ("MU", found.mu, "weight of the Tikhonov term, per electron"),
-            ("PRECISIO", "single", "precision of the arithmetic"),
-            ("ENGINE", "opencl", "engine"),
-            ("DEVICE", found.device, "device"),
-        ],
-        commands=[["cd", os.getcwd()], _command(folder, simulation, stars, name, *options)],
-        overwrite=overwrite,
-        curve=found.curve,
-    )
-
-
 def _table(simulation: Simulation, found: Sequence[Reconstruction]) -> Iterator[str]:
     columns = ("method", "rho'", "at", "rho''", "at", "star", "flux error", "width error")
     yield "{:<15} {:>8} {:>5} {:>8} {:>5} {:>11} {:>11} {:>12}".format(*columns)
@@ -288,7 +322,7 @@ def _conclusion(found: Sequence[Reconstruction]) -> Iterator[str]:
     rlm, mcrl = (each.best("rho_star")[1] for each in found)
     yield (
         "rho' is the error of the whole jet, rho'' of the 24 rows around the star, each at its "
-        "smallest; flux and width: mean error of the rows within 20 of the star"
+        "smallest; flux and width: mean error of the 40 rows around the star"
     )
     yield f"near the star the error of MC-RL is {rlm / mcrl:.1f} times smaller than that of RLM"
 

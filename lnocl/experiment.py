@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lnocl import metrics
 from lnocl.deconvolution import HISTORY_DTYPE, Estimate, deconvolve
+from lnocl.errors import InputError
 from lnocl.observation import Array, Observation
 from lnocl.simulate import Simulation
 
@@ -22,9 +23,12 @@ CURVE_DTYPE = np.dtype(
     ]
 )
 
-# Rows on either side of the star for the flux profile near it: the paper's 40 pixels.
+# Half the rows of a profile near the star: the paper's 40, 20 before the star and 20 from it on.
 NEAR_STAR = 20
-# Share of the brightest true row, spread over its width, that counts as jet in the width profile.
+# Share of the brightest row that a row needs to count in the flux profile near the star: behind
+# the star the jet is so faint that relative errors there say nothing of it.
+JET_SHARE = 0.05
+# Share of the brightest true pixel above which a pixel counts as jet in the width profile.
 WIDTH_SHARE = 0.1
 
 
@@ -80,18 +84,32 @@ class Tracker:
     method : {"RLM", "MC-RL"}
         Decides how errors and magnitude are measured (La Camera et al. 2012, section 3.2).
     every : int
-        Iterations from one look to the next.
+        Iterations from one look to the next, 1 or more.
+    n_iter : int
+        The last iteration, which is looked at in any case.
     patience : float, optional
-        Stop when the iterations exceed this many times those of the smallest rho''.
+        Stop when the iterations exceed this many times those of the smallest rho' and rho''.
+
+    Raises
+    ------
+    InputError
+        Where the simulation has not exactly one star, or `every` is less than 1.
     """
 
     def __init__(
-        self, simulation: Simulation, method: str, every: int, patience: float | None = None
+        self,
+        simulation: Simulation,
+        method: str,
+        every: int,
+        n_iter: int,
+        patience: float | None = None,
     ) -> None:
-        self.star = simulation.stars[0]
+        if every < 1:
+            raise InputError(f"every must be a whole number, 1 or more; {every} was given")
+        self.star = _only_star(simulation)
         self._simulation = simulation
         self._has_star = method == "RLM"
-        self._every, self._patience = every, patience
+        self._every, self._n_iter, self._patience = every, n_iter, patience
         self._rows = metrics.star_rows(self.star, simulation.extended.shape)
         self._truth = simulation.extended.copy()
         if self._has_star:
@@ -99,11 +117,11 @@ class Tracker:
         self.curve: list[tuple[int, float, float, float]] = []
         self.extended = np.zeros(0)
         self.star_flux = 0.0
-        self._best = (0, np.inf)
+        self._smallest = {"rho": (0, np.inf), "rho_star": (0, np.inf)}
 
     def __call__(self, iteration: int, estimate: Estimate) -> bool:
         """Measure this iteration, if its turn has come; return whether to stop."""
-        if iteration % self._every:
+        if iteration % self._every and iteration != self._n_iter:
             return False
         extended = estimate.extended
         masked = self.star if self._has_star else None
@@ -115,10 +133,13 @@ class Tracker:
             flux = float(estimate.star_fluxes[0])
         magnitude = metrics.magnitude(flux, self._simulation.zero_magnitude_flux)
         self.curve.append((iteration, rho, rho_star, magnitude))
-        if rho_star < self._best[1]:
-            self._best = iteration, rho_star
+        if rho < self._smallest["rho"][1]:
+            self._smallest["rho"] = iteration, rho
+        if rho_star < self._smallest["rho_star"][1]:
+            self._smallest["rho_star"] = iteration, rho_star
             self.extended, self.star_flux = extended, flux
-        return self._patience is not None and iteration > self._patience * self._best[0]
+        last = max(at for at, _ in self._smallest.values())
+        return self._patience is not None and iteration > self._patience * last
 
 
 def observe(simulation: Simulation) -> Observation:
@@ -157,8 +178,14 @@ def reconstruct(
         Most iterations; iterations between two looks; see `Tracker`.
     **keywords
         For `lnocl.deconvolve`.
+
+    Raises
+    ------
+    InputError
+        Where the simulation has not exactly one star, `every` is less than 1, or
+        `lnocl.deconvolve` refuses a value.
     """
-    tracker = Tracker(simulation, method, every, patience)
+    tracker = Tracker(simulation, method, every, n_iter, patience)
     stars = [] if method == "RLM" else simulation.stars
     result = deconvolve(observation, stars, mu, n_iter=n_iter, callback=tracker, **keywords)
     return Reconstruction(
@@ -180,15 +207,16 @@ def width_threshold(truth: Array) -> float:
 def profile_errors(simulation: Simulation, found: Reconstruction) -> dict[str, float]:
     """Return the mean absolute relative errors of flux and width profile near the star.
 
-    Over the rows within 20 of the star in which the true jet has at least a hundredth of its
-    brightest row (flux), or any pixel above the threshold (width); for RLM without the 3 rows
-    around the star (La Camera et al. 2012, section 4).
+    Over the 40 rows around the star, 20 before it and 19 after it, in which the true jet has at
+    least a twentieth of its brightest row (flux), or any pixel above the threshold (width); for
+    RLM without the 3 rows around the star (La Camera et al. 2012, section 4). NaN where there is
+    no such row.
     """
-    truth, star = simulation.extended, simulation.stars[0]
+    truth, star = simulation.extended, _only_star(simulation)
     masked = star if found.method == "RLM" else None
     near = slice(max(star[1] - NEAR_STAR, 0), star[1] + NEAR_STAR)
     true_flux = metrics.flux_profile(truth)
-    true_flux = np.where(true_flux < 0.01 * true_flux.max(), 0.0, true_flux)
+    true_flux = np.where(true_flux < JET_SHARE * true_flux.max(), 0.0, true_flux)
     flux = metrics.relative_error(metrics.flux_profile(found.extended, masked), true_flux)
     threshold = width_threshold(truth)
     width = metrics.relative_error(
@@ -196,6 +224,20 @@ def profile_errors(simulation: Simulation, found: Reconstruction) -> dict[str, f
         metrics.width_profile(truth, threshold),
     )
     return {
-        "flux": float(np.nanmean(np.abs(flux[near]))),
-        "width": float(np.nanmean(np.abs(width[near]))),
+        "flux": _mean_size(flux[near]),
+        "width": _mean_size(width[near]),
     }
+
+
+def _only_star(simulation: Simulation) -> tuple[int, int]:
+    if len(simulation.stars) != 1:
+        raise InputError(
+            f"the simulation has {len(simulation.stars)} stars; errors near the star need "
+            "exactly one"
+        )
+    return simulation.stars[0]
+
+
+def _mean_size(errors: Array) -> float:
+    sizes = np.abs(errors[~np.isnan(errors)])
+    return float(sizes.mean()) if sizes.size else float("nan")

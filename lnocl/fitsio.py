@@ -11,9 +11,9 @@ import secrets
 import shlex
 import stat
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import astropy
 import numpy as np
@@ -210,7 +210,9 @@ def read_result(path: str) -> SavedResult:
     )
 
 
-def check_folder(path: str, overwrite: bool, names: Iterable[str] | None = None) -> None:
+def check_folder(
+    path: str, overwrite: bool, names: Iterable[str] | None = None, make: bool = True
+) -> None:
     """Make the folder that files go to, and check that none is lost, before any work is done.
 
     Parameters
@@ -221,6 +223,8 @@ def check_folder(path: str, overwrite: bool, names: Iterable[str] | None = None)
         Whether files in it may be replaced.
     names : iterable of str, optional
         Files that will be written. By default the folder must be empty.
+    make : bool, optional
+        Whether to make the folder; otherwise only check that it can be made.
 
     Raises
     ------
@@ -228,6 +232,15 @@ def check_folder(path: str, overwrite: bool, names: Iterable[str] | None = None)
         The path is no folder, cannot be made or written to, or holds files that must not be
         overwritten.
     """
+    if not (make or os.path.lexists(path)):
+        # What can be told now of a folder that is not there yet.
+        parent = os.path.dirname(os.path.abspath(path))
+        while not os.path.lexists(parent):
+            parent = os.path.dirname(parent)
+        if not os.path.isdir(parent):
+            raise FileError(f"the output folder {path} cannot be used: {parent} is no folder")
+        check_output(os.path.join(parent, ".lnocl"), overwrite=True)
+        return
     try:
         os.makedirs(path, exist_ok=True)
         there = os.listdir(path)
@@ -343,7 +356,7 @@ def write_result(
             *([] if curve is None else [_table("CURVE", curve)]),
         ]
     )
-    _write_whole(path, hdus, overwrite)
+    _write_whole(path, lambda stream: hdus.writeto(stream, checksum=True), overwrite)
 
 
 def write_image(
@@ -370,7 +383,28 @@ def write_image(
     hdu = fits.PrimaryHDU(np.asarray(image, dtype=np.float64))
     _add_cards(hdu.header, cards)
     hdu.add_checksum(when="")  # astropy would note the time
-    _write_whole(path, fits.HDUList([hdu]), overwrite, checksum=False)
+    _write_whole(path, fits.HDUList([hdu]).writeto, overwrite)
+
+
+def write_text(path: str, text: str, overwrite: bool = False) -> None:
+    """Write a text in UTF-8: the file is there complete, or not at all.
+
+    Parameters
+    ----------
+    path : str
+        File to write.
+    text : str
+        What it shall hold.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written, or exists and must not be overwritten.
+    """
+    raw = text.encode("utf-8", "backslashreplace")
+    _write_whole(path, lambda stream: stream.write(raw), overwrite)
 
 
 def history_lines(words: Sequence[str]) -> list[str]:
@@ -554,23 +588,23 @@ def _add_cards(header: fits.Header, cards: Iterable[Card]) -> None:
         header[keyword] = (_ascii(value) if isinstance(value, str) else value, comment)
 
 
-def _write_whole(path: str, hdus: fits.HDUList, overwrite: bool, checksum: bool = True) -> None:
+def _write_whole(path: str, write: Callable[[IO[bytes]], object], overwrite: bool) -> None:
     """Write a file under another name, and rename it when it is complete and on the disk."""
     try:
-        _write_and_rename(path, hdus, overwrite, checksum)
+        _write_and_rename(path, write, overwrite)
     except FileError:
         raise
     except OSError as error:
         raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
-def _write_and_rename(path: str, hdus: fits.HDUList, overwrite: bool, checksum: bool) -> None:
+def _write_and_rename(path: str, write: Callable[[IO[bytes]], object], overwrite: bool) -> None:
     target = os.path.realpath(path)
     temporary = _temporary_beside(target)
     descriptor = _create(temporary)
     try:
         with os.fdopen(descriptor, "wb") as stream:
-            hdus.writeto(stream, checksum=checksum)
+            write(stream)
             stream.flush()
             os.fsync(stream.fileno())
         _check_replaceable(path, overwrite)

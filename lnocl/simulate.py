@@ -48,6 +48,10 @@ MIN_SIZE = 32
 MIN_JET_SIZE = 64
 DEFAULT_SIZE = 1024
 
+# Electrons that one image may hold of all sources and of the sky in a pixel; Poisson deviates are
+# 64-bit integers, and float64 counts one by one up to 9e15.
+MAX_ELECTRONS = 1e15
+
 MAG_PER_ARCSEC2 = u.mag / u.arcsec**2
 PHOTON_RATE = u.photon / u.s / u.m**2
 
@@ -283,7 +287,10 @@ def photon_rate(
     """
     flux_density = _positive("zero_point", zero_point, u.Jy) * u.Jy
     width = _positive("bandwidth", bandwidth, u.m) / _positive("wavelength", wavelength, u.m)
-    dimming = 10 ** (-0.4 * _quantity("magnitude", magnitude, u.mag))
+    try:
+        dimming = 10 ** (-0.4 * _quantity("magnitude", magnitude, u.mag))
+    except OverflowError:
+        raise InputError(f"magnitude {magnitude} is too bright for any number") from None
     return (flux_density / constants.h * width * dimming * u.photon).to(PHOTON_RATE)
 
 
@@ -398,7 +405,8 @@ class Experiment:
     Raises
     ------
     InputError
-        Where a value has the wrong unit or is out of its range.
+        Where a value has the wrong unit or is out of its range; where an image would hold more
+        than `MAX_ELECTRONS` of the extended source, of the sky in a pixel, or of read noise.
 
     Examples
     --------
@@ -439,6 +447,11 @@ class Experiment:
         _check_share("strehl", self.strehl)
         if not (isinstance(self.seed, (int, np.integer)) and self.seed >= 0):
             raise InputError(f"seed must be a whole number, 0 or more; {self.seed} was given")
+        _check_electrons("the extended source", self.source_electrons(self.extended_magnitude))
+        _check_electrons("the sky in a pixel", self.sky_electrons)
+        _check_electrons("read_noise", noise)
+        if not math.isfinite(self.source_electrons(0 * u.mag)):
+            raise InputError("a star of magnitude 0 would leave infinitely many electrons")
 
     def source_electrons(self, magnitude: u.Quantity) -> float:
         """Return the electrons that one image holds of a source of this magnitude."""
@@ -702,7 +715,8 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
     Raises
     ------
     InputError
-        Where the pixels are too coarse for the wavelength.
+        Where the pixels are too coarse for the wavelength; where the light of all sources, and of
+        the sky in a pixel, adds up to more than `MAX_ELECTRONS`.
 
     References
     ----------
@@ -718,6 +732,13 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
     ((4, 64, 64), [(32, 16)])
     """
     experiment = Experiment() if experiment is None else experiment
+    stars = [(star.x, star.y) for star in target.stars]
+    star_fluxes = np.array([experiment.source_electrons(star.magnitude) for star in target.stars])
+    for star, flux in zip(target.stars, star_fluxes, strict=True):
+        _check_electrons(f"the star at ({star.x}, {star.y})", float(flux))
+    extended_flux = experiment.source_electrons(experiment.extended_magnitude)
+    total = float(star_fluxes.sum()) + extended_flux + experiment.sky_electrons
+    _check_electrons("all light together", total)
     *psf_seeds, noise_seed = np.random.SeedSequence(experiment.seed).spawn(
         len(experiment.angles) + 1
     )
@@ -734,9 +755,7 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
             for angle, seed in zip(experiment.angles, psf_seeds, strict=True)
         ]
     )
-    extended = target.extended * experiment.source_electrons(experiment.extended_magnitude)
-    stars = [(star.x, star.y) for star in target.stars]
-    star_fluxes = np.array([experiment.source_electrons(star.magnitude) for star in target.stars])
+    extended = target.extended * extended_flux
     background = np.full(len(psfs), experiment.sky_electrons)
     read_noise = float(experiment.read_noise.value)
     expected = _expected_images(psfs, extended, stars, star_fluxes) + background[:, None, None]
@@ -790,7 +809,8 @@ def _plain(value: Any) -> Any:
 def _quantity(name: str, value: Any, unit: u.UnitBase) -> float:
     """Return a finite number in this unit."""
     try:
-        converted = u.Quantity(value).to_value(unit)
+        with np.errstate(over="ignore"):
+            converted = u.Quantity(value).to_value(unit)
     except (TypeError, ValueError, u.UnitsError):
         raise InputError(
             f"{name} must be a quantity in {unit} or the like; {value} was given"
@@ -812,6 +832,14 @@ def _not_negative(name: str, value: Any, unit: u.UnitBase) -> float:
     if number < 0:
         raise InputError(f"{name} must not be negative; {value} was given")
     return number
+
+
+def _check_electrons(name: str, number: float) -> None:
+    if not number <= MAX_ELECTRONS:
+        raise InputError(
+            f"{name} would leave {number:.3g} electrons in one image; at most "
+            f"{MAX_ELECTRONS:.0e} can be simulated"
+        )
 
 
 def _check_angles(angles: Any) -> u.Quantity:

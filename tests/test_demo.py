@@ -2,6 +2,7 @@
 
 import json
 import os
+import runpy
 import shlex
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from astropy.io import fits
 
 import lnocl
-from lnocl import cli, demo, fitsio, simulate
+from lnocl import cli, demo, experiment, fitsio, simulate
 
 SMALL = ("--size", "64")
 
@@ -145,7 +146,48 @@ BAD_SIMULATE = {
 }
 
 
+EXTREMES = {
+    "star": (["--star", "32,16,-40"], "the star at (32, 16) would leave"),
+    "time": (["--exposure-time", "1e300min"], "would leave"),
+    "sky": (["--sky", "-1000"], "too bright"),
+}
+
+
 class TestSimulate:
+    @pytest.mark.parametrize(("arguments", "message"), EXTREMES.values(), ids=EXTREMES)
+    def test_extreme_numbers_are_refused_and_leave_no_folder(self, arguments, message, capsys):
+        assert cli.main(["simulate", "hh34", *SMALL, *arguments, "-o", "deep/out"]) == 2
+        assert message in one_complaint(capsys.readouterr())
+        assert os.listdir() == []
+
+    def test_a_folder_that_cannot_be_made_is_refused_before_the_work(self, capsys, monkeypatch):
+        monkeypatch.setattr(simulate, "simulate", lambda *arguments: pytest.fail("work was begun"))
+        Path("text").write_text("kept")
+        assert cli.main(["simulate", "hh34", *SMALL, "-o", "text/out"]) == 1
+        assert "text/out cannot be used" in one_complaint(capsys.readouterr())
+
+    def test_the_record_is_whole_or_not_there(self, capsys, monkeypatch):
+        simulation = simulate.simulate(
+            simulate.hh34(64), simulate.Experiment(angles=0 * simulate.u.deg)
+        )
+        Path("out").mkdir()
+        Path("out/record.json").write_text("kept")
+        with pytest.raises(lnocl.FileError, match=r"record.json exists"):
+            demo.write_simulation("out", "hh34", simulation)
+        assert Path("out/record.json").read_text() == "kept"
+
+        def fail(*names):
+            if str(names[1]).endswith("record.json"):
+                raise OSError(28, "No space left on device")
+            return replace(*names)
+
+        replace = os.replace
+        monkeypatch.setattr(os, "replace", fail)
+        with pytest.raises(lnocl.FileError, match=r"record.json cannot be written: No space"):
+            demo.write_simulation("out", "hh34", simulation, overwrite=True)
+        assert Path("out/record.json").read_text() == "kept"
+        assert not list(Path("out").glob(".lnocl*"))
+
     def test_the_files_hold_the_simulation(self, capsys):
         options = ("--exposure-time", "10 min", "--strehl", "0.5", "--throughput", "0.2")
         more = ("--extended-magnitude", "12", "--sky", "14", "--read-noise", "5", "--seed", "3")
@@ -303,8 +345,10 @@ class TestPlot:
         fits.writeto("image.fits", np.ones((8, 8)))
         Path("full").mkdir()
         Path("full/flux.png").write_text("kept")
+        before = sorted(os.listdir())
         assert cli.main(["plot", "-o", "out", *arguments]) == status
         assert message in one_complaint(capsys.readouterr())
+        assert sorted(os.listdir()) == before
         assert Path("full/flux.png").read_text() == "kept"
 
     def test_without_matplotlib(self, capsys, monkeypatch):
@@ -312,3 +356,106 @@ class TestPlot:
         assert cli.main(["plot", "a.fits", "-o", "out"]) == 1
         assert "pip install 'lnocl[plot]'" in one_complaint(capsys.readouterr())
         assert not Path("out").exists()
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return simulate.simulate(
+        simulate.hh34(64), simulate.Experiment(angles=[0, 90] * simulate.u.deg)
+    )
+
+
+class TestExperiment:
+    @pytest.mark.parametrize(("every", "looks"), [(10, [3]), (2, [2, 3]), (1, [1, 2, 3])])
+    def test_the_last_iteration_is_always_looked_at(self, simulation, every, looks):
+        found = experiment.reconstruct(
+            simulation, experiment.observe(simulation), "MC-RL", 0.0, 3, every, engine="numpy"
+        )
+        assert found.curve["iteration"].tolist() == looks
+        assert found.best("rho_star")[0] in looks
+        assert found.extended.shape == (64, 64)
+
+    @pytest.mark.parametrize("n", [0, 2])
+    def test_exactly_one_star(self, n):
+        stars = [simulate.Star(10 + j, 20) for j in range(n)]
+        several = simulate.simulate(
+            simulate.Target(np.ones((64, 64)), stars),
+            simulate.Experiment(angles=0 * simulate.u.deg),
+        )
+        with pytest.raises(lnocl.InputError, match=f"has {n} stars"):
+            experiment.reconstruct(several, experiment.observe(several), "RLM", 0.0, 1)
+
+    def test_every_is_positive(self, simulation):
+        with pytest.raises(lnocl.InputError, match="every must be"):
+            experiment.Tracker(simulation, "RLM", 0, 5)
+
+    @pytest.mark.filterwarnings("error")
+    def test_profile_errors_are_of_40_rows_or_nan(self):
+        """20 rows before the star and 19 after it; NaN where all the light is beyond."""
+        image = np.zeros((96, 64))
+        image[70, 20] = 1.0
+        star = simulate.Star(20, 50)
+        how = simulate.Experiment(angles=0 * simulate.u.deg)
+        for row, expected in ((70, np.nan), (69, 0.0), (30, 0.0), (29, np.nan)):
+            moved = np.roll(image, row - 70, axis=0)
+            made = simulate.simulate(simulate.Target(moved, [star]), how)
+            curve = np.zeros(1, experiment.CURVE_DTYPE)
+            found = experiment.Reconstruction("MC-RL", 0.0, curve, made.extended, 1.0)
+            errors = experiment.profile_errors(made, found)
+            np.testing.assert_array_equal(list(errors.values()), expected)
+
+
+@pytest.fixture(scope="module")
+def main():
+    path = Path(__file__).parents[1] / "examples" / "hh34_table.py"
+    return runpy.run_path(str(path))["main"]
+
+
+class TestTable:
+    QUICK = ("--quick", "--mu", "3e-8", "-o", "t")
+
+    def test_rows_are_kept_and_bound_to_their_experiment(self, main, capsys):
+        assert main(self.QUICK) == 0
+        names = ["mc-rl_3e-08.fits", "rlm_0.fits", "table.ecsv", "truth.fits"]
+        assert sorted(os.listdir("t")) == names
+        header = fits.getheader("t/mc-rl_3e-08.fits")
+        assert {"NITER", "CREATOR", "SOLVER", "PIXSCALE", "MINUTES"} <= set(header)
+        assert (header["SCENE"], header["SIZEX"], header["SEED"]) == ("hh34", 64, 0)
+        truth = fits.getheader("t/truth.fits")
+        assert truth["PIXSCALE"] == 5.0
+        heading = capsys.readouterr().out
+        assert all(name in heading for name in ("rho'", "rho' at", "rho''", "rho'' at"))
+        before = {name: Path("t", name).read_bytes() for name in names}
+        assert main(self.QUICK) == 0
+        assert {name: Path("t", name).read_bytes() for name in names} == before
+        capsys.readouterr()
+        for option, keyword in (("--every", "EVERY"), ("--patience", "PATIENCE")):
+            assert main([*self.QUICK, option, "7"]) == 2
+            complaint = capsys.readouterr().err
+            assert f"its {keyword} is" in complaint
+            assert complaint.count("\n") == 1
+        assert {name: Path("t", name).read_bytes() for name in names} == before
+
+    def test_another_truth_is_refused_and_kept(self, main, capsys):
+        Path("t").mkdir()
+        fitsio.write_result("t/truth.fits", np.ones((64, 64)), [(32, 16)], [1.0])
+        before = Path("t/truth.fits").read_bytes()
+        assert main(self.QUICK) == 2
+        complaint = capsys.readouterr().err
+        assert complaint == (
+            "hh34_table: error: t/truth.fits is the truth of another experiment; give another "
+            "folder\n"
+        )
+        assert Path("t/truth.fits").read_bytes() == before
+
+    def test_wrong_use_is_one_line(self, main, capsys):
+        assert main(["--size", "65", "-o", "t"]) == 2
+        assert capsys.readouterr().err.startswith("hh34_table: error: the image is 65 x 65")
+        assert os.listdir() == []
+
+    def test_quick_takes_a_file(self, main):
+        image = np.zeros((64, 64))
+        image[20:60, 30:34] = 1.0
+        fits.writeto("jet.fits", image, fits.Header({"STARX": 32, "STARY": 24}))
+        assert main([*self.QUICK, "--scene", "jet.fits"]) == 0
+        assert fits.getheader("t/rlm_0.fits")["SCENE"] == "jet.fits"
