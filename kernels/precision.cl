@@ -45,6 +45,7 @@ typedef PASTE(REAL, WIDTH) vec;
 typedef PASTE(BITS, WIDTH) ivec;
 #define as_vec PASTE(as_, PASTE(REAL, WIDTH))
 #define as_ivec PASTE(as_, PASTE(BITS, WIDTH))
+
 #define SIDE (BLOCK / LANES)
 #define ROW_BLOCKS (NY / 2 / BLOCK)
 #define COLUMN_BLOCKS (NX / 2 / BLOCK)

@@ -33,7 +33,7 @@ TOLERANCES = {
 OBJECTIVE_TOLERANCES = {"double": 6e-14, "single": 8e-6}
 CHECKPOINTS = tuple(TOLERANCES["double"])
 
-# Sizes for their code paths: the smallest grid; one axis shorter than a 16-wide block, or both,
+# Sizes for their code paths: the smallest grid; one axis too short for a whole block, or both,
 # and exactly one block; square and oblong both ways; images that pair up two by two (even p) and
 # one left over (odd p); one row of pixels; every kind of background, read noise, mask and pad.
 RECIPES = {

@@ -70,8 +70,9 @@ KERNELS = (
     "scale_rows",
     "collect_sums",
 )
-# Worst element over largest: three times what was measured over all cases.
-TOLERANCE = {np.float32: 3e-6, np.float64: 6e-15}
+# Worst element over largest: three times what was measured over all cases on PoCL, 3.3e-7 and
+# 1.2e-15.
+TOLERANCE = {np.float32: 1e-6, np.float64: 3.7e-15}
 
 
 @functools.cache
