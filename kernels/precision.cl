@@ -72,6 +72,16 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define OWN_SCRATCH(scratch, points) (scratch)
 #endif
 
+/* Asks for the cache line at p before it is needed; PoCL's own prefetch() does nothing. */
+#if GROUP == 1 && defined(__has_builtin)
+#if __has_builtin(__builtin_prefetch)
+#define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
+#endif
+#endif
+#ifndef PREFETCH
+#define PREFETCH(p)
+#endif
+
 /* Shares n blocks among however many work-groups were launched. */
 #define FOR_EACH_BLOCK(block, n) \
     for (int block = get_group_id(0); block < (n); block += get_num_groups(0))

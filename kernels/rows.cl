@@ -77,6 +77,16 @@ __constant real READ_SIGN[4] = {-1, 1, 1, -1};
 __constant int WRITE_FIRST[4] = {0, 1, 1, 2}, WRITE_SECOND[4] = {2, 3, 3, 0};
 __constant real WRITE_SIGN[4] = {1, -1, 1, -1};
 
+/* Tiles lie far from each other in memory, so no processor foresees the next one. */
+#define TILES_AHEAD 2
+
+INLINE void prefetch_tile(__global const vec *tile)
+{
+    UNROLL
+    for (int i = 0; i < 4 * LANES; ++i)
+        PREFETCH(tile + i * SIDE);
+}
+
 /* Half spectra of one block of row pairs -> Z in the scratch, in bit-reversed order. */
 INLINE void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int block)
 {
@@ -84,7 +94,10 @@ INLINE void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int bl
         const int column = piece % SIDE, pair = piece / SIDE % SIDE, tile = piece / SIDE / SIDE;
         const int h = tile * BLOCK + column * LANES;
         const int bit = HIGH_BIT(h);
-        __global const vec *x = spectra + tile_start(block, tile) + 4 * LANES * pair * SIDE + column;
+        const int offset = 4 * LANES * pair * SIDE + column;
+        __global const vec *x = spectra + tile_start(block, tile) + offset;
+        if (tile + TILES_AHEAD < COLUMN_BLOCKS)
+            prefetch_tile(spectra + tile_start(block, tile + TILES_AHEAD) + offset);
         for (int part = 0; part < 4; ++part) {
             __global const vec *first = x + READ_FIRST[part] * SIDE;
             __global const vec *second = x + READ_SECOND[part] * SIDE;
