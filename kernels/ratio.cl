@@ -49,6 +49,31 @@ INLINE vec divergence(const vec m, const vec r)
     return m * ((1 - power) + (r * (e * LN_2) + power * (w * w * excess)));
 }
 
+/* The stars whose images reach into a block of row pairs. */
+typedef struct {
+    int count;
+    int star[N_SUMS];
+    __global const vec *image[N_SUMS];
+} near_stars;
+
+INLINE near_stars stars_near(
+    __global const vec *star_images, __global const int *first_blocks, const int n_blocks,
+    const int image, const int block)
+{
+    near_stars near;
+    near.count = 0;
+    for (int s = 0; s < N_STARS; ++s) {
+        const int k = (block - first_blocks[s]) & (ROW_BLOCKS - 1);
+        if (k < n_blocks) {
+            near.star[near.count] = s;
+            near.image[near.count] =
+                star_images + ((size_t)(s * N_IMAGES + image) * n_blocks + k) * (NX * 2 * SIDE);
+            ++near.count;
+        }
+    }
+    return near;
+}
+
 /* The ratio g / m, guarded, and the data term of the objective. g < 0: not observed. */
 INLINE vec ratio(vec g, const vec m, vec *term)
 {
@@ -71,7 +96,8 @@ INLINE vec ratio(vec g, const vec m, vec *term)
  * spectra: N_IMAGES arrays, in: row spectra of A_j f, out: twice the row spectra of r_j.
  * images: N_IMAGES arrays of pixels, negative where not observed (HAS_WEIGHTS).
  * background: [N_IMAGES], or N_IMAGES arrays of pixels (HAS_BACKGROUND_MAP).
- * star_images: N_STARS x N_IMAGES arrays of pixels. star_fluxes: [N_STARS].
+ * star_images: [N_STARS][N_IMAGES] times star_blocks blocks of pixels, from block first_blocks_s on,
+ * round the edge; beyond them P_js is 0. first_blocks, star_fluxes: [N_STARS].
  * sums: [ROW_BLOCKS][N_IMAGES][GROUP][N_SUMS][2].
  * Launch: up to ROW_BLOCKS N_IMAGES groups. In place. Scratch: NX points.
  * Twin: reference.ratio_rows.
@@ -79,7 +105,8 @@ INLINE vec ratio(vec g, const vec m, vec *term)
 KERNEL void ratio_rows(
     __global vec *restrict spectra, __global real *restrict sums,
     __global const vec *restrict images, __global const real *restrict background,
-    __global const vec *restrict star_images, __global const real *restrict star_fluxes,
+    __global const vec *restrict star_images, __global const int *restrict first_blocks,
+    const int star_blocks, __global const real *restrict star_fluxes,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
@@ -89,15 +116,16 @@ KERNEL void ratio_rows(
         const size_t at = (size_t)image * PIXELS_SIZE + (size_t)block * NX * 2 * SIDE;
         read_tiles(z, row_spectra, block);
         dit_inner(z, NX, row_roots);
-        vec_sum total[N_SUMS];
-        for (int s = 0; s < N_SUMS; ++s)
-            total[s] = (vec_sum){0, 0};
+        const near_stars near = stars_near(star_images, first_blocks, star_blocks, image, block);
+        vec_sum objective = {0, 0}, products[N_SUMS];
+        for (int s = 0; s < N_STARS; ++s)
+            products[s] = (vec_sum){0, 0};
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[8];
             load_inverse(a, z + lane, x, NX, row_roots);
-            vec part[N_SUMS];
-            for (int s = 0; s < N_SUMS; ++s)
+            vec terms = 0, part[N_SUMS];
+            for (int s = 0; s < near.count; ++s)
                 part[s] = 0;
             /* Left rolled: unrolled, the pixelwise work runs out of registers and is slower. */
             for (int q = 0; q < OUTER(NX); ++q) {
@@ -109,28 +137,29 @@ KERNEL void ratio_rows(
                 a[q].re += background[image];
                 a[q].im += background[image];
 #endif
-                for (int s = 0; s < N_STARS; ++s) {
-                    const cvec p = LOAD(
-                        star_images + (size_t)s * N_IMAGES * PIXELS_SIZE + at + lane, pixel);
-                    a[q].re += star_fluxes[s] * p.re;
-                    a[q].im += star_fluxes[s] * p.im;
+                for (int s = 0; s < near.count; ++s) {
+                    const cvec p = LOAD(near.image[s] + lane, pixel);
+                    a[q].re += star_fluxes[near.star[s]] * p.re;
+                    a[q].im += star_fluxes[near.star[s]] * p.im;
                 }
                 cvec term;
                 a[q].re = ratio(g.re, a[q].re, &term.re);
                 a[q].im = ratio(g.im, a[q].im, &term.im);
-                part[0] += term.re + term.im;
-                for (int s = 0; s < N_STARS; ++s) {
-                    const cvec p = LOAD(
-                        star_images + (size_t)s * N_IMAGES * PIXELS_SIZE + at + lane, pixel);
-                    part[1 + s] += p.re * a[q].re + p.im * a[q].im;
+                terms += term.re + term.im;
+                for (int s = 0; s < near.count; ++s) {
+                    const cvec p = LOAD(near.image[s] + lane, pixel);
+                    part[s] += p.re * a[q].re + p.im * a[q].im;
                 }
             }
-            for (int s = 0; s < N_SUMS; ++s)
-                ACCUMULATE(total[s], part[s]);
+            ACCUMULATE(objective, terms);
+            for (int s = 0; s < near.count; ++s)
+                ACCUMULATE(products[near.star[s]], part[s]);
             store_forward(z + lane, a, x, NX, row_roots);
         }
-        for (int s = 0; s < N_SUMS; ++s)
-            store_sum(sums + 2 * (((size_t)unit * GROUP + ITEM) * N_SUMS + s), total[s]);
+        __global real *item_sums = sums + 2 * ((size_t)unit * GROUP + ITEM) * N_SUMS;
+        store_sum(item_sums, objective);
+        for (int s = 0; s < N_STARS; ++s)
+            store_sum(item_sums + 2 * (1 + s), products[s]);
         BARRIER;
         dif_inner(z, NX, row_roots);
         write_tiles(row_spectra, z, block);

@@ -67,6 +67,11 @@ class Layout:
         self._conjugated = opposite
 
     @property
+    def block_bytes(self) -> int:
+        """Bytes of one block of row pairs in an array of pixels."""
+        return self.pixels_bytes // self.pixels_shape[0]
+
+    @property
     def pixels_bytes(self) -> int:
         """Bytes of one array of pixels."""
         return int(np.prod(self.pixels_shape)) * self.dtype.itemsize
@@ -77,10 +82,23 @@ class Layout:
         return int(np.prod(self.spectra_shape)) * self.dtype.itemsize
 
     def pack_pixels(self, pixels: NDArray) -> NDArray:
-        """Return pixels (..., Ny, Nx) in the kernels' order and precision."""
-        row_blocks, nx, _, block = self.pixels_shape
-        pairs = pixels.reshape(*pixels.shape[:-2], row_blocks, block, 2, nx)
+        """Return pixels (..., Ny, Nx), or some blocks' rows of them, in the kernels' order."""
+        _, nx, _, block = self.pixels_shape
+        pairs = pixels.reshape(*pixels.shape[:-2], -1, block, 2, nx)
         return np.ascontiguousarray(np.swapaxes(pairs, -3, -1), dtype=self.dtype)
+
+    def window(self, rows: NDArray[np.bool_]) -> tuple[int, int]:
+        """Return first and number of the blocks, round the edge, that hold some rows (Ny,)."""
+        row_blocks = self.pixels_shape[0]
+        held = np.flatnonzero(rows.reshape(row_blocks, -1).any(axis=1))
+        gaps = np.diff(held, append=held[0] + row_blocks)
+        widest = int(np.argmax(gaps))
+        return int(held[(widest + 1) % len(held)]), row_blocks - int(gaps[widest]) + 1
+
+    def rows_of(self, first: int, count: int) -> NDArray[np.int64]:
+        """Return the rows that some blocks hold, round the edge."""
+        rows = 2 * self.pixels_shape[-1]
+        return np.arange(first * rows, (first + count) * rows) % self.grid[0]
 
     def unpack_pixels(self, packed: NDArray) -> NDArray[np.float64]:
         """Return the pixels (Ny, Nx) of an array in the kernels' order."""

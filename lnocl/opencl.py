@@ -75,6 +75,9 @@ class OpenCLEngine:
             least_model=LEAST_MODEL,
         )
         self.layout = Layout(self.program)
+        windows = [self.layout.window(scene.star_rows(s)) for s in range(scene.n_stars)]
+        self._first_blocks = np.array([first for first, _ in windows], np.int32)
+        self._star_blocks = max((count for _, count in windows), default=1)
         self.bytes_needed = self._refuse_if_too_large(n_iter)
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
@@ -99,7 +102,8 @@ class OpenCLEngine:
             "extended": layout.pixels_bytes,
             "inverse_weight": layout.pixels_bytes if self.scene.weights is not None else item,
             "background": p * (layout.pixels_bytes if has_map else item),
-            "star_images": max(n * p * layout.pixels_bytes, item),
+            "star_images": max(n * p * self._star_blocks * layout.block_bytes, item),
+            "first_blocks": max(n, 1) * self._first_blocks.itemsize,
             "star_fluxes": max(n, 1) * item,
             "star_weights": max(n, 1) * item,
             "star_corrections": max(n, 1) * item,
@@ -146,6 +150,8 @@ class OpenCLEngine:
             buffers["images"],
             buffers["background"],
             buffers["star_images"],
+            buffers["first_blocks"],
+            np.int32(self._star_blocks),
             buffers["star_fluxes"],
             blocks=self.program.row_blocks * self.program.n_images,
         )
@@ -186,18 +192,24 @@ class OpenCLEngine:
             self._upload("background", background)
         self._make_otfs()
         if scene.n_stars:
-            self._upload_pixels(
-                "star_images",
-                (
-                    scene.star_image(j, s)
-                    for s in range(scene.n_stars)
-                    for j in range(scene.n_images)
-                ),
-            )
-            self._upload("star_weights", scene.star_weights)
+            self._upload_stars()
         self._observed: NDArray[np.bool_] | None = None
         if scene.weights is not None:
             self._invert_weights(scene.weights)
+
+    def _upload_stars(self) -> None:
+        scene, buffers = self.scene, self._buffers
+        windows = [self.layout.rows_of(first, self._star_blocks) for first in self._first_blocks]
+        self._upload_pixels(
+            "star_images",
+            (
+                scene.star_image(j, s)[rows]
+                for s, rows in enumerate(windows)
+                for j in range(scene.n_images)
+            ),
+        )
+        cl.enqueue_copy(self._queue, buffers["first_blocks"], self._first_blocks)
+        self._upload("star_weights", scene.star_weights)
 
     def _make_otfs(self) -> None:
         buffers = self._buffers
@@ -278,13 +290,11 @@ class OpenCLEngine:
 
     def _upload_pixels(self, name: str, arrays: Iterable[NDArray]) -> None:
         """Upload arrays of pixels, one behind the other."""
-        for i, array in enumerate(arrays):
-            cl.enqueue_copy(
-                self._queue,
-                self._buffers[name],
-                self.layout.pack_pixels(self._rounded(name, array)),
-                dst_offset=i * self.layout.pixels_bytes,
-            )
+        offset = 0
+        for array in arrays:
+            packed = self.layout.pack_pixels(self._rounded(name, array))
+            cl.enqueue_copy(self._queue, self._buffers[name], packed, dst_offset=offset)
+            offset += packed.nbytes
 
     def _rounded(self, name: str, values: NDArray | float) -> NDArray:
         """Return values in the engine's precision, none of them too large for it."""

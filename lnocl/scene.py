@@ -118,6 +118,14 @@ class Scene:
         x, y = self.stars[s]
         return np.roll(self.psf(j), (y, x), axis=(0, 1))
 
+    def star_rows(self, s: int) -> NDArray[np.bool_]:
+        """Return the rows of the grid, shape (Ny,), that the images of star s reach into."""
+        psfs = self.observation.psfs
+        lit = np.flatnonzero((psfs != 0).any(axis=(0, 2))) - psfs.shape[1] // 2
+        rows = np.zeros(self.grid[0], bool)
+        rows[(lit + self.stars[s][1]) % self.grid[0]] = True
+        return rows
+
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
         """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""
         return total_weight >= OBSERVED_SHARE * total_weight.max()

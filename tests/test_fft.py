@@ -151,6 +151,20 @@ def test_error_grows_as_the_root_of_the_logarithm(dtype, record_property):
     assert errors[-1] < 1.3 * np.finfo(dtype).eps
 
 
+@pytest.mark.parametrize(
+    ("rows", "count"),
+    [([0], 1), ([127], 1), ([15, 16], 2), ([100, 5], 3), ([40, 60, 70], 3), (range(128), 8)],
+)
+def test_window_is_the_shortest_run_of_blocks_round_the_edge(rows, count):
+    layout = transform((128, 128), np.float32).layout
+    assert layout.pixels_shape[0] == 8
+    held = np.zeros(128, bool)
+    held[list(rows)] = True
+    first, found = layout.window(held)
+    assert found == count
+    assert held[layout.rows_of(first, count)].sum() == held.sum()
+
+
 def test_bit_reversed_order():
     assert bit_reversed(8).tolist() == [0, 4, 2, 6, 1, 5, 3, 7]
 

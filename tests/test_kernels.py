@@ -178,6 +178,14 @@ def inputs(b):
     images = rng.poisson(3.0, (p, ny, nx)) / 3.0
     images[:, 0, 0] = 0.0
     weights = rng.random((p, ny, nx)) > 0.2
+    # One star is seen in all blocks; of two, each in half of them, the first round the edge.
+    row_blocks = b.program.row_blocks
+    star_blocks = row_blocks if n < 2 else max(1, row_blocks // 2)
+    first_blocks = np.array([row_blocks - 1, 0])[:n]
+    star_images = rounded(rng.random((n, p, ny, nx)), dtype)
+    for images_of_star, first in zip(star_images, first_blocks, strict=True):
+        dark = np.setdiff1d(np.arange(ny), b.layout.rows_of(first, star_blocks))
+        images_of_star[:, dark] = 0.0
     has_map = "-DHAS_BACKGROUND_MAP=1" in b.program.options
     has_weights = "-DHAS_WEIGHTS=1" in b.program.options
     return SimpleNamespace(
@@ -194,7 +202,9 @@ def inputs(b):
         images=rounded(images, dtype),
         weights=weights if has_weights else None,
         background=rounded(rng.uniform(0.1, 0.2, (p, ny, nx) if has_map else (p, 1, 1)), dtype),
-        star_images=rounded(rng.random((n, p, ny, nx)), dtype),
+        star_images=star_images,
+        star_blocks=star_blocks,
+        first_blocks=first_blocks,
         star_fluxes=rounded(rng.uniform(0.1, 1.0, n), dtype),
         star_weights=rounded(rng.uniform(1.0, 2.0, n), dtype),
         star_corrections=rounded(rng.uniform(0.9, 1.1, n), dtype),
@@ -298,13 +308,17 @@ def run_ratio_rows(b, i):
     background = b.put_pixels(i.background) if i.background.size > i.p else b.put(i.background)
     out = b.put_spectra(i.model_spectra)
     sums = b.put(np.full((b.ratio_groups * i.p, 1 + i.n, 2), np.nan))
+    rows = [b.layout.rows_of(first, i.star_blocks) for first in i.first_blocks]
+    stars = [image[r] for images, r in zip(i.star_images, rows, strict=True) for image in images]
     b.launcher.rows(
         "ratio_rows",
         out,
         sums,
         b.put_pixels(images),
         background,
-        b.put_pixels(i.star_images.reshape(-1, *b.grid)),
+        b.put_pixels(stars),
+        b.put(i.first_blocks, np.int32),
+        np.int32(i.star_blocks),
         b.put(i.star_fluxes),
         blocks=b.program.row_blocks * i.p,
     )()
@@ -396,6 +410,8 @@ def launch_ratio_rows(b, model, images, star_image):
         b.put_pixels(images[None]),
         background,
         b.put_pixels(star_image[None]),
+        b.put([0], np.int32),
+        np.int32(b.program.row_blocks),
         b.put([0.0]),
         blocks=b.program.row_blocks,
     )()
