@@ -56,21 +56,22 @@ KERNEL void otf_columns(
     }
 }
 
-/* spectra_j = IFFT(otf_j FFT(spectrum)) along the columns: the row spectra of A_j f from f's.
- * spectra: N_IMAGES arrays, written but for their padding. spectrum: one array, const.
- * otf: N_IMAGES arrays; otf_edge: [N_IMAGES][NY][2].
- * Launch: up to COLUMN_BLOCKS groups. Out of place. Scratch: 2 NY points.
+/* spectra_j <- IFFT(otf_j FFT(spectra_0)) along the columns: the row spectra of A_j f from f's.
+ * spectra: N_IMAGES arrays, written but for their padding. otf: N_IMAGES arrays, const;
+ * otf_edge: [N_IMAGES][NY][2].
+ * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: 2 NY points.
  * Twin: reference.convolve_columns.
  */
 KERNEL void convolve_columns(
-    __global vec *restrict spectra, __global const vec *restrict spectrum,
-    __global const vec *restrict otf, __global const real *restrict otf_edge,
+    __global vec *restrict spectra, __global const vec *restrict otf,
+    __global const real *restrict otf_edge,
     __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *source = OWN_SCRATCH(scratch, 2 * NY);
     SCRATCH vec *z = source + 2 * NY * SIDE;
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
-        forward_columns(source, spectrum + (size_t)block * ROWS * 2 * SIDE, column_roots);
+        __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
+        forward_columns(source, columns, column_roots);
         for (int image = 0; image < N_IMAGES; ++image) {
             __global const vec *k =
                 otf + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
@@ -96,32 +97,29 @@ KERNEL void convolve_columns(
                 dit_span(z + 2 * SIDE * start, NY, column_roots);
             }
             dit_middle(z, NY, column_roots);
-            finish_columns(
-                spectra + (size_t)image * SPECTRA_SIZE + (size_t)block * ROWS * 2 * SIDE, z,
-                column_roots);
+            finish_columns(columns + (size_t)image * SPECTRA_SIZE, z, column_roots);
         }
     }
 }
 
-/* spectrum = IFFT(sum_j conj(otf_j) FFT(spectra_j)) along the columns: the row spectrum of
- * sum_j A_j^T r_j from those of the r_j. Shapes as in convolve_columns.
- * Launch: up to COLUMN_BLOCKS groups. Out of place. Scratch: 2 NY points.
+/* spectra_0 <- IFFT(sum_j conj(otf_j) FFT(spectra_j)) along the columns: the row spectrum of
+ * sum_j A_j^T r_j from those of the r_j. Shapes as in convolve_columns; array 0 alone is written.
+ * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: 2 NY points.
  * Twin: reference.correlate_columns.
  */
 KERNEL void correlate_columns(
-    __global vec *restrict spectrum, __global const vec *restrict spectra,
-    __global const vec *restrict otf, __global const real *restrict otf_edge,
+    __global vec *restrict spectra, __global const vec *restrict otf,
+    __global const real *restrict otf_edge,
     __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *total = OWN_SCRATCH(scratch, 2 * NY);
     SCRATCH vec *z = total + 2 * NY * SIDE;
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
+        __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
         for (int image = 0; image < N_IMAGES; ++image) {
             __global const vec *k =
                 otf + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
-            forward_columns(
-                z, spectra + (size_t)image * SPECTRA_SIZE + (size_t)block * ROWS * 2 * SIDE,
-                column_roots);
+            forward_columns(z, columns + (size_t)image * SPECTRA_SIZE, column_roots);
             FOR_EACH(piece, NY * SIDE) {
                 const int t = piece / SIDE, lane = piece % SIDE;
                 cvec product = multiply_conjugate(LOAD(z + lane, t), LOAD(k + lane, t));
@@ -136,6 +134,6 @@ KERNEL void correlate_columns(
             BARRIER;
         }
         dit_inner(total, NY, column_roots);
-        finish_columns(spectrum + (size_t)block * ROWS * 2 * SIDE, total, column_roots);
+        finish_columns(columns, total, column_roots);
     }
 }

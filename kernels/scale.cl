@@ -1,15 +1,15 @@
 /* The SGM scalings, inside the transforms along the rows. */
 
 /* f <- f a c / (1 + mu f a), c = sum_j A_j^T r_j not below 0, a = 1 / sum_j A_j^T w_j;
- * spectrum <- row spectrum of the new f; sums: sum f^2; c_s <- c_s star_corrections_s.
- * spectrum: one array, in: row spectrum of c, out: twice the row spectrum of f.
+ * spectra <- row spectrum of the new f; sums: sum f^2; c_s <- c_s star_corrections_s.
+ * spectra: one array, in: row spectrum of c, out: twice the row spectrum of f.
  * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; where
  * there are none a = 1 / N_IMAGES). sums: [ROW_BLOCKS][GROUP][2] (HAS_MU).
  * star_fluxes, star_corrections: [N_STARS].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.scale_rows.
  */
 KERNEL void scale_rows(
-    __global vec *restrict spectrum, __global vec *restrict extended,
+    __global vec *restrict spectra, __global vec *restrict extended,
     __global real *restrict sums, __global real *restrict star_fluxes,
     __global const vec *restrict inverse_weight, __global const real *restrict star_corrections,
     const real mu, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
@@ -18,7 +18,7 @@ KERNEL void scale_rows(
     FOR_EACH_BLOCK(block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         __global vec *source = extended + at;
-        read_tiles(z, spectrum, block);
+        read_tiles(z, spectra, block);
         dit_inner(z, NX, row_roots);
         vec_sum total = {0, 0};
         FOR_EACH(piece, INNER(NX) * SIDE) {
@@ -57,7 +57,7 @@ KERNEL void scale_rows(
 #endif
         BARRIER;
         dif_inner(z, NX, row_roots);
-        write_tiles(spectrum, z, block);
+        write_tiles(spectra, z, block);
     }
     if (get_group_id(0) == 0) {
         FOR_EACH(s, N_STARS)

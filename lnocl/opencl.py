@@ -98,7 +98,6 @@ class OpenCLEngine:
             "otfs": p * layout.pixels_bytes,
             "otf_edges": p * program.grid[0] * 2 * item,
             "spectra": p * layout.spectra_bytes,
-            "spectrum": layout.spectra_bytes,
             "extended": layout.pixels_bytes,
             "inverse_weight": layout.pixels_bytes if self.scene.weights is not None else item,
             "background": p * (layout.pixels_bytes if has_map else item),
@@ -140,9 +139,7 @@ class OpenCLEngine:
         buffers, launcher = self._buffers, self._launcher
         otfs = buffers["otfs"], buffers["otf_edges"]
         mu = self.program.dtype.type(self._rounded("mu", self.scene.mu))
-        self._convolve = launcher.columns(
-            "convolve_columns", buffers["spectra"], buffers["spectrum"], *otfs
-        )
+        self._convolve = launcher.columns("convolve_columns", buffers["spectra"], *otfs)
         self._ratio = launcher.rows(
             "ratio_rows",
             buffers["spectra"],
@@ -165,12 +162,10 @@ class OpenCLEngine:
             mu,
             np.int32(0),
         )
-        self._correlate = launcher.columns(
-            "correlate_columns", buffers["spectrum"], buffers["spectra"], *otfs
-        )
+        self._correlate = launcher.columns("correlate_columns", buffers["spectra"], *otfs)
         self._scale = launcher.rows(
             "scale_rows",
-            buffers["spectrum"],
+            buffers["spectra"],
             buffers["extended"],
             buffers["square_sums"],
             buffers["star_fluxes"],
@@ -215,26 +210,32 @@ class OpenCLEngine:
         buffers = self._buffers
         for j in range(self.scene.n_images):
             self._upload_pixels("extended", [self.scene.psf(j)])
-            self._launcher.rows("rfft_rows", buffers["spectrum"], buffers["extended"])()
+            self._launcher.rows("rfft_rows", buffers["spectra"], buffers["extended"])()
             self._launcher.columns(
                 "otf_columns",
                 buffers["otfs"],
                 buffers["otf_edges"],
-                buffers["spectrum"],
+                buffers["spectra"],
                 np.int32(j),
             )()
 
     def _invert_weights(self, weights: NDArray[np.bool_]) -> None:
         """Make 1 / sum_j A_j^T w_j, 0 where nothing was observed."""
         buffers, size = self._buffers, self.layout.spectra_bytes
-        for j, weight in enumerate(weights):
-            self._upload_pixels("extended", [weight])
-            self._launcher.rows("rfft_rows", buffers["spectrum"], buffers["extended"])()
-            cl.enqueue_copy(
-                self._queue, buffers["spectra"], buffers["spectrum"], dst_offset=j * size
-            )
+        transform = self._launcher.rows("rfft_rows", buffers["spectra"], buffers["extended"])
+        for j in reversed(range(len(weights))):
+            self._upload_pixels("extended", [weights[j]])
+            transform()
+            if j > 0:  # the first array is where transforms come out
+                cl.enqueue_copy(
+                    self._queue,
+                    buffers["spectra"],
+                    buffers["spectra"],
+                    byte_count=size,
+                    dst_offset=j * size,
+                )
         self.correct()
-        self._launcher.rows("irfft_rows", self._buffers["extended"], self._buffers["spectrum"])()
+        self._launcher.rows("irfft_rows", buffers["extended"], buffers["spectra"])()
         total = self.extended()
         self._observed = self.scene.observed(total)
         inverse = np.divide(1.0, total, out=np.zeros_like(total), where=self._observed)
@@ -245,7 +246,7 @@ class OpenCLEngine:
         if self._observed is not None:
             extended = np.where(self._observed, extended, 0.0)
         self._upload_pixels("extended", [extended])
-        self._launcher.rows("rfft_rows", self._buffers["spectrum"], self._buffers["extended"])()
+        self._launcher.rows("rfft_rows", self._buffers["spectra"], self._buffers["extended"])()
         if self.scene.n_stars:
             self._upload("star_fluxes", star_fluxes)
         squares = np.zeros(self._buffers["square_sums"].size // self.program.dtype.itemsize)

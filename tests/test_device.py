@@ -92,7 +92,7 @@ def test_no_double_precision(monkeypatch):
 
 
 def scene(p, n, stars=0):
-    observation = lnocl.Observation(np.ones((p, n, n)), np.ones((1, 1)))
+    observation = lnocl.Observation(np.ones((p, n, n)), np.ones((n, n)))
     return opencl.Scene(observation, [(i, i) for i in range(stars)], 0.0, 0)
 
 
