@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 import os
 import re
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, NoReturn, TextIO
 
 from lnocl import __version__
@@ -173,7 +174,7 @@ def _add_deconvolve_arguments(parser: argparse.ArgumentParser) -> None:
         help="file for the extended source, the stars and the history of the objective",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.fits if it exists")
-    parser.add_argument("--quiet", action="store_true", help="show no progress bar and no summary")
+    parser.add_argument("--quiet", action="store_true", help="show warnings and errors only")
 
 
 def _deconvolve(arguments: argparse.Namespace) -> None:
@@ -187,18 +188,19 @@ def _deconvolve(arguments: argparse.Namespace) -> None:
     wcs = fitsio.wcs_cards(images.header)
     background = arguments.background or [0.0]
     read_noise = arguments.read_noise or [0.0]
-    result = deconvolve(
-        Observation(images.data, psfs.data, background, read_noise),
-        stars=arguments.stars,
-        mu=arguments.mu,
-        solver=arguments.solver,
-        n_iter=arguments.n_iter,
-        precision=arguments.precision,
-        engine=arguments.engine,
-        device=device,
-        pad=arguments.pad,
-        progress=not arguments.quiet,
-    )
+    with contextlib.nullcontext() if arguments.quiet else _shown_log():
+        result = deconvolve(
+            Observation(images.data, psfs.data, background, read_noise),
+            stars=arguments.stars,
+            mu=arguments.mu,
+            solver=arguments.solver,
+            n_iter=arguments.n_iter,
+            precision=arguments.precision,
+            engine=arguments.engine,
+            device=device,
+            pad=arguments.pad,
+            progress=not arguments.quiet,
+        )
     fitsio.write_result(
         arguments.output,
         result.extended,
@@ -558,9 +560,32 @@ def _show_warning(
 
 
 def _complain(kind: str, message: str) -> None:
+    _note(f"{kind}: {message}")
+
+
+def _note(message: str) -> None:
     with contextlib.suppress(OSError):
-        sys.stderr.write(_one_line(f"lnocl: {kind}: {message}", sys.stderr) + "\n")
+        sys.stderr.write(_one_line(f"lnocl: {message}", sys.stderr) + "\n")
         sys.stderr.flush()
+
+
+class _Notes(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        _note(record.getMessage())
+
+
+@contextlib.contextmanager
+def _shown_log() -> Iterator[None]:
+    """Show on stderr what the library logs."""
+    log, handler = logging.getLogger("lnocl"), _Notes()
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+        log.removeHandler(handler)
 
 
 def _one_line(text: str, stream: TextIO) -> str:

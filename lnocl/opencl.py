@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Iterable
 
@@ -16,6 +17,8 @@ from lnocl.observation import Array
 from lnocl.program import Program, Tuning
 from lnocl.reference import LEAST_MODEL
 from lnocl.scene import Scene
+
+log = logging.getLogger("lnocl")
 
 # Iterations that may wait in the queue: enough to keep the device busy, few enough that an
 # interrupt is answered soon.
@@ -113,7 +116,7 @@ class OpenCLEngine:
         }
 
     def _refuse_if_too_large(self, n_iter: int) -> int:
-        """Return the bytes that the scene takes on the device, all buffers together."""
+        """Return the bytes that the scene takes on the device, all buffers together; log them."""
         sizes = self._sizes(n_iter)
         device = self._context.devices[0]
         total = sum(sizes.values())
@@ -125,6 +128,7 @@ class OpenCLEngine:
                 f"gives {device.max_mem_alloc_size / 2**20:.0f} MiB at once: take fewer or "
                 "smaller images, fewer stars, precision single, or another device"
             )
+        log.info("%s: the scene takes %.1f MiB", self.name, total / 2**20)
         return total
 
     def _allocate(self, n_iter: int) -> None:

@@ -1,6 +1,7 @@
 """The command line: what it runs, what it refuses, and what it says."""
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -327,6 +328,11 @@ class TestDeconvolve:
         assert len(lines) == 1
         assert lines[0].startswith("lnocl: warning: ")
         assert lines[0].endswith("psf pixels are negative and were kept")
+
+    def test_what_the_device_must_hold_is_said_first(self, capsys):
+        assert run("--n-iter", "1", engine=()) == 0
+        name = re.escape(device.describe(device.choose().device))
+        assert re.match(rf"lnocl: {name}: the scene takes [\d.]+ MiB\n", capsys.readouterr().err)
 
     def test_quiet_says_nothing_but_warnings(self, capsys):
         assert run("--quiet", psf="negative.fits") == 0

@@ -106,7 +106,8 @@ def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, 
 
 
 @pytest.mark.parametrize("tuning", [None, program.Tuning(4, 16)])
-def test_memory_estimate_is_what_the_buffers_hold(tuning):
+def test_memory_estimate_is_what_the_buffers_hold(tuning, caplog):
+    caplog.set_level("INFO", "lnocl")
     observation = lnocl.Observation(np.ones((2, 8192, 64)), np.ones((1, 1)))
     engine = opencl.OpenCLEngine(
         opencl.Scene(observation, [(1, 1)], 0.0, 0), "single", None, 10, tuning
@@ -118,6 +119,20 @@ def test_memory_estimate_is_what_the_buffers_hold(tuning):
     if engine.program.scratch_is_global:
         held.append(launcher._scratch)
     assert engine.bytes_needed == sum(buffer.size for buffer in held)
+    (message,) = caplog.messages
+    assert message == f"{engine.name}: the scene takes {engine.bytes_needed / 2**20:.1f} MiB"
+
+
+@pytest.mark.parametrize(("p", "n"), [(1, 256), (4, 256), (1, 1024), (4, 1024)])
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_memory_is_little_more_than_what_must_be_held(monkeypatch, p, n, precision):
+    """Images, OTFs, one set of spectra, the estimate."""
+    monkeypatch.setattr(opencl.OpenCLEngine, "_allocate", lambda *_: None)
+    monkeypatch.setattr(opencl.OpenCLEngine, "_bind", lambda *_: None)
+    monkeypatch.setattr(opencl.OpenCLEngine, "_upload_scene", lambda *_: None)
+    engine = opencl.OpenCLEngine(scene(p, n), precision, None, 1000)
+    must = (3 * p + 1) * n * n * engine.program.dtype.itemsize
+    assert must < engine.bytes_needed <= 1.04 * must
 
 
 def test_failing_compiler_is_named(monkeypatch):
