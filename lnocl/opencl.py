@@ -15,8 +15,7 @@ from lnocl.errors import DeviceError, InputError
 from lnocl.fft import READ_WRITE, Launcher, Layout
 from lnocl.observation import Array
 from lnocl.program import Program, Tuning
-from lnocl.reference import LEAST_MODEL
-from lnocl.scene import Scene
+from lnocl.scene import LEAST_MODEL, Scene
 
 log = logging.getLogger("lnocl")
 

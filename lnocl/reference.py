@@ -12,13 +12,9 @@ from numpy.typing import NDArray
 from scipy.special import kl_div
 
 from lnocl.observation import Array
-from lnocl.scene import Scene
+from lnocl.scene import LEAST_MODEL, Scene
 
 ComplexArray = NDArray[np.complex128]
-
-# The one division guard: where the model is not above this (images have unit mean) the ratio is
-# taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
-LEAST_MODEL = 2.0**-64
 
 
 def rfft_rows(pixels: Array) -> ComplexArray:

@@ -19,6 +19,10 @@ MAX_AXIS = 8192
 # "not observed" (the threshold of Bertero & Boccacci 2005, A&A 437, 369, for boundary effects).
 OBSERVED_SHARE = 0.01
 
+# The one division guard: where the model is not above this (images have unit mean) the ratio is
+# taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
+LEAST_MODEL = 2.0**-64
+
 
 class Scene:
     """What is modelled, on a grid of powers of two, scaled to images of about unit mean.
@@ -205,6 +209,8 @@ class Scene:
 
     def _on_grid(self, array: NDArray, fill: float = 0.0) -> NDArray:
         ny, nx = self.observation.shape
+        if self.grid == (ny, nx):
+            return array
         laid = np.full((*array.shape[:-2], *self.grid), fill, dtype=array.dtype)
         laid[..., :ny, :nx] = array
         return laid

@@ -11,9 +11,10 @@ from lnocl import reference
 from lnocl.device import choose
 from lnocl.fft import READ_WRITE, Launcher, Layout, bit_reversed
 from lnocl.program import Program, Tuning
+from lnocl.scene import LEAST_MODEL
 
 CANARY = np.frombuffer(b"\xa5" * 64, np.uint8)
-LEAST_MODEL = reference.LEAST_MODEL
+
 
 # Name: (grid, tuning, scene, precisions), a capital letter for one that only CI tests. Each grid
 # is the smallest that takes some path of kernels/fft.cl; tunings other than the default share a

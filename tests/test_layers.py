@@ -19,7 +19,7 @@ LAYERS = {
     "scene": {"observation"},
     "observation": set(),
     "reference": {"observation", "scene"},
-    "opencl": {"device", "fft", "observation", "program", "reference", "scene"},
+    "opencl": {"device", "fft", "observation", "program", "scene"},
     "fft": {"program"},
     "program": {"device"},
     "device": set(),
