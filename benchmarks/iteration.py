@@ -1,125 +1,211 @@
-"""Milliseconds an iteration, beside a best-effort SciPy iteration in the same run.
+"""Milliseconds an iteration, beside the same iteration written with other libraries.
 
-    python benchmarks/iteration.py [--size 1024] [--images 4] [--precision single] [--device SPEC]
+    python benchmarks/iteration.py [--sweep NAME ...] [--device SPEC] [--turns N] [--output STEM]
 
-Both sides take turns, so that a noisy machine is noisy for both; medians are printed, and the
-median of the ratios of each turn. SciPy runs with one and with two workers, in the same
-precision, in place wherever scipy.fft allows it.
+Sweeps: "size" (64 to 4096), "images" (1 to 8), "double", and "scene" (what stars, masks, mu and
+the recording of the objective cost). Without --sweep all four. All sides of a comparison take
+turns in one process, in random order, so that a noisy machine is noisy for all; the table gives
+the median over the turns, and the median of each turn's ratio to lnocl (in "scene": to the plain
+scene). With --output the table goes to STEM.ecsv and a plot to STEM.png.
+
+SciPy, FFTW, MKL, JAX and VkFFT take part where they are installed: the last four by
+`pip install pyfftw mkl_fft jax` and `VKFFT_BACKEND=opencl pip install pyvkfft`.
 """
 
 import argparse
+import importlib.metadata
+import os
+import platform
+import random
 import time
 
-import numpy as np
-import scipy.fft
+# Threads that wait for work by spinning would take their time from the next side.
+os.environ.setdefault("KMP_BLOCKTIME", "0")
 
-import lnocl
-from lnocl.opencl import OpenCLEngine
+import numpy as np
+import sides
+from astropy.table import Table, vstack
+from machine import bytes_moved, measure, operations
+
+import lnocl.program
+from lnocl.device import choose, describe
 from lnocl.scene import Scene
 
-
-def observation(size, n_images):
-    """Return seeded Poisson images through Gaussian PSFs of different widths."""
-    rng = np.random.default_rng(0)
-    axis = np.arange(64) - 32
-    widths = 2.0 + 0.5 * np.arange(n_images)
-    psfs = [np.exp(-(axis**2)[:, None] / w - axis**2 / (2 * w)) for w in widths]
-    images = rng.poisson(100.0, (n_images, size, size))
-    return lnocl.Observation(images, np.array(psfs), background=10.0)
+SIZES = (64, 128, 256, 512, 1024, 2048, 4096)
+IMAGES = (1, 2, 3, 4, 5, 6, 7, 8)
+DOUBLE_SIZES = (256, 1024, 2048)
+SECONDS_A_TURN = 0.1
 
 
-class SciPyIteration:
-    """RLM as one would write it for speed with scipy.fft."""
-
-    def __init__(self, scene, dtype, workers):
-        self.images = scene.images().astype(dtype)
-        self.background = scene.background().astype(dtype)[:, None, None]
-        psfs = np.array([scene.psf(j) for j in range(scene.n_images)]).astype(dtype)
-        self.otfs = scipy.fft.rfft2(psfs)
-        self.adjoint_otfs = self.otfs.conj()
-        self.extended = scene.start(None, None)[0].astype(dtype)
-        self.keywords = {"workers": workers, "overwrite_x": True}
-        self.p = dtype(scene.n_images)
-
-    def __call__(self):
-        """Do one iteration."""
-        spectrum = scipy.fft.rfft2(self.extended, workers=self.keywords["workers"])
-        model = scipy.fft.irfft2(self.otfs * spectrum, **self.keywords)
-        model += self.background
-        np.divide(self.images, model, out=model)
-        spectra = scipy.fft.rfft2(model, **self.keywords)
-        spectra *= self.adjoint_otfs
-        correction = scipy.fft.irfft2(spectra.sum(axis=0), **self.keywords)
-        self.extended *= correction
-        self.extended /= self.p
+def take_turns(named, turns):
+    """Return milliseconds an iteration of each side, shape (turns, sides)."""
+    counts = {}
+    for name, side in named.items():
+        side(1)
+        start = time.perf_counter()
+        side(1)
+        counts[name] = max(1, round(SECONDS_A_TURN / (time.perf_counter() - start)))
+    times = np.zeros((turns, len(named)))
+    order = list(enumerate(named.items()))
+    for turn in range(turns):
+        for i, (name, side) in random.sample(order, len(order)):
+            time.sleep(0.02)
+            start = time.perf_counter()
+            side(counts[name])
+            times[turn, i] = 1e3 * (time.perf_counter() - start) / counts[name]
+    return times
 
 
-class OpenCLIterations:
-    """The engine's own iterations, with the objective recorded, several at a time."""
-
-    def __init__(self, scene, precision, device, tuning=None):
-        self.engine = OpenCLEngine(scene, precision, device, 100_000, tuning)
-        self.engine.start(*scene.start(None, None))
-
-    def __call__(self, count):
-        """Do several iterations and wait for the last."""
-        for _ in range(count):
-            self.engine.ratio()
-            self.engine.correct()
-            self.engine.scale()
-        self.engine.star_fluxes()
-        self.engine.objectives()
-
-
-def milliseconds(work):
-    """Return how long it takes."""
-    start = time.perf_counter()
-    work()
-    return 1e3 * (time.perf_counter() - start)
+def rows(sweep, size, n_images, dtype, names, times):
+    """Return the table of one comparison."""
+    count = len(names)
+    per_point = 1e6 * times / (n_images * size**2 * 2 * np.log2(size))
+    return Table(
+        {
+            "sweep": [sweep] * count,
+            "side": names,
+            "images": [n_images] * count,
+            "size": [size] * count,
+            "precision": [np.dtype(dtype).name] * count,
+            "ms": np.median(times, axis=0).round(4),
+            "ratio": np.median(times / times[:, :1], axis=0).round(3),
+            "ns_per_n2_log2_n2": np.median(per_point, axis=0).round(4),
+        }
+    )
 
 
-def compare(size, n_images, precision, device, turns):
-    """Return a dict of medians in ms, the ratio to the better SciPy, and the device."""
-    dtype = np.float64 if precision == "double" else np.float32
-    scene = Scene(observation(size, n_images))
-    ours = OpenCLIterations(scene, precision, device)
-    theirs = {workers: SciPyIteration(scene, dtype, workers) for workers in (1, 2)}
-    ours(2)
-    for iteration in theirs.values():
-        iteration()
-    count = max(3, round(2e7 / (size * size * n_images)))
-    times = {"lnocl": [], 1: [], 2: []}
-    for _ in range(turns):
-        times["lnocl"].append(milliseconds(lambda: ours(count)) / count)
-        for workers, iteration in theirs.items():
-            times[workers].append(np.median([milliseconds(iteration) for _ in range(3)]))
-    medians = {name: float(np.median(values)) for name, values in times.items()}
-    best = 1 if medians[1] < medians[2] else 2
-    ratio = float(np.median(np.array(times[best]) / np.array(times["lnocl"])))
+def compare(sweep, size, n_images, dtype, device, turns):
+    """Return the table of lnocl and its peers on one scene."""
+    scene = Scene(sides.observation(size, n_images))
+    named = {"lnocl": sides.Lnocl(scene, dtype, device)}
+    for name, side in sides.peers_here().items():
+        keywords = {"device": device} if side is sides.VkFFT else {}
+        named[name] = side(scene, dtype, **keywords)
+    for side in named.values():
+        side(3)
+    expected = named["lnocl"].extended
+    for name, side in named.items():
+        error = np.abs(np.asarray(side.extended) - expected).max() / expected.max()
+        if error > 1e-4:
+            raise SystemExit(f"{name} does other work: its estimate is {error:.1e} off")
+    return rows(sweep, size, n_images, dtype, list(named), take_turns(named, turns))
+
+
+def compare_scenes(device, turns, size=1024, n_images=4):
+    """Return the table of what lnocl's iteration costs where a scene has more."""
+    plain = sides.observation(size, n_images)
+    wide = sides.observation(size, n_images, psf_size=size)
+    rng = np.random.default_rng(1)
+    stars = [tuple(map(int, rng.integers(0, size, 2))) for _ in range(16)]
+    scenes = {
+        "plain": Scene(plain),
+        "1 star": Scene(plain, stars[:1]),
+        "4 stars": Scene(plain, stars[:4]),
+        "16 stars": Scene(plain, stars),
+        "1 star, PSFs as large as the images": Scene(wide, stars[:1]),
+        "4 stars, PSFs as large as the images": Scene(wide, stars[:4]),
+        "mask": Scene(sides.observation(size, n_images, mask=True)),
+        "mu": Scene(plain, mu=1e-6),
+    }
+    named = {name: sides.Lnocl(scene, np.float32, device) for name, scene in scenes.items()}
+    named["no objective"] = without_objective(scenes["plain"], device)
+    return rows("scene", size, n_images, np.float32, list(named), take_turns(named, turns))
+
+
+def without_objective(scene, device):
+    """Return lnocl's iterations with kernels that leave the objective out."""
+    source = lnocl.program.source
+    text = source()
+    for line in ("divergence(m, r)", "guarded || g == 0 ? *term : (vec)INFINITY"):
+        assert text.count(f"*term = {line};") == 1
+        text = text.replace(f"*term = {line};", "*term = 0;")
+    lnocl.program.source = lambda names: text
+    try:
+        return sides.Lnocl(scene, np.float32, device)
+    finally:
+        lnocl.program.source = source
+
+
+SWEEPS = {
+    "size": lambda *given: [compare("size", n, 4, np.float32, *given) for n in SIZES],
+    "images": lambda *given: [compare("images", 1024, p, np.float32, *given) for p in IMAGES],
+    "double": lambda *given: [compare("double", n, 4, np.float64, *given) for n in DOUBLE_SIZES],
+    "scene": lambda *given: [compare_scenes(*given)],
+}
+
+
+def facts(device):
+    """Return what the figures were measured on and with."""
+    bandwidth, rate = measure(device)
+    needed = bytes_moved(4, 1024, 1024, 4), operations(4, 1024, 1024)
+    packages = ("lnocl", "numpy", "scipy", "pyopencl", "pyfftw", "mkl_fft", "jax", "pyvkfft")
+    versions = {}
+    for package in packages:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "not installed"
     return {
-        "lnocl": medians["lnocl"],
-        "scipy 1": medians[1],
-        "scipy 2": medians[2],
-        "ratio": ratio,
-        "device": ours.engine.name,
+        "device": describe(device),
+        "processors": os.cpu_count(),
+        "python": platform.python_version(),
+        "versions": versions,
+        "copy_GB_per_s": round(bandwidth / 1e9, 1),
+        "multiply_add_GFlop_per_s": round(rate / 1e9, 1),
+        "4x1024x1024_MB": round(needed[0] / 1e6, 1),
+        "4x1024x1024_ms_at_copy_bandwidth": round(1e3 * needed[0] / bandwidth, 2),
+        "4x1024x1024_GFlop_of_transforms": round(needed[1] / 1e9, 3),
+        "4x1024x1024_ms_at_multiply_add_rate": round(1e3 * needed[1] / rate, 2),
     }
 
 
+def plot(table, title, path):
+    """Plot time against size and against the number of images."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained")
+    for axis, sweep, x in zip(axes, ("size", "images"), ("size", "images"), strict=True):
+        part = table[table["sweep"] == sweep]
+        for name in dict.fromkeys(part["side"]):
+            of_side = part[part["side"] == name]
+            width = 2.5 if name == "lnocl" else 1.2
+            axis.plot(of_side[x], of_side["ms"], "o-", ms=4, lw=width, label=name)
+        axis.set(xlabel=x, ylabel="ms an iteration", yscale="log")
+    axes[0].set(xscale="log", title="4 images of size x size, single precision")
+    axes[0].set_xticks(SIZES, SIZES)
+    axes[0].minorticks_off()
+    axes[0].legend()
+    axes[1].set(title="images of 1024 x 1024, single precision")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=120)
+
+
 def main():
-    """Run the comparison that the arguments ask for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--size", type=int, default=1024)
-    parser.add_argument("--images", type=int, default=4)
-    parser.add_argument("--precision", choices=("single", "double"), default="single")
+    """Run the sweeps that the arguments ask for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sweep", nargs="+", choices=SWEEPS, default=list(SWEEPS))
     parser.add_argument("--device")
     parser.add_argument("--turns", type=int, default=9)
+    parser.add_argument("--output")
     given = parser.parse_args()
-    row = compare(given.size, given.images, given.precision, given.device, given.turns)
-    print(f"{given.images} x {given.size} x {given.size} {given.precision}, {row['device']}")
-    print(f"lnocl             {row['lnocl']:8.2f} ms an iteration")
-    print(f"SciPy, 1 worker   {row['scipy 1']:8.2f} ms")
-    print(f"SciPy, 2 workers  {row['scipy 2']:8.2f} ms")
-    print(f"SciPy's better / lnocl, median of {given.turns} turns: {row['ratio']:.2f}")
+    device = choose(given.device).device
+    print(describe(device), flush=True)
+    tables = []
+    for sweep in given.sweep:
+        for table in SWEEPS[sweep](given.device, given.turns):
+            table.pprint_all()
+            print(flush=True)
+            tables.append(table)
+    table = vstack(tables)
+    table.meta |= facts(device) | {"turns": given.turns}
+    for name, fact in table.meta.items():
+        print(f"{name}: {fact}")
+    if given.output:
+        table.write(f"{given.output}.ecsv", overwrite=True)
+        if {"size", "images"} <= set(given.sweep):
+            plot(table, table.meta["device"], f"{given.output}.png")
 
 
 if __name__ == "__main__":

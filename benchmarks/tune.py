@@ -2,31 +2,36 @@
 
     python benchmarks/tune.py [--size 1024] [--images 4] [--precision single] [--device SPEC]
 
-Each turn times every candidate once, a few iterations long, so that a noisy machine is noisy for
-all; the ratio is that to the present default of lnocl.program.tune, turn by turn, its median.
-A turn's order is random. A candidate's worth is in its ratio, not in its milliseconds.
+Candidates take turns in random order; the ratio is that to the present default of
+lnocl.program.tune, turn by turn, its median. A candidate's worth is in its ratio, not in its
+milliseconds.
 """
 
 import argparse
-import random
 from dataclasses import replace
 
 import numpy as np
-from iteration import OpenCLIterations, milliseconds, observation
+import pyopencl as cl
+from iteration import take_turns
+from sides import Lnocl, observation
 
 from lnocl.device import choose, describe
 from lnocl.program import tune
 from lnocl.scene import Scene
 
 
-def candidates(default):
+def candidates(default, device):
     """Return tunings to try: the default with one or two of its constants changed."""
     most = default.block
     tried = [default]
-    for lanes in (2 * most, most, most // 2):
-        tried.append(replace(default, lanes=lanes, block=lanes))
-    tried.append(replace(default, block=2 * most))
-    tried += [replace(default, chunk=chunk) for chunk in (32, 1024)]
+    if device.type & cl.device_type.CPU:
+        tried += [replace(default, lanes=n, block=n) for n in (2 * most, most // 2)]
+        tried += [replace(default, block=2 * most), replace(default, block=4 * most)]
+    else:
+        tried += [replace(default, block=n) for n in (2 * most, most // 2)]
+        tried += [replace(default, group=n) for n in (32, 64, 128, 256)]
+        tried += [replace(default, block=most // 2, group=n) for n in (32, 64, 256)]
+    tried += [replace(default, chunk=chunk) for chunk in (32, 64, 256, 1024)]
     tried += [replace(default, padding=padding) for padding in (0, 8, 32)]
     return list(dict.fromkeys(tried))
 
@@ -44,15 +49,9 @@ def main():
     dtype = np.dtype(np.float64 if given.precision == "double" else np.float32)
     scene = Scene(observation(given.size, given.images))
     default = tune(device, dtype, scene.grid)
-    tried = candidates(default)
-    runs = [OpenCLIterations(scene, given.precision, given.device, tuning) for tuning in tried]
-    count = max(2, round(4e6 / (given.size**2 * given.images)))
-    for run in runs:
-        run(1)
-    times = np.zeros((given.turns, len(runs)))
-    for turn in range(given.turns):
-        for i in random.sample(range(len(runs)), len(runs)):
-            times[turn, i] = milliseconds(lambda i=i: runs[i](count)) / count
+    tried = candidates(default, device)
+    runs = {tuning: Lnocl(scene, dtype.type, given.device, tuning) for tuning in tried}
+    times = take_turns(runs, given.turns)
     ratios = np.median(times / times[:, :1], axis=0)
     print(f"{given.images} x {given.size} x {given.size} {given.precision}, {describe(device)}")
     for i in np.argsort(ratios):
