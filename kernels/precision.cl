@@ -4,7 +4,7 @@
  *   REAL, BITS      float and int, or double and long
  *   LANES           reals in a vector: 16, 8, 4, 2 or 1
  *   BLOCK           columns, or pairs of rows, transformed together; a multiple of LANES
- *   GROUP           work-items that share a block
+ *   GROUP           work-items that share a block, a power of two
  *   ROW_OUTER, ROW_LAST, COLUMN_OUTER, COLUMN_LAST    radices of a transform, see fft.cl
  *   CHUNK           points of a transform that are finished before the next are begun
  *   SCRATCH_IS_GLOBAL   0 or 1: where a block lies while it is transformed

@@ -98,7 +98,7 @@ INLINE vec ratio(vec g, const vec m, vec *term)
  * background: [N_IMAGES], or N_IMAGES arrays of pixels (HAS_BACKGROUND_MAP).
  * star_images: [N_STARS][N_IMAGES] times star_blocks blocks of pixels, from block first_blocks_s on,
  * round the edge; beyond them P_js is 0. first_blocks, star_fluxes: [N_STARS].
- * sums: [ROW_BLOCKS][N_IMAGES][GROUP][N_SUMS][2].
+ * sums: [ROW_BLOCKS][N_IMAGES][N_SUMS][2].
  * Launch: up to ROW_BLOCKS N_IMAGES groups. In place. Scratch: NX points.
  * Twin: reference.ratio_rows.
  */
@@ -109,6 +109,7 @@ KERNEL void ratio_rows(
     const int star_blocks, __global const real *restrict star_fluxes,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
+    SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
     FOR_EACH_BLOCK(unit, ROW_BLOCKS * N_IMAGES) {
         const int block = unit / N_IMAGES, image = unit % N_IMAGES;
@@ -156,10 +157,10 @@ KERNEL void ratio_rows(
                 ACCUMULATE(products[near.star[s]], part[s]);
             store_forward(z + lane, a, x, NX, row_roots);
         }
-        __global real *item_sums = sums + 2 * ((size_t)unit * GROUP + ITEM) * N_SUMS;
-        store_sum(item_sums, objective);
+        __global real *unit_sums = sums + 2 * (size_t)unit * N_SUMS;
+        store_pair(unit_sums, sum_group(sum_lanes(objective), shared));
         for (int s = 0; s < N_STARS; ++s)
-            store_sum(item_sums + 2 * (1 + s), products[s]);
+            store_pair(unit_sums + 2 * (1 + s), sum_group(sum_lanes(products[s]), shared));
         BARRIER;
         dif_inner(z, NX, row_roots);
         write_tiles(row_spectra, z, block);

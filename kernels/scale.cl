@@ -4,7 +4,7 @@
  * spectra <- row spectrum of the new f; sums: sum f^2; c_s <- c_s star_corrections_s.
  * spectra: one array, in: row spectrum of c, out: twice the row spectrum of f.
  * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; where
- * there are none a = 1 / N_IMAGES). sums: [ROW_BLOCKS][GROUP][2] (HAS_MU).
+ * there are none a = 1 / N_IMAGES). sums: [ROW_BLOCKS][2] (HAS_MU).
  * star_fluxes, star_corrections: [N_STARS].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.scale_rows.
  */
@@ -14,6 +14,7 @@ KERNEL void scale_rows(
     __global const vec *restrict inverse_weight, __global const real *restrict star_corrections,
     const real mu, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
+    SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
     FOR_EACH_BLOCK(block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
@@ -53,7 +54,7 @@ KERNEL void scale_rows(
             store_forward(z + lane, a, x, NX, row_roots);
         }
 #if HAS_MU
-        store_sum(sums + 2 * (block * GROUP + ITEM), total);
+        store_pair(sums + 2 * block, sum_group(sum_lanes(total), shared));
 #endif
         BARRIER;
         dif_inner(z, NX, row_roots);

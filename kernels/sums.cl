@@ -19,33 +19,67 @@ typedef struct {
         (total).lost += (old_ - ((total).sum - part_)) + (value_ - part_);  \
     } while (0)
 
-/* An infinite sum has lost nothing: two-sum would make it NaN. */
-INLINE void store_pair(__global real *out, const real_sum total)
-{
-    out[0] = total.sum;
-    out[1] = isinf(total.sum) ? 0 : total.lost;
-}
+#define MERGE(total, other)                 \
+    do {                                    \
+        ACCUMULATE((total), (other).sum);   \
+        (total).lost += (other).lost;       \
+    } while (0)
 
-/* Sums the lanes and writes the pair to out[0], out[1]. */
-INLINE void store_sum(__global real *out, const vec_sum total)
+INLINE real_sum sum_lanes(const vec_sum total)
 {
     union { vec v; real lanes[LANES]; } sum = {total.sum}, lost = {total.lost};
     real_sum all = {0, 0};
     UNROLL
     for (int l = 0; l < LANES; ++l) {
-        ACCUMULATE(all, sum.lanes[l]);
-        all.lost += lost.lanes[l];
+        const real_sum lane = {sum.lanes[l], lost.lanes[l]};
+        MERGE(all, lane);
     }
-    store_pair(out, all);
+    return all;
 }
 
-/* The sum of n pairs, `stride` reals apart. */
+/* A place in local memory, in the kernel's outermost block, where a group's items meet. */
+#if GROUP > 1
+#define SHARED_SUMS(name) __local real_sum name[GROUP]
+#else
+#define SHARED_SUMS(name) __local real_sum *const name = 0
+#endif
+
+/* The sum of what the items of a group have, by halves; every item gets it. */
+INLINE real_sum sum_group(real_sum own, __local real_sum *shared)
+{
+#if GROUP > 1
+    shared[ITEM] = own;
+    BARRIER;
+    for (int count = GROUP / 2; count > 0; count /= 2) {
+        if (ITEM < count) {
+            own = shared[ITEM];
+            MERGE(own, shared[ITEM + count]);
+            shared[ITEM] = own;
+        }
+        BARRIER;
+    }
+    own = shared[0];
+    BARRIER;
+#endif
+    return own;
+}
+
+/* Writes a pair to out[0], out[1]. An infinite sum has lost nothing: two-sum would make it NaN. */
+INLINE void store_pair(__global real *out, const real_sum total)
+{
+    if (ITEM == 0) {
+        out[0] = total.sum;
+        out[1] = isinf(total.sum) ? 0 : total.lost;
+    }
+}
+
+/* This item's share of the sum of n pairs, `stride` reals apart. */
 INLINE real_sum sum_pairs(__global const real *pairs, const int n, const int stride)
 {
     real_sum all = {0, 0};
-    for (int i = 0; i < n; ++i) {
-        ACCUMULATE(all, pairs[i * stride]);
-        all.lost += pairs[i * stride + 1];
+    for (int i = ITEM; i < n; i += GROUP) {
+        const real_sum pair = {pairs[i * stride], pairs[i * stride + 1]};
+        MERGE(all, pair);
     }
     return all;
 }
@@ -55,26 +89,29 @@ INLINE real_sum sum_pairs(__global const real *pairs, const int n, const int str
 /* objective = sum of the data terms + mu / 2 sum f^2;
  * star_corrections_s = sum <P_js, r_j> / star_weights_s, not below 0 (negative PSF pixels).
  * objectives: [iterations][2], a compensated pair each; entry `iteration` is written.
- * ratio_sums: [ROW_BLOCKS][N_IMAGES][GROUP][N_SUMS][2]; square_sums: [ROW_BLOCKS][GROUP][2].
+ * ratio_sums: [ROW_BLOCKS][N_IMAGES][N_SUMS][2]; square_sums: [ROW_BLOCKS][2].
  * star_corrections, star_weights: [N_STARS].
- * Launch: one work-item. Out of place. Twin: reference.collect_sums.
+ * Launch: one group. Out of place. Twin: reference.collect_sums.
  */
-__kernel __attribute__((reqd_work_group_size(1, 1, 1))) void collect_sums(
+KERNEL void collect_sums(
     __global real *restrict objectives, __global real *restrict star_corrections,
     __global const real *restrict ratio_sums, __global const real *restrict square_sums,
     __global const real *restrict star_weights, const real mu, const int iteration)
 {
-    const int n = ROW_BLOCKS * N_IMAGES * GROUP;
-    real_sum objective = sum_pairs(ratio_sums, n, 2 * N_SUMS);
+    SHARED_SUMS(shared);
+    const int n = ROW_BLOCKS * N_IMAGES;
+    real_sum objective = sum_group(sum_pairs(ratio_sums, n, 2 * N_SUMS), shared);
 #if HAS_MU
-    const real_sum squares = sum_pairs(square_sums, ROW_BLOCKS * GROUP, 2);
-    ACCUMULATE(objective, mu / 2 * squares.sum);
-    objective.lost += mu / 2 * squares.lost;
+    real_sum squares = sum_group(sum_pairs(square_sums, ROW_BLOCKS, 2), shared);
+    squares.sum *= mu / 2;
+    squares.lost *= mu / 2;
+    MERGE(objective, squares);
 #endif
     store_pair(objectives + 2 * iteration, objective);
     for (int s = 0; s < N_STARS; ++s) {
-        const real_sum star = sum_pairs(ratio_sums + 2 * (1 + s), n, 2 * N_SUMS);
+        const real_sum star = sum_group(sum_pairs(ratio_sums + 2 * (1 + s), n, 2 * N_SUMS), shared);
         const real correction = (star.sum + star.lost) / star_weights[s];
-        star_corrections[s] = correction < 0 ? 0 : correction;
+        if (ITEM == 0)
+            star_corrections[s] = correction < 0 ? 0 : correction;
     }
 }

@@ -240,9 +240,9 @@ class Launcher:
         arguments = (*arguments, self._column_roots, self._scratch)
         return self._bind(name, self.program.column_blocks, arguments)
 
-    def single(self, name: str, *arguments: Any) -> Launch:
-        """Bind a kernel on one work-item."""
-        return Launch(self.queue, self.program.kernels[name], arguments, 1, 1)
+    def one_group(self, name: str, *arguments: Any) -> Launch:
+        """Bind a kernel on one work-group."""
+        return self._bind(name, 1, arguments)
 
     def _bind(self, name: str, blocks: int, arguments: tuple[Any, ...]) -> Launch:
         group = self.program.tuning.group

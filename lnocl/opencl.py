@@ -93,7 +93,6 @@ class OpenCLEngine:
         """Return the bytes of each buffer, by name."""
         program, layout = self.program, self.layout
         p, n, item = program.n_images, program.n_stars, program.dtype.itemsize
-        groups = program.row_blocks * program.tuning.group
         has_map = self.scene.observation.background.ndim == 3
         return {
             "images": p * layout.pixels_bytes,
@@ -108,8 +107,8 @@ class OpenCLEngine:
             "star_fluxes": max(n, 1) * item,
             "star_weights": max(n, 1) * item,
             "star_corrections": max(n, 1) * item,
-            "ratio_sums": groups * p * (1 + n) * 2 * item,
-            "square_sums": groups * 2 * item,
+            "ratio_sums": program.row_blocks * p * (1 + n) * 2 * item,
+            "square_sums": program.row_blocks * 2 * item,
             "objectives": (n_iter + 1) * 2 * item,
             "scratch and roots": Launcher.bytes_needed(program),
         }
@@ -155,7 +154,7 @@ class OpenCLEngine:
             buffers["star_fluxes"],
             blocks=self.program.row_blocks * self.program.n_images,
         )
-        self._collect = launcher.single(
+        self._collect = launcher.one_group(
             "collect_sums",
             buffers["objectives"],
             buffers["star_corrections"],

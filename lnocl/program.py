@@ -57,8 +57,12 @@ def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
     if device.type & cl.device_type.CPU:
         lanes = min(32 // dtype.itemsize, most)  # 256 bits, benchmarks/tune.py
         return Tuning(lanes=lanes, block=lanes)
-    group = max(1, min(128, min(grid) // 8, device.max_work_group_size))
+    group = max(1, min(128, min(grid) // 8, _power_of_2_up_to(device.max_work_group_size)))
     return Tuning(lanes=1, block=min(8, most), group=group)
+
+
+def _power_of_2_up_to(n: int) -> int:
+    return 1 << (n.bit_length() - 1)
 
 
 class Program:

@@ -152,10 +152,6 @@ class Bench:
         packed = self.layout.pack_columns(columns[order])[:, :ny]
         return packed, np.stack([edge.real, edge.imag], axis=-1)
 
-    @property
-    def ratio_groups(self):
-        return self.program.row_blocks * self.program.tuning.group
-
 
 def rounded(array, dtype):
     """Round inputs to the precision first, so that only the kernel's own error is left."""
@@ -307,7 +303,7 @@ def run_ratio_rows(b, i):
     images = i.images if i.weights is None else np.where(i.weights, i.images, -1.0)
     background = b.put_pixels(i.background) if i.background.size > i.p else b.put(i.background)
     out = b.put_spectra(i.model_spectra)
-    sums = b.put(np.full((b.ratio_groups * i.p, 1 + i.n, 2), np.nan))
+    sums = b.put(np.full((b.program.row_blocks * i.p, 1 + i.n, 2), np.nan))
     rows = [b.layout.rows_of(first, i.star_blocks) for first in i.first_blocks]
     stars = [image[r] for images, r in zip(i.star_images, rows, strict=True) for image in images]
     b.launcher.rows(
@@ -332,7 +328,7 @@ def run_scale_rows(b, i):
         i.correction_spectra, i.extended, i.inverse_weight, i.mu, i.star_fluxes, i.star_corrections
     )
     out, extended = b.put_spectra(i.correction_spectra), b.put_pixels(i.extended)
-    sums, star_fluxes = b.put(np.zeros((b.ratio_groups, 2))), b.put(i.star_fluxes)
+    sums, star_fluxes = b.put(np.zeros((b.program.row_blocks, 2))), b.put(i.star_fluxes)
     b.launcher.rows(
         "scale_rows",
         out,
@@ -352,15 +348,15 @@ def run_scale_rows(b, i):
 
 def run_collect_sums(b, i):
     rng = np.random.default_rng(7)
-    ratio_sums = rounded(rng.normal(size=(b.ratio_groups * i.p, 1 + i.n, 2)) + 1, b.dtype)
-    square_sums = rounded(rng.random((b.ratio_groups, 2)), b.dtype)
+    ratio_sums = rounded(rng.normal(size=(b.program.row_blocks * i.p, 1 + i.n, 2)) + 1, b.dtype)
+    square_sums = rounded(rng.random((b.program.row_blocks, 2)), b.dtype)
     totals = ratio_sums.sum(axis=(0, 2))
     objective, corrections = reference.collect_sums(
         totals[0], square_sums.sum(), totals[1:], i.star_weights, i.mu
     )
     objectives = b.put(np.full((3, 2), -1.0))
     star_corrections = b.put(np.zeros(i.n))
-    b.launcher.single(
+    b.launcher.one_group(
         "collect_sums",
         objectives,
         star_corrections,
@@ -401,7 +397,7 @@ def launch_ratio_rows(b, model, images, star_image):
     background = b.put([1.0])
     spectra, sums = (
         b.put_spectra(np.fft.rfft(model - 1.0)[None] / b.grid[1]),
-        b.put(np.zeros((b.ratio_groups, 2, 2))),
+        b.put(np.zeros((b.program.row_blocks, 2, 2))),
     )
     b.launcher.rows(
         "ratio_rows",
