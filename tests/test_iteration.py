@@ -14,6 +14,8 @@ import scipy.fft
 from scenes import ENGINES, Recipe, worst
 from scipy.special import kl_div
 
+from lnocl import program
+
 # Largest errors allowed (extended source, star fluxes) after so many iterations, about three
 # times those measured over all recipes; promised are 1e-10 in double, 2e-5 in single after 100.
 TOLERANCES = {
@@ -176,3 +178,16 @@ def test_objectives_are_those_of_scipy(engine, recipe):
     errors = np.abs(result.history["objective"] - objectives)
     errors /= np.maximum(objectives, n_pixels / 2)
     assert errors.max() <= OBJECTIVE_TOLERANCES[engine["precision"]]
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("recipe", ["64x256 two stars, map", "20x50 star, mu, mask, noise"])
+def test_the_tuning_of_a_gpu_gives_the_same(monkeypatch, precision, recipe):
+    """Several work-items share a block, whatever device there is."""
+    monkeypatch.setattr(program, "tune", lambda *_: program.Tuning(lanes=1, block=8, group=4))
+    made = RECIPES[recipe].make()
+    result = made.deconvolve(n_iter=CHECKPOINTS[1], engine="opencl", precision=precision)
+    extended, star_fluxes = expected(recipe)[0][CHECKPOINTS[1]]
+    extended_tolerance, star_tolerance = TOLERANCES[precision][CHECKPOINTS[1]]
+    assert worst(result.extended, extended) <= extended_tolerance
+    assert worst(result.star_fluxes, star_fluxes) <= star_tolerance
