@@ -180,8 +180,10 @@ def test_objectives_are_those_of_scipy(engine, recipe):
     assert errors.max() <= OBJECTIVE_TOLERANCES[engine["precision"]]
 
 
-@pytest.mark.parametrize("precision", ["single", "double"])
-@pytest.mark.parametrize("recipe", ["64x256 two stars, map", "20x50 star, mu, mask, noise"])
+@pytest.mark.parametrize(
+    ("precision", "recipe"),
+    [("single", "64x256 two stars, map"), ("double", "20x50 star, mu, mask, noise")],
+)
 def test_the_tuning_of_a_gpu_gives_the_same(monkeypatch, precision, recipe):
     """Several work-items share a block, whatever device there is."""
     monkeypatch.setattr(program, "tune", lambda *_: program.Tuning(lanes=1, block=8, group=4))
