@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
@@ -19,9 +18,9 @@ from lnocl.scene import LEAST_MODEL, Scene
 
 log = logging.getLogger("lnocl")
 
-# Iterations that may wait in the queue: enough to keep the device busy, few enough that an
-# interrupt is answered soon.
-ITERATIONS_AHEAD = 8
+# The host waits once in so many iterations, for those before them: often enough that an interrupt is
+# answered soon, seldom enough that the device never waits for the host.
+ITERATIONS_AHEAD = 4
 
 # Which argument of collect_sums is the iteration, the only one that changes in a run.
 COLLECT_ITERATION = 6
@@ -84,7 +83,8 @@ class OpenCLEngine:
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
         self._n_objectives = 0
-        self._pending: deque[cl.Event] = deque()
+        self._n_scaled = 0
+        self._last_mark: cl.Event | None = None
         self._allocate(n_iter)
         self._bind()
         self._upload_scene()
@@ -269,9 +269,12 @@ class OpenCLEngine:
 
     def scale(self) -> None:
         """Scale the estimate by its correction."""
-        self._pending.append(self._scale())
-        if len(self._pending) > ITERATIONS_AHEAD:
-            self._pending.popleft().wait()
+        event = self._scale()
+        self._n_scaled += 1
+        if self._n_scaled % ITERATIONS_AHEAD == 0:
+            if self._last_mark is not None:
+                self._last_mark.wait()
+            self._last_mark = event
 
     def extended(self) -> Array:
         """Return the extended source, on the grid and scaled."""
