@@ -18,8 +18,8 @@ from lnocl.scene import LEAST_MODEL, Scene
 
 log = logging.getLogger("lnocl")
 
-# The host waits once in so many iterations, for those before them: often enough that an interrupt is
-# answered soon, seldom enough that the device never waits for the host.
+# The host waits once in so many iterations, for those before them: often enough that an interrupt
+# is answered soon, seldom enough that the device never waits for the host.
 ITERATIONS_AHEAD = 4
 
 # Which argument of collect_sums is the iteration, the only one that changes in a run.
