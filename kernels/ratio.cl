@@ -74,7 +74,10 @@ INLINE near_stars stars_near(
     return near;
 }
 
-/* The ratio g / m, guarded, and the data term of the objective. g < 0: not observed. */
+/* w (g / m - 1), g / m guarded, and the data term of the objective. g < 0: not observed, w = 0.
+ * A transform's rounding is a share of what it is given: of g / m - 1, the noise, it is less than of
+ * g / m, which is about 1 everywhere.
+ */
 INLINE vec ratio(vec g, const vec m, vec *term)
 {
 #if HAS_WEIGHTS
@@ -87,13 +90,15 @@ INLINE vec ratio(vec g, const vec m, vec *term)
     *term = guarded || g == 0 ? *term : (vec)INFINITY;
 #if HAS_WEIGHTS
     *term = observed ? *term : (vec)0;
+    return observed ? r - 1 : (vec)0;
+#else
+    return r - 1;
 #endif
-    return r;
 }
 
-/* m_j = A_j f + sum_s c_s P_js + b_j;  r_j = w_j g_j / m_j;  spectra <- row spectra of r_j;
- * sums: J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j) and <P_js, r_j>.
- * spectra: N_IMAGES arrays, in: row spectra of A_j f, out: twice the row spectra of r_j.
+/* m_j = A_j f + sum_s c_s P_js + b_j;  r_j = w_j g_j / m_j;  spectra <- row spectra of r_j - w_j;
+ * sums: J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j) and <P_js, r_j - w_j>.
+ * spectra: N_IMAGES arrays, in: row spectra of A_j f, out: twice the row spectra of r_j - w_j.
  * images: N_IMAGES arrays of pixels, negative where not observed (HAS_WEIGHTS).
  * background: [N_IMAGES], or N_IMAGES arrays of pixels (HAS_BACKGROUND_MAP).
  * star_images: [N_STARS][N_IMAGES] times star_blocks blocks of pixels, from block first_blocks_s on,

@@ -1,6 +1,12 @@
 /* The SGM scalings, inside the transforms along the rows. */
 
-/* f <- f a c / (1 + mu f a), c = sum_j A_j^T r_j not below 0, a = 1 / sum_j A_j^T w_j;
+INLINE vec not_below_0(const vec x)
+{
+    return x < 0 ? (vec)0 : x;
+}
+
+/* f <- f (1 + a c) / (1 + mu f a), c = sum_j A_j^T (r_j - w_j), a = 1 / sum_j A_j^T w_j, and 1 + a c
+ * not below 0;
  * spectra <- row spectrum of the new f; sums: sum f^2; c_s <- c_s star_corrections_s.
  * spectra: one array, in: row spectrum of c, out: twice the row spectrum of f.
  * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; where
@@ -30,20 +36,17 @@ KERNEL void scale_rows(
             /* Left rolled: unrolled, the pixelwise work runs out of registers and is slower. */
             for (int q = 0; q < OUTER(NX); ++q) {
                 const int pixel = q * INNER(NX) + x;
-                cvec f = LOAD(source + lane, pixel);
+                const cvec f = LOAD(source + lane, pixel);
 #if HAS_WEIGHTS
                 const cvec weight = LOAD(inverse_weight + at + lane, pixel);
-                f.re *= weight.re;
-                f.im *= weight.im;
 #else
-                f.re *= (real)1 / N_IMAGES;
-                f.im *= (real)1 / N_IMAGES;
+                const cvec weight = {(real)1 / N_IMAGES, (real)1 / N_IMAGES};
 #endif
-                a[q].re = f.re * (a[q].re < 0 ? (vec)0 : a[q].re);
-                a[q].im = f.im * (a[q].im < 0 ? (vec)0 : a[q].im);
+                a[q].re = f.re * not_below_0(1 + weight.re * a[q].re);
+                a[q].im = f.im * not_below_0(1 + weight.im * a[q].im);
 #if HAS_MU
-                a[q].re /= 1 + mu * f.re;
-                a[q].im /= 1 + mu * f.im;
+                a[q].re /= 1 + mu * f.re * weight.re;
+                a[q].im /= 1 + mu * f.im * weight.im;
                 part += a[q].re * a[q].re + a[q].im * a[q].im;
 #endif
                 STORE(source + lane, pixel, a[q]);

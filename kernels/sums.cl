@@ -87,7 +87,7 @@ INLINE real_sum sum_pairs(__global const real *pairs, const int n, const int str
 #define N_SUMS (1 + N_STARS)
 
 /* objective = sum of the data terms + mu / 2 sum f^2;
- * star_corrections_s = sum <P_js, r_j> / star_weights_s, not below 0 (negative PSF pixels).
+ * star_corrections_s = 1 + sum <P_js, r_j - w_j> / star_weights_s, not below 0 (negative PSF pixels).
  * objectives: [iterations][2], a compensated pair each; entry `iteration` is written.
  * ratio_sums: [ROW_BLOCKS][N_IMAGES][N_SUMS][2]; square_sums: [ROW_BLOCKS][2].
  * star_corrections, star_weights: [N_STARS].
@@ -110,7 +110,7 @@ KERNEL void collect_sums(
     store_pair(objectives + 2 * iteration, objective);
     for (int s = 0; s < N_STARS; ++s) {
         const real_sum star = sum_group(sum_pairs(ratio_sums + 2 * (1 + s), n, 2 * N_SUMS), shared);
-        const real correction = (star.sum + star.lost) / star_weights[s];
+        const real correction = 1 + (star.sum + star.lost) / star_weights[s];
         if (ITEM == 0)
             star_corrections[s] = correction < 0 ? 0 : correction;
     }

@@ -54,7 +54,7 @@ def convolve_columns(row_spectrum: ComplexArray, otfs: ComplexArray) -> ComplexA
 
 
 def correlate_columns(row_spectra: ComplexArray, otfs: ComplexArray) -> ComplexArray:
-    """Return the row spectrum of ``sum_j A_j^T r_j`` from those of the r_j."""
+    """Return the row spectrum of ``sum_j A_j^T (r_j - w_j)`` from those of the r_j - w_j."""
     return ifft_columns((np.conj(otfs) * fft_columns(row_spectra)).sum(axis=0))
 
 
@@ -66,22 +66,22 @@ def ratio_rows(
     star_images: Array,
     star_fluxes: Array,
 ) -> tuple[ComplexArray, float, Array]:
-    """Return the row spectra of the ratio, the objective's data term, and the star sums.
+    """Return the row spectra of ``r_j - w_j``, the objective's data term, and the star sums.
 
-    ``m_j = A_j f + sum_s c_s P_js + b_j``, ``r_j = w_j g_j / m_j``, ``sum_j <P_js, r_j>`` and
+    ``m_j = A_j f + sum_s c_s P_js + b_j``, ``r_j = w_j g_j / m_j``, ``sum_j <P_js, r_j - w_j>`` and
     ``J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j)``; La Camera et al. (2012), Eq. 7 and 9.
     """
     model = irfft_rows(row_spectra) + background
     model += np.einsum("s,sjyx->jyx", star_fluxes, star_images)
     guarded = model > LEAST_MODEL
-    ratio = np.divide(images, model, out=np.zeros_like(model), where=guarded)
+    excess = np.divide(images, model, out=np.zeros_like(model), where=guarded) - 1.0
     divergence = np.where(images > 0, np.inf, model)
     divergence[guarded] = kl_div(images[guarded], model[guarded])
     if weights is not None:
-        ratio = np.where(weights, ratio, 0.0)
+        excess = np.where(weights, excess, 0.0)
         divergence = np.where(weights, divergence, 0.0)
-    star_sums = np.einsum("sjyx,jyx->s", star_images, ratio)
-    return rfft_rows(ratio), float(divergence.sum()), star_sums
+    star_sums = np.einsum("sjyx,jyx->s", star_images, excess)
+    return rfft_rows(excess), float(divergence.sum()), star_sums
 
 
 def collect_sums(
@@ -89,10 +89,10 @@ def collect_sums(
 ) -> tuple[float, Array]:
     """Return the objective ``J_0 + mu / 2 sum f^2`` and the star corrections.
 
-    A star's correction is ``sum_j <P_js, r_j> / sum_j <P_js, w_j>``; one that negative PSF pixels
-    have made negative counts as 0.
+    A star's correction is ``1 + sum_j <P_js, r_j - w_j> / sum_j <P_js, w_j>``; one that negative
+    PSF pixels have made negative counts as 0.
     """
-    return objective + 0.5 * mu * squares, np.maximum(star_sums / star_weights, 0.0)
+    return objective + 0.5 * mu * squares, np.maximum(1.0 + star_sums / star_weights, 0.0)
 
 
 def scale_rows(
@@ -105,13 +105,13 @@ def scale_rows(
 ) -> tuple[Array, ComplexArray, float, Array]:
     """Return the scaled extended source, its row spectrum and sum of squares, and star fluxes.
 
-    ``f <- f a c / (1 + mu f a)`` with ``c = sum_j A_j^T r_j`` and ``a = 1 / sum_j A_j^T w_j``,
-    0 where nothing was observed; ``c_s`` is multiplied by its correction; La Camera et al.
-    (2012), Eq. 9. A correction that rounding has made negative counts as 0.
+    ``f <- f (1 + a c) / (1 + mu f a)`` with ``c = sum_j A_j^T (r_j - w_j)`` and
+    ``a = 1 / sum_j A_j^T w_j``, 0 where nothing was observed; ``c_s`` is multiplied by its
+    correction; La Camera et al. (2012), Eq. 9, as ``sum_j A_j^T w_j`` is what ``r_j = w_j`` gives.
+    A correction ``1 + a c`` that rounding has made negative counts as 0.
     """
-    correction = np.maximum(irfft_rows(row_spectrum), 0.0)
-    scaled = extended * inverse_weight
-    scaled = scaled * correction / (1.0 + mu * scaled)
+    correction = np.maximum(1.0 + inverse_weight * irfft_rows(row_spectrum), 0.0)
+    scaled = extended * correction / (1.0 + mu * extended * inverse_weight)
     squares = float((scaled**2).sum())
     return scaled, rfft_rows(scaled), squares, star_fluxes * star_corrections
 

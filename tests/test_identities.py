@@ -28,7 +28,7 @@ FULL = Recipe(SHAPE, 3, 2, mu=1e-3, masked=0.05, background="map")
 PADDED = Recipe((11, 27), 3, 2, mu=1e-3, masked=0.05, background="map", pad=2)
 
 # What rounding leaves after 50 iterations: extended source, star fluxes, objective.
-ROUNDING = {"double": (1e-14, 1.9e-15, 8e-16), "single": (4.3e-6, 3.6e-7, 1.2e-7)}
+ROUNDING = {"double": (2.7e-15, 4.4e-16, 8e-16), "single": (1.7e-6, 2.5e-7, 1.2e-7)}
 # What it leaves of a sum over the sky.
 SUM_ROUNDING = {"double": 8.5e-16, "single": 4.4e-7}
 
@@ -162,10 +162,12 @@ def test_one_iteration_through_a_single_pixel_averages_the_images(engine):
 @every_engine
 def test_dark_images_give_a_dark_sky(engine):
     made = MASKED.make()
-    result = made.deconvolve(made.observation(images=0.0 * made.images), n_iter=3, **engine)
-    assert not result.extended.any()
-    assert not result.star_fluxes.any()
-    np.testing.assert_array_equal(result.history["objective"][1:], 0.0)
+    result = made.deconvolve(made.observation(images=0.0 * made.images), n_iter=1, **engine)
+    rounding = SUM_ROUNDING[engine["precision"]]
+    assert (result.extended <= rounding * made.initial_extended.max()).all()
+    assert (result.star_fluxes <= rounding * made.initial_star_fluxes).all()
+    before, after = result.history["objective"]
+    assert after <= rounding * before
 
 
 @double_engines
