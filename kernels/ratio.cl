@@ -77,7 +77,8 @@ INLINE near_stars stars_near(
     return near;
 }
 
-/* w (g / m - 1), g / m guarded, and the data term of the objective. g < 0: not observed, w = 0.
+/* w (g / m - 1) and the data term of the objective; g < 0: not observed, w = 0. The guard: m counts
+ * as LEAST_MODEL where it is less, and g / m as 0 there, as the light that it wants is nowhere.
  * A transform's rounding is a share of what it is given: of g / m - 1, the noise, it is less than of
  * g / m, which is about 1 everywhere.
  */
@@ -88,9 +89,10 @@ INLINE vec ratio(vec g, const vec m, vec *term)
     g = observed ? g : (vec)0;
 #endif
     const ivec guarded = m > (real)LEAST_MODEL;
-    const vec r = guarded ? g / m : (vec)0;
-    *term = divergence(m, r);
-    *term = guarded || g == 0 ? *term : (vec)INFINITY;
+    const vec modelled = guarded ? m : (vec)(real)LEAST_MODEL;
+    const vec quotient = g / modelled;
+    const vec r = guarded ? quotient : (vec)0;
+    *term = divergence(modelled, quotient);
 #if HAS_WEIGHTS
     *term = observed ? *term : (vec)0;
     return observed ? r - 1 : (vec)0;

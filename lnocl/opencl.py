@@ -140,7 +140,7 @@ class OpenCLEngine:
         """Bind the kernels of an iteration, in its order."""
         buffers, launcher = self._buffers, self._launcher
         otfs = buffers["otfs"], buffers["otf_edges"]
-        mu = self.program.dtype.type(self._rounded("mu", self.scene.mu))
+        mu = self.program.dtype.type(self.scene.mu)
         self._convolve = launcher.columns("convolve_columns", buffers["spectra"], *otfs)
         self._ratio = launcher.rows(
             "ratio_rows",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import kl_div
+from scipy.special import xlog1py
 
 from lnocl.observation import Array
 from lnocl.scene import LEAST_MODEL, Scene
@@ -70,13 +70,16 @@ def ratio_rows(
 
     ``m_j = A_j f + sum_s c_s P_js + b_j``, ``r_j = w_j g_j / m_j``, ``sum_j <P_js, r_j - w_j>`` and
     ``J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j)``; La Camera et al. (2012), Eq. 7 and 9.
+    Where ``m_j`` is not above `LEAST_MODEL`, ``r_j = 0`` and ``m_j = LEAST_MODEL`` in J_0.
     """
     model = irfft_rows(row_spectra) + background
     model += np.einsum("s,sjyx->jyx", star_fluxes, star_images)
     guarded = model > LEAST_MODEL
-    excess = np.divide(images, model, out=np.zeros_like(model), where=guarded) - 1.0
-    divergence = np.where(images > 0, np.inf, model)
-    divergence[guarded] = kl_div(images[guarded], model[guarded])
+    model = np.where(guarded, model, LEAST_MODEL)
+    ratio = images / model
+    # Its terms of first order cancel, those of scipy.special.kl_div only the terms themselves.
+    divergence = model * (xlog1py(ratio, ratio - 1.0) - (ratio - 1.0))
+    excess = np.where(guarded, ratio, 0.0) - 1.0
     if weights is not None:
         excess = np.where(weights, excess, 0.0)
         divergence = np.where(weights, divergence, 0.0)

@@ -23,6 +23,9 @@ OBSERVED_SHARE = 0.01
 # taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
 LEAST_MODEL = 2.0**-64
 
+# Of mu, scaled: what the images say has no weight long before, and it stays in float32's range.
+MOST_MU = 2.0**64
+
 
 class Scene:
     """What is modelled, on a grid of powers of two, scaled to images of about unit mean.
@@ -79,9 +82,13 @@ class Scene:
             raise InputError(f"mu must be a number, finite and not negative; {mu!r} was given")
         self.grid = _grid(observation.shape, pad)
         self._warn_of_large_psf()
-        good = observation.images[~observation.mask]
-        self.scale = 2.0 ** math.frexp(good.mean())[1] if good.any() else 1.0
+        self.scale = _scale(observation.images[~observation.mask])
         self.mu = float(mu) * self.scale
+        if self.mu > MOST_MU:
+            raise InputError(
+                f"mu {mu:g} is too large for images of about {self.scale:g} electrons per pixel; "
+                f"the most that means anything there is {MOST_MU / self.scale:g}"
+            )
         observed = ~observation.mask
         self.weights = (
             None if observed.all() and self.grid == observation.shape else self._on_grid(observed)
@@ -224,6 +231,15 @@ class Scene:
                 LnoclWarning,
                 stacklevel=4,
             )
+
+
+def _scale(good: Array) -> float:
+    """Return the power of two just above the mean of some pixels; 1 where they are all 0."""
+    with np.errstate(over="ignore"):
+        mean = float(good.mean())
+    if not math.isfinite(mean):
+        raise InputError("the images are too large to be summed: divide them by a constant")
+    return 2.0 ** math.frexp(mean)[1] if mean > 0 else 1.0
 
 
 def _is_real(value: object) -> bool:

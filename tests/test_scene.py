@@ -175,6 +175,7 @@ REFUSED = {
     "complex mu": ({"mu": 1j}, "mu"),
     "None for mu": ({"mu": None}, "mu must be a number, finite and not negative; None"),
     "several mu": ({"mu": np.ones((2, 2))}, "mu"),
+    "mu too large for the images": ({"mu": 1e30}, "mu 1e+30 is too large for images of about"),
     "no iteration": ({"n_iter": 0}, "n_iter must be a whole number, 1 or more; 0 was given"),
     "negative n_iter": ({"n_iter": -1}, "n_iter must be a whole number, 1 or more; -1"),
     "fractional n_iter": ({"n_iter": 1.5}, "n_iter must be a whole number, 1 or more; 1.5"),
