@@ -79,7 +79,7 @@ def test_counts_contrast_background_and_mu(engine, counts, contrast, share, mu, 
     if mu * 2.0 ** np.frexp(images[~MASK].mean())[1] <= MOST_MU:
         deconvolve(engine, images, mask=MASK, background=background, mu=mu)
     else:
-        with pytest.raises(lnocl.InputError, match="mu .* is too large for images"):
+        with pytest.raises(lnocl.InputError, match=r"mu .* is too large for images"):
             deconvolve(engine, images, mask=MASK, background=background, mu=mu)
 
 
