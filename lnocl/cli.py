@@ -86,10 +86,10 @@ def _make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_deconvolve_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_input_arguments(parser: argparse.ArgumentParser, required: bool) -> None:
     parser.add_argument(
         "images",
-        nargs="+",
+        nargs="+" if required else "*",
         metavar="IMAGE",
         help="FITS file with an image, in electrons per pixel, or one file with a cube of them",
     )
@@ -97,7 +97,7 @@ def _add_deconvolve_arguments(parser: argparse.ArgumentParser) -> None:
         "--psf",
         nargs="+",
         action="extend",
-        required=True,
+        required=required,
         dest="psfs",
         metavar="PSF",
         help="FITS file with a PSF, its peak at (ky // 2, kx // 2): one for all images or one "
@@ -128,6 +128,10 @@ def _add_deconvolve_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X,Y",
         help="position of a point source in pixels, 0-based, x along columns; may be repeated",
     )
+
+
+def _add_deconvolve_arguments(parser: argparse.ArgumentParser) -> None:
+    _add_input_arguments(parser, required=True)
     parser.add_argument(
         "--mu",
         type=float,
@@ -425,6 +429,68 @@ def _demo(arguments: argparse.Namespace) -> None:
         _say([line])
 
 
+def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = "Without IMAGE the demo's scene is taken, whose truth is known."
+    _add_input_arguments(parser, required=False)
+    parser.add_argument(
+        "--mu",
+        type=float,
+        help="weight of the Tikhonov term on the extended source, per electron (default: 0; "
+        "that of lnocl demo for its scene)",
+    )
+    parser.add_argument(
+        "--size",
+        type=int,
+        metavar="N",
+        help="pixels along each side of the demo's scene (default: 256)",
+    )
+    parser.add_argument(
+        "--n-iter",
+        type=int,
+        default=400,
+        metavar="N",
+        help="most iterations, 8 or more; N/8, N/4 and N/2 are measured too (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--accuracy",
+        type=float,
+        default=1e-3,
+        metavar="A",
+        help="deviation from double precision that the advice may have, and excess of the "
+        "objective over that of double precision that the table times (default: %(default)s)",
+    )
+    _add_device(parser)
+    parser.add_argument(
+        "-o", "--output", metavar="STEM", help="write the table to STEM.ecsv, a plot to STEM.png"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace these files")
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
+
+
+def _bench(arguments: argparse.Namespace) -> None:
+    from lnocl import bench, device
+
+    source = bench.choose_source(
+        arguments.images,
+        arguments.psfs,
+        arguments.background,
+        arguments.read_noise,
+        arguments.stars,
+        arguments.mu,
+        arguments.size,
+    )
+    for line in bench.run(
+        source,
+        arguments.n_iter,
+        arguments.accuracy,
+        device.spec_of(device.choose(arguments.device).device),
+        arguments.output,
+        arguments.overwrite,
+        progress=not arguments.quiet,
+    ):
+        _say([line])
+
+
 def _add_plot_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "results",
@@ -502,6 +568,12 @@ COMMANDS = {
         "draw the paper's figures from results: objects, errors, magnitude and profiles",
         _add_plot_arguments,
         _plot,
+    ),
+    "bench": Command(
+        "time single and double precision, padding and iterations, measure how far each strays "
+        "from double precision, and say which to take",
+        _add_bench_arguments,
+        _bench,
     ),
     "devices": Command(
         "list the OpenCL devices, and say which one is used and why", _add_no_arguments, _devices

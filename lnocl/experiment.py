@@ -214,18 +214,43 @@ def profile_errors(simulation: Simulation, found: Reconstruction) -> dict[str, f
     """
     truth, star = simulation.extended, _only_star(simulation)
     masked = star if found.method == "RLM" else None
-    near = slice(max(star[1] - NEAR_STAR, 0), star[1] + NEAR_STAR)
+    near = near_star(star)
+    errors = profile_deviations(found.extended, truth, masked)
+    return {kind: _mean_size(each[near]) for kind, each in errors.items()}
+
+
+def near_star(star: tuple[int, int]) -> slice:
+    """Return the 40 rows around the star, 20 before it and 19 after it, those that are there."""
+    return slice(max(star[1] - NEAR_STAR, 0), star[1] + NEAR_STAR)
+
+
+def profile_deviations(
+    extended: Array, truth: Array, masked: tuple[int, int] | None = None
+) -> dict[str, Array]:
+    """Return the signed relative errors of flux and width profile, row by row.
+
+    Parameters
+    ----------
+    extended, truth : ndarray of float64, shape (ny, nx)
+        The source to measure and the one to measure it by, electrons per pixel.
+    masked : (x, y), optional
+        Position of the star around which 3 rows are left out, where it is in `extended` (RLM).
+
+    Returns
+    -------
+    dict of str to ndarray of float64, shape (ny,)
+        ``flux``, NaN where the true row is fainter than a twentieth of the brightest, and
+        ``width``, NaN where no true pixel of the row is above `width_threshold`.
+    """
     true_flux = metrics.flux_profile(truth)
     true_flux = np.where(true_flux < JET_SHARE * true_flux.max(), 0.0, true_flux)
-    flux = metrics.relative_error(metrics.flux_profile(found.extended, masked), true_flux)
     threshold = width_threshold(truth)
-    width = metrics.relative_error(
-        metrics.width_profile(found.extended, threshold, masked),
-        metrics.width_profile(truth, threshold),
-    )
     return {
-        "flux": _mean_size(flux[near]),
-        "width": _mean_size(width[near]),
+        "flux": metrics.relative_error(metrics.flux_profile(extended, masked), true_flux),
+        "width": metrics.relative_error(
+            metrics.width_profile(extended, threshold, masked),
+            metrics.width_profile(truth, threshold),
+        ),
     }
 
 

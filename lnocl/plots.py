@@ -26,6 +26,7 @@ DPI = 110
 # The palette of M. Okabe and K. Ito, "Color Universal Design" (2008), for all kinds of sight.
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 STYLES = ("-", "--", "-.", ":")
+MARKERS = ("o", "s", "^", "D")
 COLOUR_MAP = "viridis"
 
 # Pixels shown around the star: to the left and right, before and beyond it along the jet.
@@ -340,6 +341,54 @@ def profiles(
         profile.set_title(title, fontsize=10)
         profile.set_xlabel("")
     _legend_of_profiles(figure, axes[0, 0], found)
+    return figure
+
+
+def costs(settings: Mapping[str, Mapping[str, NDArray]], measure: str) -> Figure:
+    """Draw what settings deviate from a reference against the time they take.
+
+    Parameters
+    ----------
+    settings : mapping of str to mapping of str to ndarray
+        For each name the columns ``seconds``, ``deviation`` (relative) and ``front`` (whether
+        nothing is both faster and closer).
+    measure : str
+        What deviates, for the axis.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One panel, both axes logarithmic; a line joins the front. A deviation of 0, such as that
+        of the reference, has no place on the axis: a dotted line marks its time.
+
+    Raises
+    ------
+    LnoclError
+        Where matplotlib is missing.
+    """
+    figure = _figure(6.5, 4.5)
+    axis = figure.subplots()
+    seconds, deviation, front = (
+        np.concatenate([columns[name] for columns in settings.values()])
+        for name in ("seconds", "deviation", "front")
+    )
+    joined = np.flatnonzero(front.astype(bool) & (deviation > 0))
+    joined = joined[np.argsort(seconds[joined])]
+    axis.plot(seconds[joined], deviation[joined], color="0.6", lw=4, alpha=0.5, label="front")
+    for i, (name, columns) in enumerate(settings.items()):
+        shown = columns["deviation"] > 0
+        axis.plot(
+            columns["seconds"][shown],
+            columns["deviation"][shown],
+            MARKERS[i % len(MARKERS)],
+            color=_line(i)["color"],
+            label=name,
+        )
+    for time in seconds[deviation == 0]:
+        axis.axvline(time, color="black", lw=1, ls=":", label="reference (deviation 0)")
+    axis.set(xscale="log", yscale="log", xlabel="time (s)", ylabel=f"deviation, {measure}")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=9)
     return figure
 
 

@@ -11,7 +11,9 @@ import lnocl
 LAYERS = {
     "__init__": {"deconvolution", "observation"},
     "__main__": {"cli"},
-    "cli": {"deconvolution", "device", "fitsio", "observation", "simulate", "plots", "demo"},
+    "cli": {"deconvolution", "device", "fitsio", "observation", "simulate", "demo", "bench"},
+    "bench": {"demo", "experiment", "fitsio", "observation", "plots", "simulate", "trade"},
+    "trade": {"deconvolution", "experiment", "metrics", "observation", "simulate"},
     "demo": {"experiment", "fitsio", "metrics", "plots", "simulate"},
     "experiment": {"deconvolution", "metrics", "observation", "simulate"},
     "deconvolution": {"observation", "scene", "solvers", "reference", "opencl"},
