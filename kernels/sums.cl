@@ -64,12 +64,12 @@ INLINE real_sum sum_group(real_sum own, __local real_sum *shared)
     return own;
 }
 
-/* Writes a pair to out[0], out[1]. An infinite sum has lost nothing: two-sum would make it NaN. */
+/* Writes a pair to out[0], out[1]. */
 INLINE void store_pair(__global real *out, const real_sum total)
 {
     if (ITEM == 0) {
         out[0] = total.sum;
-        out[1] = isinf(total.sum) ? 0 : total.lost;
+        out[1] = total.lost;
     }
 }
 

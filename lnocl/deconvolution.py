@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, LnoclWarning
 from lnocl.observation import Array, Observation
 from lnocl.scene import Scene
 from lnocl.solvers import SOLVERS, Engine
@@ -23,6 +24,11 @@ ENGINES = ("opencl", "numpy")
 
 # Seconds between two looks at the objective for the progress bar: each look waits for the device.
 PROGRESS_INTERVAL = 0.1
+
+# What single precision strays from double, as a share of the extended source, for each iteration of
+# a long run, and the share that is worth a warning (benchmarks/precision.py, docs/precision.md).
+STRAY_PER_ITERATION = 8e-9
+STRAY_WORTH_A_WARNING = 1e-3
 
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
@@ -169,7 +175,8 @@ def deconvolve(
     Warns
     -----
     LnoclWarning
-        A PSF that is larger than the grid, whose wings wrap round.
+        A PSF that is larger than the grid, whose wings wrap round; so many iterations that single
+        precision is expected to stray from double by a thousandth of the extended source.
 
     References
     ----------
@@ -193,6 +200,8 @@ def deconvolve(
     _check_choices(solver, precision, engine, stop, device)
     if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
         raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")
+    if engine == "opencl" and precision == "single":
+        _warn_of_straying(int(n_iter))
     scene = Scene(observation, stars, mu, pad)
     extended, star_fluxes = scene.start(initial_extended, initial_star_fluxes)
     running = _make_engine(engine, scene, precision, device, n_iter)
@@ -216,6 +225,17 @@ def _check_choices(
         raise InputError(f"stop {stop!r} is not known; give None")
     if engine == "numpy" and device is not None:
         raise InputError(f"engine numpy uses no device; leave device {device!r} out")
+
+
+def _warn_of_straying(n_iter: int) -> None:
+    stray = STRAY_PER_ITERATION * n_iter
+    if stray > STRAY_WORTH_A_WARNING:
+        warnings.warn(
+            f"single precision is expected to stray from double by {stray:.1g} of the extended "
+            f"source after {n_iter} iterations; take precision double, or fewer iterations",
+            LnoclWarning,
+            stacklevel=3,
+        )
 
 
 def _make_engine(engine: str, scene: Scene, precision: str, device: str | None, n_iter: int) -> Any:

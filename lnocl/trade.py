@@ -395,7 +395,9 @@ def _rows(
 
 def _tabulate(rows: Sequence[dict[str, Any]], **meta: Any) -> Table:
     table = Table(rows=list(rows), names=list(rows[0]), meta=meta)
-    table["front"] = front(table["seconds"], table[judged(table)])
+    # To the digits shown: rounding alone does not make a setting closer than another.
+    shown = [float(f"{deviation:.1e}") for deviation in table[judged(table)]]
+    table["front"] = front(table["seconds"], shown)
     for name in table.colnames:
         unit, form, description = COLUMNS[name]
         column = table[name]

@@ -195,6 +195,15 @@ def test_subnormals_may_be_flushed(monkeypatch):
     assert worst(result.star_fluxes, expected.star_fluxes) <= 1e-6
 
 
+def test_single_precision_is_warned_of_in_very_long_runs():
+    observation = lnocl.Observation(np.ones((8, 8)), np.ones((1, 1)))
+    once = {"callback": lambda *_: True}
+    with pytest.warns(lnocl.LnoclWarning, match="stray from double by 0.002 of the extended"):
+        lnocl.deconvolve(observation, n_iter=200_000, **once)
+    lnocl.deconvolve(observation, n_iter=100_000, **once)
+    lnocl.deconvolve(observation, n_iter=200_000, precision="double", **once)
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_a_hundred_thousand_iterations(precision):

@@ -118,7 +118,8 @@ class TestNumbers:
         assert np.isnan(table["star_flux"]).all() == (not stars)
         assert np.isfinite(table["flux"]).all()
         assert trade.judged(table) == "deviation"
-        expected = trade.front(table["seconds"], table["deviation"])
+        shown = [float(f"{deviation:.1e}") for deviation in table["deviation"]]
+        expected = trade.front(table["seconds"], shown)
         np.testing.assert_array_equal(table["front"], expected)
 
     @pytest.mark.usefixtures("numpy_only")
