@@ -234,12 +234,12 @@ class Scene:
 
 
 def _scale(good: Array) -> float:
-    """Return the power of two just above the mean of some pixels; 1 where they are all 0."""
+    """Return the power of two just above the mean of some pixels; 1 where that is 0."""
     with np.errstate(over="ignore"):
         mean = float(good.mean())
     if not math.isfinite(mean):
         raise InputError("the images are too large to be summed: divide them by a constant")
-    return 2.0 ** math.frexp(mean)[1] if mean > 0 else 1.0
+    return 2.0 ** math.frexp(mean)[1]
 
 
 def _is_real(value: object) -> bool:

@@ -171,9 +171,9 @@ def inputs(b):
         return rounded(np.fft.rfft(rng.normal(size=(count, ny, nx)), axis=-1), dtype)
 
     model = rng.uniform(0.5, 3.0, (p, ny, nx))
-    model[:, 0, 0] = -1.0  # the division guard
+    model[:, 0, :2] = -1.0  # the division guard
     images = rng.poisson(3.0, (p, ny, nx)) / 3.0
-    images[:, 0, 0] = 0.0
+    images[:, 0, :2] = 0.0, 1.0
     weights = rng.random((p, ny, nx)) > 0.2
     # One star is seen in all blocks; of two, each in half of them, the first round the edge.
     row_blocks = b.program.row_blocks
