@@ -123,7 +123,7 @@ class FFTW:
         plain = Peer(scene, dtype)
         ny, nx = scene.grid
         self.p, self.images, self.background = plain.p, plain.images, plain.background
-        # FFTW does not normalise; half of it rides with the forward and the adjoint OTFs each.
+        # FFTW does not normalise its inverse; the OTFs do it, forward and adjoint.
         self.otfs, self.adjoint_otfs = plain.otfs / (ny * nx), plain.adjoint_otfs / (ny * nx)
         self.otfs = self.otfs.astype(plain.otfs.dtype)
         self.adjoint_otfs = self.adjoint_otfs.astype(plain.otfs.dtype)

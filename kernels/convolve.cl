@@ -103,7 +103,8 @@ KERNEL void convolve_columns(
 }
 
 /* spectra_0 <- IFFT(sum_j conj(otf_j) FFT(spectra_j)) along the columns: the row spectrum of
- * sum_j A_j^T (r_j - w_j) from those of the r_j - w_j. Shapes as in convolve_columns; array 0 alone is written.
+ * sum_j A_j^T (r_j - w_j) from those of the r_j - w_j. Shapes as in convolve_columns; array 0 alone
+ * is written.
  * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: 2 NY points.
  * Twin: reference.correlate_columns.
  */

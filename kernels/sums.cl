@@ -87,7 +87,8 @@ INLINE real_sum sum_pairs(__global const real *pairs, const int n, const int str
 #define N_SUMS (1 + N_STARS)
 
 /* objective = sum of the data terms + mu / 2 sum f^2;
- * star_corrections_s = 1 + sum <P_js, r_j - w_j> / star_weights_s, not below 0 (negative PSF pixels).
+ * star_corrections_s = 1 + sum <P_js, r_j - w_j> / star_weights_s, not below 0 (negative PSF
+ * pixels).
  * objectives: [iterations][2], a compensated pair each; entry `iteration` is written.
  * ratio_sums: [ROW_BLOCKS][N_IMAGES][N_SUMS][2]; square_sums: [ROW_BLOCKS][2].
  * star_corrections, star_weights: [N_STARS].
