@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.observation import Array, Observation
+from lnocl.scaling import Scaling, prepare
 from lnocl.scene import Scene
 from lnocl.solvers import SOLVERS, Engine
 
@@ -84,7 +85,8 @@ class Result:
     n_iter : int
         Iterations done.
     stop_reason : str
-        ``"n_iter"`` or ``"callback"``.
+        ``"n_iter"``, ``"callback"``, or ``"converged"``: no step of ``"sgp"`` lets the objective
+        fall any more, in the precision used.
     device : str
         Name of the device, its platform and driver; ``"numpy"`` for the reference.
     history : ndarray, fields ``iteration`` (int64) and ``objective`` (float64)
@@ -119,8 +121,9 @@ def deconvolve(
 
     Minimises ``J = sum_j sum_n [g_j ln(g_j / m_j) + m_j - g_j] + mu / 2 sum f^2`` over the star
     fluxes c and the extended source f, with ``m_j = K_j * f + sum_s c_s P_js + b_j``, stopped
-    after `n_iter` iterations of the split-gradient method. Without stars and with ``mu = 0``
-    this is Richardson-Lucy for several images.
+    after `n_iter` iterations. The split-gradient method without stars and with ``mu = 0`` is
+    Richardson-Lucy for several images; the scaled gradient projection method needs a tenth of its
+    iterations and less.
 
     Parameters
     ----------
@@ -130,8 +133,9 @@ def deconvolve(
         Positions of the point sources in pixels, 0-based, x along columns; whole numbers.
     mu : float, optional
         Weight of the Tikhonov term on the extended source, per electron; zero or more.
-    solver : {"sgm"}, optional
-        Iteration to use.
+    solver : {"sgm", "sgp"}, optional
+        Iteration to use: the split-gradient method, or the scaled gradient projection method, which
+        solves for the star fluxes at the start, so that those given matter little.
     n_iter : int, optional
         Iterations to do, 1 or more.
     stop : None, optional
@@ -182,7 +186,8 @@ def deconvolve(
     ----------
     A. La Camera, S. Antoniucci, M. Bertero et al., "Image reconstruction for observations with
     a high dynamic range: LINC-NIRVANA simulations of a stellar jet", Proc. SPIE 8445 (2012),
-    Eq. 7 to 9.
+    Eq. 7 to 9. S. Bonettini, R. Zanella, L. Zanni, "A scaled gradient projection method for
+    constrained image deblurring", Inverse Problems 25, 015002 (2009).
 
     Examples
     --------
@@ -204,7 +209,10 @@ def deconvolve(
         _warn_of_straying(int(n_iter))
     scene = Scene(observation, stars, mu, pad)
     extended, star_fluxes = scene.start(initial_extended, initial_star_fluxes)
-    running = _make_engine(engine, scene, precision, device, n_iter)
+    scaling = None
+    if solver == "sgp":
+        star_fluxes, scaling = prepare(scene, extended, star_fluxes)
+    running = _make_engine(engine, scene, precision, device, n_iter, scaling)
     running.start(extended, star_fluxes)
     done, stop_reason = _run(solver, running, scene, int(n_iter), callback, progress)
     return _wrap_up(running, scene, done, stop_reason)
@@ -238,11 +246,19 @@ def _warn_of_straying(n_iter: int) -> None:
         )
 
 
-def _make_engine(engine: str, scene: Scene, precision: str, device: str | None, n_iter: int) -> Any:
+def _make_engine(
+    engine: str,
+    scene: Scene,
+    precision: str,
+    device: str | None,
+    n_iter: int,
+    scaling: Scaling | None,
+) -> Any:
     # Imported where it is chosen: the reference runs where no OpenCL is installed.
     if engine == "numpy":
-        return importlib.import_module("lnocl.reference").ReferenceEngine(scene)
-    return importlib.import_module("lnocl.opencl").OpenCLEngine(scene, precision, device, n_iter)
+        return importlib.import_module("lnocl.reference").ReferenceEngine(scene, scaling)
+    opencl = importlib.import_module("lnocl.opencl")
+    return opencl.OpenCLEngine(scene, precision, device, n_iter, scaling=scaling)
 
 
 def _run(
@@ -256,6 +272,7 @@ def _run(
     # disable=None is tqdm's word for "quiet where stderr is no terminal".
     bar = tqdm(total=n_iter, unit="it", disable=None if progress else True)
     shown = time.monotonic()
+    iteration = 0
     with bar:
         for iteration in SOLVERS[solver](engine, n_iter):
             if not bar.disable and time.monotonic() - shown > PROGRESS_INTERVAL:
@@ -268,13 +285,17 @@ def _run(
                 stopped = callback(iteration, estimate)
                 estimate._close()
                 if stopped:
-                    return iteration, "callback"
-        bar.update(n_iter - bar.n)
-    return n_iter, "n_iter"
+                    stop_reason = "callback"
+                    break
+        else:
+            stop_reason = "n_iter" if iteration == n_iter else "converged"
+        bar.update(iteration - bar.n)
+    return iteration, stop_reason
 
 
 def _wrap_up(engine: Any, scene: Scene, done: int, stop_reason: str) -> Result:
-    engine.ratio()  # records the objective of the last estimate
+    if len(engine.objectives()) == done:
+        engine.ratio()  # records the objective of the last estimate
     history = np.zeros(done + 1, HISTORY_DTYPE)
     history["iteration"] = np.arange(done + 1)
     history["objective"] = engine.objectives() * scene.scale

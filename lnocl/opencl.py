@@ -13,7 +13,8 @@ from lnocl.device import choose, describe
 from lnocl.errors import DeviceError, InputError
 from lnocl.fft import READ_WRITE, Launcher, Layout
 from lnocl.observation import Array
-from lnocl.program import Program, Tuning
+from lnocl.program import SOURCES, STEP_SOURCES, Program, Tuning
+from lnocl.scaling import Scaling
 from lnocl.scene import LEAST_MODEL, Scene
 
 log = logging.getLogger("lnocl")
@@ -24,6 +25,8 @@ ITERATIONS_AHEAD = 4
 
 # Which argument of collect_sums is the iteration, the only one that changes in a run.
 COLLECT_ITERATION = 6
+# And which of step_rows are alpha and the share.
+STEP_ALPHA, STEP_SHARE = 10, 11
 
 
 class OpenCLEngine:
@@ -41,6 +44,8 @@ class OpenCLEngine:
         Most iterations that will be done: objectives are recorded for one more.
     tuning : Tuning, optional
         By default that of `lnocl.program.tune`.
+    scaling : Scaling, optional
+        For the scaled gradient projection method; without it its verbs are not there.
 
     Raises
     ------
@@ -57,10 +62,11 @@ class OpenCLEngine:
         device: str | None,
         n_iter: int,
         tuning: Tuning | None = None,
+        scaling: Scaling | None = None,
     ) -> None:
         chosen = choose(device).device
         self.name = describe(chosen)
-        self.scene = scene
+        self.scene, self.scaling = scene, scaling
         self._context = cl.Context([chosen])
         observation = scene.observation
         self.program = Program(
@@ -68,6 +74,7 @@ class OpenCLEngine:
             scene.grid,
             np.dtype(np.float64 if precision == "double" else np.float32),
             tuning,
+            SOURCES if scaling is None else STEP_SOURCES,
             n_images=scene.n_images,
             n_stars=scene.n_stars,
             has_mu=scene.mu > 0,
@@ -88,6 +95,10 @@ class OpenCLEngine:
         self._allocate(n_iter)
         self._bind()
         self._upload_scene()
+        if scaling is not None:
+            self._bind_steps()
+            self._upload_pixels("shift", [scaling.shift])
+            self._upload_pixels("reach", scaling.reach)
 
     def _sizes(self, n_iter: int) -> dict[str, int]:
         """Return the bytes of each buffer, by name."""
@@ -110,7 +121,21 @@ class OpenCLEngine:
             "ratio_sums": program.row_blocks * p * (1 + n) * 2 * item,
             "square_sums": program.row_blocks * 2 * item,
             "objectives": (n_iter + 1) * 2 * item,
+            **({} if self.scaling is None else self._step_sizes()),
             "scratch and roots": Launcher.bytes_needed(program),
+        }
+
+    def _step_sizes(self) -> dict[str, int]:
+        """Return the bytes of the buffers that only steps need, by name."""
+        program, layout = self.program, self.layout
+        pair = 2 * program.dtype.itemsize
+        return {
+            "previous": layout.pixels_bytes,
+            "gradient": layout.pixels_bytes,
+            "shift": layout.pixels_bytes,
+            "reach": max(program.n_stars * layout.pixels_bytes, pair),
+            "change_sums": program.row_blocks * 2 * pair,
+            "step_sums": program.row_blocks * (1 + program.n_stars) * pair,
         }
 
     def _refuse_if_too_large(self, n_iter: int) -> int:
@@ -174,6 +199,38 @@ class OpenCLEngine:
             buffers["inverse_weight"],
             buffers["star_corrections"],
             mu,
+        )
+
+    def _bind_steps(self) -> None:
+        """Bind the kernels of the scaled gradient projection method."""
+        buffers, launcher = self._buffers, self._launcher
+        real = self.program.dtype.type
+        mu = real(self.scene.mu)
+        self._gradient = launcher.rows(
+            "gradient_rows",
+            buffers["spectra"],
+            buffers["change_sums"],
+            buffers["gradient"],
+            buffers["previous"],
+            buffers["extended"],
+            buffers["shift"],
+            buffers["inverse_weight"],
+            mu,
+        )
+        self._step = launcher.rows(
+            "step_rows",
+            buffers["spectra"],
+            buffers["extended"],
+            buffers["step_sums"],
+            buffers["square_sums"],
+            buffers["previous"],
+            buffers["gradient"],
+            buffers["shift"],
+            buffers["inverse_weight"],
+            buffers["reach"],
+            mu,
+            real(0),
+            real(0),
         )
 
     def _upload_scene(self) -> None:
@@ -254,6 +311,9 @@ class OpenCLEngine:
         squares = np.zeros(self._buffers["square_sums"].size // self.program.dtype.itemsize)
         squares[0] = (extended**2).sum()
         self._upload("square_sums", squares)
+        if self.scaling is not None:
+            self._upload_pixels("previous", [extended])
+            self._upload_pixels("gradient", [np.zeros_like(extended)])
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
@@ -275,6 +335,41 @@ class OpenCLEngine:
             if self._last_mark is not None:
                 self._last_mark.wait()
             self._last_mark = event
+
+    def gradient(self) -> tuple[float, float]:
+        """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""
+        self._gradient()
+        change_step, change_change = self._sums("change_sums", 2)
+        return float(change_step), float(change_change)
+
+    def star_gradient(self) -> Array:
+        """Return the gradient of the objective in the star fluxes."""
+        return -self._sums("ratio_sums", 1 + self.scene.n_stars)[1:]
+
+    def step(self, alpha: float, share: float) -> tuple[float, Array]:
+        """Step from the base; return ``<gradient, d>`` and ``<reach_s, d>``."""
+        real = self.program.dtype.type
+        self._step.kernel.set_arg(STEP_ALPHA, real(alpha))
+        self._step.kernel.set_arg(STEP_SHARE, real(share))
+        self._step()
+        sums = self._sums("step_sums", 1 + self.scene.n_stars)
+        return float(sums[0]), sums[1:]
+
+    def set_star_fluxes(self, star_fluxes: Array) -> None:
+        """Make these the star fluxes."""
+        if self.scene.n_stars:
+            self._upload("star_fluxes", star_fluxes)
+
+    def objective(self) -> float:
+        """Return the objective recorded last, scaled."""
+        pair = np.empty(2, self.program.dtype)
+        offset = (self._n_objectives - 1) * pair.nbytes
+        cl.enqueue_copy(self._queue, pair, self._buffers["objectives"], src_offset=offset)
+        return float(pair.astype(np.float64).sum())
+
+    def forget_objective(self) -> None:
+        """Take the objective recorded last off the record."""
+        self._n_objectives -= 1
 
     def extended(self) -> Array:
         """Return the extended source, on the grid and scaled."""
@@ -312,6 +407,11 @@ class OpenCLEngine:
                 f"cannot be held in {self.program.dtype}: scale the scene, or take precision double"
             )
         return rounded
+
+    def _sums(self, name: str, n_sums: int) -> Array:
+        """Return sums over pixels from the pairs that each block left."""
+        n_pairs = self._buffers[name].size // self.program.dtype.itemsize
+        return self._download(name, n_pairs).reshape(-1, n_sums, 2).sum(axis=(0, 2))
 
     def _download(self, name: str, count: int) -> Array:
         values = np.empty(count, self.program.dtype)

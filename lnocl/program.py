@@ -12,9 +12,11 @@ import pyopencl as cl
 from lnocl.device import describe, has_double
 from lnocl.errors import DeviceError
 
-# In the order in which they build on each other: the transforms by themselves, and all.
+# In the order in which they build on each other: the transforms by themselves; the split-gradient
+# method; and the scaled gradient projection method.
 TRANSFORMS = ("precision.cl", "complex.cl", "fft.cl", "rows.cl", "columns.cl")
 SOURCES = (*TRANSFORMS, "convolve.cl", "sums.cl", "ratio.cl", "scale.cl")
+STEP_SOURCES = (*SOURCES, "step.cl")
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Program:
     tuning : Tuning, optional
         By default that of `tune`.
     sources : tuple of str, optional
-        Files of kernels to build, `SOURCES` or `TRANSFORMS`.
+        Files of kernels to build, `SOURCES`, `TRANSFORMS` or `STEP_SOURCES`.
     n_images, n_stars : int, optional
         What the scene has.
     has_mu, has_weights, has_background_map : bool, optional

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import xlog1py
 
 from lnocl.observation import Array
+from lnocl.scaling import Scaling
 from lnocl.scene import LEAST_MODEL, Scene
 
 ComplexArray = NDArray[np.complex128]
@@ -119,6 +120,54 @@ def scale_rows(
     return scaled, rfft_rows(scaled), squares, star_fluxes * star_corrections
 
 
+def scaling(extended: Array, shift: Array, inverse_weight: Array | float, mu: float) -> Array:
+    """Return ``D = (f + z) a / (1 + mu (f + z) a)``, the scaling of a gradient; z is the shift."""
+    scaled = (extended + shift) * inverse_weight
+    return scaled / (1.0 + mu * scaled)
+
+
+def gradient_rows(
+    row_spectrum: ComplexArray,
+    extended: Array,
+    previous: Array,
+    gradient: Array,
+    shift: Array,
+    inverse_weight: Array | float,
+    mu: float,
+) -> tuple[Array, float, float]:
+    """Return the gradient of J in f, and the products ``<D y, s>`` and ``<D y, D y>``.
+
+    The gradient is ``mu f - c``, ``c = sum_j A_j^T (r_j - w_j)``; y is its change from `gradient`
+    and s that of f from `previous`.
+    """
+    following = mu * extended - irfft_rows(row_spectrum)
+    change = scaling(extended, shift, inverse_weight, mu) * (following - gradient)
+    return following, float((change * (extended - previous)).sum()), float((change**2).sum())
+
+
+def step_rows(
+    extended: Array,
+    gradient: Array,
+    shift: Array,
+    inverse_weight: Array | float,
+    reach: Array,
+    mu: float,
+    alpha: float,
+    share: float,
+) -> tuple[Array, ComplexArray, float, float, Array]:
+    """Return ``f + share d``, its row spectrum and squares, ``<gradient, d>`` and ``<reach_s, d>``.
+
+    ``d = P(f - alpha D gradient) - f`` with P the projection on ``f >= 0``; Bonettini, Zanella &
+    Zanni (2009), Inverse Problems 25, 015002.
+    """
+    scaled = scaling(extended, shift, inverse_weight, mu) * gradient
+    direction = np.maximum(extended - alpha * scaled, 0.0) - extended
+    trial = np.maximum(extended + share * direction, 0.0)
+    slope = float((gradient * direction).sum())
+    reached = np.einsum("syx,yx->s", reach, direction)
+    return trial, rfft_rows(trial), float((trial**2).sum()), slope, reached
+
+
 class ReferenceEngine:
     """The iteration's verbs in plain NumPy, float64: the engine ``"numpy"``.
 
@@ -126,12 +175,14 @@ class ReferenceEngine:
     ----------
     scene : Scene
         What is modelled.
+    scaling : Scaling, optional
+        For the scaled gradient projection method.
     """
 
     name = "numpy"
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    def __init__(self, scene: Scene, scaling: Scaling | None = None) -> None:
+        self.scene, self.scaling = scene, scaling
         self._images = scene.images()
         background = scene.background()
         self._background = background if background.ndim == 3 else background[:, None, None]
@@ -156,10 +207,12 @@ class ReferenceEngine:
         self._star_fluxes = star_fluxes.copy()
         self._row_spectrum = rfft_rows(self._extended)
         self._squares = float((self._extended**2).sum())
+        self._previous = self._extended
+        self._gradient = np.zeros_like(self._extended)
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
-        self._ratio_row_spectra, objective, star_sums = ratio_rows(
+        self._ratio_row_spectra, objective, self._star_sums = ratio_rows(
             convolve_columns(self._row_spectrum, self._otfs),
             self._images,
             self.scene.weights,
@@ -168,7 +221,7 @@ class ReferenceEngine:
             self._star_fluxes,
         )
         objective, self._star_corrections = collect_sums(
-            objective, self._squares, star_sums, self.scene.star_weights, self.scene.mu
+            objective, self._squares, self._star_sums, self.scene.star_weights, self.scene.mu
         )
         self._objectives.append(objective)
 
@@ -186,6 +239,52 @@ class ReferenceEngine:
             self._star_fluxes,
             self._star_corrections,
         )
+
+    def gradient(self) -> tuple[float, float]:
+        """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""
+        assert self.scaling is not None
+        self._gradient, change_step, change_change = gradient_rows(
+            self._row_spectrum,
+            self._extended,
+            self._previous,
+            self._gradient,
+            self.scaling.shift,
+            self._inverse_weight,
+            self.scene.mu,
+        )
+        self._previous = self._extended
+        return change_step, change_change
+
+    def star_gradient(self) -> Array:
+        """Return the gradient of the objective in the star fluxes."""
+        return -self._star_sums
+
+    def step(self, alpha: float, share: float) -> tuple[float, Array]:
+        """Step from the base; return ``<gradient, d>`` and ``<reach_s, d>``."""
+        assert self.scaling is not None
+        self._extended, self._row_spectrum, self._squares, slope, reached = step_rows(
+            self._previous,
+            self._gradient,
+            self.scaling.shift,
+            self._inverse_weight,
+            self.scaling.reach,
+            self.scene.mu,
+            alpha,
+            share,
+        )
+        return slope, reached
+
+    def set_star_fluxes(self, star_fluxes: Array) -> None:
+        """Make these the star fluxes."""
+        self._star_fluxes = star_fluxes.copy()
+
+    def objective(self) -> float:
+        """Return the objective recorded last."""
+        return self._objectives[-1]
+
+    def forget_objective(self) -> None:
+        """Take the objective recorded last off the record."""
+        self._objectives.pop()
 
     def extended(self) -> Array:
         """Return the extended source, on the grid and scaled."""

@@ -5,11 +5,37 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
+import numpy as np
+
 from lnocl.observation import Array
+
+# Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002: the line search shortens a step to
+# this share until the objective falls by so much of what the slope promises; steps keep in these
+# bounds.
+SHORTER = 0.4
+SUFFICIENT = 1e-4
+ALPHA_BOUNDS = 1e-5, 1e5
+# Barzilai-Borwein steps among which the smallest is taken: docs/sgp.md.
+STEPS_KEPT = 2
+# A step this often shortened is lost in rounding.
+MOST_SHORTENED = 12
+
+
+class StarSteps(Protocol):
+    """How star fluxes follow the extended source."""
+
+    def star_step(self, fluxes: Array, gradient: Array, reached: Array) -> Array:
+        """Return the change of the star fluxes for their gradient and what a step reaches."""
 
 
 class Engine(Protocol):
-    """The verbs of an iteration; estimates are on the grid and scaled, as in `lnocl.scene`."""
+    """The verbs of an iteration; estimates are on the grid and scaled, as in `lnocl.scene`.
+
+    The split-gradient method needs those as far as `scale`; the scaled gradient projection method
+    `ratio`, `correct` and those from `gradient` on.
+    """
+
+    scaling: StarSteps | None
 
     def start(self, extended: Array, star_fluxes: Array) -> None:
         """Begin from this estimate."""
@@ -22,6 +48,31 @@ class Engine(Protocol):
 
     def scale(self) -> None:
         """Scale the estimate by its correction."""
+
+    def gradient(self) -> tuple[float, float]:
+        """Take the estimate as the base of the next step and the correction for its gradient.
+
+        Return ``<D y, s>`` and ``<D y, D y>``, with s and y the changes of estimate and gradient
+        since the last base, and D the scaling.
+        """
+
+    def star_gradient(self) -> Array:
+        """Return the gradient of the objective in the star fluxes."""
+
+    def step(self, alpha: float, share: float) -> tuple[float, Array]:
+        """Make the estimate the base plus a share of d, its projected step of length alpha.
+
+        Return ``<gradient, d>`` and what d reaches of the stars.
+        """
+
+    def set_star_fluxes(self, star_fluxes: Array) -> None:
+        """Make these the star fluxes."""
+
+    def objective(self) -> float:
+        """Return the objective recorded last."""
+
+    def forget_objective(self) -> None:
+        """Take the objective recorded last off the record."""
 
     def extended(self) -> Array:
         """Return the extended source."""
@@ -47,4 +98,56 @@ def sgm(engine: Engine, n_iter: int) -> Iterator[int]:
         yield iteration
 
 
-SOLVERS = {"sgm": sgm}
+def sgp(engine: Engine, n_iter: int) -> Iterator[int]:
+    """Iterate the scaled gradient projection method, yielding the number of iterations done.
+
+    ``f <- f + share d``, ``d = P(f - alpha D grad J) - f``, P the projection on ``f >= 0`` and D
+    the shifted scaling of `lnocl.scaling` (Bonettini, Zanella & Zanni 2009, Inverse Problems 25,
+    015002). alpha is the smaller of the last two steps of Barzilai and Borwein (1988, IMA J.
+    Numer. Anal. 8, 141), their second, in the metric of D. The star fluxes follow the extended
+    source, by `Scaling.star_step`. The share is 1, shortened until the objective falls enough; it
+    never rises. Ends early where no step lets it fall any more.
+    """
+    alpha, steps = 1.0, [ALPHA_BOUNDS[1]] * STEPS_KEPT
+    engine.ratio()
+    for iteration in range(1, n_iter + 1):
+        engine.correct()
+        change_step, change_change = engine.gradient()
+        if iteration > 1:
+            steps = [*steps[1:], _barzilai_borwein(change_step, change_change, alpha)]
+            alpha = min(steps)
+        if not _descend(engine, alpha):
+            return
+        yield iteration
+
+
+def _barzilai_borwein(change_step: float, change_change: float, alpha: float) -> float:
+    """Return the next alpha from ``<D y, s>`` and ``<D y, D y>``; longer where J bends down."""
+    step = change_step / change_change if min(change_step, change_change) > 0 else 10.0 * alpha
+    return float(np.clip(step, *ALPHA_BOUNDS))
+
+
+def _descend(engine: Engine, alpha: float) -> bool:
+    """Step along the projected gradient as far as the objective falls; return whether it fell."""
+    objective, fluxes, gradient = engine.objective(), engine.star_fluxes(), engine.star_gradient()
+    slope, reached = engine.step(alpha, 1.0)
+    assert engine.scaling is not None
+    change = engine.scaling.star_step(fluxes, gradient, reached)
+    if slope + gradient @ change >= 0:  # following the extended source would lead uphill
+        change = engine.scaling.star_step(fluxes, gradient, np.zeros_like(reached))
+    slope += float(gradient @ change)
+    share = 1.0
+    for _ in range(MOST_SHORTENED):
+        engine.set_star_fluxes(fluxes + share * change)
+        engine.ratio()
+        if engine.objective() <= objective + SUFFICIENT * share * slope:
+            return True
+        engine.forget_objective()
+        share *= SHORTER
+        engine.step(alpha, share)
+    engine.step(alpha, 0.0)
+    engine.set_star_fluxes(fluxes)
+    return False
+
+
+SOLVERS = {"sgm": sgm, "sgp": sgp}

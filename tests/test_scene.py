@@ -182,7 +182,7 @@ REFUSED = {
     "text for n_iter": ({"n_iter": "5"}, "n_iter must be a whole number, 1 or more; 5"),
     "None for n_iter": ({"n_iter": None}, "n_iter must be a whole number, 1 or more; None"),
     "several n_iter": ({"n_iter": np.ones((2, 2), int)}, "n_iter"),
-    "unknown solver": ({"solver": "sgp"}, "solver 'sgp' is not known; choose from sgm"),
+    "unknown solver": ({"solver": "cg"}, "solver 'cg' is not known; choose from sgm, sgp"),
     "unknown engine": ({"engine": "cuda"}, "engine 'cuda' is not known; choose from opencl, numpy"),
     "unknown precision": (
         {"precision": "half"},

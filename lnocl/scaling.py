@@ -1,0 +1,156 @@
+"""The scaling of the scaled gradient projection method, made from a scene and where it starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+import scipy.sparse
+
+from lnocl.observation import Array
+from lnocl.scene import LEAST_MODEL, Scene
+
+# What a pixel sees of star and background shifts its scaling by this share. With all of it the
+# empty sky takes up noise from the first steps on, without any it is stuck where it is 0: measured
+# in docs/sgp.md.
+SHIFT = 0.1
+# Of the images' mean: what a pixel is taken to see at least.
+LEAST_SEEN = 2.0**-10
+
+# A star's flux falls to this share at most in one step, so that it never reaches 0 by a step that
+# was too long.
+MOST_FADING = 0.1
+# The fit of the star fluxes ends where they change by less of their standard error.
+FIT_CHANGE = 1e-6
+FIT_ROUNDS = 50
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """What steps of the extended source and of the star fluxes are measured with.
+
+    Attributes
+    ----------
+    shift : ndarray of float64, shape (Ny, Nx)
+        z in the scaling ``D = (f + z) / (alpha + mu (f + z))``, ``alpha = sum_j A_j^T w_j``: a
+        share of ``alpha / sum_j A_j^T (w_j / (sum_s c_s P_js + b_j))``, what the pixel sees of
+        stars and background.
+    star_covariance : ndarray of float64, shape (n, n)
+        Inverse of the Fisher information of the star fluxes,
+        ``sum_j <P_js, w_j P_jt / m_j>`` at the start.
+    reach : ndarray of float64, shape (n, Ny, Nx)
+        Fisher information between each star flux and the extended source,
+        ``sum_j A_j^T (w_j P_js / m_j)`` at the start.
+    """
+
+    shift: Array
+    star_covariance: Array
+    reach: Array
+
+    def star_step(self, fluxes: Array, gradient: Array, reached: Array) -> Array:
+        """Return the change of the star fluxes that follows a step d of the extended source.
+
+        ``-F^-1 (gradient + <reach, d>)``: to the fluxes that are best where the step leads, to
+        second order, with the information F of the start; none falls by more than nine tenths.
+        """
+        change = -self.star_covariance @ (gradient + reached)
+        return np.maximum(change, (MOST_FADING - 1.0) * fluxes)
+
+
+class _Model:
+    """The model of a scene and its derivatives, on the host."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._shape = (scene.n_images, *scene.grid)
+        self.otfs = np.array([scipy.fft.rfft2(scene.psf(j)) for j in range(scene.n_images)])
+        self.weights = np.ones(self._shape) if scene.weights is None else scene.weights
+        background = scene.background()
+        self.background = background if background.ndim == 3 else background[:, None, None]
+        self.stars = _star_rows(scene)
+
+    def forward(self, extended: Array) -> Array:
+        """Return the A_j f, shape (p, Ny, Nx)."""
+        spectrum = scipy.fft.rfft2(extended)
+        return scipy.fft.irfft2(self.otfs * spectrum, self._shape[1:], workers=-1)
+
+    def adjoint(self, arrays: Array) -> Array:
+        """Return ``sum_j A_j^T x_j``, shape (Ny, Nx)."""
+        spectra = scipy.fft.rfft2(arrays, workers=-1)
+        return scipy.fft.irfft2((self.otfs.conj() * spectra).sum(axis=0), self._shape[1:])
+
+    def starlight(self, star_fluxes: Array) -> Array:
+        """Return ``sum_s c_s P_js``, shape (p, Ny, Nx)."""
+        return (self.stars.T @ star_fluxes).reshape(self._shape)
+
+
+def _star_rows(scene: Scene) -> scipy.sparse.csr_array:
+    """Return the star images P_js, each star a row of p Ny Nx pixels."""
+    size = scene.n_images * scene.grid[0] * scene.grid[1]
+    rows = [scipy.sparse.csr_array((0, size))]
+    for s in range(scene.n_stars):
+        images = [scene.star_image(j, s).ravel() for j in range(scene.n_images)]
+        rows.append(scipy.sparse.csr_array(np.concatenate(images)[None]))
+    return scipy.sparse.vstack(rows, format="csr")
+
+
+def prepare(scene: Scene, extended: Array, star_fluxes: Array) -> tuple[Array, Scaling]:
+    """Return the star fluxes that are best for this extended source, and the scaling of steps.
+
+    The fluxes minimise ``J`` for the extended source as given, whatever fluxes they are sought
+    from; so the answer does not hang on those.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is modelled.
+    extended : ndarray of float64, shape (Ny, Nx)
+        Extended source to start from, on the grid and scaled.
+    star_fluxes : ndarray of float64, shape (n,)
+        Where the fluxes are sought from, scaled.
+    """
+    model = _Model(scene)
+    diffuse = np.maximum(model.forward(extended) + model.background, 0.0)
+    fluxes = _fit_stars(model, scene.images(), diffuse, star_fluxes)
+    return fluxes, _make_scaling(scene, model, diffuse, fluxes)
+
+
+def _fit_stars(model: _Model, images: Array, diffuse: Array, star_fluxes: Array) -> Array:
+    """Return the star fluxes that minimise J, by Fisher scoring over the pixels that they light."""
+    lit = np.unique(model.stars.indices)
+    stars = model.stars[:, lit]
+    weights = np.broadcast_to(model.weights, images.shape).ravel()[lit]
+    images, diffuse = images.ravel()[lit], diffuse.ravel()[lit]
+    fluxes = star_fluxes
+    for _ in range(FIT_ROUNDS if len(fluxes) else 0):
+        total = np.maximum(diffuse + stars.T @ fluxes, LEAST_MODEL)
+        covariance = _covariance(stars, weights / total)
+        step = covariance @ (stars @ (weights * (images / total - 1.0)))
+        before, fluxes = fluxes, np.maximum(fluxes + step, MOST_FADING * fluxes)
+        if (abs(fluxes - before) <= FIT_CHANGE * np.sqrt(np.diag(covariance))).all():
+            break
+    return fluxes
+
+
+def _covariance(stars: scipy.sparse.csr_array, weights: Array) -> Array:
+    """Return the inverse of ``sum_j <P_js, w P_jt>``, the information of the star fluxes."""
+    information = (stars.multiply(weights.reshape(1, -1)) @ stars.T).toarray()
+    return np.linalg.pinv(information, hermitian=True)
+
+
+def _make_scaling(scene: Scene, model: _Model, diffuse: Array, fluxes: Array) -> Scaling:
+    starlight = model.starlight(fluxes)
+    total = np.maximum(diffuse + starlight, LEAST_MODEL)
+    seen = np.maximum(starlight + model.background, LEAST_SEEN)
+    observed = model.adjoint(np.broadcast_to(model.weights, seen.shape).astype(np.float64))
+    inverse = model.adjoint(model.weights / seen)
+    shift = np.divide(observed, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+    reach = [
+        model.adjoint((star.toarray().reshape(total.shape)) * model.weights / total)
+        for star in (model.stars[[s]] for s in range(scene.n_stars))
+    ]
+    return Scaling(
+        SHIFT * np.maximum(shift, 0.0),
+        _covariance(model.stars, (model.weights / total).ravel()),
+        np.array(reach).reshape(scene.n_stars, *scene.grid),
+    )
