@@ -134,20 +134,33 @@ def _add_deconvolve_arguments(parser: argparse.ArgumentParser) -> None:
     _add_input_arguments(parser, required=True)
     parser.add_argument(
         "--mu",
-        type=float,
+        type=_number_or_word,
         default=0.0,
-        help="weight of the Tikhonov term on the extended source, per electron "
-        "(default: %(default)s)",
+        metavar="MU",
+        help="weight of the Tikhonov term on the extended source, per electron, or auto: chosen by "
+        "held-out counts (default: %(default)s)",
     )
     parser.add_argument(
-        "--solver", choices=tuple(SOLVERS), default="sgm", help="iteration (default: %(default)s)"
+        "--solver",
+        choices=tuple(SOLVERS),
+        default="sgm",
+        help="split-gradient method, or scaled gradient projection, which needs a tenth of the "
+        "iterations and less (default: %(default)s)",
     )
     parser.add_argument(
         "--n-iter",
         type=int,
         default=1000,
         metavar="N",
-        help="iterations to do (default: %(default)s)",
+        help="iterations to do, at most (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--stop",
+        type=_number_or_word,
+        metavar="RULE",
+        help="stop before N: held-out, at the iteration that held-out counts choose; discrepancy, "
+        "when the data are fitted as well as noise allows; or a number, when the objective changes "
+        "relatively by less an iteration",
     )
     parser.add_argument(
         "--pad",
@@ -199,6 +212,7 @@ def _deconvolve(arguments: argparse.Namespace) -> None:
             mu=arguments.mu,
             solver=arguments.solver,
             n_iter=arguments.n_iter,
+            stop=arguments.stop,
             precision=arguments.precision,
             engine=arguments.engine,
             device=device,
@@ -215,6 +229,7 @@ def _deconvolve(arguments: argparse.Namespace) -> None:
         cards=_cards(arguments, result, background, read_noise, images.sha256, psfs.sha256),
         commands=[["cd", folder], _repeating_command(arguments, background, read_noise, device)],
         overwrite=arguments.overwrite,
+        held_out=result.held_out if result.held_out.size else None,
     )
     if not arguments.quiet:
         _say(_summary(arguments, result))
@@ -243,7 +258,7 @@ def _cards(
         ("SOLVER", arguments.solver, "iteration"),
         ("NITER", result.n_iter, "iterations done"),
         ("STOPPED", result.stop_reason, "why it stopped"),
-        ("MU", arguments.mu, "weight of the Tikhonov term, per electron"),
+        ("MU", result.mu, "weight of the Tikhonov term, per electron"),
         ("PAD", arguments.pad, "least unobserved pixels round the images"),
         ("PRECISIO", _precision(arguments), "precision of the arithmetic"),
         ("ENGINE", arguments.engine, "engine"),
@@ -273,9 +288,10 @@ def _repeating_command(
         "--read-noise",
         *map(repr, read_noise),
         *(word for x, y in arguments.stars for word in ("--star", f"{x!r},{y!r}")),
-        *("--mu", repr(arguments.mu)),
+        *("--mu", str(arguments.mu)),
         *("--solver", arguments.solver),
         *("--n-iter", str(arguments.n_iter)),
+        *(() if arguments.stop is None else ("--stop", str(arguments.stop))),
         *("--pad", str(arguments.pad)),
         *("--precision", _precision(arguments)),
         *("--engine", arguments.engine),
@@ -294,8 +310,10 @@ def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
         f"star at ({x:g}, {y:g}): {flux:.6g} electrons"
         for (x, y), flux in zip(arguments.stars, result.star_fluxes, strict=True)
     )
+    chosen = f", mu {result.mu:.3g}" if arguments.mu == "auto" else ""
     return [
         f"{result.n_iter} iterations on {result.device}, objective {objective:.6g}",
+        f"stopped by {result.stop_reason}{chosen}",
         *stars,
         f"extended source: {result.extended.sum():.6g} electrons",
         f"written to {arguments.output}",
@@ -581,6 +599,13 @@ COMMANDS = {
 }
 
 
+def _number_or_word(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
 def _position(text: str) -> tuple[float, float]:
     try:
         x, y = map(float, text.split(","))
@@ -642,8 +667,17 @@ def _note(message: str) -> None:
 
 
 class _Notes(logging.Handler):
+    """Shows what the library logs, once where it says the same of several runs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._shown: set[str] = set()
+
     def emit(self, record: logging.LogRecord) -> None:
-        _note(record.getMessage())
+        message = record.getMessage()
+        if message not in self._shown:
+            self._shown.add(message)
+            _note(message)
 
 
 @contextlib.contextmanager

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -15,13 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from lnocl.errors import InputError, LnoclWarning
+from lnocl.heldout import CURVE_DTYPE, Choice, choose
 from lnocl.observation import Array, Observation
-from lnocl.scaling import Scaling, prepare
-from lnocl.scene import Scene
-from lnocl.solvers import SOLVERS, Engine
+from lnocl.run import Run, Setup
+from lnocl.solvers import SOLVERS
+from lnocl.stopping import Rule, make_rule
 
 PRECISIONS = ("single", "double")
 ENGINES = ("opencl", "numpy")
+STOPS = ("discrepancy", "held-out")
 
 # Seconds between two looks at the objective for the progress bar: each look waits for the device.
 PROGRESS_INTERVAL = 0.1
@@ -45,28 +47,26 @@ class Estimate:
         Electrons.
     """
 
-    def __init__(self, engine: Engine, scene: Scene) -> None:
-        self._engine: Engine | None = engine
-        self._scene = scene
+    def __init__(self, run: Run) -> None:
+        self._run: Run | None = run
 
     @cached_property
     def extended(self) -> Array:
         """Extended source, electrons per pixel."""
-        ny, nx = self._scene.observation.shape
-        return self._live().extended()[:ny, :nx] * self._scene.scale
+        return self._live().extended()
 
     @cached_property
     def star_fluxes(self) -> Array:
         """Star fluxes, electrons."""
-        return self._live().star_fluxes() * self._scene.scale
+        return self._live().star_fluxes()
 
-    def _live(self) -> Engine:
-        if self._engine is None:
+    def _live(self) -> Run:
+        if self._run is None:
             raise RuntimeError("read what you need of the estimate before the callback returns")
-        return self._engine
+        return self._run
 
     def _close(self) -> None:
-        self._engine = None
+        self._run = None
 
 
 Callback = Callable[[int, Estimate], Any]
@@ -85,12 +85,18 @@ class Result:
     n_iter : int
         Iterations done.
     stop_reason : str
-        ``"n_iter"``, ``"callback"``, or ``"converged"``: no step of ``"sgp"`` lets the objective
-        fall any more, in the precision used.
+        ``"n_iter"``, ``"callback"``, the rule that was met (``"change"``, ``"discrepancy"``,
+        ``"held-out"``), or ``"converged"``: no step of ``"sgp"`` lets the objective fall any more,
+        in the precision used.
     device : str
         Name of the device, its platform and driver; ``"numpy"`` for the reference.
     history : ndarray, fields ``iteration`` (int64) and ``objective`` (float64)
         The objective J after each iteration, from iteration 0, the start.
+    mu : float
+        Weight of the Tikhonov term, as given or as chosen.
+    held_out : ndarray, fields ``mu``, ``iteration`` and ``error`` (float64, int64, float64)
+        Where held-out counts were asked: the relative error of the extended source that they
+        estimate, for each mu and iteration looked at; else empty.
     """
 
     extended: Array
@@ -99,15 +105,17 @@ class Result:
     stop_reason: str
     device: str
     history: NDArray[np.void]
+    mu: float = 0.0
+    held_out: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
 
 
 def deconvolve(
     observation: Observation,
     stars: Sequence[tuple[float, float]] = (),
-    mu: float = 0.0,
+    mu: float | str = 0.0,
     solver: str = "sgm",
     n_iter: int = 1000,
-    stop: None = None,
+    stop: str | float | None = None,
     precision: str = "single",
     engine: str = "opencl",
     device: str | None = None,
@@ -131,15 +139,20 @@ def deconvolve(
         The images, p of shape (ny, nx), and what is known of them.
     stars : sequence of (x, y), optional
         Positions of the point sources in pixels, 0-based, x along columns; whole numbers.
-    mu : float, optional
-        Weight of the Tikhonov term on the extended source, per electron; zero or more.
+    mu : float or "auto", optional
+        Weight of the Tikhonov term on the extended source, per electron; zero or more. "auto":
+        0 or one of seven values, three decades up to p over the brightest pixel, whichever held-out
+        counts choose (see Notes).
     solver : {"sgm", "sgp"}, optional
         Iteration to use: the split-gradient method, or the scaled gradient projection method, which
         solves for the star fluxes at the start, so that those given matter little.
     n_iter : int, optional
         Iterations to do, 1 or more.
-    stop : None, optional
-        Stopping rule besides `n_iter`; there is none yet.
+    stop : float, "discrepancy" or "held-out", optional
+        When to stop before `n_iter`. A number in (0, 1): when the objective changes relatively by
+        less an iteration, in the mean over ten. "discrepancy": when the data term has fallen to its
+        expectation for Poisson counts of the model's means. "held-out": at the iteration that
+        held-out counts choose (see Notes).
     precision : {"single", "double"}, optional
         Arithmetic of the OpenCL engine. The reference always computes in double.
     engine : {"opencl", "numpy"}, optional
@@ -160,7 +173,8 @@ def deconvolve(
         returning True. The estimate has ``extended`` and ``star_fluxes``, which are fetched
         from the device when they are read.
     progress : bool, optional
-        Show a progress bar with the objective on stderr, where that is a terminal.
+        Show a progress bar on stderr, where that is a terminal, with the objective or what the
+        stopping rule watches.
 
     Returns
     -------
@@ -171,7 +185,7 @@ def deconvolve(
     ------
     InputError
         A parameter out of its range or too large for the precision, a star outside the images,
-        no such device, or a device for the reference.
+        no such device, or a device for the reference; held-out counts of images that hold none.
     DeviceError
         No OpenCL device at all, too little memory on it, no double precision, or a compiler that
         fails.
@@ -180,7 +194,17 @@ def deconvolve(
     -----
     LnoclWarning
         A PSF that is larger than the grid, whose wings wrap round; so many iterations that single
-        precision is expected to stray from double by a thousandth of the extended source.
+        precision is expected to stray from double by a thousandth of the extended source; held-out
+        counts of images that are not whole counts, or that chose an iteration too near `n_iter`.
+
+    Notes
+    -----
+    Held-out counts: the counts are dealt out at random to two halves, independent observations of
+    the same sky. Both are reconstructed side by side, and the error of their sum is estimated from
+    the products of one's estimates with the other's (`lnocl.heldout` has the equation). Chosen is
+    the last iteration with an error within a tenth of the least; the halves go on for as long
+    again, and so this costs four such reconstructions more. A scene's own reconstruction is then
+    made from all counts.
 
     References
     ----------
@@ -202,24 +226,33 @@ def deconvolve(
     >>> (result.extended.sum() + result.star_fluxes.sum()).round(6)
     np.float64(612.0)
     """
-    _check_choices(solver, precision, engine, stop, device)
-    if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
-        raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")
+    _check_choices(mu, solver, n_iter, stop, precision, engine, device)
     if engine == "opencl" and precision == "single":
         _warn_of_straying(int(n_iter))
-    scene = Scene(observation, stars, mu, pad)
-    extended, star_fluxes = scene.start(initial_extended, initial_star_fluxes)
-    scaling = None
-    if solver == "sgp":
-        star_fluxes, scaling = prepare(scene, extended, star_fluxes)
-    running = _make_engine(engine, scene, precision, device, n_iter, scaling)
-    running.start(extended, star_fluxes)
-    done, stop_reason = _run(solver, running, scene, int(n_iter), callback, progress)
-    return _wrap_up(running, scene, done, stop_reason)
+    setup = Setup(stars, pad, solver, precision, engine, device)
+    bar = _Bar(int(n_iter), progress)
+    with bar:
+        if isinstance(mu, str) or stop == "held-out":
+            choice = _choose(setup, observation, mu, stop, int(n_iter), initial_extended, bar)
+        else:
+            choice = Choice(mu, int(n_iter), np.zeros(0, CURVE_DTYPE))
+        run = Run(
+            setup, observation, choice.mu, choice.n_iter, initial_extended, initial_star_fluxes
+        )
+        stop_reason = _iterate(run, choice.n_iter, make_rule(stop), callback, bar)
+    if stop == "held-out" and stop_reason == "n_iter":
+        stop_reason = "held-out"
+    return _wrap_up(run, stop_reason, choice)
 
 
 def _check_choices(
-    solver: str, precision: str, engine: str, stop: None, device: str | None
+    mu: object,
+    solver: str,
+    n_iter: object,
+    stop: object,
+    precision: str,
+    engine: str,
+    device: str | None,
 ) -> None:
     choices = {
         "solver": (solver, tuple(SOLVERS)),
@@ -229,8 +262,15 @@ def _check_choices(
     for name, (value, known) in choices.items():
         if value not in known:
             raise InputError(f"{name} {value!r} is not known; choose from {', '.join(known)}")
-    if stop is not None:
-        raise InputError(f"stop {stop!r} is not known; give None")
+    if isinstance(mu, str) and mu != "auto":
+        raise InputError(f"mu {mu!r} is not known; give a number or auto")
+    if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
+        raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")
+    is_change = isinstance(stop, Real) and 0 < float(stop) < 1
+    if not (stop is None or is_change or (isinstance(stop, str) and stop in STOPS)):
+        raise InputError(
+            f"stop {stop!r} is not known; give {', '.join(STOPS)}, or a number between 0 and 1"
+        )
     if engine == "numpy" and device is not None:
         raise InputError(f"engine numpy uses no device; leave device {device!r} out")
 
@@ -246,65 +286,76 @@ def _warn_of_straying(n_iter: int) -> None:
         )
 
 
-def _make_engine(
-    engine: str,
-    scene: Scene,
-    precision: str,
-    device: str | None,
+class _Bar:
+    """A progress bar that looks at what it shows at most every tenth of a second."""
+
+    def __init__(self, n_iter: int, progress: bool) -> None:
+        # disable=None is tqdm's word for "quiet where stderr is no terminal".
+        self._bar = tqdm(total=n_iter, unit="it", disable=None if progress else True)
+        self._shown = time.monotonic()
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.close()
+
+    def show(self, iteration: int, quantity: Callable[[], str], last: bool = False) -> None:
+        """Show how far it is, where it is time to."""
+        if last or (not self._bar.disable and time.monotonic() - self._shown > PROGRESS_INTERVAL):
+            self._bar.set_postfix_str(quantity(), refresh=False)
+            self._bar.update(iteration - self._bar.n)
+            self._shown = time.monotonic()
+
+
+def _choose(
+    setup: Setup,
+    observation: Observation,
+    mu: Any,
+    stop: object,
     n_iter: int,
-    scaling: Scaling | None,
-) -> Any:
-    # Imported where it is chosen: the reference runs where no OpenCL is installed.
-    if engine == "numpy":
-        return importlib.import_module("lnocl.reference").ReferenceEngine(scene, scaling)
-    opencl = importlib.import_module("lnocl.opencl")
-    return opencl.OpenCLEngine(scene, precision, device, n_iter, scaling=scaling)
+    initial_extended: ArrayLike | None,
+    bar: _Bar,
+) -> Choice:
+    """Have held-out counts choose mu and the number of iterations, or one of them."""
+    half = None if initial_extended is None else np.asarray(initial_extended) / 2.0
+    return choose(
+        partial(Run, setup, n_iter=n_iter, initial_extended=half),
+        observation,
+        None if mu == "auto" else np.array([mu]),
+        n_iter,
+        stop != "held-out",
+        lambda words: bar.show(0, lambda: words),
+    )
 
 
-def _run(
-    solver: str,
-    engine: Engine,
-    scene: Scene,
-    n_iter: int,
-    callback: Callback | None,
-    progress: bool,
-) -> tuple[int, str]:
-    # disable=None is tqdm's word for "quiet where stderr is no terminal".
-    bar = tqdm(total=n_iter, unit="it", disable=None if progress else True)
-    shown = time.monotonic()
-    iteration = 0
-    with bar:
-        for iteration in SOLVERS[solver](engine, n_iter):
-            if not bar.disable and time.monotonic() - shown > PROGRESS_INTERVAL:
-                objective = engine.objectives()[-1] * scene.scale
-                bar.set_postfix_str(f"objective {objective:.6g}", refresh=False)
-                bar.update(iteration - bar.n)
-                shown = time.monotonic()
-            if callback is not None:
-                estimate = Estimate(engine, scene)
-                stopped = callback(iteration, estimate)
-                estimate._close()
-                if stopped:
-                    stop_reason = "callback"
-                    break
-        else:
-            stop_reason = "n_iter" if iteration == n_iter else "converged"
-        bar.update(iteration - bar.n)
-    return iteration, stop_reason
+def _iterate(run: Run, n_iter: int, rule: Rule, callback: Callback | None, bar: _Bar) -> str:
+    """Iterate to the end; return why it ended."""
+    for iteration in run:
+        bar.show(iteration, partial(rule.quantity, run))
+        if callback is not None:
+            estimate = Estimate(run)
+            stopped = callback(iteration, estimate)
+            estimate._close()
+            if stopped:
+                return "callback"
+        if rule.met(run):
+            return rule.reason
+    return "n_iter" if run.done == n_iter else "converged"
 
 
-def _wrap_up(engine: Any, scene: Scene, done: int, stop_reason: str) -> Result:
-    if len(engine.objectives()) == done:
-        engine.ratio()  # records the objective of the last estimate
-    history = np.zeros(done + 1, HISTORY_DTYPE)
-    history["iteration"] = np.arange(done + 1)
-    history["objective"] = engine.objectives() * scene.scale
-    estimate = Estimate(engine, scene)
+def _wrap_up(run: Run, stop_reason: str, choice: Choice) -> Result:
+    run.finish()
+    history = np.zeros(run.done + 1, HISTORY_DTYPE)
+    history["iteration"] = np.arange(run.done + 1)
+    history["objective"] = run.objectives()
     return Result(
-        extended=estimate.extended,
-        star_fluxes=estimate.star_fluxes,
-        n_iter=done,
+        extended=run.extended(),
+        star_fluxes=run.star_fluxes(),
+        n_iter=run.done,
         stop_reason=stop_reason,
-        device=engine.name,
+        device=run.engine.name,
         history=history,
+        mu=choice.mu,
+        held_out=choice.curve,
     )

@@ -21,7 +21,7 @@ MU = 3e-8
 N_ITER = 2000
 EVERY = 20
 
-FIGURES = ("objects", "errors", "magnitude", "objective", "flux", "width")
+FIGURES = ("objects", "errors", "magnitude", "objective", "held-out", "flux", "width")
 FIGURE_FILES = tuple(f"{name}.png" for name in FIGURES)
 
 
@@ -270,6 +270,9 @@ def draw(
         yield "errors and magnitude skipped: no file has a table CURVE (lnocl demo writes it)"
         if histories:
             yield _draw(folder, "objective", plots.objectives(histories))
+    held_out = _tables(names, [each.held_out for each in saved])
+    if held_out:
+        yield _draw(folder, "held-out", plots.held_out_errors(held_out))
     if original is None or frame.star is None:
         yield "flux and width skipped: they need --truth with a star"
         return

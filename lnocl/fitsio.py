@@ -32,6 +32,7 @@ RESULT_TABLES = {
     "STARS": ("x", "y", "flux"),
     "HISTORY": ("iteration", "objective"),
     "CURVE": ("iteration", "rho", "rho_star", "magnitude"),
+    "HELDOUT": ("mu", "iteration", "error"),
 }
 
 _WCS_KEYWORD = re.compile(r"(?:CTYPE|CRPIX|CRVAL|CDELT)1([A-Z]?)")
@@ -147,8 +148,9 @@ class SavedResult(NamedTuple):
         Positions in pixels, 0-based.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons.
-    history, curve : dict of str to ndarray of float64, or None
-        Columns of the tables ``HISTORY`` and ``CURVE``; None where there is no such table.
+    history, curve, held_out : dict of str to ndarray of float64, or None
+        Columns of the tables ``HISTORY``, ``CURVE`` and ``HELDOUT``; None where there is no such
+        table.
     header : astropy.io.fits.Header
         Header of the extended source.
     """
@@ -158,6 +160,7 @@ class SavedResult(NamedTuple):
     star_fluxes: NDArray[np.float64]
     history: dict[str, NDArray[np.float64]] | None
     curve: dict[str, NDArray[np.float64]] | None
+    held_out: dict[str, NDArray[np.float64]] | None
     header: fits.Header
 
 
@@ -206,6 +209,7 @@ def read_result(path: str) -> SavedResult:
         stars["flux"],
         tables.get("HISTORY"),
         tables.get("CURVE"),
+        tables.get("HELDOUT"),
         header,
     )
 
@@ -306,12 +310,14 @@ def write_result(
     commands: Iterable[Sequence[str]] = (),
     overwrite: bool = False,
     curve: NDArray[np.void] | None = None,
+    held_out: NDArray[np.void] | None = None,
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
     The primary HDU holds the extended source, the table ``STARS`` the columns x, y and flux,
     the table ``HISTORY`` the columns iteration and objective, the table ``CURVE`` the columns
-    iteration, rho, rho_star and magnitude. All have CHECKSUM and DATASUM.
+    iteration, rho, rho_star and magnitude, the table ``HELDOUT`` mu, iteration and error. All
+    have CHECKSUM and DATASUM.
 
     Parameters
     ----------
@@ -335,6 +341,8 @@ def write_result(
         Whether an existing file may be replaced.
     curve : ndarray with fields ``iteration``, ``rho``, ``rho_star`` and ``magnitude``, optional
         Restoration errors and magnitude of the star, where the truth is known.
+    held_out : ndarray with fields ``mu``, ``iteration`` and ``error``, optional
+        Relative errors that held-out counts estimate, where they were asked.
 
     Raises
     ------
@@ -354,6 +362,7 @@ def write_result(
             _star_table(stars, star_fluxes),
             *([] if history is None else [_table("HISTORY", history)]),
             *([] if curve is None else [_table("CURVE", curve)]),
+            *([] if held_out is None else [_table("HELDOUT", held_out)]),
         ]
     )
     _write_whole(path, lambda stream: hdus.writeto(stream, checksum=True), overwrite)

@@ -381,6 +381,10 @@ class OpenCLEngine:
         """Return the star fluxes, scaled."""
         return self._download("star_fluxes", self.scene.n_stars)
 
+    def data_term(self) -> float:
+        """Return the data term of the objective recorded last, scaled."""
+        return float(self._sums("ratio_sums", 1 + self.scene.n_stars)[0])
+
     def objectives(self) -> Array:
         """Return the objectives recorded so far, scaled."""
         pairs = self._download("objectives", 2 * self._n_objectives)

@@ -300,6 +300,37 @@ def objectives(histories: Mapping[str, Mapping[str, Array]]) -> Figure:
     return figure
 
 
+def held_out_errors(tables: Mapping[str, Mapping[str, Array]]) -> Figure:
+    """Draw the errors that held-out counts estimate, a line for each mu.
+
+    Parameters
+    ----------
+    tables : mapping of str to mapping of str to ndarray
+        For each name the columns ``mu``, ``iteration`` and ``error``.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A panel for each name.
+
+    Raises
+    ------
+    LnoclError
+        Where matplotlib is missing.
+    """
+    figure = _figure(6.5 * len(tables), 4.0)
+    panels = figure.subplots(1, len(tables), squeeze=False)[0]
+    for axis, (name, table) in zip(panels, tables.items(), strict=True):
+        for i, mu in enumerate(np.unique(table["mu"])):
+            rows = table["mu"] == mu
+            axis.plot(table["iteration"][rows], table["error"][rows], **_line(i), label=f"{mu:.2g}")
+        axis.set(xscale="log", yscale="log", xlabel="iteration", ylabel="estimated relative error")
+        axis.set_title(name, fontsize=10)
+        axis.grid(alpha=0.3, which="both")
+        axis.legend(fontsize=9, title="mu")
+    return figure
+
+
 def profiles(
     kind: str, truth: Source, found: Sequence[Source], frame: Frame, near: int, threshold: float
 ) -> Figure:

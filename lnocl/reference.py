@@ -212,7 +212,7 @@ class ReferenceEngine:
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
-        self._ratio_row_spectra, objective, self._star_sums = ratio_rows(
+        self._ratio_row_spectra, self._data_term, self._star_sums = ratio_rows(
             convolve_columns(self._row_spectrum, self._otfs),
             self._images,
             self.scene.weights,
@@ -221,7 +221,7 @@ class ReferenceEngine:
             self._star_fluxes,
         )
         objective, self._star_corrections = collect_sums(
-            objective, self._squares, self._star_sums, self.scene.star_weights, self.scene.mu
+            self._data_term, self._squares, self._star_sums, self.scene.star_weights, self.scene.mu
         )
         self._objectives.append(objective)
 
@@ -293,6 +293,10 @@ class ReferenceEngine:
     def star_fluxes(self) -> Array:
         """Return the star fluxes, scaled."""
         return self._star_fluxes.copy()
+
+    def data_term(self) -> float:
+        """Return the data term of the objective recorded last, scaled."""
+        return self._data_term
 
     def objectives(self) -> Array:
         """Return the objectives recorded so far, scaled."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.fft
 import scipy.sparse
 
+from lnocl.model import Model
 from lnocl.observation import Array
 from lnocl.scene import LEAST_MODEL, Scene
 
@@ -58,42 +58,6 @@ class Scaling:
         return np.maximum(change, (MOST_FADING - 1.0) * fluxes)
 
 
-class _Model:
-    """The model of a scene and its derivatives, on the host."""
-
-    def __init__(self, scene: Scene) -> None:
-        self._shape = (scene.n_images, *scene.grid)
-        self.otfs = np.array([scipy.fft.rfft2(scene.psf(j)) for j in range(scene.n_images)])
-        self.weights = np.ones(self._shape) if scene.weights is None else scene.weights
-        background = scene.background()
-        self.background = background if background.ndim == 3 else background[:, None, None]
-        self.stars = _star_rows(scene)
-
-    def forward(self, extended: Array) -> Array:
-        """Return the A_j f, shape (p, Ny, Nx)."""
-        spectrum = scipy.fft.rfft2(extended)
-        return scipy.fft.irfft2(self.otfs * spectrum, self._shape[1:], workers=-1)
-
-    def adjoint(self, arrays: Array) -> Array:
-        """Return ``sum_j A_j^T x_j``, shape (Ny, Nx)."""
-        spectra = scipy.fft.rfft2(arrays, workers=-1)
-        return scipy.fft.irfft2((self.otfs.conj() * spectra).sum(axis=0), self._shape[1:])
-
-    def starlight(self, star_fluxes: Array) -> Array:
-        """Return ``sum_s c_s P_js``, shape (p, Ny, Nx)."""
-        return (self.stars.T @ star_fluxes).reshape(self._shape)
-
-
-def _star_rows(scene: Scene) -> scipy.sparse.csr_array:
-    """Return the star images P_js, each star a row of p Ny Nx pixels."""
-    size = scene.n_images * scene.grid[0] * scene.grid[1]
-    rows = [scipy.sparse.csr_array((0, size))]
-    for s in range(scene.n_stars):
-        images = [scene.star_image(j, s).ravel() for j in range(scene.n_images)]
-        rows.append(scipy.sparse.csr_array(np.concatenate(images)[None]))
-    return scipy.sparse.vstack(rows, format="csr")
-
-
 def prepare(scene: Scene, extended: Array, star_fluxes: Array) -> tuple[Array, Scaling]:
     """Return the star fluxes that are best for this extended source, and the scaling of steps.
 
@@ -109,17 +73,17 @@ def prepare(scene: Scene, extended: Array, star_fluxes: Array) -> tuple[Array, S
     star_fluxes : ndarray of float64, shape (n,)
         Where the fluxes are sought from, scaled.
     """
-    model = _Model(scene)
-    diffuse = np.maximum(model.forward(extended) + model.background, 0.0)
+    model = Model(scene)
+    diffuse = model.images(extended, np.zeros_like(star_fluxes))
     fluxes = _fit_stars(model, scene.images(), diffuse, star_fluxes)
     return fluxes, _make_scaling(scene, model, diffuse, fluxes)
 
 
-def _fit_stars(model: _Model, images: Array, diffuse: Array, star_fluxes: Array) -> Array:
+def _fit_stars(model: Model, images: Array, diffuse: Array, star_fluxes: Array) -> Array:
     """Return the star fluxes that minimise J, by Fisher scoring over the pixels that they light."""
     lit = np.unique(model.stars.indices)
     stars = model.stars[:, lit]
-    weights = np.broadcast_to(model.weights, images.shape).ravel()[lit]
+    weights = model.weights.ravel()[lit]
     images, diffuse = images.ravel()[lit], diffuse.ravel()[lit]
     fluxes = star_fluxes
     for _ in range(FIT_ROUNDS if len(fluxes) else 0):
@@ -138,15 +102,15 @@ def _covariance(stars: scipy.sparse.csr_array, weights: Array) -> Array:
     return np.linalg.pinv(information, hermitian=True)
 
 
-def _make_scaling(scene: Scene, model: _Model, diffuse: Array, fluxes: Array) -> Scaling:
+def _make_scaling(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Scaling:
     starlight = model.starlight(fluxes)
     total = np.maximum(diffuse + starlight, LEAST_MODEL)
     seen = np.maximum(starlight + model.background, LEAST_SEEN)
-    observed = model.adjoint(np.broadcast_to(model.weights, seen.shape).astype(np.float64))
+    observed = model.adjoint(model.weights)
     inverse = model.adjoint(model.weights / seen)
     shift = np.divide(observed, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     reach = [
-        model.adjoint((star.toarray().reshape(total.shape)) * model.weights / total)
+        model.adjoint(star.toarray().reshape(model.shape) * model.weights / total)
         for star in (model.stars[[s]] for s in range(scene.n_stars))
     ]
     return Scaling(

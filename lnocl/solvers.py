@@ -80,6 +80,9 @@ class Engine(Protocol):
     def star_fluxes(self) -> Array:
         """Return the star fluxes."""
 
+    def data_term(self) -> float:
+        """Return the data term J_0 of the objective recorded last."""
+
     def objectives(self) -> Array:
         """Return the objectives recorded so far."""
 

@@ -1,0 +1,135 @@
+"""When to stop, without knowing the truth: rules that look at a run after each iteration."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Protocol
+
+import numpy as np
+import scipy.special
+import scipy.stats
+
+from lnocl.model import Model
+from lnocl.observation import Array
+from lnocl.run import Run
+
+# A step of the scaled gradient projection method may be short by chance, ten are not.
+CHANGE_WINDOW = 10
+
+
+class Rule(Protocol):
+    """A rule that ends a run."""
+
+    reason: str
+
+    def met(self, run: Run) -> bool:
+        """Return whether the run should end."""
+
+    def quantity(self, run: Run) -> str:
+        """Return what the rule watches, for the progress bar."""
+
+
+class Never:
+    """No rule: the run goes to its last iteration."""
+
+    reason = "n_iter"
+
+    def met(self, run: Run) -> bool:
+        """Return False."""
+        return False
+
+    def quantity(self, run: Run) -> str:
+        """Return the objective."""
+        return f"objective {run.objectives()[-1]:.6g}"
+
+
+class Change:
+    """The relative change of the objective an iteration, its mean over ten, falls below a bound."""
+
+    reason = "change"
+
+    def __init__(self, least: float) -> None:
+        self.least = least
+
+    def met(self, run: Run) -> bool:
+        """Return whether the objective has settled."""
+        return run.done > CHANGE_WINDOW and self._change(run) < self.least
+
+    def quantity(self, run: Run) -> str:
+        """Return the relative change an iteration."""
+        return f"change {self._change(run):.2g}"
+
+    def _change(self, run: Run) -> float:
+        recent = run.objectives()[-CHANGE_WINDOW - 1 :]
+        if len(recent) < 2 or recent[-1] == 0:
+            return 0.0
+        return float(abs(recent[0] - recent[-1]) / (len(recent) - 1) / abs(recent[-1]))
+
+
+class Discrepancy:
+    """The data term falls to what Poisson noise alone would leave.
+
+    ``2 J_0 = sum_j sum_n e(m_j)`` over the observed pixels, with ``e(m)`` the expectation of
+    ``2 (g ln(g / m) + m - g)`` for Poisson counts g of mean m: 1 for many counts (Bertero et al.
+    2010, Inverse Problems 26, 105004), less for few. The expectation is taken anew at each power
+    of two of iterations, and before the run ends.
+    """
+
+    reason = "discrepancy"
+
+    def __init__(self) -> None:
+        self._model: Model | None = None
+        self._expected = np.nan
+
+    def met(self, run: Run) -> bool:
+        """Return whether the data are fitted as well as noise allows."""
+        if run.done & (run.done - 1) == 0:
+            self._expected = self._expect(run)
+        if self._discrepancy(run) > 1.0:
+            return False
+        self._expected = self._expect(run)
+        return self._discrepancy(run) <= 1.0
+
+    def quantity(self, run: Run) -> str:
+        """Return the data term over its expectation."""
+        return f"discrepancy {self._discrepancy(run):.4g}"
+
+    def _discrepancy(self, run: Run) -> float:
+        return 2.0 * run.engine.data_term() * run.scene.scale / self._expected
+
+    def _expect(self, run: Run) -> float:
+        if self._model is None:
+            self._model = Model(run.scene)
+        means = self._model.images(run.engine.extended(), run.engine.star_fluxes())
+        deviances = expected_deviance(means * run.scene.scale)
+        return float((self._model.weights * deviances).sum())
+
+
+def expected_deviance(mean: Array) -> Array:
+    """Return ``E[2 (g ln(g / m) + m - g)]`` for Poisson g of mean m, to 1e-4.
+
+    Examples
+    --------
+    >>> from lnocl.stopping import expected_deviance
+    >>> expected_deviance([1e-3, 1.0, 1e6]).round(3)
+    array([0.014, 1.146, 1.   ])
+    """
+    means, deviances = _deviances()
+    return np.interp(np.log(np.maximum(mean, means[0])), np.log(means), deviances)
+
+
+@cache
+def _deviances() -> tuple[Array, Array]:
+    means = np.geomspace(1e-6, 1e3, 500)
+    counts = np.arange(2000)[:, None]
+    terms = scipy.special.xlogy(counts, counts / means) + means - counts
+    return means, 2.0 * (scipy.stats.poisson.pmf(counts, means) * terms).sum(axis=0)
+
+
+def make_rule(stop: str | float | None) -> Rule:
+    """Return the rule of this name; held-out counts have chosen the iteration beforehand."""
+    if stop == "discrepancy":
+        return Discrepancy()
+    if stop is None or stop == "held-out":
+        return Never()
+    return Change(float(stop))
