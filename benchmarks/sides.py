@@ -104,6 +104,30 @@ class SciPySerial(SciPy):
     workers = 1
 
 
+class MultiComponent(SciPy):
+    """The paper's iteration: stars by sums over their images, and no Tikhonov term; single."""
+
+    def __init__(self, scene):
+        super().__init__(scene, np.float32)
+        self.fluxes = scene.start(None, None)[1].astype(np.float32)
+        stars = [
+            [scene.star_image(j, s) for j in range(scene.n_images)] for s in range(scene.n_stars)
+        ]
+        self.stars = np.array(stars, np.float32)
+
+    def iterate(self):
+        """Do one iteration."""
+        model = self.inverse(self.otfs * self.forward(self.extended.copy()))
+        model += self.background
+        model += np.einsum("s,sjyx->jyx", self.fluxes, self.stars)
+        np.divide(self.images, model, out=model)
+        self.fluxes *= np.einsum("sjyx,jyx->s", self.stars, model) / self.p
+        spectra = self.forward(model)
+        spectra *= self.adjoint_otfs
+        self.extended *= self.inverse(spectra.sum(axis=0))
+        self.extended /= self.p
+
+
 class MKL(Peer):
     """Intel's MKL by mkl_fft, with its default threads."""
 

@@ -310,10 +310,11 @@ def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
         f"star at ({x:g}, {y:g}): {flux:.6g} electrons"
         for (x, y), flux in zip(arguments.stars, result.star_fluxes, strict=True)
     )
-    chosen = f", mu {result.mu:.3g}" if arguments.mu == "auto" else ""
+    reason = f"stopped by {result.stop_reason}"
     return [
         f"{result.n_iter} iterations on {result.device}, objective {objective:.6g}",
-        f"stopped by {result.stop_reason}{chosen}",
+        *([] if result.stop_reason == "n_iter" else [reason]),
+        *([f"mu chosen: {result.mu:.3g}"] if arguments.mu == "auto" else []),
         *stars,
         f"extended source: {result.extended.sum():.6g} electrons",
         f"written to {arguments.output}",

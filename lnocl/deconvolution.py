@@ -18,6 +18,7 @@ from lnocl.errors import InputError, LnoclWarning
 from lnocl.heldout import CURVE_DTYPE, Choice, choose
 from lnocl.observation import Array, Observation
 from lnocl.run import Run, Setup
+from lnocl.scene import check_mu
 from lnocl.solvers import SOLVERS
 from lnocl.stopping import Rule, make_rule
 
@@ -262,7 +263,9 @@ def _check_choices(
     for name, (value, known) in choices.items():
         if value not in known:
             raise InputError(f"{name} {value!r} is not known; choose from {', '.join(known)}")
-    if isinstance(mu, str) and mu != "auto":
+    if not isinstance(mu, str):
+        check_mu(mu)
+    elif mu != "auto":
         raise InputError(f"mu {mu!r} is not known; give a number or auto")
     if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
         raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")

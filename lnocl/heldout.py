@@ -3,22 +3,23 @@
 Each count goes to one of two halves of the observation, by the toss of a coin, which makes them
 two independent Poisson observations of the same sky. Both are reconstructed side by side. With A_k
 and B_k the extended sources after k iterations, in the end A_L and B_L, the sum A_k + B_k is a
-reconstruction from all counts, and its error is
+reconstruction f_k from all counts, and but for a constant its squared error is
 
-    ||A_k + B_k - f||^2 = ||A_k + B_k||^2 - 2 <A_k + B_k, f> + ||f||^2,
+    ||f_k - f||^2 - ||f||^2 = ||f_k||^2 - 2 <f_k, f>,   <f_k, f> = 2 (<A_k, B_L> + <B_k, A_L>),
 
-in which 2 (<A_k, B_L> + <B_k, A_L>) stands for <A_k + B_k, f> and 4 <A_L, B_L> for ||f||^2: noise
-of independent halves averages out of these products, and what L iterations have not yet resolved is
-small where L is large. The likelihood of the held-out half itself, the usual measure, is flat over
-most of the run and ends it two to four times too early: docs/sgp.md.
+as noise of independent halves averages out of these products, and what L iterations have not yet
+resolved is small where L is large. The noise alone is ||A_k - B_k||^2. All is averaged over a few
+ways to deal the counts out. The likelihood of the held-out half itself, the usual measure, is flat
+over most of the run and ends it two to four times too early: docs/sgp.md.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,14 +30,19 @@ from lnocl.run import Run
 
 CURVE_DTYPE = np.dtype([("mu", np.float64), ("iteration", np.int64), ("error", np.float64)])
 
-# The last iteration whose error is within a tenth of the least: near a star the estimate goes on
-# improving long after the rest.
+# The last iteration is taken whose error is within a tenth of the least: near a star the estimate
+# goes on improving long after the rest. The least squared error is taken to be the noise alone;
+# what is not resolved adds as much again and more, so that a tenth is cautious.
 WITHIN = 0.1
 # The halves go on for as long again, so that what each is judged by is resolved.
 AS_LONG_AGAIN = 2
 FEWEST = 10
+# Ways to deal the counts out.
+SPLITS = 3
 # Iterations at which the halves are compared are so far apart, relatively.
-SPACING = 1.08
+SPACING = 1.1
+# Estimates before this share of the chosen iteration are let go.
+FORGOTTEN = 1.0 / 3.0
 # mu in units of p over the largest value of the extended source, at which the Tikhonov term takes
 # half of the brightest pixel.
 MU_GRID = 10.0 ** np.arange(-3.0, 0.1, 0.5)
@@ -65,12 +71,12 @@ class Choice:
     curve: NDArray[np.void]
 
 
-def halve(observation: Observation) -> tuple[Observation, Observation]:
+def halve(observation: Observation, seed: int = 0) -> tuple[Observation, Observation]:
     """Return two halves of an observation, the counts of each pixel dealt out at random.
 
     Whole counts are dealt out one by one, so that the halves of a Poisson count are independent
     Poisson counts of half its mean. Of what is no whole count the fraction goes to one of the
-    halves, which keeps their variances those of counts to 1/16. The seed is fixed.
+    halves, which keeps their variances those of counts to 1/16.
 
     Raises
     ------
@@ -84,9 +90,7 @@ def halve(observation: Observation) -> tuple[Observation, Observation]:
     """
     images = np.where(observation.mask, 0.0, observation.images)
     if not images.any():
-        raise InputError(
-            "held-out counts need counts, and the images hold none; give n_iter and mu"
-        )
+        raise InputError("the images hold no counts to hold out; give n_iter and mu")
     if images.max() > MOST_COUNTS:
         raise InputError(
             f"a pixel of {images.max():.3g} electrons cannot be dealt out; give n_iter and mu"
@@ -98,51 +102,81 @@ def halve(observation: Observation) -> tuple[Observation, Observation]:
             LnoclWarning,
             stacklevel=5,
         )
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     first = rng.binomial(whole.astype(np.int64), 0.5) + (images - whole) * rng.integers(
         0, 2, images.shape
     )
     background, mask = observation.background / 2.0, observation.mask
     psfs = observation.psfs
-    return (
-        Observation(first, psfs, background=background, mask=mask),
-        Observation(images - first, psfs, background=background, mask=mask),
-    )
+    with _quiet():
+        return (
+            Observation(first, psfs, background=background, mask=mask),
+            Observation(images - first, psfs, background=background, mask=mask),
+        )
 
 
-@dataclass
-class _Pair:
-    """The two halves' runs at one mu, and their estimates at some iterations."""
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Leave out what would be said of the halves: it is said of the whole observation too."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LnoclWarning)
+        yield
 
-    first: Run
-    second: Run
-    kept: list[tuple[int, Estimate, Estimate]] = field(default_factory=list)
+
+Pair = tuple[Estimate, Estimate]
+
+
+class _Trial:
+    """The runs of all pairs of halves at one mu, and their estimates at some iterations."""
+
+    def __init__(self, runs: Sequence[tuple[Run, Run]]) -> None:
+        self._runs = runs
+        self.kept: list[tuple[int, list[Pair]]] = []
 
     def advance(self) -> Iterator[int]:
-        """Go on to the next iteration that is kept, and yield it, to the end of either run."""
+        """Go on to the next iteration that is kept, and yield it, until a run ends."""
         due = 1
-        for iteration, _ in zip(self.first, self.second, strict=False):  # either may end early
+        for iteration, *_ in zip(*(run for pair in self._runs for run in pair), strict=False):
             if iteration == due:
-                self.kept.append((iteration, _flat(self.first), _flat(self.second)))
+                self.kept.append((iteration, [(_flat(a), _flat(b)) for a, b in self._runs]))
                 due = max(due + 1, math.floor(SPACING * due))
                 yield iteration
 
-    def errors(self, reference: tuple[Estimate, Estimate]) -> Array:
-        """Return the estimated relative error at each iteration kept; 0 where it is negative."""
-        first_end, second_end = reference
-        truth = 4.0 * float(first_end @ second_end)
-        squares = np.array(
-            [
-                float((a + b) @ (a + b)) - 4.0 * float(a @ second_end + b @ first_end) + truth
-                for _, a, b in self.kept
-            ]
-        )
-        return np.sqrt(np.maximum(squares, 0.0) / max(truth, np.finfo(float).tiny))
+    def forget(self, first: float) -> None:
+        """Let the estimates before an iteration go."""
+        self.kept = [kept for kept in self.kept if kept[0] >= first]
 
     @property
-    def end(self) -> tuple[Estimate, Estimate]:
+    def iterations(self) -> list[int]:
+        """The iterations kept."""
+        return [iteration for iteration, _ in self.kept]
+
+    @property
+    def end(self) -> list[Pair]:
         """The last estimates."""
-        return self.kept[-1][1:]
+        return self.kept[-1][1]
+
+    def excess(self, reference: Sequence[Pair]) -> Array:
+        """Return ``||f_k||^2 - 2 <f_k, f>`` at each iteration kept, judged by a reference."""
+        return np.array(
+            [
+                np.mean(
+                    [
+                        _dot(a + b, a + b) - 4.0 * (_dot(a, b_end) + _dot(b, a_end))
+                        for (a, b), (a_end, b_end) in zip(pairs, reference, strict=True)
+                    ]
+                )
+                for _, pairs in self.kept
+            ]
+        )
+
+    def noise(self, at: int) -> float:
+        """Return ``||A_k - B_k||^2`` at one of the iterations kept."""
+        return float(np.mean([_dot(a - b, a - b) for a, b in self.kept[at][1]]))
+
+
+def _dot(a: Estimate, b: Estimate) -> float:
+    return float(a @ b)
 
 
 def _flat(run: Run) -> Estimate:
@@ -175,59 +209,71 @@ def choose(
     report : callable
         Told in a few words how far it is.
     """
-    halves = halve(observation)
-    given = mus is not None
+    halves = [halve(observation, seed) for seed in range(SPLITS)]
     pending = [0.0] if mus is None else sorted(float(mu) for mu in mus)
-    reference: tuple[Estimate, Estimate] | None = None
-    curves: list[NDArray[np.void]] = []
-    best = (math.inf, 0.0, n_iter)
+    trials: list[_Judged] = []
     while pending:
         mu = pending.pop(0)
-        # A half has half the data term and a quarter of the squares.
-        pair = _Pair(begin(halves[0], 2.0 * mu), begin(halves[1], 2.0 * mu))
-        chosen = _follow(pair, mu, n_iter, at_end, reference, report)
-        reference = reference or pair.end
-        errors = pair.errors(reference)
-        iterations = [iteration for iteration, *_ in pair.kept]
-        curves.append(_curve(mu, iterations, errors))
-        error = float(errors[-1] if at_end else errors.min())
-        if error < best[0]:
-            best = error, mu, n_iter if at_end else iterations[chosen]
-        if error > (1.0 + WITHIN) * best[0]:
+        with _quiet():
+            # A half has half the data term and a quarter of the squares.
+            trial = _Trial([(begin(a, 2.0 * mu), begin(b, 2.0 * mu)) for a, b in halves])
+        judged = _follow(trial, mu, at_end, trials[0] if trials else None, report)
+        trials.append(judged)
+        if judged.error > (1.0 + WITHIN) * min(trial.error for trial in trials):
             break  # mu grows, and is too large already
-        if not given and not pending and mu == 0.0:
-            brightest = 2.0 * max(float(half.max()) for half in reference)
+        if mus is None and len(trials) == 1:
+            brightest = 2.0 * max(float(half.max()) for half in trial.end[0])
             pending = list(MU_GRID * observation.n_images / brightest) if brightest > 0 else []
-    if not at_end and AS_LONG_AGAIN * best[2] > n_iter:
+    best = min(trials, key=lambda trial: trial.error)
+    if not at_end and AS_LONG_AGAIN * best.n_iter > n_iter:
         warnings.warn(
-            f"held-out counts have chosen iteration {best[2]} of {n_iter}, too near the end to be "
-            f"sure; give n_iter {AS_LONG_AGAIN * best[2]} or more",
+            f"held-out counts have chosen iteration {best.n_iter} of {n_iter}, too near the end to "
+            f"be sure; give n_iter {AS_LONG_AGAIN * best.n_iter} or more",
             LnoclWarning,
             stacklevel=4,
         )
-    return Choice(best[1], best[2], np.concatenate(curves))
+    curve = np.concatenate([trial.curve for trial in trials])
+    return Choice(best.mu, n_iter if at_end else best.n_iter, curve)
+
+
+@dataclass
+class _Judged:
+    """What a trial has come to: the error where the reconstruction would end, and who judged."""
+
+    mu: float
+    n_iter: int
+    error: float
+    curve: NDArray[np.void]
+    reference: list[Pair]
+    zero: float
+    truth: float
 
 
 def _follow(
-    pair: _Pair,
+    trial: _Trial,
     mu: float,
-    n_iter: int,
     at_end: bool,
-    reference: tuple[Estimate, Estimate] | None,
+    first: _Judged | None,
     report: Callable[[str], None],
-) -> int:
-    """Take a pair as far as is needed; return which of the kept iterations is chosen."""
-    chosen = 0
-    for iteration in pair.advance():
-        errors = pair.errors(reference or pair.end)
-        chosen = int(np.flatnonzero(errors <= (1.0 + WITHIN) * errors.min())[-1])
-        report(
-            f"held-out counts, mu {mu:.2g}: error {errors[chosen]:.3g} at {pair.kept[chosen][0]}"
-        )
-        settled = AS_LONG_AGAIN * pair.kept[chosen][0] <= iteration and iteration >= FEWEST
-        if settled and not at_end:
+) -> _Judged:
+    """Take a trial as far as is needed, and judge it as the first one was."""
+    for iteration in trial.advance():
+        excess = trial.excess(first.reference if first else trial.end)
+        least = int(np.argmin(excess))
+        allowed = ((1.0 + WITHIN) ** 2 - 1.0) * trial.noise(least)
+        chosen = trial.iterations[np.flatnonzero(excess <= excess[least] + allowed)[-1]]
+        report(f"held-out counts, mu {mu:.2g}: iteration {chosen} of {iteration}")
+        if not at_end and iteration >= max(FEWEST, AS_LONG_AGAIN * chosen):
             break
-    return chosen
+        trial.forget(min(FORGOTTEN * chosen, trial.iterations[least]))
+    reference = first.reference if first else trial.end
+    excess = trial.excess(reference)
+    # The constant that the excess lacks, and the scale of relative errors.
+    zero = first.zero if first else trial.noise(least) - float(excess.min())
+    truth = first.truth if first else float(np.mean([4.0 * _dot(a, b) for a, b in reference]))
+    errors = np.sqrt(np.maximum(excess + zero, 0.0) / max(truth, zero, np.finfo(float).tiny))
+    error = float(errors[-1] if at_end else errors.min())
+    return _Judged(mu, chosen, error, _curve(mu, trial.iterations, errors), reference, zero, truth)
 
 
 def _curve(mu: float, iterations: list[int], errors: Array) -> NDArray[np.void]:

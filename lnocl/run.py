@@ -10,7 +10,6 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from lnocl.observation import Array, Observation
-from lnocl.scaling import prepare
 from lnocl.scene import Scene
 from lnocl.solvers import SOLVERS
 
@@ -71,6 +70,8 @@ class Run:
         extended, star_fluxes = self.scene.start(initial_extended, initial_star_fluxes)
         scaling = None
         if setup.solver == "sgp":
+            from lnocl.scaling import prepare  # it loads scipy, which not every start needs
+
             star_fluxes, scaling = prepare(self.scene, extended, star_fluxes)
         self.engine = _make_engine(setup, self.scene, n_iter, scaling)
         self.engine.start(extended, star_fluxes)

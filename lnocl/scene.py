@@ -78,8 +78,7 @@ class Scene:
     ) -> None:
         self.observation = observation
         self.stars = _check_stars(stars, observation.shape)
-        if not (_is_real(mu) and math.isfinite(mu) and mu >= 0):
-            raise InputError(f"mu must be a number, finite and not negative; {mu!r} was given")
+        check_mu(mu)
         self.grid = _grid(observation.shape, pad)
         self._warn_of_large_psf()
         self.scale = _scale(observation.images[~observation.mask])
@@ -229,7 +228,7 @@ class Scene:
                 f"the psf {psf_shape} is larger than the grid {self.grid}: its wings wrap "
                 "round; crop it, or give pad to enlarge the grid",
                 LnoclWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
 
 
@@ -242,8 +241,10 @@ def _scale(good: Array) -> float:
     return 2.0 ** math.frexp(mean)[1]
 
 
-def _is_real(value: object) -> bool:
-    return isinstance(value, Real)
+def check_mu(mu: object) -> None:
+    """Refuse a weight of the Tikhonov term that is none."""
+    if not (isinstance(mu, Real) and math.isfinite(mu) and float(mu) >= 0):
+        raise InputError(f"mu must be a number, finite and not negative; {mu!r} was given")
 
 
 def _grid(shape: tuple[int, int], pad: int) -> tuple[int, int]:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import scipy.special
-import scipy.stats
+from numpy.typing import ArrayLike
 
-from lnocl.model import Model
 from lnocl.observation import Array
 from lnocl.run import Run
+
+if TYPE_CHECKING:
+    from lnocl.model import Model
 
 # A step of the scaled gradient projection method may be short by chance, ten are not.
 CHANGE_WINDOW = 10
@@ -98,6 +99,8 @@ class Discrepancy:
         return 2.0 * run.engine.data_term() * run.scene.scale / self._expected
 
     def _expect(self, run: Run) -> float:
+        from lnocl.model import Model
+
         if self._model is None:
             self._model = Model(run.scene)
         means = self._model.images(run.engine.extended(), run.engine.star_fluxes())
@@ -105,8 +108,17 @@ class Discrepancy:
         return float((self._model.weights * deviances).sum())
 
 
-def expected_deviance(mean: Array) -> Array:
-    """Return ``E[2 (g ln(g / m) + m - g)]`` for Poisson g of mean m, to 1e-4.
+# Above this mean the expectation is 1 + 1 / (6 m), to a part in ten million.
+MANY = 1e3
+
+
+def expected_deviance(mean: ArrayLike) -> Array:
+    """Return ``E[2 (g ln(g / m) + m - g)]`` for Poisson counts g of mean m.
+
+    Parameters
+    ----------
+    mean : array_like
+        m, zero or more.
 
     Examples
     --------
@@ -114,16 +126,24 @@ def expected_deviance(mean: Array) -> Array:
     >>> expected_deviance([1e-3, 1.0, 1e6]).round(3)
     array([0.014, 1.146, 1.   ])
     """
-    means, deviances = _deviances()
-    return np.interp(np.log(np.maximum(mean, means[0])), np.log(means), deviances)
+    mean = np.asarray(mean, np.float64)
+    least, spline = _deviances()
+    few = spline(np.log(np.clip(mean, least, MANY)))
+    return np.where(mean > MANY, 1.0 + 1.0 / (6.0 * np.maximum(mean, 1.0)), few)
 
 
 @cache
-def _deviances() -> tuple[Array, Array]:
-    means = np.geomspace(1e-6, 1e3, 500)
+def _deviances() -> tuple[float, Any]:
+    """Return the least mean tabled, and the expectation as a spline over the means' logarithms."""
+    import scipy.interpolate
+    import scipy.special
+    import scipy.stats
+
+    means = np.geomspace(1e-6, MANY, 400)
     counts = np.arange(2000)[:, None]
     terms = scipy.special.xlogy(counts, counts / means) + means - counts
-    return means, 2.0 * (scipy.stats.poisson.pmf(counts, means) * terms).sum(axis=0)
+    deviances = 2.0 * (scipy.stats.poisson.pmf(counts, means) * terms).sum(axis=0)
+    return float(means[0]), scipy.interpolate.CubicSpline(np.log(means), deviances)
 
 
 def make_rule(stop: str | float | None) -> Rule:

@@ -16,7 +16,7 @@ LAYERS = {
     "trade": {"deconvolution", "experiment", "metrics", "observation", "simulate"},
     "demo": {"experiment", "fitsio", "metrics", "plots", "simulate"},
     "experiment": {"deconvolution", "metrics", "observation", "simulate"},
-    "deconvolution": {"heldout", "observation", "run", "solvers", "stopping"},
+    "deconvolution": {"heldout", "observation", "run", "scene", "solvers", "stopping"},
     "heldout": {"observation", "run"},
     "stopping": {"model", "observation", "run"},
     "run": {"observation", "scaling", "scene", "solvers", "reference", "opencl"},
