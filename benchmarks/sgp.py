@@ -10,6 +10,7 @@ starts   the best rho'' of SGP from star fluxes of 0.01 to 0.9 of the truth, at 
 bright   rho'' at contrast 30 and 1000: SGP after 500 iterations, SGM after 20,000
 stops    ten seeded scenes of random flux, contrast and number of images: errors where a rule stops
          SGP, relative to the best that the truth would choose over iterations (and mu)
+choices  what was chosen by measuring: the share of the shift, the number of steps kept
 ngc7027  relative error on the published benchmark, from DIR
 answer   the paper's case from FITS to FITS: `lnocl deconvolve --solver sgp`, beside the paper's
          iteration in SciPy until it is as good
@@ -24,6 +25,7 @@ import tempfile
 import time
 import warnings
 from pathlib import Path
+from unittest.mock import patch
 
 import astropy.units as u
 import numpy as np
@@ -32,9 +34,10 @@ from astropy.io import fits
 from astropy.table import Table
 
 import lnocl
-from lnocl import demo, experiment
+from lnocl import demo, experiment, heldout
 from lnocl.device import choose, describe
 from lnocl.metrics import restoration_error, star_rows
+from lnocl.model import Model
 from lnocl.scene import Scene
 from lnocl.simulate import Experiment, Star, Target, hh34, load_target, simulate
 
@@ -174,6 +177,25 @@ def random_scene(seed, data):
     )
 
 
+def likelihood_choice(simulation, device, n_iter=400, every=2):
+    """Return the iteration at which the likelihood of a held-out half is best."""
+    first, second = heldout.halve(experiment.observe(simulation))
+    scene = Scene(first, simulation.stars)
+    model = Model(scene)
+    curve = []
+
+    def look(iteration, estimate):
+        if iteration % every == 0:
+            found, fluxes = estimate.extended / scene.scale, estimate.star_fluxes / scene.scale
+            means = model.images(found, fluxes) * scene.scale
+            curve.append((means - second.images * np.log(means)).sum())
+
+    lnocl.deconvolve(
+        first, simulation.stars, solver="sgp", n_iter=n_iter, callback=look, device=device
+    )
+    return every * (int(np.argmin(curve)) + 1)
+
+
 def stops(data, device):
     """Yield rows of the part "stops"."""
     warnings.simplefilter("ignore", lnocl.LnoclWarning)
@@ -207,7 +229,31 @@ def stops(data, device):
             row |= {f"{name} at": found.n_iter, f"{name} rho'": errors[0] / best[against][0]}
             row |= {f"{name} rho''": errors[1] / best[against][1]}
         row["auto mu"] = auto.mu
+        at = likelihood_choice(simulation, device)
+        row |= {"likelihood at": at, "likelihood rho'": curves[0.0][at - 1, 1] / best["mu 0"][0]}
+        row["likelihood rho''"] = curves[0.0][at - 1, 2] / best["mu 0"][1]
         yield row
+
+
+def choices(data, device):
+    """Yield rows of the part "choices"."""
+    cases = [("hh34", 256, contrast, 400) for contrast in (1.0, 30.0, 1000.0)]
+    settings = [(shift, 2) for shift in (1.0, 0.3, 0.1, 0.03, 0.0)] + [(0.1, 1), (0.1, 3)]
+    for name, size, contrast, n_iter in [*cases, ("hh211", 1024, 1.0, 80)]:
+        simulation = make(name, size, data, contrast)
+        for shift, kept in settings:
+            with patch("lnocl.scaling.SHIFT", shift), patch("lnocl.solvers.STEPS_KEPT", kept):
+                curve = follow(simulation, "sgp", n_iter, device=device)
+            best = curve[np.argmin(curve[:, 2])]
+            yield {
+                "scene": name,
+                "contrast": contrast,
+                "shift": shift,
+                "steps kept": kept,
+                "best rho'": curve[:, 1].min(),
+                "best rho''": best[2],
+                "at": int(best[0]),
+            }
 
 
 def ngc7027(data, device):
@@ -278,7 +324,7 @@ def answer(data, device):
     }
 
 
-PARTS = {part.__name__: part for part in (scenes, starts, bright, stops, ngc7027, answer)}
+PARTS = {part.__name__: part for part in (scenes, starts, bright, stops, choices, ngc7027, answer)}
 
 
 def main():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.optimize
 import scipy.sparse
 
 from lnocl.model import Model
@@ -16,7 +17,7 @@ from lnocl.scene import LEAST_MODEL, Scene
 # in docs/sgp.md.
 SHIFT = 0.1
 # Of the images' mean: what a pixel is taken to see at least.
-LEAST_SEEN = 2.0**-10
+LEAST_SEEN = 2.0**-20
 
 # A star's flux falls to this share at most in one step, so that it never reaches 0 by a step that
 # was too long.
@@ -36,16 +37,15 @@ class Scaling:
         z in the scaling ``D = (f + z) / (alpha + mu (f + z))``, ``alpha = sum_j A_j^T w_j``: a
         share of ``alpha / sum_j A_j^T (w_j / (sum_s c_s P_js + b_j))``, what the pixel sees of
         stars and background.
-    star_covariance : ndarray of float64, shape (n, n)
-        Inverse of the Fisher information of the star fluxes,
-        ``sum_j <P_js, w_j P_jt / m_j>`` at the start.
+    star_information : ndarray of float64, shape (n, n)
+        Fisher information of the star fluxes, ``sum_j <P_js, w_j P_jt / m_j>`` at the start.
     reach : ndarray of float64, shape (n, Ny, Nx)
         Fisher information between each star flux and the extended source,
         ``sum_j A_j^T (w_j P_js / m_j)`` at the start.
     """
 
     shift: Array
-    star_covariance: Array
+    star_information: Array
     reach: Array
 
     def star_step(self, fluxes: Array, gradient: Array, reached: Array) -> Array:
@@ -54,8 +54,25 @@ class Scaling:
         ``-F^-1 (gradient + <reach, d>)``: to the fluxes that are best where the step leads, to
         second order, with the information F of the start; none falls by more than nine tenths.
         """
-        change = -self.star_covariance @ (gradient + reached)
-        return np.maximum(change, (MOST_FADING - 1.0) * fluxes)
+        return _star_step(self.star_information, gradient + reached, fluxes)
+
+
+def _star_step(information: Array, gradient: Array, fluxes: Array) -> Array:
+    """Return the change of the fluxes by Newton's method, none falling by more than nine tenths.
+
+    Where it would, the others are those that are best with it held there: the step minimises
+    ``<gradient, step> + <step, F step> / 2`` within those bounds, so that it never leads uphill.
+    """
+    least = (MOST_FADING - 1.0) * fluxes
+    step = -np.linalg.pinv(information, hermitian=True) @ gradient
+    if (step >= least).all():
+        return step
+    values, vectors = np.linalg.eigh(information)
+    kept = values > values.max() * len(fluxes) * np.finfo(np.float64).eps
+    root = np.sqrt(values[kept])
+    matrix = root[:, None] * vectors[:, kept].T
+    target = -(vectors[:, kept].T @ gradient) / root
+    return least + scipy.optimize.nnls(matrix, target - matrix @ least)[0]
 
 
 def prepare(scene: Scene, extended: Array, star_fluxes: Array) -> tuple[Array, Scaling]:
@@ -88,18 +105,17 @@ def _fit_stars(model: Model, images: Array, diffuse: Array, star_fluxes: Array) 
     fluxes = star_fluxes
     for _ in range(FIT_ROUNDS if len(fluxes) else 0):
         total = np.maximum(diffuse + stars.T @ fluxes, LEAST_MODEL)
-        covariance = _covariance(stars, weights / total)
-        step = covariance @ (stars @ (weights * (images / total - 1.0)))
-        before, fluxes = fluxes, np.maximum(fluxes + step, MOST_FADING * fluxes)
-        if (abs(fluxes - before) <= FIT_CHANGE * np.sqrt(np.diag(covariance))).all():
+        information = _information(stars, weights / total)
+        step = _star_step(information, stars @ (weights * (1.0 - images / total)), fluxes)
+        fluxes = fluxes + step
+        if (abs(step) * np.sqrt(np.diag(information)) <= FIT_CHANGE).all():
             break
     return fluxes
 
 
-def _covariance(stars: scipy.sparse.csr_array, weights: Array) -> Array:
-    """Return the inverse of ``sum_j <P_js, w P_jt>``, the information of the star fluxes."""
-    information = (stars.multiply(weights.reshape(1, -1)) @ stars.T).toarray()
-    return np.linalg.pinv(information, hermitian=True)
+def _information(stars: scipy.sparse.csr_array, weights: Array) -> Array:
+    """Return ``sum_j <P_js, w P_jt>``, the information of the star fluxes."""
+    return (stars.multiply(weights.reshape(1, -1)) @ stars.T).toarray()
 
 
 def _make_scaling(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Scaling:
@@ -115,6 +131,6 @@ def _make_scaling(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> 
     ]
     return Scaling(
         SHIFT * np.maximum(shift, 0.0),
-        _covariance(model.stars, (model.weights / total).ravel()),
+        _information(model.stars, (model.weights / total).ravel()),
         np.array(reach).reshape(scene.n_stars, *scene.grid),
     )

@@ -124,7 +124,7 @@ def expected_deviance(mean: ArrayLike) -> Array:
     --------
     >>> from lnocl.stopping import expected_deviance
     >>> expected_deviance([1e-3, 1.0, 1e6]).round(3)
-    array([0.014, 1.146, 1.   ])
+    array([0.014, 1.147, 1.   ])
     """
     mean = np.asarray(mean, np.float64)
     least, spline = _deviances()

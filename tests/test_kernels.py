@@ -10,7 +10,7 @@ import pytest
 from lnocl import reference
 from lnocl.device import choose
 from lnocl.fft import READ_WRITE, Launcher, Layout, bit_reversed
-from lnocl.program import Program, Tuning
+from lnocl.program import STEP_SOURCES, Program, Tuning
 from lnocl.scene import LEAST_MODEL
 
 CANARY = np.frombuffer(b"\xa5" * 64, np.uint8)
@@ -70,6 +70,8 @@ KERNELS = (
     "ratio_rows",
     "scale_rows",
     "collect_sums",
+    "gradient_rows",
+    "step_rows",
 )
 # Worst element over largest: three times what was measured over all cases on PoCL, 3.3e-7 and
 # 1.2e-15.
@@ -85,7 +87,13 @@ def context():
 def bench(case, dtype):
     grid, tuning, scene, _ = CASES[case]
     program = Program(
-        context(), grid, np.dtype(dtype), tuning, least_model=LEAST_MODEL, **SCENES[scene]
+        context(),
+        grid,
+        np.dtype(dtype),
+        tuning,
+        STEP_SOURCES,
+        least_model=LEAST_MODEL,
+        **SCENES[scene],
     )
     return Bench(program)
 
@@ -214,6 +222,12 @@ def inputs(b):
             if has_weights
             else 1.0 / p
         ),
+        # A step of so much less than f here, of more there, where the projection cuts it off; most
+        # changes have one sign, so that their sums are not small differences.
+        previous=rounded(rng.random((1, ny, nx)) * 0.5, dtype),
+        gradient=rounded(rng.uniform(-0.2, 2.0, (1, ny, nx)), dtype),
+        shift=rounded(rng.random((1, ny, nx)), dtype),
+        reach=rounded(rng.uniform(-0.1, 1.0, (n, ny, nx)), dtype),
         mu=float(np.float32(0.25)) if "-DHAS_MU=1" in b.program.options else 0.0,
     )
 
@@ -335,7 +349,7 @@ def run_scale_rows(b, i):
         extended,
         sums,
         star_fluxes,
-        b.put_pixels(i.inverse_weight) if i.weights is not None else b.put(np.zeros(1)),
+        put_inverse_weight(b, i),
         b.put(i.star_corrections),
         b.dtype.type(i.mu),
     )()
@@ -369,6 +383,70 @@ def run_collect_sums(b, i):
     found = b.take(objectives, (3, 2)).astype(float)
     yield found.sum(axis=1), np.array([-2.0, objective, -2.0])
     yield b.take(star_corrections, -1), corrections
+
+
+def run_gradient_rows(b, i):
+    expected, *products = reference.gradient_rows(
+        i.correction_spectra,
+        i.extended,
+        i.previous,
+        i.gradient,
+        i.shift,
+        i.inverse_weight,
+        i.mu,
+    )
+    gradient, previous = b.put_pixels(i.gradient), b.put_pixels(i.previous)
+    sums = b.put(np.full((b.program.row_blocks, 2, 2), np.nan))
+    b.launcher.rows(
+        "gradient_rows",
+        b.put_spectra(i.correction_spectra),
+        sums,
+        gradient,
+        previous,
+        b.put_pixels(i.extended),
+        b.put_pixels(i.shift),
+        put_inverse_weight(b, i),
+        b.dtype.type(i.mu),
+    )()
+    yield b.take_pixels(gradient), expected
+    assert np.array_equal(b.take_pixels(previous), i.extended)
+    yield b.take(sums, (-1, 2, 2)).astype(float).sum(axis=(0, 2)), np.array(products)
+
+
+def run_step_rows(b, i):
+    alpha = float(np.float32(1.3))
+    weight = np.broadcast_to(i.inverse_weight, i.extended.shape)
+    f, gradient, shift, weight = (a[0] for a in (i.extended, i.gradient, i.shift, weight))
+    for share in (1.0, float(np.float32(0.4))):
+        extended, spectrum, squares, slope, reached = reference.step_rows(
+            f, gradient, shift, weight, i.reach, i.mu, alpha, share
+        )
+        out, trial = b.empty_spectra(), b.empty_pixels()
+        sums = b.put(np.full((b.program.row_blocks, 1 + i.n, 2), np.nan))
+        square_sums = b.put(np.full((b.program.row_blocks, 2), np.nan))
+        b.launcher.rows(
+            "step_rows",
+            out,
+            trial,
+            sums,
+            square_sums,
+            b.put_pixels(i.extended),
+            b.put_pixels(i.gradient),
+            b.put_pixels(i.shift),
+            put_inverse_weight(b, i),
+            b.put_pixels(i.reach) if i.n else b.put(np.zeros(1)),
+            *(b.dtype.type(value) for value in (i.mu, alpha, share)),
+        )()
+        yield b.take_pixels(trial), extended
+        yield b.take_spectra(out), spectrum
+        found = b.take(sums, (-1, 1 + i.n, 2)).astype(float).sum(axis=(0, 2))
+        yield found, np.array([slope, *reached])
+        if i.mu:
+            yield b.take(square_sums, -1).astype(float).sum(), squares
+
+
+def put_inverse_weight(b, i):
+    return b.put_pixels(i.inverse_weight) if i.weights is not None else b.put(np.zeros(1))
 
 
 RUN = {name: globals()[f"run_{name}"] for name in KERNELS}
