@@ -2,8 +2,9 @@
 
     python benchmarks/iteration.py [--sweep NAME ...] [--device SPEC] [--turns N] [--output STEM]
 
-Sweeps: "size" (64 to 4096), "images" (1 to 8), "double", and "scene" (what stars, masks, mu and
-the recording of the objective cost). Without --sweep all four. All sides of a comparison take
+Sweeps: "size" (64 to 4096), "images" (1 to 8), "double", "scene" (what stars, masks, mu and the
+recording of the objective cost), and "step" (an iteration of the scaled gradient projection method
+beside one of the split-gradient method). Without --sweep all five. All sides of a comparison take
 turns in one process, in random order, so that a noisy machine is noisy for all; the table gives
 the median over the turns, and the median of each turn's ratio to lnocl (in "scene": to the plain
 scene). With --output the table goes to STEM.ecsv and a plot to STEM.png.
@@ -22,6 +23,7 @@ import time
 # Threads that wait for work by spinning would take their time from the next side.
 os.environ.setdefault("KMP_BLOCKTIME", "0")
 
+import astropy.units as u
 import numpy as np
 import sides
 from astropy.table import Table, vstack
@@ -29,7 +31,9 @@ from machine import bytes_moved, measure, operations
 
 import lnocl.program
 from lnocl.device import choose, describe
+from lnocl.experiment import observe
 from lnocl.scene import Scene
+from lnocl.simulate import Experiment, hh34, simulate
 
 SIZES = (64, 128, 256, 512, 1024, 2048, 4096)
 IMAGES = (1, 2, 3, 4, 5, 6, 7, 8)
@@ -126,11 +130,23 @@ def without_objective(scene, device):
         lnocl.program.source = source
 
 
+def compare_steps(device, turns, n_images, size=1024):
+    """Return the table of the two solvers' iterations on a real scene with one star."""
+    made = simulate(hh34(size), Experiment(angles=np.arange(n_images) * 180.0 / n_images * u.deg))
+    scene = Scene(observe(made), made.stars)
+    named = {
+        "sgm": sides.Lnocl(scene, np.float32, device),
+        "sgp": sides.Steps(scene, np.float32, device),
+    }
+    return rows("step", size, n_images, np.float32, list(named), take_turns(named, turns))
+
+
 SWEEPS = {
     "size": lambda *given: [compare("size", n, 4, np.float32, *given) for n in SIZES],
     "images": lambda *given: [compare("images", 1024, p, np.float32, *given) for p in IMAGES],
     "double": lambda *given: [compare("double", n, 4, np.float64, *given) for n in DOUBLE_SIZES],
     "scene": lambda *given: [compare_scenes(*given)],
+    "step": lambda *given: [compare_steps(*given, n_images=p) for p in (1, 2, 4)],
 }
 
 

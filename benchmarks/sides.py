@@ -13,6 +13,8 @@ import scipy.fft
 
 import lnocl
 from lnocl.opencl import OpenCLEngine
+from lnocl.scaling import prepare
+from lnocl.solvers import sgp
 
 WORKERS = os.cpu_count()
 
@@ -54,6 +56,23 @@ class Lnocl:
     def extended(self):
         """The extended source."""
         return self.engine.extended()
+
+
+class Steps:
+    """The scaled gradient projection method's own iterations, line search included."""
+
+    def __init__(self, scene, dtype, device=None):
+        precision = "double" if dtype == np.float64 else "single"
+        extended, star_fluxes = scene.start(None, None)
+        star_fluxes, scaling = prepare(scene, extended, star_fluxes)
+        self.engine = OpenCLEngine(scene, precision, device, 1_000_000, scaling=scaling)
+        self.engine.start(extended, star_fluxes)
+        self._iterations = sgp(self.engine, 1_000_000)
+
+    def __call__(self, count):
+        """Do some iterations and wait for the last."""
+        for _ in range(count):
+            next(self._iterations)
 
 
 class Peer:

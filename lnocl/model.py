@@ -59,8 +59,13 @@ class Model:
 
 def _star_images(scene: Scene) -> scipy.sparse.csr_array:
     size = scene.n_images * scene.grid[0] * scene.grid[1]
-    rows = [scipy.sparse.csr_array((0, size))]
+    values, indices = [np.empty(0)], [np.empty(0, np.int64)]
     for s in range(scene.n_stars):
         images = [scene.star_image(j, s).ravel() for j in range(scene.n_images)]
-        rows.append(scipy.sparse.csr_array(np.concatenate(images)[None]))
-    return scipy.sparse.vstack(rows, format="csr")
+        star = np.concatenate(images)
+        indices.append(np.flatnonzero(star))
+        values.append(star[indices[-1]])
+    ends = np.cumsum([len(lit) for lit in indices])
+    return scipy.sparse.csr_array(
+        (np.concatenate(values), np.concatenate(indices), ends), (scene.n_stars, size)
+    )

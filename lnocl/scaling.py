@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import scipy.optimize
 import scipy.sparse
 
 from lnocl.model import Model
@@ -25,6 +25,8 @@ MOST_FADING = 0.1
 # The fit of the star fluxes ends where they change by less of their standard error.
 FIT_CHANGE = 1e-6
 FIT_ROUNDS = 50
+# What the fluxes changed by, relatively, for their information to be taken anew.
+INFORMATION_CHANGE = 0.01
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,8 @@ def _star_step(information: Array, gradient: Array, fluxes: Array) -> Array:
     step = -np.linalg.pinv(information, hermitian=True) @ gradient
     if (step >= least).all():
         return step
+    import scipy.optimize  # half a second, for what is seldom needed
+
     values, vectors = np.linalg.eigh(information)
     kept = values > values.max() * len(fluxes) * np.finfo(np.float64).eps
     root = np.sqrt(values[kept])
@@ -98,14 +102,16 @@ def prepare(scene: Scene, extended: Array, star_fluxes: Array) -> tuple[Array, S
 
 def _fit_stars(model: Model, images: Array, diffuse: Array, star_fluxes: Array) -> Array:
     """Return the star fluxes that minimise J, by Fisher scoring over the pixels that they light."""
-    lit = np.unique(model.stars.indices)
-    stars = model.stars[:, lit]
+    lit = np.flatnonzero(np.bincount(model.stars.indices, minlength=images.size))
+    stars = model.stars if len(lit) == images.size else model.stars[:, lit]
     weights = model.weights.ravel()[lit]
     images, diffuse = images.ravel()[lit], diffuse.ravel()[lit]
-    fluxes = star_fluxes
+    columns = stars.T.tocsr()
+    fluxes, step = star_fluxes, np.full_like(star_fluxes, np.inf)
     for _ in range(FIT_ROUNDS if len(fluxes) else 0):
-        total = np.maximum(diffuse + stars.T @ fluxes, LEAST_MODEL)
-        information = _information(stars, weights / total)
+        total = np.maximum(diffuse + columns @ fluxes, LEAST_MODEL)
+        if (abs(step) > INFORMATION_CHANGE * fluxes).any():
+            information = _information(stars, columns, weights / total)
         step = _star_step(information, stars @ (weights * (1.0 - images / total)), fluxes)
         fluxes = fluxes + step
         if (abs(step) * np.sqrt(np.diag(information)) <= FIT_CHANGE).all():
@@ -113,9 +119,11 @@ def _fit_stars(model: Model, images: Array, diffuse: Array, star_fluxes: Array) 
     return fluxes
 
 
-def _information(stars: scipy.sparse.csr_array, weights: Array) -> Array:
-    """Return ``sum_j <P_js, w P_jt>``, the information of the star fluxes."""
-    return (stars.multiply(weights.reshape(1, -1)) @ stars.T).toarray()
+def _information(stars: scipy.sparse.csr_array, columns: Any, weights: Array) -> Array:
+    """Return ``sum_j <P_js, w P_jt>``; `columns` are the stars transposed."""
+    weighted = stars.copy()
+    weighted.data *= weights[stars.indices]
+    return (weighted @ columns).toarray()
 
 
 def _make_scaling(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Scaling:
@@ -131,6 +139,6 @@ def _make_scaling(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> 
     ]
     return Scaling(
         SHIFT * np.maximum(shift, 0.0),
-        _information(model.stars, (model.weights / total).ravel()),
+        _information(model.stars, model.stars.T, (model.weights / total).ravel()),
         np.array(reach).reshape(scene.n_stars, *scene.grid),
     )

@@ -116,12 +116,9 @@ class Scene:
     def psf(self, j: int) -> Array:
         """Return the PSF of image j on the grid, shape (Ny, Nx), its peak at the origin."""
         psf = self.observation.psfs[j]
-        rows, columns = (
-            (np.arange(k) - k // 2) % n for k, n in zip(psf.shape, self.grid, strict=True)
-        )
-        folded = np.zeros(self.grid)
-        np.add.at(folded, (rows[:, None], columns), psf)
-        return folded
+        for axis, n in enumerate(self.grid):
+            psf = _fold(psf, n, axis)
+        return psf
 
     def star_image(self, j: int, s: int) -> Array:
         """Return P_js, the PSF of image j centred on star s, shape (Ny, Nx)."""
@@ -230,6 +227,18 @@ class Scene:
                 LnoclWarning,
                 stacklevel=5,
             )
+
+
+def _fold(psf: Array, n: int, axis: int) -> Array:
+    """Return a PSF on n points of an axis, its middle at the first, its wings round the edge."""
+    k = psf.shape[axis]
+    wide = -(-k // n) * n  # a whole number of rounds
+    padding = [(0, wide - k) if i == axis else (0, 0) for i in range(2)]
+    centred = np.roll(np.pad(psf, padding), -(k // 2), axis)
+    if wide == n:
+        return centred
+    rounds = (*centred.shape[:axis], wide // n, n, *centred.shape[axis + 1 :])
+    return centred.reshape(rounds).sum(axis)
 
 
 def _scale(good: Array) -> float:
