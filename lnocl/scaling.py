@@ -90,14 +90,16 @@ def prepare(scene: Scene, extended: Array, star_fluxes: Array) -> tuple[Array, S
     scene : Scene
         What is modelled.
     extended : ndarray of float64, shape (Ny, Nx)
-        Extended source to start from, on the grid and scaled.
+        Extended source to start from, on the grid and scaled; where it was not observed it is 0.
     star_fluxes : ndarray of float64, shape (n,)
         Where the fluxes are sought from, scaled.
     """
     model = Model(scene)
-    diffuse = model.images(extended, np.zeros_like(star_fluxes))
+    total_weight = model.adjoint(model.weights)
+    observed = np.where(scene.observed(total_weight), extended, 0.0)
+    diffuse = model.images(observed, np.zeros_like(star_fluxes))
     fluxes = _fit_stars(model, scene.images(), diffuse, star_fluxes)
-    return fluxes, _make_scaling(scene, model, diffuse, fluxes)
+    return fluxes, _make_scaling(scene, model, total_weight, diffuse, fluxes)
 
 
 def _fit_stars(model: Model, images: Array, diffuse: Array, star_fluxes: Array) -> Array:
@@ -126,13 +128,14 @@ def _information(stars: scipy.sparse.csr_array, columns: Any, weights: Array) ->
     return (weighted @ columns).toarray()
 
 
-def _make_scaling(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Scaling:
+def _make_scaling(
+    scene: Scene, model: Model, total_weight: Array, diffuse: Array, fluxes: Array
+) -> Scaling:
     starlight = model.starlight(fluxes)
     total = np.maximum(diffuse + starlight, LEAST_MODEL)
     seen = np.maximum(starlight + model.background, LEAST_SEEN)
-    observed = model.adjoint(model.weights)
     inverse = model.adjoint(model.weights / seen)
-    shift = np.divide(observed, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+    shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     reach = [
         model.adjoint(star.toarray().reshape(model.shape) * model.weights / total)
         for star in (model.stars[[s]] for s in range(scene.n_stars))
