@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import scipy.sparse
 
 from lnocl.model import Model
 from lnocl.observation import Array
@@ -104,28 +102,20 @@ def prepare(scene: Scene, extended: Array, star_fluxes: Array) -> tuple[Array, S
 
 def _fit_stars(model: Model, images: Array, diffuse: Array, star_fluxes: Array) -> Array:
     """Return the star fluxes that minimise J, by Fisher scoring over the pixels that they light."""
-    lit = np.flatnonzero(np.bincount(model.stars.indices, minlength=images.size))
-    stars = model.stars if len(lit) == images.size else model.stars[:, lit]
+    lit, stars = model.stars.on_lit_pixels()
     weights = model.weights.ravel()[lit]
     images, diffuse = images.ravel()[lit], diffuse.ravel()[lit]
-    columns = stars.T.tocsr()
     fluxes, step = star_fluxes, np.full_like(star_fluxes, np.inf)
     for _ in range(FIT_ROUNDS if len(fluxes) else 0):
-        total = np.maximum(diffuse + columns @ fluxes, LEAST_MODEL)
+        total = np.maximum(diffuse + stars.light(fluxes), LEAST_MODEL)
         if (abs(step) > INFORMATION_CHANGE * fluxes).any():
-            information = _information(stars, columns, weights / total)
-        step = _star_step(information, stars @ (weights * (1.0 - images / total)), fluxes)
+            information = stars.information(weights / total)
+        gradient = stars.products(weights * (1.0 - images / total))
+        step = _star_step(information, gradient, fluxes)
         fluxes = fluxes + step
         if (abs(step) * np.sqrt(np.diag(information)) <= FIT_CHANGE).all():
             break
     return fluxes
-
-
-def _information(stars: scipy.sparse.csr_array, columns: Any, weights: Array) -> Array:
-    """Return ``sum_j <P_js, w P_jt>``; `columns` are the stars transposed."""
-    weighted = stars.copy()
-    weighted.data *= weights[stars.indices]
-    return (weighted @ columns).toarray()
 
 
 def _make_scaling(
@@ -136,12 +126,10 @@ def _make_scaling(
     seen = np.maximum(starlight + model.background, LEAST_SEEN)
     inverse = model.adjoint(model.weights / seen)
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
-    reach = [
-        model.adjoint(star.toarray().reshape(model.shape) * model.weights / total)
-        for star in (model.stars[[s]] for s in range(scene.n_stars))
-    ]
+    weights = model.weights / total
+    reach = [model.adjoint(weights * model.starlight(unit)) for unit in np.eye(scene.n_stars)]
     return Scaling(
         SHIFT * np.maximum(shift, 0.0),
-        _information(model.stars, model.stars.T, (model.weights / total).ravel()),
+        model.stars.information(weights.ravel()),
         np.array(reach).reshape(scene.n_stars, *scene.grid),
     )
