@@ -179,7 +179,7 @@ def random_scene(seed, data):
 
 def likelihood_choice(simulation, device, n_iter=400, every=2):
     """Return the iteration at which the likelihood of a held-out half is best."""
-    first, second = heldout.halve(experiment.observe(simulation))
+    ((first, second),) = heldout.halve(experiment.observe(simulation))
     scene = Scene(first, simulation.stars)
     model = Model(scene)
     curve = []

@@ -5,6 +5,16 @@ INLINE vec not_below_0(const vec x)
     return x < 0 ? (vec)0 : x;
 }
 
+/* a = 1 / sum_j A_j^T w_j of a point. */
+INLINE cvec inverse_weight_at(__global const vec *inverse_weight, const int pixel)
+{
+#if HAS_WEIGHTS
+    return LOAD(inverse_weight, pixel);
+#else
+    return (cvec){(real)1 / N_IMAGES, (real)1 / N_IMAGES};
+#endif
+}
+
 /* f <- f (1 + a c) / (1 + mu f a), c = sum_j A_j^T (r_j - w_j), a = 1 / sum_j A_j^T w_j, and 1 + a c
  * not below 0;
  * spectra <- row spectrum of the new f; sums: sum f^2; c_s <- c_s star_corrections_s.
@@ -37,11 +47,7 @@ KERNEL void scale_rows(
             for (int q = 0; q < OUTER(NX); ++q) {
                 const int pixel = q * INNER(NX) + x;
                 const cvec f = LOAD(source + lane, pixel);
-#if HAS_WEIGHTS
-                const cvec weight = LOAD(inverse_weight + at + lane, pixel);
-#else
-                const cvec weight = {(real)1 / N_IMAGES, (real)1 / N_IMAGES};
-#endif
+                const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel);
                 a[q].re = f.re * not_below_0(1 + weight.re * a[q].re);
                 a[q].im = f.im * not_below_0(1 + weight.im * a[q].im);
 #if HAS_MU

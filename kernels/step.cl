@@ -61,11 +61,7 @@ KERNEL void gradient_rows(
                 const cvec before = LOAD(previous + at + lane, pixel);
                 const cvec seen = LOAD(shift + at + lane, pixel);
                 cvec g = LOAD(gradient + at + lane, pixel);
-#if HAS_WEIGHTS
-                const cvec weight = LOAD(inverse_weight + at + lane, pixel);
-#else
-                const cvec weight = {(real)1 / N_IMAGES, (real)1 / N_IMAGES};
-#endif
+                const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel);
                 g.re = next_gradient(
                     g.re, a[q].re, f.re, before.re, scaling(f.re, seen.re, weight.re, mu), mu,
                     &step_part, &change_part);
@@ -118,11 +114,7 @@ KERNEL void step_rows(
                 const cvec f = LOAD(previous + at + lane, pixel);
                 const cvec g = LOAD(gradient + at + lane, pixel);
                 const cvec seen = LOAD(shift + at + lane, pixel);
-#if HAS_WEIGHTS
-                const cvec weight = LOAD(inverse_weight + at + lane, pixel);
-#else
-                const cvec weight = {(real)1 / N_IMAGES, (real)1 / N_IMAGES};
-#endif
+                const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel);
                 const cvec d = {
                     not_below_0(f.re - alpha * scaling(f.re, seen.re, weight.re, mu) * g.re) - f.re,
                     not_below_0(f.im - alpha * scaling(f.im, seen.im, weight.im, mu) * g.im) - f.im

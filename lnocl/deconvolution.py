@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from numbers import Real
 from typing import Any
@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.heldout import CURVE_DTYPE, Choice, choose
-from lnocl.observation import Array, Observation
+from lnocl.observation import Array, Observation, numbers
 from lnocl.run import Run, Setup
 from lnocl.scene import check_mu
 from lnocl.solvers import SOLVERS
@@ -106,8 +106,8 @@ class Result:
     stop_reason: str
     device: str
     history: NDArray[np.void]
-    mu: float = 0.0
-    held_out: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
+    mu: float
+    held_out: NDArray[np.void]
 
 
 def deconvolve(
@@ -148,7 +148,7 @@ def deconvolve(
         Iteration to use: the split-gradient method, or the scaled gradient projection method, which
         solves for the star fluxes at the start, so that those given matter little.
     n_iter : int, optional
-        Iterations to do, 1 or more.
+        Iterations to do, at most where they may end sooner; 1 or more.
     stop : float, "discrepancy" or "held-out", optional
         When to stop before `n_iter`. A number in (0, 1): when the objective changes relatively by
         less an iteration, in the mean over ten. "discrepancy": when the data term has fallen to its
@@ -172,7 +172,7 @@ def deconvolve(
     callback : callable, optional
         ``callback(iteration, estimate)``, called after every iteration; it stops the run by
         returning True. The estimate has ``extended`` and ``star_fluxes``, which are fetched
-        from the device when they are read.
+        from the device when they are read. The halves of held-out counts do not call it.
     progress : bool, optional
         Show a progress bar on stderr, where that is a terminal, with the objective or what the
         stopping rule watches.
@@ -241,6 +241,7 @@ def deconvolve(
         run = Run(
             setup, observation, choice.mu, choice.n_iter, initial_extended, initial_star_fluxes
         )
+        bar.expect(choice.n_iter)
         stop_reason = _iterate(run, choice.n_iter, make_rule(stop), callback, bar)
     if stop == "held-out" and stop_reason == "n_iter":
         stop_reason = "held-out"
@@ -304,9 +305,15 @@ class _Bar:
     def __exit__(self, *exception: object) -> None:
         self._bar.close()
 
+    def expect(self, n_iter: int) -> None:
+        """Count to another number of iterations."""
+        self._bar.total = n_iter
+
     def show(self, iteration: int, quantity: Callable[[], str], last: bool = False) -> None:
-        """Show how far it is, where it is time to."""
-        if last or (not self._bar.disable and time.monotonic() - self._shown > PROGRESS_INTERVAL):
+        """Show how far it is, where it is time to, or at the end."""
+        if self._bar.disable:
+            return
+        if last or time.monotonic() - self._shown > PROGRESS_INTERVAL:
             self._bar.set_postfix_str(quantity(), refresh=False)
             self._bar.update(iteration - self._bar.n)
             self._shown = time.monotonic()
@@ -322,7 +329,9 @@ def _choose(
     bar: _Bar,
 ) -> Choice:
     """Have held-out counts choose mu and the number of iterations, or one of them."""
-    half = None if initial_extended is None else np.asarray(initial_extended) / 2.0
+    half = None
+    if initial_extended is not None:
+        half = numbers("initial_extended", initial_extended) / 2.0
     return choose(
         partial(Run, setup, n_iter=n_iter, initial_extended=half),
         observation,
@@ -335,16 +344,19 @@ def _choose(
 
 def _iterate(run: Run, n_iter: int, rule: Rule, callback: Callback | None, bar: _Bar) -> str:
     """Iterate to the end; return why it ended."""
+    quantity = partial(rule.quantity, run)
+    stop_reason = None
     for iteration in run:
-        bar.show(iteration, partial(rule.quantity, run))
         if callback is not None:
             estimate = Estimate(run)
-            stopped = callback(iteration, estimate)
+            if callback(iteration, estimate):
+                stop_reason = "callback"
             estimate._close()
-            if stopped:
-                return "callback"
         if rule.met(run):
-            return rule.reason
+            stop_reason = stop_reason or rule.reason
+        bar.show(iteration, quantity, last=stop_reason is not None or iteration == n_iter)
+        if stop_reason is not None:
+            return stop_reason
     return "n_iter" if run.done == n_iter else "converged"
 
 

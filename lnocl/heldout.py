@@ -71,12 +71,12 @@ class Choice:
     curve: NDArray[np.void]
 
 
-def halve(observation: Observation, seed: int = 0) -> tuple[Observation, Observation]:
-    """Return two halves of an observation, the counts of each pixel dealt out at random.
+def halve(observation: Observation, ways: int = 1) -> list[tuple[Observation, Observation]]:
+    """Return two halves of an observation, the counts dealt out at random, in so many ways.
 
     Whole counts are dealt out one by one, so that the halves of a Poisson count are independent
     Poisson counts of half its mean. Of what is no whole count the fraction goes to one of the
-    halves, which keeps their variances those of counts to 1/16.
+    halves, which keeps their variances those of counts to 1/16. The seeds are fixed.
 
     Raises
     ------
@@ -102,17 +102,20 @@ def halve(observation: Observation, seed: int = 0) -> tuple[Observation, Observa
             LnoclWarning,
             stacklevel=5,
         )
-    rng = np.random.default_rng(seed)
-    first = rng.binomial(whole.astype(np.int64), 0.5) + (images - whole) * rng.integers(
-        0, 2, images.shape
-    )
-    background, mask = observation.background / 2.0, observation.mask
-    psfs = observation.psfs
-    with _quiet():
-        return (
-            Observation(first, psfs, background=background, mask=mask),
-            Observation(images - first, psfs, background=background, mask=mask),
-        )
+    background, mask, psfs = observation.background / 2.0, observation.mask, observation.psfs
+    pairs = []
+    for seed in range(ways):
+        rng = np.random.default_rng(seed)
+        first = rng.binomial(whole.astype(np.int64), 0.5).astype(np.float64)
+        first += (images - whole) * rng.integers(0, 2, images.shape)
+        with _quiet():
+            pairs.append(
+                (
+                    Observation(first, psfs, background=background, mask=mask),
+                    Observation(images - first, psfs, background=background, mask=mask),
+                )
+            )
+    return pairs
 
 
 @contextmanager
@@ -208,8 +211,18 @@ def choose(
         each mu has its own number of iterations.
     report : callable
         Told in a few words how far it is.
+
+    Raises
+    ------
+    InputError
+        No counts to deal out, or too many, or halves of which no iteration betters the start.
+
+    Warns
+    -----
+    LnoclWarning
+        Images that are not whole counts; an iteration chosen too near `n_iter`.
     """
-    halves = [halve(observation, seed) for seed in range(SPLITS)]
+    halves = halve(observation, SPLITS)
     pending = [0.0] if mus is None else sorted(float(mu) for mu in mus)
     trials: list[_Judged] = []
     while pending:
@@ -266,6 +279,10 @@ def _follow(
         if not at_end and iteration >= max(FEWEST, AS_LONG_AGAIN * chosen):
             break
         trial.forget(min(FORGOTTEN * chosen, trial.iterations[least]))
+    if not trial.kept:
+        raise InputError(
+            "half of the counts is too little: no iteration betters the start; give n_iter and mu"
+        )
     reference = first.reference if first else trial.end
     excess = trial.excess(reference)
     # The constant that the excess lacks, and the scale of relative errors.

@@ -344,6 +344,8 @@ class OpenCLEngine:
 
     def star_gradient(self) -> Array:
         """Return the gradient of the objective in the star fluxes."""
+        if not self.scene.n_stars:
+            return np.zeros(0)  # without waiting for the device
         return -self._sums("ratio_sums", 1 + self.scene.n_stars)[1:]
 
     def step(self, alpha: float, share: float) -> tuple[float, Array]:

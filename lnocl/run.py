@@ -92,6 +92,10 @@ class Run:
         """Return the star fluxes, electrons."""
         return self.engine.star_fluxes() * self.scene.scale
 
+    def objective(self) -> float:
+        """Return the objective recorded last."""
+        return self.engine.objective() * self.scene.scale
+
     def objectives(self) -> Array:
         """Return the objectives recorded so far: of the start, and after each iteration."""
         return self.engine.objectives() * self.scene.scale

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from functools import cache
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -24,7 +25,7 @@ class Rule(Protocol):
     reason: str
 
     def met(self, run: Run) -> bool:
-        """Return whether the run should end."""
+        """Return whether the run should end; asked once after each iteration."""
 
     def quantity(self, run: Run) -> str:
         """Return what the rule watches, for the progress bar."""
@@ -41,7 +42,7 @@ class Never:
 
     def quantity(self, run: Run) -> str:
         """Return the objective."""
-        return f"objective {run.objectives()[-1]:.6g}"
+        return f"objective {run.objective():.6g}"
 
 
 class Change:
@@ -50,21 +51,23 @@ class Change:
     reason = "change"
 
     def __init__(self, least: float) -> None:
-        self.least = least
+        self._least = least
+        self._recent: deque[float] = deque(maxlen=CHANGE_WINDOW + 1)
 
     def met(self, run: Run) -> bool:
         """Return whether the objective has settled."""
-        return run.done > CHANGE_WINDOW and self._change(run) < self.least
+        self._recent.append(run.objective())
+        return len(self._recent) > CHANGE_WINDOW and self._change() < self._least
 
     def quantity(self, run: Run) -> str:
         """Return the relative change an iteration."""
-        return f"change {self._change(run):.2g}"
+        return f"change {self._change():.2g}"
 
-    def _change(self, run: Run) -> float:
-        recent = run.objectives()[-CHANGE_WINDOW - 1 :]
-        if len(recent) < 2 or recent[-1] == 0:
+    def _change(self) -> float:
+        first, last = self._recent[0], self._recent[-1]
+        if last == 0 or len(self._recent) < 2:
             return 0.0
-        return float(abs(recent[0] - recent[-1]) / (len(recent) - 1) / abs(recent[-1]))
+        return abs(first - last) / (len(self._recent) - 1) / abs(last)
 
 
 class Discrepancy:
@@ -72,8 +75,8 @@ class Discrepancy:
 
     ``2 J_0 = sum_j sum_n e(m_j)`` over the observed pixels, with ``e(m)`` the expectation of
     ``2 (g ln(g / m) + m - g)`` for Poisson counts g of mean m: 1 for many counts (Bertero et al.
-    2010, Inverse Problems 26, 105004), less for few. The expectation is taken anew at each power
-    of two of iterations, and before the run ends.
+    2010, Inverse Problems 26, 105004), up to 1.15 for about one, and down to 0 for less. The
+    expectation is taken anew at each power of two of iterations, and before the run ends.
     """
 
     reason = "discrepancy"

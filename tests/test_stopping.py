@@ -1,6 +1,7 @@
 """When a run stops, and what held-out counts choose, on scenes whose truth is known."""
 
 import functools
+import io
 import warnings
 
 import numpy as np
@@ -108,7 +109,7 @@ def test_discrepancy_stops_where_noise_is_reached(mask, solver):
 class TestHalves:
     def test_are_whole_counts_that_add_up(self):
         observation, *_ = scene()
-        first, second = heldout.halve(observation)
+        ((first, second),) = heldout.halve(observation)
         np.testing.assert_array_equal(first.images + second.images, observation.images)
         assert (first.images == np.floor(first.images)).all()
         assert min(first.images.min(), second.images.min()) >= 0
@@ -121,7 +122,7 @@ class TestHalves:
         images = np.random.default_rng(5).poisson(mean, (n, n)) + fraction
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LnoclWarning)
-            first, second = heldout.halve(lnocl.Observation(images, np.ones((1, 1))))
+            ((first, second),) = heldout.halve(lnocl.Observation(images, np.ones((1, 1))))
         covariance = np.cov(first.images.ravel(), second.images.ravel())
         allowed = 6.0 * mean / 2.0 * np.sqrt(2.0) / n
         # Of a fraction, which is no count, 1/4 of its square goes to each.
@@ -131,7 +132,7 @@ class TestHalves:
 
     def test_leave_masked_pixels_out(self):
         observation, *_ = scene(mask=True)
-        first, second = heldout.halve(observation)
+        ((first, second),) = heldout.halve(observation)
         np.testing.assert_array_equal(first.mask, observation.mask)
         assert first.images[observation.mask].max() == second.images[observation.mask].max() == 0
 
@@ -203,6 +204,53 @@ class TestHeldOut:
 
     def test_without_the_rule_there_is_no_curve(self):
         assert run(scene()[0], n_iter=2).held_out.size == 0
+
+    def test_says_once_that_images_are_no_whole_counts(self):
+        observation, *_ = scene()
+        fractions = lnocl.Observation(observation.images + 0.25, observation.psfs, background=20.25)
+        with pytest.warns(LnoclWarning) as caught:
+            run(fractions, stop="held-out", n_iter=100)
+        assert [str(each.message) for each in caught if "whole" in str(each.message)] == [
+            "the images are not whole counts: they are split as if they were Poisson counts"
+        ]
+
+    def test_halves_that_end_at_once_are_refused(self):
+        with pytest.raises(lnocl.InputError, match="no iteration betters the start"):
+            heldout._follow(heldout._Trial([((), ())]), 0.0, False, None, print)
+
+    def test_start_that_is_no_number_is_refused(self):
+        with pytest.raises(lnocl.InputError, match="initial_extended"):
+            run(scene()[0], stop="held-out", initial_extended="flat")
+
+
+class Screen(io.StringIO):
+    """A terminal to show progress on."""
+
+    def isatty(self):
+        """Return True."""
+        return True
+
+
+@pytest.mark.parametrize(
+    ("stop", "words"),
+    [
+        (None, "objective"),
+        (1e-3, "change"),
+        ("discrepancy", "discrepancy"),
+        ("held-out", "objective"),
+    ],
+)
+@pytest.mark.parametrize("interval", [0.0, 1e9], ids=["each", "last alone"])
+def test_progress_ends_at_the_last_iteration(stop, words, interval, monkeypatch):
+    screen = Screen()
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setattr("lnocl.deconvolution.PROGRESS_INTERVAL", interval)
+    result = run(scene()[0], n_iter=60, stop=stop, progress=True)
+    last = screen.getvalue().rstrip().rsplit("\r", 1)[-1]
+    total = 60 if stop != "held-out" else result.n_iter
+    assert f"{result.n_iter}/{total}" in last
+    assert words in last
+    assert "nan" not in screen.getvalue()
 
 
 class TestMu:
