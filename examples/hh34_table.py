@@ -17,7 +17,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
-from lnocl import demo, experiment, fitsio, metrics, simulate
+from lnocl import demo, experiment, fitsread, fitswrite, metrics, simulate
 from lnocl.errors import InputError, LnoclError
 
 # La Camera et al. (2012), Table 1: rho' and rho'' in percent, with their iterations.
@@ -72,7 +72,7 @@ def compute(path, simulation, observation, method, mu, n_iter, every, patience, 
 
 def read_row(path, method, mu, cards):
     """Return a saved reconstruction; refuse one of another experiment."""
-    saved = fitsio.read_result(str(path))
+    saved = fitsread.read_result(str(path))
     for keyword, value, _ in [("METHOD", method, ""), ("MU", mu, ""), *cards]:
         if saved.header.get(keyword) != value:
             raise InputError(
@@ -119,7 +119,7 @@ def keep_truth(path, simulation):
     """Write the truth, or check that the one that is there is the same."""
     if not path.exists():
         scale = float(simulation.experiment.pixel_scale.value)
-        fitsio.write_result(
+        fitswrite.write_result(
             str(path),
             simulation.extended,
             simulation.stars,
@@ -130,7 +130,7 @@ def keep_truth(path, simulation):
             ],
         )
         return
-    saved = fitsio.read_result(str(path))
+    saved = fitsread.read_result(str(path))
     same = (
         saved.extended.shape == simulation.extended.shape
         and saved.stars == simulation.stars
@@ -163,7 +163,7 @@ def run(given):
     target = simulate.load_target(given.scene, given.size)
     simulation = simulate.simulate(target, simulate.Experiment(extended_magnitude=13 * u.mag))
     observation = experiment.observe(simulation)
-    fitsio.check_folder(str(given.output), overwrite=True)
+    fitswrite.check_folder(str(given.output), overwrite=True)
     keep_truth(given.output / "truth.fits", simulation)
     jobs = []
     for method, mu in [("RLM", 0.0), *(("MC-RL", mu) for mu in given.mu)]:

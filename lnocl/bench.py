@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from astropy.table import Table
 
-from lnocl import __version__, demo, experiment, fitsio, plots, trade
+from lnocl import __version__, demo, experiment, fitsread, fitswrite, plots, trade
 from lnocl.errors import InputError, LnoclError
 from lnocl.observation import Observation
 from lnocl.simulate import Simulation, load_target, simulate
@@ -98,7 +98,7 @@ class Files(NamedTuple):
 
     def load(self) -> Problem:
         """Read them."""
-        images, psfs = fitsio.read_stack(self.images), fitsio.read_stack(self.psfs)
+        images, psfs = fitsread.read_stack(self.images), fitsread.read_stack(self.psfs)
         observation = Observation(images.data, psfs.data, self.background, self.read_noise)
         inputs = {
             "images": dict(zip(self.images, images.sha256, strict=True)),
@@ -248,7 +248,7 @@ def _lines(table: Table) -> list[str]:
 def _write(table: Table, stem: str, overwrite: bool) -> Iterator[str]:
     text = io.StringIO()
     table.write(text, format="ascii.ecsv")
-    fitsio.write_text(f"{stem}.ecsv", text.getvalue(), overwrite)
+    fitswrite.write_text(f"{stem}.ecsv", text.getvalue(), overwrite)
     yield f"written to {stem}.ecsv"
     try:
         plots.check()
@@ -276,4 +276,4 @@ def _check_files(stem: str, overwrite: bool, inputs: Sequence[str]) -> None:
     if not os.path.basename(stem):
         raise InputError(f"the output {stem!r} names no file; give a path without its ending")
     for ending in (".ecsv", ".png"):
-        fitsio.check_output(stem + ending, overwrite, inputs)
+        fitswrite.check_output(stem + ending, overwrite, inputs)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl import __version__, experiment, fitsio, metrics, plots
+from lnocl import __version__, experiment, fitsread, fitswrite, metrics, plots
 from lnocl.errors import InputError, LnoclError
 from lnocl.experiment import Reconstruction
 from lnocl.simulate import Experiment, Simulation, load_target, simulate
@@ -58,17 +58,21 @@ def write_simulation(
     for j, (image, psf, angle) in enumerate(
         zip(simulation.images, simulation.psfs, angles, strict=True), 1
     ):
-        common: list[fitsio.Card] = [creator, scale, ("ANGLE", angle, "of the baseline, degrees")]
-        taken: list[fitsio.Card] = [
+        common: list[fitswrite.Card] = [
+            creator,
+            scale,
+            ("ANGLE", angle, "of the baseline, degrees"),
+        ]
+        taken: list[fitswrite.Card] = [
             ("BUNIT", "electron", "per pixel"),
             ("EXPTIME", float(how.exposure_time.to_value("s")), "seconds"),
             ("BKG", float(simulation.background[j - 1]), "background, electrons"),
             ("RON", simulation.read_noise, "read noise, electrons"),
         ]
-        fitsio.write_image(_in(folder, f"image_{j}"), image, [*common, *taken], overwrite)
-        fitsio.write_image(_in(folder, f"psf_{j}"), psf, common, overwrite)
+        fitswrite.write_image(_in(folder, f"image_{j}"), image, [*common, *taken], overwrite)
+        fitswrite.write_image(_in(folder, f"psf_{j}"), psf, common, overwrite)
     zero = ("MAGZERO", simulation.zero_magnitude_flux, "electrons of magnitude 0")
-    fitsio.write_result(
+    fitswrite.write_result(
         _in(folder, "truth"),
         simulation.extended,
         simulation.stars,
@@ -78,7 +82,7 @@ def write_simulation(
     )
     record = {"lnocl": __version__, "scene": scene, **simulation.record()}
     path = os.path.join(folder, "record.json")
-    fitsio.write_text(path, json.dumps(record, indent=2) + "\n", overwrite)
+    fitswrite.write_text(path, json.dumps(record, indent=2) + "\n", overwrite)
     return _command(folder, simulation, simulation.stars, "result")
 
 
@@ -114,9 +118,9 @@ def run(
     """
     experiment_at = Experiment(seed=seed)
     target = load_target(SCENE, size)
-    fitsio.check_folder(folder, overwrite, make=False)
+    fitswrite.check_folder(folder, overwrite, make=False)
     simulation = simulate(target, experiment_at)
-    fitsio.check_folder(folder, overwrite)
+    fitswrite.check_folder(folder, overwrite)
     write_simulation(folder, SCENE, simulation, overwrite)
     yield (
         f"simulated {SCENE}: {len(simulation.images)} images of {size} x {size} pixels, a star of "
@@ -154,7 +158,7 @@ def write_reconstruction(
     path: str,
     simulation: Simulation,
     found: Reconstruction,
-    cards: Iterable[fitsio.Card] = (),
+    cards: Iterable[fitswrite.Card] = (),
     commands: Iterable[Sequence[str]] = (),
     overwrite: bool = False,
 ) -> None:
@@ -182,7 +186,7 @@ def write_reconstruction(
     """
     stars = [] if found.method == "RLM" else simulation.stars
     n_iter, _ = found.best("rho_star")
-    fitsio.write_result(
+    fitswrite.write_result(
         path,
         found.extended,
         stars,
@@ -216,7 +220,7 @@ def draw(
     folder : str
         Made where it does not exist; figures are written to it.
     results : sequence of str
-        Files that `fitsio.write_result` has written. Without stars: RLM.
+        Files that `fitswrite.write_result` has written. Without stars: RLM.
     truth : str, optional
         File with the true source and one star.
     overwrite : bool, optional
@@ -237,10 +241,10 @@ def draw(
         Where the shapes of the files differ, or one holds no flux or values that are not finite.
     """
     plots.check()
-    fitsio.check_folder(folder, overwrite, FIGURE_FILES, make=False)
+    fitswrite.check_folder(folder, overwrite, FIGURE_FILES, make=False)
     results = list(dict.fromkeys(results))
-    saved = [fitsio.read_result(path) for path in results]
-    true = None if truth is None else fitsio.read_result(truth)
+    saved = [fitsread.read_result(path) for path in results]
+    true = None if truth is None else fitsread.read_result(truth)
     for path, each in zip(results, saved, strict=True):
         first = saved[0] if true is None else true
         if each.extended.shape != first.extended.shape:
@@ -261,7 +265,7 @@ def draw(
     original = None if true is None else plots.Source("truth", true.extended)
     curves = _tables(names, [each.curve for each in saved])
     histories = _tables(names, [each.history for each in saved])
-    fitsio.check_folder(folder, overwrite, FIGURE_FILES)
+    fitswrite.check_folder(folder, overwrite, FIGURE_FILES)
     yield _draw(folder, "objects", plots.objects(original, sources, frame))
     if curves:
         yield _draw(folder, "errors", plots.errors(curves))
@@ -370,7 +374,7 @@ def _draw(folder: str, name: str, figure: plots.Figure) -> str:
     return f"drew {path}"
 
 
-def _names(paths: Sequence[str], saved: Sequence[fitsio.SavedResult]) -> list[str]:
+def _names(paths: Sequence[str], saved: Sequence[fitsread.SavedResult]) -> list[str]:
     """Return the method and mu of each result, with its file where that leaves two alike."""
     names = []
     for each in saved:
@@ -394,13 +398,13 @@ def _tables(
     }
 
 
-def _frame(saved: Sequence[fitsio.SavedResult]) -> plots.Frame:
+def _frame(saved: Sequence[fitsread.SavedResult]) -> plots.Frame:
     star = next((each.stars[0] for each in saved if each.stars), None)
     scale = next((each.header["PIXSCALE"] for each in saved if "PIXSCALE" in each.header), None)
     return plots.Frame(star, scale)
 
 
-def _true_magnitude(true: fitsio.SavedResult | None) -> float | None:
+def _true_magnitude(true: fitsread.SavedResult | None) -> float | None:
     if true is None or not true.stars or "MAGZERO" not in true.header:
         return None
     return metrics.magnitude(float(true.star_fluxes[0]), true.header["MAGZERO"])

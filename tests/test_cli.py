@@ -215,13 +215,15 @@ class TestRefusals:
         def fail(*arguments, **parameters):
             raise error
 
-        monkeypatch.setattr(cli, "deconvolve", fail)
+        monkeypatch.setattr("lnocl.commands.deconvolve.deconvolve", fail)
         assert run() == status
         assert message in one_complaint(capsys.readouterr())
         assert not Path("out.fits").exists()
 
     def test_a_mistake_of_ours_keeps_its_traceback(self, monkeypatch):
-        monkeypatch.setattr(cli, "deconvolve", lambda *arguments, **parameters: 1 / 0)
+        monkeypatch.setattr(
+            "lnocl.commands.deconvolve.deconvolve", lambda *arguments, **parameters: 1 / 0
+        )
         with pytest.raises(ZeroDivisionError):
             run()
 

@@ -12,7 +12,8 @@ import pytest
 from astropy.io import fits
 
 import lnocl
-from lnocl import cli, demo, experiment, fitsio, simulate
+from lnocl import cli, demo, experiment, fitsread, fitswrite, simulate
+from lnocl.commands import messages
 
 SMALL = ("--size", "64")
 
@@ -39,7 +40,7 @@ def run(tmp_path_factory):
         patch.setattr(demo, "N_ITER", 100)
         patch.setattr(sys, "stderr", nowhere)
         said = []
-        patch.setattr(cli, "_say", said.extend)
+        patch.setattr(messages, "say", said.extend)
         assert cli.main(["demo", *SMALL, "-o", "here"]) == 0
     return home / "here", said
 
@@ -62,7 +63,7 @@ class TestDemo:
         rows = [line.split() for line in said if line.startswith(("RLM ", "MC-RL "))]
         assert [row[0] for row in rows] == ["RLM", "MC-RL"]
         for row, name in zip(rows, ("rlm", "mc-rl"), strict=True):
-            curve = fitsio.read_result(str(files / f"{name}.fits")).curve
+            curve = fitsread.read_result(str(files / f"{name}.fits")).curve
             assert f"{curve['rho'].min():.2%}" in row
             assert f"{curve['rho_star'].min():.2%}" in row
         assert float(rows[0][3].rstrip("%")) > float(rows[1][4].rstrip("%"))
@@ -75,8 +76,8 @@ class TestDemo:
         assert Path(home[1]) == files.parent
         monkeypatch.chdir(files.parent)
         assert cli.main([*words[1:-1], str(folder / "again.fits"), "--quiet"]) == 0
-        again = fitsio.read_result(str(folder / "again.fits"))
-        first = fitsio.read_result(str(files / "mc-rl.fits"))
+        again = fitsread.read_result(str(folder / "again.fits"))
+        first = fitsread.read_result(str(files / "mc-rl.fits"))
         np.testing.assert_array_equal(again.extended, first.extended)
         np.testing.assert_array_equal(again.star_fluxes, first.star_fluxes)
         np.testing.assert_array_equal(again.history["objective"], first.history["objective"])
@@ -210,7 +211,7 @@ class TestSimulate:
             with fits.open(f"out/image_{j}.fits", checksum=True) as hdus:
                 np.testing.assert_array_equal(hdus[0].data, expected.images[j - 1])
             np.testing.assert_array_equal(fits.getdata(f"out/psf_{j}.fits"), expected.psfs[j - 1])
-        truth = fitsio.read_result("out/truth.fits")
+        truth = fitsread.read_result("out/truth.fits")
         np.testing.assert_array_equal(truth.extended, expected.extended)
         assert truth.stars == [(20.0, 30.0)]
         np.testing.assert_array_equal(truth.star_fluxes, expected.star_fluxes)
@@ -263,7 +264,7 @@ class TestSimulate:
         image[20:30, 18:22] = 1.0
         fits.writeto("mine.fits", image, fits.Header({"STARX": 20, "STARY": 24}))
         assert cli.main(["simulate", "mine.fits", "-o", "out", "--angle", "0"]) == 0
-        assert fitsio.read_result("out/truth.fits").stars == [(20.0, 24.0)]
+        assert fitsread.read_result("out/truth.fits").stars == [(20.0, 24.0)]
 
     @pytest.mark.parametrize(
         ("arguments", "status", "message"), BAD_SIMULATE.values(), ids=BAD_SIMULATE
@@ -297,7 +298,7 @@ class TestPlot:
     def test_what_is_not_there_is_skipped_with_a_line(self, capsys):
         image = np.ones((32, 32))
         history = np.array([(0, 3.5), (1, 2.5)], [("iteration", int), ("objective", float)])
-        fitsio.write_result("a.fits", image, [], [], history)
+        fitswrite.write_result("a.fits", image, [], [], history)
         assert cli.main(["plot", "a.fits", "-o", "out"]) == 0
         assert capsys.readouterr().out.splitlines() == [
             "drew out/objects.png",
@@ -309,11 +310,11 @@ class TestPlot:
     def test_names_tell_results_apart(self):
         for name, stars in (("a", []), ("b", [(3, 4)]), ("c", [(3, 4)]), ("d", [(3, 4)])):
             cards = [("MU", 1e-8 if name == "d" else 0.0, "")]
-            fitsio.write_result(
+            fitswrite.write_result(
                 f"{name}.fits", np.ones((8, 8)), stars, [1.0] * len(stars), cards=cards
             )
         paths = [f"{name}.fits" for name in "abcd"]
-        saved = [fitsio.read_result(path) for path in paths]
+        saved = [fitsread.read_result(path) for path in paths]
         assert demo._names(paths, saved) == [
             "RLM",
             "MC-RL mu=0 (b.fits)",
@@ -341,7 +342,7 @@ class TestPlot:
     def test_refusals(self, arguments, status, message, capsys):
         arrays = {"a": np.ones((9, 8)), "b": np.ones((8, 8)), "dark": np.zeros((9, 8))}
         for name, array in {**arrays, "nan": np.full((8, 8), np.nan)}.items():
-            fitsio.write_result(f"{name}.fits", array, [], [])
+            fitswrite.write_result(f"{name}.fits", array, [], [])
         fits.writeto("image.fits", np.ones((8, 8)))
         Path("full").mkdir()
         Path("full/flux.png").write_text("kept")
@@ -438,7 +439,7 @@ class TestTable:
 
     def test_another_truth_is_refused_and_kept(self, main, capsys):
         Path("t").mkdir()
-        fitsio.write_result("t/truth.fits", np.ones((64, 64)), [(32, 16)], [1.0])
+        fitswrite.write_result("t/truth.fits", np.ones((64, 64)), [(32, 16)], [1.0])
         before = Path("t/truth.fits").read_bytes()
         assert main(self.QUICK) == 2
         complaint = capsys.readouterr().err

@@ -70,7 +70,7 @@ def test_installed(built, kind, tmp_path):
     borrowed = os.pathsep.join(path for path in sys.path if "site-packages" in path)
     code = (
         f"import sys; sys.path += {borrowed.split(os.pathsep)!r}\n"
-        "import lnocl, lnocl.program\n"
+        "import lnocl, lnocl.cli, lnocl.program\n"
         "print(lnocl.__file__)\nprint(lnocl.program.source())"
     )
     found, _, source = run(python, "-I", "-c", code, cwd=tmp_path).partition("\n")

@@ -1,28 +1,20 @@
-"""FITS in and out: what is read, what is refused, and what of a run a file keeps."""
+"""FITS in: what is read, what is refused, and where an image lies."""
 
 import gzip
 import hashlib
-import os
 import random
-import stat
-import subprocess
 import tracemalloc
 import warnings
 
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.io.fits.scripts import fitscheck
-from astropy.table import QTable
 from astropy.wcs import WCS
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from lnocl import fitsio
+from lnocl import fitsread, fitswrite
 from lnocl.errors import FileError, InputError, LnoclWarning
 
 IMAGE = np.arange(1.0, 121.0).reshape(10, 12)
-HISTORY = np.array([(0, 3.5), (1, 2.5)], dtype=[("iteration", np.int64), ("objective", float)])
 
 LINEAR = {
     "CTYPE1": "RA---TAN",
@@ -70,25 +62,11 @@ def table():
     return fits.BinTableHDU.from_columns([fits.Column("a", "D", array=np.zeros(3))])
 
 
-def write(path, **changes):
-    fitsio.write_result(
-        **{
-            "path": str(path),
-            "extended": IMAGE,
-            "stars": [(3.0, 4.5)],
-            "star_fluxes": [17.25],
-            "history": HISTORY,
-        }
-        | changes
-    )
-    return str(path)
-
-
 class TestReading:
     @pytest.mark.parametrize("dtype", ["u1", "i2", "u2", "i4", "i8", "f4", "f8"])
     def test_every_type_of_pixel_becomes_float64_of_this_machine(self, tmp_path, dtype):
         path = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE.astype(dtype)))
-        data = fitsio.read_stack([path]).data
+        data = fitsread.read_stack([path]).data
         assert data.dtype == np.float64
         assert data.dtype.isnative
         np.testing.assert_array_equal(data, IMAGE[None])
@@ -96,7 +74,7 @@ class TestReading:
     def test_scaling_is_applied_and_blank_pixels_are_nan(self, tmp_path):
         hdu = fits.PrimaryHDU(IMAGE.astype("i2"))
         hdu.header.update(BLANK=7, BSCALE=0.5, BZERO=100.0)
-        data = fitsio.read_stack([save(tmp_path / "a.fits", hdu)]).data[0]
+        data = fitsread.read_stack([save(tmp_path / "a.fits", hdu)]).data[0]
         assert np.isnan(data[0, 6])
         assert data[0, 7] == 104.0
         assert np.isnan(data).sum() == 1
@@ -112,7 +90,7 @@ class TestReading:
             fits.ImageHDU(IMAGE, header, name="SCI"),
             fits.ImageHDU(IMAGE + 1.0, name="ERR"),
         )
-        stack = fitsio.read_stack([path])
+        stack = fitsread.read_stack([path])
         np.testing.assert_array_equal(stack.data, IMAGE[None])
         assert stack.header["EXTNAME"] == "SCI"
         assert stack.header["CRVAL1"] == LINEAR["CRVAL1"]
@@ -123,8 +101,8 @@ class TestReading:
         files = [
             save(tmp_path / f"{j}.fits", fits.PrimaryHDU(plane)) for j, plane in enumerate(planes)
         ]
-        np.testing.assert_array_equal(fitsio.read_stack([cube]).data, np.array(planes))
-        np.testing.assert_array_equal(fitsio.read_stack(files).data, np.array(planes))
+        np.testing.assert_array_equal(fitsread.read_stack([cube]).data, np.array(planes))
+        np.testing.assert_array_equal(fitsread.read_stack(files).data, np.array(planes))
 
     def test_a_compressed_file_is_read(self, tmp_path):
         image = np.random.default_rng(1).normal(size=(200, 150))  # more than a buffer holds
@@ -132,7 +110,7 @@ class TestReading:
         packed = tmp_path / "a.fits.gz"
         packed.write_bytes(gzip.compress((tmp_path / "a.fits").read_bytes()))
         np.testing.assert_array_equal(
-            fitsio.read_stack([str(packed)]).data, fitsio.read_stack([plain]).data
+            fitsread.read_stack([str(packed)]).data, fitsread.read_stack([plain]).data
         )
 
     def test_checksums_are_those_of_the_files(self, tmp_path):
@@ -143,25 +121,25 @@ class TestReading:
             hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
             for name in ("a.fits", "b.fits")
         ]
-        assert fitsio.read_stack(paths).sha256 == expected
+        assert fitsread.read_stack(paths).sha256 == expected
         assert expected[0] != expected[1]
 
     def test_a_failed_datasum_is_announced(self, tmp_path):
         path = tmp_path / "a.fits"
         save(path, fits.PrimaryHDU(IMAGE), checksum=True)
-        fitsio.read_stack([str(path)])
+        fitsread.read_stack([str(path)])
         damaged = bytearray(path.read_bytes())
         damaged[2880 + 8 * 3 + 2] ^= 1
         path.write_bytes(damaged)
         with pytest.warns(LnoclWarning, match="a.fits: the data do not match their DATASUM"):
-            fitsio.read_stack([str(path)])
+            fitsread.read_stack([str(path)])
 
     def test_missing_padding_is_announced(self, tmp_path):
         path = tmp_path / "a.fits"
         save(path, fits.PrimaryHDU(IMAGE))
         path.write_bytes(path.read_bytes()[: 2880 + IMAGE.nbytes])
         with pytest.warns(LnoclWarning, match="truncated"):
-            data = fitsio.read_stack([str(path)]).data
+            data = fitsread.read_stack([str(path)]).data
         np.testing.assert_array_equal(data, IMAGE[None])
 
 
@@ -241,7 +219,7 @@ class TestRefusedFiles:
         path = tmp_path / "a.fits"
         make(path)
         with pytest.raises(FileError) as caught:
-            fitsio.read_stack([str(path)])
+            fitsread.read_stack([str(path)])
         assert str(caught.value).startswith(f"{path} ")
         assert message in str(caught.value)
 
@@ -257,7 +235,7 @@ class TestRefusedFiles:
         tracemalloc.start()
         try:
             with pytest.raises(FileError, match=r"is truncated|GiB of memory"):
-                fitsio.read_stack([str(path)])
+                fitsread.read_stack([str(path)])
             assert tracemalloc.get_traced_memory()[1] < 2**24
         finally:
             tracemalloc.stop()
@@ -266,13 +244,13 @@ class TestRefusedFiles:
     def test_wrong_dimensions(self, tmp_path, shape):
         path = save(tmp_path / "a.fits", fits.PrimaryHDU(np.ones(shape)))
         with pytest.raises(InputError, match=f"a.fits has an image of {len(shape)} dimensions"):
-            fitsio.read_stack([path])
+            fitsread.read_stack([path])
 
     def test_a_cube_among_several_files(self, tmp_path):
         image = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE))
         cube = save(tmp_path / "b.fits", fits.PrimaryHDU(np.array([IMAGE, IMAGE])))
         with pytest.raises(InputError, match=r"b.fits has an image of 3 dimensions; several"):
-            fitsio.read_stack([image, cube])
+            fitsread.read_stack([image, cube])
 
     def test_different_shapes(self, tmp_path):
         one = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE))
@@ -280,7 +258,7 @@ class TestRefusedFiles:
         with pytest.raises(
             InputError, match=r"b.fits has the shape \(12, 10\) and .*a.fits \(10, 12\)"
         ):
-            fitsio.read_stack([one, other])
+            fitsread.read_stack([one, other])
 
     def test_damage_never_raises_anything_else(self, tmp_path):
         """Bits flipped, bytes changed in headers, ends cut off; fixed seed, a second of it."""
@@ -308,8 +286,8 @@ class TestRefusedFiles:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", LnoclWarning)
                 try:
-                    stack = fitsio.read_stack([str(path)])
-                    fitsio.wcs_cards(stack.header)
+                    stack = fitsread.read_stack([str(path)])
+                    fitsread.wcs_cards(stack.header)
                     outcomes["read"] += 1
                 except (FileError, InputError):
                     outcomes["refused"] += 1
@@ -324,8 +302,9 @@ class TestCoordinates:
         if len(shape) == 3:
             header.update(CTYPE3="WAVE", CRVAL3=1e-6, CD3_3=1e-9)
         source = save(tmp_path / "a.fits", fits.PrimaryHDU(np.ones(shape), header))
-        stack = fitsio.read_stack([source])
-        output = write(tmp_path / "out.fits", wcs=fitsio.wcs_cards(stack.header))
+        stack = fitsread.read_stack([source])
+        output = str(tmp_path / "out.fits")
+        fitswrite.write_result(output, IMAGE, [], [], wcs=fitsread.wcs_cards(stack.header))
         pixels = np.array([[0.0, 0.0], [11.0, 3.0], [-20.0, 50.5]])
         for key in (" ", "P"):
             with warnings.catch_warnings():
@@ -339,15 +318,15 @@ class TestCoordinates:
         assert "CTYPE3" not in fits.getheader(output)
 
     def test_an_image_without_coordinates_gets_none(self):
-        assert len(fitsio.wcs_cards(fits.PrimaryHDU(IMAGE).header)) == 0
+        assert len(fitsread.wcs_cards(fits.PrimaryHDU(IMAGE).header)) == 0
 
     def test_deprecated_cards_are_written_mended(self):
-        cards = fitsio.wcs_cards(fits.Header(LINEAR | {"RADECSYS": "FK5", "EQUINOX": 2000.0}))
+        cards = fitsread.wcs_cards(fits.Header(LINEAR | {"RADECSYS": "FK5", "EQUINOX": 2000.0}))
         assert cards["RADESYS"] == "FK5"
         WCS(cards)
 
     def test_sip_without_its_suffix_says_nothing_and_is_kept(self, capfd):
-        cards = fitsio.wcs_cards(fits.Header(SIP | {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN"}))
+        cards = fitsread.wcs_cards(fits.Header(SIP | {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN"}))
         assert capfd.readouterr() == ("", "")
         assert cards["A_2_0"] == SIP["A_2_0"]
         assert cards["CTYPE1"] == "RA---TAN-SIP"
@@ -364,163 +343,12 @@ class TestCoordinates:
     )
     def test_coordinates_that_cannot_be_kept_are_announced(self, broken):
         with pytest.warns(LnoclWarning, match="of the first image cannot be kept"):
-            cards = fitsio.wcs_cards(fits.Header(LINEAR | broken))
+            cards = fitsread.wcs_cards(fits.Header(LINEAR | broken))
         assert len(cards) == 0
 
     def test_a_broken_system_leaves_the_others(self):
         with pytest.warns(LnoclWarning, match=r"\(WCS\) of the first image") as caught:
-            cards = fitsio.wcs_cards(fits.Header(LINEAR | {"CTYPE1": "DEC--TAN"} | PHYSICAL))
+            cards = fitsread.wcs_cards(fits.Header(LINEAR | {"CTYPE1": "DEC--TAN"} | PHYSICAL))
         assert len(caught) == 1
         assert "CTYPE1" not in cards
         assert cards["CTYPE1P"] == "x"
-
-
-class TestWriting:
-    def test_the_file_holds_the_result_and_opens_without_a_warning(self, tmp_path):
-        path = write(tmp_path / "out.fits", cards=[("MU", 0.25, "weight")])
-        with fits.open(path, checksum=True) as hdus:
-            assert [hdu.name for hdu in hdus] == ["PRIMARY", "STARS", "HISTORY"]
-            np.testing.assert_array_equal(hdus[0].data, IMAGE)
-            assert hdus[0].header["BUNIT"] == "electron"
-            assert hdus[0].header["MU"] == 0.25
-            assert hdus[0].header.comments["MU"] == "weight"
-        stars = QTable.read(path, hdu="STARS")
-        assert [str(stars[name].unit) for name in stars.colnames] == ["pix", "pix", "ct"]
-        assert [column.value.item() for column in stars.columns.values()] == [3.0, 4.5, 17.25]
-        history = QTable.read(path, hdu="HISTORY")
-        assert history.colnames == ["iteration", "objective"]
-        np.testing.assert_array_equal(history.as_array(), HISTORY)
-
-    def test_fitscheck_passes_and_would_not(self, tmp_path):
-        path = tmp_path / "out.fits"
-        write(path)
-        assert fitscheck.main(["--compliance", str(path)]) == 0
-        damaged = bytearray(path.read_bytes())
-        damaged[-2880] ^= 1
-        path.write_bytes(damaged)
-        assert fitscheck.main([str(path)]) > 0
-
-    def test_no_stars_make_an_empty_table(self, tmp_path):
-        path = write(tmp_path / "out.fits", stars=[], star_fluxes=[])
-        assert len(QTable.read(path, hdu="STARS")) == 0
-        assert fitscheck.main(["--compliance", path]) == 0
-
-    @pytest.mark.parametrize("value", ["x" * 300, "it's 'quoted' & more &", "naïve\n☃", "a\\b"])
-    def test_strings_of_any_kind_survive_in_cards(self, tmp_path, value):
-        path = write(tmp_path / "out.fits", cards=[("DEVICE", value, "")])
-        kept = fits.getheader(path)["DEVICE"]
-        assert kept.encode("ascii").decode("unicode_escape") == value
-        assert fitscheck.main(["--compliance", path]) == 0
-
-    def test_a_new_file_has_the_permissions_of_any_new_file(self, tmp_path):
-        path = tmp_path / "out.fits"
-        before = os.umask(0o027)
-        try:
-            write(path)
-        finally:
-            os.umask(before)
-        assert stat.S_IMODE(path.stat().st_mode) == 0o640
-
-    def test_a_link_stays_a_link(self, tmp_path):
-        target, link = tmp_path / "target.fits", tmp_path / "link.fits"
-        target.touch()
-        link.symlink_to(target)
-        write(link, overwrite=True)
-        assert link.is_symlink()
-        np.testing.assert_array_equal(fits.getdata(target), IMAGE)
-
-    @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
-    @pytest.mark.parametrize("there", [False, True])
-    def test_a_failure_leaves_what_was_there(self, tmp_path, monkeypatch, error, there):
-        path = tmp_path / "out.fits"
-        if there:
-            path.write_bytes(b"old")
-
-        def fail(descriptor):
-            raise error
-
-        monkeypatch.setattr(os, "fsync", fail)
-        expected = FileError if isinstance(error, OSError) else KeyboardInterrupt
-        with pytest.raises(expected) as caught:
-            write(path, overwrite=True)
-        if isinstance(error, OSError):
-            assert str(caught.value) == f"{path} cannot be written: No space left on device"
-        assert [entry.name for entry in tmp_path.iterdir()] == (["out.fits"] if there else [])
-        assert not there or path.read_bytes() == b"old"
-
-    def test_a_file_that_came_into_being_meanwhile_is_kept(self, tmp_path):
-        path = tmp_path / "out.fits"
-        path.write_bytes(b"old")
-        with pytest.raises(FileError, match="exists"):
-            write(path)
-        assert path.read_bytes() == b"old"
-        assert len(list(tmp_path.iterdir())) == 1
-
-
-class TestCheckOutput:
-    def test_a_new_name_and_an_overwritten_one_pass(self, tmp_path):
-        path = tmp_path / "out.fits"
-        fitsio.check_output(str(path), overwrite=False)
-        assert list(tmp_path.iterdir()) == []
-        path.write_bytes(b"old")
-        fitsio.check_output(str(path), overwrite=True)
-        assert path.read_bytes() == b"old"
-
-    @pytest.mark.parametrize(
-        ("name", "error", "message"),
-        [
-            ("there.fits", FileError, "exists; give another name, or --overwrite"),
-            ("missing/out.fits", FileError, "does not exist; create it first"),
-            ("there.fits/out.fits", FileError, "cannot be written: Not a directory"),
-            ("folder", FileError, "is no regular file"),
-            ("n" * 300 + ".fits", FileError, "cannot be written: File name too long"),
-            ("new/", FileError, "names no file"),
-            ("out.fits.gz", InputError, "is not compressed"),
-        ],
-    )
-    def test_unusable_output(self, tmp_path, name, error, message):
-        (tmp_path / "there.fits").touch()
-        (tmp_path / "folder").mkdir()
-        with pytest.raises(error, match=message):
-            fitsio.check_output(f"{tmp_path}/{name}", overwrite=False)
-
-    def test_a_folder_that_takes_no_file(self):
-        with pytest.raises(FileError, match=r"cannot be written to its folder"):
-            fitsio.check_output("/proc/out.fits", overwrite=False)
-
-    def test_a_device_is_never_replaced(self):
-        with pytest.raises(FileError, match="no regular file"):
-            fitsio.check_output(os.devnull, overwrite=True)
-
-    def test_an_input_is_never_replaced(self, tmp_path):
-        path = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE))
-        (tmp_path / "link.fits").symlink_to(path)
-        with pytest.raises(InputError, match="is one of the inputs"):
-            fitsio.check_output(
-                str(tmp_path / "link.fits"), overwrite=True, inputs=["missing.fits", path]
-            )
-
-
-NAMES = st.text(
-    st.characters(exclude_characters="\0") | st.sampled_from("'\"\\ \n&$é\udcff"), max_size=200
-).filter(lambda name: not any("\ud800" <= c <= "\udfff" and c != "\udcff" for c in name))
-
-
-class TestHistoryLines:
-    @settings(
-        max_examples=60,
-        deadline=None,
-        suppress_health_check=[HealthCheck.function_scoped_fixture],
-    )
-    @given(words=st.lists(NAMES, min_size=1, max_size=6))
-    def test_a_shell_reads_from_the_header_what_was_given(self, words):
-        header = fits.Header()
-        for line in fitsio.history_lines(["printf", "%s\\0", *words]):
-            assert len(line) <= 72
-            assert line.isascii()
-            assert line.isprintable()
-            header.add_history(line)
-        header = fits.Header.fromstring(header.tostring())
-        script = "\n".join(header["HISTORY"])
-        printed = subprocess.run(["bash", "-c", script], capture_output=True, check=True).stdout
-        assert printed == b"".join(os.fsencode(word) + b"\0" for word in words)

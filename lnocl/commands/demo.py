@@ -1,0 +1,45 @@
+"""The command ``demo``: simulate, reconstruct and draw a jet and its star."""
+
+from __future__ import annotations
+
+import argparse
+
+from lnocl.commands import messages
+from lnocl.commands.arguments import Command, add_device, add_folder
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_folder(parser, "images, results and pictures", default="lnocl_demo")
+    parser.add_argument(
+        "--size",
+        type=int,
+        default=256,
+        metavar="N",
+        help="pixels along each side (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        metavar="N",
+        help="of residual phases and noise (default: %(default)s)",
+    )
+    add_device(parser)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from lnocl import demo, device
+
+    spec = device.spec_of(device.choose(arguments.device).device)
+    for line in demo.run(
+        arguments.output, arguments.size, arguments.seed, spec, arguments.overwrite
+    ):
+        messages.say([line])
+
+
+COMMAND = Command(
+    "simulate a jet and its star, reconstruct them with and without the star as a component, "
+    "and show the difference in a table and pictures",
+    _add_arguments,
+    _run,
+)

@@ -1,0 +1,91 @@
+"""Everything that the command line writes to stdout and stderr."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from typing import TextIO
+
+
+def say(lines: Iterable[str]) -> None:
+    """Write lines to stdout; a reader that has left early is no error."""
+    try:
+        for line in lines:
+            sys.stdout.write(_one_line(line, sys.stdout) + "\n")
+        sys.stdout.flush()
+    except OSError as error:
+        # What is still buffered would fail again when the interpreter ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            raise
+
+
+def fail(message: str, exit_status: int) -> int:
+    """Write an error to stderr, and return the exit status."""
+    _complain("error", message)
+    return exit_status
+
+
+def show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Write a warning to stderr, in place of `warnings.showwarning`."""
+    _complain("warning", str(message))
+
+
+@contextlib.contextmanager
+def shown_log() -> Iterator[None]:
+    """Show on stderr what the library logs."""
+    log, handler = logging.getLogger("lnocl"), _Notes()
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+        log.removeHandler(handler)
+
+
+def _complain(kind: str, message: str) -> None:
+    _note(f"{kind}: {message}")
+
+
+def _note(message: str) -> None:
+    with contextlib.suppress(OSError):
+        sys.stderr.write(_one_line(f"lnocl: {message}", sys.stderr) + "\n")
+        sys.stderr.flush()
+
+
+class _Notes(logging.Handler):
+    """Shows what the library logs, once where it says the same of several runs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._shown: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        message = record.getMessage()
+        if message not in self._shown:
+            self._shown.add(message)
+            _note(message)
+
+
+def _one_line(text: str, stream: TextIO) -> str:
+    """Return text in one line, with escapes for what a terminal should not or cannot show."""
+    joined = " ".join(part.strip() for part in text.splitlines())
+    shown = "".join(c if c.isprintable() else _escape(c) for c in joined)
+    encoding = stream.encoding or "ascii"
+    return shown.encode(encoding, "backslashreplace").decode(encoding)
+
+
+def _escape(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")

@@ -1,0 +1,317 @@
+"""FITS in: images and PSFs, their coordinates, and results that were saved."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import astropy
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS
+from numpy.typing import NDArray
+
+from lnocl.errors import FileError, InputError, LnoclWarning
+
+RESULT_TABLES = {
+    "STARS": ("x", "y", "flux"),
+    "HISTORY": ("iteration", "objective"),
+    "CURVE": ("iteration", "rho", "rho_star", "magnitude"),
+    "HELDOUT": ("mu", "iteration", "error"),
+}
+
+_WCS_KEYWORD = re.compile(r"(?:CTYPE|CRPIX|CRVAL|CDELT)1([A-Z]?)")
+
+
+class Stack(NamedTuple):
+    """Images that were read.
+
+    Attributes
+    ----------
+    data : ndarray of float64, shape (p, ny, nx)
+        Pixels, in the units of the files.
+    header : astropy.io.fits.Header
+        Header of the first image.
+    sha256 : list of str
+        SHA-256 checksum of each file, in hexadecimal.
+    """
+
+    data: NDArray[np.float64]
+    header: fits.Header
+    sha256: list[str]
+
+
+def read_stack(paths: Sequence[str]) -> Stack:
+    """Read images: one FITS file each, or one file with a cube.
+
+    The image of a file is the first HDU that is an image and has pixels: the primary HDU or an
+    image extension. BSCALE, BZERO and BLANK are applied (a blank pixel is NaN). A file may be
+    compressed as a whole (gzip, bzip2 and what else astropy opens), but not in tiles.
+
+    Parameters
+    ----------
+    paths : sequence of str
+        One file with an image (ny, nx) or a cube (p, ny, nx), or p files with an image each.
+
+    Returns
+    -------
+    Stack
+        The images, the first one's header, and the checksums of the files.
+
+    Raises
+    ------
+    FileError
+        A file that is missing, no FITS, damaged, truncated or tile-compressed, or that holds no
+        image or one that is larger than the memory.
+    InputError
+        An image of another dimension or shape than the others.
+
+    Warns
+    -----
+    LnoclWarning
+        What astropy found wrong with a file and could mend; data that do not match their
+        DATASUM.
+    """
+    images, headers, sha256 = zip(*(_read_file(path) for path in paths), strict=True)
+    for path, image in zip(paths, images, strict=True):
+        _check_shape(path, image.shape, paths[0], images[0].shape, alone=len(paths) == 1)
+    ny, nx = images[0].shape[-2:]
+    data = images[0] if len(images) == 1 else np.stack(images)
+    return Stack(data.reshape(-1, ny, nx), headers[0], list(sha256))
+
+
+def wcs_cards(header: fits.Header) -> fits.Header:
+    """Return the cards of every coordinate system of an image, as astropy writes them.
+
+    Parameters
+    ----------
+    header : astropy.io.fits.Header
+        Header of a two-dimensional image or of a cube of them.
+
+    Returns
+    -------
+    astropy.io.fits.Header
+        The primary and the alternate systems of the first two axes, with SIP and other
+        distortions that cards can describe. Empty where the image has no coordinates.
+
+    Warns
+    -----
+    LnoclWarning
+        A system that astropy cannot read or that needs tables besides the header (``-TAB``,
+        lookup tables of distortions); it is left out.
+    """
+    cards = fits.Header()
+    for key in sorted({match[1] for match in map(_WCS_KEYWORD.fullmatch, header) if match}):
+        try:
+            with warnings.catch_warnings(), _quiet_log():
+                # What astropy mends on reading it writes mended.
+                warnings.simplefilter("ignore")
+                wcs = WCS(header, key=key or " ", naxis=2)
+                if key and not wcs.wcs.ctype[0].endswith("-SIP"):
+                    wcs.sip = None  # that of the primary system, which astropy gives to all
+                cards.update(wcs.to_header(relax=True))
+        except Exception as error:
+            warnings.warn(
+                f"the coordinates (WCS{key and ' ' + key}) of the first image cannot be kept "
+                f"and are left out: {error}",
+                LnoclWarning,
+                stacklevel=2,
+            )
+    return cards
+
+
+class SavedResult(NamedTuple):
+    """A result, or a truth, that was read.
+
+    Attributes
+    ----------
+    extended : ndarray of float64, shape (ny, nx)
+        Extended source, electrons per pixel.
+    stars : list of (x, y)
+        Positions in pixels, 0-based.
+    star_fluxes : ndarray of float64, shape (n,)
+        Electrons.
+    history, curve, held_out : dict of str to ndarray of float64, or None
+        Columns of the tables ``HISTORY``, ``CURVE`` and ``HELDOUT``; None where there is no such
+        table.
+    header : astropy.io.fits.Header
+        Header of the extended source.
+    """
+
+    extended: NDArray[np.float64]
+    stars: list[tuple[float, float]]
+    star_fluxes: NDArray[np.float64]
+    history: dict[str, NDArray[np.float64]] | None
+    curve: dict[str, NDArray[np.float64]] | None
+    held_out: dict[str, NDArray[np.float64]] | None
+    header: fits.Header
+
+
+def read_result(path: str) -> SavedResult:
+    """Read what `fitswrite.write_result` has written.
+
+    Parameters
+    ----------
+    path : str
+        File with an image (ny, nx) and a table ``STARS`` with the columns x, y and flux.
+
+    Returns
+    -------
+    SavedResult
+        The extended source, the stars, and the tables that are there.
+
+    Raises
+    ------
+    FileError
+        A file that `read_stack` refuses, or whose tables are not those of a result.
+    """
+    extended, header, _ = _read_file(path)
+    try:
+        with fits.open(path, memmap=False) as hdus:
+            tables = {
+                hdu.name: {name: np.array(hdu.data[name], np.float64) for name in hdu.columns.names}
+                for hdu in hdus
+                if isinstance(hdu, fits.BinTableHDU) and hdu.name in RESULT_TABLES
+            }
+    except Exception as error:
+        # As in _read_stream: astropy raises whatever a damaged file leads it to.
+        raise FileError(f"{path} has tables that cannot be read: {error}") from error
+    lacking = [
+        f"{table} {name}"
+        for table, names in RESULT_TABLES.items()
+        for name in names
+        if (table in tables or table == "STARS") and name not in tables.get(table, ())
+    ]
+    if lacking or extended.ndim != 2:
+        what = f"there is no column {lacking[0]}" if lacking else "the image is a cube"
+        raise FileError(f"{path} is no result or truth that lnocl has written: {what}")
+    stars = tables["STARS"]
+    return SavedResult(
+        extended,
+        list(zip(stars["x"].tolist(), stars["y"].tolist(), strict=True)),
+        stars["flux"],
+        tables.get("HISTORY"),
+        tables.get("CURVE"),
+        tables.get("HELDOUT"),
+        header,
+    )
+
+
+def _read_file(path: str) -> tuple[NDArray[np.float64], fits.Header, str]:
+    """Return the image in a file, its header and the checksum of the file."""
+    try:
+        with open(path, "rb") as stream:
+            return _read_stream(stream, path)
+    except FileError:
+        raise
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise FileError(f"{path} cannot be opened: {reason}") from error
+
+
+def _read_stream(
+    stream: io.BufferedReader, path: str
+) -> tuple[NDArray[np.float64], fits.Header, str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            with fits.open(stream, memmap=False, disable_image_compression=True) as hdus:
+                hdu = _first_image(hdus, path)
+                if hdu is None:
+                    notes = "".join(f"; {warning.message}" for warning in caught)
+                    raise FileError(f"{path} holds no image{notes}")
+                header = hdu.header.copy()
+                data = _read_pixels(hdu, path, stream)
+                stream.seek(0)
+                sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+        except (FileError, MemoryError):
+            raise
+        except Exception as error:
+            # astropy raises whatever a damaged file leads it to; its advice is for programmers.
+            reason = str(error).partition(". ")[0]
+            raise FileError(f"{path} is no FITS file, or a damaged one: {reason}") from error
+    for warning in caught:
+        warnings.warn(f"{path}: {warning.message}", LnoclWarning, stacklevel=4)
+    return data, header, sha256
+
+
+def _first_image(hdus: fits.HDUList, path: str) -> fits.PrimaryHDU | None:
+    last = -1
+    for hdu in hdus:
+        begin = hdu.fileinfo()["hdrLoc"]
+        if begin <= last:
+            # A negative size in a damaged header sends astropy round in circles.
+            raise FileError(f"{path} is damaged: the size of an extension is negative")
+        last = begin
+        if hdu.header.get("ZIMAGE") is True:
+            # Decompressing damaged tiles corrupts the memory (seen with astropy 8.0).
+            raise FileError(f"{path} is tile-compressed; unpack it first, such as with funpack")
+        if hdu.is_image and len(getattr(hdu, "shape", ())) > 0 and 0 not in hdu.shape:
+            return hdu
+    return None
+
+
+def _read_pixels(hdu: fits.PrimaryHDU, path: str, stream: io.BufferedReader) -> NDArray[np.float64]:
+    _check_size(hdu, path, stream)
+    if "DATASUM" in hdu.header and hdu.verify_datasum() == 0:
+        warnings.warn("the data do not match their DATASUM; the file may be damaged", stacklevel=2)
+    return np.array(hdu.data, dtype=np.float64)
+
+
+def _check_size(hdu: fits.PrimaryHDU, path: str, stream: io.BufferedReader) -> None:
+    """Refuse pixels that are not there or that do not fit the memory, before they are read."""
+    # pread leaves the place where a decompressor reads.
+    uncompressed = os.pread(stream.fileno(), 6, 0) == b"SIMPLE"
+    if uncompressed:
+        promised = hdu.fileinfo()["datLoc"] + hdu.size
+        actual = os.fstat(stream.fileno()).st_size
+        if actual < promised:
+            raise FileError(
+                f"{path} is truncated: it should have {promised} bytes and has {actual}"
+            )
+    needed = 8 * int(np.prod([int(n) for n in hdu.shape], dtype=object))
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > memory:
+        raise FileError(
+            f"{path} has an image of shape {hdu.shape}, {needed / 2**30:.3g} GiB; "
+            f"this machine has {memory / 2**30:.3g} GiB of memory"
+        )
+
+
+@contextlib.contextmanager
+def _quiet_log() -> Iterator[None]:
+    """Keep astropy's notes, such as on SIP coefficients, from the terminal."""
+    level = astropy.log.level
+    astropy.log.setLevel("WARNING")
+    try:
+        yield
+    finally:
+        astropy.log.setLevel(level)
+
+
+def _check_shape(
+    path: str,
+    shape: tuple[int, ...],
+    first_path: str,
+    first_shape: tuple[int, ...],
+    alone: bool,
+) -> None:
+    if alone and len(shape) not in (2, 3):
+        raise InputError(
+            f"{path} has an image of {len(shape)} dimensions; two are needed, or three for a cube"
+        )
+    if not alone and len(shape) != 2:
+        raise InputError(
+            f"{path} has an image of {len(shape)} dimensions; several files need two each "
+            "(a cube goes alone)"
+        )
+    if shape != first_shape:
+        raise InputError(
+            f"{path} has the shape {shape} and {first_path} {first_shape}; they must be the same"
+        )
