@@ -77,6 +77,9 @@ INLINE near_stars stars_near(
     return near;
 }
 
+/* How a pixel is known that was not observed: by its value, or by its exposure. */
+#define HAS_SENTINEL (HAS_WEIGHTS && !HAS_EXPOSURE_MAP)
+
 /* w (g / m - 1) and the data term of the objective; g < 0: not observed, w = 0. The guard: m counts
  * as LEAST_MODEL where it is less, and g / m as 0 there, as the light that it wants is nowhere.
  * A transform's rounding is a share of what it is given: of g / m - 1, the noise, it is less than of
@@ -84,7 +87,7 @@ INLINE near_stars stars_near(
  */
 INLINE vec ratio(vec g, const vec m, vec *term)
 {
-#if HAS_WEIGHTS
+#if HAS_SENTINEL
     const ivec observed = g >= 0;
     g = observed ? g : (vec)0;
 #endif
@@ -93,7 +96,7 @@ INLINE vec ratio(vec g, const vec m, vec *term)
     const vec quotient = g / modelled;
     const vec r = guarded ? quotient : (vec)0;
     *term = divergence(modelled, quotient);
-#if HAS_WEIGHTS
+#if HAS_SENTINEL
     *term = observed ? *term : (vec)0;
     return observed ? r - 1 : (vec)0;
 #else
@@ -106,6 +109,7 @@ INLINE vec ratio(vec g, const vec m, vec *term)
  * spectra: N_IMAGES arrays, in: row spectra of A_j f, out: twice the row spectra of r_j - w_j.
  * images: N_IMAGES arrays of pixels, negative where not observed (HAS_WEIGHTS).
  * background: [N_IMAGES], or N_IMAGES arrays of pixels (HAS_BACKGROUND_MAP).
+ * exposure: N_IMAGES arrays of pixels, w (HAS_EXPOSURE_MAP; then no image is negative).
  * star_images: [N_STARS][N_IMAGES] times star_blocks blocks of pixels, from block first_blocks_s on,
  * round the edge; beyond them P_js is 0. first_blocks, star_fluxes: [N_STARS].
  * sums: [ROW_BLOCKS][N_IMAGES][N_SUMS][2].
@@ -115,8 +119,9 @@ INLINE vec ratio(vec g, const vec m, vec *term)
 KERNEL void ratio_rows(
     __global vec *restrict spectra, __global real *restrict sums,
     __global const vec *restrict images, __global const real *restrict background,
-    __global const vec *restrict star_images, __global const int *restrict first_blocks,
-    const int star_blocks, __global const real *restrict star_fluxes,
+    __global const vec *restrict exposure, __global const vec *restrict star_images,
+    __global const int *restrict first_blocks, const int star_blocks,
+    __global const real *restrict star_fluxes,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
@@ -156,6 +161,13 @@ KERNEL void ratio_rows(
                 cvec term;
                 a[q].re = ratio(g.re, a[q].re, &term.re);
                 a[q].im = ratio(g.im, a[q].im, &term.im);
+#if HAS_EXPOSURE_MAP
+                const cvec w = LOAD(exposure + at + lane, pixel);
+                a[q].re *= w.re;
+                a[q].im *= w.im;
+                term.re *= w.re;
+                term.im *= w.im;
+#endif
                 terms += term.re + term.im;
                 for (int s = 0; s < near.count; ++s) {
                     const cvec p = LOAD(near.image[s] + lane, pixel);

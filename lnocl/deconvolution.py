@@ -83,6 +83,13 @@ class Result:
         Extended source, electrons per pixel.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons, in the order of the stars given.
+    star_positions : ndarray of float64, shape (n, 2)
+        (x, y) in pixels, as given or refined.
+    star_flux_errors : ndarray of float64, shape (n,)
+        Standard errors, electrons, by the Fisher information of fluxes and positions where the
+        extended source is known; 0 where positions were not refined.
+    star_position_errors : ndarray of float64, shape (n, 2)
+        Likewise, pixels.
     n_iter : int
         Iterations done.
     stop_reason : str
@@ -102,6 +109,9 @@ class Result:
 
     extended: Array
     star_fluxes: Array
+    star_positions: Array
+    star_flux_errors: Array
+    star_position_errors: Array
     n_iter: int
     stop_reason: str
     device: str
@@ -125,6 +135,7 @@ def deconvolve(
     initial_star_fluxes: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: bool = False,
+    refine_positions: bool = False,
 ) -> Result:
     """Reconstruct the sky from several images as stars plus an extended source.
 
@@ -231,7 +242,7 @@ def deconvolve(
     _check_choices(mu, solver, n_iter, stop, precision, engine, device)
     if engine == "opencl" and precision == "single":
         _warn_of_straying(int(n_iter))
-    setup = Setup(stars, pad, solver, precision, engine, device)
+    setup = Setup(stars, pad, solver, precision, engine, device, refine_positions)
     bar = _Bar(int(n_iter), progress)
     with bar:
         if isinstance(mu, str) or stop == "held-out":
@@ -365,9 +376,13 @@ def _wrap_up(run: Run, stop_reason: str, choice: Choice) -> Result:
     history = np.zeros(run.done + 1, HISTORY_DTYPE)
     history["iteration"] = np.arange(run.done + 1)
     history["objective"] = run.objectives()
+    flux_errors, position_errors = run.star_errors()
     return Result(
         extended=run.extended(),
         star_fluxes=run.star_fluxes(),
+        star_positions=run.star_positions(),
+        star_flux_errors=flux_errors,
+        star_position_errors=position_errors,
         n_iter=run.done,
         stop_reason=stop_reason,
         device=run.engine.name,

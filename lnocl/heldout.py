@@ -102,7 +102,12 @@ def halve(observation: Observation, ways: int = 1) -> list[tuple[Observation, Ob
             LnoclWarning,
             stacklevel=5,
         )
-    background, mask, psfs = observation.background / 2.0, observation.mask, observation.psfs
+    known = {
+        "background": observation.background / 2.0,
+        "mask": observation.mask,
+        "exposure": observation.exposure,
+        "offsets": observation.offsets,
+    }
     pairs = []
     for seed in range(ways):
         rng = np.random.default_rng(seed)
@@ -111,8 +116,8 @@ def halve(observation: Observation, ways: int = 1) -> list[tuple[Observation, Ob
         with _quiet():
             pairs.append(
                 (
-                    Observation(first, psfs, background=background, mask=mask),
-                    Observation(images - first, psfs, background=background, mask=mask),
+                    Observation(first, observation.psfs, **known),
+                    Observation(images - first, observation.psfs, **known),
                 )
             )
     return pairs
@@ -236,7 +241,8 @@ def choose(
             break  # mu grows, and is too large already
         if mus is None and len(trials) == 1:
             brightest = 2.0 * max(float(half.max()) for half in trial.end[0])
-            pending = list(MU_GRID * observation.n_images / brightest) if brightest > 0 else []
+            total = observation.exposure.sum(axis=0).max()
+            pending = list(MU_GRID * total / brightest) if brightest > 0 else []
     best = min(trials, key=lambda trial: trial.error)
     if not at_end and AS_LONG_AGAIN * best.n_iter > n_iter:
         warnings.warn(

@@ -18,7 +18,7 @@ class Model:
     shape : tuple of int
         (p, Ny, Nx).
     weights : ndarray of float64, shape (p, Ny, Nx)
-        1 where a pixel was observed, else 0.
+        Its relative exposure where a pixel was observed, else 0.
     background : ndarray of float64, shape (p, 1, 1) or (p, Ny, Nx)
         b_j.
     stars : StarImages

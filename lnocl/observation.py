@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lnocl import units
 from lnocl.errors import InputError, LnoclWarning
 
 Array = NDArray[np.float64]
@@ -17,30 +18,45 @@ class Observation:
     """Images of one sky, each with its point spread function, background and bad pixels.
 
     Everything is checked and copied here, once, and held in float64. The data follow
-    ``images[j] ~ Poisson(psfs[j] * sky + background[j]) + Normal(0, read_noise[j])``.
+    ``images[j] ~ Poisson(exposure[j] (psfs[j] * sky) + background[j]) + Normal(0, read_noise[j])``,
+    the sky moved by ``offsets[j]``.
 
     Parameters
     ----------
     images : array_like, shape (p, ny, nx) or (ny, nx)
         Counts in electrons per pixel. A pixel that is not finite, or that is masked in a
         `numpy.ma` array, counts as bad. Counts that are negative after the read noise was
-        added are set to zero, and their number is announced.
+        added are set to zero, and their number is announced. An `astropy.units.Quantity`, an
+        `astropy.nddata.NDData` such as a CCDData, or a sequence of these, is taken with its unit
+        and mask; counts per time are multiplied by the exposure. Uncertainties are not used.
     psfs : array_like, shape (p, ky, kx) or (ky, kx)
         Point spread functions, peak at ``(ky // 2, kx // 2)``, of any positive sum: they are
         normalised here. One serves all images. Negative pixels are kept and announced.
     background : float or array_like, shape (p,) or (p, ny, nx), optional
-        Known background, electrons per pixel, zero or more.
-    read_noise : float or array_like, shape (p,), optional
+        Known background, electrons per pixel, zero or more. A Quantity may be per time.
+    read_noise : float or array_like, shape (p,) or (p, ny, nx), optional
         Standard deviation of the read noise, electrons, zero or more. Its square is added to
-        images and background (Snyder's approximation of Gaussian noise by Poisson noise).
+        images and background (Snyder's approximation of Gaussian noise by Poisson noise). Of a
+        survey's inverse variance of sky and read noise together it is the root of one over it.
     mask : array_like of bool, shape (p, ny, nx) or (ny, nx), optional
         True where a pixel is bad, as in `numpy.ma`. One serves all images.
+    exposure : float or array_like, shape (p,), (p, ny, nx) or (ny, nx), optional
+        Exposure of each image, or of each of its pixels, in seconds or relative to any unit: the
+        sky is in electrons per pixel and this unit. More than zero; a map is zero where a pixel
+        saw nothing, which counts as bad.
+    offsets : array_like, shape (p, 2), optional
+        ``(dx, dy)`` of each image, pixels: what lies at (x, y) in the sky lies at
+        ``(x + dx, y + dy)`` in the image. They are taken into the PSFs; no counts are resampled.
 
     Attributes
     ----------
     images, background : ndarray of float64
         Shapes (p, ny, nx), and (p,) or (p, ny, nx); `read_noise` squared is included in both.
         Bad pixels of the images hold 0.
+    exposure : ndarray of float64, shape (p,) or (p, ny, nx)
+        As given.
+    offsets : ndarray of float64, shape (p, 2)
+        As given.
     psfs : ndarray of float64, shape (p, ky, kx)
         Of unit sum.
     mask : ndarray of bool, shape (p, ny, nx)
@@ -49,8 +65,9 @@ class Observation:
     Raises
     ------
     InputError
-        Where an array has the wrong shape or type, is empty, or holds values out of range;
-        where a PSF has no positive sum or is not finite; where no good pixel is left.
+        Where an array has the wrong shape, type or unit, is empty, or holds values out of range;
+        where a PSF has no positive sum or is not finite; where no good pixel is left; where an
+        offset leaves nothing of an image.
 
     Warns
     -----
@@ -78,12 +95,20 @@ class Observation:
         background: ArrayLike = 0.0,
         read_noise: ArrayLike = 0.0,
         mask: ArrayLike | None = None,
+        exposure: ArrayLike = 1.0,
+        offsets: ArrayLike | None = None,
     ) -> None:
-        given = _as_array("images", images, np.ma.asanyarray)
+        counts, are_rates = units.plain("images", units.as_masked(images), per_exposure=True)
+        given = _as_array("images", counts, np.ma.asanyarray)
         self.images = _stack("images", np.ma.getdata(given))
         self.mask = np.ma.getmaskarray(given).copy().reshape(self.images.shape)
-        self.psfs = _check_psfs(psfs, self.n_images)
+        self.psfs = _check_psfs(units.bare(psfs), self.n_images)
+        self.offsets = self._check_offsets(offsets)
         self._apply_mask(mask)
+        self.exposure = self._check_exposure(exposure)
+        if are_rates:
+            self.images *= _each_pixel(self.exposure)
+        self._refuse_all_masked()
         self.background = self._check_background(background)
         self._add_read_noise(read_noise)
         self._clip_negative()
@@ -118,31 +143,71 @@ class Observation:
                 LnoclWarning,
                 stacklevel=3,
             )
+
+    def _refuse_all_masked(self) -> None:
         if self.mask.all():
             raise InputError("all pixels are masked; there is nothing to reconstruct from")
         self.images[self.mask] = 0.0
 
-    def _check_background(self, background: ArrayLike) -> Array:
-        values = numbers("background", background)
-        if values.ndim == 3:
-            if values.shape != self.images.shape:
-                raise InputError(
-                    f"background has shape {values.shape}; the images have {self.images.shape}"
-                )
-            values[self.mask] = 0.0
-        else:
-            values = _one_each("background", values, self.n_images)
-        _refuse_unless("background", values, "finite and not negative", values >= 0)
+    def _check_exposure(self, exposure: ArrayLike) -> Array:
+        """Return exposures; what saw nothing is masked."""
+        values = self._one_or_map("exposure", units.seconds(exposure), 1.0)
+        if values.ndim == 1:
+            _refuse_unless("exposure", values, "finite and more than zero", values > 0)
+            return values
+        _refuse_unless("exposure", values, "finite and not negative", values >= 0)
+        self.mask |= values == 0
         return values
 
+    def _check_background(self, background: ArrayLike) -> Array:
+        given, are_rates = units.plain("background", background, per_exposure=True)
+        values = self._one_or_map("background", given, 0.0)
+        _refuse_unless("background", values, "finite and not negative", values >= 0)
+        if not are_rates:
+            return values
+        if values.ndim < self.exposure.ndim:
+            values = _each_pixel(values)
+        return values * (_each_pixel(self.exposure) if values.ndim == 3 else self.exposure)
+
     def _add_read_noise(self, read_noise: ArrayLike) -> None:
-        sigma = _one_each("read_noise", numbers("read_noise", read_noise), self.n_images)
+        sigma = self._one_or_map("read_noise", units.plain("read_noise", read_noise)[0], 0.0)
         _refuse_unless("read_noise", sigma, "finite and not negative", sigma >= 0)
         with np.errstate(over="ignore"):
-            variance = sigma[:, None, None] ** 2
+            variance = sigma**2
         _refuse_unless("the square of read_noise", variance, "finite", variance >= 0)
-        self.images += np.where(self.mask, 0.0, variance)
-        self.background += variance if self.background.ndim == 3 else variance[:, 0, 0]
+        self.images += np.where(self.mask, 0.0, _each_pixel(variance))
+        if variance.ndim != self.background.ndim:
+            variance, self.background = _each_pixel(variance), _each_pixel(self.background)
+        self.background = self.background + variance
+
+    def _one_or_map(self, name: str, given: ArrayLike, masked: float) -> Array:
+        """Return one number for each image, or for each pixel: one map serves all images."""
+        values = numbers(name, given)
+        if values.ndim < 2:
+            return _one_each(name, values, self.n_images)
+        if values.shape not in (self.images.shape, self.shape):
+            raise InputError(
+                f"{name} has shape {values.shape}; the images have {self.images.shape}"
+            )
+        return np.where(self.mask, masked, values)
+
+    def _check_offsets(self, offsets: ArrayLike | None) -> Array:
+        if offsets is None:
+            return np.zeros((self.n_images, 2))
+        values = numbers("offsets", units.pixels("offsets", offsets))
+        if values.shape != (self.n_images, 2):
+            raise InputError(
+                f"offsets has shape {values.shape}; give (dx, dy) for each of the "
+                f"{self.n_images} images"
+            )
+        size = np.array(self.shape[::-1])
+        _refuse_unless(
+            "offsets",
+            values,
+            f"finite, and less than the images' {size[0]} by {size[1]} pixels",
+            abs(values) < size,
+        )
+        return values
 
     def _clip_negative(self) -> None:
         negative = self.images < 0
@@ -183,6 +248,11 @@ def _stack(name: str, values: ArrayLike) -> Array:
     if array.size == 0:
         raise InputError(f"{name} is empty: its shape is {array.shape}")
     return array.reshape((-1, *array.shape[-2:]))
+
+
+def _each_pixel(values: Array) -> Array:
+    """Return values that broadcast over images."""
+    return values if values.ndim == 3 else values[:, None, None]
 
 
 def _one_each(name: str, values: Array, n_images: int) -> Array:

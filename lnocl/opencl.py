@@ -68,7 +68,6 @@ class OpenCLEngine:
         self.name = describe(chosen)
         self.scene, self.scaling = scene, scaling
         self._context = cl.Context([chosen])
-        observation = scene.observation
         self.program = Program(
             self._context,
             scene.grid,
@@ -79,7 +78,8 @@ class OpenCLEngine:
             n_stars=scene.n_stars,
             has_mu=scene.mu > 0,
             has_weights=scene.weights is not None,
-            has_background_map=observation.background.ndim == 3,
+            has_exposure_map=scene.has_exposure_map,
+            has_background_map=self._has_background_map,
             least_model=LEAST_MODEL,
         )
         self.layout = Layout(self.program)
@@ -100,11 +100,14 @@ class OpenCLEngine:
             self._upload_pixels("shift", [scaling.shift])
             self._upload_pixels("reach", scaling.reach)
 
+    @property
+    def _has_background_map(self) -> bool:
+        return self.scene.has_exposure_map or self.scene.observation.background.ndim == 3
+
     def _sizes(self, n_iter: int) -> dict[str, int]:
         """Return the bytes of each buffer, by name."""
         program, layout = self.program, self.layout
         p, n, item = program.n_images, program.n_stars, program.dtype.itemsize
-        has_map = self.scene.observation.background.ndim == 3
         return {
             "images": p * layout.pixels_bytes,
             "otfs": p * layout.pixels_bytes,
@@ -112,7 +115,8 @@ class OpenCLEngine:
             "spectra": p * layout.spectra_bytes,
             "extended": layout.pixels_bytes,
             "inverse_weight": layout.pixels_bytes if self.scene.weights is not None else item,
-            "background": p * (layout.pixels_bytes if has_map else item),
+            "background": p * (layout.pixels_bytes if self._has_background_map else item),
+            "exposure": p * layout.pixels_bytes if self.scene.has_exposure_map else item,
             "star_images": max(n * p * self._star_blocks * layout.block_bytes, item),
             "first_blocks": max(n, 1) * self._first_blocks.itemsize,
             "star_fluxes": max(n, 1) * item,
@@ -173,6 +177,7 @@ class OpenCLEngine:
             buffers["ratio_sums"],
             buffers["images"],
             buffers["background"],
+            buffers["exposure"],
             buffers["star_images"],
             buffers["first_blocks"],
             np.int32(self._star_blocks),
@@ -236,7 +241,9 @@ class OpenCLEngine:
     def _upload_scene(self) -> None:
         scene = self.scene
         images = scene.images()
-        if scene.weights is not None:
+        if scene.weights is not None and scene.has_exposure_map:
+            self._upload_pixels("exposure", scene.weights)
+        elif scene.weights is not None:
             images[~scene.weights] = -1.0  # how the kernels know an unobserved pixel
         self._upload_pixels("images", images)
         background = scene.background()
@@ -246,13 +253,15 @@ class OpenCLEngine:
             self._upload("background", background)
         self._make_otfs()
         if scene.n_stars:
-            self._upload_stars()
+            cl.enqueue_copy(self._queue, self._buffers["first_blocks"], self._first_blocks)
+            self.move_stars()
         self._observed: NDArray[np.bool_] | None = None
         if scene.weights is not None:
             self._invert_weights(scene.weights)
 
-    def _upload_stars(self) -> None:
-        scene, buffers = self.scene, self._buffers
+    def move_stars(self) -> None:
+        """Put the stars where the scene has them now."""
+        scene = self.scene
         windows = [self.layout.rows_of(first, self._star_blocks) for first in self._first_blocks]
         self._upload_pixels(
             "star_images",
@@ -262,7 +271,6 @@ class OpenCLEngine:
                 for j in range(scene.n_images)
             ),
         )
-        cl.enqueue_copy(self._queue, buffers["first_blocks"], self._first_blocks)
         self._upload("star_weights", scene.star_weights)
 
     def _make_otfs(self) -> None:
@@ -278,7 +286,7 @@ class OpenCLEngine:
                 np.int32(j),
             )()
 
-    def _invert_weights(self, weights: NDArray[np.bool_]) -> None:
+    def _invert_weights(self, weights: NDArray) -> None:
         """Make 1 / sum_j A_j^T w_j, 0 where nothing was observed."""
         buffers, size = self._buffers, self.layout.spectra_bytes
         transform = self._launcher.rows("rfft_rows", buffers["spectra"], buffers["extended"])

@@ -84,7 +84,7 @@ class Program:
         Files of kernels to build, `SOURCES`, `TRANSFORMS` or `STEP_SOURCES`.
     n_images, n_stars : int, optional
         What the scene has.
-    has_mu, has_weights, has_background_map : bool, optional
+    has_mu, has_weights, has_background_map, has_exposure_map : bool, optional
         What the scene has.
     least_model : float, optional
         The division guard.
@@ -126,6 +126,7 @@ class Program:
         has_mu: bool = False,
         has_weights: bool = False,
         has_background_map: bool = False,
+        has_exposure_map: bool = False,
         least_model: float = 0.0,
     ) -> None:
         device = context.devices[0]
@@ -163,6 +164,7 @@ class Program:
             "HAS_MU": int(has_mu),
             "HAS_WEIGHTS": int(has_weights),
             "HAS_BACKGROUND_MAP": int(has_background_map),
+            "HAS_EXPOSURE_MAP": int(has_exposure_map),
             "LEAST_MODEL": f"{least_model!r}",
         }
         definitions = [f"-D{name}={value}" for name, value in constants.items()]

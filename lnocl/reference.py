@@ -7,6 +7,8 @@ are half spectra along x alone, shape (..., Ny, Nx // 2 + 1).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import xlog1py
@@ -62,7 +64,7 @@ def correlate_columns(row_spectra: ComplexArray, otfs: ComplexArray) -> ComplexA
 def ratio_rows(
     row_spectra: ComplexArray,
     images: Array,
-    weights: NDArray[np.bool_] | None,
+    weights: NDArray[Any] | None,
     background: Array,
     star_images: Array,
     star_fluxes: Array,
@@ -82,8 +84,7 @@ def ratio_rows(
     divergence = model * (xlog1py(ratio, ratio - 1.0) - (ratio - 1.0))
     excess = np.where(guarded, ratio, 0.0) - 1.0
     if weights is not None:
-        excess = np.where(weights, excess, 0.0)
-        divergence = np.where(weights, divergence, 0.0)
+        excess, divergence = weights * excess, weights * divergence
     star_sums = np.einsum("sjyx,jyx->s", star_images, excess)
     return rfft_rows(excess), float(divergence.sum()), star_sums
 
@@ -187,11 +188,16 @@ class ReferenceEngine:
         background = scene.background()
         self._background = background if background.ndim == 3 else background[:, None, None]
         self._otfs = np.array([otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)])
+        self.move_stars()
+        self._inverse_weight = self._invert_weight()
+        self._objectives: list[float] = []
+
+    def move_stars(self) -> None:
+        """Put the stars where the scene has them now."""
+        scene = self.scene
         self._star_images = np.array(
             [[scene.star_image(j, s) for j in range(scene.n_images)] for s in range(scene.n_stars)]
         ).reshape(scene.n_stars, *self._images.shape)
-        self._inverse_weight = self._invert_weight()
-        self._objectives: list[float] = []
 
     def _invert_weight(self) -> Array | float:
         if self.scene.weights is None:

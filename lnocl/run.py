@@ -5,13 +5,17 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.observation import Array, Observation
 from lnocl.scene import Scene
 from lnocl.solvers import SOLVERS
+
+if TYPE_CHECKING:
+    from lnocl.scaling import Scaling
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,11 @@ class Setup:
     precision: str
     engine: str
     device: str | None
+    refine_positions: bool = False
+
+
+# Iterations after which star positions are refined: this, and twice as many each time.
+FIRST_REFINED = 3
 
 
 class Run:
@@ -66,31 +75,91 @@ class Run:
         initial_extended: ArrayLike | None = None,
         initial_star_fluxes: ArrayLike | None = None,
     ) -> None:
-        self.scene = Scene(observation, setup.stars, mu, setup.pad)
-        extended, star_fluxes = self.scene.start(initial_extended, initial_star_fluxes)
-        scaling = None
-        if setup.solver == "sgp":
-            from lnocl.scaling import prepare  # it loads scipy, which not every start needs
+        leeway = 0.0
+        if setup.refine_positions:
+            from lnocl.refine import RADIUS
 
-            star_fluxes, scaling = prepare(self.scene, extended, star_fluxes)
+            leeway = RADIUS
+        self._setup, self._n_iter = setup, n_iter
+        self.scene = Scene(observation, setup.stars, mu, setup.pad, leeway)
+        self._given_stars = self.scene.stars
+        self._refines = setup.refine_positions and self.scene.n_stars > 0
+        extended, star_fluxes = self.scene.start(initial_extended, initial_star_fluxes)
+        if self._refines:
+            star_fluxes = self._move_stars(extended, star_fluxes)
+        star_fluxes, scaling = self._prepare(extended, star_fluxes)
         self.engine = _make_engine(setup, self.scene, n_iter, scaling)
         self.engine.start(extended, star_fluxes)
         self.done = 0
-        self._iterations = SOLVERS[setup.solver](self.engine, n_iter)
 
     def __iter__(self) -> Iterator[int]:
-        for iteration in self._iterations:
-            self.done = iteration
-            yield iteration
+        while self.done < self._n_iter:
+            begin = self.done
+            for iteration in SOLVERS[self._setup.solver](self.engine, self._next_end() - begin):
+                self.done = begin + iteration
+                yield self.done
+            if self.done == begin or not self._refines:
+                return
+            if self.done < self._n_iter:
+                self._refine()
+
+    def _next_end(self) -> int:
+        """Return the iteration after which positions are refined, or the last."""
+        if not self._refines:
+            return self._n_iter
+        return min(max(FIRST_REFINED, 2 * self.done), self._n_iter)
+
+    def _refine(self) -> None:
+        """Move the stars to where the extended source of now makes them most likely."""
+        self._forget_end()
+        extended = self.engine.extended()
+        star_fluxes = self._move_stars(extended, self.engine.star_fluxes())
+        star_fluxes, self.engine.scaling = self._prepare(extended, star_fluxes)
+        self.engine.move_stars()
+        self.engine.start(extended, star_fluxes)
+
+    def _move_stars(self, extended: Array, star_fluxes: Array) -> Array:
+        """Move the stars of the scene; return their fluxes there."""
+        from lnocl.refine import StarFit, Stars
+
+        fit = StarFit(self.scene, extended, self._given_stars)
+        stars = fit.minimise(Stars(star_fluxes, self.scene.stars))
+        self.scene.move_stars(stars.positions)
+        return stars.fluxes
+
+    def _prepare(self, extended: Array, star_fluxes: Array) -> tuple[Array, Scaling | None]:
+        """Return the star fluxes that the solver begins with, and its scaling."""
+        if self._setup.solver != "sgp":
+            return star_fluxes, None
+        from lnocl.scaling import prepare  # it loads scipy, which not every start needs
+
+        return prepare(self.scene, extended, star_fluxes)
+
+    def star_positions(self) -> Array:
+        """Return the star positions, pixels, shape (n, 2)."""
+        return self.scene.stars
+
+    def star_errors(self) -> tuple[Array, Array]:
+        """Return the standard errors of star fluxes and positions, 0 where none were refined."""
+        if not self._refines:
+            return np.zeros(self.scene.n_stars), np.zeros((self.scene.n_stars, 2))
+        from lnocl.refine import StarFit, Stars
+
+        fit = StarFit(self.scene, self.engine.extended(), self._given_stars)
+        errors = fit.errors(Stars(self.engine.star_fluxes(), self.scene.stars))
+        # J is divided by the scale too, so that its information is that of as many fewer counts.
+        fluxes, positions = errors.fluxes * self.scene.unit, errors.positions
+        root = 1.0 / np.sqrt(self.scene.scale)
+        return fluxes * root, positions * root
 
     def extended(self) -> Array:
         """Return the extended source, electrons per pixel, shape (ny, nx)."""
         ny, nx = self.scene.observation.shape
-        return self.engine.extended()[:ny, :nx] * self.scene.scale
+        return self.engine.extended()[:ny, :nx] * self.scene.unit
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes, electrons."""
-        return self.engine.star_fluxes() * self.scene.scale
+        return self.engine.star_fluxes() * self.scene.unit
 
     def objective(self) -> float:
         """Return the objective recorded last."""
@@ -104,6 +173,11 @@ class Run:
         """Record the objective of the last estimate, where the solver has not done so."""
         if len(self.engine.objectives()) == self.done:
             self.engine.ratio()
+
+    def _forget_end(self) -> None:
+        """Take the objective of the last estimate off the record, where the solver has put it."""
+        if len(self.engine.objectives()) > self.done:
+            self.engine.forget_objective()
 
 
 def _make_engine(setup: Setup, scene: Scene, n_iter: int, scaling: Any) -> Any:

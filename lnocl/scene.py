@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
 from numbers import Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.observation import Array, Observation, numbers
+from lnocl.placement import MARGIN, Stamp, place
 
 MAX_AXIS = 8192
 
@@ -30,38 +31,48 @@ MOST_MU = 2.0**64
 class Scene:
     """What is modelled, on a grid of powers of two, scaled to images of about unit mean.
 
-    The scale is a power of two, so that it changes no digit: images, background, star fluxes
-    and the extended source are divided by it, mu is multiplied by it.
+    The scale of images and background is a power of two, so that it changes no digit. Exposures
+    are taken relative to their mean: as ``m_j = e_j (K_j * f + sum_s c_s P_js) + b_j`` is linear,
+    one of a whole image goes into its PSF, and a map e_j(n) into the weights, with images and
+    background divided by it, which leaves the objective as it is but for the weights.
 
     Parameters
     ----------
     observation : Observation
         The images and what is known of them.
     stars : sequence of (x, y)
-        Positions of the point sources in pixels, 0-based, x along columns; whole numbers.
+        Positions of the point sources in pixels of the first image less its offset, 0-based, x
+        along columns.
     mu : float
         Weight of the Tikhonov term on the extended source, per electron, zero or more.
     pad : int
         Unobserved pixels kept round the images, at least.
+    leeway : float
+        Pixels that a star may be moved later on, by `move_stars`.
 
     Attributes
     ----------
     grid : tuple of int
         Shape (Ny, Nx) of the grid, powers of two; the images lie at its origin.
+    stars : ndarray of float64, shape (n, 2)
+        Positions.
     scale : float
-        Electrons per unit.
+        Electrons per unit of the images.
+    unit : float
+        Electrons per exposure and unit of the estimate.
     mu : float
         Scaled.
-    weights : ndarray of bool, shape (p, Ny, Nx), or None
-        True where a pixel was observed; None where all were.
+    weights : ndarray of bool or float64, shape (p, Ny, Nx), or None
+        True where a pixel was observed, or its relative exposure where exposures are maps; None
+        where all were observed alike.
     star_weights : ndarray of float64, shape (n,)
         ``sum_j <P_js, w_j>``, the share of each star's light that was observed, summed.
 
     Raises
     ------
     InputError
-        A star outside the images, between pixels or unobserved; mu or pad out of range; images
-        too large for the transform.
+        A star outside the images or unobserved; mu or pad out of range; images too large for the
+        transform.
 
     Warns
     -----
@@ -72,27 +83,42 @@ class Scene:
     def __init__(
         self,
         observation: Observation,
-        stars: Sequence[tuple[float, float]] = (),
+        stars: ArrayLike = (),
         mu: float = 0.0,
         pad: int = 0,
+        leeway: float = 0.0,
     ) -> None:
         self.observation = observation
-        self.stars = _check_stars(stars, observation.shape)
+        self.stars = _check_stars(stars, observation)
+        self._leeway = leeway
         check_mu(mu)
         self.grid = _grid(observation.shape, pad)
         self._warn_of_large_psf()
         self.scale = _scale(observation.images[~observation.mask])
-        self.mu = float(mu) * self.scale
+        exposure = observation.exposure
+        has_map = exposure.ndim == 3
+        mean_exposure = float((exposure[~observation.mask] if has_map else exposure).mean())
+        self.unit = self.scale / mean_exposure
+        self.mu = float(mu) * self.unit * self.unit / self.scale
         if self.mu > MOST_MU:
             raise InputError(
                 f"mu {mu:g} is too large for images of about {self.scale:g} electrons per pixel; "
-                f"the most that means anything there is {MOST_MU / self.scale:g}"
+                f"the most that means anything there is {MOST_MU / (self.mu / mu):g}"
             )
-        observed = ~observation.mask
-        self.weights = (
-            None if observed.all() and self.grid == observation.shape else self._on_grid(observed)
-        )
+        relative = exposure / mean_exposure
+        self._gains = np.ones(self.n_images) if has_map else relative
+        self.weights = self._weigh(relative if has_map else None)
         self.star_weights = self._weigh_stars()
+
+    def move_stars(self, stars: ArrayLike) -> None:
+        """Give the stars other positions, none farther away than the leeway."""
+        self.stars = _check_stars(stars, self.observation)
+        self.star_weights = self._weigh_stars()
+
+    @property
+    def has_exposure_map(self) -> bool:
+        """Whether the weights are exposures, not only whether a pixel was observed."""
+        return self.weights is not None and self.weights.dtype != np.bool_
 
     @property
     def n_images(self) -> int:
@@ -106,31 +132,55 @@ class Scene:
 
     def images(self) -> Array:
         """Return the images on the grid, scaled, shape (p, Ny, Nx); 0 where not observed."""
-        return self._on_grid(self.observation.images / self.scale)
+        return self._per_exposure(self._on_grid(self.observation.images / self.scale), 0.0)
 
     def background(self) -> Array:
         """Return the background, scaled, shape (p,) or (p, Ny, Nx); 1 where not observed."""
         background = self.observation.background / self.scale
-        return background if background.ndim == 1 else self._on_grid(background, fill=1.0)
+        if self.has_exposure_map and background.ndim == 1:
+            background = np.broadcast_to(background[:, None, None], self.observation.images.shape)
+        if background.ndim == 1:
+            return background
+        return self._per_exposure(self._on_grid(background, fill=1.0), 1.0)
+
+    def _per_exposure(self, images: Array, fill: float) -> Array:
+        if not self.has_exposure_map:
+            return images
+        assert self.weights is not None
+        observed = self.weights > 0
+        return np.divide(images, self.weights, out=np.full_like(images, fill), where=observed)
 
     def psf(self, j: int) -> Array:
-        """Return the PSF of image j on the grid, shape (Ny, Nx), its peak at the origin."""
-        psf = self.observation.psfs[j]
-        for axis, n in enumerate(self.grid):
-            psf = _fold(psf, n, axis)
-        return psf
+        """Return the PSF of image j on the grid, shape (Ny, Nx), its peak at the offset."""
+        return self._place(j, 0.0, 0.0).on_grid(self.grid)
 
     def star_image(self, j: int, s: int) -> Array:
         """Return P_js, the PSF of image j centred on star s, shape (Ny, Nx)."""
-        x, y = self.stars[s]
-        return np.roll(self.psf(j), (y, x), axis=(0, 1))
+        return self.star_stamp(j, s).on_grid(self.grid)
+
+    def star_stamp(self, j: int, s: int) -> Stamp:
+        """Return P_js, where it is not 0."""
+        return self._place(j, *self.stars[s])
+
+    def scaled_psfs(self) -> list[Array]:
+        """Return the PSFs times the relative exposure of their image, where that is a number."""
+        return list(self._gains[:, None, None] * self.observation.psfs)
+
+    def _place(self, j: int, x: float, y: float) -> Stamp:
+        dx, dy = self.observation.offsets[j]
+        return place(self._gains[j] * self.observation.psfs[j], self.grid, x + dx, y + dy)
 
     def star_rows(self, s: int) -> NDArray[np.bool_]:
-        """Return the rows of the grid, shape (Ny,), that the images of star s reach into."""
-        psfs = self.observation.psfs
-        lit = np.flatnonzero((psfs != 0).any(axis=(0, 2))) - psfs.shape[1] // 2
+        """Return the rows of the grid, shape (Ny,), that the images of star s may reach into."""
         rows = np.zeros(self.grid[0], bool)
-        rows[(lit + self.stars[s][1]) % self.grid[0]] = True
+        for j in range(self.n_images):
+            stamp = self.star_stamp(j, s)
+            lit = stamp.rows(self.grid)[(stamp.values != 0).any(axis=1)]
+            rows[lit] = True
+        if self._leeway:
+            reach = int(np.ceil(self._leeway)) + MARGIN
+            for step in range(-reach, reach + 1):
+                rows = rows | np.roll(rows, step)
         return rows
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
@@ -161,10 +211,10 @@ class Scene:
         if star_fluxes is None:
             fluxes = default_fluxes
         else:
-            fluxes = _check_start("initial_star_fluxes", star_fluxes, (self.n_stars,)) / self.scale
+            fluxes = _check_start("initial_star_fluxes", star_fluxes, (self.n_stars,)) / self.unit
         if extended is None:
             return np.full(self.grid, level), fluxes
-        given = _check_start("initial_extended", extended, self.observation.shape) / self.scale
+        given = _check_start("initial_extended", extended, self.observation.shape) / self.unit
         return self._on_grid(given, fill=given.mean()), fluxes
 
     def _read_off(self) -> tuple[Array, float]:
@@ -172,7 +222,7 @@ class Scene:
         images, background = self.images(), self.background()
         if background.ndim == 1:
             background = background[:, None, None]
-        weights = np.ones(images.shape, bool) if self.weights is None else self.weights
+        weights = np.ones(images.shape, bool) if self.weights is None else self.weights > 0
         excess = np.where(weights, images - background, 0.0)
         n_observed = weights.sum()
         mean = excess.sum() / n_observed
@@ -195,20 +245,32 @@ class Scene:
     def _weigh_stars(self) -> Array:
         if self.weights is None:
             return np.full(self.n_stars, float(self.n_images))
-        shares = np.array(
-            [
-                [self.star_image(j, s)[self.weights[j]].sum() for s in range(self.n_stars)]
-                for j in range(self.n_images)
-            ]
-        ).reshape(self.n_images, self.n_stars)
-        total = shares.sum(axis=0)
+        total = np.array([self._weigh_star(s) for s in range(self.n_stars)])
         for (x, y), weight in zip(self.stars, total, strict=True):
             if weight < OBSERVED_SHARE * self.n_images:
                 raise InputError(
-                    f"the star at ({x}, {y}) lies where all images are masked; "
+                    f"the star at ({x:g}, {y:g}) lies where all images are masked; "
                     "leave it out or mend the mask"
                 )
         return total
+
+    def _weigh_star(self, s: int) -> float:
+        assert self.weights is not None
+        total = 0.0
+        for j, weights in enumerate(self.weights):
+            stamp = self.star_stamp(j, s)
+            seen = weights[np.ix_(stamp.rows(self.grid), stamp.columns(self.grid))]
+            total += float((stamp.values * seen).sum())
+        return total
+
+    def _weigh(self, relative: Array | None) -> NDArray[Any] | None:
+        """Return the weights for relative exposures, where they are a map."""
+        observed = ~self.observation.mask
+        if relative is not None:
+            return self._on_grid(np.where(observed, relative, 0.0))
+        if observed.all() and self.grid == self.observation.shape:
+            return None
+        return self._on_grid(observed)
 
     def _on_grid(self, array: NDArray, fill: float = 0.0) -> NDArray:
         ny, nx = self.observation.shape
@@ -227,18 +289,6 @@ class Scene:
                 LnoclWarning,
                 stacklevel=5,
             )
-
-
-def _fold(psf: Array, n: int, axis: int) -> Array:
-    """Return a PSF on n points of an axis, its middle at the first, its wings round the edge."""
-    k = psf.shape[axis]
-    wide = -(-k // n) * n  # a whole number of rounds
-    padding = [(0, wide - k) if i == axis else (0, 0) for i in range(2)]
-    centred = np.roll(np.pad(psf, padding), -(k // 2), axis)
-    if wide == n:
-        return centred
-    rounds = (*centred.shape[:axis], wide // n, n, *centred.shape[axis + 1 :])
-    return centred.reshape(rounds).sum(axis)
 
 
 def _scale(good: Array) -> float:
@@ -268,27 +318,21 @@ def _grid(shape: tuple[int, int], pad: int) -> tuple[int, int]:
     return ny, nx
 
 
-def _check_stars(
-    stars: Sequence[tuple[float, float]], shape: tuple[int, int]
-) -> list[tuple[int, int]]:
+def _check_stars(stars: ArrayLike, observation: Observation) -> Array:
     positions = numbers("stars", stars)
     if positions.size == 0:
-        return []
+        return np.zeros((0, 2))
     if positions.ndim != 2 or positions.shape[1] != 2:
         raise InputError(f"stars has shape {positions.shape}; give pairs (x, y)")
-    ny, nx = shape
-    for x, y in positions:
-        if not (0 <= x <= nx - 1 and 0 <= y <= ny - 1):
+    ny, nx = observation.shape
+    for position in positions:
+        x, y = (position + observation.offsets).T
+        if not ((x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)).any():
             raise InputError(
-                f"the star at ({x:g}, {y:g}) lies outside the images: x must be in "
-                f"[0, {nx - 1}] and y in [0, {ny - 1}]"
+                f"the star at ({position[0]:g}, {position[1]:g}) lies outside the images: x must "
+                f"be in [0, {nx - 1}] and y in [0, {ny - 1}]"
             )
-        if x != round(x) or y != round(y):
-            raise InputError(
-                f"the star at ({x:g}, {y:g}) lies between pixels; give the nearest whole pixel "
-                f"({round(x)}, {round(y)})"
-            )
-    return [(round(x), round(y)) for x, y in positions]
+    return positions
 
 
 def _check_start(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -106,9 +106,9 @@ class Discrepancy:
 
         if self._model is None:
             self._model = Model(run.scene)
-        means = self._model.images(run.engine.extended(), run.engine.star_fluxes())
-        deviances = expected_deviance(means * run.scene.scale)
-        return float((self._model.weights * deviances).sum())
+        weights = self._model.weights
+        means = weights * self._model.images(run.engine.extended(), run.engine.star_fluxes())
+        return float(expected_deviance(means * run.scene.scale)[weights > 0].sum())
 
 
 # Above this mean the expectation is 1 + 1 / (6 m), to a part in ten million.

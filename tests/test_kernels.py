@@ -28,6 +28,8 @@ CASES = {
     "radices 4, 4 and 8, 4": ((16, 32), None, THREE_IMAGES, "sd"),
     "radices 8, 8 and 4, 8, 4": ((64, 128), None, "two images, star, mu", "sd"),
     "radices 8, 8, 4": ((256, 16), None, "plain", "S"),
+    "exposure map": ((32, 16), None, "exposure map", "sd"),
+    "exposure map, group": ((32, 16), Tuning(1, 8, group=4), "exposure map", "S"),
     "radices 8, 8, 8": ((8, 512), None, "plain", "S"),
     "radices 4, 8, 8, 4, middle pass": ((32, 1024), None, "plain", "sD"),
     "middle pass along y": ((2048, 4), None, "plain", "d"),
@@ -47,6 +49,13 @@ SCENES = {
         "has_background_map": True,
     },
     "mask, mu": {"n_images": 1, "has_weights": True, "has_mu": True},
+    "exposure map": {
+        "n_images": 2,
+        "n_stars": 1,
+        "has_weights": True,
+        "has_exposure_map": True,
+        "has_background_map": True,
+    },
 }
 DTYPES = {"s": np.float32, "d": np.float64}
 RUNS = [
@@ -183,6 +192,9 @@ def inputs(b):
     images = rng.poisson(3.0, (p, ny, nx)) / 3.0
     images[:, 0, :2] = 0.0, 1.0
     weights = rng.random((p, ny, nx)) > 0.2
+    has_exposure_map = "-DHAS_EXPOSURE_MAP=1" in b.program.options
+    if has_exposure_map:
+        weights = rounded(weights * rng.uniform(0.5, 2.0, weights.shape), dtype)
     # One star is seen in all blocks; of two, each in half of them, the first round the edge.
     row_blocks = b.program.row_blocks
     star_blocks = row_blocks if n < 2 else max(1, row_blocks // 2)
@@ -206,6 +218,7 @@ def inputs(b):
         model_spectra=rounded(np.fft.rfft(model, axis=-1) / nx, dtype),
         images=rounded(images, dtype),
         weights=weights if has_weights else None,
+        has_exposure_map=has_exposure_map,
         background=rounded(rng.uniform(0.1, 0.2, (p, ny, nx) if has_map else (p, 1, 1)), dtype),
         star_images=star_images,
         star_blocks=star_blocks,
@@ -314,7 +327,11 @@ def run_ratio_rows(b, i):
     spectra, objective, star_sums = reference.ratio_rows(
         i.model_spectra, i.images, i.weights, i.background, i.star_images, i.star_fluxes
     )
-    images = i.images if i.weights is None else np.where(i.weights, i.images, -1.0)
+    images, exposure = i.images, b.put(np.zeros(1))
+    if i.has_exposure_map:
+        exposure = b.put_pixels(i.weights)
+    elif i.weights is not None:
+        images = np.where(i.weights, i.images, -1.0)
     background = b.put_pixels(i.background) if i.background.size > i.p else b.put(i.background)
     out = b.put_spectra(i.model_spectra)
     sums = b.put(np.full((b.program.row_blocks * i.p, 1 + i.n, 2), np.nan))
@@ -326,6 +343,7 @@ def run_ratio_rows(b, i):
         sums,
         b.put_pixels(images),
         background,
+        exposure,
         b.put_pixels(stars),
         b.put(i.first_blocks, np.int32),
         np.int32(i.star_blocks),
@@ -483,6 +501,7 @@ def launch_ratio_rows(b, model, images, star_image):
         sums,
         b.put_pixels(images[None]),
         background,
+        b.put(np.zeros(1)),
         b.put_pixels(star_image[None]),
         b.put([0], np.int32),
         np.int32(b.program.row_blocks),

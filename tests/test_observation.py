@@ -190,7 +190,10 @@ REFUSED = {
     "None for a background": ({"background": None}, "background holds object"),
     "ragged background": ({"background": RAGGED}, "background"),
     "two numbers of read noise": ({"read_noise": [1, 2]}, "read_noise has shape (2,)"),
-    "map of read noise": ({"read_noise": IMAGES}, "read_noise has shape (3, 4, 4)"),
+    "small map of read noise": (
+        {"read_noise": IMAGES[:, 1:]},
+        "read_noise has shape (3, 3, 4); the images have (3, 4, 4)",
+    ),
     "negative read noise": ({"read_noise": -1}, "read_noise must be finite and not negative; -1"),
     "NaN read noise": (
         {"read_noise": [0, 0, np.nan]},

@@ -1,0 +1,112 @@
+"""A PSF at any position of a periodic grid, between pixels too."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.observation import Array
+
+# Pixels that a PSF is given on each side before it is moved by a fraction: what rings beyond the
+# edges of its array dies out in them.
+MARGIN = 16
+
+
+class Stamp(NamedTuple):
+    """Part of a periodic grid: its values, and the row and column of the first of them."""
+
+    values: Array
+    y: int
+    x: int
+
+    def on_grid(self, grid: tuple[int, int]) -> Array:
+        """Return the values on the whole grid, 0 elsewhere."""
+        laid = np.zeros(grid)
+        laid[: self.values.shape[0], : self.values.shape[1]] = self.values
+        return np.roll(laid, (self.y, self.x), axis=(0, 1))
+
+    def rows(self, grid: tuple[int, int]) -> NDArray[np.int_]:
+        """Return the rows of the grid that the values lie in."""
+        return (self.y + np.arange(self.values.shape[0])) % grid[0]
+
+    def columns(self, grid: tuple[int, int]) -> NDArray[np.int_]:
+        """Return the columns of the grid that the values lie in."""
+        return (self.x + np.arange(self.values.shape[1])) % grid[1]
+
+
+def place(psf: Array, grid: tuple[int, int], x: float, y: float) -> Stamp:
+    """Return a PSF with its middle, pixel ``(ky // 2, kx // 2)``, at a position of a grid.
+
+    Whole pixels move it as it is; the fraction left, at most half a pixel, by the phase
+    ``exp(-2 pi i (kx dx / nx + ky dy / ny))`` of its spectrum, which is exact where the PSF is
+    limited to the frequencies that its pixels can hold. Its sum is kept to rounding.
+
+    Parameters
+    ----------
+    psf : ndarray of float64, shape (ky, kx)
+        Of any size; where it is larger than the grid it is wrapped round.
+    grid : tuple of int
+        Shape (Ny, Nx).
+    x, y : float
+        Where the middle goes, in pixels of the grid, which is periodic.
+
+    Notes
+    -----
+    What is sharper than the pixels can hold rings when it is moved. For Gaussians moved by half a
+    pixel in x and y the most negative pixel, as a share of the peak, is 0.11 for a width (FWHM) of
+    0.75 pixels, 0.043 for 1, 0.0021 for 1.5 and 2e-5 for 2 (tests/test_placement.py).
+    """
+    whole = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+    fraction = y - whole[0], x - whole[1]
+    if any(fraction):
+        for axis, n in enumerate(grid):
+            psf = _widen(psf, n, axis)
+        psf = _move(psf, fraction)
+    first = []
+    for axis, n in enumerate(grid):
+        if psf.shape[axis] > n:
+            psf = fold(psf, n, axis)
+        first.append(whole[axis] - psf.shape[axis] // 2)
+    return Stamp(psf, *first)
+
+
+def _move(psf: Array, fraction: tuple[float, float]) -> Array:
+    import scipy.fft  # scipy takes a tenth of a second, which stars on whole pixels need not spend
+    from scipy.ndimage import fourier_shift
+
+    spectrum = fourier_shift(scipy.fft.rfft2(psf), fraction, n=psf.shape[1])
+    return scipy.fft.irfft2(spectrum, psf.shape)
+
+
+def differentiate(psf: Array, axis: int) -> Array:
+    """Return the derivative of a PSF along an axis, by its spectrum, with `MARGIN` round it."""
+    psf = np.pad(psf, MARGIN)
+    n = psf.shape[axis]
+    factors = 2j * np.pi * np.fft.fftfreq(n)
+    if n % 2 == 0:
+        factors[n // 2] = 0.0  # the sign of the highest frequency is not known
+    spectrum = np.fft.fft(psf, axis=axis) * (factors if axis else factors[:, None])
+    return np.fft.ifft(spectrum, axis=axis).real
+
+
+def fold(psf: Array, n: int, axis: int) -> Array:
+    """Return a PSF on n points of an axis, its middle at ``n // 2``, its wings round the edge."""
+    k = psf.shape[axis]
+    before = (n // 2 - k // 2) % n
+    wide = -(-(k + before) // n) * n
+    padding = [(0, 0), (0, 0)]
+    padding[axis] = before, wide - k - before
+    padded = np.pad(psf, padding)
+    shape = (*padded.shape[:axis], wide // n, n, *padded.shape[axis + 1 :])
+    return padded.reshape(shape).sum(axis)
+
+
+def _widen(psf: Array, n: int, axis: int) -> Array:
+    """Return a PSF with margins along an axis, or round the whole axis where they do not fit."""
+    if psf.shape[axis] + 2 * MARGIN >= n:
+        return fold(psf, n, axis)
+    padding = [(0, 0), (0, 0)]
+    padding[axis] = MARGIN, MARGIN
+    return np.pad(psf, padding)
