@@ -33,6 +33,8 @@ COLOUR_MAP = "viridis"
 ACROSS, BEFORE, BEYOND = 24, 16, 32
 # Share of the brightest true pixel at which the log stretch ends.
 LOG_FLOOR = 1e-3
+# Share of a PSF's peak at which its stretch ends.
+PSF_FLOOR = 1e-4
 # Share of the brightest true row below which a row has no relative error worth showing.
 FAINT_ROW = 0.01
 # Largest relative error that an axis makes room for, percent.
@@ -421,6 +423,90 @@ def costs(settings: Mapping[str, Mapping[str, NDArray]], measure: str) -> Figure
     axis.grid(alpha=0.3)
     axis.legend(fontsize=9)
     return figure
+
+
+def star_psf(
+    frame: Array, bad: NDArray[np.bool_], centre: tuple[float, float], psf: Array, angle: float
+) -> Figure:
+    """Draw a frame of a star, the PSF made from it, and the PSF's profiles.
+
+    Parameters
+    ----------
+    frame : ndarray of float64, shape (ny, nx)
+        The frame, its background subtracted.
+    bad : ndarray of bool, shape (ny, nx)
+        Its bad pixels; drawn in the first colour of the palette.
+    centre : tuple of float
+        The star's (x, y) in the frame, 0-based pixels.
+    psf : ndarray of float64, shape (k, k)
+        The PSF, centred on ``(k // 2, k // 2)``.
+    angle : float
+        Degrees by which it was rotated.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Frame and PSF in logarithmic stretch from 1 to `PSF_FLOOR` of the PSF's peak, the crop
+        outlined; rows and columns through the middle.
+
+    Raises
+    ------
+    LnoclError
+        Where matplotlib is missing.
+    """
+    figure = _figure(12.5, 4.0)
+    left, middle, right = figure.subplots(1, 3)
+    side = len(psf)
+    first = -(side // 2) - 0.5
+    edges = first, first + side
+    y, x = (np.arange(n) - c for n, c in zip(frame.shape, centre[::-1], strict=True))
+    seen = np.where(bad, np.nan, frame)
+    near = np.abs(y[:, None]) + np.abs(x) <= side
+    brightest = np.nanmax(np.where(near, seen, np.nan)) if (near & ~bad).any() else 1.0
+    _draw_log(left, seen, (x[0] - 0.5, x[-1] + 0.5, y[0] - 0.5, y[-1] + 0.5), brightest)
+    corners = np.array([[edges[i], edges[j]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1), (0, 0))])
+    cosine, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    left.plot(*(corners @ np.array([[cosine, -sine], [sine, cosine]])).T, color="white", lw=1)
+    wide = 0.75 * side
+    left.set(xlim=(max(-wide, x[0]), min(wide, x[-1])), ylim=(max(-wide, y[0]), min(wide, y[-1])))
+    left.set_title("Frame, bad pixels coloured, and crop", fontsize=11)
+    shown = _draw_log(middle, psf, (*edges, *edges), psf.max())
+    turned = f", rotated by {angle:g} degrees" if angle else ""
+    middle.set_title(f"PSF{turned}", fontsize=11)
+    figure.colorbar(shown, ax=middle, label="share of the peak", extend="min", pad=0.02)
+    at = np.arange(side) - side // 2
+    for i, (values, name) in enumerate(
+        ((psf[side // 2], "along x"), (psf[:, side // 2], "along y"))
+    ):
+        right.plot(at, values / psf.max(), **_line(i), label=name)
+    right.set_yscale("symlog", linthresh=PSF_FLOOR)
+    right.axvline(0, color="0.4", lw=1, ls=":")
+    right.set_title("PSF through its centre", fontsize=11)
+    right.set(xlabel="pixels from the centre", ylabel="share of the peak")
+    right.grid(alpha=0.3)
+    right.legend(fontsize=9)
+    for axis in (left, middle):
+        axis.set(xlabel="x from the centre (pixels)", ylabel="y (pixels)")
+        axis.plot(0, 0, "+", color="white", ms=9, mew=0.8)
+    return figure
+
+
+def _draw_log(
+    axis: Axes, image: Array, extent: tuple[float, float, float, float], top: float
+) -> Any:
+    """Draw an image in logarithmic stretch, what is negative as the darkest."""
+    from matplotlib import colormaps
+    from matplotlib.colors import LogNorm
+
+    colours = colormaps[COLOUR_MAP].with_extremes(bad=COLOURS[0])
+    return axis.imshow(
+        (image / top).clip(PSF_FLOOR),
+        norm=LogNorm(PSF_FLOOR, 1),
+        cmap=colours,
+        origin="lower",
+        interpolation="nearest",
+        extent=extent,
+    )
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -67,6 +67,7 @@ LAYERS = {
     "kernels.__init__": set(),
     "metrics": set(),
     "plots": {"metrics"},
+    "psf": {"observation"},
     "simulate": set(),
 }
 KNOWS_OPENCL = {"opencl", "fft", "program", "device"}

@@ -128,3 +128,26 @@ def test_without_matplotlib_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(LnoclError, match=r"pip install 'lnocl\[plot\]'"):
         plots.errors({"RLM": CURVE})
+
+
+@pytest.mark.parametrize("angle", [0.0, 30.0])
+def test_a_psf_is_shown_beside_the_frame_that_it_was_made_from(angle):
+    y, x = np.mgrid[:61, :70]
+    frame = np.exp(-((x - 30) ** 2 + (y - 28) ** 2) / 8.0) - 0.01
+    bad = np.zeros(frame.shape, bool)
+    bad[28, 31] = True
+    psf = frame[18:39, 20:41]
+    figure = plots.star_psf(frame, bad, (30.0, 28.0), psf, angle)
+    left, right = panels(figure)
+    assert left.get_array().mask[28, 31]
+    assert left.get_array().mask.sum() == 1
+    assert left.get_extent() == [-30.5, 39.5, -28.5, 32.5]
+    np.testing.assert_array_equal(right.get_array(), (psf / psf.max()).clip(plots.PSF_FLOOR))
+    assert right.get_extent() == [-10.5, 10.5, -10.5, 10.5]
+    crop = np.array(left.axes.lines[0].get_data())
+    # What was at -angle in the frame is along x in the PSF.
+    turn = np.exp(-1j * np.radians(angle))
+    np.testing.assert_allclose((crop[0] + 1j * crop[1])[2], (10.5 + 10.5j) * turn)
+    np.testing.assert_array_equal(lines(figure.axes[2])["along x"][1], psf[10] / psf.max())
+    np.testing.assert_array_equal(lines(figure.axes[2])["along y"][1], psf[:, 10] / psf.max())
+    assert (right.axes.get_title() == "PSF") == (angle == 0)

@@ -19,6 +19,8 @@ from astropy.wcs import WCS
 from scipy.signal import fftconvolve
 
 from lnocl.cli import main
+from lnocl.errors import LnoclWarning
+from lnocl.psf import make_psf
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -190,3 +192,67 @@ def test_a_point_source_keeps_its_counts(engine, capsys):
         before.all_pix2world([[0, 0], [168, 146]], 0),
         rtol=1e-13,
     )
+
+
+class TestAltair:
+    """A Fizeau frame of a star, its core clipped: four PSFs at four angles from one."""
+
+    FRAME = DATA / "lbti-fizeau-altair" / "lm_180507_009030.fits"
+
+    @staticmethod
+    def fringes(psf):
+        """Return frequency, in cycles a pixel, and angle, degrees, of the side lobe of the MTF."""
+        k = len(psf)
+        window = np.exp(-0.5 * np.add.outer(*[(np.arange(k) - k // 2) ** 2 / 20.0**2] * 2))
+        n = 1024
+        spectrum = np.abs(np.fft.fft2(psf * window, s=(n, n)))
+        fy, fx = np.fft.fftfreq(n)[:, None], np.fft.fftfreq(n)
+        f = np.hypot(fx, fy)
+        spectrum[(f < 1 / 8) | (f > 1 / 4)] = 0
+        iy, ix = np.unravel_index(spectrum.argmax(), spectrum.shape)
+        return f[iy, ix], np.degrees(np.arctan2(fy[iy, 0], fx[ix])) % 180
+
+    def test_four_psfs_of_one_frame(self):
+        frame = fits.getdata(self.FRAME)
+        stars = [
+            make_psf(frame, size=160, clip_negative=True, rotate=angle)
+            for angle in (0, 45, 90, 135)
+        ]
+        frequency, first = self.fringes(stars[0].psf)
+        for star, angle in zip(stars, (0, 45, 90, 135), strict=True):
+            # The authors of the frame recentred it: on its middle, it turns out.
+            assert star.centre == pytest.approx((202.5, 202.5), abs=0.02)
+            assert star.psf.sum() == pytest.approx(1, abs=1e-12)
+            assert star.psf.min() == 0
+            f, found = self.fringes(star.psf)
+            assert f == pytest.approx(frequency, rel=0.01)
+            assert (found - first - angle + 90) % 180 == pytest.approx(90, abs=1)
+            peak = np.argwhere(star.psf == star.psf.max())[0] - 80
+            assert np.hypot(*peak) < 8
+        np.testing.assert_allclose(
+            stars[2].psf[1:, 1:], np.rot90(stars[0].psf[1:, 1:], -1), rtol=0,
+            atol=1e-3 * stars[0].psf.max(),
+        )  # fmt: skip
+
+    def test_the_clipped_core_is_repaired_with_a_warning(self):
+        frame = fits.getdata(self.FRAME)
+        with pytest.warns(LnoclWarning, match="24 saturated pixels .* its core is a guess"):
+            star = make_psf(frame, size=160, saturation=57000.0)
+        assert star.psf.max() * star.flux > 57000
+        assert star.centre == pytest.approx((202.5, 202.5), abs=0.1)
+
+
+class TestChandra:
+    """PSF images that are not centred, and one that is sharper than its pixels."""
+
+    @pytest.mark.parametrize(
+        ("name", "centroid"), [("4683", (22.94, 21.65)), ("4684", (23.24, 23.09))]
+    )
+    def test_the_centres_that_were_published_are_found(self, name, centroid):
+        path = DATA / "chandra-sgra-pair" / f"chandra-psf-obs-id-{name}.fits.gz"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LnoclWarning)
+            star = make_psf(fits.getdata(path), background=0.0)
+            again = make_psf(star.psf, background=0.0)
+        assert star.centre == pytest.approx(centroid, abs=0.1)
+        assert again.centre == pytest.approx([k // 2 for k in star.psf.shape], abs=0.05)
