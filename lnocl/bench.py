@@ -10,8 +10,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from astropy.table import Table
 
-from lnocl import __version__, demo, experiment, fitsread, fitswrite, plots, trade
+from lnocl import __version__, demo, experiment, fitswrite, frames, plots, trade
 from lnocl.errors import InputError, LnoclError
+from lnocl.frames import Known, Word
 from lnocl.observation import Observation
 from lnocl.simulate import Simulation, load_target, simulate
 
@@ -86,8 +87,8 @@ class Files(NamedTuple):
 
     images: Sequence[str]
     psfs: Sequence[str]
-    background: Sequence[float]
-    read_noise: Sequence[float]
+    background: Sequence[Word]
+    read_noise: Sequence[Word]
     stars: Sequence[tuple[float, float]]
     mu: float
 
@@ -98,22 +99,22 @@ class Files(NamedTuple):
 
     def load(self) -> Problem:
         """Read them."""
-        images, psfs = fitsread.read_stack(self.images), fitsread.read_stack(self.psfs)
-        observation = Observation(images.data, psfs.data, self.background, self.read_noise)
+        known = Known(self.background, self.read_noise)
+        read = frames.read_frames(self.images, self.psfs, known)
         inputs = {
-            "images": dict(zip(self.images, images.sha256, strict=True)),
-            "psfs": dict(zip(self.psfs, psfs.sha256, strict=True)),
-            "background": list(self.background),
+            "images": dict(zip(self.images, read.sha256["images"], strict=True)),
+            "psfs": dict(zip(self.psfs, read.sha256["psfs"], strict=True)),
+            "background": read.background,
             "read_noise": list(self.read_noise),
         }
-        return Problem(observation, self.stars, self.mu, inputs)
+        return Problem(read.observation, self.stars, self.mu, inputs)
 
 
 def choose_source(
     images: Sequence[str],
     psfs: Sequence[str] | None,
-    background: Sequence[float] | None,
-    read_noise: Sequence[float] | None,
+    background: Sequence[Word] | None,
+    read_noise: Sequence[Word] | None,
     stars: Sequence[tuple[float, float]],
     mu: float | None,
     size: int | None,
@@ -124,8 +125,8 @@ def choose_source(
     ----------
     images, psfs : sequence of str
         Paths of FITS files.
-    background, read_noise : sequence of float, optional
-        Electrons, one for all images or one for each; by default 0.
+    background, read_noise : sequence of float or str, optional
+        As for `frames.Known`; by default 0.
     stars : sequence of (x, y)
         Positions in pixels, 0-based.
     mu : float, optional

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from numbers import Real
 from typing import Any
@@ -118,6 +118,28 @@ class Result:
     history: NDArray[np.void]
     mu: float
     held_out: NDArray[np.void]
+    _models: Callable[[], Array] = field(repr=False, compare=False)
+    _observation: Observation = field(repr=False, compare=False)
+
+    def models(self) -> Array:
+        """Return the m_j, shape (p, ny, nx), electrons per pixel.
+
+        ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j``, in double precision. As in the observation,
+        the square of the read noise is included.
+        """
+        return self._models()
+
+    def residuals(self) -> Array:
+        """Return ``(g_j - m_j) / sqrt(m_j)``, shape (p, ny, nx): about 1 where only noise is left.
+
+        NaN where a pixel is bad, or the model is 0.
+        """
+        observation, models = self._observation, self.models()
+        usable = ~observation.mask & (models > 0)
+        excess = observation.images - models
+        return np.divide(
+            excess, np.sqrt(np.maximum(models, 0.0)), out=np.full_like(excess, np.nan), where=usable
+        )
 
 
 def deconvolve(
@@ -150,7 +172,8 @@ def deconvolve(
     observation : Observation
         The images, p of shape (ny, nx), and what is known of them.
     stars : sequence of (x, y), optional
-        Positions of the point sources in pixels, 0-based, x along columns; whole numbers.
+        Positions of the point sources in pixels, 0-based, x along columns. Between pixels a star's
+        image is the PSF moved by the phase of its spectrum (`lnocl.placement.place`).
     mu : float or "auto", optional
         Weight of the Tikhonov term on the extended source, per electron; zero or more. "auto":
         0 or one of seven values, three decades up to p over the brightest pixel, whichever held-out
@@ -187,6 +210,10 @@ def deconvolve(
     progress : bool, optional
         Show a progress bar on stderr, where that is a terminal, with the objective or what the
         stopping rule watches.
+    refine_positions : bool, optional
+        Move the stars to where they are most likely, at most 3 pixels away, by Fisher scoring of
+        all fluxes and positions with the extended source held fixed: at the start and after 3, 6,
+        12, 24 ... iterations (`lnocl.refine`).
 
     Returns
     -------
@@ -389,4 +416,6 @@ def _wrap_up(run: Run, stop_reason: str, choice: Choice) -> Result:
         history=history,
         mu=choice.mu,
         held_out=choice.curve,
+        _models=run.models(),
+        _observation=run.scene.observation,
     )

@@ -36,15 +36,20 @@ class Stack(NamedTuple):
     ----------
     data : ndarray of float64, shape (p, ny, nx)
         Pixels, in the units of the files.
-    header : astropy.io.fits.Header
-        Header of the first image.
+    headers : list of astropy.io.fits.Header
+        Header of each file.
     sha256 : list of str
         SHA-256 checksum of each file, in hexadecimal.
     """
 
     data: NDArray[np.float64]
-    header: fits.Header
+    headers: list[fits.Header]
     sha256: list[str]
+
+    @property
+    def header(self) -> fits.Header:
+        """Header of the first image."""
+        return self.headers[0]
 
 
 def read_stack(paths: Sequence[str]) -> Stack:
@@ -62,7 +67,7 @@ def read_stack(paths: Sequence[str]) -> Stack:
     Returns
     -------
     Stack
-        The images, the first one's header, and the checksums of the files.
+        The images, the headers and the checksums of the files.
 
     Raises
     ------
@@ -83,7 +88,21 @@ def read_stack(paths: Sequence[str]) -> Stack:
         _check_shape(path, image.shape, paths[0], images[0].shape, alone=len(paths) == 1)
     ny, nx = images[0].shape[-2:]
     data = images[0] if len(images) == 1 else np.stack(images)
-    return Stack(data.reshape(-1, ny, nx), headers[0], list(sha256))
+    return Stack(data.reshape(-1, ny, nx), list(headers), list(sha256))
+
+
+def read_extension(path: str, name: str) -> NDArray[np.float64] | None:
+    """Return the image extension of this name of a file, or None where there is none.
+
+    Raises
+    ------
+    FileError
+        As `read_stack`.
+    """
+    try:
+        return _read_file(path, name)[0]
+    except _NoImageError:
+        return None
 
 
 def wcs_cards(header: fits.Header) -> fits.Header:
@@ -109,7 +128,7 @@ def wcs_cards(header: fits.Header) -> fits.Header:
     cards = fits.Header()
     for key in sorted({match[1] for match in map(_WCS_KEYWORD.fullmatch, header) if match}):
         try:
-            with warnings.catch_warnings(), _quiet_log():
+            with warnings.catch_warnings(), quiet_log():
                 # What astropy mends on reading it writes mended.
                 warnings.simplefilter("ignore")
                 wcs = WCS(header, key=key or " ", naxis=2)
@@ -203,11 +222,17 @@ def read_result(path: str) -> SavedResult:
     )
 
 
-def _read_file(path: str) -> tuple[NDArray[np.float64], fits.Header, str]:
-    """Return the image in a file, its header and the checksum of the file."""
+class _NoImageError(FileError):
+    """A file holds no image, or none of the name that is sought."""
+
+
+def _read_file(
+    path: str, extension: str | None = None
+) -> tuple[NDArray[np.float64], fits.Header, str]:
+    """Return an image in a file, its header and the checksum of the file."""
     try:
         with open(path, "rb") as stream:
-            return _read_stream(stream, path)
+            return _read_stream(stream, path, extension)
     except FileError:
         raise
     except (OSError, ValueError) as error:
@@ -216,16 +241,16 @@ def _read_file(path: str) -> tuple[NDArray[np.float64], fits.Header, str]:
 
 
 def _read_stream(
-    stream: io.BufferedReader, path: str
+    stream: io.BufferedReader, path: str, extension: str | None
 ) -> tuple[NDArray[np.float64], fits.Header, str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             with fits.open(stream, memmap=False, disable_image_compression=True) as hdus:
-                hdu = _first_image(hdus, path)
+                hdu = _first_image(hdus, path, extension)
                 if hdu is None:
                     notes = "".join(f"; {warning.message}" for warning in caught)
-                    raise FileError(f"{path} holds no image{notes}")
+                    raise _NoImageError(f"{path} holds no image{notes}")
                 header = hdu.header.copy()
                 data = _read_pixels(hdu, path, stream)
                 stream.seek(0)
@@ -241,7 +266,7 @@ def _read_stream(
     return data, header, sha256
 
 
-def _first_image(hdus: fits.HDUList, path: str) -> fits.PrimaryHDU | None:
+def _first_image(hdus: fits.HDUList, path: str, extension: str | None) -> fits.PrimaryHDU | None:
     last = -1
     for hdu in hdus:
         begin = hdu.fileinfo()["hdrLoc"]
@@ -252,7 +277,8 @@ def _first_image(hdus: fits.HDUList, path: str) -> fits.PrimaryHDU | None:
         if hdu.header.get("ZIMAGE") is True:
             # Decompressing damaged tiles corrupts the memory (seen with astropy 8.0).
             raise FileError(f"{path} is tile-compressed; unpack it first, such as with funpack")
-        if hdu.is_image and len(getattr(hdu, "shape", ())) > 0 and 0 not in hdu.shape:
+        is_sought = extension is None or hdu.name == extension
+        if is_sought and hdu.is_image and len(getattr(hdu, "shape", ())) and 0 not in hdu.shape:
             return hdu
     return None
 
@@ -285,7 +311,7 @@ def _check_size(hdu: fits.PrimaryHDU, path: str, stream: io.BufferedReader) -> N
 
 
 @contextlib.contextmanager
-def _quiet_log() -> Iterator[None]:
+def quiet_log() -> Iterator[None]:
     """Keep astropy's notes, such as on SIP coefficients, from the terminal."""
     level = astropy.log.level
     astropy.log.setLevel("WARNING")

@@ -6,9 +6,10 @@ import os
 import secrets
 import shlex
 import stat
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import IO
+from types import MappingProxyType
+from typing import IO, NamedTuple
 
 import numpy as np
 from astropy.io import fits
@@ -22,6 +23,15 @@ HISTORY_WIDTH = 70
 COMPRESSED = (".gz", ".bz2", ".xz", ".zip", ".z", ".fz")
 
 Card = tuple[str, str | int | float, str]
+
+
+class StarColumn(NamedTuple):
+    """A column of the table of stars."""
+
+    name: str
+    values: ArrayLike
+    unit: str
+    comment: str
 
 
 def check_folder(
@@ -112,7 +122,7 @@ def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None
 def write_result(
     path: str,
     extended: ArrayLike,
-    stars: Sequence[tuple[float, float]],
+    stars: ArrayLike,
     star_fluxes: ArrayLike,
     history: NDArray[np.void] | None = None,
     wcs: fits.Header | None = None,
@@ -121,13 +131,16 @@ def write_result(
     overwrite: bool = False,
     curve: NDArray[np.void] | None = None,
     held_out: NDArray[np.void] | None = None,
+    per_second: bool = False,
+    star_columns: Sequence[StarColumn] = (),
+    cubes: Mapping[str, tuple[ArrayLike, str]] = MappingProxyType({}),
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
-    The primary HDU holds the extended source, the table ``STARS`` the columns x, y and flux,
-    the table ``HISTORY`` the columns iteration and objective, the table ``CURVE`` the columns
-    iteration, rho, rho_star and magnitude, the table ``HELDOUT`` mu, iteration and error. All
-    have CHECKSUM and DATASUM.
+    The primary HDU holds the extended source, the table ``STARS`` the columns x, y, flux and what
+    else is given, the table ``HISTORY`` iteration and objective, the table ``CURVE`` iteration,
+    rho, rho_star and magnitude, the table ``HELDOUT`` mu, iteration and error. All have CHECKSUM
+    and DATASUM.
 
     Parameters
     ----------
@@ -135,8 +148,8 @@ def write_result(
         File to write.
     extended : array_like, shape (ny, nx)
         Extended source, electrons per pixel.
-    stars : sequence of (x, y)
-        Positions in pixels, 0-based.
+    stars : array_like, shape (n, 2)
+        Positions (x, y) in pixels, 0-based.
     star_fluxes : array_like, shape (n,)
         Electrons.
     history : ndarray with fields ``iteration`` and ``objective``, optional
@@ -153,14 +166,21 @@ def write_result(
         Restoration errors and magnitude of the star, where the truth is known.
     held_out : ndarray with fields ``mu``, ``iteration`` and ``error``, optional
         Relative errors that held-out counts estimate, where they were asked.
+    per_second : bool, optional
+        Whether extended source and fluxes are electrons per second.
+    star_columns : sequence of StarColumn, optional
+        Further columns of the table of stars.
+    cubes : mapping of str to (array_like, str), optional
+        Further images (p, ny, nx), by the name of their extension, with their unit.
 
     Raises
     ------
     FileError
         The file cannot be written, or exists and must not be overwritten.
     """
-    header = fits.Header() if wcs is None else wcs.copy()
-    header["BUNIT"] = ("electron", "per pixel")
+    coordinates = fits.Header() if wcs is None else wcs
+    header = coordinates.copy()
+    header["BUNIT"] = ("electron/s" if per_second else "electron", "per pixel")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
     _add_cards(header, cards)
     for words in commands:
@@ -169,10 +189,11 @@ def write_result(
     hdus = fits.HDUList(
         [
             fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
-            _star_table(stars, star_fluxes),
+            _star_table(stars, star_fluxes, per_second, star_columns),
             *([] if history is None else [_table("HISTORY", history)]),
             *([] if curve is None else [_table("CURVE", curve)]),
             *([] if held_out is None else [_table("HELDOUT", held_out)]),
+            *(_cube(name, *cube, coordinates) for name, cube in cubes.items()),
         ]
     )
     _write_whole(path, lambda stream: hdus.writeto(stream, checksum=True), overwrite)
@@ -319,21 +340,35 @@ def _write_and_rename(path: str, write: Callable[[IO[bytes]], object], overwrite
         raise
 
 
-def _star_table(stars: Sequence[tuple[float, float]], fluxes: ArrayLike) -> fits.BinTableHDU:
+def _star_table(
+    stars: ArrayLike, fluxes: ArrayLike, per_second: bool, others: Sequence[StarColumn]
+) -> fits.BinTableHDU:
     x, y = np.asarray(stars, dtype=np.float64).reshape(-1, 2).T
+    electrons = "electrons per second" if per_second else "electrons"
+    columns = [
+        StarColumn("x", x, "pix", "column, 0-based"),
+        StarColumn("y", y, "pix", "row, 0-based"),
+        # FITS has no name for electrons, and astropy warns of units that FITS lacks.
+        StarColumn("flux", fluxes, "ct/s" if per_second else "ct", electrons),
+        *others,
+    ]
     table = fits.BinTableHDU.from_columns(
         [
-            fits.Column("x", "D", unit="pix", array=x),
-            fits.Column("y", "D", unit="pix", array=y),
-            # FITS has no name for electrons, and astropy warns of units that FITS lacks.
-            fits.Column("flux", "D", unit="ct", array=np.asarray(fluxes, dtype=np.float64)),
+            fits.Column(c.name, "D", unit=c.unit, array=np.asarray(c.values, dtype=np.float64))
+            for c in columns
         ],
         name="STARS",
     )
-    table.header["TTYPE1"] = ("x", "column, 0-based")
-    table.header["TTYPE2"] = ("y", "row, 0-based")
-    table.header["TTYPE3"] = ("flux", "electrons")
+    for i, column in enumerate(columns, 1):
+        table.header[f"TTYPE{i}"] = (column.name, column.comment)
     return table
+
+
+def _cube(name: str, images: ArrayLike, unit: str, coordinates: fits.Header) -> fits.ImageHDU:
+    hdu = fits.ImageHDU(np.asarray(images, dtype=np.float32), coordinates, name=name)
+    if unit:
+        hdu.header["BUNIT"] = unit
+    return hdu
 
 
 def _table(name: str, rows: NDArray[np.void]) -> fits.BinTableHDU:

@@ -72,7 +72,8 @@ class StarFit:
         lit = np.zeros((self._scene.n_images, *grid), bool)
         for j, (_, derivative, _) in enumerate(self._psfs):
             for position in self._given:
-                stamp = self._stamp(j, np.pad(derivative, reach), position)
+                # Between pixels, where a PSF has its margins.
+                stamp = self._stamp(j, np.pad(derivative, reach), np.floor(position) + 0.25)
                 lit[j][np.ix_(stamp.rows(grid), stamp.columns(grid))] = True
         return lit.ravel()
 

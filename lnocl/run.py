@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -161,6 +162,11 @@ class Run:
         """Return the star fluxes, electrons."""
         return self.engine.star_fluxes() * self.scene.unit
 
+    def models(self) -> Callable[[], Array]:
+        """Return what makes the m_j of the estimate of now, electrons per pixel."""
+        extended, star_fluxes = self.engine.extended(), self.engine.star_fluxes()
+        return partial(_model_images, self.scene, extended, star_fluxes)
+
     def objective(self) -> float:
         """Return the objective recorded last."""
         return self.engine.objective() * self.scene.scale
@@ -178,6 +184,17 @@ class Run:
         """Take the objective of the last estimate off the record, where the solver has put it."""
         if len(self.engine.objectives()) > self.done:
             self.engine.forget_objective()
+
+
+def _model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Array:
+    from lnocl.model import Model
+
+    ny, nx = scene.observation.shape
+    model = Model(scene)
+    images = model.images(extended, star_fluxes)
+    if scene.has_exposure_map:
+        images *= model.weights
+    return images[:, :ny, :nx] * scene.scale
 
 
 def _make_engine(setup: Setup, scene: Scene, n_iter: int, scaling: Any) -> Any:

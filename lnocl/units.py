@@ -70,23 +70,34 @@ def plain(name: str, values: Any, per_exposure: bool = False) -> tuple[Any, bool
     unit = getattr(values, "unit", None)
     if unit is None:
         return (values.value if isinstance(values, _Counts) else values), False
+    known = count_of(unit)
+    if known is None:
+        from astropy import units as u
+
+        advice = "; multiply by the gain, electrons per adu" if unit.is_equivalent(u.adu) else ""
+        raise InputError(f"{name} in {unit} are no counts: give electrons per pixel{advice}")
+    factor, is_rate = known
+    if is_rate and not per_exposure:
+        raise InputError(f"{name} in {unit} are counts per time; give electrons")
+    return values.value * factor, is_rate
+
+
+def count_of(unit: Any) -> tuple[float, bool] | None:
+    """Return how many counts a unit is, and whether per second; None where it is no count.
+
+    Electrons, photons and counts are all taken as counts, per pixel or not.
+    """
     from astropy import units as u
 
-    for name_of_count in COUNTS:
-        for divisor in (u.pix, u.dimensionless_unscaled):
-            count = getattr(u, name_of_count) / divisor
-            if unit.is_equivalent(count):
-                return values.value * unit.to(count), False
-            if unit.is_equivalent(count / u.s):
-                if per_exposure:
-                    return values.value * unit.to(count / u.s), True
-                raise InputError(
-                    f"{name} in {unit} are counts per time; give exposure in seconds with them"
-                )
-    if unit.is_equivalent(u.dimensionless_unscaled):
-        return values.value * unit.to(u.dimensionless_unscaled), False
-    advice = "; multiply by the gain (electrons per adu)" if unit.is_equivalent(u.adu) else ""
-    raise InputError(f"{name} in {unit} are no counts: give electrons{advice or ' per pixel'}")
+    pixels = (u.dimensionless_unscaled, u.pix)
+    times = ((u.dimensionless_unscaled, False), (u.s, True))
+    for count in (*(getattr(u, name) for name in COUNTS), u.dimensionless_unscaled):
+        for pixel in pixels:
+            for time, is_rate in times:
+                known = count / pixel / time
+                if unit.is_equivalent(known):
+                    return float(unit.to(known)), is_rate
+    return None
 
 
 def seconds(values: Any) -> Any:

@@ -45,24 +45,22 @@ def add_input_arguments(parser: argparse.ArgumentParser, required: bool) -> None
         required=required,
         dest="psfs",
         metavar="PSF",
-        help="FITS file with a PSF, its peak at (ky // 2, kx // 2): one for all images or one "
+        help="FITS file with a PSF, its centre at (ky // 2, kx // 2): one for all images or one "
         "for each, or one file with a cube of them",
     )
-    parser.add_argument(
+    _add_values(
+        parser,
         "--background",
-        nargs="+",
-        action="extend",
-        type=float,
-        metavar="B",
-        help="electrons per pixel, one for all images or one for each (default: 0)",
+        "B",
+        "electrons per pixel, or a FITS file with a map of them, or auto: the sigma-clipped median "
+        "of the image; one for all images or one for each (default: 0)",
     )
-    parser.add_argument(
+    _add_values(
+        parser,
         "--read-noise",
-        nargs="+",
-        action="extend",
-        type=float,
-        metavar="S",
-        help="standard deviation in electrons, one for all images or one for each (default: 0)",
+        "S",
+        "standard deviation in electrons, or a FITS file with a map of it, one for all images or "
+        "one for each (default: 0)",
     )
     parser.add_argument(
         "--star",
@@ -73,6 +71,81 @@ def add_input_arguments(parser: argparse.ArgumentParser, required: bool) -> None
         metavar="X,Y",
         help="position of a point source in pixels, 0-based, x along columns; may be repeated",
     )
+
+
+def add_frame_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what real frames need besides: exposures, bad pixels, offsets, stars on the sky."""
+    _add_values(
+        parser,
+        "--exposure",
+        "T",
+        "seconds, or a FITS file with a map of them, one for all images or one for each, or a "
+        "keyword of the images' headers; the result is then in electrons per second",
+    )
+    parser.add_argument(
+        "--gain",
+        type=float,
+        metavar="G",
+        help="electrons for each unit of the images (and second, where the unit is per second)",
+    )
+    parser.add_argument(
+        "--inverse-variance",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FILE",
+        help="FITS file with 1 / variance of sky and read noise, in units of the images; 0 where a "
+        "pixel is bad",
+    )
+    parser.add_argument(
+        "--mask",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FILE",
+        help="FITS file that is not 0 where a pixel is bad, one for all images or one for each; or "
+        "dq, the extension DQ of each image",
+    )
+    parser.add_argument(
+        "--saturation",
+        type=float,
+        metavar="V",
+        help="pixels of this value and above are bad, in units of the images",
+    )
+    parser.add_argument(
+        "--align",
+        choices=("wcs",),
+        help="shift the PSFs by the offsets between the images that their coordinates give",
+    )
+    parser.add_argument(
+        "--star-sky",
+        action="append",
+        default=[],
+        metavar="RA,DEC",
+        help="position of a point source on the sky, in degrees or as hh:mm:ss,dd:mm:ss; may be "
+        "repeated",
+    )
+    parser.add_argument(
+        "--stars",
+        metavar="FILE",
+        dest="star_table",
+        help="table of point sources, any that astropy reads: columns x and y, or ra and dec",
+    )
+
+
+def _add_values(parser: argparse.ArgumentParser, option: str, metavar: str, words: str) -> None:
+    """Add an option of numbers or words, one or several."""
+    parser.add_argument(
+        option, nargs="+", action="extend", type=number_or_word, metavar=metavar, help=words
+    )
+
+
+def number_or_word(text: str) -> float | str:
+    """Return a number where a text is one, else the text."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def add_folder(parser: argparse.ArgumentParser, content: str, **keywords: Any) -> None:

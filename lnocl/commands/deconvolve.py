@@ -5,20 +5,39 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 from lnocl import __version__
 from lnocl.commands import messages
-from lnocl.commands.arguments import Command, add_device, add_input_arguments
+from lnocl.commands.arguments import (
+    Command,
+    add_device,
+    add_frame_arguments,
+    add_input_arguments,
+    number_or_word,
+)
 from lnocl.deconvolution import ENGINES, PRECISIONS, SOLVERS, Result, deconvolve
-from lnocl.observation import Observation
+
+if TYPE_CHECKING:
+    from astropy.io import fits
+
+    from lnocl.fitsread import Stack
+    from lnocl.fitswrite import StarColumn
+    from lnocl.frames import Frames
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_input_arguments(parser, required=True)
+    add_frame_arguments(parser)
+    parser.add_argument(
+        "--refine",
+        action="store_true",
+        help="move the stars to where they are most likely, at most 3 pixels away",
+    )
     parser.add_argument(
         "--mu",
-        type=_number_or_word,
+        type=number_or_word,
         default=0.0,
         metavar="MU",
         help="weight of the Tikhonov term on the extended source, per electron, or auto: chosen by "
@@ -40,7 +59,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--stop",
-        type=_number_or_word,
+        type=number_or_word,
         metavar="RULE",
         help="stop before N: held-out, at the iteration that held-out counts choose; discrepancy, "
         "when the data are fitted as well as noise allows; or a number, when the objective changes "
@@ -74,6 +93,21 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="OUT.fits",
         help="file for the extended source, the stars and the history of the objective",
     )
+    parser.add_argument(
+        "--zero-point",
+        type=float,
+        metavar="MAG",
+        help="magnitude of one electron, or of one per second where exposures are given: adds a "
+        "column mag to the table of stars",
+    )
+    parser.add_argument(
+        "--models", action="store_true", help="write the model of each image too, electrons"
+    )
+    parser.add_argument(
+        "--residuals",
+        action="store_true",
+        help="write (image - model) / sqrt(model) of each image too",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.fits if it exists")
     parser.add_argument("--quiet", action="store_true", help="show warnings and errors only")
 
@@ -81,20 +115,16 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     from lnocl import fitsread, fitswrite
 
-    fitswrite.check_output(
-        arguments.output, arguments.overwrite, [*arguments.images, *arguments.psfs]
-    )
+    fitswrite.check_output(arguments.output, arguments.overwrite, _input_paths(arguments))
     folder = os.getcwd()
     device = _device_spec(arguments)
-    images = fitsread.read_stack(arguments.images)
-    psfs = fitsread.read_stack(arguments.psfs)
-    wcs = fitsread.wcs_cards(images.header)
-    background = arguments.background or [0.0]
-    read_noise = arguments.read_noise or [0.0]
     with contextlib.nullcontext() if arguments.quiet else messages.shown_log():
+        frames = _read_frames(arguments)
+        stars = _stars(arguments, frames.images)
+        wcs = fitsread.wcs_cards(frames.images.header)
         result = deconvolve(
-            Observation(images.data, psfs.data, background, read_noise),
-            stars=arguments.stars,
+            frames.observation,
+            stars=stars,
             mu=arguments.mu,
             solver=arguments.solver,
             n_iter=arguments.n_iter,
@@ -104,21 +134,114 @@ def _run(arguments: argparse.Namespace) -> None:
             device=device,
             pad=arguments.pad,
             progress=not arguments.quiet,
+            refine_positions=arguments.refine,
         )
     fitswrite.write_result(
         arguments.output,
         result.extended,
-        arguments.stars,
+        result.star_positions,
         result.star_fluxes,
         result.history,
         wcs=wcs,
-        cards=_cards(arguments, result, background, read_noise, images.sha256, psfs.sha256),
-        commands=[["cd", folder], _repeating_command(arguments, background, read_noise, device)],
+        cards=_cards(arguments, result, frames),
+        commands=[["cd", folder], _repeating_command(arguments, stars, frames, device)],
         overwrite=arguments.overwrite,
         held_out=result.held_out if result.held_out.size else None,
+        per_second=bool(arguments.exposure),
+        star_columns=_star_columns(arguments, result, frames.images.header),
+        cubes=_cubes(arguments, result),
     )
     if not arguments.quiet:
         messages.say(_summary(arguments, result))
+
+
+def _input_paths(arguments: argparse.Namespace) -> list[str]:
+    """Return what is named on the command line and may be a file to read."""
+    return [
+        *arguments.images,
+        *arguments.psfs,
+        *arguments.inverse_variance,
+        *arguments.mask,
+        *(
+            word
+            for words in (arguments.background, arguments.read_noise, arguments.exposure)
+            for word in words or ()
+            if isinstance(word, str)
+        ),
+        *([] if arguments.star_table is None else [arguments.star_table]),
+    ]
+
+
+def _read_frames(arguments: argparse.Namespace) -> Frames:
+    from lnocl.frames import Known, read_frames
+
+    return read_frames(
+        arguments.images,
+        arguments.psfs,
+        Known(
+            background=arguments.background or [0.0],
+            read_noise=arguments.read_noise or [0.0],
+            inverse_variance=arguments.inverse_variance,
+            exposure=arguments.exposure or [],
+            mask=arguments.mask,
+            saturation=arguments.saturation,
+            gain=arguments.gain,
+            align=arguments.align,
+        ),
+    )
+
+
+def _stars(arguments: argparse.Namespace, images: Stack) -> list[tuple[float, float]]:
+    """Return the positions of all stars, in pixels: of --star, --star-sky and --stars."""
+    positions = list(arguments.stars)
+    if arguments.star_sky or arguments.star_table:
+        from lnocl import sky
+
+        if arguments.star_sky:
+            wcs = sky.celestial_wcs(images.header, arguments.images[0])
+            positions += sky.to_pixels(sky.parse_sky(arguments.star_sky), wcs).tolist()
+        if arguments.star_table:
+            positions += sky.read_stars(
+                arguments.star_table, images.header, arguments.images[0]
+            ).tolist()
+    return [(x, y) for x, y in positions]
+
+
+def _star_columns(
+    arguments: argparse.Namespace, result: Result, header: fits.Header
+) -> list[StarColumn]:
+    """Return what the table of stars holds besides positions and fluxes."""
+    from lnocl import sky
+    from lnocl.fitswrite import StarColumn
+    from lnocl.metrics import magnitude
+
+    columns = []
+    if arguments.refine:
+        x_error, y_error = result.star_position_errors.T
+        unit = "ct/s" if arguments.exposure else "ct"
+        columns += [
+            StarColumn("x_error", x_error, "pix", "standard error"),
+            StarColumn("y_error", y_error, "pix", "standard error"),
+            StarColumn("flux_error", result.star_flux_errors, unit, "standard error"),
+        ]
+    if arguments.zero_point is not None:
+        zero_flux = 10.0 ** (0.4 * arguments.zero_point)
+        magnitudes = [magnitude(flux, zero_flux) for flux in result.star_fluxes]
+        columns.append(StarColumn("mag", magnitudes, "mag", "by the zero point"))
+    if sky.has_celestial(header):
+        ra, dec = sky.to_sky(result.star_positions, header).T
+        columns += [
+            StarColumn("ra", ra, "deg", "right ascension, ICRS"),
+            StarColumn("dec", dec, "deg", "declination, ICRS"),
+        ]
+    return columns
+
+
+def _cubes(arguments: argparse.Namespace, result: Result) -> dict[str, tuple[Any, str]]:
+    return {
+        **({"MODELS": (result.models(), "electron")} if arguments.models else {}),
+        **({"RESIDUALS": (result.residuals(), "")} if arguments.residuals else {}),
+    }
 
 
 def _device_spec(arguments: argparse.Namespace) -> str | None:
@@ -130,15 +253,23 @@ def _device_spec(arguments: argparse.Namespace) -> str | None:
     return device.spec_of(device.choose(arguments.device).device)
 
 
+# Keywords of the cards that hold the checksum of each file, by what the files are.
+CHECKSUM_KEYWORDS = {
+    "images": "ISUM",
+    "psfs": "PSUM",
+    "background": "BSUM",
+    "read_noise": "RSUM",
+    "inverse_variance": "VSUM",
+    "exposure": "ESUM",
+    "mask": "MSUM",
+}
+
+
 def _cards(
-    arguments: argparse.Namespace,
-    result: Result,
-    background: Sequence[float],
-    read_noise: Sequence[float],
-    image_sums: Sequence[str],
-    psf_sums: Sequence[str],
+    arguments: argparse.Namespace, result: Result, frames: Frames
 ) -> list[tuple[str, str | int | float, str]]:
     """Return the cards that say what was run; a checksum leaves no room for a comment."""
+    observation = frames.observation
     return [
         ("CREATOR", f"lnocl {__version__}", "program that wrote this file"),
         ("SOLVER", arguments.solver, "iteration"),
@@ -149,17 +280,51 @@ def _cards(
         ("PRECISIO", _precision(arguments), "precision of the arithmetic"),
         ("ENGINE", arguments.engine, "engine"),
         ("DEVICE", result.device, "device"),
-        *((f"BKG{j}", b, "background, electrons") for j, b in enumerate(background, 1)),
-        *((f"RON{j}", s, "read noise, electrons") for j, s in enumerate(read_noise, 1)),
-        *((f"ISUM{j}", digest, "") for j, digest in enumerate(image_sums, 1)),
-        *((f"PSUM{j}", digest, "") for j, digest in enumerate(psf_sums, 1)),
+        *_numbered("BKG", frames.background, "background, electrons"),
+        *_numbered("RON", arguments.read_noise or [0.0], "read noise, electrons"),
+        *_numbered("EXP", _exposures(arguments, frames), "exposure, seconds"),
+        *_given("GAIN", arguments.gain, "electrons for each unit of the images"),
+        *_given("SATLEVEL", arguments.saturation, "saturation, in units of the images"),
+        *_given("ZEROPT", arguments.zero_point, "magnitude of one electron (per second)"),
+        *([("REFINED", True, "star positions")] if arguments.refine else []),
+        *(
+            (f"OFF{axis}{j}", float(offset), "offset of the image, pixels")
+            for j, offsets in enumerate(observation.offsets if arguments.align else [], 1)
+            for axis, offset in zip("XY", offsets, strict=True)
+        ),
+        *(
+            (f"{CHECKSUM_KEYWORDS[what]}{j}", digest, "")
+            for what, digests in frames.sha256.items()
+            for j, digest in enumerate(digests, 1)
+        ),
     ]
+
+
+def _exposures(arguments: argparse.Namespace, frames: Frames) -> Sequence[float | str]:
+    """Return the exposure of each image, or the files of maps."""
+    if not arguments.exposure or frames.observation.exposure.ndim == 3:
+        return arguments.exposure or []
+    return [float(exposure) for exposure in frames.observation.exposure]
+
+
+def _numbered(
+    keyword: str, values: Sequence[float | str], comment: str
+) -> list[tuple[str, float | str, str]]:
+    """Return a card for each value; of a file its name."""
+    return [
+        (f"{keyword}{j}", value if isinstance(value, float) else os.path.basename(value), comment)
+        for j, value in enumerate(values, 1)
+    ]
+
+
+def _given(keyword: str, value: float | None, comment: str) -> list[tuple[str, float, str]]:
+    return [] if value is None else [(keyword, value, comment)]
 
 
 def _repeating_command(
     arguments: argparse.Namespace,
-    background: Sequence[float],
-    read_noise: Sequence[float],
+    stars: Sequence[tuple[float, float]],
+    frames: Frames,
     device: str | None,
 ) -> list[str]:
     """Return the words of the command that makes the same result, every parameter spelled out."""
@@ -167,23 +332,44 @@ def _repeating_command(
         "lnocl",
         "deconvolve",
         *map(_as_path, arguments.images),
-        "--psf",
-        *map(_as_path, arguments.psfs),
-        "--background",
-        *map(repr, background),
-        "--read-noise",
-        *map(repr, read_noise),
-        *(word for x, y in arguments.stars for word in ("--star", f"{x!r},{y!r}")),
-        *("--mu", str(arguments.mu)),
-        *("--solver", arguments.solver),
-        *("--n-iter", str(arguments.n_iter)),
-        *(() if arguments.stop is None else ("--stop", str(arguments.stop))),
-        *("--pad", str(arguments.pad)),
-        *("--precision", _precision(arguments)),
-        *("--engine", arguments.engine),
-        *(() if device is None else ("--device", device)),
-        *("-o", _as_path(arguments.output)),
+        *_option("--psf", map(_as_path, arguments.psfs)),
+        *_option("--background", map(_as_word, frames.background)),
+        *_option("--read-noise", map(_as_word, arguments.read_noise or [0.0])),
+        *_option("--exposure", map(_as_word, arguments.exposure or [])),
+        *_option("--gain", _if_given(arguments.gain)),
+        *_option("--inverse-variance", map(_as_path, arguments.inverse_variance)),
+        *_option("--mask", map(_as_path, arguments.mask)),
+        *_option("--saturation", _if_given(arguments.saturation)),
+        *_option("--align", _if_given(arguments.align)),
+        *(word for x, y in stars for word in ("--star", f"{x!r},{y!r}")),
+        *(["--refine"] if arguments.refine else []),
+        *_option("--mu", [str(arguments.mu)]),
+        *_option("--solver", [arguments.solver]),
+        *_option("--n-iter", [str(arguments.n_iter)]),
+        *_option("--stop", _if_given(arguments.stop)),
+        *_option("--pad", [str(arguments.pad)]),
+        *_option("--precision", [_precision(arguments)]),
+        *_option("--engine", [arguments.engine]),
+        *_option("--device", _if_given(device)),
+        *_option("--zero-point", _if_given(arguments.zero_point)),
+        *(["--models"] if arguments.models else []),
+        *(["--residuals"] if arguments.residuals else []),
+        *_option("-o", [_as_path(arguments.output)]),
     ]
+
+
+def _option(name: str, values: Iterable[str]) -> list[str]:
+    """Return the words of an option; none where it has no value."""
+    words = list(values)
+    return [name, *words] if words else []
+
+
+def _if_given(value: object) -> list[str]:
+    return [] if value is None else [str(value)]
+
+
+def _as_word(value: float | str) -> str:
+    return repr(value) if isinstance(value, float) else _as_path(value)
 
 
 def _precision(arguments: argparse.Namespace) -> str:
@@ -192,9 +378,10 @@ def _precision(arguments: argparse.Namespace) -> str:
 
 def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
     objective = result.history["objective"][-1]
+    electrons = "electrons per second" if arguments.exposure else "electrons"
     stars = (
-        f"star at ({x:g}, {y:g}): {flux:.6g} electrons"
-        for (x, y), flux in zip(arguments.stars, result.star_fluxes, strict=True)
+        f"star at ({x:.7g}, {y:.7g}): {flux:.6g} {electrons}"
+        for (x, y), flux in zip(result.star_positions, result.star_fluxes, strict=True)
     )
     reason = f"stopped by {result.stop_reason}"
     return [
@@ -202,16 +389,9 @@ def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
         *([] if result.stop_reason == "n_iter" else [reason]),
         *([f"mu chosen: {result.mu:.3g}"] if arguments.mu == "auto" else []),
         *stars,
-        f"extended source: {result.extended.sum():.6g} electrons",
+        f"extended source: {result.extended.sum():.6g} {electrons}",
         f"written to {arguments.output}",
     ]
-
-
-def _number_or_word(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def _as_path(path: str) -> str:
