@@ -12,6 +12,7 @@ import numpy as np
 import scipy.fft
 
 import lnocl
+from lnocl.model import Model
 from lnocl.opencl import OpenCLEngine
 from lnocl.scaling import prepare
 from lnocl.solvers import sgp
@@ -64,7 +65,7 @@ class Steps:
     def __init__(self, scene, dtype, device=None):
         precision = "double" if dtype == np.float64 else "single"
         extended, star_fluxes = scene.start(None, None)
-        star_fluxes, scaling = prepare(scene, extended, star_fluxes)
+        star_fluxes, scaling = prepare(scene, Model(scene), extended, star_fluxes)
         self.engine = OpenCLEngine(scene, precision, device, 1_000_000, scaling=scaling)
         self.engine.start(extended, star_fluxes)
         self._iterations = sgp(self.engine, 1_000_000)

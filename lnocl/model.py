@@ -34,6 +34,10 @@ class Model:
         )
         background = scene.background()
         self.background = background if background.ndim == 3 else background[:, None, None]
+        self.move_stars(scene)
+
+    def move_stars(self, scene: Scene) -> None:
+        """Put the stars where the scene has them now."""
         self.stars = _star_images(scene)
 
     def forward(self, extended: Array) -> Array:

@@ -97,8 +97,7 @@ class OpenCLEngine:
         self._upload_scene()
         if scaling is not None:
             self._bind_steps()
-            self._upload_pixels("shift", [scaling.shift])
-            self._upload_pixels("reach", scaling.reach)
+            self.set_scaling(scaling)
 
     @property
     def _has_background_map(self) -> bool:
@@ -258,6 +257,12 @@ class OpenCLEngine:
         self._observed: NDArray[np.bool_] | None = None
         if scene.weights is not None:
             self._invert_weights(scene.weights)
+
+    def set_scaling(self, scaling: Scaling) -> None:
+        """Measure steps with this from now on."""
+        self.scaling = scaling
+        self._upload_pixels("shift", [scaling.shift])
+        self._upload_pixels("reach", scaling.reach)
 
     def move_stars(self) -> None:
         """Put the stars where the scene has them now."""

@@ -192,6 +192,10 @@ class ReferenceEngine:
         self._inverse_weight = self._invert_weight()
         self._objectives: list[float] = []
 
+    def set_scaling(self, scaling: Scaling) -> None:
+        """Measure steps with this from now on."""
+        self.scaling = scaling
+
     def move_stars(self) -> None:
         """Put the stars where the scene has them now."""
         scene = self.scene

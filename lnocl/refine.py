@@ -10,7 +10,7 @@ from scipy import sparse
 
 from lnocl.model import Model
 from lnocl.observation import Array
-from lnocl.placement import Stamp, differentiate, place
+from lnocl.placement import MARGIN, Stamp, differentiate, place
 from lnocl.scene import LEAST_MODEL, Scene
 
 # How far from where it was given a star may go, in pixels.
@@ -19,6 +19,11 @@ RADIUS = 3.0
 LONGEST_STEP = 0.5
 # No flux falls to less than this share in one step.
 MOST_FADING = 0.1
+# Share of what the data say of a position that the pixels which are looked at must hold: far wings
+# say little and are many.
+INFORMATION_SHARE = 0.99
+# Of a PSF's peak: what its darkest pixels are taken for there, which may be 0 or less.
+LEAST_LIT = 1e-6
 # Steps end where they are less than this share of a standard error.
 FINISHED = 0.01
 MOST_STEPS = 30
@@ -37,30 +42,33 @@ class StarFit:
 
     ``J_0(c, x, y)`` with ``m_j = A_j f + sum_s c_s P_j(x_s, y_s) + b_j`` is minimised by Fisher
     scoring over all of them together, ``F = sum_j <D_j, w_j D_j / m_j>``, D the derivatives of the
-    m_j: ``P_js`` and ``-c_s`` times the derivatives of the PSF along x and y.
+    m_j: ``P_js`` and ``-c_s`` times the derivatives of the PSF along x and y. Looked at are squares
+    round the stars that hold 99 % of the information on positions; the light of PSFs beyond them
+    stays where the stars of the scene put it.
 
     Parameters
     ----------
     scene : Scene
         What is modelled; its stars are where the search begins.
+    model : Model
+        Of the scene.
     extended : ndarray of float64, shape (Ny, Nx)
         Extended source, on the grid and scaled.
     given : ndarray of float64, shape (n, 2)
         Positions that the stars must stay within `RADIUS` of.
     """
 
-    def __init__(self, scene: Scene, extended: Array, given: Array) -> None:
+    def __init__(self, scene: Scene, model: Model, extended: Array, given: Array) -> None:
         self._scene, self._given = scene, given
-        self._psfs = [
-            [psf, -differentiate(psf, 1), -differentiate(psf, 0)] for psf in scene.scaled_psfs()
-        ]
+        self._psfs = _cut([_with_derivatives(psf) for psf in scene.scaled_psfs()])
         lit = self._lit_pixels()
         self._place = np.cumsum(lit) - 1
         self._n_lit = int(lit.sum())
-        model = Model(scene)
         self._images = scene.images().ravel()[lit]
         self._diffuse = (model.forward(extended) + model.background).ravel()[lit]
         self._weights = model.weights.ravel()[lit]
+        whole = [model.starlight(unit).ravel()[lit] for unit in np.eye(scene.n_stars)]
+        self._beyond = np.array(whole).T - self._columns(0, scene.stars).toarray()
 
     def _stamp(self, j: int, psf: Array, position: Array) -> Stamp:
         x, y = position + self._scene.observation.offsets[j]
@@ -95,7 +103,8 @@ class StarFit:
         return self._place[np.concatenate(pixels)], np.concatenate(values)
 
     def _model(self, light: Any, fluxes: Array) -> Array:
-        return np.maximum(self._diffuse + light @ fluxes, LEAST_MODEL)
+        starlight = light @ fluxes + self._beyond @ fluxes
+        return np.maximum(self._diffuse + starlight, LEAST_MODEL)
 
     def objective(self, stars: Stars) -> float:
         """Return J_0 over the pixels that stars may light, but for a constant."""
@@ -106,6 +115,7 @@ class StarFit:
         """Return gradient and Fisher information of J_0 in (c_1 ... c_n, x_1 ..., y_1 ...)."""
         light, *moved = (self._columns(k, stars.positions) for k in range(3))
         model = self._model(light, stars.fluxes)
+        light = light + sparse.csc_array(self._beyond)
         columns = sparse.hstack([light, *(each * stars.fluxes for each in moved)], format="csc")
         gradient = columns.T @ (self._weights * (1.0 - self._images / model))
         weighted = columns * (self._weights / model)[:, None]
@@ -146,6 +156,28 @@ class StarFit:
         variances = np.diag(np.linalg.pinv(information, hermitian=True))
         roots = np.sqrt(np.maximum(variances, 0.0))
         return Stars(roots[:n], roots[n:].reshape(2, n).T)
+
+
+def _with_derivatives(psf: Array) -> list[Array]:
+    """Return a PSF with margins, and what changes where it is moved along x and along y."""
+    return [np.pad(psf, MARGIN), -differentiate(psf, 1), -differentiate(psf, 0)]
+
+
+def _cut(psfs: list[list[Array]]) -> list[list[Array]]:
+    """Return PSFs cut to the square round their middle that holds enough of the information."""
+    # Where the star's own light is the noise, a pixel says |grad P|^2 / P of a position.
+    information = sum(
+        (dx**2 + dy**2) / np.maximum(psf, LEAST_LIT * psf.max()) for psf, dx, dy in psfs
+    )
+    ky, kx = information.shape
+    y, x = np.indices(information.shape)
+    distance = np.maximum(abs(y - ky // 2), abs(x - kx // 2))
+    within = np.cumsum(np.bincount(distance.ravel(), information.ravel()))
+    half = int(np.argmax(within >= INFORMATION_SHARE * within[-1]))
+    cut = np.s_[
+        max(ky // 2 - half, 0) : ky // 2 + half + 1, max(kx // 2 - half, 0) : kx // 2 + half + 1
+    ]
+    return [[np.ascontiguousarray(each[cut]) for each in three] for three in psfs]
 
 
 def _shorten(vectors: Array, longest: float) -> Array:

@@ -16,6 +16,7 @@ from lnocl.scene import Scene
 from lnocl.solvers import SOLVERS
 
 if TYPE_CHECKING:
+    from lnocl.model import Model
     from lnocl.scaling import Scaling
 
 
@@ -86,9 +87,14 @@ class Run:
         self._given_stars = self.scene.stars
         self._refines = setup.refine_positions and self.scene.n_stars > 0
         extended, star_fluxes = self.scene.start(initial_extended, initial_star_fluxes)
+        needs_model = self._refines or setup.solver == "sgp"
+        model = _make_model(self.scene) if needs_model else None
         if self._refines:
+            self._model: Any = model  # else it is let go
             star_fluxes = self._move_stars(extended, star_fluxes)
-        star_fluxes, scaling = self._prepare(extended, star_fluxes)
+        scaling = None
+        if setup.solver == "sgp":
+            star_fluxes, scaling = _prepare(self.scene, model, extended, star_fluxes)
         self.engine = _make_engine(setup, self.scene, n_iter, scaling)
         self.engine.start(extended, star_fluxes)
         self.done = 0
@@ -115,7 +121,9 @@ class Run:
         self._forget_end()
         extended = self.engine.extended()
         star_fluxes = self._move_stars(extended, self.engine.star_fluxes())
-        star_fluxes, self.engine.scaling = self._prepare(extended, star_fluxes)
+        if self.engine.scaling is not None:
+            star_fluxes, scaling = _prepare(self.scene, self._model, extended, star_fluxes)
+            self.engine.set_scaling(scaling)
         self.engine.move_stars()
         self.engine.start(extended, star_fluxes)
 
@@ -123,18 +131,11 @@ class Run:
         """Move the stars of the scene; return their fluxes there."""
         from lnocl.refine import StarFit, Stars
 
-        fit = StarFit(self.scene, extended, self._given_stars)
+        fit = StarFit(self.scene, self._model, extended, self._given_stars)
         stars = fit.minimise(Stars(star_fluxes, self.scene.stars))
         self.scene.move_stars(stars.positions)
+        self._model.move_stars(self.scene)
         return stars.fluxes
-
-    def _prepare(self, extended: Array, star_fluxes: Array) -> tuple[Array, Scaling | None]:
-        """Return the star fluxes that the solver begins with, and its scaling."""
-        if self._setup.solver != "sgp":
-            return star_fluxes, None
-        from lnocl.scaling import prepare  # it loads scipy, which not every start needs
-
-        return prepare(self.scene, extended, star_fluxes)
 
     def star_positions(self) -> Array:
         """Return the star positions, pixels, shape (n, 2)."""
@@ -146,7 +147,7 @@ class Run:
             return np.zeros(self.scene.n_stars), np.zeros((self.scene.n_stars, 2))
         from lnocl.refine import StarFit, Stars
 
-        fit = StarFit(self.scene, self.engine.extended(), self._given_stars)
+        fit = StarFit(self.scene, self._model, self.engine.extended(), self._given_stars)
         errors = fit.errors(Stars(self.engine.star_fluxes(), self.scene.stars))
         # J is divided by the scale too, so that its information is that of as many fewer counts.
         fluxes, positions = errors.fluxes * self.scene.unit, errors.positions
@@ -186,11 +187,26 @@ class Run:
             self.engine.forget_objective()
 
 
-def _model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Array:
+# What follows loads scipy, which not every start needs.
+
+
+def _make_model(scene: Scene) -> Model:
     from lnocl.model import Model
 
+    return Model(scene)
+
+
+def _prepare(
+    scene: Scene, model: Any, extended: Array, star_fluxes: Array
+) -> tuple[Array, Scaling]:
+    from lnocl.scaling import prepare
+
+    return prepare(scene, model, extended, star_fluxes)
+
+
+def _model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Array:
     ny, nx = scene.observation.shape
-    model = Model(scene)
+    model = _make_model(scene)
     images = model.images(extended, star_fluxes)
     if scene.has_exposure_map:
         images *= model.weights

@@ -77,7 +77,9 @@ def _star_step(information: Array, gradient: Array, fluxes: Array) -> Array:
     return least + scipy.optimize.nnls(matrix, target - matrix @ least)[0]
 
 
-def prepare(scene: Scene, extended: Array, star_fluxes: Array) -> tuple[Array, Scaling]:
+def prepare(
+    scene: Scene, model: Model, extended: Array, star_fluxes: Array
+) -> tuple[Array, Scaling]:
     """Return the star fluxes that are best for this extended source, and the scaling of steps.
 
     The fluxes minimise ``J`` for the extended source as given, whatever fluxes they are sought
@@ -87,12 +89,13 @@ def prepare(scene: Scene, extended: Array, star_fluxes: Array) -> tuple[Array, S
     ----------
     scene : Scene
         What is modelled.
+    model : Model
+        Of the scene.
     extended : ndarray of float64, shape (Ny, Nx)
         Extended source to start from, on the grid and scaled; where it was not observed it is 0.
     star_fluxes : ndarray of float64, shape (n,)
         Where the fluxes are sought from, scaled.
     """
-    model = Model(scene)
     total_weight = model.adjoint(model.weights)
     observed = np.where(scene.observed(total_weight), extended, 0.0)
     diffuse = model.images(observed, np.zeros_like(star_fluxes))

@@ -40,6 +40,9 @@ class Engine(Protocol):
     def start(self, extended: Array, star_fluxes: Array) -> None:
         """Begin from this estimate."""
 
+    def move_stars(self) -> None:
+        """Put the stars where the scene has them now."""
+
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
 

@@ -472,7 +472,7 @@ def prepared(made, stars, star_fluxes):
     """Return the problem, its unknowns at the start, and the scaling with its unit."""
     scene = Scene(made.observation(), stars, made.recipe.mu)
     start = scene.start(made.initial_extended, star_fluxes)
-    fluxes, steps = scaling.prepare(scene, *start)
+    fluxes, steps = scaling.prepare(scene, Model(scene), *start)
     x = np.append(made.initial_extended, fluxes * scene.scale)
     return problem_of(made, stars), x, steps, scene.scale
 
@@ -525,7 +525,7 @@ def test_star_fluxes_are_best_where_the_engine_starts(name):
     made = SCENES[name].make()
     scene = Scene(made.observation(), made.stars, made.recipe.mu, made.recipe.pad)
     extended, star_fluxes = scene.start(None, None)
-    star_fluxes, steps = scaling.prepare(scene, extended, star_fluxes)
+    star_fluxes, steps = scaling.prepare(scene, Model(scene), extended, star_fluxes)
     engine = reference.ReferenceEngine(scene, steps)
     engine.start(extended, star_fluxes)
     engine.ratio()
@@ -539,7 +539,9 @@ def test_star_fluxes_are_best_where_the_engine_starts(name):
 def engine_of(name, precision, takes_steps):
     made = SCENES[name].make()
     scene = Scene(made.observation(), made.stars, made.recipe.mu, made.recipe.pad)
-    steps = scaling.prepare(scene, *scene.start(None, None))[1] if takes_steps else None
+    steps = (
+        scaling.prepare(scene, Model(scene), *scene.start(None, None))[1] if takes_steps else None
+    )
     return opencl.OpenCLEngine(scene, precision, None, 10, scaling=steps)
 
 
