@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 
 from lnocl import __version__
-from lnocl.commands import bench, deconvolve, demo, devices, messages, plot, simulate
+from lnocl.commands import bench, deconvolve, demo, devices, messages, plot, psf, simulate
 from lnocl.commands.arguments import Parser
 from lnocl.errors import LnoclError, LnoclWarning
 
@@ -17,6 +17,7 @@ INTERRUPTED = 130
 COMMANDS = {
     "demo": demo.COMMAND,
     "deconvolve": deconvolve.COMMAND,
+    "psf": psf.COMMAND,
     "simulate": simulate.COMMAND,
     "plot": plot.COMMAND,
     "bench": bench.COMMAND,

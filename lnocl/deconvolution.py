@@ -46,6 +46,8 @@ class Estimate:
         Extended source, electrons per pixel.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons.
+    star_positions : ndarray of float64, shape (n, 2)
+        (x, y) in pixels, as refined last.
     """
 
     def __init__(self, run: Run) -> None:
@@ -60,6 +62,11 @@ class Estimate:
     def star_fluxes(self) -> Array:
         """Star fluxes, electrons."""
         return self._live().star_fluxes()
+
+    @cached_property
+    def star_positions(self) -> Array:
+        """Star positions, pixels."""
+        return self._live().star_positions().copy()
 
     def _live(self) -> Run:
         if self._run is None:
@@ -152,7 +159,7 @@ def deconvolve(
     precision: str = "single",
     engine: str = "opencl",
     device: str | None = None,
-    pad: int = 0,
+    pad: int | str = 0,
     initial_extended: ArrayLike | None = None,
     initial_star_fluxes: ArrayLike | None = None,
     callback: Callback | None = None,
@@ -172,8 +179,9 @@ def deconvolve(
     observation : Observation
         The images, p of shape (ny, nx), and what is known of them.
     stars : sequence of (x, y), optional
-        Positions of the point sources in pixels, 0-based, x along columns. Between pixels a star's
-        image is the PSF moved by the phase of its spectrum (`lnocl.placement.place`).
+        Positions of the point sources in pixels of an image without offset, 0-based, x along
+        columns. Between pixels a star's image is the PSF moved by the phase of its spectrum
+        (`lnocl.placement.place`).
     mu : float or "auto", optional
         Weight of the Tikhonov term on the extended source, per electron; zero or more. "auto":
         0 or one of seven values, three decades up to p over the brightest pixel, whichever held-out
@@ -196,9 +204,11 @@ def deconvolve(
         OpenCL device as ``PLATFORM[:DEVICE]``, each an index or a part of the name (see
         `lnocl.device.choose`). By default that of the environment variable PYOPENCL_CTX, else
         the first GPU, else the first CPU.
-    pad : int, optional
+    pad : int or "auto", optional
         Unobserved pixels kept round the images, at least; the grid is then the next power of
-        two on each axis. With ``pad=0`` and a power-of-two image the model is periodic.
+        two on each axis. With ``pad=0`` and a power-of-two image the model is periodic. "auto",
+        for sources that run over the edge: the radius with nine tenths of the PSFs' light, at most
+        half the shorter side (docs/frames.md).
     initial_extended : array_like, shape (ny, nx), optional
         Extended source to start from; by default flat.
     initial_star_fluxes : array_like, shape (n,), optional

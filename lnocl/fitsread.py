@@ -105,6 +105,19 @@ def read_extension(path: str, name: str) -> NDArray[np.float64] | None:
         return None
 
 
+def read_keyword(path: str, header: fits.Header, keyword: str) -> str | float | None:
+    """Return what a keyword says of an image that was read from a file; None where it is missing.
+
+    Of an image in an extension the primary header is asked too, where telescopes leave what holds
+    for the whole file.
+    """
+    if keyword in header:
+        return header[keyword]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they were shown when the image was read
+        return fits.getheader(path, 0).get(keyword)
+
+
 def wcs_cards(header: fits.Header) -> fits.Header:
     """Return the cards of every coordinate system of an image, as astropy writes them.
 

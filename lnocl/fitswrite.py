@@ -6,6 +6,7 @@ import os
 import secrets
 import shlex
 import stat
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from types import MappingProxyType
@@ -183,9 +184,7 @@ def write_result(
     header["BUNIT"] = ("electron/s" if per_second else "electron", "per pixel")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
     _add_cards(header, cards)
-    for words in commands:
-        for line in history_lines(words):
-            header.add_history(line)
+    _add_commands(header, commands)
     hdus = fits.HDUList(
         [
             fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
@@ -200,7 +199,12 @@ def write_result(
 
 
 def write_image(
-    path: str, image: ArrayLike, cards: Iterable[Card] = (), overwrite: bool = False
+    path: str,
+    image: ArrayLike,
+    cards: Iterable[Card] = (),
+    overwrite: bool = False,
+    notes: Iterable[str] = (),
+    commands: Iterable[Sequence[str]] = (),
 ) -> None:
     """Write an image; the same image and cards give the same bytes.
 
@@ -208,12 +212,17 @@ def write_image(
     ----------
     path : str
         File to write.
-    image : array_like, shape (ny, nx)
-        Any image.
+    image : array_like, shape (ny, nx) or (p, ny, nx)
+        Any image, or a cube of them.
     cards : iterable of (keyword, value, comment), optional
         Cards of its header.
     overwrite : bool, optional
         Whether an existing file may be replaced.
+    notes : iterable of str, optional
+        Lines of printable ASCII that say what was done; the HISTORY lines hold them as comments
+        of a shell.
+    commands : iterable of sequence of str, optional
+        Shell commands that repeat the run, as words; the HISTORY lines spell them out.
 
     Raises
     ------
@@ -222,6 +231,10 @@ def write_image(
     """
     hdu = fits.PrimaryHDU(np.asarray(image, dtype=np.float64))
     _add_cards(hdu.header, cards)
+    for note in notes:
+        for line in textwrap.wrap(note, HISTORY_WIDTH - 2):
+            hdu.header.add_history(f"# {line}")
+    _add_commands(hdu.header, commands)
     hdu.add_checksum(when="")  # astropy would note the time
     _write_whole(path, fits.HDUList([hdu]).writeto, overwrite)
 
@@ -312,6 +325,12 @@ def _create(path: str) -> int:
 def _add_cards(header: fits.Header, cards: Iterable[Card]) -> None:
     for keyword, value, comment in cards:
         header[keyword] = (_ascii(value) if isinstance(value, str) else value, comment)
+
+
+def _add_commands(header: fits.Header, commands: Iterable[Sequence[str]]) -> None:
+    for words in commands:
+        for line in history_lines(words):
+            header.add_history(line)
 
 
 def _write_whole(path: str, write: Callable[[IO[bytes]], object], overwrite: bool) -> None:

@@ -30,7 +30,7 @@ class Observation:
         `astropy.nddata.NDData` such as a CCDData, or a sequence of these, is taken with its unit
         and mask; counts per time are multiplied by the exposure. Uncertainties are not used.
     psfs : array_like, shape (p, ky, kx) or (ky, kx)
-        Point spread functions, peak at ``(ky // 2, kx // 2)``, of any positive sum: they are
+        Point spread functions, centre at ``(ky // 2, kx // 2)``, of any positive sum: they are
         normalised here. One serves all images. Negative pixels are kept and announced.
     background : float or array_like, shape (p,) or (p, ny, nx), optional
         Known background, electrons per pixel, zero or more. A Quantity may be per time.
@@ -42,8 +42,8 @@ class Observation:
         True where a pixel is bad, as in `numpy.ma`. One serves all images.
     exposure : float or array_like, shape (p,), (p, ny, nx) or (ny, nx), optional
         Exposure of each image, or of each of its pixels, in seconds or relative to any unit: the
-        sky is in electrons per pixel and this unit. More than zero; a map is zero where a pixel
-        saw nothing, which counts as bad.
+        sky is in electrons per pixel and this unit; by default 1. More than zero; a map is zero
+        where a pixel saw nothing, which counts as bad.
     offsets : array_like, shape (p, 2), optional
         ``(dx, dy)`` of each image, pixels: what lies at (x, y) in the sky lies at
         ``(x + dx, y + dy)`` in the image. They are taken into the PSFs; no counts are resampled.
@@ -95,21 +95,22 @@ class Observation:
         background: ArrayLike = 0.0,
         read_noise: ArrayLike = 0.0,
         mask: ArrayLike | None = None,
-        exposure: ArrayLike = 1.0,
+        exposure: ArrayLike | None = None,
         offsets: ArrayLike | None = None,
     ) -> None:
-        counts, are_rates = units.plain("images", units.as_masked(images), per_exposure=True)
+        has_exposure = exposure is not None
+        counts, are_rates = units.plain("images", images, has_exposure)
         given = _as_array("images", counts, np.ma.asanyarray)
         self.images = _stack("images", np.ma.getdata(given))
         self.mask = np.ma.getmaskarray(given).copy().reshape(self.images.shape)
-        self.psfs = _check_psfs(units.bare(psfs), self.n_images)
+        self.psfs = _check_psfs(units.bare("psfs", psfs), self.n_images)
         self.offsets = self._check_offsets(offsets)
         self._apply_mask(mask)
-        self.exposure = self._check_exposure(exposure)
+        self.exposure = self._check_exposure(1.0 if exposure is None else exposure)
         if are_rates:
             self.images *= _each_pixel(self.exposure)
         self._refuse_all_masked()
-        self.background = self._check_background(background)
+        self.background = self._check_background(background, has_exposure)
         self._add_read_noise(read_noise)
         self._clip_negative()
 
@@ -159,8 +160,8 @@ class Observation:
         self.mask |= values == 0
         return values
 
-    def _check_background(self, background: ArrayLike) -> Array:
-        given, are_rates = units.plain("background", background, per_exposure=True)
+    def _check_background(self, background: ArrayLike, has_exposure: bool) -> Array:
+        given, are_rates = units.plain("background", background, has_exposure)
         values = self._one_or_map("background", given, 0.0)
         _refuse_unless("background", values, "finite and not negative", values >= 0)
         if not are_rates:

@@ -426,9 +426,13 @@ def costs(settings: Mapping[str, Mapping[str, NDArray]], measure: str) -> Figure
 
 
 def star_psf(
-    frame: Array, bad: NDArray[np.bool_], centre: tuple[float, float], psf: Array, angle: float
+    frame: Array,
+    bad: NDArray[np.bool_],
+    centre: tuple[float, float],
+    psfs: Sequence[Array],
+    angles: Sequence[float],
 ) -> Figure:
-    """Draw a frame of a star, the PSF made from it, and the PSF's profiles.
+    """Draw a frame of a star, the PSFs made from it, and the PSFs' profiles.
 
     Parameters
     ----------
@@ -438,15 +442,15 @@ def star_psf(
         Its bad pixels; drawn in the first colour of the palette.
     centre : tuple of float
         The star's (x, y) in the frame, 0-based pixels.
-    psf : ndarray of float64, shape (k, k)
-        The PSF, centred on ``(k // 2, k // 2)``.
-    angle : float
-        Degrees by which it was rotated.
+    psfs : sequence of ndarray of float64, shape (k, k)
+        The PSFs, centred on ``(k // 2, k // 2)``; a row of the figure each.
+    angles : sequence of float
+        Degrees by which each was rotated.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Frame and PSF in logarithmic stretch from 1 to `PSF_FLOOR` of the PSF's peak, the crop
+        Frame and PSF in logarithmic stretch from 1 to `PSF_FLOOR` of the peak of each, the crop
         outlined; rows and columns through the middle.
 
     Raises
@@ -454,41 +458,64 @@ def star_psf(
     LnoclError
         Where matplotlib is missing.
     """
-    figure = _figure(12.5, 4.0)
-    left, middle, right = figure.subplots(1, 3)
-    side = len(psf)
-    first = -(side // 2) - 0.5
-    edges = first, first + side
-    y, x = (np.arange(n) - c for n, c in zip(frame.shape, centre[::-1], strict=True))
+    figure = _figure(12.5, 4.0 * len(psfs))
     seen = np.where(bad, np.nan, frame)
-    near = np.abs(y[:, None]) + np.abs(x) <= side
-    brightest = np.nanmax(np.where(near, seen, np.nan)) if (near & ~bad).any() else 1.0
-    _draw_log(left, seen, (x[0] - 0.5, x[-1] + 0.5, y[0] - 0.5, y[-1] + 0.5), brightest)
-    corners = np.array([[edges[i], edges[j]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1), (0, 0))])
+    rows = figure.subplots(len(psfs), 3, squeeze=False)
+    for (left, middle, right), psf, angle in zip(rows, psfs, angles, strict=True):
+        _draw_frame(left, seen, centre, len(psf), angle)
+        _draw_psf(middle, psf, angle)
+        _draw_middle(right, psf)
+        for axis in (left, middle):
+            axis.set(xlabel="x from the centre (pixels)", ylabel="y (pixels)")
+            axis.plot(0, 0, "+", color="white", ms=9, mew=0.8)
+    return figure
+
+
+def _draw_frame(
+    axis: Axes, seen: Array, centre: tuple[float, float], side: int, angle: float
+) -> None:
+    """Draw a frame, NaN where it is bad, and the crop before it was rotated."""
+    low, high = _edges(side)
+    y, x = (np.arange(n) - c for n, c in zip(seen.shape, centre[::-1], strict=True))
+    near = (np.abs(y[:, None]) + np.abs(x) <= side) & np.isfinite(seen)
+    brightest = seen[near].max() if near.any() else 1.0
+    _draw_log(axis, seen, (x[0] - 0.5, x[-1] + 0.5, y[0] - 0.5, y[-1] + 0.5), brightest)
+    corners = np.array([[low, low], [high, low], [high, high], [low, high], [low, low]])
     cosine, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
-    left.plot(*(corners @ np.array([[cosine, -sine], [sine, cosine]])).T, color="white", lw=1)
+    axis.plot(*(corners @ np.array([[cosine, -sine], [sine, cosine]])).T, color="white", lw=1)
     wide = 0.75 * side
-    left.set(xlim=(max(-wide, x[0]), min(wide, x[-1])), ylim=(max(-wide, y[0]), min(wide, y[-1])))
-    left.set_title("Frame, bad pixels coloured, and crop", fontsize=11)
-    shown = _draw_log(middle, psf, (*edges, *edges), psf.max())
+    axis.set(xlim=(max(-wide, x[0]), min(wide, x[-1])), ylim=(max(-wide, y[0]), min(wide, y[-1])))
+    axis.set_title("Frame, bad pixels coloured, and crop", fontsize=11)
+
+
+def _draw_psf(axis: Axes, psf: Array, angle: float) -> None:
+    edges = _edges(len(psf))
+    shown = _draw_log(axis, psf, (*edges, *edges), psf.max())
     turned = f", rotated by {angle:g} degrees" if angle else ""
-    middle.set_title(f"PSF{turned}", fontsize=11)
-    figure.colorbar(shown, ax=middle, label="share of the peak", extend="min", pad=0.02)
+    axis.set_title(f"PSF{turned}", fontsize=11)
+    axis.figure.colorbar(shown, ax=axis, label="share of the peak", extend="min", pad=0.02)
+
+
+def _draw_middle(axis: Axes, psf: Array) -> None:
+    """Draw row and column of a PSF through its middle."""
+    side = len(psf)
     at = np.arange(side) - side // 2
     for i, (values, name) in enumerate(
         ((psf[side // 2], "along x"), (psf[:, side // 2], "along y"))
     ):
-        right.plot(at, values / psf.max(), **_line(i), label=name)
-    right.set_yscale("symlog", linthresh=PSF_FLOOR)
-    right.axvline(0, color="0.4", lw=1, ls=":")
-    right.set_title("PSF through its centre", fontsize=11)
-    right.set(xlabel="pixels from the centre", ylabel="share of the peak")
-    right.grid(alpha=0.3)
-    right.legend(fontsize=9)
-    for axis in (left, middle):
-        axis.set(xlabel="x from the centre (pixels)", ylabel="y (pixels)")
-        axis.plot(0, 0, "+", color="white", ms=9, mew=0.8)
-    return figure
+        axis.plot(at, values / psf.max(), **_line(i), label=name)
+    axis.set_yscale("symlog", linthresh=PSF_FLOOR)
+    axis.axvline(0, color="0.4", lw=1, ls=":")
+    axis.set_title("PSF through its centre", fontsize=11)
+    axis.set(xlabel="pixels from the centre", ylabel="share of the peak")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=9)
+
+
+def _edges(side: int) -> tuple[float, float]:
+    """Return where an image begins and ends, from the pixel ``side // 2``."""
+    first = -(side // 2) - 0.5
+    return first, first + side
 
 
 def _draw_log(

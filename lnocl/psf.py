@@ -8,42 +8,30 @@ from __future__ import annotations
 import math
 import operator
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from astropy.stats import sigma_clipped_stats
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
-from scipy.interpolate import RBFInterpolator
-from scipy.ndimage import convolve1d, fourier_shift, maximum_filter, median_filter
 
+from lnocl import resampling
+from lnocl.centring import FWHM, SEARCH, Mask, Pixel, Point, brightest, fit_gaussian
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.observation import numbers
+from lnocl.repair import WINDOW, repair
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-# Places in the frame, row before column.
-Pixel = tuple[int, int]
-Point = tuple[float, float]
 
 MIN_SIZE = 3
-# Pixels that the centre may lie away from where the star was said or seen to be.
-SEARCH = 16
+# The first steps, which do not depend on the angle: star, background, bad pixels, centre.
+N_SHARED_STEPS = 4
 # Pixels kept around the crop while it is shifted and rotated, since Fourier shifts wrap.
 MARGIN = 16
-# A bad pixel is repaired if in the square of side `WINDOW` around it are `MIN_GOOD` good ones. So
-# many lie on no two lines and on no conic, where the interpolation would not be unique.
-WINDOW, MIN_GOOD = 11, 40
-# Good pixels that a bad one is interpolated from.
-NEIGHBOURS = 48
 # Pixels that a background is measured from, at least.
 MIN_SKY = 100
 # Width of the frame's border, as a share of the shorter side.
 BORDER = 1 / 16
-# The narrowest and the widest Gaussian fitted, pixels and share of what it is fitted in.
-MIN_SIGMA, MAX_SIGMA = 0.8, 1 / 3
-MAX_ITERATIONS = 500
-FWHM = 2 * math.sqrt(2 * math.log(2))
 # By how much a shift or a rotation may make negative pixels grow without a warning: a share of the
 # flux, and of what they were, since noise is not what it was after either.
 RINGING, OF_NOISE = 0.01, 0.2
@@ -200,14 +188,86 @@ def make_psf(
     negative pixels: 0, 0.00 % of the flux; kept
     normalised: flux 125664 set to 1
     """
+    (star,) = _make(
+        frame, position, size, background, mask, saturation, recentre, clip_negative, [rotate]
+    )
+    return star
+
+
+def make_psfs(
+    frame: ArrayLike,
+    rotate: Sequence[float],
+    position: ArrayLike | None = None,
+    size: int | None = None,
+    background: float | str = "auto",
+    mask: ArrayLike | None = None,
+    saturation: float | None = None,
+    recentre: bool = True,
+    clip_negative: bool = False,
+) -> list[StarPsf]:
+    """Return the PSFs that a frame of a star gives at several angles.
+
+    Star, background, repair and centre are found once, so the PSFs differ in their angle only.
+    With one angle this is `make_psf`.
+
+    Parameters
+    ----------
+    rotate : sequence of float
+        Angles, degrees, as in `make_psf`. The four of the paper's baselines are 0, 45, 90, 135.
+    frame, position, size, background, mask, saturation, recentre, clip_negative
+        As in `make_psf`. The size, or the largest there is, is that which fits at all angles.
+
+    Returns
+    -------
+    list of StarPsf
+        One for each angle, all of one shape; their steps begin with the same lines.
+
+    Raises
+    ------
+    InputError
+        As `make_psf`; where there is no angle.
+
+    Warns
+    -----
+    LnoclWarning
+        As `make_psf`, once for all angles.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lnocl.psf import make_psfs
+    >>> y, x = np.mgrid[:40, :50]
+    >>> frame = np.exp(-((x - 23.3) ** 2 / 8 + (y - 18.8) ** 2 / 32))
+    >>> stars = make_psfs(frame, [0, 90], size=21, background=0)
+    >>> np.abs(stars[1].psf - stars[0].psf.T).max() < 1e-7
+    np.True_
+    """
+    return _make(
+        frame, position, size, background, mask, saturation, recentre, clip_negative, rotate
+    )
+
+
+def _make(
+    frame: ArrayLike,
+    position: ArrayLike | None,
+    size: int | None,
+    background: float | str,
+    mask: ArrayLike | None,
+    saturation: float | None,
+    recentre: bool,
+    clip_negative: bool,
+    rotate: Sequence[float],
+) -> list[StarPsf]:
     given, bad = _read(frame, mask)
     saturated = ~bad & (given >= _saturation(saturation))
     # A repaired pixel takes nothing from its value, however far beyond the level that is.
     pixels = np.where(bad, 0.0, np.minimum(given, _saturation(saturation)))
-    side, angle = _size(size), _angle(rotate)
+    side, angles = _size(size), [_angle(angle) for angle in rotate]
     for name, flag in (("recentre", recentre), ("clip_negative", clip_negative)):
         if not isinstance(flag, bool | np.bool_):
             raise InputError(f"{name} is {flag!r}; give True or False")
+    if not angles:
+        raise InputError("rotate holds no angle; give one or more")
     unusable = bad | saturated
     if unusable.all():
         raise InputError("all pixels of the frame are bad; there is no star to be seen")
@@ -215,36 +275,58 @@ def make_psf(
 
     start, line = _find(pixels, bad, position)
     steps.append(line)
-    level, line = _background(background, pixels, unusable, start, side, angle)
+    half = None if side is None else max(resampling.reach(side, angle) for angle in angles)
+    level, line = _background(background, pixels, unusable, start, half)
     steps.append(line)
     light = np.where(unusable, 0.0, pixels - level)
-    region = _region(pixels.shape, start, side, angle)
+    region = _region(pixels.shape, start, half)
     hollow, line = _repair(light, unusable, saturated, region)
     steps.append(line)
     centre, line = _centre(light, region, start, level) if recentre else _stay(start)
     steps.append(line)
     pixel = _nearest(centre)
-    side = _fit(pixels.shape, pixel, side, angle)
+    side = min(_fit(given.shape, pixel, side, angle) for angle in angles)
     if hollow[pixel]:
         raise InputError(
             f"the star at {_at(pixel)} is a hole: only few of the {WINDOW} x {WINDOW} pixels "
             "there are good; take a frame with a shorter exposure"
         )
-    work = before = _cut(light, pixel, _reach(side, angle) + MARGIN)
-    if recentre:
-        work = _shift(work, (pixel[0] - centre[0], pixel[1] - centre[1]))
+    by = (pixel[0] - centre[0], pixel[1] - centre[1]) if recentre else None
+    stars, rung = [], []
+    for angle in angles:
+        psf, share, lines = _turn(light, pixel, by, side, angle, level, clip_negative)
+        rung.append(share)
+        flux = float(psf.sum())
+        lines = [*steps, *lines, f"normalised: flux {flux:.6g} set to 1"]
+        at = centre[1], centre[0]
+        stars.append(StarPsf(psf / flux, tuple(lines), flux, at, level, given, unusable))
+    _warn_of_guess(_cut(saturated, pixel, side // 2), _cut(light, pixel, side // 2))
+    _warn_of_ringing(rung)
+    return stars
+
+
+def _turn(
+    light: Array,
+    pixel: Pixel,
+    by: Point | None,
+    side: int,
+    angle: float,
+    level: float,
+    clip_negative: bool,
+) -> tuple[Array, tuple[float, float], list[str]]:
+    """Return the PSF at an angle, the negative share of its flux before and after, and lines."""
+    lines = []
+    work = before = _cut(light, pixel, resampling.reach(side, angle) + MARGIN)
+    if by is not None:
+        work = resampling.shift(work, by)
     if angle:
         work, line = _rotate(work, angle, side // 2)
-        steps.append(line)
+        lines.append(line)
     psf, line = _crop(work, side, light, pixel, level)
-    steps.append(line)
-    _warn_of_guess(_cut(saturated, pixel, side // 2), _cut(light, pixel, side // 2))
-    _warn_of_ringing(_middle(before, side), psf)
+    lines.append(line)
+    share = [float(-image.clip(max=0).sum() / psf.sum()) for image in (_middle(before, side), psf)]
     psf, line = _negative(psf, clip_negative)
-    steps.append(line)
-    flux = float(psf.sum())
-    steps.append(f"normalised: flux {flux:.6g} set to 1")
-    return StarPsf(psf / flux, tuple(steps), flux, (centre[1], centre[0]), level, given, unusable)
+    return psf, (share[0], share[1]), [*lines, line]
 
 
 def _read(frame: ArrayLike, mask: ArrayLike | None) -> tuple[Array, Mask]:
@@ -307,7 +389,7 @@ def _find(pixels: Array, bad: Mask, position: ArrayLike | None) -> tuple[Pixel, 
     """Return the pixel at the star."""
     ny, nx = pixels.shape
     if position is None:
-        start = _brightest(pixels, bad)
+        start = brightest(pixels, bad)
         return start, f"star: brightest pixel of the median-filtered frame, {_at(start)}"
     given = numbers("position", position)
     if given.shape != (2,) or not np.isfinite(given).all():
@@ -321,25 +403,10 @@ def _find(pixels: Array, bad: Mask, position: ArrayLike | None) -> tuple[Pixel, 
     return start, f"star: given at x = {given[0]:g}, y = {given[1]:g}"
 
 
-def _brightest(pixels: Array, bad: Mask) -> Pixel:
-    """Return the brightest pixel after a median filter of 3 x 3 good pixels."""
-    smooth = median_filter(pixels, 3)
-    around = np.pad(np.where(bad, np.nan, pixels), 1, constant_values=np.nan)
-    y, x = np.nonzero(maximum_filter(bad, 3))
-    windows = np.stack([around[y + i, x + j] for i in range(3) for j in range(3)], axis=1)
-    seen = np.isfinite(windows).any(axis=1)
-    smooth[y, x] = -np.inf
-    smooth[y[seen], x[seen]] = np.nanmedian(windows[seen], axis=1) if seen.any() else 0.0
-    iy, ix = np.unravel_index(int(smooth.argmax()), smooth.shape)
-    return int(iy), int(ix)
-
-
-def _region(
-    shape: tuple[int, ...], start: Pixel, side: int | None, angle: float
-) -> tuple[slice, slice]:
+def _region(shape: tuple[int, ...], start: Pixel, half: int | None) -> tuple[slice, slice]:
     """Return all that can reach the PSF, wherever the centre will be found."""
-    half = max(shape) if side is None else _reach(side, angle) + MARGIN + SEARCH
-    y, x = (slice(max(i - half, 0), i + half + 1) for i in start)
+    far = max(shape) if half is None else half + MARGIN + SEARCH
+    y, x = (slice(max(i - far, 0), i + far + 1) for i in start)
     return y, x
 
 
@@ -348,8 +415,7 @@ def _background(
     pixels: Array,
     bad: Mask,
     start: Pixel,
-    side: int | None,
-    angle: float,
+    half: int | None,
 ) -> tuple[float, str]:
     if not isinstance(background, str):
         level = _one_number("background", background)
@@ -358,8 +424,9 @@ def _background(
         raise InputError(f'background is {background!r}; give a number or "auto"')
     y, x = (np.abs(np.arange(n) - i) for n, i in zip(pixels.shape, start, strict=True))
     distance = np.maximum(y[:, None], x)
-    half = max(pixels.shape) if side is None else _reach(side, angle)
-    sky, where = ~bad & (distance > half) & (distance <= 2 * half), "around the crop"
+    sky, where = np.zeros_like(bad), "around the crop"
+    if half is not None:
+        sky = ~bad & (distance > half) & (distance <= 2 * half)
     if sky.sum() < MIN_SKY:
         width = max(1, int(min(pixels.shape) * BORDER))
         sky, where = ~bad, "in the frame's border"
@@ -379,28 +446,17 @@ def _repair(
     """Interpolate the bad pixels of a region in place; return those that are too far inside."""
     if not bad.any():
         return bad, "bad pixels: none"
-    n_good = (~bad).astype(np.int64)
-    for axis in (0, 1):
-        n_good = convolve1d(n_good, np.ones(WINDOW, int), axis, mode="constant")
-    inside = np.zeros_like(bad)
-    inside[region] = True
-    hollow = bad & inside & (n_good < MIN_GOOD)
-    wanted = bad & inside & ~hollow
-    near = maximum_filter(wanted, 2 * WINDOW + 1) & ~bad
-    if wanted.any():
-        light[wanted] = RBFInterpolator(
-            np.argwhere(near), light[near], NEIGHBOURS, kernel="quintic"
-        )(np.argwhere(wanted))
+    repaired, hollow = repair(light, bad, region)
     if n_hollow := int(hollow.sum()):
         warnings.warn(
             f"{n_hollow} bad pixels around the star have too few good ones beside them and were "
             "set to the background",
             LnoclWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     return hollow, (
         f"bad pixels: {bad.sum()} in the frame, {saturated.sum()} of them saturated; "
-        f"{wanted.sum()} around the star repaired, {n_hollow} set to the background"
+        f"{repaired.sum()} around the star repaired, {n_hollow} set to the background"
     )
 
 
@@ -414,9 +470,7 @@ def _centre(
 ) -> tuple[Point, str]:
     """Return the centre of the star, to a part of a pixel."""
     origin = region[0].start, region[1].start
-    (y, x), sigma = _fit_gaussian(
-        light[region], (start[0] - origin[0], start[1] - origin[1]), level
-    )
+    (y, x), sigma = fit_gaussian(light[region], (start[0] - origin[0], start[1] - origin[1]), level)
     centre = float(y + origin[0]), float(x + origin[1])
     pixel = _nearest(centre)
     shift = pixel[0] - centre[0], pixel[1] - centre[1]
@@ -426,60 +480,6 @@ def _centre(
     )
 
 
-def _fit_gaussian(light: Array, start: Pixel, level: float) -> tuple[Point, float]:
-    """Return centre (y, x) and sigma of the circular Gaussian that fits best by least squares.
-
-    The moments of the light weighted with the Gaussian are those that the Gaussian itself has
-    under this weight: its centre, and half its variance.
-    """
-    around = tuple(slice(max(i - SEARCH, 0), i + SEARCH + 1) for i in start)
-    peak = light[around].max()
-    if peak <= 0:
-        raise InputError(
-            f"nothing within {SEARCH} pixels of the star is above the background {level:g}; "
-            "give another position or a lower background"
-        )
-    widest = max(light.shape) * MAX_SIGMA
-    area = int((light[around] >= peak / 2).sum())
-    sigma = min(max(math.sqrt(area / (2 * math.pi * math.log(2))), MIN_SIGMA), widest)
-    y, x = map(float, start)
-    for _ in range(MAX_ITERATIONS):
-        rows, columns = (_weighted(n, at, sigma) for n, at in zip(light.shape, (y, x), strict=True))
-        moments = rows @ light @ columns.T
-        if moments[0, 0] <= 0:
-            break
-        dy, dx = 2 * moments[1, 0] / moments[0, 0], 2 * moments[0, 1] / moments[0, 0]
-        y, x = y + dy, x + dx
-        if not max(abs(y - start[0]), abs(x - start[1])) <= SEARCH:
-            break
-        variance = (moments[2, 0] + moments[0, 2]) / (2 * moments[0, 0])
-        ratio = variance / sigma**2
-        # The new variance is 1 / (1 / variance - 1 / sigma^2), grown by 4 at most.
-        ratio = ratio / (1 - ratio) if 0 < ratio < 0.8 else 4.0 if ratio > 0 else 0.25
-        new = min(max(sigma * math.sqrt(ratio), MIN_SIGMA), widest)
-        if max(abs(dy), abs(dx), abs(new - sigma)) < 1e-9:
-            return (y, x), new
-        sigma = new
-    raise InputError(
-        f"no star is found within {SEARCH} pixels of where it should be; give its position, or "
-        "another background"
-    )
-
-
-def _weighted(n: int, at: float, sigma: float) -> Array:
-    """Return the Gaussian times 1, d and d^2 for the distances d along an axis."""
-    d = np.arange(n) - at
-    return np.exp(-0.5 * (d / sigma) ** 2) * np.array([np.ones(n), d, d * d])
-
-
-def _reach(side: int, angle: float) -> int:
-    """Return how far from its middle a square of this side reaches before it is rotated."""
-    if angle == 0:
-        return side // 2
-    t = math.radians(abs(_quarters(angle)[1]))
-    return math.ceil(side // 2 * (math.cos(t) + math.sin(t)) - 1e-9)
-
-
 def _largest(shape: tuple[int, ...], pixel: Pixel, angle: float) -> int:
     """Return the side of the largest PSF that the frame has around a pixel."""
     before = min(pixel)
@@ -487,7 +487,7 @@ def _largest(shape: tuple[int, ...], pixel: Pixel, angle: float) -> int:
     if angle == 0:
         return min(2 * before + 1, 2 * after + 2)
     side = 2 * min(before, after) + 1
-    while side > 1 and _reach(side, angle) > min(before, after):
+    while side > 1 and resampling.reach(side, angle) > min(before, after):
         side -= 2
     return side
 
@@ -524,22 +524,9 @@ def _middle(work: NDArray, side: int) -> NDArray:
     return work[first : first + side, first : first + side]
 
 
-def _shift(work: Array, by: Point) -> Array:
-    return np.asarray(fft.ifft2(fourier_shift(fft.fft2(work), by)).real)
-
-
-def _quarters(angle: float) -> tuple[int, float]:
-    """Return quarter turns and the rest of an angle, degrees."""
-    quarters = round(angle / 90)
-    return quarters, angle - 90 * quarters
-
-
 def _rotate(work: Array, angle: float, radius: int) -> tuple[Array, str]:
     """Rotate about the middle; what it costs is measured within a radius."""
-    quarters, rest = _quarters(angle)
-    turned = np.rot90(work, -quarters)
-    if rest:
-        turned = _shear(turned, rest)
+    turned = resampling.rotate(work, angle)
     y, x = (np.arange(len(work)) - len(work) // 2 for _ in range(2))
     disc = np.hypot(y[:, None], x) <= radius
     sharpness = [
@@ -549,21 +536,6 @@ def _rotate(work: Array, angle: float, radius: int) -> tuple[Array, str]:
         f"rotation: {angle:g} degrees; its sharpness, the sum of the squares over the square of "
         f"the sum, changed by {_percent(sharpness[1] / sharpness[0] - 1, 4)}"
     )
-
-
-def _shear(image: Array, angle: float) -> Array:
-    """Rotate by up to 45 degrees: along x, along y, and along x again."""
-    t = math.radians(angle)
-    n = len(image)
-    k, r = fft.fftfreq(n), np.arange(n) - n // 2
-
-    def along_x(rows: Array, slope: float) -> Array:
-        phase = np.exp(-2j * np.pi * slope * np.multiply.outer(r, k))
-        return np.asarray(fft.ifft(fft.fft(rows, axis=1) * phase, axis=1).real)
-
-    image = along_x(image, -math.tan(t / 2))
-    image = along_x(image.T, math.sin(t)).T
-    return along_x(image, -math.tan(t / 2))
 
 
 def _crop(work: Array, side: int, light: Array, pixel: Pixel, level: float) -> tuple[Array, str]:
@@ -577,6 +549,8 @@ def _crop(work: Array, side: int, light: Array, pixel: Pixel, level: float) -> t
             f"the flux of the PSF above the background {level:g} is {kept:g}; give another "
             "position or a lower background"
         )
+    if side == largest:
+        return psf, f"crop: {side} x {side} pixels, the largest square there is"
     left_out = _percent(1 - kept / whole) + " of the flux" if whole > 0 else "an unknown share"
     return psf, (
         f"crop: {side} x {side} pixels; {left_out} in the largest square there is, "
@@ -591,19 +565,20 @@ def _warn_of_guess(saturated: Mask, light: Array) -> None:
             f"{n_saturated} saturated pixels of the PSF were repaired, and hold "
             f"{_percent(share)} of its flux: its core is a guess",
             LnoclWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
-def _warn_of_ringing(before: Array, after: Array) -> None:
-    negative = [-image.clip(max=0).sum() / after.sum() for image in (before, after)]
-    if negative[1] > RINGING + (1 + OF_NOISE) * negative[0]:
+def _warn_of_ringing(shares: Sequence[tuple[float, float]]) -> None:
+    """Warn of the worst, of shares of the flux in negative pixels before and after."""
+    before, after = max(shares, key=lambda share: share[1] - (1 + OF_NOISE) * share[0])
+    if after > RINGING + (1 + OF_NOISE) * before:
         warnings.warn(
-            f"shift and rotation ring: negative pixels hold {_percent(negative[1])} of the flux, "
-            f"{_percent(negative[0])} before; the star is undersampled, and recentre=False leaves "
-            "its pixels as they are",
+            f"shift and rotation ring: negative pixels hold {_percent(after)} of the flux, "
+            f"{_percent(before)} before; the star is undersampled, and without recentring its "
+            "pixels are left as they are",
             LnoclWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

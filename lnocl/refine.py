@@ -10,7 +10,7 @@ from scipy import sparse
 
 from lnocl.model import Model
 from lnocl.observation import Array
-from lnocl.placement import MARGIN, Stamp, differentiate, place
+from lnocl.placement import MARGIN, place
 from lnocl.scene import LEAST_MODEL, Scene
 
 # How far from where it was given a star may go, in pixels.
@@ -24,9 +24,12 @@ MOST_FADING = 0.1
 INFORMATION_SHARE = 0.99
 # Of a PSF's peak: what its darkest pixels are taken for there, which may be 0 or less.
 LEAST_LIT = 1e-6
-# Steps end where they are less than this share of a standard error.
-FINISHED = 0.01
+# Steps end where they are less than this share of a standard error that images of unit mean would
+# give: of a tenth of their own up to a mean of a million electrons.
+FINISHED = 1e-4
 MOST_STEPS = 30
+# Before the first, each star is tried this far along x and y too: fringes make false minima.
+TRIED = 1.5
 MOST_HALVED = 10
 
 
@@ -42,9 +45,9 @@ class StarFit:
 
     ``J_0(c, x, y)`` with ``m_j = A_j f + sum_s c_s P_j(x_s, y_s) + b_j`` is minimised by Fisher
     scoring over all of them together, ``F = sum_j <D_j, w_j D_j / m_j>``, D the derivatives of the
-    m_j: ``P_js`` and ``-c_s`` times the derivatives of the PSF along x and y. Looked at are squares
-    round the stars that hold 99 % of the information on positions; the light of PSFs beyond them
-    stays where the stars of the scene put it.
+    m_j: ``P_js``, and ``c_s`` times its derivatives with respect to x_s and y_s. Looked at are
+    squares round the stars that hold 99 % of the information on positions; the light of PSFs beyond
+    them stays where the stars of the scene put it.
 
     Parameters
     ----------
@@ -60,7 +63,7 @@ class StarFit:
 
     def __init__(self, scene: Scene, model: Model, extended: Array, given: Array) -> None:
         self._scene, self._given = scene, given
-        self._psfs = _cut([_with_derivatives(psf) for psf in scene.scaled_psfs()])
+        self._psfs = _cut(scene.scaled_psfs())
         lit = self._lit_pixels()
         self._place = np.cumsum(lit) - 1
         self._n_lit = int(lit.sum())
@@ -70,18 +73,14 @@ class StarFit:
         whole = [model.starlight(unit).ravel()[lit] for unit in np.eye(scene.n_stars)]
         self._beyond = np.array(whole).T - self._columns(0, scene.stars).toarray()
 
-    def _stamp(self, j: int, psf: Array, position: Array) -> Stamp:
-        x, y = position + self._scene.observation.offsets[j]
-        return place(psf, self._scene.grid, x, y)
-
     def _lit_pixels(self) -> NDArray[np.bool_]:
         """Return which pixels of the images a star may light, wherever it goes."""
-        grid, reach = self._scene.grid, int(np.ceil(2 * RADIUS))
+        grid, reach = self._scene.grid, int(np.ceil(RADIUS)) + MARGIN + 1
         lit = np.zeros((self._scene.n_images, *grid), bool)
-        for j, (_, derivative, _) in enumerate(self._psfs):
+        for j, psf in enumerate(self._psfs):
             for position in self._given:
-                # Between pixels, where a PSF has its margins.
-                stamp = self._stamp(j, np.pad(derivative, reach), np.floor(position) + 0.25)
+                x, y = np.floor(position + self._scene.observation.offsets[j] + 0.5)
+                stamp = place(np.pad(psf, reach), grid, x, y)
                 lit[j][np.ix_(stamp.rows(grid), stamp.columns(grid))] = True
         return lit.ravel()
 
@@ -95,38 +94,64 @@ class StarFit:
     def _light(self, k: int, position: Array) -> tuple[NDArray[np.int64], Array]:
         ny, nx = self._scene.grid
         pixels, values = [], []
-        for j, psfs in enumerate(self._psfs):
-            stamp = self._stamp(j, psfs[k], position)
+        for j, psf in enumerate(self._psfs):
+            x, y = position + self._scene.observation.offsets[j]
+            stamp = place(psf, (ny, nx), x, y, (None, 1, 0)[k])
             rows, columns = stamp.rows((ny, nx)), stamp.columns((ny, nx))
             pixels.append(((j * ny + rows)[:, None] * nx + columns).ravel())
             values.append(stamp.values.ravel())
         return self._place[np.concatenate(pixels)], np.concatenate(values)
 
-    def _model(self, light: Any, fluxes: Array) -> Array:
-        starlight = light @ fluxes + self._beyond @ fluxes
-        return np.maximum(self._diffuse + starlight, LEAST_MODEL)
+    def _light_of(self, positions: Array) -> Any:
+        """Return the ``P_js`` of all stars as sparse columns, what lies beyond the squares too."""
+        return self._columns(0, positions) + sparse.csc_array(self._beyond)
+
+    def _data_term(self, model: Array) -> float:
+        model = np.maximum(model, LEAST_MODEL)
+        return float(self._weights @ (model - self._images * np.log(model)))
 
     def objective(self, stars: Stars) -> float:
         """Return J_0 over the pixels that stars may light, but for a constant."""
-        model = self._model(self._columns(0, stars.positions), stars.fluxes)
-        return float(self._weights @ (model - self._images * np.log(model)))
+        return self._data_term(self._diffuse + self._light_of(stars.positions) @ stars.fluxes)
 
     def derivatives(self, stars: Stars) -> tuple[Array, Array]:
         """Return gradient and Fisher information of J_0 in (c_1 ... c_n, x_1 ..., y_1 ...)."""
-        light, *moved = (self._columns(k, stars.positions) for k in range(3))
-        model = self._model(light, stars.fluxes)
-        light = light + sparse.csc_array(self._beyond)
+        light = self._light_of(stars.positions)
+        moved = [self._columns(k, stars.positions) for k in (1, 2)]
+        model = np.maximum(self._diffuse + light @ stars.fluxes, LEAST_MODEL)
         columns = sparse.hstack([light, *(each * stars.fluxes for each in moved)], format="csc")
-        gradient = columns.T @ (self._weights * (1.0 - self._images / model))
-        weighted = columns * (self._weights / model)[:, None]
+        weights = np.where(model > LEAST_MODEL, self._weights, 0.0)  # the guard does not move
+        gradient = columns.T @ (weights * (1.0 - self._images / model))
+        weighted = columns * (weights / model)[:, None]
         return gradient, (columns.T @ weighted).toarray()
+
+    def look_round(self, stars: Stars) -> Stars:
+        """Return each star at the best of nine places, the others where they are, and its flux."""
+        light = self._light_of(stars.positions)
+        fluxes, positions = stars.fluxes.copy(), stars.positions.copy()
+        steps = TRIED * np.array([(dx, dy) for dx in (0, -1, 1) for dy in (0, -1, 1)])
+        for s, position in enumerate(stars.positions):
+            others = self._diffuse + light @ np.where(np.arange(len(fluxes)) == s, 0.0, fluxes)
+            least = MOST_FADING * fluxes[s]
+            tried = [self._try(s, position + step, others, least) for step in steps]
+            best = int(np.argmin([objective for objective, _ in tried]))
+            positions[s], fluxes[s] = position + steps[best], tried[best][1]
+        return Stars(fluxes, positions)
+
+    def _try(self, s: int, position: Array, others: Array, least: float) -> tuple[float, float]:
+        """Return J_0 with star s there, and its flux by weighted least squares, or the least."""
+        star = self._columns(0, position[None]).toarray()[:, 0] + self._beyond[:, s]
+        weighted = self._weights * star / np.maximum(np.maximum(self._images, others), LEAST_MODEL)
+        norm = float(weighted @ star)
+        flux = max(float(weighted @ (self._images - others)) / norm if norm > 0 else 0.0, least)
+        return self._data_term(others + flux * star), flux
 
     def minimise(self, stars: Stars) -> Stars:
         """Return the stars that are most likely, sought from these."""
         objective = self.objective(stars)
         for _ in range(MOST_STEPS):
             gradient, information = self.derivatives(stars)
-            step = -np.linalg.pinv(information, hermitian=True) @ gradient
+            step = -_invert(information) @ gradient
             for _ in range(MOST_HALVED):
                 following = self._follow(stars, step)
                 lower = self.objective(following)
@@ -150,34 +175,42 @@ class StarFit:
         return Stars(fluxes, self._given + _shorten(stars.positions + moves - self._given, RADIUS))
 
     def errors(self, stars: Stars) -> Stars:
-        """Return standard errors, the roots of the diagonal of ``F^-1``."""
+        """Return standard errors, the roots of the diagonal of ``F^-1``; infinite where F is 0."""
         n = len(stars.fluxes)
         _, information = self.derivatives(stars)
-        variances = np.diag(np.linalg.pinv(information, hermitian=True))
-        roots = np.sqrt(np.maximum(variances, 0.0))
-        return Stars(roots[:n], roots[n:].reshape(2, n).T)
+        roots = np.sqrt(np.maximum(np.diag(_invert(information)), 0.0))
+        errors: Array = np.where(np.diag(information) > 0, roots, np.inf)
+        return Stars(errors[:n], errors[n:].reshape(2, n).T)
 
 
-def _with_derivatives(psf: Array) -> list[Array]:
-    """Return a PSF with margins, and what changes where it is moved along x and along y."""
-    return [np.pad(psf, MARGIN), -differentiate(psf, 1), -differentiate(psf, 0)]
+def _invert(information: Array) -> Array:
+    """Return the inverse, in units of its diagonal's: those of fluxes and positions are far apart.
+
+    What is not known at all, such as the position of a star of no flux, has rows of 0.
+    """
+    roots = np.sqrt(np.diag(information))
+    units = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > 0)
+    units = units[:, None] * units
+    inverse = np.asarray(np.linalg.pinv(information * units, hermitian=True), np.float64)
+    return inverse * units
 
 
-def _cut(psfs: list[list[Array]]) -> list[list[Array]]:
+def _cut(psfs: list[Array]) -> list[Array]:
     """Return PSFs cut to the square round their middle that holds enough of the information."""
     # Where the star's own light is the noise, a pixel says |grad P|^2 / P of a position.
     information = sum(
-        (dx**2 + dy**2) / np.maximum(psf, LEAST_LIT * psf.max()) for psf, dx, dy in psfs
+        (np.square(np.gradient(np.pad(psf, 1))).sum(axis=0)[1:-1, 1:-1])
+        / np.maximum(psf, LEAST_LIT * psf.max())
+        for psf in psfs
     )
-    ky, kx = information.shape
-    y, x = np.indices(information.shape)
-    distance = np.maximum(abs(y - ky // 2), abs(x - kx // 2))
-    within = np.cumsum(np.bincount(distance.ravel(), information.ravel()))
+    middle = np.array(psfs[0].shape) // 2
+    y, x = np.indices(psfs[0].shape)
+    distance = np.maximum(abs(y - middle[0]), abs(x - middle[1]))
+    within = np.cumsum(np.bincount(distance.ravel(), np.ravel(information)))
     half = int(np.argmax(within >= INFORMATION_SHARE * within[-1]))
-    cut = np.s_[
-        max(ky // 2 - half, 0) : ky // 2 + half + 1, max(kx // 2 - half, 0) : kx // 2 + half + 1
-    ]
-    return [[np.ascontiguousarray(each[cut]) for each in three] for three in psfs]
+    first = np.maximum(middle - half, 0)
+    cut = np.s_[first[0] : middle[0] + half + 1, first[1] : middle[1] + half + 1]
+    return [psf[cut] for psf in psfs]
 
 
 def _shorten(vectors: Array, longest: float) -> Array:

@@ -25,7 +25,7 @@ class Setup:
     """What runs on several observations of one sky have in common; as for `deconvolve`."""
 
     stars: Sequence[tuple[float, float]]
-    pad: int
+    pad: int | str
     solver: str
     precision: str
     engine: str
@@ -91,7 +91,7 @@ class Run:
         model = _make_model(self.scene) if needs_model else None
         if self._refines:
             self._model: Any = model  # else it is let go
-            star_fluxes = self._move_stars(extended, star_fluxes)
+            star_fluxes = self._move_stars(extended, star_fluxes, look_round=True)
         scaling = None
         if setup.solver == "sgp":
             star_fluxes, scaling = _prepare(self.scene, model, extended, star_fluxes)
@@ -127,12 +127,14 @@ class Run:
         self.engine.move_stars()
         self.engine.start(extended, star_fluxes)
 
-    def _move_stars(self, extended: Array, star_fluxes: Array) -> Array:
+    def _move_stars(self, extended: Array, star_fluxes: Array, look_round: bool = False) -> Array:
         """Move the stars of the scene; return their fluxes there."""
         from lnocl.refine import StarFit, Stars
 
         fit = StarFit(self.scene, self._model, extended, self._given_stars)
-        stars = fit.minimise(Stars(star_fluxes, self.scene.stars))
+        given = Stars(star_fluxes, self.scene.stars)
+        starts = [given, fit.look_round(given)] if look_round else [given]
+        stars = min(map(fit.minimise, starts), key=fit.objective)
         self.scene.move_stars(stars.positions)
         self._model.move_stars(self.scene)
         return stars.fluxes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import warnings
 from numbers import Real
@@ -10,9 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lnocl.edges import recommend_pad
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.observation import Array, Observation, numbers
 from lnocl.placement import MARGIN, Stamp, place
+
+log = logging.getLogger("lnocl")
 
 MAX_AXIS = 8192
 
@@ -45,8 +49,8 @@ class Scene:
         along columns.
     mu : float
         Weight of the Tikhonov term on the extended source, per electron, zero or more.
-    pad : int
-        Unobserved pixels kept round the images, at least.
+    pad : int or "auto"
+        Unobserved pixels kept round the images, at least; "auto": `edges.recommend_pad`.
     leeway : float
         Pixels that a star may be moved later on, by `move_stars`.
 
@@ -85,13 +89,16 @@ class Scene:
         observation: Observation,
         stars: ArrayLike = (),
         mu: float = 0.0,
-        pad: int = 0,
+        pad: int | str = 0,
         leeway: float = 0.0,
     ) -> None:
         self.observation = observation
         self.stars = _check_stars(stars, observation)
         self._leeway = leeway
         check_mu(mu)
+        if isinstance(pad, str) and pad == "auto":
+            pad = recommend_pad(observation)
+            log.info("pad: %d pixels, by the PSFs", pad)
         self.grid = _grid(observation.shape, pad)
         self._warn_of_large_psf()
         self.scale = _scale(observation.images[~observation.mask])
@@ -109,11 +116,19 @@ class Scene:
         self._gains = np.ones(self.n_images) if has_map else relative
         self.weights = self._weigh(relative if has_map else None)
         self.star_weights = self._weigh_stars()
+        self._refuse_unseen_stars()
 
     def move_stars(self, stars: ArrayLike) -> None:
-        """Give the stars other positions, none farther away than the leeway."""
-        self.stars = _check_stars(stars, self.observation)
+        """Give the stars other positions, none farther away than the leeway.
+
+        They may leave the images, but a star that would go where all is masked stays where it was.
+        """
+        before, weights = self.stars, self.star_weights
+        self.stars = numbers("stars", stars)
         self.star_weights = self._weigh_stars()
+        unseen = self.star_weights < OBSERVED_SHARE * self.n_images
+        self.stars = np.where(unseen[:, None], before, self.stars)
+        self.star_weights = np.where(unseen, weights, self.star_weights)
 
     @property
     def has_exposure_map(self) -> bool:
@@ -175,12 +190,11 @@ class Scene:
         rows = np.zeros(self.grid[0], bool)
         for j in range(self.n_images):
             stamp = self.star_stamp(j, s)
-            lit = stamp.rows(self.grid)[(stamp.values != 0).any(axis=1)]
-            rows[lit] = True
+            may_be_lit = (stamp.values != 0).any(axis=1) | (self._leeway > 0)
+            rows[stamp.rows(self.grid)[may_be_lit]] = True
         if self._leeway:
-            reach = int(np.ceil(self._leeway)) + MARGIN
-            for step in range(-reach, reach + 1):
-                rows = rows | np.roll(rows, step)
+            reach = int(np.ceil(self._leeway)) + MARGIN + 1
+            rows = np.any([np.roll(rows, step) for step in range(-reach, reach + 1)], axis=0)
         return rows
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
@@ -245,14 +259,15 @@ class Scene:
     def _weigh_stars(self) -> Array:
         if self.weights is None:
             return np.full(self.n_stars, float(self.n_images))
-        total = np.array([self._weigh_star(s) for s in range(self.n_stars)])
-        for (x, y), weight in zip(self.stars, total, strict=True):
+        return np.array([self._weigh_star(s) for s in range(self.n_stars)])
+
+    def _refuse_unseen_stars(self) -> None:
+        for (x, y), weight in zip(self.stars, self.star_weights, strict=True):
             if weight < OBSERVED_SHARE * self.n_images:
                 raise InputError(
                     f"the star at ({x:g}, {y:g}) lies where all images are masked; "
                     "leave it out or mend the mask"
                 )
-        return total
 
     def _weigh_star(self, s: int) -> float:
         assert self.weights is not None
@@ -306,9 +321,9 @@ def check_mu(mu: object) -> None:
         raise InputError(f"mu must be a number, finite and not negative; {mu!r} was given")
 
 
-def _grid(shape: tuple[int, int], pad: int) -> tuple[int, int]:
+def _grid(shape: tuple[int, int], pad: object) -> tuple[int, int]:
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
-        raise InputError(f"pad must be a whole number, 0 or more; {pad} was given")
+        raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
     ny, nx = (max(2, 1 << (n + 2 * int(pad) - 1).bit_length()) for n in shape)
     if max(ny, nx) > MAX_AXIS:
         raise InputError(
@@ -331,6 +346,7 @@ def _check_stars(stars: ArrayLike, observation: Observation) -> Array:
             raise InputError(
                 f"the star at ({position[0]:g}, {position[1]:g}) lies outside the images: x must "
                 f"be in [0, {nx - 1}] and y in [0, {ny - 1}]"
+                + (" of one of them, its offset added" if observation.offsets.any() else "")
             )
     return positions
 

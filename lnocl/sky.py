@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
+from astropy.io.registry import IORegistryError
 from astropy.table import Table
 from astropy.wcs import WCS
 from astropy.wcs.utils import pixel_to_pixel
@@ -16,6 +20,9 @@ from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError
 from lnocl.fitsread import quiet_log
+from lnocl.units import parse
+
+log = logging.getLogger("lnocl")
 
 # What the offset between two images may differ by over them, in pixels: from rotation, scale and
 # distortion.
@@ -26,17 +33,17 @@ POINTS = 5
 Pairs = NDArray[np.float64]
 
 
-def celestial_wcs(header: fits.Header, path: str) -> WCS:
+def celestial_wcs(header: fits.Header, path: str, advice: str = "give positions in pixels") -> WCS:
     """Return the celestial coordinates of an image.
 
     Raises
     ------
     InputError
-        An image without celestial coordinates.
+        An image without celestial coordinates, or with some that astropy cannot use.
     """
     wcs = _find_wcs(header)
     if wcs is None:
-        raise InputError(f"{path} has no sky coordinates (WCS); give positions in pixels")
+        raise InputError(f"{path} has no sky coordinates (WCS) that can be used; {advice}")
     return wcs
 
 
@@ -50,7 +57,8 @@ def _find_wcs(header: fits.Header) -> WCS | None:
         warnings.simplefilter("ignore")  # what astropy mends
         try:
             wcs = WCS(header, naxis=2)
-            return wcs if wcs.has_celestial else None
+            assert wcs.pixel_to_world(0, 0).icrs  # the Sun's, say, are not on the sky
+            return wcs
         except Exception:  # whatever a damaged header leads astropy to
             return None
 
@@ -83,17 +91,42 @@ def parse_sky(texts: Sequence[str]) -> SkyCoord:
 def _parse_sky(text: str) -> SkyCoord:
     ra, _, dec = text.partition(",")
     try:
-        try:
+        if _is_number(ra):
             return SkyCoord(float(ra), float(dec), unit="deg")
-        except ValueError:
-            return SkyCoord(ra, dec, unit=("hourangle", "deg"))
+        return SkyCoord(ra, dec, unit=("hourangle", "deg"))
     except (ValueError, u.UnitsError):
         raise InputError(f"{text!r} is not RA,DEC in degrees, or as hh:mm:ss,dd:mm:ss") from None
 
 
-def to_pixels(coordinates: SkyCoord, wcs: WCS) -> Pairs:
-    """Return the pixel positions (x, y), 0-based, of positions on the sky, shape (n, 2)."""
-    return np.array(wcs.world_to_pixel(coordinates), float).reshape(2, -1).T
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def to_pixels(coordinates: SkyCoord, wcs: WCS, path: str) -> Pairs:
+    """Return the pixel positions (x, y), 0-based, of positions on the sky, shape (n, 2).
+
+    Raises
+    ------
+    InputError
+        A position that the projection of the image does not show.
+    """
+    found = _pixel_to(wcs.world_to_pixel, coordinates).reshape(2, -1).T
+    for position, pixels in zip(coordinates.ravel(), found, strict=True):
+        if not np.isfinite(pixels).all():
+            raise InputError(
+                f"the star at RA, Dec {position.to_string(precision=5)} lies in another part of "
+                f"the sky than {path}"
+            )
+    return found
+
+
+def _pixel_to(convert: Callable[..., Any], *given: Any) -> Pairs:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of SIP that does not converge far from the image
+        return np.array(convert(*given), float)
 
 
 def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
@@ -116,30 +149,52 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
     InputError
         A table without these columns, or ra and dec for an image without WCS.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            table = Table.read(path)
-    except Exception as error:  # astropy raises whatever a file leads its readers to
-        reason = str(error).strip().partition("\n")[0]
-        raise FileError(f"{path} cannot be read as a table: {reason}") from error
+    table = _read_table(path)
     columns = {name.lower(): table[name] for name in table.colnames}
     if {"x", "y"} <= columns.keys():
-        return np.array([_numbers(path, columns[name], u.pix) for name in "xy"]).T
-    if not {"ra", "dec"} <= columns.keys():
-        raise InputError(f"{path} has neither columns x and y nor ra and dec")
+        found = np.array([_numbers(path, columns[name], u.pix) for name in "xy"]).T
+    elif {"ra", "dec"} <= columns.keys():
+        found = _from_sky(path, columns["ra"], columns["dec"], header, image)
+    else:
+        raise InputError(
+            f"{path} has neither columns x and y nor ra and dec; it has "
+            f"{', '.join(table.colnames) or 'none'}"
+        )
+    log.info("%s: %d stars", path, len(found))
+    return found
+
+
+def _from_sky(path: str, ra: Any, dec: Any, header: fits.Header, image: str) -> Pairs:
     wcs = celestial_wcs(header, image)
-    ra, dec = (_numbers(path, columns[name], u.deg) for name in ("ra", "dec"))
-    return to_pixels(SkyCoord(ra, dec, unit="deg"), wcs)
+    degrees = _numbers(path, ra, u.deg), _numbers(path, dec, u.deg)
+    if (abs(degrees[1]) > 90).any():
+        raise InputError(f"column {dec.name} of {path} has rows beyond 90 degrees")
+    return to_pixels(SkyCoord(*degrees, unit="deg"), wcs, image)
 
 
-def _numbers(path: str, column: u.Quantity, unit: u.UnitBase) -> Pairs:
+def _read_table(path: str) -> Table:
     try:
-        values = u.Quantity(column, column.unit or unit).to_value(unit).astype(float)
-        values = np.ma.filled(values, np.nan)
+        with open(path, "rb"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                return Table.read(path)
+            except IORegistryError:  # a name that says nothing of what is in it
+                return Table.read(path, format="ascii")
+    except Exception as error:  # astropy raises whatever a file leads its readers to
+        reason = getattr(error, "strerror", None) or str(error).strip().partition("\n")[0]
+        raise FileError(f"{path} cannot be read as a table: {reason}") from error
+
+
+def _numbers(path: str, column: Any, unit: u.UnitBase) -> Pairs:
+    try:
+        values = np.array(getattr(column, "unmasked", column), float)
+        given = parse(str(column.unit or unit))
+        values = values * given.to(unit)
     except (TypeError, ValueError) as error:
         raise InputError(f"column {column.name} of {path} is no position: {error}") from None
-    if not np.isfinite(values).all():
+    if values.ndim != 1:
+        raise InputError(f"column {column.name} of {path} has several numbers in a row")
+    if not np.isfinite(values).all() or np.any(getattr(column, "mask", False)):
         raise InputError(f"column {column.name} of {path} has rows without a number")
     return values
 
@@ -152,33 +207,47 @@ def offsets(headers: Sequence[fits.Header], paths: Sequence[str], shape: tuple[i
     Raises
     ------
     InputError
-        An image without sky coordinates, or one that is rotated or scaled against the first, by
-        so much that the offset is not the same over the image within a tenth of a pixel.
+        An image without sky coordinates; one that shows another part of the sky than the first;
+        one that is rotated or scaled against it, by so much that the offset is not the same over
+        the image within a tenth of a pixel.
     """
-    first, *others = (celestial_wcs(h, path) for h, path in zip(headers, paths, strict=True))
-    ny, nx = shape
-    x, y = np.meshgrid(np.linspace(0, nx - 1, POINTS), np.linspace(0, ny - 1, POINTS))
-    found = [(0.0, 0.0)]
+    first, *others = (
+        celestial_wcs(header, path, "leave --align out")
+        for header, path in zip(headers, paths, strict=True)
+    )
+    found = [np.zeros(2)]
     for wcs, path in zip(others, paths[1:], strict=True):
-        moved = np.array(pixel_to_pixel(first, wcs, x, y))
-        change = moved - (x, y)
-        if not np.isfinite(change).all():
-            raise InputError(f"the sky coordinates of {path} and {paths[0]} have nothing in common")
-        mean = change.mean(axis=(1, 2))
-        if abs(change - mean[:, None, None]).max() > MOST_TURNED:
-            raise InputError(_describe_turn(moved, path, paths[0]))
-        found.append((float(mean[0]), float(mean[1])))
+        found.append(_offset(first, wcs, paths[0], path, shape))
     return np.array(found)
 
 
-def _describe_turn(moved: Pairs, path: str, first: str) -> str:
-    """Say how an image lies to the first."""
+def _offset(first: WCS, wcs: WCS, first_path: str, path: str, shape: tuple[int, int]) -> Pairs:
+    ny, nx = shape
+    x, y = np.meshgrid(np.linspace(0, nx - 1, POINTS), np.linspace(0, ny - 1, POINTS))
+    moved = _pixel_to(pixel_to_pixel, first, wcs, x, y)
+    change = moved - (x, y)
+    mean = change.mean(axis=(1, 2))
+    if not (abs(mean) < (nx, ny)).all():  # NaN is where a projection has no pixel
+        raise InputError(
+            f"{path} shows another part of the sky than {first_path}, by its sky coordinates; "
+            "leave one of them out"
+        )
+    spread = abs(change - mean[:, None, None]).max()
+    if spread > MOST_TURNED:
+        raise InputError(
+            f"{path} is {_describe_turn(moved, nx)} against {first_path}, which moves pixels by "
+            f"up to {spread:.2g} besides the offset: images are never resampled; give those of "
+            "one orientation and scale together, or have them reduced to one grid"
+        )
+    return mean
+
+
+def _describe_turn(moved: Pairs, nx: int) -> str:
+    """Say how an image lies to the first, from where the points of that one lie in it."""
     along_x = moved[:, POINTS // 2, -1] - moved[:, POINTS // 2, 0]
-    angle = np.degrees(np.arctan2(along_x[1], along_x[0]))
     along_y = moved[:, -1, POINTS // 2] - moved[:, 0, POINTS // 2]
-    mirrored = along_x[0] * along_y[1] - along_x[1] * along_y[0] < 0
-    how = "mirrored" if mirrored else f"rotated by {angle:.3g} degrees or scaled"
-    return (
-        f"{path} is {how} against {first}: images are never resampled; give those of one "
-        "orientation and scale together, or have them reduced to one grid"
-    )
+    if along_x[0] * along_y[1] - along_x[1] * along_y[0] < 0:
+        return "mirrored"
+    angle = np.degrees(np.arctan2(along_x[1], along_x[0]))
+    scale = np.hypot(*along_x) / max(nx - 1, 1)
+    return f"rotated by {angle:z.2f} degrees and scaled by {scale:.4f}"

@@ -83,6 +83,7 @@ class Discrepancy:
 
     def __init__(self) -> None:
         self._model: Model | None = None
+        self._stars: Array | None = None
         self._expected = np.nan
 
     def met(self, run: Run) -> bool:
@@ -104,8 +105,8 @@ class Discrepancy:
     def _expect(self, run: Run) -> float:
         from lnocl.model import Model
 
-        if self._model is None:
-            self._model = Model(run.scene)
+        if self._model is None or self._stars is not run.scene.stars:  # they may have moved
+            self._model, self._stars = Model(run.scene), run.scene.stars
         weights = self._model.weights
         means = weights * self._model.images(run.engine.extended(), run.engine.star_fluxes())
         return float(expected_deviance(means * run.scene.scale)[weights > 0].sum())

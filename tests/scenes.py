@@ -32,6 +32,15 @@ def make_psfs(n_images, shape):
     return np.array(psfs)
 
 
+def make_smooth_psfs(n_images, shape):
+    """Return PSFs that pixels hold to rounding, so that they can be moved by fractions of one."""
+    y, x = np.indices(shape)
+    y, x = y - shape[0] // 2, x - shape[1] // 2
+    widths = (2.6, 3.2), (3.1, 2.7), (2.9, 2.6)
+    cores = [np.exp(-0.5 * (((x - 0.6) / w) ** 2 + ((y + 0.4) / h) ** 2)) for w, h in widths]
+    return np.array([core + 0.3 * np.roll(core, (2, -3), (0, 1)) for core in cores[:n_images]])
+
+
 def blur(sky, psf):
     """Return the sky through a PSF, periodic, as a plain sum over the PSF's pixels."""
     blurred = np.zeros(sky.shape)
@@ -55,6 +64,9 @@ class Recipe:
     read_noise: Any = 0.0
     masked: float = 0.0  # share of the pixels, different in each image
     n_iter: int = 1000
+    exposure: str = "none"  # or "each", "map" with zeros in places
+    fractions: bool = False  # whether images have offsets, and stars lie, between pixels
+    smooth: bool = False  # whether the PSFs hold nothing that pixels cannot
 
     def make(self):
         return Made(self)
@@ -70,9 +82,12 @@ class Made:
         rng = np.random.default_rng([ny, nx, p, recipe.n_stars])
         y, x = np.indices(recipe.shape)
         ridge = y - 0.45 * ny - 0.15 * ny * np.sin(5.0 * x / nx)
-        sky = 90.0 * np.exp(-0.5 * (ridge / (0.08 * ny + 0.5)) ** 2) * (1.2 + np.cos(9.0 * x / nx))
+        self.sky = sky = (
+            90.0 * np.exp(-0.5 * (ridge / (0.08 * ny + 0.5)) ** 2) * (1.2 + np.cos(9.0 * x / nx))
+        )
+        self.sky = sky
         # Far from the ridge the sky is dark: without a background, pixels there are empty.
-        self.psfs = make_psfs(p, recipe.psf_shape)
+        self.psfs = (make_smooth_psfs if recipe.smooth else make_psfs)(p, recipe.psf_shape)
         self.stars = [(int(nx * u), int(ny * v)) for u, v in [(0.3, 0.55), (0.75, 0.2), (0, 0.99)]]
         self.stars = self.stars[: recipe.n_stars]
         fluxes = np.array([3e3, 9e2, 4e3])[: recipe.n_stars]
@@ -88,7 +103,16 @@ class Made:
         }[recipe.background]
         level = np.asarray(self.background)
         level = level[:, None, None] if level.ndim == 1 else level
-        means = np.array([blur(object_, psf) for psf in self.psfs]) + level
+        means = np.array([blur(object_, psf) for psf in self.psfs])
+        self.offsets = None
+        if recipe.fractions:
+            self.stars = [(sx + 0.3, sy - 0.4) for sx, sy in self.stars]
+            self.offsets = np.array([(0.0, 0.0), (1.4, -0.7), (-2.5, 0.25)])[:p]
+            means = np.array([moved(m, *by) for m, by in zip(means, self.offsets, strict=True)])
+        self.exposure = self._make_exposure()
+        if self.exposure is not None:
+            means *= self.exposure if self.exposure.ndim == 3 else self.exposure[:, None, None]
+        means += level
         self.images = rng.poisson(np.maximum(means, 0.0)).astype(float)
         sigma = np.broadcast_to(recipe.read_noise, (p,))[:, None, None]
         self.images += sigma * rng.standard_normal(self.images.shape)
@@ -98,6 +122,19 @@ class Made:
         self.initial_extended = sky.mean() * rng.uniform(0.5, 1.5, recipe.shape)
         self.initial_star_fluxes = fluxes * np.array([0.6, 1.5, 0.9])[: recipe.n_stars]
 
+    def _make_exposure(self):
+        (ny, nx), p = self.recipe.shape, self.recipe.n_images
+        if self.recipe.exposure == "none":
+            return None
+        each = np.linspace(0.7, 2.1, p)
+        if self.recipe.exposure == "each":
+            return each
+        x = np.arange(nx) + 0.5
+        exposure = each[:, None, None] * (1.0 + 0.4 * np.cos(4.0 * x / nx)) * np.ones((ny, 1))
+        dead = np.random.default_rng(7).random(exposure.shape) < 0.05
+        dead[0, :, nx // 2] = True
+        return np.where(dead, 0.0, exposure)
+
     def observation(self, **changes):
         given = {
             "images": self.images,
@@ -105,6 +142,8 @@ class Made:
             "background": self.background,
             "read_noise": self.recipe.read_noise,
             "mask": self.mask,
+            "exposure": self.exposure,
+            "offsets": self.offsets,
         }
         return lnocl.Observation(**(given | changes))
 
@@ -131,3 +170,21 @@ def same(result, other):
     np.testing.assert_array_equal(result.extended, other.extended)
     np.testing.assert_array_equal(result.star_fluxes, other.star_fluxes)
     np.testing.assert_array_equal(result.history, other.history)
+
+
+def interpolation(n, shift):
+    """Return the matrix that moves n periodic samples, by the trigonometric interpolant.
+
+    Its columns are Dirichlet's kernel, summed in closed form; no FFT is used.
+    """
+    distance = np.subtract.outer(np.arange(n), np.arange(n)) - shift
+    u = np.pi * (distance - n * np.round(distance / n))
+    with np.errstate(invalid="ignore"):
+        kernel = np.sin(u) / (n * (np.sin(u / n) if n % 2 else np.tan(u / n)))
+    return np.where(u == 0, 1.0, kernel)
+
+
+def moved(arrays, x, y):
+    """Return periodic arrays moved by any distance."""
+    ny, nx = arrays.shape[-2:]
+    return interpolation(ny, y) @ arrays @ interpolation(nx, x).T

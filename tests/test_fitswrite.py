@@ -49,6 +49,42 @@ class TestWriting:
         assert history.colnames == ["iteration", "objective"]
         np.testing.assert_array_equal(history.as_array(), HISTORY)
 
+    def test_further_columns_of_the_stars(self, tmp_path):
+        columns = [
+            fitswrite.StarColumn("mag", [17.5], "mag", "by the zero point"),
+            fitswrite.StarColumn("ra", np.array([150.25]), "deg", "right ascension, ICRS"),
+            fitswrite.StarColumn("x_error", [0], "", "standard error"),
+        ]
+        path = write(tmp_path / "out.fits", star_columns=columns, per_second=True)
+        stars = QTable.read(path, hdu="STARS")
+        assert stars.colnames == ["x", "y", "flux", "mag", "ra", "x_error"]
+        assert [str(stars[name].unit) for name in stars.colnames[:5]] == [
+            "pix", "pix", "ct / s", "mag", "deg"
+        ]  # fmt: skip
+        assert [float(stars[name].value[0]) for name in ("mag", "ra")] == [17.5, 150.25]
+        header = fits.getheader(path, "STARS")
+        assert header.comments["TTYPE3"] == "electrons per second"
+        assert header.comments["TTYPE4"] == "by the zero point"
+        assert fits.getheader(path)["BUNIT"] == "electron/s"
+        assert fitscheck.main(["--compliance", path]) == 0
+
+    def test_cubes_have_their_unit_and_the_coordinates_of_the_image(self, tmp_path):
+        cube = np.random.default_rng(2).normal(size=(3, *IMAGE.shape))
+        cube[1, 2, 3] = np.nan
+        wcs = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 4.5})
+        cubes = {"MODELS": (cube, "electron"), "RESIDUALS": (2.0 * cube, "")}
+        path = write(tmp_path / "out.fits", wcs=wcs, cubes=cubes, cards=[("MU", 0.25, "")])
+        with fits.open(path, checksum=True) as hdus:
+            assert [hdu.name for hdu in hdus][3:] == ["MODELS", "RESIDUALS"]
+            np.testing.assert_array_equal(hdus["MODELS"].data, cube.astype("f4"))
+            np.testing.assert_array_equal(hdus["RESIDUALS"].data, (2.0 * cube).astype("f4"))
+            assert hdus["MODELS"].header["BUNIT"] == "electron"
+            assert "BUNIT" not in hdus["RESIDUALS"].header
+            for hdu in hdus[3:]:
+                assert hdu.header["CRPIX1"] == 4.5
+                assert "MU" not in hdu.header
+        assert fitscheck.main(["--compliance", path]) == 0
+
     def test_fitscheck_passes_and_would_not(self, tmp_path):
         path = tmp_path / "out.fits"
         write(path)

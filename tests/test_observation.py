@@ -75,6 +75,68 @@ def test_read_noise_squared_is_added_to_images_and_background(read_noise, backgr
     np.testing.assert_array_equal(held[~mask], expected[~mask])
 
 
+@pytest.mark.parametrize("background", [5.0, 0.5 * IMAGES])
+@pytest.mark.parametrize("read_noise", [IMAGES / 7, IMAGES[1] / 7], ids=["each", "one for all"])
+def test_read_noise_may_be_a_map(read_noise, background):
+    mask = IMAGES % 5 == 0
+    noise = np.where(mask, np.nan, read_noise)  # what is masked may hold anything
+    observation = observe(read_noise=noise, background=background, mask=mask)
+    variance = np.where(mask, 0.0, np.broadcast_to(read_noise, IMAGES.shape) ** 2)
+    np.testing.assert_array_equal(observation.images, np.where(mask, 0.0, IMAGES + variance))
+    expected = np.broadcast_to(background, IMAGES.shape) + variance
+    np.testing.assert_array_equal(observation.background[~mask], expected[~mask])
+
+
+@pytest.mark.parametrize("name", ["background", "read_noise", "exposure"])
+def test_one_map_serves_all_images(name):
+    for mask in (None, IMAGES % 5 == 0):
+        one = vars(observe(**{name: IMAGES[1]}, mask=mask))
+        each = vars(observe(**{name: np.array([IMAGES[1]] * 3)}, mask=mask))
+        for attribute, values in each.items():
+            np.testing.assert_array_equal(one[attribute], values)
+        assert one["background" if name == "read_noise" else name].shape == IMAGES.shape
+
+
+@pytest.mark.parametrize(
+    ("exposure", "held"),
+    [
+        (None, [1.0, 1.0, 1.0]),
+        (2, [2.0, 2.0, 2.0]),
+        ([0.5], [0.5, 0.5, 0.5]),
+        ((1, 2, 1e-9), [1.0, 2.0, 1e-9]),
+        (IMAGES[0], [IMAGES[0]] * 3),
+    ],
+)
+def test_exposure(exposure, held):
+    observation = observe(exposure=exposure)
+    np.testing.assert_array_equal(observation.exposure, held)
+    assert observation.exposure.dtype == np.float64
+    assert not observation.mask.any()
+    np.testing.assert_array_equal(observation.images, IMAGES)
+
+
+@pytest.mark.parametrize("exposure", [np.where(IMAGES % 7, 2.0, 0.0), IMAGES[0] - 1.0])
+def test_exposure_of_zero_masks(exposure):
+    mask = IMAGES == 30
+    observation = observe(exposure=np.where(mask, np.nan, exposure), mask=mask)
+    expected = mask | (np.broadcast_to(exposure, IMAGES.shape) == 0)
+    np.testing.assert_array_equal(observation.mask, expected)
+    np.testing.assert_array_equal(observation.images, np.where(expected, 0.0, IMAGES))
+    np.testing.assert_array_equal(
+        observation.exposure[~mask], np.broadcast_to(exposure, IMAGES.shape)[~mask]
+    )
+
+
+def test_offsets():
+    np.testing.assert_array_equal(observe().offsets, np.zeros((3, 2)))
+    offsets = [(0, 0), (3.9, -3.5), (-1, 2)]
+    np.testing.assert_array_equal(observe(offsets=offsets).offsets, offsets)
+    wide = lnocl.Observation(np.ones((2, 5)), PSF, offsets=[(4.5, -1.5)])
+    np.testing.assert_array_equal(wide.offsets, [(4.5, -1.5)])
+    with pytest.raises(lnocl.InputError, match="the images' 5 by 2 pixels; 2 was given"):
+        lnocl.Observation(np.ones((2, 5)), PSF, offsets=[(4.5, 2)])
+
+
 MASK = IMAGES[0] % 3 == 0
 
 
@@ -119,6 +181,8 @@ def test_input_is_copied_and_never_modified():
         "background": np.ones_like(IMAGES),
         "read_noise": np.array([0.0, 0.5, 1.0]),
         "mask": IMAGES > 40,
+        "exposure": np.where(IMAGES == 9, 0.0, 2.0),
+        "offsets": np.array([(0.0, 0.0), (1.0, 0.5), (0.0, -1.0)]),
     }
     before = {name: array.copy() for name, array in given.items()}
     with pytest.warns(lnocl.LnoclWarning):
@@ -210,6 +274,52 @@ REFUSED = {
     "mask of another shape": ({"mask": np.zeros((4, 5), bool)}, "mask has shape (4, 5)"),
     "too few masks": ({"mask": np.zeros((2, 4, 4), bool)}, "mask has shape (2, 4, 4)"),
     "ragged mask": ({"mask": [[True, False], [True]]}, "mask"),
+    "exposure of 0": ({"exposure": 0}, "exposure must be finite and more than zero; 0 was"),
+    "negative exposure": (
+        {"exposure": [1, -2, 3]},
+        "exposure must be finite and more than zero; -2 was given",
+    ),
+    "NaN exposure": ({"exposure": np.nan}, "exposure must be finite and more than zero; nan"),
+    "infinite exposure": ({"exposure": np.inf}, "exposure must be finite and more than zero; inf"),
+    "two exposures": ({"exposure": [1, 2]}, "exposure has shape (2,); give one number, or one for"),
+    "negative exposure in a map": (
+        {"exposure": IMAGES - 2},
+        "exposure must be finite and not negative; -1 was given",
+    ),
+    "NaN in a map of exposures": (
+        {"exposure": np.where(IMAGES == 7, np.nan, 1)},
+        "exposure must be finite and not negative; nan was given",
+    ),
+    "small map of exposures": (
+        {"exposure": IMAGES[:, 1:]},
+        "exposure has shape (3, 3, 4); the images have (3, 4, 4)",
+    ),
+    "map of exposures of two images": ({"exposure": IMAGES[1:]}, "exposure has shape (2, 4, 4)"),
+    "map that saw nothing": ({"exposure": 0 * IMAGES}, "all pixels are masked"),
+    "map that saw what is masked": (
+        {"exposure": (IMAGES < 20) * 1.0, "mask": IMAGES < 20},
+        "all pixels are masked",
+    ),
+    "text for an exposure": ({"exposure": "1 s"}, "exposure holds <U3"),
+    "complex exposure": ({"exposure": 1j}, "exposure holds complex128"),
+    "ragged exposure": ({"exposure": RAGGED}, "exposure"),
+    "two offsets": (
+        {"offsets": [(0, 0), (1, 1)]},
+        "offsets has shape (2, 2); give (dx, dy) for each of the 3 images",
+    ),
+    "offsets in three dimensions": ({"offsets": np.zeros((3, 3))}, "offsets has shape (3, 3)"),
+    "one offset for all": ({"offsets": (1, 2)}, "offsets has shape (2,)"),
+    "offset beyond the image": (
+        {"offsets": [(0, 0), (0, -4), (0, 0)]},
+        "offsets must be finite, and less than the images' 4 by 4 pixels; -4 was given",
+    ),
+    "NaN offset": ({"offsets": np.full((3, 2), np.nan)}, "4 by 4 pixels; nan was given"),
+    "text for offsets": ({"offsets": "0,0"}, "offsets holds <U3"),
+    "ragged offsets": ({"offsets": [(0, 0), (1,), (0, 0)]}, "offsets"),
+    "negative read noise in a map": (
+        {"read_noise": IMAGES - 2},
+        "read_noise must be finite and not negative; -1 was given",
+    ),
     "all masked": ({"mask": np.ones((4, 4), bool)}, "all pixels are masked"),
     "all masked by numpy.ma": ({"images": np.ma.masked_all((3, 4, 4))}, "all pixels are masked"),
 }

@@ -137,7 +137,7 @@ def test_a_psf_is_shown_beside_the_frame_that_it_was_made_from(angle):
     bad = np.zeros(frame.shape, bool)
     bad[28, 31] = True
     psf = frame[18:39, 20:41]
-    figure = plots.star_psf(frame, bad, (30.0, 28.0), psf, angle)
+    figure = plots.star_psf(frame, bad, (30.0, 28.0), [psf], [angle])
     left, right = panels(figure)
     assert left.get_array().mask[28, 31]
     assert left.get_array().mask.sum() == 1
@@ -151,3 +151,17 @@ def test_a_psf_is_shown_beside_the_frame_that_it_was_made_from(angle):
     np.testing.assert_array_equal(lines(figure.axes[2])["along x"][1], psf[10] / psf.max())
     np.testing.assert_array_equal(lines(figure.axes[2])["along y"][1], psf[:, 10] / psf.max())
     assert (right.axes.get_title() == "PSF") == (angle == 0)
+
+
+def test_several_psfs_are_shown_in_a_row_each():
+    frame = np.arange(900.0).reshape(30, 30)
+    psfs = [frame[5:16, 5:16], frame[6:17, 6:17]]
+    figure = plots.star_psf(frame, frame < 0, (12.0, 12.0), psfs, [0.0, 90.0])
+    images = panels(figure)
+    assert len(images) == 4
+    for image, psf in zip(images[1::2], psfs, strict=True):
+        np.testing.assert_array_equal(image.get_array(), psf / psf.max())
+    assert [image.axes.get_title() for image in images[1::2]] == [
+        "PSF",
+        "PSF, rotated by 90 degrees",
+    ]

@@ -15,7 +15,8 @@ from scipy import special
 from scipy.ndimage import fourier_shift
 
 from lnocl.errors import InputError, LnoclError, LnoclWarning
-from lnocl.psf import MARGIN, MIN_GOOD, WINDOW, make_psf
+from lnocl.psf import MARGIN, N_SHARED_STEPS, make_psf, make_psfs
+from lnocl.repair import MIN_GOOD, WINDOW
 from lnocl.simulate import fizeau_psf
 
 
@@ -520,6 +521,52 @@ def test_a_rotated_crop_must_lie_in_the_frame():
     make_psf(frame, background=0.0, rotate=45.0, size=largest)
     with pytest.raises(InputError, match=r"rotated by 45 degrees, .* a size of 45 or less"):
         make_psf(frame, background=0.0, rotate=45.0, size=largest + 1)
+
+
+# --- Several angles
+
+
+@pytest.mark.parametrize("options", [{"size": 21}, {"background": 40.0}, {"recentre": False}])
+def test_several_angles_share_what_does_not_depend_on_them(options):
+    frame = STAR + np.random.default_rng(8).normal(0, 2, STAR.shape)
+    frame[28, 31] = np.nan
+    stars = make_psfs(frame, [0, 30, 90, -45], clip_negative=True, **options)
+    side = min(len(make_psf(frame, rotate=a, **options).psf) for a in (0, 30, 90, -45))
+    for star, angle in zip(stars, (0, 30, 90, -45), strict=True):
+        assert star.psf.shape == (side, side)
+        assert star.steps[:N_SHARED_STEPS] == stars[0].steps[:N_SHARED_STEPS]
+        assert star.centre == stars[0].centre
+        alone = make_psf(
+            frame, rotate=angle, clip_negative=True,
+            **options | {"size": side, "background": star.background},
+        )  # fmt: skip
+        np.testing.assert_allclose(star.psf, alone.psf, rtol=0, atol=1e-9)
+        assert star.steps[N_SHARED_STEPS:] == alone.steps[N_SHARED_STEPS:]
+
+
+def test_the_background_of_several_angles_is_outside_all_crops():
+    stars = make_psfs(STAR, [0, 45], size=21)
+    alone = make_psf(STAR, size=21, rotate=45)
+    assert stars[0].steps[1] == alone.steps[1]
+
+
+def test_several_angles_warn_once_of_the_worst():
+    frame = gaussian(1.0, 32.4, 32.4)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        make_psfs(frame, [0, 20, 45], background=0.0, size=21)
+    (warning,) = caught
+    assert warning.filename == __file__
+    shares = []
+    for angle in (0, 20, 45):
+        star = quiet(frame, rotate=angle, background=0.0, size=21)
+        shares.append(float(line(star, "negative pixels").split(", ")[1].split()[0]))
+    assert f"hold {-min(shares):.2f} % of the flux" in str(warning.message)
+
+
+def test_no_angle_is_refused():
+    with pytest.raises(InputError, match="rotate holds no angle; give one or more"):
+        make_psfs(STAR, [])
 
 
 # --- What is refused

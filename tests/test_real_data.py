@@ -4,6 +4,8 @@ The data are no part of the project; without them these tests skip.
 """
 
 import hashlib
+import importlib.util
+import os
 import shlex
 import subprocess
 import sys
@@ -234,6 +236,45 @@ class TestAltair:
             atol=1e-3 * stars[0].psf.max(),
         )  # fmt: skip
 
+    def test_the_example_makes_four_psfs(self, tmp_path):
+        """The shell script, with this lnocl in its path."""
+        pytest.importorskip("matplotlib")
+        program = tmp_path / "bin" / "lnocl"
+        program.parent.mkdir()
+        program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m lnocl "$@"\n')
+        program.chmod(0o755)
+        script = Path(__file__).parents[1] / "examples" / "altair_psfs.sh"
+        path = f"{program.parent}{os.pathsep}{os.environ['PATH']}"
+        done = subprocess.run(
+            ["sh", script, DATA],
+            capture_output=True, text=True, check=False, env=os.environ | {"PATH": path},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert done.stderr.splitlines() == [
+            "lnocl: warning: 24 saturated pixels of the PSF were repaired, and hold 15.46 % of its "
+            "flux: its core is a guess"
+        ]
+        assert done.stdout.splitlines()[-2:] == [
+            "written to altair_psfs.fits: 4 PSFs of 144 x 144 pixels, the star's centre at "
+            "(72, 72)",
+            "drew altair_psfs.png",
+        ]
+        assert fitscheck.main(["--compliance", "altair_psfs.fits"]) == 0
+        psfs = fits.getdata("altair_psfs.fits")
+        assert psfs.shape == (4, 144, 144)
+        np.testing.assert_allclose(psfs.sum(axis=(1, 2)), 1, rtol=1e-12)
+        frequency, first = self.fringes(psfs[0])
+        for psf, angle in zip(psfs, (0, 45, 90, 135), strict=True):
+            f, found = self.fringes(psf)
+            assert f == pytest.approx(frequency, rel=0.01)
+            assert (found - first - angle + 90) % 180 == pytest.approx(90, abs=1)
+
+    def test_the_example_without_the_data_says_so(self, tmp_path):
+        script = Path(__file__).parents[1] / "examples" / "altair_psfs.sh"
+        done = subprocess.run(["sh", script, tmp_path], capture_output=True, text=True, check=True)
+        assert done.stdout.startswith("skipped: ")
+        assert not list(tmp_path.iterdir())
+
     def test_the_clipped_core_is_repaired_with_a_warning(self):
         frame = fits.getdata(self.FRAME)
         with pytest.warns(LnoclWarning, match="24 saturated pixels .* its core is a guess"):
@@ -256,3 +297,107 @@ class TestChandra:
             again = make_psf(star.psf, background=0.0)
         assert star.centre == pytest.approx(centroid, abs=0.1)
         assert again.centre == pytest.approx([k // 2 for k in star.psf.shape], abs=0.05)
+
+
+def run(*words):
+    """Run deconvolve quietly on files and words; return residuals, model sum, objective, table."""
+    words = [str(word) for word in words]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        what = ["--models", "--residuals", "--quiet", "--overwrite", "-o", "out.fits"]
+        assert main(["deconvolve", *words, *what]) == 0
+        with fits.open("out.fits") as hdus:
+            return (
+                hdus["RESIDUALS"].data,
+                hdus["MODELS"].data.sum(),
+                hdus["HISTORY"].data["objective"][-1],
+                hdus["STARS"].data.copy(),
+                hdus[0].data,
+            )
+
+
+@pytest.fixture(scope="module")
+def example():
+    """Return examples/real.py as a module."""
+    path = Path(__file__).parents[1] / "examples" / "real.py"
+    spec = importlib.util.spec_from_file_location("real", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class TestExamples:
+    """What docs/real.md says of examples/*.sh."""
+
+    @pytest.mark.filterwarnings("ignore::lnocl.errors.LnoclWarning")
+    def test_refined_stars_halve_the_residuals_of_the_lensed_quasar(self, example):
+        """With a PSF of the four images themselves; the file's is twice as wide as they are."""
+        where = DATA / "hst-lensed-quasar"
+        sci, exptime = (where / f"quasar_F814W_{name}.fits" for name in ("sci", "exptime"))
+        example.stars_psf(sci, exptime, "psf.fits")
+        stars = [word for x, y in example.IMAGES for word in ("--star", f"{x},{y}")]
+        words = [sci, "--psf", "psf.fits", "--exposure", exptime, "--read-noise", 5.187, "--pad", 4,
+                 *stars, "--n-iter", 10]  # fmt: skip
+        rms = []
+        for refine in ([], ["--refine"]):
+            residuals, _, _, table, _ = run(*words, *refine)
+            rms.append(np.sqrt(np.nanmean(residuals[0, 40:80, 40:80] ** 2)))
+        assert rms[0] == pytest.approx(3.99, abs=0.1)
+        assert rms[1] < 0.5 * rms[0]
+        assert rms[1] == pytest.approx(1.32, abs=0.1)
+        assert (table["x_error"] < 0.01).all()
+
+    @pytest.mark.filterwarnings("ignore::lnocl.errors.LnoclWarning")
+    @pytest.mark.filterwarnings("ignore::astropy.wcs.FITSFixedWarning")
+    def test_two_images_together_are_sharper_where_they_are_aligned(self, example):
+        where = DATA / "chandra-sgra-pair"
+        for name in ("4683", "4684"):
+            example.centred_psf(
+                where / f"chandra-psf-obs-id-{name}.fits.gz", f"psf_{name}.fits", 43
+            )
+            counts = where / f"chandra-counts-obs-id-{name}.fits.gz"
+            example.field(counts, f"counts_{name}.fits", "127,117", 32)
+        images = ["counts_4683.fits", "counts_4684.fits"]
+        words = [*images, "--psf", "psf_4683.fits", "psf_4684.fits", "--pad", 24, "--n-iter", 100]
+        total = sum(fits.getdata(path).sum() for path in images)
+        _, model, aligned, _, sharp = run(*words, "--align", "wcs")
+        _, _, apart, _, blurred = run(*words)
+        assert apart - aligned > 70
+        assert sharp.max() > 1.2 * blurred.max()
+        assert model == pytest.approx(total, rel=0.005)
+
+    def test_the_point_has_nearly_all_counts(self, example):
+        """1831 less a background of 0.0025 in each of 147 x 169 pixels."""
+        where = DATA / "chandra-pg1634-point"
+        counts = where / "pg1634_counts_0.25pix.fits"
+        example.pixel_psf(where / "pg1634_psf_0.25pix.fits", "psf.fits")
+        words = ["--background", 0.0025, "--star", "89,76", "--n-iter", 30, "--refine"]
+        _, _, _, table, extended = run(counts, "--psf", "psf.fits", *words)
+        above = 1831 - 0.0025 * 147 * 169
+        assert 0.95 * above < table["flux"].item() < above
+        assert extended.sum() < 0.06 * above
+        assert 0.05 < table["x_error"].item() < 0.1
+
+    @pytest.mark.filterwarnings("ignore::lnocl.errors.LnoclWarning")
+    def test_the_quasar_is_between_pixels(self, example):
+        where = DATA / "hst-quasar-j0005"
+        example.centred_psf(where / "sci_psf.fits", "psf.fits", 63)
+        words = [where / "sci_J0005-0006.fits", "--psf", "psf.fits", "--inverse-variance",
+                 where / "ivm_J0005-0006.fits", "--exposure", "EXPTIME", "--pad", 16,
+                 "--star", "64,64", "--solver", "sgp", "--n-iter", 10]  # fmt: skip
+        whole, refined = run(*words), run(*words, "--refine")
+        assert refined[2] < 0.5 * whole[2]
+        assert refined[3]["flux"].item() == pytest.approx(130, abs=1)
+        assert (refined[3]["x"].item(), refined[3]["y"].item()) == pytest.approx(
+            (64.11, 63.52), abs=0.02
+        )
+
+    @pytest.mark.filterwarnings("ignore::lnocl.errors.LnoclWarning")
+    def test_a_spitzer_mosaic(self, example):
+        image = DATA / "spitzer-glimpse" / "spitzer_glimpse_irac2_l18.fits"
+        example.star_psf(image, "psf.fits", "442,344", 33)
+        words = ["--gain", 31.306, "--background", "auto", "--pad", 16, "--star", "442,344"]
+        residuals, *_, table, extended = run(image, "--psf", "psf.fits", *words, "--n-iter", 3)
+        assert np.isnan(residuals).sum() == 3
+        assert extended.shape == (513, 1025)
+        assert table["flux"].item() == pytest.approx(22804.5 * 31.306, rel=0.1)

@@ -200,9 +200,12 @@ REFUSED = {
         {"mu": None, "stop": "held-out"},
         "mu must be a number, finite and not negative; None",
     ),
-    "negative pad": ({"pad": -1}, "pad must be a whole number, 0 or more; -1 was given"),
-    "fractional pad": ({"pad": 1.5}, "pad must be a whole number, 0 or more; 1.5 was given"),
-    "text for pad": ({"pad": "1"}, "pad must be a whole number, 0 or more; 1 was given"),
+    "negative pad": ({"pad": -1}, "pad must be a whole number, 0 or more, or auto; -1 was given"),
+    "fractional pad": (
+        {"pad": 1.5},
+        "pad must be a whole number, 0 or more, or auto; 1.5",
+    ),
+    "text for pad": ({"pad": "1"}, "pad must be a whole number, 0 or more, or auto; 1 was given"),
     "several pads": ({"pad": np.ones((2, 2), int)}, "pad"),
     "pad too large": ({"pad": MAX_AXIS // 2}, "with pad=4096 need a grid of (16384, 16384)"),
     "start of another shape": (

@@ -136,6 +136,17 @@ class TestHalves:
         np.testing.assert_array_equal(first.mask, observation.mask)
         assert first.images[observation.mask].max() == second.images[observation.mask].max() == 0
 
+    def test_keep_exposures_and_offsets(self):
+        exposure = np.where(np.arange(16).reshape(4, 4) == 5, 0.0, [[[2.0]], [[3.0]]])
+        observation = lnocl.Observation(
+            np.full((2, 4, 4), 9.0), np.ones((1, 1)), exposure=exposure, offsets=[(0, 0), (1, -0.5)]
+        )
+        for half in heldout.halve(observation)[0]:
+            seen = ~observation.mask
+            np.testing.assert_array_equal(half.mask, observation.mask)
+            np.testing.assert_array_equal(half.offsets, observation.offsets)
+            np.testing.assert_array_equal(half.exposure[seen], observation.exposure[seen])
+
     def test_say_that_images_are_no_whole_counts(self):
         observation = lnocl.Observation(np.full((4, 4), 2.5), np.ones((1, 1)))
         with pytest.warns(LnoclWarning, match="the images are not whole counts"):

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from collections.abc import Callable
 from typing import Any, NamedTuple, NoReturn
 
 from lnocl.errors import InputError
+
+# What arguments are added to: a parser, or a group of it that has a heading of its own.
+Arguments = argparse._ActionsContainer
 
 
 class Command(NamedTuple):
@@ -30,13 +34,14 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message}; see {self.prog} --help")
 
 
-def add_input_arguments(parser: argparse.ArgumentParser, required: bool) -> None:
-    """Add the images and what is known of them: PSFs, background, read noise, stars."""
+def add_input_arguments(parser: Arguments, required: bool) -> None:
+    """Add the images and what is known of them: PSFs, background, read noise."""
     parser.add_argument(
         "images",
         nargs="+" if required else "*",
         metavar="IMAGE",
-        help="FITS file with an image, in electrons per pixel, or one file with a cube of them",
+        help="FITS file with an image, or one file with a cube of them; in electrons per pixel, "
+        "unless its header says otherwise (BUNIT)",
     )
     parser.add_argument(
         "--psf",
@@ -62,31 +67,36 @@ def add_input_arguments(parser: argparse.ArgumentParser, required: bool) -> None
         "standard deviation in electrons, or a FITS file with a map of it, one for all images or "
         "one for each (default: 0)",
     )
+
+
+def add_star(parser: Arguments) -> None:
+    """Add the positions of stars in pixels."""
     parser.add_argument(
         "--star",
         action="append",
         default=[],
-        type=_position,
+        type=position,
         dest="stars",
         metavar="X,Y",
-        help="position of a point source in pixels, 0-based, x along columns; may be repeated",
+        help="position of a star in pixels, 0-based, x along columns; may be repeated",
     )
 
 
-def add_frame_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what real frames need besides: exposures, bad pixels, offsets, stars on the sky."""
+def add_frame_arguments(parser: Arguments) -> None:
+    """Add what real frames need besides: exposures, gain, bad pixels, offsets."""
     _add_values(
         parser,
         "--exposure",
         "T",
         "seconds, or a FITS file with a map of them, one for all images or one for each, or a "
-        "keyword of the images' headers; the result is then in electrons per second",
+        "keyword of the images' headers such as EXPTIME; the result is then in electrons per "
+        "second",
     )
     parser.add_argument(
         "--gain",
-        type=float,
+        type=finite,
         metavar="G",
-        help="electrons for each unit of the images (and second, where the unit is per second)",
+        help="electrons for each adu or count, or whatever else the images are in",
     )
     parser.add_argument(
         "--inverse-variance",
@@ -94,8 +104,8 @@ def add_frame_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="FILE",
-        help="FITS file with 1 / variance of sky and read noise, in units of the images; 0 where a "
-        "pixel is bad",
+        help="FITS file with 1 / variance of sky and read noise, in units of the images, one for "
+        "all images or one for each; 0 where a pixel is bad",
     )
     parser.add_argument(
         "--mask",
@@ -108,32 +118,19 @@ def add_frame_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--saturation",
-        type=float,
+        type=finite,
         metavar="V",
         help="pixels of this value and above are bad, in units of the images",
     )
     parser.add_argument(
         "--align",
         choices=("wcs",),
-        help="shift the PSFs by the offsets between the images that their coordinates give",
-    )
-    parser.add_argument(
-        "--star-sky",
-        action="append",
-        default=[],
-        metavar="RA,DEC",
-        help="position of a point source on the sky, in degrees or as hh:mm:ss,dd:mm:ss; may be "
-        "repeated",
-    )
-    parser.add_argument(
-        "--stars",
-        metavar="FILE",
-        dest="star_table",
-        help="table of point sources, any that astropy reads: columns x and y, or ra and dec",
+        help="the images are not on one grid: take the offsets between them from their sky "
+        "coordinates",
     )
 
 
-def _add_values(parser: argparse.ArgumentParser, option: str, metavar: str, words: str) -> None:
+def _add_values(parser: Arguments, option: str, metavar: str, words: str) -> None:
     """Add an option of numbers or words, one or several."""
     parser.add_argument(
         option, nargs="+", action="extend", type=number_or_word, metavar=metavar, help=words
@@ -148,6 +145,17 @@ def number_or_word(text: str) -> float | str:
         return text
 
 
+def finite(text: str) -> float:
+    """Return a number that a header can hold."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
+    return number
+
+
 def add_folder(parser: argparse.ArgumentParser, content: str, **keywords: Any) -> None:
     """Add the option for the folder of the output, and that to replace files in it."""
     default = " (default: %(default)s)" if "default" in keywords else ""
@@ -157,7 +165,7 @@ def add_folder(parser: argparse.ArgumentParser, content: str, **keywords: Any) -
     parser.add_argument("--overwrite", action="store_true", help="replace files in DIR")
 
 
-def add_device(parser: argparse.ArgumentParser) -> None:
+def add_device(parser: Arguments) -> None:
     """Add the option for the OpenCL device."""
     parser.add_argument(
         "--device",
@@ -167,9 +175,15 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _position(text: str) -> tuple[float, float]:
+def position(text: str) -> tuple[float, float]:
+    """Return the numbers of ``X,Y``."""
     try:
         x, y = map(float, text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not X,Y") from None
     return x, y
+
+
+def as_path(path: str) -> str:
+    """Return a path that is not taken for an option, for a command to be repeated."""
+    return f"./{path}" if path.startswith("-") else path

@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 
 from lnocl.commands import messages
-from lnocl.commands.arguments import Command, add_device, add_input_arguments
+from lnocl.commands.arguments import Command, add_device, add_input_arguments, add_star
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "Without IMAGE the demo's scene is taken, whose truth is known."
     add_input_arguments(parser, required=False)
+    add_star(parser)
     parser.add_argument(
         "--mu",
         type=float,

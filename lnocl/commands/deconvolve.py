@@ -11,10 +11,14 @@ from typing import TYPE_CHECKING, Any
 from lnocl import __version__
 from lnocl.commands import messages
 from lnocl.commands.arguments import (
+    Arguments,
     Command,
     add_device,
     add_frame_arguments,
     add_input_arguments,
+    add_star,
+    as_path,
+    finite,
     number_or_word,
 )
 from lnocl.deconvolution import ENGINES, PRECISIONS, SOLVERS, Result, deconvolve
@@ -25,16 +29,49 @@ if TYPE_CHECKING:
     from lnocl.fitsread import Stack
     from lnocl.fitswrite import StarColumn
     from lnocl.frames import Frames
+    from lnocl.observation import Observation
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_input_arguments(parser, required=True)
-    add_frame_arguments(parser)
+    add_input_arguments(parser.add_argument_group("images"), required=True)
+    add_frame_arguments(parser.add_argument_group("what real images need besides"))
+    stars = parser.add_argument_group("stars")
+    add_star(stars)
+    _add_star_arguments(stars)
+    _add_run_arguments(parser.add_argument_group("reconstruction"))
+    _add_output_arguments(parser.add_argument_group("output"))
+
+
+def _add_star_arguments(parser: Arguments) -> None:
+    parser.add_argument(
+        "--star-sky",
+        action="append",
+        default=[],
+        metavar="RA,DEC",
+        help="position of a star on the sky (ICRS), in degrees or as hh:mm:ss,dd:mm:ss; may be "
+        "repeated",
+    )
+    parser.add_argument(
+        "--stars",
+        metavar="FILE",
+        dest="star_table",
+        help="table of stars, any that astropy reads: columns x and y, or ra and dec",
+    )
     parser.add_argument(
         "--refine",
         action="store_true",
         help="move the stars to where they are most likely, at most 3 pixels away",
     )
+    parser.add_argument(
+        "--zero-point",
+        type=finite,
+        metavar="MAG",
+        help="magnitude of one electron, or of one per second where exposures are given: adds a "
+        "column mag to the table of stars",
+    )
+
+
+def _add_run_arguments(parser: Arguments) -> None:
     parser.add_argument(
         "--mu",
         type=number_or_word,
@@ -62,15 +99,16 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         type=number_or_word,
         metavar="RULE",
         help="stop before N: held-out, at the iteration that held-out counts choose; discrepancy, "
-        "when the data are fitted as well as noise allows; or a number, when the objective changes "
-        "relatively by less an iteration",
+        "when the data are fitted as well as noise allows; or a number below 1, when an iteration "
+        "changes the objective by a smaller share of it",
     )
     parser.add_argument(
         "--pad",
-        type=int,
+        type=_whole_or_word,
         default=0,
         metavar="N",
-        help="unobserved pixels kept round the images, at least (default: %(default)s)",
+        help="unobserved pixels kept round the images, at least; auto, where sources run over the "
+        "edge: as many as the PSFs need (default: %(default)s)",
     )
     parser.add_argument(
         "--precision",
@@ -86,6 +124,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "(default: %(default)s)",
     )
     add_device(parser)
+
+
+def _add_output_arguments(parser: Arguments) -> None:
     parser.add_argument(
         "-o",
         "--output",
@@ -94,19 +135,14 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help="file for the extended source, the stars and the history of the objective",
     )
     parser.add_argument(
-        "--zero-point",
-        type=float,
-        metavar="MAG",
-        help="magnitude of one electron, or of one per second where exposures are given: adds a "
-        "column mag to the table of stars",
-    )
-    parser.add_argument(
-        "--models", action="store_true", help="write the model of each image too, electrons"
+        "--models",
+        action="store_true",
+        help="write a cube with the model of each image too, in electrons",
     )
     parser.add_argument(
         "--residuals",
         action="store_true",
-        help="write (image - model) / sqrt(model) of each image too",
+        help="write a cube with (image - model) / sqrt(model) of each image too",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.fits if it exists")
     parser.add_argument("--quiet", action="store_true", help="show warnings and errors only")
@@ -199,7 +235,8 @@ def _stars(arguments: argparse.Namespace, images: Stack) -> list[tuple[float, fl
 
         if arguments.star_sky:
             wcs = sky.celestial_wcs(images.header, arguments.images[0])
-            positions += sky.to_pixels(sky.parse_sky(arguments.star_sky), wcs).tolist()
+            coordinates = sky.parse_sky(arguments.star_sky)
+            positions += sky.to_pixels(coordinates, wcs, arguments.images[0]).tolist()
         if arguments.star_table:
             positions += sky.read_stars(
                 arguments.star_table, images.header, arguments.images[0]
@@ -225,8 +262,7 @@ def _star_columns(
             StarColumn("flux_error", result.star_flux_errors, unit, "standard error"),
         ]
     if arguments.zero_point is not None:
-        zero_flux = 10.0 ** (0.4 * arguments.zero_point)
-        magnitudes = [magnitude(flux, zero_flux) for flux in result.star_fluxes]
+        magnitudes = [magnitude(flux, 1.0) + arguments.zero_point for flux in result.star_fluxes]
         columns.append(StarColumn("mag", magnitudes, "mag", "by the zero point"))
     if sky.has_celestial(header):
         ra, dec = sky.to_sky(result.star_positions, header).T
@@ -276,7 +312,7 @@ def _cards(
         ("NITER", result.n_iter, "iterations done"),
         ("STOPPED", result.stop_reason, "why it stopped"),
         ("MU", result.mu, "weight of the Tikhonov term, per electron"),
-        ("PAD", arguments.pad, "least unobserved pixels round the images"),
+        ("PAD", _pad(arguments, observation), "least unobserved pixels round the images"),
         ("PRECISIO", _precision(arguments), "precision of the arithmetic"),
         ("ENGINE", arguments.engine, "engine"),
         ("DEVICE", result.device, "device"),
@@ -298,6 +334,12 @@ def _cards(
             for j, digest in enumerate(digests, 1)
         ),
     ]
+
+
+def _pad(arguments: argparse.Namespace, observation: Observation) -> int:
+    from lnocl.edges import recommend_pad
+
+    return recommend_pad(observation) if arguments.pad == "auto" else arguments.pad
 
 
 def _exposures(arguments: argparse.Namespace, frames: Frames) -> Sequence[float | str]:
@@ -331,14 +373,14 @@ def _repeating_command(
     return [
         "lnocl",
         "deconvolve",
-        *map(_as_path, arguments.images),
-        *_option("--psf", map(_as_path, arguments.psfs)),
+        *map(as_path, arguments.images),
+        *_option("--psf", map(as_path, arguments.psfs)),
         *_option("--background", map(_as_word, frames.background)),
         *_option("--read-noise", map(_as_word, arguments.read_noise or [0.0])),
         *_option("--exposure", map(_as_word, arguments.exposure or [])),
         *_option("--gain", _if_given(arguments.gain)),
-        *_option("--inverse-variance", map(_as_path, arguments.inverse_variance)),
-        *_option("--mask", map(_as_path, arguments.mask)),
+        *_option("--inverse-variance", map(as_path, arguments.inverse_variance)),
+        *_option("--mask", map(as_path, arguments.mask)),
         *_option("--saturation", _if_given(arguments.saturation)),
         *_option("--align", _if_given(arguments.align)),
         *(word for x, y in stars for word in ("--star", f"{x!r},{y!r}")),
@@ -354,7 +396,7 @@ def _repeating_command(
         *_option("--zero-point", _if_given(arguments.zero_point)),
         *(["--models"] if arguments.models else []),
         *(["--residuals"] if arguments.residuals else []),
-        *_option("-o", [_as_path(arguments.output)]),
+        *_option("-o", [as_path(arguments.output)]),
     ]
 
 
@@ -369,7 +411,7 @@ def _if_given(value: object) -> list[str]:
 
 
 def _as_word(value: float | str) -> str:
-    return repr(value) if isinstance(value, float) else _as_path(value)
+    return repr(value) if isinstance(value, float) else as_path(value)
 
 
 def _precision(arguments: argparse.Namespace) -> str:
@@ -394,9 +436,11 @@ def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
     ]
 
 
-def _as_path(path: str) -> str:
-    """Return a path that is not taken for an option."""
-    return f"./{path}" if path.startswith("-") else path
+def _whole_or_word(text: str) -> int | str:
+    try:
+        return int(text)
+    except ValueError:
+        return text
 
 
 COMMAND = Command(

@@ -1,0 +1,178 @@
+"""What the shell scripts beside this one need: PSFs and cut-outs made, figures printed and drawn.
+
+python examples/real.py star-psf FRAME OUT X,Y SIZE   PSF of a star in a frame
+python examples/real.py centred-psf FRAME OUT SIZE       PSF image without background, centred
+python examples/real.py pixel-psf PSF OUT             PSF spread over Chandra's pixels
+python examples/real.py field IN OUT X,Y HALF         cut out a square, coordinates kept
+python examples/real.py stars-psf SCI EXPTIME OUT     one PSF of the lensed quasar's four images
+python examples/real.py figures RESULT...             counts, stars and residuals of results
+python examples/real.py draw OUT.png TITLE=FILE[,EXTENSION]:X,Y,HALF:LOW:HIGH...
+"""
+
+import sys
+
+import numpy as np
+from astropy.io import fits
+from astropy.nddata import Cutout2D
+from astropy.wcs import WCS
+from scipy.ndimage import convolve1d, fourier_shift
+
+import lnocl
+from lnocl.psf import make_psf
+
+# The lensed quasar: its images' brightest pixels (x, y), and what its sky's noise is squared.
+IMAGES = ((77, 73), (47, 56), (55, 77), (73, 48))
+SKY_VARIANCE = 26.9
+HALF = 10  # pixels from the middle to the edge of the PSF made of them
+ROUNDS = 4
+
+
+def pair(text):
+    """Return the numbers of X,Y."""
+    x, y = map(float, text.split(","))
+    return x, y
+
+
+def star_psf(frame, out, position, size):
+    """Write the PSF that a star shows; its background is measured around it."""
+    star = make_psf(fits.getdata(frame), pair(position), int(size), clip_negative=True)
+    print(*star.steps, sep="\n")
+    fits.writeto(out, star.psf, overwrite=True)
+
+
+def centred_psf(frame, out, size):
+    """Write a PSF image without background, centred."""
+    star = make_psf(fits.getdata(frame), size=int(size), background=0.0, clip_negative=True)
+    print(star.steps[3])
+    fits.writeto(out, star.psf, overwrite=True)
+
+
+def pixel_psf(psf, out):
+    """Write a Chandra PSF of quarter pixels, spread twice over a pixel.
+
+    An event is known to a pixel, wherever in it the photon fell, and the pipeline of 2000 moved
+    each at random within one pixel more (RAND_PIX_SIZE=0.5 in the header's history).
+    """
+    pixel = np.array([0.5, 1, 1, 1, 0.5]) / 4
+    spread = fits.getdata(psf).astype(float)
+    for axis in (0, 1, 0, 1):
+        spread = convolve1d(spread, pixel, axis)
+    fits.writeto(out, spread, overwrite=True)
+
+
+def field(path, out, position, half):
+    """Write a square of an image around a position, with its coordinates."""
+    data, header = fits.getdata(path, header=True)
+    size = 2 * int(half)
+    cut = Cutout2D(data.astype(float), pair(position), size, WCS(header), mode="strict", copy=True)
+    fits.writeto(out, cut.data, cut.wcs.to_header(), overwrite=True)
+
+
+def stars_psf(sci, exptime, out, which="0,1,2,3"):
+    """Write one PSF of the images of the lensed quasar, the residuals of all put back into it.
+
+    The mean of the images, each centred; then, `ROUNDS` times, the stars are fitted with it and
+    what is left at each is moved to the middle and added, weighted by flux: steps of Landweber's
+    to the PSF that fits all of them best.
+    """
+    rates, seconds = (fits.getdata(path).astype(float) for path in (sci, exptime))
+    chosen = [int(s) for s in which.split(",")]
+    side = 2 * HALF + 1
+    psf = np.mean([make_psf(rates, IMAGES[s], side, background=0.0).psf for s in chosen], axis=0)
+    for _ in range(ROUNDS):
+        psf = psf.clip(0) / psf.clip(0).sum()
+        noise = np.sqrt(SKY_VARIANCE)
+        observation = lnocl.Observation(rates * seconds, psf, read_noise=noise, exposure=seconds)
+        fit = lnocl.deconvolve(
+            observation, IMAGES, solver="sgp", n_iter=10, refine_positions=True, pad=4
+        )
+        left = np.divide(
+            observation.images[0] - fit.models()[0],
+            seconds, out=np.zeros_like(rates), where=seconds > 0,
+        )  # fmt: skip
+        left = np.pad(left, 16)
+        for s in chosen:
+            position = fit.star_positions[s]
+            x, y = np.floor(position + 0.5).astype(int)
+            cut = left[y - HALF : y + HALF + 33, x - HALF : x + HALF + 33]
+            by = (np.array([x, y]) - position)[::-1]
+            moved = np.fft.ifft2(fourier_shift(np.fft.fft2(cut), by)).real[16:-16, 16:-16]
+            weight = fit.star_fluxes[s] / (fit.star_fluxes[chosen] ** 2).sum()
+            psf = psf + weight * moved
+    psf = psf.clip(0) / psf.clip(0).sum()
+    fits.writeto(out, psf, overwrite=True)
+
+
+def figures(*paths):
+    """Print what came out: objective, stars, counts of model and data, residuals."""
+    for path in paths:
+        with fits.open(path) as hdus:
+            extended, stars = hdus[0].data, hdus["STARS"].data
+            objective = hdus["HISTORY"].data["objective"][-1]
+            line = f"{path}: objective {objective:.1f}, extended {extended.sum():.1f}"
+            line += f", brightest pixel {extended.max():.4g}"
+            if len(stars):
+                line += f", stars {stars['flux'].sum():.1f}"
+            if "RESIDUALS" in hdus:
+                models, residuals = hdus["MODELS"].data, hdus["RESIDUALS"].data
+                data = models + np.sqrt(models) * np.nan_to_num(residuals)
+                middle = residuals[:, 40:80, 40:80]
+                line += f", model / data {models.sum() / data.sum():.4f}"
+                line += f", residuals' rms {np.sqrt(np.nanmean(residuals**2)):.3f}"
+                if middle.size:
+                    line += f", within [40:80, 40:80] {np.sqrt(np.nanmean(middle**2)):.3f}"
+            print(line)
+            for star in stars:
+                print("  star", ", ".join(f"{name} {star[name]:.6g}" for name in stars.names))
+
+
+def draw(out, *panels):
+    """Draw cut-outs beside each other, each between two levels, in the scale of a square root."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(3.1 * len(panels), 3.5), layout="constrained", dpi=75,
+        squeeze=False,
+    )  # fmt: skip
+    for axis, panel in zip(axes[0], panels, strict=True):
+        title, _, what = panel.partition("=")
+        path, where, low, high = what.rsplit(":", 3)
+        path, _, extension = path.partition(",")
+        data = fits.getdata(path, extension or 0)
+        data = data[0] if data.ndim == 3 else data
+        x, y, half = map(int, where.split(","))
+        y0, x0 = max(y - half, 0), max(x - half, 0)
+        data = data[y0 : y + half, x0 : x + half]
+        vmin, vmax = float(low), float(high)
+        extent = (x0 - 0.5, x0 + data.shape[1] - 0.5, y0 - 0.5, y0 + data.shape[0] - 0.5)
+        if vmin >= 0:
+            data = np.sqrt(np.clip((data - vmin) / (vmax - vmin), 0, 1))
+            vmin, vmax, colours = 0, 1, "inferno"
+        else:
+            colours = "RdBu_r"
+        axis.imshow(data, origin="lower", vmin=vmin, vmax=vmax, cmap=colours, extent=extent)
+        axis.set_title(f"{title}\n{low} to {high}", fontsize=9, pad=4)
+    figure.savefig(out, pil_kwargs={"optimize": True})
+    print(f"wrote {out}")
+
+
+COMMANDS = {
+    "star-psf": star_psf,
+    "centred-psf": centred_psf,
+    "pixel-psf": pixel_psf,
+    "field": field,
+    "stars-psf": stars_psf,
+    "figures": figures,
+    "draw": draw,
+}
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        print(__doc__)
+    elif sys.argv[1] not in COMMANDS:
+        sys.exit(f"real.py: no command {sys.argv[1]}; choose from {', '.join(COMMANDS)}")
+    else:
+        COMMANDS[sys.argv[1]](*sys.argv[2:])

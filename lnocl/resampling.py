@@ -1,0 +1,77 @@
+"""Shifts and rotations of an image by the phase of its Fourier transform."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.ndimage import fourier_shift
+
+Array = NDArray[np.float64]
+
+
+def shift(image: Array, by: tuple[float, float]) -> Array:
+    """Return an image moved by (rows, columns), wrapped round.
+
+    Parameters
+    ----------
+    image : ndarray of float64, shape (ny, nx)
+        Any image.
+    by : tuple of float
+        Pixels.
+    """
+    return np.asarray(fft.ifft2(fourier_shift(fft.fft2(image), by)).real)
+
+
+def rotate(image: Array, angle: float) -> Array:
+    """Return a square image rotated about its middle, pixel ``n // 2`` of both axes.
+
+    Parameters
+    ----------
+    image : ndarray of float64, shape (n, n)
+        Of odd side; what leaves it is wrapped round.
+    angle : float
+        Degrees from the x axis towards the y axis. Multiples of 90 are exact.
+    """
+    quarters, rest = _quarters(angle)
+    turned = np.rot90(image, -quarters)
+    return _shear(turned, rest) if rest else turned
+
+
+def reach(side: int, angle: float) -> int:
+    """Return how far from its middle a square of this side reaches before it is rotated.
+
+    Parameters
+    ----------
+    side : int
+        Pixels.
+    angle : float
+        Degrees.
+    """
+    if angle == 0:
+        return side // 2
+    t = math.radians(abs(_quarters(angle)[1]))
+    return math.ceil(side // 2 * (math.cos(t) + math.sin(t)) - 1e-9)
+
+
+def _quarters(angle: float) -> tuple[int, float]:
+    """Return quarter turns and the rest of an angle, degrees."""
+    quarters = round(angle / 90)
+    return quarters, angle - 90 * quarters
+
+
+def _shear(image: Array, angle: float) -> Array:
+    """Rotate by up to 45 degrees: along x, along y, and along x again."""
+    t = math.radians(angle)
+    n = len(image)
+    k, r = fft.fftfreq(n), np.arange(n) - n // 2
+
+    def along_x(rows: Array, slope: float) -> Array:
+        phase = np.exp(-2j * np.pi * slope * np.multiply.outer(r, k))
+        return np.asarray(fft.ifft(fft.fft(rows, axis=1) * phase, axis=1).real)
+
+    image = along_x(image, -math.tan(t / 2))
+    image = along_x(image.T, math.sin(t)).T
+    return along_x(image, -math.tan(t / 2))

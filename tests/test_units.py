@@ -1,0 +1,273 @@
+"""Astropy's containers through the door: the same as the numbers in electrons, or a clear word."""
+
+import warnings
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.nddata import CCDData, NDData, StdDevUncertainty
+
+import lnocl
+
+PSF = np.array([[0.0, 1.0, 0.0], [1.0, 4.0, 2.0]])
+IMAGES = np.arange(1.0, 49.0).reshape(3, 4, 4)
+MASK = IMAGES % 5 == 0
+TIMES = np.array([10.0, 20.0, 40.0])
+
+
+def observe(**changes):
+    return lnocl.Observation(**({"images": IMAGES, "psfs": PSF} | changes))
+
+
+def assert_same(observation, other):
+    for name, values in vars(other).items():
+        np.testing.assert_array_equal(getattr(observation, name), values)
+        assert type(getattr(observation, name)) is np.ndarray
+
+
+# --- Units of counts
+
+
+@pytest.mark.parametrize(
+    ("unit", "electrons"),
+    [
+        (u.electron, 1.0),
+        (u.photon, 1.0),
+        (u.count, 1.0),
+        (u.electron / u.pix, 1.0),
+        (u.ct / u.pixel, 1.0),
+        (u.dimensionless_unscaled, 1.0),
+        (1024 * u.electron, 1024.0),
+        (u.Unit(1 / 1024), 1 / 1024),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("kind", ["array", "list", "integers"])
+def test_counts(unit, electrons, kind):
+    images = IMAGES.astype(int) if kind == "integers" else IMAGES
+    given = [image * unit for image in images] if kind == "list" else images * unit
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        observation = observe(images=given, background=2 * unit, read_noise=[1, 2, 3] * unit)
+    expected = {"images": electrons * IMAGES, "background": 2 * electrons}
+    assert_same(observation, observe(**expected, read_noise=np.array([1, 2, 3]) * electrons))
+
+
+@pytest.mark.parametrize("per", [1 / u.s, 1 / u.pix / u.s, 60 / u.min])
+@pytest.mark.parametrize(
+    ("exposure", "seconds"),
+    [
+        (TIMES * u.s, TIMES),
+        (TIMES * 1000 * u.ms, TIMES),
+        (list(TIMES * u.s), TIMES),
+        (TIMES, TIMES),
+        (TIMES * u.dimensionless_unscaled, TIMES),
+        (8 * u.s, 8.0),
+        (IMAGES * u.s, IMAGES),
+        (NDData(IMAGES[0] * u.s), IMAGES[0]),
+        (NDData(IMAGES), IMAGES),
+        ([CCDData(image, unit=u.s) for image in IMAGES], IMAGES),
+    ],
+)
+def test_counts_per_time_are_multiplied_by_the_exposure(exposure, seconds, per):
+    each = seconds if np.ndim(seconds) != 1 else seconds[:, None, None]
+    images = IMAGES / 8
+    observation = observe(images=images * u.electron * per, exposure=exposure)
+    assert_same(observation, observe(images=images * each, exposure=seconds))
+
+
+@pytest.mark.parametrize("seconds", [TIMES, IMAGES / 4, 2.0], ids=["each", "map", "one"])
+@pytest.mark.parametrize("rate", [0.5, np.array([0.5, 0.25, 2.0]), IMAGES / 8, IMAGES[2]])
+def test_background_may_be_per_time(rate, seconds):
+    exposed, each = (
+        np.broadcast_to(v[:, None, None] if np.ndim(v) == 1 else v, IMAGES.shape)
+        for v in (seconds, rate)
+    )
+    observation = observe(background=rate * u.ct / u.s, exposure=seconds * u.s)
+    held = observation.background
+    held = held[:, None, None] if held.ndim == 1 else held
+    np.testing.assert_array_equal(np.broadcast_to(held, IMAGES.shape), each * exposed)
+    np.testing.assert_array_equal(observation.images, IMAGES)
+
+
+def test_masked_rates_stay_masked():
+    images = np.where(MASK, np.nan, IMAGES) / u.s * u.electron
+    exposure = np.where(IMAGES == 7, 0.0, 4.0)
+    observation = observe(images=images, mask=MASK, exposure=exposure * u.s)
+    expected = observe(images=4.0 * IMAGES, mask=MASK | (IMAGES == 7), exposure=4.0)
+    np.testing.assert_array_equal(observation.images, expected.images)
+    np.testing.assert_array_equal(observation.mask, expected.mask)
+
+
+# --- NDData
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        NDData(IMAGES, mask=MASK),
+        NDData(IMAGES, mask=MASK, unit=u.electron),
+        NDData(np.ma.array(IMAGES, mask=MASK)),
+        CCDData(IMAGES / 1024, mask=MASK, unit=1024 * u.photon),
+        [CCDData(i, mask=m, unit="electron") for i, m in zip(IMAGES, MASK, strict=True)],
+        tuple(NDData(i, mask=m) for i, m in zip(IMAGES, MASK, strict=True)),
+        [np.ma.array(i, mask=m) for i, m in zip(IMAGES, MASK, strict=True)],
+        [
+            *(NDData(i, mask=m) for i, m in zip(IMAGES[:2], MASK[:2], strict=True)),
+            np.ma.array(IMAGES[2], mask=MASK[2]),
+        ],
+    ],
+)
+def test_nddata_bring_their_mask_and_unit(images):
+    assert_same(observe(images=images), observe(mask=MASK))
+    more = IMAGES[0] > 9
+    assert_same(observe(images=images, mask=more), observe(mask=MASK | more))
+
+
+def test_nddata_without_a_mask_and_with_one_for_all():
+    image = CCDData(IMAGES[0], unit="adu").multiply(2 * u.electron / u.adu)  # the gain
+    assert_same(observe(images=image), observe(images=2 * IMAGES[0]))
+    images = [NDData(IMAGES[0]), NDData(IMAGES[1], mask=MASK[1]), IMAGES[2].tolist()]
+    mask = MASK * np.array([0, 1, 0], bool)[:, None, None]
+    assert_same(observe(images=images), observe(mask=mask))
+    dead = [NDData(IMAGES[0]), NDData(IMAGES[1], mask=True)]
+    np.testing.assert_array_equal(observe(images=dead).mask, [MASK[0] & False, MASK[0] | True])
+
+
+def test_uncertainties_are_not_used():
+    image = CCDData(IMAGES[0], unit="electron", uncertainty=StdDevUncertainty(IMAGES[0]))
+    assert_same(observe(images=image), observe(images=IMAGES[0]))
+
+
+def test_nddata_are_never_modified():
+    image = CCDData(IMAGES[0].copy(), unit="electron", mask=MASK[0].copy())
+    observation = observe(images=image, mask=IMAGES[0] < 5)
+    np.testing.assert_array_equal(image.data, IMAGES[0])
+    np.testing.assert_array_equal(image.mask, MASK[0])
+    assert not np.shares_memory(image.data, observation.images)
+    assert not np.shares_memory(image.mask, observation.mask)
+
+
+@pytest.mark.parametrize(
+    "psfs",
+    [
+        PSF * u.m,
+        NDData(PSF),
+        CCDData(PSF, unit="adu"),
+        [CCDData(PSF, unit="adu")] * 3,
+        [PSF * u.Jy] * 3,
+        [NDData(PSF, mask=PSF == 1)] * 3,
+    ],
+)
+def test_units_of_psfs_do_not_matter(psfs):
+    assert_same(observe(psfs=psfs), observe())
+
+
+@pytest.mark.parametrize("unit", [u.pix, 2 * u.pix])
+def test_offsets_may_be_pixels(unit):
+    offsets = np.array([(0, 0), (1.5, -0.5), (-1, 1)])
+    expected = observe(offsets=offsets * unit.to(u.pix))
+    for given in (offsets * unit, [tuple(pair * unit) for pair in offsets]):
+        assert_same(observe(offsets=given), expected)
+
+
+# --- What is refused
+
+REFUSED = {
+    "images in adu": (
+        {"images": IMAGES * u.adu},
+        "images in adu are no counts: give electrons; multiply by the gain (electrons per adu)",
+    ),
+    "images in adu per second": (
+        {"images": IMAGES * u.adu / u.s, "exposure": 1 * u.s},
+        "images in adu / s are no counts: give electrons; multiply by the gain",
+    ),
+    "images in DN": ({"images": IMAGES * u.DN}, "multiply by the gain (electrons per adu)"),
+    "a list in adu": ({"images": [image * u.adu for image in IMAGES]}, "images in adu are no"),
+    "CCDData in adu": ({"images": CCDData(IMAGES, unit="adu")}, "images in adu are no counts"),
+    "images in jansky": (
+        {"images": IMAGES * u.Jy},
+        "images in Jy are no counts: give electrons per pixel",
+    ),
+    "rates without exposure": (
+        {"images": IMAGES * u.electron / u.s},
+        "images in electron / s are counts per time; give exposure in seconds with them",
+    ),
+    "background in jansky": ({"background": 2 * u.Jy}, "background in Jy are no counts"),
+    "background per time without exposure": (
+        {"background": 2 * u.electron / u.s},
+        "background in electron / s are counts per time; give exposure in seconds with them",
+    ),
+    "background as NDData in adu": (
+        {"background": NDData(IMAGES, unit="adu")},
+        "background in adu are no counts",
+    ),
+    "read noise in adu": ({"read_noise": 2 * u.adu}, "read_noise in adu are no counts"),
+    "read noise per time": (
+        {"read_noise": 2 * u.electron / u.s, "exposure": 2 * u.s},
+        "read_noise in electron / s are counts per time; give electrons",
+    ),
+    "exposure in metres": (
+        {"exposure": 2 * u.m},
+        "exposure in m is no time: give seconds, or numbers without unit",
+    ),
+    "exposures in metres": ({"exposure": [2 * u.m] * 3}, "exposure in m is no time"),
+    "exposures in two units": (
+        {"exposure": [2 * u.s, 2 * u.min, 1 * u.s]},
+        "exposure come in several units (s, min); give them in one",
+    ),
+    "negative exposure": ({"exposure": -2 * u.s}, "exposure must be finite and more than zero; -2"),
+    "offsets in mm": (
+        {"offsets": np.zeros((3, 2)) * u.mm},
+        "offsets in mm are no pixels: give pixels, from the WCS of the images",
+    ),
+    "offsets in arcsec": ({"offsets": [(1 * u.arcsec, 1 * u.arcsec)] * 3}, "offsets in arcsec are"),
+    "several units": (
+        {"images": [CCDData(i, unit=n) for i, n in zip(IMAGES, ("ct", "adu", "ct"), strict=True)]},
+        "images come in several units (ct, adu); give them in one",
+    ),
+    "one without a unit": (
+        {"images": [CCDData(IMAGES[0], unit="electron"), IMAGES[1]]},
+        "images come in several units (electron, None); give them in one",
+    ),
+    "quantities of several units": (
+        {"images": [IMAGES[0] * u.electron, IMAGES[1] * u.ct]},
+        "images come in several units (electron, ct); give them in one",
+    ),
+    "shapes that differ": (
+        {"images": [CCDData(IMAGES[0], unit="ct"), CCDData(IMAGES[1, 1:], unit="ct")]},
+        "images cannot be read as an array: their shapes differ",
+    ),
+    "mask of another shape": (
+        {"images": NDData(IMAGES, mask=MASK[:, 1:])},
+        "images have a mask of shape (3, 3, 4); their data have (3, 4, 4)",
+    ),
+    "psfs in several units": (
+        {"psfs": [PSF * u.m, PSF * u.s, PSF * u.s]},
+        "psfs come in several units (m, s); give them in one",
+    ),
+    "complex counts": ({"images": (IMAGES + 1j) * u.electron}, "images holds complex128"),
+    "rates of strings": ({"images": "1 electron"}, "images"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused(case):
+    changes, message = REFUSED[case]
+    with pytest.raises(lnocl.InputError) as caught:
+        observe(**changes)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_nothing_of_astropy_is_loaded_for_plain_arrays():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, numpy as np, lnocl\n"
+        "lnocl.Observation(np.ones((2, 4, 4)), np.ones((1, 1)), 1.0, [1, 2], None, [1, 2],"
+        " [(0, 0), (1, 0.5)])\n"
+        "assert not [name for name in sys.modules if name.startswith('astropy')]"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
