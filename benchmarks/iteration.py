@@ -101,6 +101,8 @@ def compare_scenes(device, turns, size=1024, n_images=4):
     wide = sides.observation(size, n_images, psf_size=size)
     rng = np.random.default_rng(1)
     stars = [tuple(map(int, rng.integers(0, size, 2))) for _ in range(16)]
+    times, shifts = np.arange(1.0, n_images + 1), rng.uniform(-3, 3, (n_images, 2))
+    exposure = rng.uniform(0.5, 1.5, plain.images.shape)
     scenes = {
         "plain": Scene(plain),
         "1 star": Scene(plain, stars[:1]),
@@ -110,6 +112,10 @@ def compare_scenes(device, turns, size=1024, n_images=4):
         "4 stars, PSFs as large as the images": Scene(wide, stars[:4]),
         "mask": Scene(sides.observation(size, n_images, mask=True)),
         "mu": Scene(plain, mu=1e-6),
+        "1 star between pixels": Scene(plain, [np.add(stars[0], (0.3, -0.4))]),
+        "exposure times": Scene(sides.observation(size, n_images, exposure=times)),
+        "exposure map": Scene(sides.observation(size, n_images, exposure=exposure)),
+        "offsets": Scene(sides.observation(size, n_images, offsets=shifts)),
     }
     named = {name: sides.Lnocl(scene, np.float32, device) for name, scene in scenes.items()}
     named["no objective"] = without_objective(scenes["plain"], device)

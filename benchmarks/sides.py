@@ -20,7 +20,7 @@ from lnocl.solvers import sgp
 WORKERS = os.cpu_count()
 
 
-def observation(size, n_images, psf_size=64, mask=False):
+def observation(size, n_images, psf_size=64, mask=False, **known):
     """Return seeded Poisson images through Gaussian PSFs of different widths."""
     rng = np.random.default_rng(0)
     axis = np.arange(psf_size) - psf_size // 2
@@ -29,7 +29,7 @@ def observation(size, n_images, psf_size=64, mask=False):
     psfs = [np.exp(-(axis**2)[:, None] / w - axis**2 / (2 * w)) + 1e-9 for w in widths]
     images = rng.poisson(100.0, (n_images, size, size))
     bad = rng.random(images.shape) < 0.01 if mask else None
-    return lnocl.Observation(images, np.array(psfs), background=10.0, mask=bad)
+    return lnocl.Observation(images, np.array(psfs), background=10.0, mask=bad, **known)
 
 
 class Lnocl:
