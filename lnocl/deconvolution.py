@@ -242,7 +242,8 @@ def deconvolve(
     Warns
     -----
     LnoclWarning
-        A PSF that is larger than the grid, whose wings wrap round; so many iterations that single
+        A PSF that is larger than the grid, whose wings wrap round; offsets without `pad`; a PSF
+        that rings where it is moved between pixels; so many iterations that single
         precision is expected to stray from double by a thousandth of the extended source; held-out
         counts of images that are not whole counts, or that chose an iteration too near `n_iter`.
 

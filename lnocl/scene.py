@@ -24,6 +24,10 @@ MAX_AXIS = 8192
 # "not observed" (the threshold of Bertero & Boccacci 2005, A&A 437, 369, for boundary effects).
 OBSERVED_SHARE = 0.01
 
+# Of a PSF's peak: what it may ring by, moved by half a pixel, before that is worth a warning.
+# Gaussians ring more where they are narrower than 1.9 pixels.
+MOST_RINGING = 0.01
+
 # The one division guard: where the model is not above this (images have unit mean) the ratio is
 # taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
 LEAST_MODEL = 2.0**-64
@@ -81,7 +85,8 @@ class Scene:
     Warns
     -----
     LnoclWarning
-        A PSF that is larger than the grid, whose wings wrap round.
+        A PSF that is larger than the grid, whose wings wrap round; offsets larger than what is
+        unobserved beside the images; a PSF that rings where it is moved between pixels.
     """
 
     def __init__(
@@ -101,6 +106,7 @@ class Scene:
             log.info("pad: %d pixels, by the PSFs", pad)
         self.grid = _grid(observation.shape, pad)
         self._warn_of_large_psf()
+        self._warn_of_wrapped_offsets()
         self.scale = _scale(observation.images[~observation.mask])
         exposure = observation.exposure
         has_map = exposure.ndim == 3
@@ -117,6 +123,7 @@ class Scene:
         self.weights = self._weigh(relative if has_map else None)
         self.star_weights = self._weigh_stars()
         self._refuse_unseen_stars()
+        self._warn_of_ringing()
 
     def move_stars(self, stars: ArrayLike) -> None:
         """Give the stars other positions, none farther away than the leeway.
@@ -294,6 +301,34 @@ class Scene:
         laid = np.full((*array.shape[:-2], *self.grid), fill, dtype=array.dtype)
         laid[..., :ny, :nx] = array
         return laid
+
+    def _warn_of_wrapped_offsets(self) -> None:
+        offsets = np.ceil(abs(self.observation.offsets).max(axis=0)).astype(int)[::-1]
+        room = np.subtract(self.grid, self.observation.shape)
+        if (offsets > room).any():
+            warnings.warn(
+                f"the images are shifted by up to {offsets.max()} pixels, and what leaves one edge "
+                f"comes in at the opposite one: give pad {offsets.max()}, or auto",
+                LnoclWarning,
+                stacklevel=5,
+            )
+
+    def _warn_of_ringing(self) -> None:
+        """Warn of PSFs that are moved between pixels and are sharper than pixels can hold."""
+        for j, (psf, offset) in enumerate(
+            zip(self.observation.psfs, self.observation.offsets, strict=True)
+        ):
+            moved = np.concatenate([[offset], self.stars + offset])
+            if not self._leeway and (moved == np.round(moved)).all():
+                continue
+            dark = min(psf.min(), 0.0) - place(psf, self.grid, 0.5, 0.5).values.min()
+            if dark > MOST_RINGING * psf.max():
+                warnings.warn(
+                    f"psf {j} is sharper than its pixels can hold: moved between pixels it rings "
+                    f"by up to {dark / psf.max():.1%} of its peak; stars at whole pixels would not",
+                    LnoclWarning,
+                    stacklevel=5,
+                )
 
     def _warn_of_large_psf(self) -> None:
         psf_shape = self.observation.psfs.shape[1:]

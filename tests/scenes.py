@@ -17,6 +17,12 @@ ENGINES = [
     pytest.param({"engine": "opencl", "precision": "single"}, id="opencl-single"),
 ]
 
+# The same where a program is built for each scene, which takes seconds: CI tests double later.
+FEWER_ENGINES = [
+    pytest.param(*e.values, id=e.id, marks=[pytest.mark.exhaustive] if "double" in e.id else [])
+    for e in ENGINES
+]
+
 
 def make_psfs(n_images, shape):
     """Return PSFs that have no symmetry and no two of which are equal, centroids off centre."""

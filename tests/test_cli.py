@@ -435,6 +435,9 @@ class TestFrames:
 
     @pytest.fixture(autouse=True)
     def frames(self, folder):
+        y, x = np.indices((15, 15)) - 7
+        smooth = np.exp(-(x**2 + y**2) / 3.0)  # wide enough to be moved between pixels
+        fits.writeto("psfs.fits", np.array([smooth, smooth.T**1.2]), overwrite=True)
         for j, (dx, dy, exposure) in enumerate([(0.0, 0.0, 30.0), (1.25, -0.5, 60.0)], 1):
             header = self.WCS.copy()
             header["CRPIX1"] += dx

@@ -174,6 +174,9 @@ def test_everything_is_held_in_double(dtype):
     np.testing.assert_array_equal(observation.images, IMAGES.astype(dtype).astype(float) + 1)
 
 
+@pytest.mark.filterwarnings(
+    "ignore:psf . is sharper than its pixels", "ignore:the images are shifted by up to"
+)
 def test_input_is_copied_and_never_modified():
     given = {
         "images": np.where(IMAGES == 7, np.nan, IMAGES - 3.0),

@@ -271,3 +271,58 @@ def test_stars_are_any_sequence_of_pairs(stars):
     result = lnocl.deconvolve(OBSERVATION, stars=stars, n_iter=np.int64(2), engine="numpy")
     assert result.star_fluxes.shape == (len(stars),)
     assert result.device == "numpy"
+
+
+def gaussian(fwhm, size=15):
+    y, x = np.indices((size, size)) - size // 2
+    return np.exp(-4 * np.log(2) * (x**2 + y**2) / fwhm**2)
+
+
+SHARP = "psf 0 is sharper than its pixels can hold: moved between pixels it rings by up to"
+
+
+@pytest.mark.parametrize(
+    ("fwhm", "given", "warned"),
+    [
+        (1.5, {"stars": [(20, 21.5)]}, SHARP),
+        (1.5, {"stars": [(20, 21)], "leeway": 3.0}, SHARP),
+        (1.5, {"stars": [(20, 21)]}, None),
+        (1.5, {}, None),
+        (2.0, {"stars": [(20, 21.5)]}, None),
+    ],
+)
+def test_psf_that_rings_between_pixels_is_warned_of(fwhm, given, warned):
+    observation = lnocl.Observation(np.ones((48, 48)), gaussian(fwhm))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Scene(observation, **given)
+    assert [str(w.message).startswith(str(warned)) for w in caught] == [True] * (warned is not None)
+
+
+def test_what_the_warning_says_of_the_ringing_is_so():
+    observation = lnocl.Observation(np.ones((48, 48)), gaussian(1.5))
+    with pytest.warns(lnocl.LnoclWarning, match="by up to 2.7% of its peak"):
+        scene = Scene(observation, [(20.5, 21.5)])
+    darkest = -scene.star_image(0, 0).min() / observation.psfs.max()
+    assert 0.0265 < darkest < 0.0275
+
+
+@pytest.mark.parametrize(
+    ("shape", "offsets", "pad", "warned"),
+    [
+        ((32, 32), [(0, 0), (2.25, 0)], 0, True),
+        ((32, 32), [(0, 0), (0, -3)], 0, True),
+        ((32, 32), [(0, 0), (0, 0)], 0, False),
+        ((32, 32), [(0, 0), (2.25, 0)], 3, False),
+        ((32, 30), [(0, 0), (2, 0)], 0, False),
+        ((30, 32), [(0, 0), (2, 0)], 0, True),
+    ],
+)
+def test_offsets_that_wrap_round_are_warned_of(shape, offsets, pad, warned):
+    observation = lnocl.Observation(np.ones((2, *shape)), gaussian(3), offsets=offsets)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Scene(observation, pad=pad)
+    expected = [f"by up to {int(np.ceil(np.abs(offsets).max()))} pixels"] if warned else []
+    assert len(caught) == len(expected)
+    assert all(words in str(w.message) for w, words in zip(caught, expected, strict=True))
