@@ -156,6 +156,10 @@ EXHAUSTIVE = {
         "8x128 exposure map, star between pixels",
     ),
     "opencl-double": (
+        "64x256 two stars, map",
+        "64x64 four images, no background",
+        "16x16 three stars, pad, mask",
+        "8x16 three stars, mu, five images",
         "32x16 exposures, two stars between pixels",
         "8x128 exposure map, star between pixels",
     ),

@@ -23,20 +23,20 @@ CANARY = np.frombuffer(b"\xa5" * 64, np.uint8)
 THREE_IMAGES = "three images, two stars, mask, background map"
 CASES = {
     "outer radix 2": ((2, 2), None, "plain", "sd"),
-    "outer radix 4": ((4, 4), None, "plain", "s"),
+    "outer radix 4": ((4, 4), None, "plain", "S"),
     "outer radix 8": ((8, 8), None, "mask, mu", "s"),
-    "radices 4, 4 and 8, 4": ((16, 32), None, THREE_IMAGES, "sd"),
-    "radices 8, 8 and 4, 8, 4": ((64, 128), None, "two images, star, mu", "sd"),
+    "radices 4, 4 and 8, 4": ((16, 32), None, THREE_IMAGES, "sD"),
+    "radices 8, 8 and 4, 8, 4": ((64, 128), None, "two images, star, mu", "Sd"),
     "radices 8, 8, 4": ((256, 16), None, "plain", "S"),
-    "exposure map": ((32, 16), None, "exposure map", "sd"),
+    "exposure map": ((32, 16), None, "exposure map", "sD"),
     "exposure map, group": ((32, 16), Tuning(1, 8, group=4), "exposure map", "S"),
     "radices 8, 8, 8": ((8, 512), None, "plain", "S"),
-    "radices 4, 8, 8, 4, middle pass": ((32, 1024), None, "plain", "sD"),
+    "radices 4, 8, 8, 4, middle pass": ((32, 1024), None, "plain", "SD"),
     "middle pass along y": ((2048, 4), None, "plain", "d"),
     "global scratch": ((8192, 64), Tuning(4, 16), "plain", "s"),
     "several vectors a block": ((64, 32), Tuning(4, 8), "mask, mu", "S"),
     "group": ((64, 32), Tuning(1, 8, group=4), THREE_IMAGES, "sD"),
-    "group, middle pass": ((2048, 16), Tuning(1, 2, group=64), "plain", "d"),
+    "group, middle pass": ((2048, 16), Tuning(1, 2, group=64), "plain", "D"),
     "group, global scratch": ((4096, 64), Tuning(4, 32, group=8), "mask, mu", "S"),
 }
 SCENES = {

@@ -236,6 +236,7 @@ class TestAltair:
             atol=1e-3 * stars[0].psf.max(),
         )  # fmt: skip
 
+    @pytest.mark.exhaustive
     def test_the_example_makes_four_psfs(self, tmp_path):
         """The shell script, with this lnocl in its path."""
         pytest.importorskip("matplotlib")
@@ -326,6 +327,7 @@ def example():
     return module
 
 
+@pytest.mark.exhaustive  # .ci/run runs the scripts anyway
 class TestExamples:
     """What docs/real.md says of examples/*.sh."""
 
