@@ -28,11 +28,10 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.table import Table
+import parts
 from scipy.ndimage import gaussian_filter
 
 import lnocl
-from lnocl.device import choose, describe
 from lnocl.metrics import restoration_error
 from lnocl.simulate import Experiment, fizeau_psf, hh34, simulate
 
@@ -402,19 +401,7 @@ def main():
     parser.add_argument("--output")
     parser.add_argument("--figure", help="with the part edges: where to draw it")
     given = parser.parse_args()
-    rows = []
-    for row in PARTS[given.part](given):
-        print(
-            "  ".join(
-                f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()
-            ),
-            flush=True,
-        )
-        rows.append(row)
-    table = Table(rows)
-    table.meta |= {"device": describe(choose(given.device).device), "lnocl": lnocl.__version__}
-    if given.output:
-        table.write(f"{given.output}-{given.part}.ecsv", overwrite=True)
+    parts.report(PARTS[given.part](given), given.part, given.device, given.output)
 
 
 if __name__ == "__main__":

@@ -26,12 +26,12 @@ from unittest.mock import patch
 
 import astropy.units as u
 import numpy as np
+import parts
 from astropy.table import Table
 from sgp import make
 
 import lnocl
 from lnocl import experiment
-from lnocl.device import choose, describe
 from lnocl.metrics import restoration_error, star_rows
 from lnocl.model import Model
 from lnocl.observation import Observation
@@ -449,19 +449,7 @@ def main():
     if given.part == "figure":
         figure(given.output)
         return
-    rows = []
-    for row in PARTS[given.part](given.device):
-        print(
-            "  ".join(
-                f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()
-            ),
-            flush=True,
-        )
-        rows.append(row)
-    table = Table(rows)
-    table.meta |= {"device": describe(choose(given.device).device), "lnocl": lnocl.__version__}
-    if given.output:
-        table.write(f"{given.output}-{given.part}.ecsv", overwrite=True)
+    parts.report(PARTS[given.part](given.device), given.part, given.device, given.output)
 
 
 if __name__ == "__main__":

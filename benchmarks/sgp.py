@@ -29,13 +29,12 @@ from unittest.mock import patch
 
 import astropy.units as u
 import numpy as np
+import parts
 import sides
 from astropy.io import fits
-from astropy.table import Table
 
 import lnocl
 from lnocl import demo, experiment, heldout
-from lnocl.device import choose, describe
 from lnocl.metrics import restoration_error, star_rows
 from lnocl.model import Model
 from lnocl.scene import Scene
@@ -337,19 +336,9 @@ def main():
     parser.add_argument("--device")
     parser.add_argument("--output")
     given = parser.parse_args()
-    rows = []
-    for row in PARTS[given.part](given.data, given.device):
-        print(
-            "  ".join(
-                f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()
-            ),
-            flush=True,
-        )
-        rows.append(row)
-    table = Table(rows)
-    table.meta |= {"device": describe(choose(given.device).device), "lnocl": lnocl.__version__}
-    if given.output:
-        table.write(f"{given.output}-{given.part}.ecsv", overwrite=True)
+    parts.report(
+        PARTS[given.part](given.data, given.device), given.part, given.device, given.output
+    )
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ class Scene:
         has_map = exposure.ndim == 3
         mean_exposure = float((exposure[~observation.mask] if has_map else exposure).mean())
         self.unit = self.scale / mean_exposure
-        self.mu = float(mu) * self.unit * self.unit / self.scale
+        self.mu = float(mu) * self.unit / mean_exposure
         if self.mu > MOST_MU:
             raise InputError(
                 f"mu {mu:g} is too large for images of about {self.scale:g} electrons per pixel; "
@@ -308,7 +308,7 @@ class Scene:
         if (offsets > room).any():
             warnings.warn(
                 f"the images are shifted by up to {offsets.max()} pixels, and what leaves one edge "
-                f"comes in at the opposite one: give pad {offsets.max()}, or auto",
+                f"comes in at the opposite one: give pad {offsets.max()} or more",
                 LnoclWarning,
                 stacklevel=5,
             )
@@ -319,13 +319,14 @@ class Scene:
             zip(self.observation.psfs, self.observation.offsets, strict=True)
         ):
             moved = np.concatenate([[offset], self.stars + offset])
-            if not self._leeway and (moved == np.round(moved)).all():
+            may_move = self._leeway > 0 and self.n_stars > 0
+            if not may_move and (moved == np.round(moved)).all():
                 continue
             dark = min(psf.min(), 0.0) - place(psf, self.grid, 0.5, 0.5).values.min()
             if dark > MOST_RINGING * psf.max():
                 warnings.warn(
                     f"psf {j} is sharper than its pixels can hold: moved between pixels it rings "
-                    f"by up to {dark / psf.max():.1%} of its peak; stars at whole pixels would not",
+                    f"by up to {dark / psf.max():.1%} of its peak, at whole pixels not",
                     LnoclWarning,
                     stacklevel=5,
                 )

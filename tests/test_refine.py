@@ -14,9 +14,10 @@ from scipy.optimize import minimize
 from scipy.special import kl_div
 
 import lnocl
-from lnocl import refine
+from lnocl import refine, scaling
 from lnocl.model import Model
 from lnocl.refine import RADIUS, StarFit, Stars
+from lnocl.run import Run, Setup
 from lnocl.scene import Scene
 
 # PSFs here are small, and whole offsets periodic.
@@ -494,3 +495,30 @@ def test_discrepancy_knows_where_the_stars_are():
     # Stars are moved after 3 iterations: what is expected after 4 is of where they are then.
     run(solver="sgp", n_iter=4, callback=look)
     assert abs(np.array(ratios) - 1.0).max() <= 1e-12
+
+
+def test_steps_are_measured_anew_where_stars_have_moved(monkeypatch):
+    made, prepared, prepare = RUN.make(), [], scaling.prepare
+
+    def prepare_and_note(*given):
+        prepared.append(prepare(*given))
+        return prepared[-1]
+
+    monkeypatch.setattr(scaling, "prepare", prepare_and_note)
+    setup = Setup(made.stars + OFF, 0, "sgp", "double", "numpy", None, refine_positions=True)
+    run = Run(setup, made.observation(), 0.0, 7)
+    assert list(run) == list(range(1, 8))
+    assert len(prepared) == 3  # at the start, after 3 and after 6
+    assert run.engine.scaling is prepared[-1][1]
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 3.0, 30.0])
+def test_no_step_leads_uphill(share, monkeypatch):
+    """One step at a time, from fluxes and positions far off."""
+    monkeypatch.setattr(refine, "MOST_STEPS", 1)
+    monkeypatch.setattr(refine, "LONGEST_STEP", 6.0)  # far beyond the parabola
+    for name in RECIPES:
+        *_, fit, stars, _ = fit_of(name)
+        for far in np.random.default_rng(0).uniform(-2, 2, (10, *stars.positions.shape)):
+            begin = Stars(share * stars.fluxes, stars.positions + far)
+            assert fit.objective(fit.minimise(begin)) <= fit.objective(begin)

@@ -288,6 +288,7 @@ SHARP = "psf 0 is sharper than its pixels can hold: moved between pixels it ring
         (1.5, {"stars": [(20, 21)], "leeway": 3.0}, SHARP),
         (1.5, {"stars": [(20, 21)]}, None),
         (1.5, {}, None),
+        (1.5, {"leeway": 3.0}, None),
         (2.0, {"stars": [(20, 21.5)]}, None),
     ],
 )

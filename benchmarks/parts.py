@@ -1,0 +1,19 @@
+"""What the benchmarks in parts share: print the rows of a table as they come, and write it."""
+
+from astropy.table import Table
+
+import lnocl
+from lnocl.device import choose, describe
+
+
+def report(rows, part, device, output):
+    """Print rows one by one; with an output write them to OUTPUT-PART.ecsv, the device named."""
+    kept = []
+    for row in rows:
+        words = (f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items())
+        print("  ".join(words), flush=True)
+        kept.append(row)
+    table = Table(kept)
+    table.meta |= {"device": describe(choose(device).device), "lnocl": lnocl.__version__}
+    if output:
+        table.write(f"{output}-{part}.ecsv", overwrite=True)
