@@ -240,8 +240,8 @@ def test_whole_offsets_are_rolled_images(solver):
     other = made.deconvolve(
         made.observation(**rolled, offsets=WHOLE), n_iter=10, solver=solver, **numpy_alone
     )
-    # Measured 4.8e-16 and 1.3e-14, fluxes 1.4e-15: the mean of the rolled map is rounded in another order, and sgp
-    # multiplies that.
+    # Measured 4.8e-16 and 1.3e-14, fluxes 1.4e-15: the mean of the rolled map is rounded in
+    # another order, and sgp multiplies that.
     assert_close(other, result, {"sgm": 1.5e-15, "sgp": 4e-14}[solver], 4e-15, 9e-16)
 
 
