@@ -32,6 +32,7 @@ from machine import bytes_moved, measure, operations
 import lnocl.program
 from lnocl.device import choose, describe
 from lnocl.experiment import observe
+from lnocl.penalty import Penalty
 from lnocl.scene import Scene
 from lnocl.simulate import Experiment, hh34, simulate
 
@@ -111,7 +112,8 @@ def compare_scenes(device, turns, size=1024, n_images=4):
         "1 star, PSFs as large as the images": Scene(wide, stars[:1]),
         "4 stars, PSFs as large as the images": Scene(wide, stars[:4]),
         "mask": Scene(sides.observation(size, n_images, mask=True)),
-        "mu": Scene(plain, mu=1e-6),
+        "mu": Scene(plain, penalty=Penalty(1e-6)),
+        "smoothing": Scene(plain, penalty=Penalty(smoothing=1e-4)),
         "1 star between pixels": Scene(plain, [np.add(stars[0], (0.3, -0.4))]),
         "exposure times": Scene(sides.observation(size, n_images, exposure=times)),
         "exposure map": Scene(sides.observation(size, n_images, exposure=exposure)),
@@ -140,9 +142,11 @@ def compare_steps(device, turns, n_images, size=1024):
     """Return the table of the two solvers' iterations on a real scene with one star."""
     made = simulate(hh34(size), Experiment(angles=np.arange(n_images) * 180.0 / n_images * u.deg))
     scene = Scene(observe(made), made.stars)
+    smoothed = Scene(observe(made), made.stars, Penalty(smoothing=1e-4))
     named = {
         "sgm": sides.Lnocl(scene, np.float32, device),
         "sgp": sides.Steps(scene, np.float32, device),
+        "sgp, smoothed": sides.Steps(smoothed, np.float32, device),
     }
     return rows("step", size, n_images, np.float32, list(named), take_turns(named, turns))
 

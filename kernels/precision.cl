@@ -11,7 +11,8 @@
  *   NX, NY          the grid, powers of two from 2 to 8192; BLOCK divides NX / 2 and NY / 2
  *   ROWS            rows that a block of spectra takes in memory: NY and some padding
  *   N_IMAGES, N_STARS
- *   HAS_MU, HAS_WEIGHTS, HAS_BACKGROUND_MAP, HAS_EXPOSURE_MAP    0 or 1: what the scene has
+ *   HAS_MU, HAS_SMOOTHING, HAS_WEIGHTS, HAS_BACKGROUND_MAP, HAS_EXPOSURE_MAP    0 or 1: what the
+ *                   scene has
  *   LEAST_MODEL     the division guard
  *
  * Layouts, in reals, the last index fastest:

@@ -15,12 +15,13 @@ INLINE cvec inverse_weight_at(__global const vec *inverse_weight, const int pixe
 #endif
 }
 
-/* f <- f (1 + a c) / (1 + mu f a), c = sum_j A_j^T (r_j - w_j), a = 1 / sum_j A_j^T w_j, and 1 + a c
- * not below 0;
+/* f <- f (1 + a u) / (1 + (mu + curvature) f a), u = c + curvature f - slope,
+ * c = sum_j A_j^T (r_j - w_j), a = 1 / sum_j A_j^T w_j, and 1 + a u not below 0;
  * spectra <- row spectrum of the new f; sums: sum f^2; c_s <- c_s star_corrections_s.
  * spectra: one array, in: row spectrum of c, out: twice the row spectrum of f.
  * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; where
- * there are none a = 1 / N_IMAGES). sums: [ROW_BLOCKS][2] (HAS_MU).
+ * there are none a = 1 / N_IMAGES). slope, curvature: one array of pixels each, const, those of f
+ * (HAS_SMOOTHING; else they count as 0). sums: [ROW_BLOCKS][2] (HAS_MU).
  * star_fluxes, star_corrections: [N_STARS].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.scale_rows.
  */
@@ -28,7 +29,7 @@ KERNEL void scale_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
     __global real *restrict sums, __global real *restrict star_fluxes,
     __global const vec *restrict inverse_weight, __global const real *restrict star_corrections,
-    const real mu, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global const vec *restrict slope, __global const vec *restrict curvature, const real mu, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
@@ -48,11 +49,19 @@ KERNEL void scale_rows(
                 const int pixel = q * INNER(NX) + x;
                 const cvec f = LOAD(source + lane, pixel);
                 const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel);
+                const cvec bend = smoothing_at(curvature + at + lane, pixel);
+#if HAS_SMOOTHING
+                const cvec down = smoothing_at(slope + at + lane, pixel);
+                a[q].re += bend.re * f.re - down.re;
+                a[q].im += bend.im * f.im - down.im;
+#endif
                 a[q].re = f.re * not_below_0(1 + weight.re * a[q].re);
                 a[q].im = f.im * not_below_0(1 + weight.im * a[q].im);
+#if HAS_PENALTY
+                a[q].re /= 1 + penalty_weight(mu, bend.re) * f.re * weight.re;
+                a[q].im /= 1 + penalty_weight(mu, bend.im) * f.im * weight.im;
+#endif
 #if HAS_MU
-                a[q].re /= 1 + mu * f.re * weight.re;
-                a[q].im /= 1 + mu * f.im * weight.im;
                 part += a[q].re * a[q].re + a[q].im * a[q].im;
 #endif
                 STORE(source + lane, pixel, a[q]);

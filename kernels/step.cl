@@ -1,45 +1,44 @@
 /* A step of the scaled gradient projection method, inside the transforms along the rows. */
 
-/* D = (f + z) a / (1 + mu (f + z) a): a split gradient's own scaling, shifted by z. */
-INLINE vec scaling(const vec f, const vec shift, const vec weight, const real mu)
+/* D = (f + z) a / (1 + (mu + curvature) (f + z) a): a split gradient's own scaling, shifted by z. */
+INLINE vec scaling_of(
+    const vec f, const vec shift, const vec weight, const vec curvature, const real mu)
 {
     const vec scaled = (f + shift) * weight;
-#if HAS_MU
-    return scaled / (1 + mu * scaled);
+#if HAS_PENALTY
+    return scaled / (1 + penalty_weight(mu, curvature) * scaled);
 #else
     return scaled;
 #endif
 }
 
-/* y = gradient' - gradient, and its share of the sums <D y, s> and <D y, D y>. */
-INLINE vec next_gradient(
-    const vec gradient, const vec correction, const vec f, const vec previous, const vec d,
-    const real mu, vec *change_step, vec *change_change)
+/* mu f + slope - c. */
+INLINE vec next_gradient(const vec correction, const vec f, const vec slope, const real mu)
 {
-#if HAS_MU
-    const vec next = mu * f - correction;
+#if HAS_SMOOTHING
+    return mu * f + slope - correction;
+#elif HAS_MU
+    return mu * f - correction;
 #else
-    const vec next = -correction;
+    return -correction;
 #endif
-    const vec change = d * (next - gradient);
-    *change_step += change * (f - previous);
-    *change_change += change * change;
-    return next;
 }
 
-/* gradient' = mu f - c, c = sum_j A_j^T (r_j - w_j); previous' = f;
- * sums: <D y, s> and <D y, D y>, y = gradient' - gradient, s = f - previous, with the scaling
- * D = (f + shift) a / (1 + mu (f + shift) a), a = 1 / sum_j A_j^T w_j.
+/* gradient' = mu f + slope - c, c = sum_j A_j^T (r_j - w_j); previous' = f;
+ * scaling' = D = (f + shift) a / (1 + (mu + curvature) (f + shift) a), a = 1 / sum_j A_j^T w_j;
+ * sums: <D y, s> and <D y, D y>, y = gradient' - gradient, s = f - previous.
  * spectra: one array, const, row spectrum of c. extended (f), shift: one array of pixels each,
- * const; gradient, previous: one each, updated. inverse_weight: one array of pixels, a
- * (HAS_WEIGHTS; where there are none a = 1 / N_IMAGES). sums: [ROW_BLOCKS][2][2].
+ * const; gradient, previous: one each, updated; scaling: one, written. inverse_weight: one array of
+ * pixels, a (HAS_WEIGHTS; where there are none a = 1 / N_IMAGES). slope, curvature: one array of
+ * pixels each, const, those of f (HAS_SMOOTHING; else they count as 0). sums: [ROW_BLOCKS][2][2].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.gradient_rows.
  */
 KERNEL void gradient_rows(
     __global const vec *restrict spectra, __global real *restrict sums,
     __global vec *restrict gradient, __global vec *restrict previous,
-    __global const vec *restrict extended, __global const vec *restrict shift,
-    __global const vec *restrict inverse_weight, const real mu,
+    __global vec *restrict scaling, __global const vec *restrict extended,
+    __global const vec *restrict shift, __global const vec *restrict inverse_weight,
+    __global const vec *restrict slope, __global const vec *restrict curvature, const real mu,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
@@ -60,16 +59,24 @@ KERNEL void gradient_rows(
                 const cvec f = LOAD(extended + at + lane, pixel);
                 const cvec before = LOAD(previous + at + lane, pixel);
                 const cvec seen = LOAD(shift + at + lane, pixel);
-                cvec g = LOAD(gradient + at + lane, pixel);
+                const cvec g = LOAD(gradient + at + lane, pixel);
                 const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel);
-                g.re = next_gradient(
-                    g.re, a[q].re, f.re, before.re, scaling(f.re, seen.re, weight.re, mu), mu,
-                    &step_part, &change_part);
-                g.im = next_gradient(
-                    g.im, a[q].im, f.im, before.im, scaling(f.im, seen.im, weight.im, mu), mu,
-                    &step_part, &change_part);
-                STORE(gradient + at + lane, pixel, g);
+                const cvec down = smoothing_at(slope + at + lane, pixel);
+                const cvec bend = smoothing_at(curvature + at + lane, pixel);
+                const cvec d = {
+                    scaling_of(f.re, seen.re, weight.re, bend.re, mu),
+                    scaling_of(f.im, seen.im, weight.im, bend.im, mu)
+                };
+                const cvec next = {
+                    next_gradient(a[q].re, f.re, down.re, mu),
+                    next_gradient(a[q].im, f.im, down.im, mu)
+                };
+                const cvec change = {d.re * (next.re - g.re), d.im * (next.im - g.im)};
+                step_part += change.re * (f.re - before.re) + change.im * (f.im - before.im);
+                change_part += change.re * change.re + change.im * change.im;
+                STORE(gradient + at + lane, pixel, next);
                 STORE(previous + at + lane, pixel, f);
+                STORE(scaling + at + lane, pixel, d);
             }
             ACCUMULATE(change_step, step_part);
             ACCUMULATE(change_change, change_part);
@@ -82,9 +89,9 @@ KERNEL void gradient_rows(
 
 /* d = P(f - alpha D gradient) - f, P the projection on f >= 0; extended = f + share d;
  * spectra <- row spectrum of extended; sums: <gradient, d> and <reach_s, d>;
- * squares: sum extended^2. D as in gradient_rows.
+ * squares: sum extended^2.
  * spectra: one array, out: twice the row spectrum. extended: one array of pixels, written.
- * previous (f), gradient, shift: one each, const. inverse_weight: as in gradient_rows.
+ * previous (f), gradient, scaling (D): one each, const.
  * reach: N_STARS arrays of pixels. sums: [ROW_BLOCKS][N_SUMS][2]; squares: [ROW_BLOCKS][2] (HAS_MU).
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.step_rows.
  */
@@ -92,8 +99,8 @@ KERNEL void step_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
     __global real *restrict sums, __global real *restrict squares,
     __global const vec *restrict previous, __global const vec *restrict gradient,
-    __global const vec *restrict shift, __global const vec *restrict inverse_weight,
-    __global const vec *restrict reach, const real mu, const real alpha, const real share,
+    __global const vec *restrict scaling, __global const vec *restrict reach,
+    const real alpha, const real share,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
@@ -113,11 +120,10 @@ KERNEL void step_rows(
                 const int pixel = q * INNER(NX) + x;
                 const cvec f = LOAD(previous + at + lane, pixel);
                 const cvec g = LOAD(gradient + at + lane, pixel);
-                const cvec seen = LOAD(shift + at + lane, pixel);
-                const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel);
+                const cvec scale = LOAD(scaling + at + lane, pixel);
                 const cvec d = {
-                    not_below_0(f.re - alpha * scaling(f.re, seen.re, weight.re, mu) * g.re) - f.re,
-                    not_below_0(f.im - alpha * scaling(f.im, seen.im, weight.im, mu) * g.im) - f.im
+                    not_below_0(f.re - alpha * scale.re * g.re) - f.re,
+                    not_below_0(f.im - alpha * scale.im * g.im) - f.im
                 };
                 parts[0] += g.re * d.re + g.im * d.im;
                 for (int s = 0; s < N_STARS; ++s) {

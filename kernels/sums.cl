@@ -86,18 +86,19 @@ INLINE real_sum sum_pairs(__global const real *pairs, const int n, const int str
 
 #define N_SUMS (1 + N_STARS)
 
-/* objective = sum of the data terms + mu / 2 sum f^2;
+/* objective = sum of the data terms + mu / 2 sum f^2 + the edge-preserving term;
  * star_corrections_s = 1 + sum <P_js, r_j - w_j> / star_weights_s, not below 0 (negative PSF
  * pixels).
  * objectives: [iterations][2], a compensated pair each; entry `iteration` is written.
- * ratio_sums: [ROW_BLOCKS][N_IMAGES][N_SUMS][2]; square_sums: [ROW_BLOCKS][2].
+ * ratio_sums: [ROW_BLOCKS][N_IMAGES][N_SUMS][2]; square_sums (HAS_MU), smooth_sums
+ * (HAS_SMOOTHING): [ROW_BLOCKS][2].
  * star_corrections, star_weights: [N_STARS].
  * Launch: one group. Out of place. Twin: reference.collect_sums.
  */
 KERNEL void collect_sums(
     __global real *restrict objectives, __global real *restrict star_corrections,
     __global const real *restrict ratio_sums, __global const real *restrict square_sums,
-    __global const real *restrict star_weights, const real mu, const int iteration)
+    __global const real *restrict smooth_sums, __global const real *restrict star_weights, const real mu, const int iteration)
 {
     SHARED_SUMS(shared);
     const int n = ROW_BLOCKS * N_IMAGES;
@@ -107,6 +108,10 @@ KERNEL void collect_sums(
     squares.sum *= mu / 2;
     squares.lost *= mu / 2;
     MERGE(objective, squares);
+#endif
+#if HAS_SMOOTHING
+    const real_sum smooth = sum_group(sum_pairs(smooth_sums, ROW_BLOCKS, 2), shared);
+    MERGE(objective, smooth);
 #endif
     store_pair(objectives + 2 * iteration, objective);
     for (int s = 0; s < N_STARS; ++s) {

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from lnocl.errors import InputError, LnoclWarning
-from lnocl.heldout import CURVE_DTYPE, Choice, choose
+from lnocl.heldout import CURVE_DTYPE, Choice, Grid, choose, several_mu, several_smoothings
 from lnocl.observation import Array, Observation, numbers
+from lnocl.penalty import Penalty
 from lnocl.run import Run, Setup
-from lnocl.scene import check_mu
 from lnocl.solvers import SOLVERS
 from lnocl.stopping import Rule, make_rule
 
@@ -109,9 +109,11 @@ class Result:
         The objective J after each iteration, from iteration 0, the start.
     mu : float
         Weight of the Tikhonov term, as given or as chosen.
-    held_out : ndarray, fields ``mu``, ``iteration`` and ``error`` (float64, int64, float64)
+    smoothing : float
+        Weight of the edge-preserving term, as given or as chosen.
+    held_out : ndarray, fields ``mu``, ``smoothing``, ``iteration`` (int64) and ``error``
         Where held-out counts were asked: the relative error of the extended source that they
-        estimate, for each mu and iteration looked at; else empty.
+        estimate, for each penalty and iteration looked at; else empty.
     """
 
     extended: Array
@@ -124,6 +126,7 @@ class Result:
     device: str
     history: NDArray[np.void]
     mu: float
+    smoothing: float
     held_out: NDArray[np.void]
     _models: Callable[[], Array] = field(repr=False, compare=False)
     _observation: Observation = field(repr=False, compare=False)
@@ -165,12 +168,14 @@ def deconvolve(
     callback: Callback | None = None,
     progress: bool = False,
     refine_positions: bool = False,
+    smoothing: float | str = 0.0,
 ) -> Result:
     """Reconstruct the sky from several images as stars plus an extended source.
 
-    Minimises ``J = sum_j sum_n [g_j ln(g_j / m_j) + m_j - g_j] + mu / 2 sum f^2`` over the star
-    fluxes c and the extended source f, with ``m_j = K_j * f + sum_s c_s P_js + b_j``, stopped
-    after `n_iter` iterations. The split-gradient method without stars and with ``mu = 0`` is
+    Minimises ``J = sum_j sum_n [g_j ln(g_j / m_j) + m_j - g_j] + mu / 2 sum f^2`` and, for
+    `smoothing`, ``+ smoothing sum [sqrt((f - f')^2 + delta^2) - delta]`` over pairs of neighbours,
+    over the star fluxes c and the extended source f, with ``m_j = K_j * f + sum_s c_s P_js + b_j``,
+    stopped after `n_iter` iterations. The split-gradient method without stars and penalties is
     Richardson-Lucy for several images; the scaled gradient projection method needs a tenth of its
     iterations and less.
 
@@ -224,6 +229,12 @@ def deconvolve(
         Move the stars to where they are most likely, at most 3 pixels away, by Fisher scoring of
         all fluxes and positions with the extended source held fixed: at the start and after 3, 6,
         12, 24 ... iterations (`lnocl.refine`).
+    smoothing : float or "auto", optional
+        Weight of an edge-preserving term (`lnocl.penalty.Penalty`), zero or more, without unit;
+        delta is three times the mean of the extended source. It keeps the noise down that grows
+        with the iterations, most of all beside bright stars; 1e-4 to 1e-3 for stars a hundred times
+        as bright as what is beside them (docs/sgp.md). "auto": 0 or one of five values, whichever
+        held-out counts choose (see Notes).
 
     Returns
     -------
@@ -233,8 +244,9 @@ def deconvolve(
     Raises
     ------
     InputError
-        A parameter out of its range or too large for the precision, a star outside the images,
-        no such device, or a device for the reference; held-out counts of images that hold none.
+        A parameter out of its range or too large for the precision, mu and smoothing both "auto",
+        a star outside the images, no such device, or a device for the reference; held-out counts
+        of images that hold none.
     DeviceError
         No OpenCL device at all, too little memory on it, no double precision, or a compiler that
         fails.
@@ -277,18 +289,21 @@ def deconvolve(
     >>> (result.extended.sum() + result.star_fluxes.sum()).round(6)
     np.float64(612.0)
     """
-    _check_choices(mu, solver, n_iter, stop, precision, engine, device)
+    _check_choices(solver, n_iter, stop, precision, engine, device)
+    penalty, grid = _penalties(mu, smoothing)
     if engine == "opencl" and precision == "single":
         _warn_of_straying(int(n_iter))
     setup = Setup(stars, pad, solver, precision, engine, device, refine_positions)
     bar = _Bar(int(n_iter), progress)
     with bar:
-        if isinstance(mu, str) or stop == "held-out":
-            choice = _choose(setup, observation, mu, stop, int(n_iter), initial_extended, bar)
+        if grid is not None or stop == "held-out":
+            choice = _choose(
+                setup, observation, penalty, grid, stop, int(n_iter), initial_extended, bar
+            )
         else:
-            choice = Choice(mu, int(n_iter), np.zeros(0, CURVE_DTYPE))
+            choice = Choice(penalty, int(n_iter), np.zeros(0, CURVE_DTYPE))
         run = Run(
-            setup, observation, choice.mu, choice.n_iter, initial_extended, initial_star_fluxes
+            setup, observation, choice.penalty, choice.n_iter, initial_extended, initial_star_fluxes
         )
         bar.expect(choice.n_iter)
         stop_reason = _iterate(run, choice.n_iter, make_rule(stop), callback, bar)
@@ -297,8 +312,21 @@ def deconvolve(
     return _wrap_up(run, stop_reason, choice)
 
 
+def _penalties(mu: Any, smoothing: Any) -> tuple[Penalty, Grid | None]:
+    """Return the penalty, the least one where there are several, and what makes the others."""
+    for name, weight in (("mu", mu), ("smoothing", smoothing)):
+        if isinstance(weight, str) and weight != "auto":
+            raise InputError(f"{name} {weight!r} is not known; give a number or auto")
+    if isinstance(mu, str) and isinstance(smoothing, str):
+        raise InputError("mu and smoothing cannot both be auto; give one of them as a number")
+    if isinstance(mu, str):
+        return Penalty(0.0, smoothing), several_mu(smoothing)
+    if isinstance(smoothing, str):
+        return Penalty(mu, 0.0), several_smoothings(mu)
+    return Penalty(mu, smoothing), None
+
+
 def _check_choices(
-    mu: object,
     solver: str,
     n_iter: object,
     stop: object,
@@ -314,10 +342,6 @@ def _check_choices(
     for name, (value, known) in choices.items():
         if value not in known:
             raise InputError(f"{name} {value!r} is not known; choose from {', '.join(known)}")
-    if not isinstance(mu, str):
-        check_mu(mu)
-    elif mu != "auto":
-        raise InputError(f"mu {mu!r} is not known; give a number or auto")
     if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
         raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")
     is_change = isinstance(stop, Real) and 0 < float(stop) < 1
@@ -371,20 +395,22 @@ class _Bar:
 def _choose(
     setup: Setup,
     observation: Observation,
-    mu: Any,
+    penalty: Penalty,
+    grid: Grid | None,
     stop: object,
     n_iter: int,
     initial_extended: ArrayLike | None,
     bar: _Bar,
 ) -> Choice:
-    """Have held-out counts choose mu and the number of iterations, or one of them."""
+    """Have held-out counts choose the penalty and the number of iterations, or one of them."""
     half = None
     if initial_extended is not None:
         half = numbers("initial_extended", initial_extended) / 2.0
     return choose(
         partial(Run, setup, n_iter=n_iter, initial_extended=half),
         observation,
-        None if mu == "auto" else np.array([mu]),
+        penalty,
+        grid,
         n_iter,
         stop != "held-out",
         lambda words: bar.show(0, lambda: words),
@@ -425,7 +451,8 @@ def _wrap_up(run: Run, stop_reason: str, choice: Choice) -> Result:
         stop_reason=stop_reason,
         device=run.engine.name,
         history=history,
-        mu=choice.mu,
+        mu=choice.penalty.mu,
+        smoothing=choice.penalty.smoothing,
         held_out=choice.curve,
         _models=run.models(),
         _observation=run.scene.observation,

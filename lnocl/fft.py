@@ -240,6 +240,10 @@ class Launcher:
         arguments = (*arguments, self._column_roots, self._scratch)
         return self._bind(name, self.program.column_blocks, arguments)
 
+    def blocks(self, name: str, *arguments: Any) -> Launch:
+        """Bind a kernel over the blocks of rows of one array that transforms nothing."""
+        return self._bind(name, self.program.row_blocks, arguments)
+
     def one_group(self, name: str, *arguments: Any) -> Launch:
         """Bind a kernel on one work-group."""
         return self._bind(name, 1, arguments)

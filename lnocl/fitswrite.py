@@ -140,8 +140,8 @@ def write_result(
 
     The primary HDU holds the extended source, the table ``STARS`` the columns x, y, flux and what
     else is given, the table ``HISTORY`` iteration and objective, the table ``CURVE`` iteration,
-    rho, rho_star and magnitude, the table ``HELDOUT`` mu, iteration and error. All have CHECKSUM
-    and DATASUM.
+    rho, rho_star and magnitude, the table ``HELDOUT`` mu, smoothing, iteration and error. All have
+    CHECKSUM and DATASUM.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def write_result(
         Whether an existing file may be replaced.
     curve : ndarray with fields ``iteration``, ``rho``, ``rho_star`` and ``magnitude``, optional
         Restoration errors and magnitude of the star, where the truth is known.
-    held_out : ndarray with fields ``mu``, ``iteration`` and ``error``, optional
+    held_out : ndarray with fields ``mu``, ``smoothing``, ``iteration`` and ``error``, optional
         Relative errors that held-out counts estimate, where they were asked.
     per_second : bool, optional
         Whether extended source and fluxes are electrons per second.

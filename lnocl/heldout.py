@@ -1,4 +1,4 @@
-"""Iterations and mu chosen by held-out counts: two reconstructions, each judged by the other.
+"""Iterations and penalty chosen by held-out counts: two reconstructions, each judged by the other.
 
 Each count goes to one of two halves of the observation, by the toss of a coin, which makes them
 two independent Poisson observations of the same sky. Both are reconstructed side by side. With A_k
@@ -26,9 +26,17 @@ from numpy.typing import NDArray
 
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.observation import Array, Observation
+from lnocl.penalty import Penalty
 from lnocl.run import Run
 
-CURVE_DTYPE = np.dtype([("mu", np.float64), ("iteration", np.int64), ("error", np.float64)])
+CURVE_DTYPE = np.dtype(
+    [
+        ("mu", np.float64),
+        ("smoothing", np.float64),
+        ("iteration", np.int64),
+        ("error", np.float64),
+    ]
+)
 
 # The last iteration is taken whose error is within a tenth of the least: near a star the estimate
 # goes on improving long after the rest. The least squared error is taken to be the noise alone;
@@ -46,10 +54,13 @@ FORGOTTEN = 1.0 / 3.0
 # mu in units of p over the largest value of the extended source, at which the Tikhonov term takes
 # half of the brightest pixel.
 MU_GRID = 10.0 ** np.arange(-3.0, 0.1, 0.5)
+# The weight of the edge-preserving term in units of the noise of the gradient of the data term.
+SMOOTHING_GRID = 10.0 ** np.arange(-1.5, 0.6, 0.5)
 MOST_COUNTS = 2.0**62
 
 Estimate = NDArray[np.float32]
-BeginHalf = Callable[[Observation, float], Run]
+BeginHalf = Callable[[Observation, Penalty], Run]
+Grid = Callable[[Observation, float], list[Penalty]]
 
 
 @dataclass
@@ -58,15 +69,15 @@ class Choice:
 
     Attributes
     ----------
-    mu : float
-        Weight of the Tikhonov term.
+    penalty : Penalty
+        On the extended source.
     n_iter : int
         Iterations.
-    curve : ndarray, fields ``mu``, ``iteration`` and ``error``
+    curve : ndarray, fields ``mu``, ``smoothing``, ``iteration`` and ``error``
         Estimated relative error of the extended source, ``||f - truth|| / ||truth||``.
     """
 
-    mu: float
+    penalty: Penalty
     n_iter: int
     curve: NDArray[np.void]
 
@@ -90,10 +101,13 @@ def halve(observation: Observation, ways: int = 1) -> list[tuple[Observation, Ob
     """
     images = np.where(observation.mask, 0.0, observation.images)
     if not images.any():
-        raise InputError("the images hold no counts to hold out; give n_iter and mu")
+        raise InputError(
+            "the images hold no counts to hold out; give n_iter, mu and smoothing as numbers"
+        )
     if images.max() > MOST_COUNTS:
         raise InputError(
-            f"a pixel of {images.max():.3g} electrons cannot be dealt out; give n_iter and mu"
+            f"a pixel of {images.max():.3g} electrons cannot be dealt out; give n_iter, mu and "
+            "smoothing as numbers"
         )
     whole = np.floor(images)
     if (whole != images).any():
@@ -134,8 +148,39 @@ def _quiet() -> Iterator[None]:
 Pair = tuple[Estimate, Estimate]
 
 
+def several_mu(smoothing: float) -> Grid:
+    """Return what makes the penalties to choose mu from, once the brightest pixel is known."""
+
+    def grid(observation: Observation, brightest: float) -> list[Penalty]:
+        total = observation.exposure.sum(axis=0).max()
+        return [Penalty(mu, smoothing) for mu in MU_GRID * total / brightest]
+
+    return grid
+
+
+def several_smoothings(mu: float) -> Grid:
+    """Return what makes the penalties to choose the smoothing from.
+
+    They are measured by the standard deviation of the gradient of the data term where only counts
+    vary, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, < > the mean over the pixels observed.
+    """
+
+    def grid(observation: Observation, brightest: float) -> list[Penalty]:
+        relative = observation.exposure
+        if relative.ndim == 1:
+            relative = relative[:, None, None]
+        variance = np.ma.masked_array(
+            relative**2 / np.maximum(observation.images, 1.0), observation.mask
+        ).mean(axis=(1, 2))
+        squares = (observation.psfs**2).sum(axis=(1, 2))
+        noise = float(np.sqrt((variance * squares).sum()))
+        return [Penalty(mu, smoothing) for smoothing in SMOOTHING_GRID * noise]
+
+    return grid
+
+
 class _Trial:
-    """The runs of all pairs of halves at one mu, and their estimates at some iterations."""
+    """The runs of all pairs of halves at one penalty, and their estimates at some iterations."""
 
     def __init__(self, runs: Sequence[tuple[Run, Run]]) -> None:
         self._runs = runs
@@ -194,26 +239,30 @@ def _flat(run: Run) -> Estimate:
 def choose(
     begin: BeginHalf,
     observation: Observation,
-    mus: Array | None,
+    penalty: Penalty,
+    grid: Grid | None,
     n_iter: int,
     at_end: bool,
     report: Callable[[str], None],
 ) -> Choice:
-    """Return the mu and the number of iterations that held-out counts choose.
+    """Return the penalty and the number of iterations that held-out counts choose.
 
     Parameters
     ----------
     begin : callable
-        ``begin(observation, mu)`` begins a run of at most `n_iter` iterations.
+        ``begin(observation, penalty)`` begins a run of at most `n_iter` iterations.
     observation : Observation
         What is to be reconstructed.
-    mus : ndarray of float64, or None
-        The weights to choose from; None for `MU_GRID` and 0.
+    penalty : Penalty
+        The least, or the only one.
+    grid : callable, optional
+        ``grid(observation, brightest)`` makes the others to choose from, growing; `several_mu` or
+        `several_smoothings`.
     n_iter : int
         Iterations at most.
     at_end : bool
-        Whether the reconstruction will go on to `n_iter`, and mu is to be the best there; else
-        each mu has its own number of iterations.
+        Whether the reconstruction will go on to `n_iter`, and the penalty is to be the best there;
+        else each penalty has its own number of iterations.
     report : callable
         Told in a few words how far it is.
 
@@ -228,21 +277,20 @@ def choose(
         Images that are not whole counts; an iteration chosen too near `n_iter`.
     """
     halves = halve(observation, SPLITS)
-    pending = [0.0] if mus is None else sorted(float(mu) for mu in mus)
+    pending = [penalty]
     trials: list[_Judged] = []
     while pending:
-        mu = pending.pop(0)
+        penalty = pending.pop(0)
         with _quiet():
-            # A half has half the data term and a quarter of the squares.
-            trial = _Trial([(begin(a, 2.0 * mu), begin(b, 2.0 * mu)) for a, b in halves])
-        judged = _follow(trial, mu, at_end, trials[0] if trials else None, report)
+            halved = penalty.of_half()
+            trial = _Trial([(begin(a, halved), begin(b, halved)) for a, b in halves])
+        judged = _follow(trial, penalty, at_end, trials[0] if trials else None, report)
         trials.append(judged)
         if judged.error > (1.0 + WITHIN) * min(trial.error for trial in trials):
-            break  # mu grows, and is too large already
-        if mus is None and len(trials) == 1:
+            break  # the penalty grows, and is too large already
+        if grid is not None and len(trials) == 1:
             brightest = 2.0 * max(float(half.max()) for half in trial.end[0])
-            total = observation.exposure.sum(axis=0).max()
-            pending = list(MU_GRID * total / brightest) if brightest > 0 else []
+            pending = grid(observation, brightest) if brightest > 0 else []
     best = min(trials, key=lambda trial: trial.error)
     if not at_end and AS_LONG_AGAIN * best.n_iter > n_iter:
         warnings.warn(
@@ -252,14 +300,14 @@ def choose(
             stacklevel=4,
         )
     curve = np.concatenate([trial.curve for trial in trials])
-    return Choice(best.mu, n_iter if at_end else best.n_iter, curve)
+    return Choice(best.penalty, n_iter if at_end else best.n_iter, curve)
 
 
 @dataclass
 class _Judged:
     """What a trial has come to: the error where the reconstruction would end, and who judged."""
 
-    mu: float
+    penalty: Penalty
     n_iter: int
     error: float
     curve: NDArray[np.void]
@@ -270,7 +318,7 @@ class _Judged:
 
 def _follow(
     trial: _Trial,
-    mu: float,
+    penalty: Penalty,
     at_end: bool,
     first: _Judged | None,
     report: Callable[[str], None],
@@ -281,13 +329,15 @@ def _follow(
         least = int(np.argmin(excess))
         allowed = ((1.0 + WITHIN) ** 2 - 1.0) * trial.noise(least)
         chosen = trial.iterations[np.flatnonzero(excess <= excess[least] + allowed)[-1]]
-        report(f"held-out counts, mu {mu:.2g}: iteration {chosen} of {iteration}")
+        weights = f"mu {penalty.mu:.2g}, smoothing {penalty.smoothing:.2g}"
+        report(f"held-out counts, {weights}: iteration {chosen} of {iteration}")
         if not at_end and iteration >= max(FEWEST, AS_LONG_AGAIN * chosen):
             break
         trial.forget(min(FORGOTTEN * chosen, trial.iterations[least]))
     if not trial.kept:
         raise InputError(
-            "half of the counts is too little: no iteration betters the start; give n_iter and mu"
+            "half of the counts is too little: no iteration betters the start; give n_iter, mu and "
+            "smoothing as numbers"
         )
     reference = first.reference if first else trial.end
     excess = trial.excess(reference)
@@ -296,10 +346,12 @@ def _follow(
     truth = first.truth if first else float(np.mean([4.0 * _dot(a, b) for a, b in reference]))
     errors = np.sqrt(np.maximum(excess + zero, 0.0) / max(truth, zero, np.finfo(float).tiny))
     error = float(errors[-1] if at_end else errors.min())
-    return _Judged(mu, chosen, error, _curve(mu, trial.iterations, errors), reference, zero, truth)
+    curve = _curve(penalty, trial.iterations, errors)
+    return _Judged(penalty, chosen, error, curve, reference, zero, truth)
 
 
-def _curve(mu: float, iterations: list[int], errors: Array) -> NDArray[np.void]:
+def _curve(penalty: Penalty, iterations: list[int], errors: Array) -> NDArray[np.void]:
     curve = np.zeros(len(iterations), CURVE_DTYPE)
-    curve["mu"], curve["iteration"], curve["error"] = mu, iterations, errors
+    curve["mu"], curve["smoothing"] = penalty.mu, penalty.smoothing
+    curve["iteration"], curve["error"] = iterations, errors
     return curve

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lnocl.device import choose, describe
 from lnocl.errors import DeviceError, InputError
-from lnocl.fft import READ_WRITE, Launcher, Layout
+from lnocl.fft import READ_WRITE, Launch, Launcher, Layout
 from lnocl.observation import Array
 from lnocl.program import SOURCES, STEP_SOURCES, Program, Tuning
 from lnocl.scaling import Scaling
@@ -24,9 +24,9 @@ log = logging.getLogger("lnocl")
 ITERATIONS_AHEAD = 4
 
 # Which argument of collect_sums is the iteration, the only one that changes in a run.
-COLLECT_ITERATION = 6
+COLLECT_ITERATION = 7
 # And which of step_rows are alpha and the share.
-STEP_ALPHA, STEP_SHARE = 10, 11
+STEP_ALPHA, STEP_SHARE = 8, 9
 
 
 class OpenCLEngine:
@@ -77,6 +77,7 @@ class OpenCLEngine:
             n_images=scene.n_images,
             n_stars=scene.n_stars,
             has_mu=scene.mu > 0,
+            has_smoothing=scene.smoothing > 0,
             has_weights=scene.weights is not None,
             has_exposure_map=scene.has_exposure_map,
             has_background_map=self._has_background_map,
@@ -123,6 +124,9 @@ class OpenCLEngine:
             "star_corrections": max(n, 1) * item,
             "ratio_sums": program.row_blocks * p * (1 + n) * 2 * item,
             "square_sums": program.row_blocks * 2 * item,
+            "slope": layout.pixels_bytes if self.scene.smoothing else item,
+            "curvature": layout.pixels_bytes if self.scene.smoothing else item,
+            "smooth_sums": program.row_blocks * 2 * item,
             "objectives": (n_iter + 1) * 2 * item,
             **({} if self.scaling is None else self._step_sizes()),
             "scratch and roots": Launcher.bytes_needed(program),
@@ -135,6 +139,7 @@ class OpenCLEngine:
         return {
             "previous": layout.pixels_bytes,
             "gradient": layout.pixels_bytes,
+            "scaling": layout.pixels_bytes,
             "shift": layout.pixels_bytes,
             "reach": max(program.n_stars * layout.pixels_bytes, pair),
             "change_sums": program.row_blocks * 2 * pair,
@@ -189,10 +194,13 @@ class OpenCLEngine:
             buffers["star_corrections"],
             buffers["ratio_sums"],
             buffers["square_sums"],
+            buffers["smooth_sums"],
             buffers["star_weights"],
             mu,
             np.int32(0),
         )
+        if self.scene.smoothing:
+            self._smooth = self._bind_smooth()
         self._correlate = launcher.columns("correlate_columns", buffers["spectra"], *otfs)
         self._scale = launcher.rows(
             "scale_rows",
@@ -202,24 +210,40 @@ class OpenCLEngine:
             buffers["star_fluxes"],
             buffers["inverse_weight"],
             buffers["star_corrections"],
+            buffers["slope"],
+            buffers["curvature"],
             mu,
+        )
+
+    def _bind_smooth(self) -> Launch:
+        buffers, real = self._buffers, self.program.dtype.type
+        return self._launcher.blocks(
+            "smooth",
+            buffers["slope"],
+            buffers["curvature"],
+            buffers["smooth_sums"],
+            buffers["extended"],
+            real(self.scene.smoothing),
+            real(self.scene.edge),
         )
 
     def _bind_steps(self) -> None:
         """Bind the kernels of the scaled gradient projection method."""
         buffers, launcher = self._buffers, self._launcher
         real = self.program.dtype.type
-        mu = real(self.scene.mu)
         self._gradient = launcher.rows(
             "gradient_rows",
             buffers["spectra"],
             buffers["change_sums"],
             buffers["gradient"],
             buffers["previous"],
+            buffers["scaling"],
             buffers["extended"],
             buffers["shift"],
             buffers["inverse_weight"],
-            mu,
+            buffers["slope"],
+            buffers["curvature"],
+            real(self.scene.mu),
         )
         self._step = launcher.rows(
             "step_rows",
@@ -229,10 +253,8 @@ class OpenCLEngine:
             buffers["square_sums"],
             buffers["previous"],
             buffers["gradient"],
-            buffers["shift"],
-            buffers["inverse_weight"],
+            buffers["scaling"],
             buffers["reach"],
-            mu,
             real(0),
             real(0),
         )
@@ -332,6 +354,8 @@ class OpenCLEngine:
         """Make the ratios of the estimate; record its objective."""
         self._convolve()
         self._ratio()
+        if self.scene.smoothing:
+            self._smooth()
         self._collect.kernel.set_arg(COLLECT_ITERATION, np.int32(self._n_objectives))
         self._collect()
         self._n_objectives += 1

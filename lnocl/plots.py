@@ -303,12 +303,12 @@ def objectives(histories: Mapping[str, Mapping[str, Array]]) -> Figure:
 
 
 def held_out_errors(tables: Mapping[str, Mapping[str, Array]]) -> Figure:
-    """Draw the errors that held-out counts estimate, a line for each mu.
+    """Draw the errors that held-out counts estimate, a line for each penalty.
 
     Parameters
     ----------
     tables : mapping of str to mapping of str to ndarray
-        For each name the columns ``mu``, ``iteration`` and ``error``.
+        For each name the columns ``mu``, ``smoothing``, ``iteration`` and ``error``.
 
     Returns
     -------
@@ -323,13 +323,16 @@ def held_out_errors(tables: Mapping[str, Mapping[str, Array]]) -> Figure:
     figure = _figure(6.5 * len(tables), 4.0)
     panels = figure.subplots(1, len(tables), squeeze=False)[0]
     for axis, (name, table) in zip(panels, tables.items(), strict=True):
-        for i, mu in enumerate(np.unique(table["mu"])):
-            rows = table["mu"] == mu
-            axis.plot(table["iteration"][rows], table["error"][rows], **_line(i), label=f"{mu:.2g}")
+        varied = max(("mu", "smoothing"), key=lambda weight: len(np.unique(table[weight])))
+        for i, value in enumerate(np.unique(table[varied])):
+            rows = table[varied] == value
+            axis.plot(
+                table["iteration"][rows], table["error"][rows], **_line(i), label=f"{value:.2g}"
+            )
         axis.set(xscale="log", yscale="log", xlabel="iteration", ylabel="estimated relative error")
         axis.set_title(name, fontsize=10)
         axis.grid(alpha=0.3, which="both")
-        axis.legend(fontsize=9, title="mu")
+        axis.legend(fontsize=9, title=varied)
     return figure
 
 

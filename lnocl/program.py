@@ -15,7 +15,7 @@ from lnocl.errors import DeviceError
 # In the order in which they build on each other: the transforms by themselves; the split-gradient
 # method; and the scaled gradient projection method.
 TRANSFORMS = ("precision.cl", "complex.cl", "fft.cl", "rows.cl", "columns.cl")
-SOURCES = (*TRANSFORMS, "convolve.cl", "sums.cl", "ratio.cl", "scale.cl")
+SOURCES = (*TRANSFORMS, "convolve.cl", "sums.cl", "ratio.cl", "smooth.cl", "scale.cl")
 STEP_SOURCES = (*SOURCES, "step.cl")
 
 
@@ -84,7 +84,7 @@ class Program:
         Files of kernels to build, `SOURCES`, `TRANSFORMS` or `STEP_SOURCES`.
     n_images, n_stars : int, optional
         What the scene has.
-    has_mu, has_weights, has_background_map, has_exposure_map : bool, optional
+    has_mu, has_smoothing, has_weights, has_background_map, has_exposure_map : bool, optional
         What the scene has.
     least_model : float, optional
         The division guard.
@@ -124,6 +124,7 @@ class Program:
         n_images: int = 1,
         n_stars: int = 0,
         has_mu: bool = False,
+        has_smoothing: bool = False,
         has_weights: bool = False,
         has_background_map: bool = False,
         has_exposure_map: bool = False,
@@ -162,6 +163,7 @@ class Program:
             "N_IMAGES": n_images,
             "N_STARS": n_stars,
             "HAS_MU": int(has_mu),
+            "HAS_SMOOTHING": int(has_smoothing),
             "HAS_WEIGHTS": int(has_weights),
             "HAS_BACKGROUND_MAP": int(has_background_map),
             "HAS_EXPOSURE_MAP": int(has_exposure_map),

@@ -89,15 +89,39 @@ def ratio_rows(
     return rfft_rows(excess), float(divergence.sum()), star_sums
 
 
+def smooth(extended: Array, beta: float, delta: float) -> tuple[Array, Array, float]:
+    """Return slope, curvature and value of the edge-preserving term.
+
+    ``beta sum psi(f - f')`` over the pairs of pixels that share an edge, also round the grid's own
+    edges, ``psi(t) = sqrt(t^2 + delta^2) - delta``. slope is its gradient, and curvature the sum of
+    ``beta psi'(f - f') / (f - f')`` over the four neighbours of a pixel.
+    """
+    slope, curvature, value = np.zeros_like(extended), np.zeros_like(extended), 0.0
+    for axis in (-1, -2):
+        step = extended - np.roll(extended, -1, axis)
+        root = np.sqrt(step**2 + delta**2)
+        slope += step / root - np.roll(step / root, 1, axis)
+        curvature += 1.0 / root + np.roll(1.0 / root, 1, axis)
+        value += float((step**2 / (root + delta)).sum())
+    return beta * slope, beta * curvature, beta * value
+
+
 def collect_sums(
-    objective: float, squares: float, star_sums: Array, star_weights: Array, mu: float
+    objective: float,
+    squares: float,
+    smoothness: float,
+    star_sums: Array,
+    star_weights: Array,
+    mu: float,
 ) -> tuple[float, Array]:
-    """Return the objective ``J_0 + mu / 2 sum f^2`` and the star corrections.
+    """Return the objective, ``J_0 + mu / 2 sum f^2 +`` smoothness, and the star corrections.
 
     A star's correction is ``1 + sum_j <P_js, r_j - w_j> / sum_j <P_js, w_j>``; one that negative
     PSF pixels have made negative counts as 0.
     """
-    return objective + 0.5 * mu * squares, np.maximum(1.0 + star_sums / star_weights, 0.0)
+    return objective + 0.5 * mu * squares + smoothness, np.maximum(
+        1.0 + star_sums / star_weights, 0.0
+    )
 
 
 def scale_rows(
@@ -107,24 +131,23 @@ def scale_rows(
     mu: float,
     star_fluxes: Array,
     star_corrections: Array,
+    slope: Array | float = 0.0,
+    curvature: Array | float = 0.0,
 ) -> tuple[Array, ComplexArray, float, Array]:
     """Return the scaled extended source, its row spectrum and sum of squares, and star fluxes.
 
-    ``f <- f (1 + a c) / (1 + mu f a)`` with ``c = sum_j A_j^T (r_j - w_j)`` and
-    ``a = 1 / sum_j A_j^T w_j``, 0 where nothing was observed; ``c_s`` is multiplied by its
-    correction; La Camera et al. (2012), Eq. 9, as ``sum_j A_j^T w_j`` is what ``r_j = w_j`` gives.
-    A correction ``1 + a c`` that rounding has made negative counts as 0.
+    ``f <- f (1 + a u) / (1 + (mu + curvature) f a)``, ``u = c + curvature f - slope``, with
+    ``c = sum_j A_j^T (r_j - w_j)`` and ``a = 1 / sum_j A_j^T w_j``, 0 where nothing was observed;
+    ``c_s`` is multiplied by its correction; La Camera et al. (2012), Eq. 9, as
+    ``sum_j A_j^T w_j`` is what ``r_j = w_j`` gives. slope and curvature, of the edge-preserving
+    term (`smooth`), split its gradient into curvature f and what is left, neither negative.
+    A correction ``1 + a u`` that rounding has made negative counts as 0.
     """
-    correction = np.maximum(1.0 + inverse_weight * irfft_rows(row_spectrum), 0.0)
-    scaled = extended * correction / (1.0 + mu * extended * inverse_weight)
+    excess = irfft_rows(row_spectrum) + curvature * extended - slope
+    correction = np.maximum(1.0 + inverse_weight * excess, 0.0)
+    scaled = extended * correction / (1.0 + (mu + curvature) * extended * inverse_weight)
     squares = float((scaled**2).sum())
     return scaled, rfft_rows(scaled), squares, star_fluxes * star_corrections
-
-
-def scaling(extended: Array, shift: Array, inverse_weight: Array | float, mu: float) -> Array:
-    """Return ``D = (f + z) a / (1 + mu (f + z) a)``, the scaling of a gradient; z is the shift."""
-    scaled = (extended + shift) * inverse_weight
-    return scaled / (1.0 + mu * scaled)
 
 
 def gradient_rows(
@@ -135,34 +158,37 @@ def gradient_rows(
     shift: Array,
     inverse_weight: Array | float,
     mu: float,
-) -> tuple[Array, float, float]:
-    """Return the gradient of J in f, and the products ``<D y, s>`` and ``<D y, D y>``.
+    slope: Array | float = 0.0,
+    curvature: Array | float = 0.0,
+) -> tuple[Array, Array, float, float]:
+    """Return the gradient of J in f, its scaling D, ``<D y, s>`` and ``<D y, D y>``.
 
-    The gradient is ``mu f - c``, ``c = sum_j A_j^T (r_j - w_j)``; y is its change from `gradient`
-    and s that of f from `previous`.
+    The gradient is ``mu f + slope - c``, ``c = sum_j A_j^T (r_j - w_j)``; y is its change from
+    `gradient` and s that of f from `previous`. With z the shift,
+    ``D = (f + z) a / (1 + (mu + curvature) (f + z) a)``.
     """
-    following = mu * extended - irfft_rows(row_spectrum)
-    change = scaling(extended, shift, inverse_weight, mu) * (following - gradient)
-    return following, float((change * (extended - previous)).sum()), float((change**2).sum())
+    following = mu * extended + slope - irfft_rows(row_spectrum)
+    scaled = (extended + shift) * inverse_weight
+    scaling = scaled / (1.0 + (mu + curvature) * scaled)
+    change = scaling * (following - gradient)
+    products = float((change * (extended - previous)).sum()), float((change**2).sum())
+    return following, scaling, *products
 
 
 def step_rows(
     extended: Array,
     gradient: Array,
-    shift: Array,
-    inverse_weight: Array | float,
+    scaling: Array,
     reach: Array,
-    mu: float,
     alpha: float,
     share: float,
 ) -> tuple[Array, ComplexArray, float, float, Array]:
     """Return ``f + share d``, its row spectrum and squares, ``<gradient, d>`` and ``<reach_s, d>``.
 
-    ``d = P(f - alpha D gradient) - f`` with P the projection on ``f >= 0``; Bonettini, Zanella &
-    Zanni (2009), Inverse Problems 25, 015002.
+    ``d = P(f - alpha D gradient) - f`` with P the projection on ``f >= 0`` and D the scaling;
+    Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002.
     """
-    scaled = scaling(extended, shift, inverse_weight, mu) * gradient
-    direction = np.maximum(extended - alpha * scaled, 0.0) - extended
+    direction = np.maximum(extended - alpha * scaling * gradient, 0.0) - extended
     trial = np.maximum(extended + share * direction, 0.0)
     slope = float((gradient * direction).sum())
     reached = np.einsum("syx,yx->s", reach, direction)
@@ -217,6 +243,7 @@ class ReferenceEngine:
         self._star_fluxes = star_fluxes.copy()
         self._row_spectrum = rfft_rows(self._extended)
         self._squares = float((self._extended**2).sum())
+        self._slope = self._curvature = np.zeros_like(self._extended)
         self._previous = self._extended
         self._gradient = np.zeros_like(self._extended)
 
@@ -230,8 +257,18 @@ class ReferenceEngine:
             self._star_images,
             self._star_fluxes,
         )
+        smoothness = 0.0
+        if self.scene.smoothing:
+            self._slope, self._curvature, smoothness = smooth(
+                self._extended, self.scene.smoothing, self.scene.edge
+            )
         objective, self._star_corrections = collect_sums(
-            self._data_term, self._squares, self._star_sums, self.scene.star_weights, self.scene.mu
+            self._data_term,
+            self._squares,
+            smoothness,
+            self._star_sums,
+            self.scene.star_weights,
+            self.scene.mu,
         )
         self._objectives.append(objective)
 
@@ -248,12 +285,14 @@ class ReferenceEngine:
             self.scene.mu,
             self._star_fluxes,
             self._star_corrections,
+            self._slope,
+            self._curvature,
         )
 
     def gradient(self) -> tuple[float, float]:
         """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""
         assert self.scaling is not None
-        self._gradient, change_step, change_change = gradient_rows(
+        self._gradient, self._scaling, change_step, change_change = gradient_rows(
             self._row_spectrum,
             self._extended,
             self._previous,
@@ -261,6 +300,8 @@ class ReferenceEngine:
             self.scaling.shift,
             self._inverse_weight,
             self.scene.mu,
+            self._slope,
+            self._curvature,
         )
         self._previous = self._extended
         return change_step, change_change
@@ -275,10 +316,8 @@ class ReferenceEngine:
         self._extended, self._row_spectrum, self._squares, slope, reached = step_rows(
             self._previous,
             self._gradient,
-            self.scaling.shift,
-            self._inverse_weight,
+            self._scaling,
             self.scaling.reach,
-            self.scene.mu,
             alpha,
             share,
         )

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.observation import Array, Observation
+from lnocl.penalty import Penalty
 from lnocl.scene import Scene
 from lnocl.solvers import SOLVERS
 
@@ -46,8 +47,8 @@ class Run:
         What is done.
     observation : Observation
         On what.
-    mu : float
-        Weight of the Tikhonov term.
+    penalty : Penalty
+        On the extended source.
     n_iter : int
         Iterations at most.
     initial_extended, initial_star_fluxes : array_like, optional
@@ -72,7 +73,7 @@ class Run:
         self,
         setup: Setup,
         observation: Observation,
-        mu: float,
+        penalty: Penalty,
         n_iter: int,
         initial_extended: ArrayLike | None = None,
         initial_star_fluxes: ArrayLike | None = None,
@@ -83,7 +84,7 @@ class Run:
 
             leeway = RADIUS
         self._setup, self._n_iter = setup, n_iter
-        self.scene = Scene(observation, setup.stars, mu, setup.pad, leeway)
+        self.scene = Scene(observation, setup.stars, penalty, setup.pad, leeway)
         self._given_stars = self.scene.stars
         self._refines = setup.refine_positions and self.scene.n_stars > 0
         extended, star_fluxes = self.scene.start(initial_extended, initial_star_fluxes)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import warnings
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl.edges import recommend_pad
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.observation import Array, Observation, numbers
+from lnocl.penalty import MOST_WEIGHT, Penalty
 from lnocl.placement import MARGIN, Stamp, place
 
 log = logging.getLogger("lnocl")
@@ -32,8 +32,11 @@ MOST_RINGING = 0.01
 # taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
 LEAST_MODEL = 2.0**-64
 
-# Of mu, scaled: what the images say has no weight long before, and it stays in float32's range.
-MOST_MU = 2.0**64
+NO_PENALTY = Penalty()
+
+# The edge-preserving term takes for an edge what is this many times the mean of a flat extended
+# source: docs/sgp.md.
+EDGE = 3.0
 
 
 class Scene:
@@ -51,8 +54,8 @@ class Scene:
     stars : sequence of (x, y)
         Positions of the point sources in pixels of the first image less its offset, 0-based, x
         along columns.
-    mu : float
-        Weight of the Tikhonov term on the extended source, per electron, zero or more.
+    penalty : Penalty
+        On the extended source.
     pad : int or "auto"
         Unobserved pixels kept round the images, at least; "auto": `edges.recommend_pad`.
     leeway : float
@@ -68,8 +71,10 @@ class Scene:
         Electrons per unit of the images.
     unit : float
         Electrons per exposure and unit of the estimate.
-    mu : float
-        Scaled.
+    mu, smoothing : float
+        Weights of the penalty, scaled.
+    edge : float
+        delta of the edge-preserving term, scaled; 0 where there is no such term.
     weights : ndarray of bool or float64, shape (p, Ny, Nx), or None
         True where a pixel was observed, or its relative exposure where exposures are maps; None
         where all were observed alike.
@@ -79,8 +84,8 @@ class Scene:
     Raises
     ------
     InputError
-        A star outside the images or unobserved; mu or pad out of range; images too large for the
-        transform.
+        A star outside the images or unobserved; penalty or pad out of range; images too large for
+        the transform.
 
     Warns
     -----
@@ -93,14 +98,13 @@ class Scene:
         self,
         observation: Observation,
         stars: ArrayLike = (),
-        mu: float = 0.0,
+        penalty: Penalty = NO_PENALTY,
         pad: int | str = 0,
         leeway: float = 0.0,
     ) -> None:
         self.observation = observation
         self.stars = _check_stars(stars, observation)
         self._leeway = leeway
-        check_mu(mu)
         if isinstance(pad, str) and pad == "auto":
             pad = recommend_pad(observation)
             log.info("pad: %d pixels, by the PSFs", pad)
@@ -112,18 +116,24 @@ class Scene:
         has_map = exposure.ndim == 3
         mean_exposure = float((exposure[~observation.mask] if has_map else exposure).mean())
         self.unit = self.scale / mean_exposure
-        self.mu = float(mu) * self.unit / mean_exposure
-        if self.mu > MOST_MU:
-            raise InputError(
-                f"mu {mu:g} is too large for images of about {self.scale:g} electrons per pixel; "
-                f"the most that means anything there is {MOST_MU / (self.mu / mu):g}"
-            )
+        self.mu = self._scaled("mu", penalty.mu, self.unit / mean_exposure)
+        self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / mean_exposure)
         relative = exposure / mean_exposure
         self._gains = np.ones(self.n_images) if has_map else relative
         self.weights = self._weigh(relative if has_map else None)
         self.star_weights = self._weigh_stars()
         self._refuse_unseen_stars()
         self._warn_of_ringing()
+        self.edge = EDGE * self._read_off()[1] if self.smoothing else 0.0
+
+    def _scaled(self, name: str, weight: float, factor: float) -> float:
+        """Return a weight of the penalty, scaled; refuse one that is too large for float32."""
+        if weight * factor > MOST_WEIGHT:
+            raise InputError(
+                f"{name} {weight:g} is too large for images of about {self.scale:g} electrons per "
+                f"pixel; the most that means anything there is {MOST_WEIGHT / factor:g}"
+            )
+        return float(weight) * factor
 
     def move_stars(self, stars: ArrayLike) -> None:
         """Give the stars other positions, none farther away than the leeway.
@@ -349,12 +359,6 @@ def _scale(good: Array) -> float:
     if not math.isfinite(mean):
         raise InputError("the images are too large to be summed: divide them by a constant")
     return 2.0 ** math.frexp(mean)[1]
-
-
-def check_mu(mu: object) -> None:
-    """Refuse a weight of the Tikhonov term that is none."""
-    if not (isinstance(mu, Real) and math.isfinite(mu) and float(mu) >= 0):
-        raise InputError(f"mu must be a number, finite and not negative; {mu!r} was given")
 
 
 def _grid(shape: tuple[int, int], pad: object) -> tuple[int, int]:

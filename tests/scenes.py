@@ -64,6 +64,7 @@ class Recipe:
     n_images: int = 1
     n_stars: int = 0
     mu: float = 0.0
+    smoothing: float = 0.0
     pad: int = 0
     psf_shape: tuple[int, int] = (7, 8)
     background: str = "scalar"  # or "zero", "each", "map"
@@ -157,6 +158,7 @@ class Made:
         given = {
             "stars": self.stars,
             "mu": self.recipe.mu,
+            "smoothing": self.recipe.smoothing,
             "pad": self.recipe.pad,
             "initial_extended": self.initial_extended,
             "initial_star_fluxes": self.initial_star_fluxes,

@@ -96,7 +96,7 @@ def test_no_double_precision(monkeypatch):
 
 def scene(p, n, stars=0):
     observation = lnocl.Observation(np.ones((p, n, n)), np.ones((n, n)))
-    return opencl.Scene(observation, [(i, i) for i in range(stars)], 0.0, 0)
+    return opencl.Scene(observation, [(i, i) for i in range(stars)])
 
 
 @pytest.mark.parametrize("limit", ["global_mem_size", "max_mem_alloc_size"])
@@ -112,9 +112,7 @@ def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, 
 def test_memory_estimate_is_what_the_buffers_hold(tuning, caplog):
     caplog.set_level("INFO", "lnocl")
     observation = lnocl.Observation(np.ones((2, 8192, 64)), np.ones((1, 1)))
-    engine = opencl.OpenCLEngine(
-        opencl.Scene(observation, [(1, 1)], 0.0, 0), "single", None, 10, tuning
-    )
+    engine = opencl.OpenCLEngine(opencl.Scene(observation, [(1, 1)]), "single", None, 10, tuning)
     assert engine.program.scratch_is_global == (tuning is not None)
     engine.extended()  # waits for the device
     launcher = engine._launcher

@@ -10,7 +10,7 @@ from scenes import ENGINES, blur, make_psfs, worst
 
 import lnocl
 from lnocl import program
-from lnocl.scene import MOST_MU
+from lnocl.penalty import MOST_WEIGHT
 
 SHAPE = (16, 32)
 PSFS = make_psfs(2, (7, 8))
@@ -76,7 +76,7 @@ def expose(counts, contrast, background, seed=0):
 def test_counts_contrast_background_and_mu(engine, counts, contrast, share, mu, seed):
     background = share * counts
     images = expose(counts, contrast, background, seed)
-    if mu * 2.0 ** np.frexp(images[~MASK].mean())[1] <= MOST_MU:
+    if mu * 2.0 ** np.frexp(images[~MASK].mean())[1] <= MOST_WEIGHT:
         deconvolve(engine, images, mask=MASK, background=background, mu=mu)
     else:
         with pytest.raises(lnocl.InputError, match=r"mu .* is too large for images"):

@@ -24,8 +24,8 @@ BARE = Recipe(SHAPE, 3, background="zero")
 # The same with stars and bad pixels.
 MASKED = Recipe(SHAPE, 3, 2, masked=0.1, background="zero")
 # Everything at once, on the periodic grid and with unobserved pixels round the images.
-FULL = Recipe(SHAPE, 3, 2, mu=1e-3, masked=0.05, background="map")
-PADDED = Recipe((11, 27), 3, 2, mu=1e-3, masked=0.05, background="map", pad=2)
+FULL = Recipe(SHAPE, 3, 2, mu=1e-3, smoothing=0.01, masked=0.05, background="map")
+PADDED = Recipe((11, 27), 3, 2, mu=1e-3, smoothing=0.01, masked=0.05, background="map", pad=2)
 
 # What rounding leaves after 50 iterations: extended source, star fluxes, objective.
 ROUNDING = {"double": (2.7e-15, 4.4e-16, 8e-16), "single": (1.7e-6, 2.5e-7, 1.2e-7)}
@@ -233,10 +233,9 @@ def test_the_same_image_several_times_is_one_image(engine):
         name: np.repeat(getattr(made, name), times, axis=0)
         for name in ("images", "psfs", "background", "mask")
     }
-    # p images weigh p times as much against the Tikhonov term.
-    several = made.deconvolve(
-        made.observation(**again), n_iter=50, mu=times * made.recipe.mu, **engine
-    )
+    # p images weigh p times as much against the penalty.
+    weights = {"mu": times * made.recipe.mu, "smoothing": times * made.recipe.smoothing}
+    several = made.deconvolve(made.observation(**again), n_iter=50, **weights, **engine)
     objective = times * once.history["objective"]
     assert_close(several, once.extended, once.star_fluxes, objective, engine["precision"])
 

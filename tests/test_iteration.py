@@ -16,6 +16,8 @@ from scenes import ENGINES, Recipe, moved, worst
 from scipy.special import kl_div
 
 from lnocl import program
+from lnocl.penalty import Penalty
+from lnocl.scene import Scene
 
 # PSFs here are small, and whole offsets periodic.
 pytestmark = pytest.mark.filterwarnings(
@@ -58,8 +60,8 @@ CHECKPOINTS = tuple(TOLERANCES["double"])
 RECIPES = {
     "2x2": Recipe((2, 2), psf_shape=(2, 2)),
     "1x60 star": Recipe((1, 60), 2, 1, psf_shape=(2, 9)),
-    "64x2 mu": Recipe((64, 2), 3, mu=2e-3, psf_shape=(5, 1)),
-    "8x16 three stars, mu, five images": Recipe((8, 16), 5, 3, mu=1e-3),
+    "64x2 mu, smoothing": Recipe((64, 2), 3, mu=2e-3, smoothing=0.1, psf_shape=(5, 1)),
+    "8x16 three stars, mu, smoothing, five images": Recipe((8, 16), 5, 3, mu=1e-3, smoothing=0.1),
     "16x32 star, mu, mask, noise": Recipe(
         (16, 32), 4, 1, mu=1e-3, masked=0.05, background="each", read_noise=1.5
     ),
@@ -88,6 +90,9 @@ def scipy_iteration(made):
     """Yield extended source, star fluxes and objective: of the start, then of each iteration."""
     mu, pad, shape = made.recipe.mu, made.recipe.pad, made.recipe.shape
     ny, nx = (max(2, 2 ** int(np.ceil(np.log2(n + 2 * pad)))) for n in shape)
+    smoothing = made.recipe.smoothing
+    scene = Scene(made.observation(), made.stars, Penalty(mu, smoothing))
+    edge = scene.edge * scene.unit or 1.0  # its own value is tested in test_scene.py
     inside = np.s_[..., : shape[0], : shape[1]]
 
     variance = np.square(np.broadcast_to(made.recipe.read_noise, len(made.images)))[:, None, None]
@@ -135,22 +140,28 @@ def scipy_iteration(made):
         model += np.einsum("s,jsyx->jyx", fluxes, star_images)
         model = np.maximum(exposure * model + background, 0.0)
         data_term = kl_div(images[observed_pixels], model[observed_pixels]).sum()
-        yield extended[inside], fluxes, data_term + 0.5 * mu * (extended**2).sum()
+        steps = [extended - np.roll(extended, by, axis) for axis in (0, 1) for by in (-1, 1)]
+        roots = [np.hypot(step, edge) for step in steps]
+        roughness = sum((root - edge).sum() for root in roots) / 2  # each pair is there twice
+        penalty = 0.5 * mu * (extended**2).sum() + smoothing * roughness
+        yield extended[inside], fluxes, data_term + penalty
 
         ratio = np.divide(
             images, model, out=np.zeros_like(model), where=observed_pixels & (images > 0)
         )
         correction = back_project(exposure * ratio)
         fluxes = fluxes * np.einsum("jsyx,jyx->s", star_images, exposure * ratio) / star_weights
-        divisor = np.where(observed, total_weight + mu * extended, np.inf)
-        extended = extended * correction / divisor
+        curvature = smoothing * sum(1.0 / root for root in roots)
+        pull = smoothing * sum((extended - d) / root for d, root in zip(steps, roots, strict=True))
+        divisor = np.where(observed, total_weight + (mu + curvature) * extended, np.inf)
+        extended = extended * (correction + pull) / divisor
 
 
 # One precision of these is left to CI: the other shows that the path is right.
 EXHAUSTIVE = {
     "opencl-single": (
         "1x60 star",
-        "64x2 mu",
+        "64x2 mu, smoothing",
         "16x32 star, mu, mask, noise",
         "512x16 three stars",
         "8x128 exposure map, star between pixels",
@@ -159,7 +170,7 @@ EXHAUSTIVE = {
         "64x256 two stars, map",
         "64x64 four images, no background",
         "16x16 three stars, pad, mask",
-        "8x16 three stars, mu, five images",
+        "8x16 three stars, mu, smoothing, five images",
         "32x16 exposures, two stars between pixels",
         "8x128 exposure map, star between pixels",
     ),

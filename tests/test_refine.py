@@ -16,6 +16,7 @@ from scipy.special import kl_div
 import lnocl
 from lnocl import refine, scaling
 from lnocl.model import Model
+from lnocl.penalty import Penalty
 from lnocl.refine import RADIUS, StarFit, Stars
 from lnocl.run import Run, Setup
 from lnocl.scene import Scene
@@ -506,7 +507,7 @@ def test_steps_are_measured_anew_where_stars_have_moved(monkeypatch):
 
     monkeypatch.setattr(scaling, "prepare", prepare_and_note)
     setup = Setup(made.stars + OFF, 0, "sgp", "double", "numpy", None, refine_positions=True)
-    run = Run(setup, made.observation(), 0.0, 7)
+    run = Run(setup, made.observation(), Penalty(), 7)
     assert list(run) == list(range(1, 8))
     assert len(prepared) == 3  # at the start, after 3 and after 6
     assert run.engine.scaling is prepared[-1][1]

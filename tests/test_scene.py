@@ -7,6 +7,7 @@ import pytest
 from scenes import Recipe, make_psfs
 
 import lnocl
+from lnocl.penalty import Penalty
 from lnocl.scene import MAX_AXIS, Scene
 
 SHAPE = (8, 16)
@@ -55,7 +56,7 @@ def test_scale_is_a_power_of_two_that_gives_unit_mean(level):
     mask = np.zeros(SHAPE, bool)
     mask[0] = True
     images = np.where(mask, 1e30, level)
-    scene = Scene(lnocl.Observation(images, np.ones((1, 1)), mask=mask), mu=0.7)
+    scene = Scene(lnocl.Observation(images, np.ones((1, 1)), mask=mask), penalty=Penalty(0.7))
     assert np.frexp(scene.scale)[0] == 0.5
     assert 0.5 <= scene.images()[0][~mask].mean() < 1
     assert scene.mu == 0.7 * scene.scale
@@ -146,6 +147,18 @@ def test_given_start():
     np.testing.assert_array_equal(star_fluxes * scene.scale, [4.0, 0.0])
 
 
+@pytest.mark.parametrize("exposure", [None, 2.0], ids=["no exposure", "exposure"])
+def test_edge_is_three_times_the_mean_of_the_extended_source(exposure):
+    images = np.full((2, 8, 16), 8.0)
+    images[:, 3, 4] += 600.0
+    observation = lnocl.Observation(images, np.ones((1, 1)), background=2.0, exposure=exposure)
+    scene = Scene(observation, [(4, 3)], Penalty(0.0, 0.5))
+    np.testing.assert_allclose(scene.edge * scene.unit, 3.0 * 6.0 / (exposure or 1.0))
+    # J is in units of the scale, the estimate in its own.
+    np.testing.assert_allclose(scene.smoothing, 0.5 * scene.unit / scene.scale)
+    assert Scene(observation, [(4, 3)]).edge == 0.0
+
+
 # --- What a run refuses
 
 REFUSED = {
@@ -175,6 +188,9 @@ REFUSED = {
     "None for mu": ({"mu": None}, "mu must be a number, finite and not negative; None"),
     "several mu": ({"mu": np.ones((2, 2))}, "mu"),
     "mu too large for the images": ({"mu": 1e30}, "mu 1e+30 is too large for images of about"),
+    "negative smoothing": ({"smoothing": -1.0}, "smoothing must be a number, finite and not negat"),
+    "text for smoothing": ({"smoothing": "some"}, "smoothing 'some' is not known; give a number"),
+    "smoothing too large": ({"smoothing": 1e30}, "smoothing 1e+30 is too large for images of"),
     "no iteration": ({"n_iter": 0}, "n_iter must be a whole number, 1 or more; 0 was given"),
     "negative n_iter": ({"n_iter": -1}, "n_iter must be a whole number, 1 or more; -1"),
     "fractional n_iter": ({"n_iter": 1.5}, "n_iter must be a whole number, 1 or more; 1.5"),

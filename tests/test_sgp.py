@@ -19,6 +19,7 @@ from scipy.special import kl_div
 import lnocl
 from lnocl import opencl, reference, scaling, solvers
 from lnocl.model import Model
+from lnocl.penalty import Penalty
 from lnocl.scene import Scene
 
 every_engine = pytest.mark.parametrize("engine", FEWER_ENGINES)
@@ -50,7 +51,18 @@ class Problem:
     Electrons throughout.
     """
 
-    def __init__(self, images, psfs, background=0.0, mask=None, stars=(), mu=0.0, exposure=None):
+    def __init__(
+        self,
+        images,
+        psfs,
+        background=0.0,
+        mask=None,
+        stars=(),
+        mu=0.0,
+        exposure=None,
+        smoothing=0.0,
+        edge=1.0,
+    ):
         p, ny, nx = images.shape
         y, x = np.indices((ny, nx))
         matrix = np.zeros((p, ny, nx, ny, nx))
@@ -70,21 +82,34 @@ class Problem:
         if exposure is not None:
             self.weights *= exposure.ravel() > 0
         self.mu = np.repeat([mu, 0.0], [ny * nx, len(stars)])
+        self.smoothing, self.edge = smoothing, edge
+        at = y * nx + x
+        pairs = [at.ravel(), at.ravel()], [np.roll(at, -1, axis).ravel() for axis in (0, 1)]
+        first, second = (np.concatenate(indices) for indices in pairs)
+        self.differences = np.zeros((2 * ny * nx, ny * nx + len(stars)))
+        np.add.at(self.differences, (np.arange(len(first)), first), 1.0)
+        np.add.at(self.differences, (np.arange(len(second)), second), -1.0)
 
     def model(self, x):
         return self.matrix @ x + self.background
 
     def objective(self, x):
         data_term = self.weights @ kl_div(self.images, np.maximum(self.model(x), 0.0))
-        return data_term + 0.5 * self.mu @ x**2
+        roughness = np.sum(np.hypot(self.differences @ x, self.edge) - self.edge)
+        return data_term + 0.5 * self.mu @ x**2 + self.smoothing * roughness
 
     def gradient(self, x):
-        return self.matrix.T @ (self.weights * (1 - self.images / self.model(x))) + self.mu * x
+        steps = self.differences @ x
+        roughness = self.differences.T @ (steps / np.hypot(steps, self.edge))
+        data_term = self.matrix.T @ (self.weights * (1 - self.images / self.model(x)))
+        return data_term + self.mu * x + self.smoothing * roughness
 
     def errors(self, x):
         """Return the standard errors of each unknown by itself, from the second derivatives."""
         curvature = self.weights * self.images / self.model(x) ** 2
-        return 1.0 / np.sqrt((self.matrix**2).T @ curvature + self.mu)
+        bends = self.edge**2 / np.hypot(self.differences @ x, self.edge) ** 3
+        roughness = (self.differences**2).T @ bends
+        return 1.0 / np.sqrt((self.matrix**2).T @ curvature + self.mu + self.smoothing * roughness)
 
     def off_the_minimum(self, x):
         """Return how far the projected gradient moves an unknown at most, in standard errors."""
@@ -113,8 +138,18 @@ class Problem:
 
 def problem_of(made, stars=None):
     stars = made.stars if stars is None else stars
+    recipe = made.recipe
+    scene = Scene(made.observation(), stars, Penalty(recipe.mu, recipe.smoothing))
     return Problem(
-        made.images, made.psfs, made.background, made.mask, stars, made.recipe.mu, made.exposure
+        made.images,
+        made.psfs,
+        made.background,
+        made.mask,
+        stars,
+        recipe.mu,
+        made.exposure,
+        recipe.smoothing,
+        scene.edge * scene.unit or 1.0,
     )
 
 
@@ -134,6 +169,10 @@ MINIMA = {
     "three stars, mask, map": Recipe((16, 16), 3, 3, mu=0.05, masked=0.05, background="map"),
     "three stars, mask, map, exposures": Recipe(
         (16, 16), 3, 3, mu=0.05, masked=0.05, background="map", exposure="map"
+    ),
+    "smoothed, two stars": Recipe((16, 16), 2, 2, mu=0.05, smoothing=0.3),
+    "smoothed, star, exposures": Recipe(
+        (16, 16), 3, 1, mu=0.05, smoothing=0.3, masked=0.05, exposure="map"
     ),
     "large, star": Recipe((32, 32), 3, 1, mu=0.05, background="each"),
     "large, three stars": Recipe((32, 32), 2, 3, mu=0.05),
@@ -200,9 +239,9 @@ def test_star_that_is_not_there_leaves_its_neighbour_alone():
         solver="sgp", n_iter=300, engine="numpy", stars=stars, initial_star_fluxes=[1e3, 1e3]
     )
     assert problem.split(best)[1][1] == 0
-    # Measured 2.2e-16 of J, 8.2e-8 standard errors.
+    # Measured 2.2e-16 of J, 2.9e-7 standard errors.
     assert relative_error(problem.objective(unknowns(result)), problem.objective(best)) <= 7e-16
-    assert problem.off_the_minimum(unknowns(result)) <= 2.5e-7
+    assert problem.off_the_minimum(unknowns(result)) <= 6e-7
 
 
 @pytest.mark.parametrize("contrast", [100, 1000])
@@ -480,7 +519,7 @@ TINY = Recipe((8, 8), 2, 2, mu=1e-3, masked=0.1, background="map", psf_shape=(3,
 
 def prepared(made, stars, star_fluxes):
     """Return the problem, its unknowns at the start, and the scaling with its unit."""
-    scene = Scene(made.observation(), stars, made.recipe.mu)
+    scene = Scene(made.observation(), stars, Penalty(made.recipe.mu))
     start = scene.start(made.initial_extended, star_fluxes)
     fluxes, steps = scaling.prepare(scene, Model(scene), *start)
     x = np.append(made.initial_extended, fluxes * scene.scale)
@@ -533,7 +572,7 @@ def test_dot_product_of_the_model():
 def test_star_fluxes_are_best_where_the_engine_starts(name):
     """The sky that was not observed is dark, for the engine and for the fit."""
     made = SCENES[name].make()
-    scene = Scene(made.observation(), made.stars, made.recipe.mu, made.recipe.pad)
+    scene = Scene(made.observation(), made.stars, Penalty(made.recipe.mu), made.recipe.pad)
     extended, star_fluxes = scene.start(None, None)
     star_fluxes, steps = scaling.prepare(scene, Model(scene), extended, star_fluxes)
     engine = reference.ReferenceEngine(scene, steps)
@@ -548,7 +587,7 @@ def test_star_fluxes_are_best_where_the_engine_starts(name):
 
 def engine_of(name, precision, takes_steps):
     made = SCENES[name].make()
-    scene = Scene(made.observation(), made.stars, made.recipe.mu, made.recipe.pad)
+    scene = Scene(made.observation(), made.stars, Penalty(made.recipe.mu), made.recipe.pad)
     steps = (
         scaling.prepare(scene, Model(scene), *scene.start(None, None))[1] if takes_steps else None
     )
@@ -565,11 +604,11 @@ def test_memory_estimate_is_what_the_buffers_hold(name):
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
-def test_only_steps_take_three_images_more_and_one_for_each_star(precision):
+def test_only_steps_take_four_images_more_and_one_for_each_star(precision):
     name = "four images, three stars"
     without = engine_of(name, precision, takes_steps=False)
     more = engine_of(name, precision, takes_steps=True).bytes_needed - without.bytes_needed
-    images = (3 + 3) * without.layout.pixels_bytes
+    images = (4 + 3) * without.layout.pixels_bytes
     assert images < more <= 1.02 * images  # measured 1.008
 
 

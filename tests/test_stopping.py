@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import lnocl
 from lnocl import heldout
 from lnocl.errors import LnoclWarning
+from lnocl.penalty import Penalty
 from lnocl.stopping import CHANGE_WINDOW, expected_deviance
 
 SIZE, STAR = 64, (40, 24)
@@ -227,7 +228,7 @@ class TestHeldOut:
 
     def test_halves_that_end_at_once_are_refused(self):
         with pytest.raises(lnocl.InputError, match="no iteration betters the start"):
-            heldout._follow(heldout._Trial([((), ())]), 0.0, False, None, print)
+            heldout._follow(heldout._Trial([((), ())]), Penalty(), False, None, print)
 
     def test_start_that_is_no_number_is_refused(self):
         with pytest.raises(lnocl.InputError, match="initial_extended"):
@@ -284,6 +285,44 @@ class TestMu:
         """Half the counts with twice mu: half the data term, a quarter of the squares."""
         observation, *_ = scene()
         half = lnocl.Observation(observation.images / 2, observation.psfs, background=10.0)
-        whole = run(observation, mu=1e-4, n_iter=30)
-        halved = run(half, mu=2e-4, n_iter=30)
+        penalty = Penalty(1e-4, 1e-3)
+        of_half = penalty.of_half()
+        whole = run(observation, mu=penalty.mu, smoothing=penalty.smoothing, n_iter=30)
+        halved = run(half, mu=of_half.mu, smoothing=of_half.smoothing, n_iter=30)
         np.testing.assert_array_equal(2.0 * halved.extended, whole.extended)
+
+
+class TestSmoothing:
+    def test_auto_is_the_weight_of_least_error(self):
+        result = run(scene()[0], stop="held-out", smoothing="auto")
+        curve = result.held_out
+        weights = np.unique(curve["smoothing"])
+        least = {w: curve["error"][curve["smoothing"] == w].min() for w in weights}
+        assert result.smoothing == min(least, key=least.get)
+        assert len(least) > 1
+        assert set(curve["mu"]) == {0.0}
+
+    def test_after_too_many_iterations_it_is_better_than_none(self):
+        observation, _, truth = scene()
+        result = run(observation, smoothing="auto", n_iter=150)
+        assert result.smoothing > 0
+        assert error(result, truth) < 0.8 * error(run(observation, n_iter=150), truth)
+
+    def test_both_auto_are_refused(self):
+        with pytest.raises(lnocl.InputError, match="mu and smoothing cannot both be auto"):
+            run(scene()[0], mu="auto", smoothing="auto")
+
+    @pytest.mark.parametrize("exposure", [(4.0, 4.0, 4.0), (2.0, 4.0, 6.0)])
+    def test_grid_is_the_noise_of_the_gradient(self, exposure):
+        """As the counts of a flat sky scatter it."""
+        rng = np.random.default_rng(3)
+        images = np.stack([rng.poisson(50.0 * e, (64, 64)) for e in exposure]).astype(float)
+        psfs = np.array([[[0, 0, 1, 0, 0]], [[0, 1, 1, 0, 0]], [[1, 1, 1, 1, 1]]])
+        observation = lnocl.Observation(images, psfs, exposure=np.array(exposure))
+        gradient = np.zeros((64, 64))
+        for image, psf, e in zip(images, observation.psfs, exposure, strict=True):
+            excess = e * (image / (50.0 * e) - 1.0)
+            gradient += sum(v * np.roll(excess, 2 - x, 1) for x, v in enumerate(psf.ravel()))
+        grid = heldout.several_smoothings(0.0)(observation, 1.0)
+        found = [penalty.smoothing for penalty in grid] / heldout.SMOOTHING_GRID
+        np.testing.assert_allclose(found, gradient.std(), rtol=0.04)

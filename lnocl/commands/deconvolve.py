@@ -81,6 +81,14 @@ def _add_run_arguments(parser: Arguments) -> None:
         "held-out counts (default: %(default)s)",
     )
     parser.add_argument(
+        "--smoothing",
+        type=number_or_word,
+        default=0.0,
+        metavar="WEIGHT",
+        help="weight of an edge-preserving term that keeps noise down, 1e-4 to 1e-3 beside bright "
+        "stars, or auto: chosen by held-out counts (default: %(default)s)",
+    )
+    parser.add_argument(
         "--solver",
         choices=tuple(SOLVERS),
         default="sgm",
@@ -162,6 +170,7 @@ def _run(arguments: argparse.Namespace) -> None:
             frames.observation,
             stars=stars,
             mu=arguments.mu,
+            smoothing=arguments.smoothing,
             solver=arguments.solver,
             n_iter=arguments.n_iter,
             stop=arguments.stop,
@@ -312,6 +321,7 @@ def _cards(
         ("NITER", result.n_iter, "iterations done"),
         ("STOPPED", result.stop_reason, "why it stopped"),
         ("MU", result.mu, "weight of the Tikhonov term, per electron"),
+        ("SMOOTHIN", result.smoothing, "weight of the edge-preserving term"),
         ("PAD", _pad(arguments, observation), "least unobserved pixels round the images"),
         ("PRECISIO", _precision(arguments), "precision of the arithmetic"),
         ("ENGINE", arguments.engine, "engine"),
@@ -386,6 +396,7 @@ def _repeating_command(
         *(word for x, y in stars for word in ("--star", f"{x!r},{y!r}")),
         *(["--refine"] if arguments.refine else []),
         *_option("--mu", [str(arguments.mu)]),
+        *_option("--smoothing", [str(arguments.smoothing)]),
         *_option("--solver", [arguments.solver]),
         *_option("--n-iter", [str(arguments.n_iter)]),
         *_option("--stop", _if_given(arguments.stop)),
@@ -430,6 +441,7 @@ def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
         f"{result.n_iter} iterations on {result.device}, objective {objective:.6g}",
         *([] if result.stop_reason == "n_iter" else [reason]),
         *([f"mu chosen: {result.mu:.3g}"] if arguments.mu == "auto" else []),
+        *([f"smoothing chosen: {result.smoothing:.3g}"] if arguments.smoothing == "auto" else []),
         *stars,
         f"extended source: {result.extended.sum():.6g} {electrons}",
         f"written to {arguments.output}",

@@ -1,0 +1,53 @@
+"""The penalty on the extended source, beside the data term of the objective."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from numbers import Real
+
+from lnocl.errors import InputError
+
+# Of a weight: the most that means anything, beside images scaled to unit mean.
+MOST_WEIGHT = 2.0**64
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """``mu / 2 sum f^2 + smoothing sum psi(f - f')``, over pixels, and over pairs of neighbours.
+
+    ``psi(t) = sqrt(t^2 + delta^2) - delta`` is the hypersurface potential (Charbonnier et al. 1997,
+    IEEE Trans. Image Process. 6, 298): steps far below delta are smoothed as by a quadratic term,
+    while of an edge far above it only the height counts, so that it stays sharp.
+
+    Attributes
+    ----------
+    mu : float
+        Weight of the Tikhonov term, per electron, zero or more.
+    smoothing : float
+        Weight of the edge-preserving term, zero or more. It has no unit (with exposures that of an
+        exposure).
+
+    Raises
+    ------
+    InputError
+        A weight that is none.
+    """
+
+    mu: float = 0.0
+    smoothing: float = 0.0
+
+    def __post_init__(self) -> None:
+        weights: dict[str, object] = {"mu": self.mu, "smoothing": self.smoothing}
+        for name, weight in weights.items():
+            if not (isinstance(weight, Real) and math.isfinite(weight) and float(weight) >= 0):
+                raise InputError(
+                    f"{name} must be a number, finite and not negative; {weight!r} was given"
+                )
+
+    def of_half(self) -> Penalty:
+        """Return the penalty of half the counts of an observation that gives half the estimate.
+
+        A half has half the data term and a quarter of the squares; delta is halved too.
+        """
+        return Penalty(2.0 * self.mu, self.smoothing)
