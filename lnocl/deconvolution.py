@@ -185,7 +185,7 @@ def deconvolve(
         The images, p of shape (ny, nx), and what is known of them.
     stars : sequence of (x, y), optional
         Positions of the point sources in pixels of an image without offset, 0-based, x along
-        columns. Between pixels a star's image is the PSF moved by the phase of its spectrum
+        columns. Between pixels a star's image is the PSF moved in its spectrum
         (`lnocl.placement.place`).
     mu : float or "auto", optional
         Weight of the Tikhonov term on the extended source, per electron; zero or more. "auto":

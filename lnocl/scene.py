@@ -25,7 +25,7 @@ MAX_AXIS = 8192
 OBSERVED_SHARE = 0.01
 
 # Of a PSF's peak: what it may ring by, moved by half a pixel, before that is worth a warning.
-# Gaussians ring more where they are narrower than 1.9 pixels.
+# Gaussians do not ring where they are centred on a pixel, sharp ones do where they are not.
 MOST_RINGING = 0.01
 
 # The one division guard: where the model is not above this (images have unit mean) the ratio is

@@ -12,7 +12,7 @@ import functools
 import numpy as np
 import pytest
 import scipy.fft
-from scenes import ENGINES, Recipe, moved, worst
+from scenes import ENGINES, Recipe, placed, worst
 from scipy.special import kl_div
 
 from lnocl import program
@@ -113,10 +113,10 @@ def scipy_iteration(made):
         folded = np.zeros((ny, nx))
         for (y, x), value in np.ndenumerate(psf / psf.sum()):
             folded[(y - psf.shape[0] // 2) % ny, (x - psf.shape[1] // 2) % nx] += value
-        otfs.append(scipy.fft.fft2(moved(folded, *offset) if made.recipe.fractions else folded))
+        otfs.append(scipy.fft.fft2(placed(folded, *offset) if made.recipe.fractions else folded))
         for x, y in made.stars:
             if made.recipe.fractions:
-                star_images.append(moved(folded, x + offset[0], y + offset[1]))
+                star_images.append(placed(folded, x + offset[0], y + offset[1]))
             else:
                 pixel = np.zeros((ny, nx))
                 pixel[y, x] = 1.0
