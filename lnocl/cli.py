@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 
 from lnocl import __version__
-from lnocl.commands import bench, deconvolve, demo, devices, messages, plot, psf, simulate
+from lnocl.commands import bench, deconvolve, demo, devices, messages, plot, psf, selftest, simulate
 from lnocl.commands.arguments import Parser
 from lnocl.errors import LnoclError, LnoclWarning
 
@@ -22,6 +22,7 @@ COMMANDS = {
     "plot": plot.COMMAND,
     "bench": bench.COMMAND,
     "devices": devices.COMMAND,
+    "selftest": selftest.COMMAND,
 }
 
 

@@ -20,6 +20,7 @@ LAYERS = {
         "commands.devices",
         "commands.plot",
         "commands.psf",
+        "commands.selftest",
         "commands.simulate",
     },
     "commands.__init__": set(),
@@ -33,6 +34,7 @@ LAYERS = {
     "commands.devices": SHARED | {"device"},
     "commands.plot": SHARED | {"demo"},
     "commands.psf": SHARED | {"fitsread", "fitswrite", "plots", "psf"},
+    "commands.selftest": SHARED | {"device", "selftest"},
     "commands.simulate": SHARED | {"demo", "fitswrite", "simulate"},
     "bench": {
         "demo",
@@ -44,6 +46,9 @@ LAYERS = {
         "simulate",
         "trade",
     },
+    "selftest": {"deconvolution", "device", "observation", "rig", "simulate", "twins"},
+    "twins": {"fft", "reference", "rig"},
+    "rig": {"fft", "program", "scene"},
     "trade": {"deconvolution", "experiment", "metrics", "observation", "simulate"},
     "demo": {"experiment", "fitsread", "fitswrite", "metrics", "plots", "simulate"},
     "experiment": {"deconvolution", "metrics", "observation", "simulate"},
@@ -91,7 +96,7 @@ LAYERS = {
     "psf": {"centring", "observation", "repair", "resampling"},
     "simulate": set(),
 }
-KNOWS_OPENCL = {"opencl", "fft", "program", "device"}
+KNOWS_OPENCL = {"opencl", "fft", "program", "device", "rig", "twins", "selftest"}
 PACKAGE = Path(lnocl.__file__).parent
 MODULES = sorted(
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in PACKAGE.glob("**/*.py")

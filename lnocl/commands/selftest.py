@@ -1,0 +1,36 @@
+"""The command ``selftest``: try the kernels on a device, and say whether they are right."""
+
+from __future__ import annotations
+
+import argparse
+
+from lnocl import __version__
+from lnocl.commands import messages
+from lnocl.commands.arguments import Command, add_device
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = "Exit status: 0 all is right, 1 something is wrong, 2 wrong use."
+    add_device(parser)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from lnocl import device, selftest
+
+    chosen = device.choose(arguments.device).device
+    messages.say(
+        [
+            f"lnocl {__version__} on {device.describe(chosen)}, {chosen.version}; this takes up to "
+            "a minute"
+        ]
+    )
+    rows = selftest.run(chosen)
+    messages.say(selftest.table(rows))
+    messages.say([selftest.verdict(rows, chosen)])
+
+
+COMMAND = Command(
+    "try every kernel and short deconvolutions on a device, and say whether they are right",
+    _add_arguments,
+    _run,
+)
