@@ -17,7 +17,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
-from lnocl import demo, experiment, fitsread, fitswrite, metrics, simulate
+from lnocl import atomic, demo, experiment, fitsread, fitswrite, metrics, simulate
 from lnocl.errors import InputError, LnoclError
 
 # La Camera et al. (2012), Table 1: rho' and rho'' in percent, with their iterations.
@@ -163,7 +163,7 @@ def run(given):
     target = simulate.load_target(given.scene, given.size)
     simulation = simulate.simulate(target, simulate.Experiment(extended_magnitude=13 * u.mag))
     observation = experiment.observe(simulation)
-    fitswrite.check_folder(str(given.output), overwrite=True)
+    atomic.check_folder(str(given.output), overwrite=True)
     keep_truth(given.output / "truth.fits", simulation)
     jobs = []
     for method, mu in [("RLM", 0.0), *(("MC-RL", mu) for mu in given.mu)]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from astropy.table import Table
 
-from lnocl import __version__, demo, experiment, fitswrite, frames, plots, trade
+from lnocl import __version__, atomic, demo, experiment, frames, plots, trade
 from lnocl.errors import InputError, LnoclError
 from lnocl.frames import Known, Word
 from lnocl.observation import Observation
@@ -249,14 +249,14 @@ def _lines(table: Table) -> list[str]:
 def _write(table: Table, stem: str, overwrite: bool) -> Iterator[str]:
     text = io.StringIO()
     table.write(text, format="ascii.ecsv")
-    fitswrite.write_text(f"{stem}.ecsv", text.getvalue(), overwrite)
+    atomic.write_text(f"{stem}.ecsv", text.getvalue(), overwrite)
     yield f"written to {stem}.ecsv"
     try:
         plots.check()
     except LnoclError as error:
         yield f"no picture: {error}"
         return
-    plots.save(_figure(table), f"{stem}.png")
+    plots.save(_figure(table), f"{stem}.png", overwrite)
     yield f"drew {stem}.png"
 
 
@@ -277,4 +277,4 @@ def _check_files(stem: str, overwrite: bool, inputs: Sequence[str]) -> None:
     if not os.path.basename(stem):
         raise InputError(f"the output {stem!r} names no file; give a path without its ending")
     for ending in (".ecsv", ".png"):
-        fitswrite.check_output(stem + ending, overwrite, inputs)
+        atomic.check_output(stem + ending, overwrite, inputs)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl import __version__, experiment, fitsread, fitswrite, metrics, plots
+from lnocl import __version__, atomic, experiment, fitsread, fitswrite, metrics, plots
 from lnocl.errors import InputError, LnoclError
 from lnocl.experiment import Reconstruction
 from lnocl.simulate import Experiment, Simulation, load_target, simulate
@@ -82,7 +82,7 @@ def write_simulation(
     )
     record = {"lnocl": __version__, "scene": scene, **simulation.record()}
     path = os.path.join(folder, "record.json")
-    fitswrite.write_text(path, json.dumps(record, indent=2) + "\n", overwrite)
+    atomic.write_text(path, json.dumps(record, indent=2) + "\n", overwrite)
     return _command(folder, simulation, simulation.stars, "result")
 
 
@@ -118,9 +118,9 @@ def run(
     """
     experiment_at = Experiment(seed=seed)
     target = load_target(SCENE, size)
-    fitswrite.check_folder(folder, overwrite, make=False)
+    atomic.check_folder(folder, overwrite, make=False)
     simulation = simulate(target, experiment_at)
-    fitswrite.check_folder(folder, overwrite)
+    atomic.check_folder(folder, overwrite)
     write_simulation(folder, SCENE, simulation, overwrite)
     yield (
         f"simulated {SCENE}: {len(simulation.images)} images of {size} x {size} pixels, a star of "
@@ -241,21 +241,11 @@ def draw(
         Where the shapes of the files differ, or one holds no flux or values that are not finite.
     """
     plots.check()
-    fitswrite.check_folder(folder, overwrite, FIGURE_FILES, make=False)
+    atomic.check_folder(folder, overwrite, FIGURE_FILES, make=False)
     results = list(dict.fromkeys(results))
     saved = [fitsread.read_result(path) for path in results]
     true = None if truth is None else fitsread.read_result(truth)
-    for path, each in zip(results, saved, strict=True):
-        first = saved[0] if true is None else true
-        if each.extended.shape != first.extended.shape:
-            raise InputError(
-                f"{path} has the shape {each.extended.shape} and {truth or results[0]} "
-                f"{first.extended.shape}; they must be the same"
-            )
-        if not (np.isfinite(each.extended).all() and each.extended.max() > 0):
-            raise InputError(f"{path} holds values that are not finite, or no flux")
-    if true is not None and not (np.isfinite(true.extended).all() and true.extended.max() > 0):
-        raise InputError(f"{truth} holds values that are not finite, or no flux")
+    _check_saved([*([] if true is None else [true]), *saved])
     names = _names(results, saved)
     sources = [
         plots.Source(name, each.extended, holds_star=not each.stars)
@@ -265,25 +255,41 @@ def draw(
     original = None if true is None else plots.Source("truth", true.extended)
     curves = _tables(names, [each.curve for each in saved])
     histories = _tables(names, [each.history for each in saved])
-    fitswrite.check_folder(folder, overwrite, FIGURE_FILES)
-    yield _draw(folder, "objects", plots.objects(original, sources, frame))
+    atomic.check_folder(folder, overwrite, FIGURE_FILES)
+    yield _draw(folder, "objects", plots.objects(original, sources, frame), overwrite)
     if curves:
-        yield _draw(folder, "errors", plots.errors(curves))
-        yield _draw(folder, "magnitude", plots.magnitudes(curves, _true_magnitude(true)))
+        yield _draw(folder, "errors", plots.errors(curves), overwrite)
+        yield _draw(folder, "magnitude", plots.magnitudes(curves, _true_magnitude(true)), overwrite)
     else:
         yield "errors and magnitude skipped: no file has a table CURVE (lnocl demo writes it)"
         if histories:
-            yield _draw(folder, "objective", plots.objectives(histories))
+            yield _draw(folder, "objective", plots.objectives(histories), overwrite)
     held_out = _tables(names, [each.held_out for each in saved])
     if held_out:
-        yield _draw(folder, "held-out", plots.held_out_errors(held_out))
+        yield _draw(folder, "held-out", plots.held_out_errors(held_out), overwrite)
     if original is None or frame.star is None:
         yield "flux and width skipped: they need --truth with a star"
         return
     threshold = experiment.width_threshold(original.extended)
     for kind in ("flux", "width"):
         figure = plots.profiles(kind, original, sources, frame, experiment.NEAR_STAR, threshold)
-        yield _draw(folder, kind, figure)
+        yield _draw(folder, kind, figure, overwrite)
+
+
+def _check_saved(saved: Sequence[fitsread.SavedResult]) -> None:
+    first = saved[0]
+    ny, nx = first.extended.shape
+    for each in saved:
+        if each.extended.shape != (ny, nx):
+            raise InputError(
+                f"{each.path} has the shape {each.extended.shape} and {first.path} {(ny, nx)}; "
+                "they must be the same"
+            )
+        if not (np.isfinite(each.extended).all() and each.extended.max() > 0):
+            raise InputError(f"{each.path} holds values that are not finite, or no flux")
+        for x, y in each.stars:
+            if not (-0.5 <= x < nx - 0.5 and -0.5 <= y < ny - 0.5):
+                raise InputError(f"{each.path} has a star at ({x:g}, {y:g}), outside its image")
 
 
 def _in(folder: str, name: str) -> str:
@@ -363,14 +369,14 @@ def _pictures(
         plots.Frame(simulation.stars[0], scale),
         experiment.NEAR_STAR,
     )
-    yield _draw(folder, "demo", figure)
+    yield _draw(folder, "demo", figure, overwrite)
     results = [_in(folder, each.method.lower()) for each in found]
     yield from draw(folder, results, _in(folder, "truth"), overwrite)
 
 
-def _draw(folder: str, name: str, figure: plots.Figure) -> str:
+def _draw(folder: str, name: str, figure: plots.Figure, overwrite: bool) -> str:
     path = os.path.join(folder, f"{name}.png")
-    plots.save(figure, path)
+    plots.save(figure, path, overwrite)
     return f"drew {path}"
 
 
@@ -378,7 +384,7 @@ def _names(paths: Sequence[str], saved: Sequence[fitsread.SavedResult]) -> list[
     """Return the method and mu of each result, with its file where that leaves two alike."""
     names = []
     for each in saved:
-        mu = each.header.get("MU", 0.0)
+        mu = each.number("MU") or 0.0
         method = "MC-RL" if each.stars else "RLM"
         names.append(f"{method} mu={mu:g}" if each.stars or mu else method)
     return [
@@ -400,11 +406,12 @@ def _tables(
 
 def _frame(saved: Sequence[fitsread.SavedResult]) -> plots.Frame:
     star = next((each.stars[0] for each in saved if each.stars), None)
-    scale = next((each.header["PIXSCALE"] for each in saved if "PIXSCALE" in each.header), None)
+    scale = next((each.number("PIXSCALE") for each in saved if "PIXSCALE" in each.header), None)
     return plots.Frame(star, scale)
 
 
 def _true_magnitude(true: fitsread.SavedResult | None) -> float | None:
-    if true is None or not true.stars or "MAGZERO" not in true.header:
+    if true is None or not true.stars:
         return None
-    return metrics.magnitude(float(true.star_fluxes[0]), true.header["MAGZERO"])
+    zero = true.number("MAGZERO")
+    return None if zero is None else metrics.magnitude(float(true.star_fluxes[0]), zero)

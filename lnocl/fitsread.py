@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import io
-import os
 import re
 import warnings
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
-import astropy
 import numpy as np
 from astropy.io import fits
-from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError, LnoclWarning
+from lnocl.fitsfile import open_fits
+from lnocl.headers import make_wcs, number, quiet_log, readable
 
 RESULT_TABLES = {
     "STARS": ("x", "y", "flux"),
@@ -57,7 +53,7 @@ def read_stack(paths: Sequence[str]) -> Stack:
 
     The image of a file is the first HDU that is an image and has pixels: the primary HDU or an
     image extension. BSCALE, BZERO and BLANK are applied (a blank pixel is NaN). A file may be
-    compressed as a whole (gzip, bzip2 and what else astropy opens), but not in tiles.
+    compressed as a whole (gzip, bzip2, xz), but not in tiles.
 
     Parameters
     ----------
@@ -91,6 +87,22 @@ def read_stack(paths: Sequence[str]) -> Stack:
     return Stack(data.reshape(-1, ny, nx), list(headers), list(sha256))
 
 
+def read_single(path: str) -> Stack:
+    """Read the one image of a file.
+
+    Raises
+    ------
+    FileError, InputError
+        As `read_stack`; a cube of several images.
+    """
+    stack = read_stack([path])
+    if len(stack.data) > 1:
+        raise InputError(
+            f"{path} holds {len(stack.data)} images; give a file with one, such as their mean"
+        )
+    return stack
+
+
 def read_extension(path: str, name: str) -> NDArray[np.float64] | None:
     """Return the image extension of this name of a file, or None where there is none.
 
@@ -110,12 +122,19 @@ def read_keyword(path: str, header: fits.Header, keyword: str) -> str | float | 
 
     Of an image in an extension the primary header is asked too, where telescopes leave what holds
     for the whole file.
+
+    Raises
+    ------
+    FileError
+        As `read_stack`.
     """
     if keyword in header:
         return header[keyword]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they were shown when the image was read
-        return fits.getheader(path, 0).get(keyword)
+        with open_fits(path) as file:
+            primary = readable(next(file.hdus()).header)
+    return primary.get(keyword)
 
 
 def wcs_cards(header: fits.Header) -> fits.Header:
@@ -141,10 +160,10 @@ def wcs_cards(header: fits.Header) -> fits.Header:
     cards = fits.Header()
     for key in sorted({match[1] for match in map(_WCS_KEYWORD.fullmatch, header) if match}):
         try:
+            # What astropy mends on reading it writes mended.
+            wcs = make_wcs(header, key or " ")
             with warnings.catch_warnings(), quiet_log():
-                # What astropy mends on reading it writes mended.
                 warnings.simplefilter("ignore")
-                wcs = WCS(header, key=key or " ", naxis=2)
                 if key and not wcs.wcs.ctype[0].endswith("-SIP"):
                     wcs.sip = None  # that of the primary system, which astropy gives to all
                 cards.update(wcs.to_header(relax=True))
@@ -174,6 +193,8 @@ class SavedResult(NamedTuple):
         table.
     header : astropy.io.fits.Header
         Header of the extended source.
+    path : str
+        The file.
     """
 
     extended: NDArray[np.float64]
@@ -183,6 +204,17 @@ class SavedResult(NamedTuple):
     curve: dict[str, NDArray[np.float64]] | None
     held_out: dict[str, NDArray[np.float64]] | None
     header: fits.Header
+    path: str
+
+    def number(self, keyword: str) -> float | None:
+        """Return the number that a keyword of the header gives; None where it is missing.
+
+        Raises
+        ------
+        InputError
+            It gives no finite number.
+        """
+        return number(self.path, self.header, keyword)
 
 
 def read_result(path: str) -> SavedResult:
@@ -203,17 +235,17 @@ def read_result(path: str) -> SavedResult:
     FileError
         A file that `read_stack` refuses, or whose tables are not those of a result.
     """
-    extended, header, _ = _read_file(path)
-    try:
-        with fits.open(path, memmap=False) as hdus:
-            tables = {
-                hdu.name: {name: np.array(hdu.data[name], np.float64) for name in hdu.columns.names}
-                for hdu in hdus
-                if isinstance(hdu, fits.BinTableHDU) and hdu.name in RESULT_TABLES
-            }
-    except Exception as error:
-        # As in _read_stream: astropy raises whatever a damaged file leads it to.
-        raise FileError(f"{path} has tables that cannot be read: {error}") from error
+    image: tuple[NDArray[np.float64], fits.Header] | None = None
+    tables = {}
+    with open_fits(path) as file:
+        for hdu in file.hdus():
+            if image is None and _has_pixels(hdu):
+                image = file.pixels(hdu), readable(hdu.header)
+            elif isinstance(hdu, fits.BinTableHDU) and hdu.name in RESULT_TABLES:
+                tables[hdu.name] = file.columns(hdu)
+    if image is None:
+        raise _NoImageError(f"{path} holds no image")
+    extended, header = image
     lacking = [
         f"{table} {name}"
         for table, names in RESULT_TABLES.items()
@@ -232,6 +264,7 @@ def read_result(path: str) -> SavedResult:
         tables.get("CURVE"),
         tables.get("HELDOUT"),
         header,
+        path,
     )
 
 
@@ -243,95 +276,15 @@ def _read_file(
     path: str, extension: str | None = None
 ) -> tuple[NDArray[np.float64], fits.Header, str]:
     """Return an image in a file, its header and the checksum of the file."""
-    try:
-        with open(path, "rb") as stream:
-            return _read_stream(stream, path, extension)
-    except FileError:
-        raise
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise FileError(f"{path} cannot be opened: {reason}") from error
+    with open_fits(path) as file:
+        for hdu in file.hdus():
+            if extension in (None, hdu.name) and _has_pixels(hdu):
+                return file.pixels(hdu), readable(hdu.header), file.sha256()
+    raise _NoImageError(f"{path} holds no image")
 
 
-def _read_stream(
-    stream: io.BufferedReader, path: str, extension: str | None
-) -> tuple[NDArray[np.float64], fits.Header, str]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            with fits.open(stream, memmap=False, disable_image_compression=True) as hdus:
-                hdu = _first_image(hdus, path, extension)
-                if hdu is None:
-                    notes = "".join(f"; {warning.message}" for warning in caught)
-                    raise _NoImageError(f"{path} holds no image{notes}")
-                header = hdu.header.copy()
-                data = _read_pixels(hdu, path, stream)
-                stream.seek(0)
-                sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-        except (FileError, MemoryError):
-            raise
-        except Exception as error:
-            # astropy raises whatever a damaged file leads it to; its advice is for programmers.
-            reason = str(error).partition(". ")[0]
-            raise FileError(f"{path} is no FITS file, or a damaged one: {reason}") from error
-    for warning in caught:
-        warnings.warn(f"{path}: {warning.message}", LnoclWarning, stacklevel=4)
-    return data, header, sha256
-
-
-def _first_image(hdus: fits.HDUList, path: str, extension: str | None) -> fits.PrimaryHDU | None:
-    last = -1
-    for hdu in hdus:
-        begin = hdu.fileinfo()["hdrLoc"]
-        if begin <= last:
-            # A negative size in a damaged header sends astropy round in circles.
-            raise FileError(f"{path} is damaged: the size of an extension is negative")
-        last = begin
-        if hdu.header.get("ZIMAGE") is True:
-            # Decompressing damaged tiles corrupts the memory (seen with astropy 8.0).
-            raise FileError(f"{path} is tile-compressed; unpack it first, such as with funpack")
-        is_sought = extension is None or hdu.name == extension
-        if is_sought and hdu.is_image and len(getattr(hdu, "shape", ())) and 0 not in hdu.shape:
-            return hdu
-    return None
-
-
-def _read_pixels(hdu: fits.PrimaryHDU, path: str, stream: io.BufferedReader) -> NDArray[np.float64]:
-    _check_size(hdu, path, stream)
-    if "DATASUM" in hdu.header and hdu.verify_datasum() == 0:
-        warnings.warn("the data do not match their DATASUM; the file may be damaged", stacklevel=2)
-    return np.array(hdu.data, dtype=np.float64)
-
-
-def _check_size(hdu: fits.PrimaryHDU, path: str, stream: io.BufferedReader) -> None:
-    """Refuse pixels that are not there or that do not fit the memory, before they are read."""
-    # pread leaves the place where a decompressor reads.
-    uncompressed = os.pread(stream.fileno(), 6, 0) == b"SIMPLE"
-    if uncompressed:
-        promised = hdu.fileinfo()["datLoc"] + hdu.size
-        actual = os.fstat(stream.fileno()).st_size
-        if actual < promised:
-            raise FileError(
-                f"{path} is truncated: it should have {promised} bytes and has {actual}"
-            )
-    needed = 8 * int(np.prod([int(n) for n in hdu.shape], dtype=object))
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > memory:
-        raise FileError(
-            f"{path} has an image of shape {hdu.shape}, {needed / 2**30:.3g} GiB; "
-            f"this machine has {memory / 2**30:.3g} GiB of memory"
-        )
-
-
-@contextlib.contextmanager
-def quiet_log() -> Iterator[None]:
-    """Keep astropy's notes, such as on SIP coefficients, from the terminal."""
-    level = astropy.log.level
-    astropy.log.setLevel("WARNING")
-    try:
-        yield
-    finally:
-        astropy.log.setLevel(level)
+def _has_pixels(hdu: Any) -> bool:
+    return hdu.is_image and len(getattr(hdu, "shape", ())) > 0 and 0 not in hdu.shape
 
 
 def _check_shape(

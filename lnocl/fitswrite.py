@@ -1,27 +1,23 @@
-"""FITS out: images, and the result with what is needed to repeat the run; what outputs may be."""
+"""FITS out: images, and the result with what is needed to repeat the run."""
 
 from __future__ import annotations
 
 import os
-import secrets
 import shlex
-import stat
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from types import MappingProxyType
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.errors import FileError, InputError
+from lnocl.atomic import whole_file
 
 # A HISTORY card holds 72 characters; the last one may be needed for a backslash and a space.
 HISTORY_WIDTH = 70
-
-COMPRESSED = (".gz", ".bz2", ".xz", ".zip", ".z", ".fz")
 
 Card = tuple[str, str | int | float, str]
 
@@ -33,91 +29,6 @@ class StarColumn(NamedTuple):
     values: ArrayLike
     unit: str
     comment: str
-
-
-def check_folder(
-    path: str, overwrite: bool, names: Iterable[str] | None = None, make: bool = True
-) -> None:
-    """Make the folder that files go to, and check that none is lost, before any work is done.
-
-    Parameters
-    ----------
-    path : str
-        Folder; made where it does not exist.
-    overwrite : bool
-        Whether files in it may be replaced.
-    names : iterable of str, optional
-        Files that will be written. By default the folder must be empty.
-    make : bool, optional
-        Whether to make the folder; otherwise only check that it can be made.
-
-    Raises
-    ------
-    FileError
-        The path is no folder, cannot be made or written to, or holds files that must not be
-        overwritten.
-    """
-    if not (make or os.path.lexists(path)):
-        # What can be told now of a folder that is not there yet.
-        parent = os.path.dirname(os.path.abspath(path))
-        while not os.path.lexists(parent):
-            parent = os.path.dirname(parent)
-        if not os.path.isdir(parent):
-            raise FileError(f"the output folder {path} cannot be used: {parent} is no folder")
-        check_output(os.path.join(parent, ".lnocl"), overwrite=True)
-        return
-    try:
-        os.makedirs(path, exist_ok=True)
-        there = os.listdir(path)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise FileError(f"the output folder {path} cannot be used: {reason}") from error
-    if names is None and there and not overwrite:
-        raise FileError(
-            f"the output folder {path} is not empty; give another, or --overwrite to replace "
-            "files in it"
-        )
-    for name in [".lnocl"] if names is None else names:
-        check_output(os.path.join(path, name), overwrite)
-
-
-def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None:
-    """Check that a result can be written, before any work is done for it.
-
-    Parameters
-    ----------
-    path : str
-        File to write.
-    overwrite : bool
-        Whether it may exist already.
-    inputs : iterable of str, optional
-        Files that it must not replace.
-
-    Raises
-    ------
-    FileError
-        The file exists and must not be overwritten, is a folder or a device, or its folder
-        does not exist or cannot be written to.
-    InputError
-        The file is one of the inputs, or its name asks for compression.
-    """
-    if path.lower().endswith(COMPRESSED):
-        raise InputError(f"the output {path} is not compressed; give it a name ending in .fits")
-    target = os.path.realpath(path)
-    _check_replaceable(path, overwrite)
-    for source in inputs:
-        if os.path.exists(target) and os.path.exists(source) and os.path.samefile(source, target):
-            raise InputError(f"the output {path} is one of the inputs; give it another name")
-    if not os.path.isdir(os.path.dirname(target)):
-        raise FileError(f"the folder of the output {path} does not exist; create it first")
-    try:
-        temporary = _temporary_beside(target)
-        os.close(_create(temporary))
-        os.unlink(temporary)
-    except OSError as error:
-        raise FileError(
-            f"the output {path} cannot be written to its folder: {error.strerror}"
-        ) from error
 
 
 def write_result(
@@ -195,7 +106,8 @@ def write_result(
             *(_cube(name, *cube, coordinates) for name, cube in cubes.items()),
         ]
     )
-    _write_whole(path, lambda stream: hdus.writeto(stream, checksum=True), overwrite)
+    with whole_file(path, overwrite) as stream:
+        hdus.writeto(stream, checksum=True)
 
 
 def write_image(
@@ -236,28 +148,8 @@ def write_image(
             hdu.header.add_history(f"# {line}")
     _add_commands(hdu.header, commands)
     hdu.add_checksum(when="")  # astropy would note the time
-    _write_whole(path, fits.HDUList([hdu]).writeto, overwrite)
-
-
-def write_text(path: str, text: str, overwrite: bool = False) -> None:
-    """Write a text in UTF-8: the file is there complete, or not at all.
-
-    Parameters
-    ----------
-    path : str
-        File to write.
-    text : str
-        What it shall hold.
-    overwrite : bool, optional
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    FileError
-        The file cannot be written, or exists and must not be overwritten.
-    """
-    raw = text.encode("utf-8", "backslashreplace")
-    _write_whole(path, lambda stream: stream.write(raw), overwrite)
+    with whole_file(path, overwrite) as stream:
+        fits.HDUList([hdu]).writeto(stream)
 
 
 def history_lines(words: Sequence[str]) -> list[str]:
@@ -294,34 +186,6 @@ def history_lines(words: Sequence[str]) -> list[str]:
     return [*lines, line]
 
 
-def _check_replaceable(path: str, overwrite: bool) -> None:
-    try:
-        mode = os.stat(path).st_mode
-    except FileNotFoundError:
-        if not os.path.basename(path):
-            raise FileError(f"the output {path!r} names no file") from None
-        return
-    except (OSError, ValueError) as error:
-        raise FileError(
-            f"the output {path} cannot be written: {getattr(error, 'strerror', None) or error}"
-        ) from error
-    if not stat.S_ISREG(mode):
-        raise FileError(f"the output {path} exists and is no regular file; give another name")
-    if not overwrite:
-        raise FileError(
-            f"the output {path} exists; give another name, or --overwrite to replace it"
-        )
-
-
-def _temporary_beside(target: str) -> str:
-    return os.path.join(os.path.dirname(target), f".lnocl-{secrets.token_hex(8)}.tmp")
-
-
-def _create(path: str) -> int:
-    """Create a file that must not exist, with the permissions of any new file."""
-    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-
-
 def _add_cards(header: fits.Header, cards: Iterable[Card]) -> None:
     for keyword, value, comment in cards:
         header[keyword] = (_ascii(value) if isinstance(value, str) else value, comment)
@@ -331,32 +195,6 @@ def _add_commands(header: fits.Header, commands: Iterable[Sequence[str]]) -> Non
     for words in commands:
         for line in history_lines(words):
             header.add_history(line)
-
-
-def _write_whole(path: str, write: Callable[[IO[bytes]], object], overwrite: bool) -> None:
-    """Write a file under another name, and rename it when it is complete and on the disk."""
-    try:
-        _write_and_rename(path, write, overwrite)
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"{path} cannot be written: {error.strerror or error}") from error
-
-
-def _write_and_rename(path: str, write: Callable[[IO[bytes]], object], overwrite: bool) -> None:
-    target = os.path.realpath(path)
-    temporary = _temporary_beside(target)
-    descriptor = _create(temporary)
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            write(stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        _check_replaceable(path, overwrite)
-        os.replace(temporary, target)
-    except BaseException:
-        os.unlink(temporary)
-        raise
 
 
 def _star_table(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl import metrics
+from lnocl.atomic import whole_file
 from lnocl.errors import LnoclError
 
 if TYPE_CHECKING:
@@ -113,17 +114,25 @@ def check() -> None:
         ) from None
 
 
-def save(figure: Figure, path: str) -> None:
-    """Write a figure as PNG.
+def save(figure: Figure, path: str, overwrite: bool = False) -> None:
+    """Write a figure as PNG: the file is there complete, or not at all.
 
     Parameters
     ----------
     figure : matplotlib.figure.Figure
         One of those that the functions here return.
     path : str
-        File to write; replaced where it exists.
+        File to write.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written, or exists and must not be overwritten.
     """
-    figure.savefig(path, format="png", dpi=DPI, pil_kwargs={"optimize": True})
+    with whole_file(path, overwrite) as stream:
+        figure.savefig(stream, format="png", dpi=DPI, pil_kwargs={"optimize": True})
 
 
 def overview(
@@ -370,7 +379,9 @@ def profiles(
     axes = figure.subplots(2, 2, sharex="col", height_ratios=(1.3, 1))
     close = _near(truth, frame, near)
     bright = np.flatnonzero(_bright_rows(truth))
-    rest = slice(close.stop, max(int(bright[-1]) + 1, close.stop + 1))
+    # The last row at least, also where the star's rows reach the edge.
+    start = min(close.stop, len(truth.extended) - 1)
+    rest = slice(start, max(int(bright[-1]), start) + 1)
     for column, rows, title in ((0, close, "Near the star"), (1, rest, "The rest of the jet")):
         profile, error = axes[:, column]
         _draw_profile(profile, error, kind, truth, found, frame, rows, threshold)
@@ -677,7 +688,7 @@ def _draw_profile(
         percent = 100 * metrics.relative_error(values, reference)[rows]
         profile.plot(y, values[rows] * scale, **_line(i), label=source.name)
         error.plot(y, percent, **_line(i), marker=".", ms=4, label=source.name)
-        largest = max(largest, *np.abs(percent[np.isfinite(percent)]))
+        largest = max([largest, *np.abs(percent[np.isfinite(percent)])])
     error.set_ylim(*(np.array([-1.1, 1.1]) * min(largest, MAX_PERCENT)))
     error.axhline(0, color="black", lw=1)
     for axis in (profile, error):

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from astropy import constants
 from astropy import units as u
-from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.optimize import brentq
 from scipy.special import expit
 
-from lnocl.errors import FileError, InputError
+from lnocl import fitsread
+from lnocl.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -622,11 +622,11 @@ def load_target(
         )
     if size is not None:
         raise InputError(f"size {size} was given with {scene}, which has its own; leave it out")
-    image, header = _read_image(Path(scene))
+    image = fitsread.read_single(str(scene))
     if stars is None:
-        keyed = "STARX" in header and "STARY" in header
-        stars = [Star(header["STARX"], header["STARY"])] if keyed else []
-    return Target(image, stars)
+        keyed = "STARX" in image.header and "STARY" in image.header
+        stars = [Star(image.header["STARX"], image.header["STARY"])] if keyed else []
+    return Target(image.data[0], stars)
 
 
 @dataclass(frozen=True, eq=False)
@@ -785,18 +785,6 @@ def _expected_images(
     for (x, y), flux in zip(stars, star_fluxes, strict=True):
         images += flux * np.roll(psfs, (y - ny // 2, x - nx // 2), axis=(1, 2))
     return images
-
-
-def _read_image(path: Path) -> tuple[NDArray, fits.Header]:
-    try:
-        with fits.open(path) as hdus:
-            for hdu in hdus:
-                if hdu.is_image and hdu.data is not None and hdu.data.ndim == 2:
-                    return np.array(hdu.data), hdu.header
-    except (OSError, EOFError, TypeError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise FileError(f"{path} cannot be read as FITS: {reason}") from error
-    raise FileError(f"{path} holds no image of two axes")
 
 
 def _plain(value: Any) -> Any:

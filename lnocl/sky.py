@@ -6,20 +6,23 @@ import logging
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.io.registry import IORegistryError
+from astropy.io.registry import identify_format
 from astropy.table import Table
+from astropy.utils.data import get_readable_fileobj
+from astropy.utils.xml.iterparser import get_xml_iterator
 from astropy.wcs import WCS
 from astropy.wcs.utils import pixel_to_pixel
 from numpy.typing import NDArray
 
-from lnocl.errors import FileError, InputError
-from lnocl.fitsread import quiet_log
+from lnocl.errors import FileError, InputError, LnoclError
+from lnocl.fitsfile import open_fits
+from lnocl.headers import make_wcs, quiet_log
 from lnocl.units import parse
 
 log = logging.getLogger("lnocl")
@@ -56,7 +59,7 @@ def _find_wcs(header: fits.Header) -> WCS | None:
     with warnings.catch_warnings(), quiet_log():
         warnings.simplefilter("ignore")  # what astropy mends
         try:
-            wcs = WCS(header, naxis=2)
+            wcs = make_wcs(header)
             assert wcs.pixel_to_world(0, 0).icrs  # the Sun's, say, are not on the sky
             return wcs
         except Exception:  # whatever a damaged header leads astropy to
@@ -174,15 +177,43 @@ def _from_sky(path: str, ra: Any, dec: Any, header: fits.Header, image: str) -> 
 
 def _read_table(path: str) -> Table:
     try:
-        with open(path, "rb"), warnings.catch_warnings():
+        with (
+            open(path, "rb") as stream,
+            get_readable_fileobj(stream, encoding="binary") as content,
+            warnings.catch_warnings(),
+        ):
             warnings.simplefilter("ignore")
-            try:
-                return Table.read(path)
-            except IORegistryError:  # a name that says nothing of what is in it
-                return Table.read(path, format="ascii")
+            formats = identify_format("read", Table, path, content, [content], {})
+            # A name that says nothing of what is in the file is that of a plain text.
+            kind = formats[0] if formats else "ascii"
+            if kind == "fits":
+                return _read_fits_table(path)
+            if kind == "votable":
+                _check_votable(path, content)
+            # Its name would be taken for a table if it held a line break, for an address, ...
+            return Table.read(content, format=kind)
+    except LnoclError:
+        raise
     except Exception as error:  # astropy raises whatever a file leads its readers to
         reason = getattr(error, "strerror", None) or str(error).strip().partition("\n")[0]
         raise FileError(f"{path} cannot be read as a table: {reason}") from error
+
+
+def _read_fits_table(path: str) -> Table:
+    with open_fits(path, "cannot be read as a table") as file:
+        return Table.read(fits.HDUList(list(file.hdus())), format="fits")
+
+
+def _check_votable(path: str, content: IO[bytes]) -> None:
+    """Refuse a table that would have astropy read another file, or fetch one."""
+    with get_xml_iterator(content) as elements:
+        for is_start, tag, attributes, _ in elements:
+            if is_start and tag == "STREAM" and "href" in attributes:
+                raise FileError(
+                    f"{path} has its rows elsewhere, at {attributes['href']}; give a table that "
+                    "holds them"
+                )
+    content.seek(0)
 
 
 def _numbers(path: str, column: Any, unit: u.UnitBase) -> Pairs:

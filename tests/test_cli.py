@@ -116,6 +116,7 @@ BAD_ARGUMENTS = {
     "mu nan": (["--mu", "nan"], 2, "mu must be"),
     "mu minus nan": (["--mu", "-nan"], 2, "mu must be"),
     "mu a word": (["--mu", "little"], 2, "mu 'little' is not known; give a number or auto"),
+    "smoothing negative": (["--smoothing", "-1"], 2, "smoothing must be"),
     "background": (["--background", "-1"], 2, "background must be finite and not negative; -1"),
     "background nan": (["--background", "nan"], 2, "background must be finite"),
     "background inf": (["--background", "-inf"], 2, "background must be finite"),
@@ -281,7 +282,7 @@ class TestDeconvolve:
             "--star",
             "2,9",
         ),
-        *("--mu", "1e-3", "--n-iter", "7", "--pad", "3"),
+        *("--mu", "1e-3", "--smoothing", "0.02", "--n-iter", "7", "--pad", "3"),
     )
 
     @pytest.mark.parametrize(
@@ -303,6 +304,7 @@ class TestDeconvolve:
             ),
             stars=[(7, 5), (2, 9)],
             mu=1e-3,
+            smoothing=0.02,
             n_iter=7,
             pad=3,
             engine="numpy",
@@ -335,6 +337,7 @@ class TestDeconvolve:
             "NITER": 7,
             "STOPPED": "n_iter",
             "MU": 1e-3,
+            "SMOOTHIN": 0.02,
             "PAD": 3,
             "PRECISIO": "double",
             "ENGINE": "numpy",
@@ -348,7 +351,7 @@ class TestDeconvolve:
         assert "".join(header["HISTORY"]).replace("\\", "") == (
             f"cd {os.getcwd()}lnocl deconvolve a.fits b.fits --psf k1.fits "
             "--background 2.5 3.0000000000000004 --read-noise 1.0 --star 7.0,5.0 --star 2.0,9.0 "
-            "--mu 0.001 --solver sgm --n-iter 7 --pad 3 --precision double --engine numpy "
+            "--mu 0.001 --smoothing 0.02 --solver sgm --n-iter 7 --pad 3 --precision double --engine numpy "
             "-o out.fits"
         )
 
@@ -429,7 +432,8 @@ class TestFrames:
         *("--background", "auto", "level.fits", "--exposure", "EXPTIME", "--gain", "1.7"),
         *("--inverse-variance", "inverse.fits", "--mask", "mask.fits", "dq", "--align", "wcs"),
         *("--saturation", "1000", "--star", "3,12.25", "--stars", "stars.csv", "--refine"),
-        *("--mu", "1e-4", "--solver", "sgp", "--n-iter", "9", "--stop", "1e-9", "--pad", "2"),
+        *("--mu", "1e-4", "--smoothing", "1e-3", "--solver", "sgp"),
+        *("--n-iter", "9", "--stop", "1e-9", "--pad", "2"),
         *("--zero-point", "-2.5", "--models", "--residuals"),
     )
 
@@ -514,6 +518,7 @@ class TestFrames:
             observation,
             stars=stars,
             mu=1e-4,
+            smoothing=1e-3,
             solver="sgp",
             n_iter=9,
             stop=1e-9,

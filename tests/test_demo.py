@@ -125,7 +125,7 @@ BAD_SIMULATE = {
     "odd": (["hh34", "--size", "129"], 2, "the image is 129 x 129 pixels; each side must be"),
     "small": (["hh34", "--size", "32"], 2, "each side must be even and 64 or more"),
     "no flux": (["dark.fits"], 2, "the extended source has no flux"),
-    "no FITS": (["text.fits"], 1, "text.fits cannot be read as FITS"),
+    "no FITS": (["text.fits"], 1, "text.fits is no FITS file"),
     "size of a file": (["dark.fits", *SMALL], 2, "which has its own; leave it out"),
     "strehl 0": (["hh34", "--strehl", "0"], 2, "strehl must be in (0, 1]; 0.0 was given"),
     "strehl 2": (["hh34", "--strehl", "2"], 2, "strehl must be in (0, 1]"),

@@ -204,7 +204,7 @@ class TestRefusedFiles:
         [
             (lambda path: None, "cannot be opened: No such file"),
             (lambda path: path.mkdir(), "cannot be opened: Is a directory"),
-            (lambda path: path.touch(), "Empty or corrupt"),
+            (lambda path: path.touch(), "is no FITS file, or a damaged one: it ends too early"),
             (text, "is no FITS file"),
             (truncated, f"is truncated: it should have {2880 + 960} bytes and has {2880 + 959}"),
             (truncated_header, "is no FITS file, or a damaged one"),

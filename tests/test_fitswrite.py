@@ -1,7 +1,6 @@
-"""FITS out: what of a run a file keeps, and what no output may be."""
+"""FITS out: what of a run a file keeps."""
 
 import os
-import stat
 import subprocess
 
 import numpy as np
@@ -13,7 +12,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lnocl import fitswrite
-from lnocl.errors import FileError, InputError
 
 IMAGE = np.arange(1.0, 121.0).reshape(10, 12)
 HISTORY = np.array([(0, 3.5), (1, 2.5)], dtype=[("iteration", np.int64), ("objective", float)])
@@ -105,95 +103,6 @@ class TestWriting:
         kept = fits.getheader(path)["DEVICE"]
         assert kept.encode("ascii").decode("unicode_escape") == value
         assert fitscheck.main(["--compliance", path]) == 0
-
-    def test_a_new_file_has_the_permissions_of_any_new_file(self, tmp_path):
-        path = tmp_path / "out.fits"
-        before = os.umask(0o027)
-        try:
-            write(path)
-        finally:
-            os.umask(before)
-        assert stat.S_IMODE(path.stat().st_mode) == 0o640
-
-    def test_a_link_stays_a_link(self, tmp_path):
-        target, link = tmp_path / "target.fits", tmp_path / "link.fits"
-        target.touch()
-        link.symlink_to(target)
-        write(link, overwrite=True)
-        assert link.is_symlink()
-        np.testing.assert_array_equal(fits.getdata(target), IMAGE)
-
-    @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
-    @pytest.mark.parametrize("there", [False, True])
-    def test_a_failure_leaves_what_was_there(self, tmp_path, monkeypatch, error, there):
-        path = tmp_path / "out.fits"
-        if there:
-            path.write_bytes(b"old")
-
-        def fail(descriptor):
-            raise error
-
-        monkeypatch.setattr(os, "fsync", fail)
-        expected = FileError if isinstance(error, OSError) else KeyboardInterrupt
-        with pytest.raises(expected) as caught:
-            write(path, overwrite=True)
-        if isinstance(error, OSError):
-            assert str(caught.value) == f"{path} cannot be written: No space left on device"
-        assert [entry.name for entry in tmp_path.iterdir()] == (["out.fits"] if there else [])
-        assert not there or path.read_bytes() == b"old"
-
-    def test_a_file_that_came_into_being_meanwhile_is_kept(self, tmp_path):
-        path = tmp_path / "out.fits"
-        path.write_bytes(b"old")
-        with pytest.raises(FileError, match="exists"):
-            write(path)
-        assert path.read_bytes() == b"old"
-        assert len(list(tmp_path.iterdir())) == 1
-
-
-class TestCheckOutput:
-    def test_a_new_name_and_an_overwritten_one_pass(self, tmp_path):
-        path = tmp_path / "out.fits"
-        fitswrite.check_output(str(path), overwrite=False)
-        assert list(tmp_path.iterdir()) == []
-        path.write_bytes(b"old")
-        fitswrite.check_output(str(path), overwrite=True)
-        assert path.read_bytes() == b"old"
-
-    @pytest.mark.parametrize(
-        ("name", "error", "message"),
-        [
-            ("there.fits", FileError, "exists; give another name, or --overwrite"),
-            ("missing/out.fits", FileError, "does not exist; create it first"),
-            ("there.fits/out.fits", FileError, "cannot be written: Not a directory"),
-            ("folder", FileError, "is no regular file"),
-            ("n" * 300 + ".fits", FileError, "cannot be written: File name too long"),
-            ("new/", FileError, "names no file"),
-            ("out.fits.gz", InputError, "is not compressed"),
-        ],
-    )
-    def test_unusable_output(self, tmp_path, name, error, message):
-        (tmp_path / "there.fits").touch()
-        (tmp_path / "folder").mkdir()
-        with pytest.raises(error, match=message):
-            fitswrite.check_output(f"{tmp_path}/{name}", overwrite=False)
-
-    def test_a_folder_that_takes_no_file(self):
-        with pytest.raises(FileError, match=r"cannot be written to its folder"):
-            fitswrite.check_output("/proc/out.fits", overwrite=False)
-
-    def test_a_device_is_never_replaced(self):
-        with pytest.raises(FileError, match="no regular file"):
-            fitswrite.check_output(os.devnull, overwrite=True)
-
-    def test_an_input_is_never_replaced(self, tmp_path):
-        path = str(tmp_path / "a.fits")
-        fits.PrimaryHDU(IMAGE).writeto(path)
-        (tmp_path / "link.fits").symlink_to(path)
-        with pytest.raises(InputError, match="is one of the inputs"):
-            fitswrite.check_output(
-                str(tmp_path / "link.fits"), overwrite=True, inputs=["missing.fits", path]
-            )
 
 
 NAMES = st.text(

@@ -103,6 +103,16 @@ def test_profiles_and_their_errors(kind, expected):
     assert lines(rest)["RLM"][0][0] == 5.0 * 20
 
 
+@pytest.mark.parametrize("kind", ["flux", "width"])
+@pytest.mark.parametrize("star", [(20, 4), (20, 62)])
+def test_profiles_of_a_star_in_the_dark_or_at_the_edge(kind, star):
+    light = jet()
+    light[:30] = 0.0
+    dark = plots.Source("truth", light)
+    figure = plots.profiles(kind, dark, FOUND, plots.Frame(star), near=20, threshold=1.0)
+    assert all(len(lines(axis)["MC-RL"][0]) for axis in figure.axes)
+
+
 def test_the_overview_has_a_panel_for_each_and_two_profiles(tmp_path):
     figure = plots.overview(TRUTH, plots.Source("image", jet()), FOUND, FRAME, 20)
     assert len(panels(figure)) == 4

@@ -157,9 +157,9 @@ def _add_output_arguments(parser: Arguments) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl import fitsread, fitswrite
+    from lnocl import atomic, fitsread, fitswrite
 
-    fitswrite.check_output(arguments.output, arguments.overwrite, _input_paths(arguments))
+    atomic.check_output(arguments.output, arguments.overwrite, _input_paths(arguments))
     folder = os.getcwd()
     device = _device_spec(arguments)
     with contextlib.nullcontext() if arguments.quiet else messages.shown_log():

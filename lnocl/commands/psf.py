@@ -145,14 +145,14 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _check_outputs(arguments: argparse.Namespace) -> None:
     """Check all that can be told before the frame is read."""
-    from lnocl import fitswrite
+    from lnocl import atomic
 
     if len(arguments.stars) > 1:
         raise InputError(
             f"a PSF is made of one star, and {len(arguments.stars)} were given; give --star once"
         )
     inputs = [arguments.frame, *([] if arguments.mask is None else [arguments.mask])]
-    fitswrite.check_output(arguments.output, arguments.overwrite, inputs)
+    atomic.check_output(arguments.output, arguments.overwrite, inputs)
     if arguments.plot is None:
         return
 
@@ -168,7 +168,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
         raise InputError(
             f"--plot draws {MAX_DRAWN} PSFs at most, and {len(arguments.angles)} angles were given"
         )
-    fitswrite.check_output(arguments.plot, arguments.overwrite, inputs)
+    atomic.check_output(arguments.plot, arguments.overwrite, inputs)
     plots.check()
 
 
@@ -176,11 +176,7 @@ def _read_image(path: str) -> tuple[NDArray[np.float64], str]:
     """Return the one image of a file, and the file's checksum."""
     from lnocl import fitsread
 
-    stack = fitsread.read_stack([path])
-    if len(stack.data) > 1:
-        raise InputError(
-            f"{path} holds {len(stack.data)} images; give a file with one, such as their mean"
-        )
+    stack = fitsread.read_single(path)
     return stack.data[0], stack.sha256[0]
 
 
@@ -273,7 +269,7 @@ def _draw(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> None:
         [star.psf for star in stars],
         arguments.angles,
     )
-    plots.save(figure, arguments.plot)
+    plots.save(figure, arguments.plot, arguments.overwrite)
 
 
 COMMAND = Command(

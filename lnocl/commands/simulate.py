@@ -77,7 +77,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     from astropy import units as u
 
-    from lnocl import demo, fitswrite, simulate
+    from lnocl import atomic, demo, simulate
 
     stars = arguments.stars and [simulate.Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
     target = simulate.load_target(arguments.scene, arguments.size, stars)
@@ -92,9 +92,9 @@ def _run(arguments: argparse.Namespace) -> None:
     experiment = simulate.Experiment(
         **{name: value * units[name] if name in units else value for name, value in given.items()}
     )
-    fitswrite.check_folder(arguments.output, arguments.overwrite, make=False)
+    atomic.check_folder(arguments.output, arguments.overwrite, make=False)
     simulation = simulate.simulate(target, experiment)
-    fitswrite.check_folder(arguments.output, arguments.overwrite)
+    atomic.check_folder(arguments.output, arguments.overwrite)
     command = demo.write_simulation(
         arguments.output, arguments.scene, simulation, arguments.overwrite
     )

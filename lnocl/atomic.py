@@ -1,0 +1,232 @@
+"""Output files: what they may be, and that each is there complete or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import secrets
+import stat
+from collections.abc import Iterable, Iterator
+from typing import IO, Any
+
+from lnocl.errors import FileError, InputError
+
+COMPRESSED = (".gz", ".bz2", ".xz", ".zip", ".z", ".fz")
+
+
+def check_folder(
+    path: str, overwrite: bool, names: Iterable[str] | None = None, make: bool = True
+) -> None:
+    """Make the folder that files go to, and check that none is lost, before any work is done.
+
+    Parameters
+    ----------
+    path : str
+        Folder; made where it does not exist.
+    overwrite : bool
+        Whether files in it may be replaced.
+    names : iterable of str, optional
+        Files that will be written. By default the folder must be empty.
+    make : bool, optional
+        Whether to make the folder; otherwise only check that it can be made.
+
+    Raises
+    ------
+    FileError
+        The path is no folder, cannot be made or written to, or holds files that must not be
+        overwritten.
+    """
+    if not (make or os.path.lexists(path)):
+        # What can be told now of a folder that is not there yet.
+        parent = os.path.dirname(os.path.abspath(path))
+        while not os.path.lexists(parent):
+            parent = os.path.dirname(parent)
+        if not os.path.isdir(parent):
+            raise FileError(f"the output folder {path} cannot be used: {parent} is no folder")
+        check_output(os.path.join(parent, ".lnocl"), overwrite=True)
+        return
+    try:
+        os.makedirs(path, exist_ok=True)
+        there = os.listdir(path)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise FileError(f"the output folder {path} cannot be used: {reason}") from error
+    if names is None and there and not overwrite:
+        raise FileError(
+            f"the output folder {path} is not empty; give another, or --overwrite to replace "
+            "files in it"
+        )
+    for name in [".lnocl"] if names is None else names:
+        check_output(os.path.join(path, name), overwrite)
+
+
+def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None:
+    """Check that a result can be written, before any work is done for it.
+
+    Parameters
+    ----------
+    path : str
+        File to write.
+    overwrite : bool
+        Whether it may exist already.
+    inputs : iterable of str, optional
+        Files that it must not replace.
+
+    Raises
+    ------
+    FileError
+        The file exists and must not be overwritten, is a folder or a device, or its folder
+        does not exist or cannot be written to.
+    InputError
+        The file is one of the inputs, or its name asks for compression.
+    """
+    if path.lower().endswith(COMPRESSED):
+        raise InputError(f"the output {path} is not compressed; give it a name ending in .fits")
+    target = os.path.realpath(path)
+    _check_replaceable(path, overwrite)
+    for source in inputs:
+        if os.path.exists(target) and os.path.exists(source) and os.path.samefile(source, target):
+            raise InputError(f"the output {path} is one of the inputs; give it another name")
+    if not os.path.isdir(os.path.dirname(target)):
+        raise FileError(f"the folder of the output {path} does not exist; create it first")
+    try:
+        temporary = _temporary_beside(target)
+        _Output(temporary).close()
+        os.unlink(temporary)
+    except OSError as error:
+        raise FileError(
+            f"the output {path} cannot be written to its folder: {error.strerror}"
+        ) from error
+
+
+@contextlib.contextmanager
+def whole_file(path: str, overwrite: bool = False) -> Iterator[IO[bytes]]:
+    """Yield a stream whose content becomes the file once it is complete and on the disk.
+
+    Until then it is a temporary file in the same folder. After a failure that one is gone, and a
+    file that was there is as it was.
+
+    Parameters
+    ----------
+    path : str
+        File to write.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Yields
+    ------
+    binary stream
+        To write to.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written, or exists and must not be overwritten.
+    """
+    target = os.path.realpath(path)
+    temporary = _temporary_beside(target)
+    with _explained(path):
+        output = _Output(temporary)
+    try:
+        with _explained(path, output):
+            with io.BufferedWriter(output) as stream:
+                yield stream
+                stream.flush()
+                os.fsync(stream.fileno())
+            _check_replaceable(path, overwrite)
+            os.replace(temporary, target)
+    except BaseException:
+        with contextlib.suppress(OSError):  # what failed before is what must be told
+            os.unlink(temporary)
+        raise
+
+
+def write_text(path: str, text: str, overwrite: bool = False) -> None:
+    """Write a text in UTF-8: the file is there complete, or not at all.
+
+    Parameters
+    ----------
+    path : str
+        File to write.
+    text : str
+        What it shall hold.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written, or exists and must not be overwritten.
+    """
+    with whole_file(path, overwrite) as stream:
+        stream.write(text.encode("utf-8", "backslashreplace"))
+
+
+class _Output(io.RawIOBase):
+    """A new file that remembers why it could not be written.
+
+    Those who write may make something else of that: astropy raises AttributeError on a full disk.
+    """
+
+    def __init__(self, path: str) -> None:
+        super().__init__()
+        self.failure: OSError | None = None
+        self._file = open(path, "xb", buffering=0)  # noqa: SIM115
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._file.fileno()
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def write(self, data: Any) -> int:
+        try:
+            return self._file.write(data)
+        except OSError as error:
+            self.failure = error
+            raise
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+@contextlib.contextmanager
+def _explained(path: str, output: _Output | None = None) -> Iterator[None]:
+    """Raise what the operating system refuses as FileError; let all else pass."""
+    try:
+        yield
+    except FileError:
+        raise
+    except Exception as error:
+        failure = (output.failure if output else None) or error
+        if not isinstance(failure, OSError):
+            raise
+        raise FileError(f"{path} cannot be written: {failure.strerror or failure}") from error
+
+
+def _check_replaceable(path: str, overwrite: bool) -> None:
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        if not os.path.basename(path):
+            raise FileError(f"the output {path!r} names no file") from None
+        return
+    except (OSError, ValueError) as error:
+        raise FileError(
+            f"the output {path} cannot be written: {getattr(error, 'strerror', None) or error}"
+        ) from error
+    if not stat.S_ISREG(mode):
+        raise FileError(f"the output {path} exists and is no regular file; give another name")
+    if not overwrite:
+        raise FileError(
+            f"the output {path} exists; give another name, or --overwrite to replace it"
+        )
+
+
+def _temporary_beside(target: str) -> str:
+    return os.path.join(os.path.dirname(target), f".lnocl-{secrets.token_hex(8)}.tmp")

@@ -1,0 +1,230 @@
+"""An open FITS file: the one place where what astropy raises of a file becomes our error."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import warnings
+from collections.abc import Iterator
+from typing import IO, Any
+
+import numpy as np
+from astropy.io import fits
+from astropy.utils.data import get_readable_fileobj
+from numpy.typing import NDArray
+
+from lnocl.errors import FileError, LnoclError, LnoclWarning
+
+# What astropy counts to when it reads a header, and as far as FITS lets it count.
+COUNTS = ("NAXIS", "TFIELDS")
+MAX_COUNT = 999
+
+
+class FitsFile:
+    """A FITS file that `open_fits` has opened.
+
+    Parameters
+    ----------
+    path : str
+        Its name.
+    stream : binary stream
+        The file as it lies on the disk.
+    content : binary stream
+        What it holds, unpacked where it is compressed as a whole.
+    hdus : astropy.io.fits.HDUList
+        The same, read.
+    length : int
+        Bytes of the content.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        stream: io.BufferedReader,
+        content: IO[bytes],
+        hdus: fits.HDUList,
+        length: int,
+    ) -> None:
+        self.path = path
+        self._stream, self._content, self._hdus = stream, content, hdus
+        self._length = length
+
+    def hdus(self) -> Iterator[Any]:
+        """Yield the HDUs, each after a look whether the file holds as much as its header claims.
+
+        Raises
+        ------
+        FileError
+            An HDU of negative size, beyond the end of the file or compressed in tiles.
+
+        Warns
+        -----
+        UserWarning
+            The end of the file is no HDU, and left out.
+        """
+        for hdu in self._hdus:
+            where = hdu.fileinfo()
+            # With a keyword given twice it may be another size than that of check_header.
+            check_size(self.path, self._length, where["datLoc"], hdu.size)
+            if hdu.header.get("ZIMAGE") is True:
+                # Decompressing damaged tiles corrupts the memory (seen with astropy 8.0).
+                raise FileError(
+                    f"{self.path} is tile-compressed; unpack it first, such as with funpack"
+                )
+            yield hdu
+            end = where["datLoc"] + where["datSpan"]
+            if end >= self._length:
+                return
+            try:
+                check_header(self.path, self._content, self._length, end)
+            except FileError:
+                raise
+            except Exception as error:
+                warnings.warn(f"what follows byte {end} is left out: {error}", stacklevel=2)
+                return
+
+    def pixels(self, hdu: Any) -> NDArray[np.float64]:
+        """Return the pixels of an image.
+
+        Raises
+        ------
+        FileError
+            An image larger than the memory.
+
+        Warns
+        -----
+        UserWarning
+            Data that do not match their DATASUM.
+        """
+        needed = 8 * int(np.prod([int(n) for n in hdu.shape], dtype=object))
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        if needed > memory:
+            raise FileError(
+                f"{self.path} has an image of shape {hdu.shape}, {needed / 2**30:.3g} GiB; "
+                f"this machine has {memory / 2**30:.3g} GiB of memory"
+            )
+        _verify(hdu)
+        return np.array(hdu.data, dtype=np.float64)
+
+    def columns(self, hdu: Any) -> dict[str, NDArray[np.float64]]:
+        """Return the columns of a table, by name.
+
+        Raises
+        ------
+        FileError
+            A column with several numbers in a row.
+
+        Warns
+        -----
+        UserWarning
+            Data that do not match their DATASUM.
+        """
+        _verify(hdu)
+        columns = {name: np.array(hdu.data[name], np.float64) for name in hdu.columns.names}
+        for name, values in columns.items():
+            if values.ndim != 1:
+                raise FileError(
+                    f"{self.path} has several numbers in a row of column {name} of {hdu.name}"
+                )
+        return columns
+
+    def sha256(self) -> str:
+        """Return the checksum of the file, in hexadecimal; nothing can be read after it."""
+        self._stream.seek(0)
+        return hashlib.file_digest(self._stream, "sha256").hexdigest()
+
+
+def check_header(path: str, content: IO[bytes], length: int, start: int) -> None:
+    """Refuse a header that claims too much, before astropy counts to it or makes room for it.
+
+    Raises
+    ------
+    FileError
+        The header that starts at this byte has more axes or columns than FITS allows, or data
+        that are not there.
+    Exception
+        Whatever astropy raises of what is no header.
+    """
+    content.seek(start)
+    header = fits.Header.fromfile(content)
+    for card in header.cards:
+        if card.keyword in COUNTS and not 0 <= card.value <= MAX_COUNT:
+            raise FileError(f"{path} is damaged: {card.keyword} is {card.value}")
+    check_size(path, length, content.tell(), header.data_size)
+
+
+def check_size(path: str, length: int, start: int, size: int) -> None:
+    """Refuse data that are not there.
+
+    Raises
+    ------
+    FileError
+        They have a negative size, or end beyond the end of the file.
+    """
+    if size < 0:
+        # This would send astropy round in circles.
+        raise FileError(f"{path} is damaged: the size of an extension is negative")
+    if length < start + size:
+        raise FileError(
+            f"{path} is truncated: it should have {start + size} bytes and has {length}"
+        )
+
+
+@contextlib.contextmanager
+def open_fits(
+    path: str, complaint: str = "is no FITS file, or a damaged one"
+) -> Iterator[FitsFile]:
+    """Open a FITS file, and raise whatever is found wrong with it while it is open as FileError.
+
+    Parameters
+    ----------
+    path : str
+        File to read.
+    complaint : str, optional
+        What a file is, or cannot be, where astropy cannot read it.
+
+    Yields
+    ------
+    FitsFile
+        To read from; do nothing else meanwhile, lest its errors be taken for the file's.
+
+    Raises
+    ------
+    FileError
+        A file that is missing, no FITS or damaged.
+
+    Warns
+    -----
+    LnoclWarning
+        What astropy found wrong and could mend.
+    """
+    try:
+        stream = open(path, "rb")  # noqa: SIM115
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise FileError(f"{path} cannot be opened: {reason}") from error
+    with stream, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            with get_readable_fileobj(stream, encoding="binary") as content:
+                # Of a compressed file this unpacks all of it, and so verifies its checksum.
+                length = content.seek(0, os.SEEK_END)
+                check_header(path, content, length, 0)
+                content.seek(0)
+                with fits.open(content, memmap=False, disable_image_compression=True) as hdus:
+                    yield FitsFile(path, stream, content, hdus, length)
+        except (LnoclError, MemoryError):
+            raise
+        except Exception as error:
+            # astropy raises whatever a damaged file leads it to; its advice is for programmers.
+            reason = str(error).partition(". ")[0] or "it ends too early"
+            raise FileError(f"{path} {complaint}: {reason}") from error
+    for warning in caught:
+        warnings.warn(f"{path}: {warning.message}", LnoclWarning, stacklevel=5)
+
+
+def _verify(hdu: Any) -> None:
+    if "DATASUM" in hdu.header and hdu.verify_datasum() == 0:
+        warnings.warn("the data do not match their DATASUM; the file may be damaged", stacklevel=2)
