@@ -22,8 +22,8 @@ DTYPES = {"s": np.float32, "d": np.float64}
 ON_GPU = "as on a GPU"
 DECONVOLUTION = "deconvolution"
 
-# As those of test_kernels.py, and smaller: grid, tuning, scene, precisions. Without a tuning the one
-# for a CPU, of one work-item a group; in a group of several, all barriers count.
+# As those of test_kernels.py, and smaller: grid, tuning, scene, precisions. Without a tuning the
+# one for a CPU, of one work-item a group; in a group of several, all barriers count.
 CASES = {
     "smallest grid": ((2, 2), None, "two images, star, mu", "sD"),
     "an item a block": ((16, 16), None, rig.THREE_IMAGES, "sd"),
