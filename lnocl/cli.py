@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted.
+        Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 terminated.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("always", LnoclWarning)
@@ -62,7 +62,7 @@ def _make_parser() -> Parser:
     parser = Parser(
         prog="lnocl",
         description="Multi-component Richardson-Lucy deconvolution of astronomical images.",
-        epilog="Exit status: 0 done, 1 failed, 2 wrong use.",
+        epilog="Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 terminated.",
     )
     parser.add_argument("--version", action="version", version=f"lnocl {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)

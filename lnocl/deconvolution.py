@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -12,12 +11,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
+from lnocl.checkpoint import Keeper, describe
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.heldout import CURVE_DTYPE, Choice, Grid, choose, several_mu, several_smoothings
 from lnocl.observation import Array, Observation, numbers
 from lnocl.penalty import Penalty
+from lnocl.progress import Bar
 from lnocl.run import Run, Setup
 from lnocl.solvers import SOLVERS
 from lnocl.stopping import Rule, make_rule
@@ -25,9 +25,6 @@ from lnocl.stopping import Rule, make_rule
 PRECISIONS = ("single", "double")
 ENGINES = ("opencl", "numpy")
 STOPS = ("discrepancy", "held-out")
-
-# Seconds between two looks at the objective for the progress bar: each look waits for the device.
-PROGRESS_INTERVAL = 0.1
 
 # What single precision strays from double, as a share of the extended source, for each iteration of
 # a long run, and the share that is worth a warning (benchmarks/precision.py, docs/precision.md).
@@ -169,6 +166,9 @@ def deconvolve(
     progress: bool = False,
     refine_positions: bool = False,
     smoothing: float | str = 0.0,
+    checkpoint: str | None = None,
+    checkpoint_every: float = 60.0,
+    resume: str | None = None,
 ) -> Result:
     """Reconstruct the sky from several images as stars plus an extended source.
 
@@ -235,6 +235,15 @@ def deconvolve(
         with the iterations, most of all beside bright stars; 1e-4 to 1e-3 for stars a hundred times
         as bright as what is beside them (docs/sgp.md). "auto": 0 or one of five values, whichever
         held-out counts choose (see Notes).
+    checkpoint : str, optional
+        File for checkpoints (FITS): written after the first iteration, then every
+        `checkpoint_every` seconds, and at the end. Each replaces the one before once it is
+        complete.
+    checkpoint_every : float, optional
+        Seconds between checkpoints, zero or more.
+    resume : str, optional
+        Checkpoint to go on from. Everything else must be as it was when it was written; the result
+        is then bit for bit that of a run that was never interrupted.
 
     Returns
     -------
@@ -247,6 +256,9 @@ def deconvolve(
         A parameter out of its range or too large for the precision, mu and smoothing both "auto",
         a star outside the images, no such device, or a device for the reference; held-out counts
         of images that hold none.
+    FileError
+        A checkpoint that cannot be written or read, is damaged, or would replace that of another
+        run.
     DeviceError
         No OpenCL device at all, too little memory on it, no double precision, or a compiler that
         fails.
@@ -294,9 +306,26 @@ def deconvolve(
     if engine == "opencl" and precision == "single":
         _warn_of_straying(int(n_iter))
     setup = Setup(stars, pad, solver, precision, engine, device, refine_positions)
-    bar = _Bar(int(n_iter), progress)
+    keeper = Keeper(
+        checkpoint,
+        checkpoint_every,
+        resume,
+        lambda: describe(
+            observation,
+            setup,
+            mu=mu,
+            smoothing=smoothing,
+            n_iter=int(n_iter),
+            stop=stop,
+            initial_extended=initial_extended,
+            initial_star_fluxes=initial_star_fluxes,
+        ),
+    )
+    bar = Bar(int(n_iter), progress)
     with bar:
-        if grid is not None or stop == "held-out":
+        if keeper.saved is not None:
+            choice = keeper.saved.choice()
+        elif grid is not None or stop == "held-out":
             choice = _choose(
                 setup, observation, penalty, grid, stop, int(n_iter), initial_extended, bar
             )
@@ -305,8 +334,12 @@ def deconvolve(
         run = Run(
             setup, observation, choice.penalty, choice.n_iter, initial_extended, initial_star_fluxes
         )
+        rule = make_rule(stop)
+        stop_reason = keeper.restore(run, rule)
         bar.expect(choice.n_iter)
-        stop_reason = _iterate(run, choice.n_iter, make_rule(stop), callback, bar)
+        if not stop_reason:
+            keep = partial(keeper.keep, run, rule, choice)
+            stop_reason = _iterate(run, choice.n_iter, rule, callback, bar, keep)
     if stop == "held-out" and stop_reason == "n_iter":
         stop_reason = "held-out"
     return _wrap_up(run, stop_reason, choice)
@@ -364,34 +397,6 @@ def _warn_of_straying(n_iter: int) -> None:
         )
 
 
-class _Bar:
-    """A progress bar that looks at what it shows at most every tenth of a second."""
-
-    def __init__(self, n_iter: int, progress: bool) -> None:
-        # disable=None is tqdm's word for "quiet where stderr is no terminal".
-        self._bar = tqdm(total=n_iter, unit="it", disable=None if progress else True)
-        self._shown = time.monotonic()
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._bar.close()
-
-    def expect(self, n_iter: int) -> None:
-        """Count to another number of iterations."""
-        self._bar.total = n_iter
-
-    def show(self, iteration: int, quantity: Callable[[], str], last: bool = False) -> None:
-        """Show how far it is, where it is time to, or at the end."""
-        if self._bar.disable:
-            return
-        if last or time.monotonic() - self._shown > PROGRESS_INTERVAL:
-            self._bar.set_postfix_str(quantity(), refresh=False)
-            self._bar.update(iteration - self._bar.n)
-            self._shown = time.monotonic()
-
-
 def _choose(
     setup: Setup,
     observation: Observation,
@@ -400,7 +405,7 @@ def _choose(
     stop: object,
     n_iter: int,
     initial_extended: ArrayLike | None,
-    bar: _Bar,
+    bar: Bar,
 ) -> Choice:
     """Have held-out counts choose the penalty and the number of iterations, or one of them."""
     half = None
@@ -417,8 +422,15 @@ def _choose(
     )
 
 
-def _iterate(run: Run, n_iter: int, rule: Rule, callback: Callback | None, bar: _Bar) -> str:
-    """Iterate to the end; return why it ended."""
+def _iterate(
+    run: Run,
+    n_iter: int,
+    rule: Rule,
+    callback: Callback | None,
+    bar: Bar,
+    keep: Callable[[str], None],
+) -> str:
+    """Iterate to the end, keeping checkpoints; return why it ended."""
     quantity = partial(rule.quantity, run)
     stop_reason = None
     for iteration in run:
@@ -431,8 +443,11 @@ def _iterate(run: Run, n_iter: int, rule: Rule, callback: Callback | None, bar: 
             stop_reason = stop_reason or rule.reason
         bar.show(iteration, quantity, last=stop_reason is not None or iteration == n_iter)
         if stop_reason is not None:
-            return stop_reason
-    return "n_iter" if run.done == n_iter else "converged"
+            break
+        keep("")
+    stop_reason = stop_reason or ("n_iter" if run.done == n_iter else "converged")
+    keep(stop_reason)
+    return stop_reason
 
 
 def _wrap_up(run: Run, stop_reason: str, choice: Choice) -> Result:

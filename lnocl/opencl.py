@@ -429,6 +429,28 @@ class OpenCLEngine:
         pairs = self._download("objectives", 2 * self._n_objectives)
         return pairs.reshape(-1, 2).sum(axis=1)
 
+    def state(self) -> dict[str, NDArray]:
+        """Return what `restore` needs, as it is between iterations, as it lies on the device."""
+        state = {}
+        for name in self._stateful:
+            state[name] = np.empty(self._buffers[name].size, np.uint8).view(self.program.dtype)
+            cl.enqueue_copy(self._queue, state[name], self._buffers[name])
+        state["objectives"] = state["objectives"][: 2 * self._n_objectives]
+        return state
+
+    @property
+    def _stateful(self) -> tuple[str, ...]:
+        estimate = "extended", "star_fluxes", "square_sums", "objectives"
+        return estimate if self.scaling is None else (*estimate, "previous", "gradient")
+
+    def restore(self, state: dict[str, NDArray]) -> None:
+        """Go on from this state."""
+        for name in self._stateful:
+            if name in state:  # no objective may have been recorded yet
+                cl.enqueue_copy(self._queue, self._buffers[name], state[name])
+        self._launcher.rows("rfft_rows", self._buffers["spectra"], self._buffers["extended"])()
+        self._n_objectives = len(state.get("objectives", ())) // 2
+
     def _upload(self, name: str, values: Array) -> None:
         cl.enqueue_copy(self._queue, self._buffers[name], self._rounded(name, values))
 

@@ -350,3 +350,23 @@ class ReferenceEngine:
     def objectives(self) -> Array:
         """Return the objectives recorded so far, scaled."""
         return np.array(self._objectives)
+
+    def state(self) -> dict[str, Array]:
+        """Return what `restore` needs, as it is between iterations."""
+        return {
+            "extended": self._extended,
+            "star_fluxes": self._star_fluxes,
+            "square_sums": np.array([self._squares]),
+            "objectives": self.objectives(),
+            "previous": self._previous,
+            "gradient": self._gradient,
+        }
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Go on from this state."""
+        self._extended, self._previous = state["extended"], state["previous"]
+        self._gradient = state["gradient"]
+        self._star_fluxes = state.get("star_fluxes", np.zeros(0))
+        self._row_spectrum = rfft_rows(self._extended)
+        self._squares = float(state["square_sums"][0])
+        self._objectives = state.get("objectives", np.zeros(0)).tolist()

@@ -9,12 +9,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from lnocl.observation import Array, Observation
 from lnocl.penalty import Penalty
 from lnocl.scene import Scene
-from lnocl.solvers import SOLVERS
+from lnocl.solvers import SOLVERS, Steps
 
 if TYPE_CHECKING:
     from lnocl.model import Model
@@ -99,23 +99,63 @@ class Run:
         self.engine = _make_engine(setup, self.scene, n_iter, scaling)
         self.engine.start(extended, star_fluxes)
         self.done = 0
+        self._begin_stage()
 
     def __iter__(self) -> Iterator[int]:
+        solve = SOLVERS[self._setup.solver]
         while self.done < self._n_iter:
             begin = self.done
-            for iteration in SOLVERS[self._setup.solver](self.engine, self._next_end() - begin):
+            for iteration in solve(self.engine, self._due - begin, self._steps):
                 self.done = begin + iteration
                 yield self.done
-            if self.done == begin or not self._refines:
+            was_stuck = begin == self.done < self._due
+            if was_stuck or not self._refines:
                 return
             if self.done < self._n_iter:
                 self._refine()
+                self._begin_stage()
 
-    def _next_end(self) -> int:
-        """Return the iteration after which positions are refined, or the last."""
-        if not self._refines:
-            return self._n_iter
-        return min(max(FIRST_REFINED, 2 * self.done), self._n_iter)
+    def _begin_stage(self) -> None:
+        """Begin the iterations until positions are refined, or the last one."""
+        self._steps = Steps()
+        due = max(FIRST_REFINED, 2 * self.done) if self._refines else self._n_iter
+        self._due = min(due, self._n_iter)
+
+    def state(self) -> dict[str, NDArray]:
+        """Return what `restore` needs, as it is between iterations."""
+        steps, scaling = self._steps, self.engine.scaling
+        state = {
+            **self.engine.state(),
+            "progress": np.array([self.done, self._due, steps.begun]),
+            "steps": np.array([steps.alpha, *steps.lengths]),
+            "positions": self.scene.stars,
+        }
+        if scaling is not None:
+            state |= {"shift": scaling.shift, "reach": scaling.reach}
+            state["star_information"] = scaling.star_information
+        return state
+
+    def restore(self, state: dict[str, NDArray]) -> None:
+        """Go on from the state of such a run, made of the same observation and parameters."""
+        self.done, self._due = (int(number) for number in state["progress"][:2])
+        alpha, *lengths = state["steps"].tolist()
+        self._steps = Steps(alpha, lengths, bool(state["progress"][2]))
+        if self._refines:
+            self.scene.move_stars(state["positions"])
+            self._model.move_stars(self.scene)
+            self.engine.move_stars()
+        if self.engine.scaling is not None:
+            self.engine.set_scaling(self._restored_scaling(state))
+        self.engine.restore(state)
+        self._forget_end()
+
+    def _restored_scaling(self, state: dict[str, NDArray]) -> Scaling:
+        from lnocl.scaling import Scaling
+
+        n, grid = self.scene.n_stars, self.scene.grid
+        reach = state.get("reach", np.zeros(0)).reshape(n, *grid)
+        information = state.get("star_information", np.zeros(0)).reshape(n, n)
+        return Scaling(state["shift"], information, reach)
 
     def _refine(self) -> None:
         """Move the stars to where the extended source of now makes them most likely."""

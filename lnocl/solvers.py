@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.observation import Array
 
@@ -89,8 +91,33 @@ class Engine(Protocol):
     def objectives(self) -> Array:
         """Return the objectives recorded so far."""
 
+    def state(self) -> dict[str, NDArray]:
+        """Return what `restore` needs, as it is between iterations."""
 
-def sgm(engine: Engine, n_iter: int) -> Iterator[int]:
+    def restore(self, state: dict[str, NDArray]) -> None:
+        """Go on from this state."""
+
+
+@dataclass
+class Steps:
+    """What the scaled gradient projection method remembers from one iteration to the next.
+
+    Attributes
+    ----------
+    alpha : float
+        The last step.
+    lengths : list of float
+        The Barzilai-Borwein steps among which the smallest is taken.
+    begun : bool
+        Whether there was an iteration.
+    """
+
+    alpha: float = 1.0
+    lengths: list[float] = field(default_factory=lambda: [ALPHA_BOUNDS[1]] * STEPS_KEPT)
+    begun: bool = False
+
+
+def sgm(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int]:
     """Iterate the split-gradient method, yielding the number of iterations done.
 
     ``c_s <- c_s / p sum_j <P_js, r_j>`` and ``f <- f / (p + mu f) sum_j A_j^T r_j``
@@ -104,7 +131,7 @@ def sgm(engine: Engine, n_iter: int) -> Iterator[int]:
         yield iteration
 
 
-def sgp(engine: Engine, n_iter: int) -> Iterator[int]:
+def sgp(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int]:
     """Iterate the scaled gradient projection method, yielding the number of iterations done.
 
     ``f <- f + share d``, ``d = P(f - alpha D grad J) - f``, P the projection on ``f >= 0`` and D
@@ -114,15 +141,17 @@ def sgp(engine: Engine, n_iter: int) -> Iterator[int]:
     source, by `Scaling.star_step`. The share is 1, shortened until the objective falls enough; it
     never rises. Ends early where no step lets it fall any more.
     """
-    alpha, steps = 1.0, [ALPHA_BOUNDS[1]] * STEPS_KEPT
+    steps = steps or Steps()
     engine.ratio()
     for iteration in range(1, n_iter + 1):
         engine.correct()
         change_step, change_change = engine.gradient()
-        if iteration > 1:
-            steps = [*steps[1:], _barzilai_borwein(change_step, change_change, alpha)]
-            alpha = min(steps)
-        if not _descend(engine, alpha):
+        if steps.begun:
+            length = _barzilai_borwein(change_step, change_change, steps.alpha)
+            steps.lengths = [*steps.lengths[1:], length]
+            steps.alpha = min(steps.lengths)
+        steps.begun = True
+        if not _descend(engine, steps.alpha):
             return
         yield iteration
 
@@ -156,4 +185,5 @@ def _descend(engine: Engine, alpha: float) -> bool:
     return False
 
 
-SOLVERS = {"sgm": sgm, "sgp": sgp}
+Solver = Callable[[Engine, int, Steps], Iterator[int]]
+SOLVERS: dict[str, Solver] = {"sgm": sgm, "sgp": sgp}

@@ -30,6 +30,12 @@ class Rule(Protocol):
     def quantity(self, run: Run) -> str:
         """Return what the rule watches, for the progress bar."""
 
+    def state(self) -> list[float]:
+        """Return what `restore` needs."""
+
+    def restore(self, state: list[float]) -> None:
+        """Go on from this state."""
+
 
 class Never:
     """No rule: the run goes to its last iteration."""
@@ -43,6 +49,13 @@ class Never:
     def quantity(self, run: Run) -> str:
         """Return the objective."""
         return f"objective {run.objective():.6g}"
+
+    def state(self) -> list[float]:
+        """Return nothing."""
+        return []
+
+    def restore(self, state: list[float]) -> None:
+        """Do nothing."""
 
 
 class Change:
@@ -62,6 +75,14 @@ class Change:
     def quantity(self, run: Run) -> str:
         """Return the relative change an iteration."""
         return f"change {self._change():.2g}"
+
+    def state(self) -> list[float]:
+        """Return the objectives looked at."""
+        return list(self._recent)
+
+    def restore(self, state: list[float]) -> None:
+        """Go on from the objectives looked at."""
+        self._recent.extend(state)
 
     def _change(self) -> float:
         first, last = self._recent[0], self._recent[-1]
@@ -98,6 +119,14 @@ class Discrepancy:
     def quantity(self, run: Run) -> str:
         """Return the data term over its expectation."""
         return f"discrepancy {self._discrepancy(run):.4g}"
+
+    def state(self) -> list[float]:
+        """Return the expectation."""
+        return [self._expected]
+
+    def restore(self, state: list[float]) -> None:
+        """Go on with this expectation."""
+        (self._expected,) = state
 
     def _discrepancy(self, run: Run) -> float:
         return 2.0 * run.engine.data_term() * run.scene.scale / self._expected

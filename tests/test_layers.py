@@ -26,10 +26,11 @@ LAYERS = {
     "commands.__init__": set(),
     "commands.arguments": set(),
     "commands.messages": set(),
+    "commands.checkpoints": {"commands.arguments"},
     "commands.bench": SHARED | {"bench", "device"},
     "commands.deconvolve": SHARED
     | {"atomic", "deconvolution", "device", "edges", "fitsread", "fitswrite", "frames", "metrics"}
-    | {"observation", "sky"},
+    | {"commands.checkpoints", "observation", "sky"},
     "commands.demo": SHARED | {"demo", "device"},
     "commands.devices": SHARED | {"device"},
     "commands.plot": SHARED | {"demo"},
@@ -52,7 +53,18 @@ LAYERS = {
     "trade": {"deconvolution", "experiment", "metrics", "observation", "simulate"},
     "demo": {"atomic", "experiment", "fitsread", "fitswrite", "metrics", "plots", "simulate"},
     "experiment": {"deconvolution", "metrics", "observation", "simulate"},
-    "deconvolution": {"heldout", "observation", "penalty", "run", "solvers", "stopping"},
+    "deconvolution": {
+        "checkpoint",
+        "heldout",
+        "observation",
+        "penalty",
+        "progress",
+        "run",
+        "solvers",
+        "stopping",
+    },
+    "checkpoint": {"atomic", "fitsfile", "heldout", "observation", "penalty", "run", "stopping"},
+    "progress": set(),
     "heldout": {"observation", "penalty", "run"},
     "stopping": {"model", "observation", "run"},
     "run": {

@@ -256,7 +256,7 @@ class Screen(io.StringIO):
 def test_progress_ends_at_the_last_iteration(stop, words, interval, monkeypatch):
     screen = Screen()
     monkeypatch.setattr("sys.stderr", screen)
-    monkeypatch.setattr("lnocl.deconvolution.PROGRESS_INTERVAL", interval)
+    monkeypatch.setattr("lnocl.progress.PROGRESS_INTERVAL", interval)
     result = run(scene()[0], n_iter=60, stop=stop, progress=True)
     last = screen.getvalue().rstrip().rsplit("\r", 1)[-1]
     total = 60 if stop != "held-out" else result.n_iter

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import os
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lnocl import __version__
-from lnocl.commands import messages
+from lnocl.commands import checkpoints, messages
 from lnocl.commands.arguments import (
     Arguments,
     Command,
@@ -40,6 +41,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_star_arguments(stars)
     _add_run_arguments(parser.add_argument_group("reconstruction"))
     _add_output_arguments(parser.add_argument_group("output"))
+    checkpoints.add_arguments(parser.add_argument_group("long runs"))
 
 
 def _add_star_arguments(parser: Arguments) -> None:
@@ -159,28 +161,39 @@ def _add_output_arguments(parser: Arguments) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     from lnocl import atomic, fitsread, fitswrite
 
-    atomic.check_output(arguments.output, arguments.overwrite, _input_paths(arguments))
+    inputs = _input_paths(arguments)
+    atomic.check_output(
+        arguments.output, arguments.overwrite, [*inputs, *_if_given(arguments.resume)]
+    )
+    checkpoints.check(arguments, inputs)
     folder = os.getcwd()
     device = _device_spec(arguments)
     with contextlib.nullcontext() if arguments.quiet else messages.shown_log():
         frames = _read_frames(arguments)
         stars = _stars(arguments, frames.images)
         wcs = fitsread.wcs_cards(frames.images.header)
-        result = deconvolve(
-            frames.observation,
-            stars=stars,
-            mu=arguments.mu,
-            smoothing=arguments.smoothing,
-            solver=arguments.solver,
-            n_iter=arguments.n_iter,
-            stop=arguments.stop,
-            precision=arguments.precision,
-            engine=arguments.engine,
-            device=device,
-            pad=arguments.pad,
-            progress=not arguments.quiet,
-            refine_positions=arguments.refine,
-        )
+        with checkpoints.Interrupts() as interrupts:
+            result = deconvolve(
+                frames.observation,
+                stars=stars,
+                mu=arguments.mu,
+                smoothing=arguments.smoothing,
+                solver=arguments.solver,
+                n_iter=arguments.n_iter,
+                stop=arguments.stop,
+                precision=arguments.precision,
+                engine=arguments.engine,
+                device=device,
+                pad=arguments.pad,
+                progress=not arguments.quiet,
+                refine_positions=arguments.refine,
+                callback=interrupts.callback,
+                checkpoint=arguments.checkpoint,
+                checkpoint_every=arguments.checkpoint_every,
+                resume=arguments.resume,
+            )
+    if interrupts.caught:
+        result = dataclasses.replace(result, stop_reason="interrupt")
     fitswrite.write_result(
         arguments.output,
         result.extended,
@@ -198,6 +211,7 @@ def _run(arguments: argparse.Namespace) -> None:
     )
     if not arguments.quiet:
         messages.say(_summary(arguments, result))
+    interrupts.explain(arguments, result.n_iter)
 
 
 def _input_paths(arguments: argparse.Namespace) -> list[str]:

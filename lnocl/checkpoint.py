@@ -1,0 +1,260 @@
+"""Checkpoints: what a run has come to, in a file that it can go on from, bit for bit."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.atomic import check_output, whole_file
+from lnocl.errors import FileError, InputError, LnoclWarning
+from lnocl.heldout import CURVE_DTYPE, Choice
+from lnocl.observation import Observation, numbers
+from lnocl.penalty import Penalty
+from lnocl.run import Run, Setup
+from lnocl.stopping import Rule
+
+Arrays = dict[str, NDArray[Any]]
+
+OBSERVED = ("images", "psfs", "background", "mask", "exposure", "offsets")
+# The widest value: a SHA-256 in hexadecimal, or the repr of a parameter or name of a device.
+WIDTH = 256
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint holds.
+
+    Attributes
+    ----------
+    path : str
+        The file it was read from.
+    described : dict of str to str
+        What the run was bound to, as from `describe`.
+    ended : str
+        Why the run had ended; empty where it had not.
+    arrays : dict of str to ndarray
+        Its state.
+    """
+
+    path: str
+    described: dict[str, str]
+    ended: str
+    arrays: Arrays
+
+    def choice(self) -> Choice:
+        """Return what held-out counts had chosen, or what had been given."""
+        mu, smoothing, n_iter = self.arrays["choice"].tolist()
+        names = CURVE_DTYPE.names or ()
+        columns = self.arrays.get("curve", np.zeros((len(names), 0)))
+        curve = np.zeros(columns.shape[1], CURVE_DTYPE)
+        for name, column in zip(names, columns, strict=True):
+            curve[name] = column
+        return Choice(Penalty(mu, smoothing), int(n_iter), curve)
+
+    def refuse_unless(self, described: Mapping[str, str]) -> None:
+        """Refuse to go on where anything differs from what the run was bound to.
+
+        Raises
+        ------
+        InputError
+            Something differs; the message names it.
+        """
+        differing = [name for name in described if self.described.get(name) != described[name]]
+        if differing:
+            raise InputError(
+                f"the checkpoint {self.path} is of another run: {', '.join(differing)} "
+                f"differ{'s' * (len(differing) == 1)}; repeat its command as it was, or begin anew"
+            )
+
+
+def describe(observation: Observation, setup: Setup, **parameters: Any) -> dict[str, str]:
+    """Return what a run is bound to: checksums of arrays, and the other parameters in words."""
+    bound = {
+        "version": version("lnocl"),
+        **{name: getattr(observation, name) for name in OBSERVED},
+        **vars(setup),
+        **parameters,
+    }
+    del bound["device"]  # as it was asked for; it is bound to the one that was chosen
+    return {name: _describe(name, value) for name, value in bound.items()}
+
+
+def _describe(name: str, value: Any) -> str:
+    if value is None or isinstance(value, (str, Real)):
+        return repr(value)[:WIDTH]
+    array = numbers(name, value).astype("<f8")
+    digest = hashlib.sha256(repr(array.shape).encode())
+    digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def read(path: str) -> Checkpoint:
+    """Read a checkpoint.
+
+    Raises
+    ------
+    FileError
+        A file that is missing, no checkpoint, truncated or altered.
+    """
+    from astropy.io import fits  # which runs without checkpoints need not load
+
+    from lnocl.fitsfile import open_fits
+
+    arrays: Arrays = {}
+    with open_fits(path, "is no checkpoint, or a damaged one") as file:
+        for hdu in file.hdus():
+            if isinstance(hdu, fits.PrimaryHDU):
+                ended, digest = str(hdu.header["ENDED"]), hdu.header["DIGEST"]
+            elif hdu.name == "RUN":
+                described = {str(row["name"]): str(row["value"]) for row in hdu.data}
+            else:
+                arrays[hdu.name.lower()] = np.array(hdu.data, hdu.data.dtype.newbyteorder("="))
+        if digest != _digest(described, ended, arrays):
+            raise FileError(f"the checkpoint {path} is truncated or altered: its digest is wrong")
+    return Checkpoint(path, described, ended, arrays)
+
+
+def _digest(described: Mapping[str, str], ended: str, arrays: Arrays) -> str:
+    """Return the SHA-256 of all that a checkpoint holds."""
+    digest = hashlib.sha256(repr((sorted(described.items()), ended)).encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(repr((name, array.shape, array.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def write(path: str, described: Mapping[str, str], ended: str, arrays: Arrays) -> None:
+    """Write a checkpoint; a file of that name is replaced once this one is complete.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written.
+    """
+    from astropy.io import fits
+
+    kept = {name: array for name, array in arrays.items() if array.size}  # FITS has none of 0
+    primary = fits.PrimaryHDU()
+    primary.header["ENDED"] = ended, "why the run ended; empty where it goes on"
+    primary.header["DIGEST"] = _digest(described, ended, kept)
+    table = np.array(list(described.items()), [("name", "U32"), ("value", f"U{WIDTH}")])
+    images = [fits.ImageHDU(array, name=name.upper()) for name, array in kept.items()]
+    hdus = fits.HDUList([primary, fits.BinTableHDU(table, name="RUN"), *images])
+    with whole_file(path, overwrite=True) as stream:
+        hdus.writeto(stream)
+
+
+class Keeper:
+    """Keeps the checkpoints of a run, and finds the one that it goes on from.
+
+    Parameters
+    ----------
+    path : str or None
+        File to write; None for no checkpoints.
+    every : float
+        Seconds between them, zero or more.
+    resume : str or None
+        The checkpoint that the run goes on from, which may be replaced.
+    describe : callable
+        Returns what the run is bound to; called where there is a path or a checkpoint.
+
+    Attributes
+    ----------
+    saved : Checkpoint or None
+        What the run goes on from.
+
+    Raises
+    ------
+    InputError
+        `every` is no such number, or the checkpoint is of another run.
+    FileError
+        The file cannot be written, or exists and is not the one gone on from; the checkpoint
+        cannot be read.
+    """
+
+    def __init__(
+        self,
+        path: str | None,
+        every: object,
+        resume: str | None,
+        describe: Callable[[], dict[str, str]],
+    ) -> None:
+        self._path, self._saved_at = path, -math.inf
+        self._described = describe() if path is not None or resume is not None else {}
+        self.saved = None if resume is None else read(resume)
+        if self.saved is not None:
+            self.saved.refuse_unless(self._described)
+        if not (isinstance(every, Real) and float(every) >= 0):
+            raise InputError(f"checkpoint_every must be seconds, 0 or more; {every!r} was given")
+        self._every = float(every)
+        if path is None:
+            return
+        if os.path.lexists(path) and not (resume and os.path.samefile(path, resume)):
+            raise FileError(f"the checkpoint {path} exists; resume from it, or remove it")
+        check_output(path, overwrite=True)
+
+    def restore(self, run: Run, rule: Rule) -> str:
+        """Put a run where its checkpoint was, if any; return why it had ended, if it had.
+
+        A run that a callback has ended, or an interrupt, goes on.
+
+        Raises
+        ------
+        InputError
+            The checkpoint was written on another device.
+        """
+        self._described["device"] = _describe("device", run.engine.name)
+        if self.saved is None:
+            return ""
+        self.saved.refuse_unless(self._described)
+        run.restore(self.saved.arrays)
+        rule.restore(self.saved.arrays.get("rule", np.zeros(0)).tolist())
+        return "" if self.saved.ended == "callback" else self.saved.ended
+
+    def keep(self, run: Run, rule: Rule, choice: Choice, ended: str) -> None:
+        """Write a checkpoint, where it is time to, or the run has ended.
+
+        Raises
+        ------
+        FileError
+            The first one cannot be written.
+
+        Warns
+        -----
+        LnoclWarning
+            A later one cannot be written.
+        """
+        if self._path is None:
+            return
+        if ended or time.monotonic() - self._saved_at >= self._every:
+            chosen = [choice.penalty.mu, choice.penalty.smoothing, choice.n_iter]
+            curve = [choice.curve[name] for name in CURVE_DTYPE.names or ()]
+            state = {"rule": rule.state(), "choice": chosen, "curve": curve}
+            arrays = {name: np.array(values, np.float64) for name, values in state.items()}
+            self._write(ended, run.state() | arrays)
+            self._saved_at = time.monotonic()
+
+    def _write(self, ended: str, arrays: Arrays) -> None:
+        """Write a checkpoint; what cannot be written later on costs no run that has come so far."""
+        assert self._path is not None
+        try:
+            write(self._path, self._described, ended, arrays)
+        except FileError as error:
+            if self._saved_at == -math.inf:
+                raise
+            warnings.warn(
+                f"{error}; the run goes on, and the checkpoint before is whole",
+                LnoclWarning,
+                stacklevel=5,
+            )

@@ -1,0 +1,350 @@
+"""Runs that were cut off go on as if they had not been, from nothing but their own checkpoints."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from scenes import ENGINES, Recipe
+
+import lnocl
+from lnocl import checkpoint
+from lnocl.commands.checkpoints import Interrupts
+
+STARS = Recipe((16, 32), 2, 2, mu=1e-3, smoothing=0.01, masked=0.05)
+NO_STAR = Recipe((16, 16), 1)
+# Recipe and further arguments of each kind of run that remembers something else.
+KINDS = {
+    "stars, penalties": (STARS, {}),
+    "no star": (NO_STAR, {}),
+    "refined": (STARS, {"refine_positions": True}),
+    "change": (STARS, {"stop": 3e-4}),
+    "discrepancy": (STARS, {"stop": "discrepancy"}),
+    "held-out": (STARS, {"stop": "held-out", "smoothing": "auto"}),
+}
+RUNS = [
+    pytest.param(solver, kind, *engine.values, id=f"{solver}-{kind}-{engine.id}")
+    for solver in ("sgm", "sgp")
+    for kind in KINDS
+    for engine in ENGINES
+    if engine.id == "numpy" or (kind in ("stars, penalties", "no star") and "single" in engine.id)
+]
+
+
+def assert_same(found, expected):
+    for name in ("extended", "star_fluxes", "star_positions", "history", "held_out"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert found.stop_reason == expected.stop_reason
+    assert (found.mu, found.smoothing) == (expected.mu, expected.smoothing)
+
+
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+@pytest.mark.parametrize(("solver", "kind", "engine"), RUNS)
+def test_what_was_cut_off_ends_bit_for_bit_where_it_would_have(solver, kind, engine, tmp_path):
+    recipe, more = KINDS[kind]
+    made, path = recipe.make(), str(tmp_path / "run.fits")
+    given = {"solver": solver, "n_iter": 40, **engine, **more}
+    whole = made.deconvolve(**given)
+    cuts = [k for k in (1, 3, 4, 6, 17) if k < whole.n_iter]
+    assert len(cuts) >= 2
+    for cut in cuts:
+        made.deconvolve(
+            **given, checkpoint=path, callback=lambda k, _, cut=cut: k == cut, checkpoint_every=1e9
+        )
+        assert_same(made.deconvolve(**given, resume=path), whole)
+        os.remove(path)
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_a_run_that_had_ended_is_as_it_was(solver, tmp_path):
+    made, path = STARS.make(), str(tmp_path / "run.fits")
+    given = {"solver": solver, "n_iter": 400, "stop": 1e-3, "engine": "numpy"}
+    whole = made.deconvolve(**given, checkpoint=path)
+    assert whole.stop_reason == "change"
+    again = made.deconvolve(**given, resume=path, callback=lambda *_: pytest.fail("iterated"))
+    assert_same(again, whole)
+
+
+def test_checkpoints_do_not_change_the_run(tmp_path):
+    made, path = STARS.make(), str(tmp_path / "run.fits")
+    given = {"solver": "sgp", "n_iter": 9, "engine": "numpy"}
+    assert_same(
+        made.deconvolve(**given, checkpoint=path, checkpoint_every=0), made.deconvolve(**given)
+    )
+
+
+@pytest.mark.parametrize(
+    ("every", "times"), [(0.0, 6), (1e9, 2)], ids=["after each iteration and the end", "seldom"]
+)
+def test_they_are_written_first_then_when_it_is_time_and_at_the_end(
+    every, times, tmp_path, monkeypatch
+):
+    written = []
+    monkeypatch.setattr(checkpoint, "write", lambda *given: written.append(given))
+    given = {"n_iter": 5, "engine": "numpy", "checkpoint": str(tmp_path / "run.fits")}
+    STARS.make().deconvolve(**given, checkpoint_every=every)
+    assert len(written) == times
+    assert [ended for _, _, ended, _ in written] == [""] * (times - 1) + ["n_iter"]
+
+
+# --- What is refused
+
+CHANGES = {
+    "images": lambda made: {"observation": made.observation(images=made.images + 1.0)},
+    "psfs": lambda made: {"observation": made.observation(psfs=made.psfs + 1e-3)},
+    "background": lambda made: {"observation": made.observation(background=8.5)},
+    "mask": lambda made: {"observation": made.observation(mask=None)},
+    "exposure": lambda made: {"observation": made.observation(exposure=2.0)},
+    "offsets": lambda made: {"observation": made.observation(offsets=[(0, 0), (1, 0)])},
+    "stars": lambda made: {"stars": made.stars[::-1]},
+    "mu": lambda made: {"mu": 1.0000001e-3},
+    "smoothing": lambda made: {"smoothing": 0.02},
+    "solver": lambda made: {"solver": "sgp"},
+    "n_iter": lambda made: {"n_iter": 7},
+    "stop": lambda made: {"stop": "discrepancy"},
+    "pad": lambda made: {"pad": 1},
+    "precision": lambda made: {"precision": "double"},
+    "engine": lambda made: {"engine": "opencl"},
+    "refine_positions": lambda made: {"refine_positions": True},
+    "initial_extended": lambda made: {"initial_extended": None},
+    "initial_star_fluxes": lambda made: {"initial_star_fluxes": None},
+}
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    path = str(tmp_path_factory.mktemp("saved") / "run.fits")
+    STARS.make().deconvolve(n_iter=6, engine="numpy", checkpoint=path)
+    return path
+
+
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_checkpoint_of_another_run_is_refused(name, saved):
+    made = STARS.make()
+    changed = {"n_iter": 6, "engine": "numpy", "resume": saved} | CHANGES[name](made)
+    with pytest.raises(lnocl.InputError, match=rf"is of another run: .*\b{name}\b.* differ"):
+        made.deconvolve(**changed)
+
+
+def test_another_device_or_version_is_refused(saved, tmp_path):
+    found = checkpoint.read(saved)
+    for name in ("device", "version"):
+        path = str(tmp_path / f"{name}.fits")
+        checkpoint.write(path, found.described | {name: "'other'"}, found.ended, found.arrays)
+        with pytest.raises(lnocl.InputError, match=f"of another run: {name} differs; repeat"):
+            STARS.make().deconvolve(n_iter=6, engine="numpy", resume=path)
+
+
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+def test_nothing_truncated_or_altered_is_gone_on_from(saved, tmp_path):
+    whole = Path(saved).read_bytes()
+    path = tmp_path / "damaged.fits"
+    sound, refused, rng = checkpoint.read(saved), 0, random.Random(1)
+    for length in range(0, len(whole) - 2880, 1441):
+        path.write_bytes(whole[:length])
+        with pytest.raises(lnocl.FileError):
+            checkpoint.read(str(path))
+    for at in rng.sample(range(len(whole)), 300):
+        flipped = bytearray(whole)
+        flipped[at] ^= 1 << rng.randrange(7)
+        path.write_bytes(flipped)
+        try:
+            read = checkpoint.read(str(path))
+        except lnocl.FileError:
+            refused += 1
+            continue
+        # A comment, or padding.
+        assert (read.described, read.ended) == (sound.described, sound.ended)
+        for name, array in sound.arrays.items():
+            np.testing.assert_array_equal(read.arrays[name], array)
+    assert refused > 50
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"SIMPLE", b"\x80\x04pickle"], ids=["empty", "cut", "other"]
+)
+def test_what_is_no_checkpoint_is_refused(content, tmp_path):
+    path = tmp_path / "other.fits"
+    path.write_bytes(content)
+    with pytest.raises(lnocl.FileError, match="is no checkpoint, or a damaged one"):
+        checkpoint.read(str(path))
+    fits.writeto(path, np.ones((4, 4)), overwrite=True)
+    with pytest.raises(lnocl.FileError):
+        checkpoint.read(str(path))
+
+
+def test_the_checkpoint_of_another_run_is_not_replaced(saved):
+    before = Path(saved).read_bytes()
+    with pytest.raises(lnocl.FileError, match="exists; resume from it, or remove it"):
+        STARS.make().deconvolve(n_iter=6, engine="numpy", checkpoint=saved)
+    assert Path(saved).read_bytes() == before
+
+
+@pytest.mark.parametrize("every", [-1.0, np.nan, "often"])
+def test_times_that_are_none_are_refused(every, tmp_path):
+    with pytest.raises(lnocl.InputError, match="checkpoint_every must be seconds"):
+        STARS.make().deconvolve(
+            n_iter=1, engine="numpy", checkpoint=str(tmp_path / "c"), checkpoint_every=every
+        )
+
+
+@pytest.mark.parametrize("written", [0, 2], ids=["first", "later"])
+def test_a_full_disk_stops_no_run_that_has_come_far(written, tmp_path, monkeypatch):
+    path = str(tmp_path / "run.fits")
+    genuine, count = checkpoint.write, []
+
+    def fills_up(*given):
+        if len(count) == written:
+            raise lnocl.FileError(f"{path} cannot be written: No space left on device")
+        count.append(1)
+        genuine(*given)
+
+    monkeypatch.setattr(checkpoint, "write", fills_up)
+    given = {"n_iter": 5, "engine": "numpy", "checkpoint": path, "checkpoint_every": 0.0}
+    if written == 0:
+        with pytest.raises(lnocl.FileError, match="No space left"):
+            STARS.make().deconvolve(**given)
+        return
+    with pytest.warns(lnocl.LnoclWarning, match="No space left on device; the run goes on"):
+        found = STARS.make().deconvolve(**given)
+    assert found.n_iter == 5
+    assert checkpoint.read(path).arrays["progress"][0] == written
+
+
+# --- The command line, killed and interrupted
+
+
+@pytest.fixture
+def command(tmp_path):
+    """Return the beginning of a command; its iterations are short."""
+    made = Recipe((64, 64), 2, 1, smoothing=1e-3, background="scalar").make()
+    for name in ("images", "psfs"):
+        fits.writeto(tmp_path / f"{name}.fits", getattr(made, name))
+    (x, y) = made.stars[0]
+    return [
+        *(sys.executable, "-m", "lnocl", "deconvolve", "images.fits", "--psf", "psfs.fits"),
+        *("--background", "8", "--star", f"{x},{y}", "--quiet", "--overwrite"),
+    ]
+
+
+def start(command, folder, *more):
+    return subprocess.Popen([*command, *more], cwd=folder, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process):
+    _, complaint = process.communicate()
+    assert process.returncode == 0, complaint
+
+
+def results(path):
+    with fits.open(path) as hdus:
+        return [hdus[0].data, hdus["STARS"].data["flux"], hdus["HISTORY"].data["objective"]]
+
+
+def wait_for_change(path, process, before=None):
+    """Wait until there is a checkpoint newer than before, or the process has ended."""
+    while process.poll() is None:
+        if path.exists() and path.stat().st_mtime_ns != before:
+            return
+        time.sleep(0.001)
+
+
+@pytest.mark.parametrize(
+    ("solver", "kills"),
+    [
+        ("sgm", 3),
+        ("sgp", 3),
+        pytest.param("sgm", 50, marks=pytest.mark.exhaustive),
+        pytest.param("sgp", 50, marks=pytest.mark.exhaustive),
+    ],
+)
+def test_killed_at_any_moment_it_ends_where_it_would_have(solver, kills, command, tmp_path):
+    rng = random.Random(solver)
+    command = [*command, "--solver", solver, "--n-iter", "400"]
+    whole, found, saved = (tmp_path / f"{name}.fits" for name in ("whole", "found", "run"))
+    finish(start(command, tmp_path, "-o", whole.name))
+    command = [*command, "-o", found.name, "--checkpoint", saved.name, "--checkpoint-every", "0"]
+    progress, killed = 0, 0
+    while killed < kills:
+        resume = ["--resume", saved.name] if saved.exists() else []
+        before = saved.stat().st_mtime_ns if resume else None
+        process = start(command, tmp_path, *resume)
+        wait_for_change(saved, process, before)
+        time.sleep(rng.uniform(0.0, 0.03))
+        process.kill()
+        process.communicate()
+        killed += process.returncode == -signal.SIGKILL
+        read = checkpoint.read(str(saved))  # never a half-written one
+        assert read.arrays["progress"][0] >= progress
+        progress = read.arrays["progress"][0]
+        if read.ended:  # it was too quick: begin anew
+            saved.unlink()
+            progress = 0
+    finish(start(command, tmp_path, "--resume", saved.name))
+    for one, other in zip(results(found), results(whole), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_one_signal_ends_it_with_a_result_and_a_checkpoint(number, command, tmp_path):
+    command = [*command, "--n-iter", "100000"]
+    saved = tmp_path / "run.fits"
+    process = start(command, tmp_path, "-o", "found.fits", "--checkpoint", saved.name)
+    wait_for_change(saved, process)
+    process.send_signal(number)
+    _, complaint = process.communicate()
+    assert process.returncode == 128 + number
+    header = fits.getheader(tmp_path / "found.fits")
+    assert header["STOPPED"] == "interrupt"
+    assert complaint.splitlines()[-1] == (
+        f"lnocl: error: interrupted after {header['NITER']} iterations; what they gave is in "
+        "found.fits; go on with --resume run.fits"
+    )
+    assert checkpoint.read(str(saved)).arrays["progress"][0] == header["NITER"]
+
+
+def test_two_signals_end_it_at_once(command, tmp_path):
+    fits.writeto(tmp_path / "large.fits", np.full((2, 2048, 2048), 50.0, np.float32))
+    command = ["large.fits" if word == "images.fits" else word for word in command]
+    command = [*command, "--engine", "numpy", "--n-iter", "100000", "-o", "found.fits"]
+    saved = tmp_path / "run.fits"
+    process = start(command, tmp_path, "--checkpoint", saved.name)
+    wait_for_change(saved, process)
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.4)  # longer than the interpreter waits for NumPy, shorter than an iteration
+    process.send_signal(signal.SIGINT)
+    _, complaint = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert complaint.splitlines()[-1] == "lnocl: error: interrupted"
+    assert not (tmp_path / "found.fits").exists()
+    assert checkpoint.read(str(saved)).arrays["progress"][0] == 1
+
+
+def test_signals_do_again_what_they_did_once_the_run_is_over():
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with Interrupts() as interrupts:
+        assert not interrupts.callback(1, None)
+        assert signal.getsignal(signal.SIGINT) != before[0]
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.parametrize("name", ["found.fits", "images.fits"])
+def test_a_checkpoint_in_the_place_of_other_files_is_refused(name, command, tmp_path):
+    process = start(command, tmp_path, "-o", "found.fits", "--checkpoint", name)
+    _, complaint = process.communicate()
+    assert process.returncode == 2
+    assert f"the checkpoint {name} is the output or an input" in complaint
+
+
+def test_the_output_does_not_replace_the_checkpoint_gone_on_from(command, saved, tmp_path):
+    process = start(command, tmp_path, "-o", saved, "--resume", saved)
+    _, complaint = process.communicate()
+    assert process.returncode == 2
+    assert "is one of the inputs" in complaint
