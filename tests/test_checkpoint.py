@@ -28,8 +28,16 @@ KINDS = {
     "discrepancy": (STARS, {"stop": "discrepancy"}),
     "held-out": (STARS, {"stop": "held-out", "smoothing": "auto"}),
 }
+# What is the same for both solvers.
+REFINED_RULES = ("refined", "change", "discrepancy", "held-out")
 RUNS = [
-    pytest.param(solver, kind, *engine.values, id=f"{solver}-{kind}-{engine.id}")
+    pytest.param(
+        solver,
+        kind,
+        *engine.values,
+        id=f"{solver}-{kind}-{engine.id}",
+        marks=[pytest.mark.exhaustive] if solver == "sgm" and kind in REFINED_RULES else [],
+    )
     for solver in ("sgm", "sgp")
     for kind in KINDS
     for engine in ENGINES
@@ -49,9 +57,9 @@ def assert_same(found, expected):
 def test_what_was_cut_off_ends_bit_for_bit_where_it_would_have(solver, kind, engine, tmp_path):
     recipe, more = KINDS[kind]
     made, path = recipe.make(), str(tmp_path / "run.fits")
-    given = {"solver": solver, "n_iter": 40, **engine, **more}
+    given = {"solver": solver, "n_iter": 30, **engine, **more}
     whole = made.deconvolve(**given)
-    cuts = [k for k in (1, 3, 4, 6, 17) if k < whole.n_iter]
+    cuts = [k for k in (1, 3, 10) if k < whole.n_iter]
     assert len(cuts) >= 2
     for cut in cuts:
         made.deconvolve(
@@ -259,8 +267,8 @@ def wait_for_change(path, process, before=None):
 @pytest.mark.parametrize(
     ("solver", "kills"),
     [
-        ("sgm", 3),
-        ("sgp", 3),
+        ("sgm", 1),
+        ("sgp", 1),
         pytest.param("sgm", 50, marks=pytest.mark.exhaustive),
         pytest.param("sgp", 50, marks=pytest.mark.exhaustive),
     ],
