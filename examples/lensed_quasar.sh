@@ -13,25 +13,25 @@ sci=$data/quasar_F814W_sci.fits exptime=$data/quasar_F814W_exptime.fits
 python "$here/real.py" stars-psf "$sci" "$exptime" "$out/psf.fits"
 
 # Electrons per second, with a map of the exposure; the sky was subtracted, its noise is 5.19 e-.
-known="--psf $out/psf.fits --exposure $exptime --read-noise 5.187 --pad 4 --quiet --overwrite"
+known="--exposure $exptime --read-noise 5.187 --pad 4 --models --residuals --quiet --overwrite"
 stars="--star 77,73 --star 47,56 --star 55,77 --star 73,48"
-for n in 3 10 30 100 300; do
-    lnocl deconvolve "$sci" $known $stars --n-iter $n --models --residuals -o "$out/whole_$n.fits"
-    lnocl deconvolve "$sci" $known $stars --refine --n-iter $n --models --residuals \
-        -o "$out/refined_$n.fits"
-    python "$here/real.py" figures "$out/whole_$n.fits" "$out/refined_$n.fits"
+for how in "0 30" "0 300" "30 30" "30 300"; do
+    set -- $how
+    for refine in "" --refine; do
+        lnocl deconvolve "$sci" --psf "$out/psf.fits" $known $stars $refine \
+            --smoothing "$1" --n-iter "$2" -o "$out/smoothing_$1_$2$refine.fits"
+        python "$here/real.py" figures "$out/smoothing_$1_$2$refine.fits"
+    done
 done
 # Plain Richardson-Lucy: no stars.
-lnocl deconvolve "$sci" $known --n-iter 100 -o "$out/plain.fits"
+lnocl deconvolve "$sci" --psf "$out/psf.fits" $known --n-iter 100 -o "$out/plain.fits"
 # With the PSF of the file, for comparison: nothing but another PSF helps.
-for refine in "" --refine; do
-    lnocl deconvolve "$sci" --psf "$data/quasar_F814W_psf.fits" --exposure "$exptime" \
-        --read-noise 5.187 --pad 4 --quiet $stars $refine --n-iter 30 --models --residuals \
-        -o "$out/file_psf$refine.fits" --overwrite
-    python "$here/real.py" figures "$out/file_psf$refine.fits"
-done
+lnocl deconvolve "$sci" --psf "$data/quasar_F814W_psf.fits" $known $stars --refine --n-iter 30 \
+    -o "$out/file_psf.fits"
+python "$here/real.py" figures "$out/file_psf.fits"
 python "$here/real.py" draw "$out/lensed_quasar.png" "image, e-/s=$sci:62,62,32:0:0.5" \
-    "Richardson-Lucy, 100=$out/plain.fits:62,62,32:0:0.3" \
-    "refined stars, 30=$out/refined_30.fits:62,62,32:0:0.3" \
-    "residuals, whole pixels=$out/whole_30.fits,RESIDUALS:62,62,32:-10:10" \
-    "residuals, refined=$out/refined_30.fits,RESIDUALS:62,62,32:-10:10"
+    "Richardson-Lucy, 100=$out/plain.fits:62,62,32:0:0.2" \
+    "refined stars, 300=$out/smoothing_0_300--refine.fits:62,62,32:0:0.2" \
+    "refined, 300, smoothing=$out/smoothing_30_300--refine.fits:62,62,32:0:0.2" \
+    "residuals, whole pixels=$out/smoothing_30_300.fits,RESIDUALS:62,62,32:-10:10" \
+    "residuals, refined=$out/smoothing_30_300--refine.fits,RESIDUALS:62,62,32:-10:10"

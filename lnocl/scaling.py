@@ -111,14 +111,23 @@ def _fit_stars(model: Model, images: Array, diffuse: Array, star_fluxes: Array) 
     fluxes, step = star_fluxes, np.full_like(star_fluxes, np.inf)
     for _ in range(FIT_ROUNDS if len(fluxes) else 0):
         total = np.maximum(diffuse + stars.light(fluxes), LEAST_MODEL)
+        moving = _weights_above_guard(weights, total)
         if (abs(step) > INFORMATION_CHANGE * fluxes).any():
-            information = stars.information(weights / total)
-        gradient = stars.products(weights * (1.0 - images / total))
+            information = stars.information(moving / total)
+        gradient = stars.products(moving * (1.0 - images / total))
         step = _star_step(information, gradient, fluxes)
         fluxes = fluxes + step
         if (abs(step) * np.sqrt(np.diag(information)) <= FIT_CHANGE).all():
             break
     return fluxes
+
+
+def _weights_above_guard(weights: Array, total: Array) -> Array:
+    """Return weights without the pixels where the model is the guard: no star moves it there.
+
+    PSFs with negative pixels make it so; one such pixel would have all of the information.
+    """
+    return np.where(total > LEAST_MODEL, weights, 0.0)
 
 
 def _make_scaling(
@@ -129,7 +138,7 @@ def _make_scaling(
     seen = np.maximum(starlight + model.background, LEAST_SEEN)
     inverse = model.adjoint(model.weights / seen)
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
-    weights = model.weights / total
+    weights = _weights_above_guard(model.weights, total) / total
     reach = [model.adjoint(weights * model.starlight(unit)) for unit in np.eye(scene.n_stars)]
     return Scaling(
         SHIFT * np.maximum(shift, 0.0),

@@ -29,14 +29,14 @@ KINDS = {
     "held-out": (STARS, {"stop": "held-out", "smoothing": "auto"}),
 }
 # What is the same for both solvers.
-REFINED_RULES = ("refined", "change", "discrepancy", "held-out")
+IN_BOTH_SOLVERS = ("refined", "change", "discrepancy", "held-out")
 RUNS = [
     pytest.param(
         solver,
         kind,
         *engine.values,
         id=f"{solver}-{kind}-{engine.id}",
-        marks=[pytest.mark.exhaustive] if solver == "sgm" and kind in REFINED_RULES else [],
+        marks=[pytest.mark.exhaustive] if solver == "sgm" and kind in IN_BOTH_SOLVERS else [],
     )
     for solver in ("sgm", "sgp")
     for kind in KINDS

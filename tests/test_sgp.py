@@ -544,6 +544,25 @@ def test_star_fluxes_are_the_best_for_the_start_where_one_is_not_there():
     assert problem.split(start)[1][1] <= 1e-3
 
 
+@pytest.mark.filterwarnings("ignore::lnocl.errors.LnoclWarning")
+def test_a_pixel_that_a_star_makes_negative_says_nothing_of_its_flux():
+    """The model there is the guard, whatever the flux; before, all fluxes were fitted to it."""
+    psf = np.outer([1.0, 2.0, 4.0, 2.0, 1.0], [1.0, 2.0, 4.0, 2.0, 1.0])
+    psf[0, 0] = -5.0
+    image = np.full((16, 16), 10.0)
+    image[6:11, 6:11] += 1e4 * psf.clip(0) / psf.sum()
+    masked = np.ma.masked_array(image, np.zeros(image.shape, bool))
+    masked[6, 6] = np.ma.masked
+    found = []
+    for images in (image, masked):
+        scene = Scene(lnocl.Observation(images, psf, background=10.0), [(8, 8)])
+        start = np.zeros(scene.grid), np.array([1e4 / scene.unit])
+        fluxes, steps = scaling.prepare(scene, Model(scene), *start)
+        found.append([fluxes[0] * scene.unit, steps.star_information[0, 0] / scene.unit])
+    assert found[0][0] == pytest.approx(1e4, rel=1e-12)
+    np.testing.assert_allclose(*found, rtol=0.02)
+
+
 def test_scaling_is_that_of_the_matrix():
     made = TINY.make()
     problem, x, steps, unit = prepared(made, made.stars, [1e3, 1e3])
