@@ -172,7 +172,9 @@ class Program:
         definitions = [f"-D{name}={value}" for name, value in constants.items()]
         self.options = ["-cl-std=CL1.2", "-w", *definitions]
         built = _build(context, source(sources), self.options)
-        self.kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
+        # Not by all_kernels: its kernels are retained once too often, and kept with their program.
+        names = str(built.get_info(cl.program_info.KERNEL_NAMES)).split(";")
+        self.kernels = {name: cl.Kernel(built, name) for name in names}
 
     @property
     def row_blocks(self) -> int:

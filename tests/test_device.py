@@ -108,10 +108,11 @@ def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, 
         opencl.OpenCLEngine(scene(2, 64, stars=9), "single", device.spec_of(found), 10)
 
 
-@pytest.mark.parametrize("tuning", [None, program.Tuning(4, 16)])
-def test_memory_estimate_is_what_the_buffers_hold(tuning, caplog):
+@pytest.mark.parametrize(("height", "tuning"), [(64, None), (8192, program.Tuning(4, 16))])
+def test_memory_estimate_is_what_the_buffers_hold(height, tuning, caplog):
+    """With scratch in local memory, of which 32 KiB will do, and with scratch in global memory."""
     caplog.set_level("INFO", "lnocl")
-    observation = lnocl.Observation(np.ones((2, 8192, 64)), np.ones((1, 1)))
+    observation = lnocl.Observation(np.ones((2, height, 64)), np.ones((1, 1)))
     engine = opencl.OpenCLEngine(opencl.Scene(observation, [(1, 1)]), "single", None, 10, tuning)
     assert engine.program.scratch_is_global == (tuning is not None)
     engine.extended()  # waits for the device
@@ -162,6 +163,13 @@ def test_build_options_are_recorded_and_kernels_fetched_once():
     engine.scale()
     engine.extended()  # waits for the device
     assert engine.program.kernels["scale_rows"] is kernel
+
+
+def test_kernels_and_their_program_are_let_go():
+    """PyOpenCL's `Program.all_kernels` gives kernels that keep themselves and their program."""
+    context = cl.Context([device.choose().device])
+    built = program.Program(context, (8, 8), np.dtype(np.float32))
+    assert {kernel.reference_count for kernel in built.kernels.values()} == {1}
 
 
 @pytest.mark.parametrize(
