@@ -243,7 +243,14 @@ def command(tmp_path):
 
 
 def start(command, folder, *more):
-    return subprocess.Popen([*command, *more], cwd=folder, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [*command, *more],
+        cwd=folder,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Which whoever runs the tests in the background may ignore.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
 
 
 def finish(process):
@@ -335,7 +342,19 @@ def test_more_than_one_signal_ends_it_at_once(command, tmp_path):
     assert checkpoint.read(str(saved)).arrays["progress"][0] == 1
 
 
+def test_a_signal_that_was_ignored_stays_so():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Interrupts() as interrupts:
+            interrupts.callback(1, None)
+            assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_signals_do_again_what_they_did_once_the_run_is_over():
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     with Interrupts() as interrupts:
         assert not interrupts.callback(1, None)

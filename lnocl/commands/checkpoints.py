@@ -72,7 +72,9 @@ class Interrupts:
     def callback(self, iteration: int, estimate: object) -> bool:
         """Return whether the run should end, as `lnocl.deconvolve` asks after each iteration."""
         if not (self._before or self.caught):
-            self._before = {number: signal.signal(number, self._catch) for number in SIGNALS}
+            for number in SIGNALS:
+                if signal.getsignal(number) != signal.SIG_IGN:  # as in the background of a script
+                    self._before[number] = signal.signal(number, self._catch)
         return self.caught != 0
 
     def explain(self, arguments: argparse.Namespace, n_iter: int) -> None:
