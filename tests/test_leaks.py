@@ -32,12 +32,12 @@ def test_memory_and_files_stay_as_they_are(leaks, solver, work):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", ["memory", "files"])
 def test_planted_leaks_are_found(leaks, monkeypatch, kind):
-    """An engine that keeps a tenth of a MiB, which is touched, or a file open."""
+    """An engine that keeps a MiB, which is touched, or a file open."""
     kept = []
     genuine = opencl.OpenCLEngine.start
 
     def start(self, *given):
-        kept.append(bytearray(b"x" * 100_000) if kind == "memory" else os.open(__file__, 0))
+        kept.append(bytearray(b"x" * 1_000_000) if kind == "memory" else os.open(__file__, 0))
         genuine(self, *given)
 
     monkeypatch.setattr(opencl.OpenCLEngine, "start", start)
