@@ -1,7 +1,6 @@
 /* A step of the scaled gradient projection method, inside the transforms along the rows. */
 
-/* D = (f + z) a / (1 + (mu + curvature) (f + z) a): a split gradient's own scaling, shifted by z. */
-INLINE vec scaling_of(
+INLINE vec shifted_scaling(
     const vec f, const vec shift, const vec weight, const vec curvature, const real mu)
 {
     const vec scaled = (f + shift) * weight;
@@ -10,6 +9,22 @@ INLINE vec scaling_of(
 #else
     return scaled;
 #endif
+}
+
+/* D = (f + z) a / (1 + (mu + curvature) (f + z) a): a split gradient's own scaling, shifted by z.
+ * Made twice, from what it is made of: to write it and read it back is slower.
+ */
+INLINE cvec scaling_at(
+    const cvec f, __global const vec *shift, __global const vec *inverse_weight,
+    __global const vec *curvature, const int pixel, const real mu)
+{
+    const cvec seen = LOAD(shift, pixel);
+    const cvec weight = inverse_weight_at(inverse_weight, pixel);
+    const cvec bend = smoothing_at(curvature, pixel);
+    return (cvec){
+        shifted_scaling(f.re, seen.re, weight.re, bend.re, mu),
+        shifted_scaling(f.im, seen.im, weight.im, bend.im, mu)
+    };
 }
 
 /* mu f + slope - c. */
@@ -24,20 +39,20 @@ INLINE vec next_gradient(const vec correction, const vec f, const vec slope, con
 #endif
 }
 
-/* gradient' = mu f + slope - c, c = sum_j A_j^T (r_j - w_j); previous' = f;
- * scaling' = D = (f + shift) a / (1 + (mu + curvature) (f + shift) a), a = 1 / sum_j A_j^T w_j;
- * sums: <D y, s> and <D y, D y>, y = gradient' - gradient, s = f - previous.
- * spectra: one array, const, row spectrum of c. extended (f), shift: one array of pixels each,
- * const; gradient, previous: one each, updated; scaling: one, written. inverse_weight: one array of
- * pixels, a (HAS_WEIGHTS; where there are none a = 1 / N_IMAGES). slope, curvature: one array of
- * pixels each, const, those of f (HAS_SMOOTHING; else they count as 0). sums: [ROW_BLOCKS][2][2].
+/* gradient' = mu f + slope - c, c = sum_j A_j^T (r_j - w_j);
+ * sums: <D y, s> and <D y, D y>, y = gradient' - gradient, s = f - previous,
+ * D = (f + shift) a / (1 + (mu + curvature) (f + shift) a), a = 1 / sum_j A_j^T w_j.
+ * spectra: one array, const, row spectrum of c. gradient: one array of pixels, updated. extended
+ * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (HAS_WEIGHTS; where
+ * there are none a = 1 / N_IMAGES). slope, curvature: one array of pixels each, const, those of f
+ * (HAS_SMOOTHING; else they count as 0). sums: [ROW_BLOCKS][2][2].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.gradient_rows.
  */
 KERNEL void gradient_rows(
     __global const vec *restrict spectra, __global real *restrict sums,
-    __global vec *restrict gradient, __global vec *restrict previous,
-    __global vec *restrict scaling, __global const vec *restrict extended,
-    __global const vec *restrict shift, __global const vec *restrict inverse_weight,
+    __global vec *restrict gradient, __global const vec *restrict extended,
+    __global const vec *restrict previous, __global const vec *restrict shift,
+    __global const vec *restrict inverse_weight,
     __global const vec *restrict slope, __global const vec *restrict curvature, const real mu,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
@@ -58,15 +73,11 @@ KERNEL void gradient_rows(
                 const int pixel = q * INNER(NX) + x;
                 const cvec f = LOAD(extended + at + lane, pixel);
                 const cvec before = LOAD(previous + at + lane, pixel);
-                const cvec seen = LOAD(shift + at + lane, pixel);
                 const cvec g = LOAD(gradient + at + lane, pixel);
-                const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel);
                 const cvec down = smoothing_at(slope + at + lane, pixel);
-                const cvec bend = smoothing_at(curvature + at + lane, pixel);
-                const cvec d = {
-                    scaling_of(f.re, seen.re, weight.re, bend.re, mu),
-                    scaling_of(f.im, seen.im, weight.im, bend.im, mu)
-                };
+                const cvec d = scaling_at(
+                    f, shift + at + lane, inverse_weight + at + lane, curvature + at + lane, pixel,
+                    mu);
                 const cvec next = {
                     next_gradient(a[q].re, f.re, down.re, mu),
                     next_gradient(a[q].im, f.im, down.im, mu)
@@ -75,8 +86,6 @@ KERNEL void gradient_rows(
                 step_part += change.re * (f.re - before.re) + change.im * (f.im - before.im);
                 change_part += change.re * change.re + change.im * change.im;
                 STORE(gradient + at + lane, pixel, next);
-                STORE(previous + at + lane, pixel, f);
-                STORE(scaling + at + lane, pixel, d);
             }
             ACCUMULATE(change_step, step_part);
             ACCUMULATE(change_change, change_part);
@@ -91,16 +100,17 @@ KERNEL void gradient_rows(
  * spectra <- row spectrum of extended; sums: <gradient, d> and <reach_s, d>;
  * squares: sum extended^2.
  * spectra: one array, out: twice the row spectrum. extended: one array of pixels, written.
- * previous (f), gradient, scaling (D): one each, const.
- * reach: N_STARS arrays of pixels. sums: [ROW_BLOCKS][N_SUMS][2]; squares: [ROW_BLOCKS][2] (HAS_MU).
+ * previous (f), gradient, shift: one each, const; inverse_weight, curvature: as for gradient_rows,
+ * which has D. reach: N_STARS arrays of pixels. sums: [ROW_BLOCKS][N_SUMS][2]; squares: [ROW_BLOCKS][2] (HAS_MU).
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.step_rows.
  */
 KERNEL void step_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
     __global real *restrict sums, __global real *restrict squares,
     __global const vec *restrict previous, __global const vec *restrict gradient,
-    __global const vec *restrict scaling, __global const vec *restrict reach,
-    const real alpha, const real share,
+    __global const vec *restrict shift, __global const vec *restrict inverse_weight,
+    __global const vec *restrict curvature, __global const vec *restrict reach,
+    const real mu, const real alpha, const real share,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
@@ -110,39 +120,37 @@ KERNEL void step_rows(
         vec_sum totals[N_SUMS], square_total = {0, 0};
         for (int i = 0; i < N_SUMS; ++i)
             totals[i] = (vec_sum){0, 0};
+        /* A pass of its own over the pixels in their order, which prefetching follows: inside the
+         * transform they come from too many places at once.
+         */
+        FOR_EACH(piece, NX * SIDE) {
+            const int pixel = piece / SIDE, lane = piece % SIDE;
+            const cvec f = LOAD(previous + at + lane, pixel);
+            const cvec g = LOAD(gradient + at + lane, pixel);
+            const cvec scale = scaling_at(
+                f, shift + at + lane, inverse_weight + at + lane, curvature + at + lane, pixel, mu);
+            const cvec d = {
+                not_below_0(f.re - alpha * scale.re * g.re) - f.re,
+                not_below_0(f.im - alpha * scale.im * g.im) - f.im
+            };
+            /* f + d is not below 0 but for rounding. */
+            const cvec trial = {not_below_0(f.re + share * d.re), not_below_0(f.im + share * d.im)};
+            STORE(extended + at + lane, pixel, trial);
+            ACCUMULATE(totals[0], g.re * d.re + g.im * d.im);
+            for (int s = 0; s < N_STARS; ++s) {
+                const cvec r = LOAD(reach + (size_t)s * PIXELS_SIZE + at + lane, pixel);
+                ACCUMULATE(totals[1 + s], r.re * d.re + r.im * d.im);
+            }
+#if HAS_MU
+            ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
+#endif
+        }
+        BARRIER;
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[8];
-            vec parts[N_SUMS], square_part = 0;
-            for (int i = 0; i < N_SUMS; ++i)
-                parts[i] = 0;
-            for (int q = 0; q < OUTER(NX); ++q) {
-                const int pixel = q * INNER(NX) + x;
-                const cvec f = LOAD(previous + at + lane, pixel);
-                const cvec g = LOAD(gradient + at + lane, pixel);
-                const cvec scale = LOAD(scaling + at + lane, pixel);
-                const cvec d = {
-                    not_below_0(f.re - alpha * scale.re * g.re) - f.re,
-                    not_below_0(f.im - alpha * scale.im * g.im) - f.im
-                };
-                parts[0] += g.re * d.re + g.im * d.im;
-                for (int s = 0; s < N_STARS; ++s) {
-                    const cvec r = LOAD(reach + (size_t)s * PIXELS_SIZE + at + lane, pixel);
-                    parts[1 + s] += r.re * d.re + r.im * d.im;
-                }
-                /* f + d is not below 0 but for rounding. */
-                a[q].re = not_below_0(f.re + share * d.re);
-                a[q].im = not_below_0(f.im + share * d.im);
-#if HAS_MU
-                square_part += a[q].re * a[q].re + a[q].im * a[q].im;
-#endif
-                STORE(extended + at + lane, pixel, a[q]);
-            }
-            for (int i = 0; i < N_SUMS; ++i)
-                ACCUMULATE(totals[i], parts[i]);
-#if HAS_MU
-            ACCUMULATE(square_total, square_part);
-#endif
+            for (int q = 0; q < OUTER(NX); ++q)
+                a[q] = LOAD(extended + at + lane, q * INNER(NX) + x);
             store_forward(z + lane, a, x, NX, row_roots);
         }
         for (int i = 0; i < N_SUMS; ++i)

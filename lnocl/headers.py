@@ -7,12 +7,15 @@ import math
 import re
 import warnings
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import astropy
 from astropy.io import fits
-from astropy.wcs import WCS
 
 from lnocl.errors import InputError
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 # The most that FITS and the SIP convention know of what astropy makes room for.
 _LIMITS = (
@@ -66,6 +69,8 @@ def make_wcs(header: fits.Header, key: str = " ") -> WCS:
     Exception
         Whatever else a damaged header leads astropy to.
     """
+    from astropy.wcs import WCS  # a fifth of a second, for headers that have one
+
     for keyword in header:
         for pattern, most in _LIMITS:
             if pattern.fullmatch(keyword) and not 0 <= header[keyword] <= most:

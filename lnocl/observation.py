@@ -287,4 +287,5 @@ def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
         warnings.warn(
             f"{n_negative} psf pixels are negative and were kept", LnoclWarning, stacklevel=3
         )
-    return np.array(np.broadcast_to(stack / sums, (n_images, *stack.shape[1:])))
+    stack /= sums
+    return np.repeat(stack, n_images, axis=0) if len(stack) < n_images else stack

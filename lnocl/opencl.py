@@ -26,7 +26,11 @@ ITERATIONS_AHEAD = 4
 # Which argument of collect_sums is the iteration, the only one that changes in a run.
 COLLECT_ITERATION = 7
 # And which of step_rows are alpha and the share.
-STEP_ALPHA, STEP_SHARE = 8, 9
+STEP_ALPHA, STEP_SHARE = 11, 12
+# Which arguments are the estimate and the one before it, which change places at every base.
+GRADIENT_EXTENDED, GRADIENT_PREVIOUS = 3, 4
+STEP_EXTENDED, STEP_PREVIOUS = 1, 4
+SMOOTH_EXTENDED = 3
 
 
 class OpenCLEngine:
@@ -91,6 +95,7 @@ class OpenCLEngine:
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
         self._n_objectives = 0
+        self._found: tuple[float, Array] | None = None
         self._n_scaled = 0
         self._last_mark: cl.Event | None = None
         self._allocate(n_iter)
@@ -139,7 +144,6 @@ class OpenCLEngine:
         return {
             "previous": layout.pixels_bytes,
             "gradient": layout.pixels_bytes,
-            "scaling": layout.pixels_bytes,
             "shift": layout.pixels_bytes,
             "reach": max(program.n_stars * layout.pixels_bytes, pair),
             "change_sums": program.row_blocks * 2 * pair,
@@ -236,9 +240,8 @@ class OpenCLEngine:
             buffers["spectra"],
             buffers["change_sums"],
             buffers["gradient"],
-            buffers["previous"],
-            buffers["scaling"],
             buffers["extended"],
+            buffers["previous"],
             buffers["shift"],
             buffers["inverse_weight"],
             buffers["slope"],
@@ -253,8 +256,11 @@ class OpenCLEngine:
             buffers["square_sums"],
             buffers["previous"],
             buffers["gradient"],
-            buffers["scaling"],
+            buffers["shift"],
+            buffers["inverse_weight"],
+            buffers["curvature"],
             buffers["reach"],
+            real(self.scene.mu),
             real(0),
             real(0),
         )
@@ -355,10 +361,16 @@ class OpenCLEngine:
         self._convolve()
         self._ratio()
         if self.scene.smoothing:
-            self._smooth()
+            self._smooth_buffer("extended")
         self._collect.kernel.set_arg(COLLECT_ITERATION, np.int32(self._n_objectives))
         self._collect()
         self._n_objectives += 1
+        self._found = None
+
+    def _smooth_buffer(self, name: str) -> None:
+        """Make the slope and the curvature of these pixels."""
+        self._smooth.kernel.set_arg(SMOOTH_EXTENDED, self._buffers[name])
+        self._smooth()
 
     def correct(self) -> None:
         """Back-project the ratios to the correction."""
@@ -377,16 +389,28 @@ class OpenCLEngine:
         """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""
         self._gradient()
         change_step, change_change = self._sums("change_sums", 2)
+        self._make_estimate_the_base()
         return float(change_step), float(change_change)
+
+    def _make_estimate_the_base(self) -> None:
+        """Exchange the estimate and the one before it: the next is written over what was before."""
+        buffers = self._buffers
+        buffers["extended"], buffers["previous"] = buffers["previous"], buffers["extended"]
+        self._gradient.kernel.set_arg(GRADIENT_EXTENDED, buffers["extended"])
+        self._gradient.kernel.set_arg(GRADIENT_PREVIOUS, buffers["previous"])
+        self._step.kernel.set_arg(STEP_EXTENDED, buffers["extended"])
+        self._step.kernel.set_arg(STEP_PREVIOUS, buffers["previous"])
 
     def star_gradient(self) -> Array:
         """Return the gradient of the objective in the star fluxes."""
         if not self.scene.n_stars:
             return np.zeros(0)  # without waiting for the device
-        return -self._sums("ratio_sums", 1 + self.scene.n_stars)[1:]
+        return -self._find()[1][1:]
 
     def step(self, alpha: float, share: float) -> tuple[float, Array]:
         """Step from the base; return ``<gradient, d>`` and ``<reach_s, d>``."""
+        if self.scene.smoothing and share < 1:  # the curvature is that of a longer step by now
+            self._smooth_buffer("previous")
         real = self.program.dtype.type
         self._step.kernel.set_arg(STEP_ALPHA, real(alpha))
         self._step.kernel.set_arg(STEP_SHARE, real(share))
@@ -401,14 +425,27 @@ class OpenCLEngine:
 
     def objective(self) -> float:
         """Return the objective recorded last, scaled."""
-        pair = np.empty(2, self.program.dtype)
-        offset = (self._n_objectives - 1) * pair.nbytes
-        cl.enqueue_copy(self._queue, pair, self._buffers["objectives"], src_offset=offset)
-        return float(pair.astype(np.float64).sum())
+        return self._find()[0]
+
+    def _find(self) -> tuple[float, Array]:
+        """Return the objective recorded last, and the sums that `ratio` left, in one transfer."""
+        if self._found is None:
+            pair = np.empty(2, self.program.dtype)
+            cl.enqueue_copy(
+                self._queue,
+                pair,
+                self._buffers["objectives"],
+                src_offset=(self._n_objectives - 1) * pair.nbytes,
+                is_blocking=False,
+            )
+            sums = self._sums("ratio_sums", 1 + self.scene.n_stars)  # waits for both
+            self._found = float(pair.astype(np.float64).sum()), sums
+        return self._found
 
     def forget_objective(self) -> None:
         """Take the objective recorded last off the record."""
         self._n_objectives -= 1
+        self._found = None
 
     def extended(self) -> Array:
         """Return the extended source, on the grid and scaled."""
@@ -422,7 +459,7 @@ class OpenCLEngine:
 
     def data_term(self) -> float:
         """Return the data term of the objective recorded last, scaled."""
-        return float(self._sums("ratio_sums", 1 + self.scene.n_stars)[0])
+        return float(self._find()[1][0])
 
     def objectives(self) -> Array:
         """Return the objectives recorded so far, scaled."""
@@ -450,6 +487,7 @@ class OpenCLEngine:
                 cl.enqueue_copy(self._queue, self._buffers[name], state[name])
         self._launcher.rows("rfft_rows", self._buffers["spectra"], self._buffers["extended"])()
         self._n_objectives = len(state.get("objectives", ())) // 2
+        self._found = None
 
     def _upload(self, name: str, values: Array) -> None:
         cl.enqueue_copy(self._queue, self._buffers[name], self._rounded(name, values))

@@ -160,38 +160,47 @@ def gradient_rows(
     mu: float,
     slope: Array | float = 0.0,
     curvature: Array | float = 0.0,
-) -> tuple[Array, Array, float, float]:
-    """Return the gradient of J in f, its scaling D, ``<D y, s>`` and ``<D y, D y>``.
+) -> tuple[Array, float, float]:
+    """Return the gradient of J in f, ``<D y, s>`` and ``<D y, D y>``.
 
     The gradient is ``mu f + slope - c``, ``c = sum_j A_j^T (r_j - w_j)``; y is its change from
     `gradient` and s that of f from `previous`. With z the shift,
     ``D = (f + z) a / (1 + (mu + curvature) (f + z) a)``.
     """
     following = mu * extended + slope - irfft_rows(row_spectrum)
-    scaled = (extended + shift) * inverse_weight
-    scaling = scaled / (1.0 + (mu + curvature) * scaled)
+    scaling = _shifted_scaling(extended, shift, inverse_weight, mu + curvature)
     change = scaling * (following - gradient)
-    products = float((change * (extended - previous)).sum()), float((change**2).sum())
-    return following, scaling, *products
+    return following, float((change * (extended - previous)).sum()), float((change**2).sum())
+
+
+def _shifted_scaling(
+    extended: Array, shift: Array, inverse_weight: Array | float, penalty_weight: Array | float
+) -> Array:
+    scaled = (extended + shift) * inverse_weight
+    return scaled / (1.0 + penalty_weight * scaled)
 
 
 def step_rows(
     extended: Array,
     gradient: Array,
-    scaling: Array,
+    shift: Array,
+    inverse_weight: Array | float,
     reach: Array,
+    mu: float,
     alpha: float,
     share: float,
+    curvature: Array | float = 0.0,
 ) -> tuple[Array, ComplexArray, float, float, Array]:
     """Return ``f + share d``, its row spectrum and squares, ``<gradient, d>`` and ``<reach_s, d>``.
 
-    ``d = P(f - alpha D gradient) - f`` with P the projection on ``f >= 0`` and D the scaling;
-    Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002.
+    ``d = P(f - alpha D gradient) - f`` with P the projection on ``f >= 0`` and D as in
+    `gradient_rows`; Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002.
     """
+    scaling = _shifted_scaling(extended, shift, inverse_weight, mu + curvature)
     direction = np.maximum(extended - alpha * scaling * gradient, 0.0) - extended
     trial = np.maximum(extended + share * direction, 0.0)
     slope = float((gradient * direction).sum())
-    reached = np.einsum("syx,yx->s", reach, direction)
+    reached = (reach * direction).sum(axis=(-2, -1))
     return trial, rfft_rows(trial), float((trial**2).sum()), slope, reached
 
 
@@ -292,7 +301,7 @@ class ReferenceEngine:
     def gradient(self) -> tuple[float, float]:
         """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""
         assert self.scaling is not None
-        self._gradient, self._scaling, change_step, change_change = gradient_rows(
+        self._gradient, change_step, change_change = gradient_rows(
             self._row_spectrum,
             self._extended,
             self._previous,
@@ -303,7 +312,7 @@ class ReferenceEngine:
             self._slope,
             self._curvature,
         )
-        self._previous = self._extended
+        self._previous, self._base_curvature = self._extended, self._curvature
         return change_step, change_change
 
     def star_gradient(self) -> Array:
@@ -316,10 +325,13 @@ class ReferenceEngine:
         self._extended, self._row_spectrum, self._squares, slope, reached = step_rows(
             self._previous,
             self._gradient,
-            self._scaling,
+            self.scaling.shift,
+            self._inverse_weight,
             self.scaling.reach,
+            self.scene.mu,
             alpha,
             share,
+            self._base_curvature,
         )
         return slope, reached
 

@@ -70,7 +70,8 @@ class StarFit:
         self._images = scene.images().ravel()[lit]
         self._diffuse = (model.forward(extended) + model.background).ravel()[lit]
         self._weights = model.weights.ravel()[lit]
-        whole = [model.starlight(unit).ravel()[lit] for unit in np.eye(scene.n_stars)]
+        units = np.eye(scene.n_stars)
+        whole = [np.array([*model.starlight(unit)]).ravel()[lit] for unit in units]
         self._beyond = np.array(whole).T - self._columns(0, scene.stars).toarray()
 
     def _lit_pixels(self) -> NDArray[np.bool_]:

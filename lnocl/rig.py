@@ -220,7 +220,6 @@ def inputs(rig: Rig) -> SimpleNamespace:
         previous=own(rng.random((1, ny, nx)) * 0.5),
         gradient=own(rng.uniform(-0.2, 2.0, (1, ny, nx))),
         shift=own(rng.random((1, ny, nx))),
-        scaling=own(rng.random((1, ny, nx))),
         slope=own(rng.uniform(-0.5, 1.0, (1, ny, nx))) if has_smoothing else 0.0,
         curvature=own(rng.random((1, ny, nx))) if has_smoothing else 0.0,
         smoothing=float(np.float32(0.4)) if has_smoothing else 0.0,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.model import Model
 from lnocl.observation import Array
@@ -54,17 +57,26 @@ class Scaling:
         ``-F^-1 (gradient + <reach, d>)``: to the fluxes that are best where the step leads, to
         second order, with the information F of the start; none falls by more than nine tenths.
         """
-        return _star_step(self.star_information, gradient + reached, fluxes)
+        return _star_step(self.star_information, self._inverse, gradient + reached, fluxes)
+
+    @cached_property
+    def _inverse(self) -> NDArray:
+        return _inverse(self.star_information)
 
 
-def _star_step(information: Array, gradient: Array, fluxes: Array) -> Array:
+def _inverse(information: Array) -> NDArray:
+    """Return the inverse; of a star that is told from no other, the pseudo-inverse."""
+    return np.linalg.pinv(information, hermitian=True)
+
+
+def _star_step(information: Array, inverse: NDArray, gradient: Array, fluxes: Array) -> Array:
     """Return the change of the fluxes by Newton's method, none falling by more than nine tenths.
 
     Where it would, the others are those that are best with it held there: the step minimises
     ``<gradient, step> + <step, F step> / 2`` within those bounds, so that it never leads uphill.
     """
     least = (MOST_FADING - 1.0) * fluxes
-    step = -np.linalg.pinv(information, hermitian=True) @ gradient
+    step = -inverse @ gradient
     if (step >= least).all():
         return step
     import scipy.optimize  # half a second, for what is seldom needed
@@ -105,21 +117,38 @@ def prepare(
 
 def _fit_stars(model: Model, images: Array, diffuse: Array, star_fluxes: Array) -> Array:
     """Return the star fluxes that minimise J, by Fisher scoring over the pixels that they light."""
-    lit, stars = model.stars.on_lit_pixels()
-    weights = model.weights.ravel()[lit]
-    images, diffuse = images.ravel()[lit], diffuse.ravel()[lit]
+    lit = []
+    for arrays, stars in zip(
+        zip(images, diffuse, model.weights, strict=True), model.stars, strict=True
+    ):
+        pixels, stars_there = stars.on_lit_pixels()
+        lit.append((*(array.ravel()[pixels] for array in arrays), stars_there))
+    n = len(star_fluxes)
     fluxes, step = star_fluxes, np.full_like(star_fluxes, np.inf)
-    for _ in range(FIT_ROUNDS if len(fluxes) else 0):
-        total = np.maximum(diffuse + stars.light(fluxes), LEAST_MODEL)
-        moving = _weights_above_guard(weights, total)
-        if (abs(step) > INFORMATION_CHANGE * fluxes).any():
-            information = stars.information(moving / total)
-        gradient = stars.products(moving * (1.0 - images / total))
-        step = _star_step(information, gradient, fluxes)
+    for _ in range(FIT_ROUNDS if n else 0):
+        was_far = (abs(step) > INFORMATION_CHANGE * fluxes).any()
+        if was_far:
+            information = np.zeros((n, n))
+        gradient = np.zeros(n)
+        for image, others, weights, stars in lit:
+            total = _above_guard(stars.light(fluxes), others)
+            moving = _weights_above_guard(weights, total)
+            if was_far:
+                information += stars.information(moving / total)
+            gradient += stars.products(moving * (1.0 - image / total))
+        if was_far:
+            inverse = _inverse(information)
+        step = _star_step(information, inverse, gradient, fluxes)
         fluxes = fluxes + step
         if (abs(step) * np.sqrt(np.diag(information)) <= FIT_CHANGE).all():
             break
     return fluxes
+
+
+def _above_guard(starlight: Array, others: Array) -> Array:
+    """Return the model, in the place of its starlight."""
+    starlight += others
+    return np.maximum(starlight, LEAST_MODEL, out=starlight)
 
 
 def _weights_above_guard(weights: Array, total: Array) -> Array:
@@ -133,15 +162,24 @@ def _weights_above_guard(weights: Array, total: Array) -> Array:
 def _make_scaling(
     scene: Scene, model: Model, total_weight: Array, diffuse: Array, fluxes: Array
 ) -> Scaling:
-    starlight = model.starlight(fluxes)
-    total = np.maximum(diffuse + starlight, LEAST_MODEL)
-    seen = np.maximum(starlight + model.background, LEAST_SEEN)
-    inverse = model.adjoint(model.weights / seen)
+    def what_is_seen() -> Iterator[Array]:
+        for light, background in zip(model.starlight(fluxes), model.background, strict=True):
+            light += background
+            yield np.maximum(light, LEAST_SEEN, out=light)
+
+    inverse = model.adjoint(w / seen for w, seen in zip(model.weights, what_is_seen(), strict=True))
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
-    weights = _weights_above_guard(model.weights, total) / total
-    reach = [model.adjoint(weights * model.starlight(unit)) for unit in np.eye(scene.n_stars)]
-    return Scaling(
-        SHIFT * np.maximum(shift, 0.0),
-        model.stars.information(weights.ravel()),
-        np.array(reach).reshape(scene.n_stars, *scene.grid),
+    ratios = np.empty(model.shape)
+    for ratio, weights, light, others in zip(
+        ratios, model.weights, model.starlight(fluxes), diffuse, strict=True
+    ):
+        total = _above_guard(light, others)
+        np.divide(_weights_above_guard(weights, total), total, out=ratio)
+    reach = np.empty((scene.n_stars, *scene.grid))
+    for s, unit in enumerate(np.eye(scene.n_stars)):
+        lights = model.starlight(unit)
+        reach[s] = model.adjoint(x * light for x, light in zip(ratios, lights, strict=True))
+    information = sum(
+        stars.information(x.ravel()) for x, stars in zip(ratios, model.stars, strict=True)
     )
+    return Scaling(SHIFT * np.maximum(shift, 0.0), np.asarray(information), reach)

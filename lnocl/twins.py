@@ -246,7 +246,7 @@ def _run_collect_sums(rig: Rig, given: SimpleNamespace) -> Pairs:
 
 
 def _run_gradient_rows(rig: Rig, given: SimpleNamespace) -> Pairs:
-    *expected, change_step, change_change = reference.gradient_rows(
+    expected, change_step, change_change = reference.gradient_rows(
         given.correction_spectra,
         given.extended,
         given.previous,
@@ -257,35 +257,36 @@ def _run_gradient_rows(rig: Rig, given: SimpleNamespace) -> Pairs:
         given.slope,
         given.curvature,
     )
-    gradient, previous = rig.put_pixels(given.gradient), rig.put_pixels(given.previous)
-    scaling = rig.empty_pixels()
-    sums = rig.empty_sums(2)
+    gradient, sums = rig.put_pixels(given.gradient), rig.empty_sums(2)
     rig.launcher.rows(
         "gradient_rows",
         rig.put_spectra(given.correction_spectra),
         sums,
         gradient,
-        previous,
-        scaling,
         rig.put_pixels(given.extended),
+        rig.put_pixels(given.previous),
         rig.put_pixels(given.shift),
         _put_inverse_weight(rig, given),
         *_put_smoothing(rig, given),
         rig.dtype.type(given.mu),
     )()
-    yield rig.take_pixels(gradient), expected[0]
-    yield rig.take_pixels(scaling), expected[1]
-    if not np.array_equal(rig.take_pixels(previous), given.extended):
-        raise DeviceError("the estimate is not kept as it was")
+    yield rig.take_pixels(gradient), expected
     yield rig.take_sums(sums, 2), np.array([change_step, change_change])
 
 
 def _run_step_rows(rig: Rig, given: SimpleNamespace) -> Pairs:
     alpha = float(np.float32(1.3))
-    f, gradient, scaling = (a[0] for a in (given.extended, given.gradient, given.scaling))
     for share in (1.0, float(np.float32(0.4))):
         extended, spectrum, squares, slope, reached = reference.step_rows(
-            f, gradient, scaling, given.reach, alpha, share
+            given.extended,
+            given.gradient,
+            given.shift,
+            given.inverse_weight,
+            given.reach,
+            given.mu,
+            alpha,
+            share,
+            given.curvature,
         )
         out, trial = rig.empty_spectra(), rig.empty_pixels()
         sums, square_sums = rig.empty_sums(1 + given.n), rig.empty_sums(1)
@@ -297,9 +298,11 @@ def _run_step_rows(rig: Rig, given: SimpleNamespace) -> Pairs:
             square_sums,
             rig.put_pixels(given.extended),
             rig.put_pixels(given.gradient),
-            rig.put_pixels(given.scaling),
+            rig.put_pixels(given.shift),
+            _put_inverse_weight(rig, given),
+            _put_smoothing(rig, given)[1],
             rig.put_pixels(given.reach) if given.n else rig.put(np.zeros(1)),
-            *(rig.dtype.type(value) for value in (alpha, share)),
+            *(rig.dtype.type(value) for value in (given.mu, alpha, share)),
         )()
         yield rig.take_pixels(trial), extended
         yield rig.take_spectra(out), spectrum

@@ -19,7 +19,11 @@ TRIED = twins.kernels_of(rig.SCENES[SCENE])
 # In the source of the kernels, once each: what is there, and a fault to put in its place.
 FAULTS = {
     "correlate_columns": ("edge[0], -edge[1], z, t", "edge[0], edge[1], z, t"),
-    "gradient_rows": ("STORE(previous + at + lane, pixel, f)", "STORE(previous + at + lane, 0, f)"),
+    "elsewhere": (
+        "finish_columns(columns, total, column_roots);",
+        "finish_columns(columns, total, column_roots);"
+        "finish_columns(columns + SPECTRA_SIZE, total, column_roots);",
+    ),
     "step_rows": (
         "KERNEL void step_rows",
         "__kernel __attribute__((reqd_work_group_size(2, 1, 1))) void step_rows",
@@ -157,14 +161,14 @@ def test_a_wrong_kernel_is_named(capsys, plant):
 
 
 def test_kernels_that_write_where_they_must_not_or_do_not_start_are_named(capsys, plant):
-    plant("gradient_rows", "step_rows")
+    plant("elsewhere", "step_rows")
     status, out, err = outcome(capsys)
     assert status == 1
-    named = "gradient_rows (single), step_rows (single)"
+    named = "correlate_columns (single), step_rows (single)"
     assert err == [f"lnocl: error: WRONG on {NAME}: {named}: {ADVICE}"]
     assert sum(" failed " in line for line in out) == 2
-    of_gradient, of_step = out[-2:]
-    assert of_gradient == "gradient_rows (single, 16 x 32): the estimate is not kept as it was"
+    of_correlate, of_step = out[-2:]
+    assert of_correlate == "correlate_columns (single, 16 x 32): others than array 0 are written"
     assert of_step.startswith("step_rows (single, 16 x 32): ")
     assert "INVALID_WORK_GROUP_SIZE" in of_step
 

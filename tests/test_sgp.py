@@ -179,10 +179,10 @@ MINIMA = {
 }
 # Those that OpenCL programs are built for; test_iteration.py has exposures on both engines.
 SMALL = [name for name in MINIMA if "large" not in name and "exposures" not in name]
-# Of J, of the extended source and of the star fluxes. Measured: in double 3.6e-16, 2.7e-8 and
+# Of J, of the extended source and of the star fluxes. Measured: in double 1.1e-15, 4.1e-8 and
 # 1.5e-9, which is where L-BFGS-B ends; in single 6.2e-7, 9.5e-4 and 7.9e-6; after 5000 iterations
 # of the split-gradient method 2.5e-9, 6.4e-5 and 3.9e-6.
-SGP_TOLERANCES = {"double": (1e-15, 7e-8, 4e-9), "single": (1.6e-6, 2.5e-3, 2e-5)}
+SGP_TOLERANCES = {"double": (2.5e-15, 7e-8, 4e-9), "single": (1.6e-6, 2.5e-3, 2e-5)}
 SGM_TOLERANCES = 7e-9, 1.5e-4, 1e-5
 # In standard errors. Measured 3.8e-6 and 0.036.
 OFF_THE_MINIMUM = {"double": 1e-5, "single": 0.1}
@@ -623,11 +623,11 @@ def test_memory_estimate_is_what_the_buffers_hold(name):
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
-def test_only_steps_take_four_images_more_and_one_for_each_star(precision):
+def test_only_steps_take_three_images_more_and_one_for_each_star(precision):
     name = "four images, three stars"
     without = engine_of(name, precision, takes_steps=False)
     more = engine_of(name, precision, takes_steps=True).bytes_needed - without.bytes_needed
-    images = (4 + 3) * without.layout.pixels_bytes
+    images = (3 + 3) * without.layout.pixels_bytes
     assert images < more <= 1.02 * images  # measured 1.008
 
 
