@@ -67,13 +67,19 @@ class Steps:
         extended, star_fluxes = scene.start(None, None)
         star_fluxes, scaling = prepare(scene, Model(scene), extended, star_fluxes)
         self.engine = OpenCLEngine(scene, precision, device, 1_000_000, scaling=scaling)
-        self.engine.start(extended, star_fluxes)
+        self._start = extended, star_fluxes
+        self._begin()
+
+    def _begin(self):
+        self.engine.start(*self._start)
         self._iterations = sgp(self.engine, 1_000_000)
 
     def __call__(self, count):
         """Do some iterations and wait for the last."""
         for _ in range(count):
-            next(self._iterations)
+            if next(self._iterations, None) is None:  # at the minimum
+                self._begin()
+                next(self._iterations)
 
 
 class Peer:

@@ -33,6 +33,34 @@ STEP_EXTENDED, STEP_PREVIOUS = 1, 4
 SMOOTH_EXTENDED = 3
 
 
+class Transfer:
+    """Numbers on their way from the device, while it goes on.
+
+    Parameters
+    ----------
+    queue : pyopencl.CommandQueue
+        In whose order they are read.
+    dtype : numpy.dtype
+        Of the numbers.
+    *ranges : tuple of (pyopencl.Buffer, int, int)
+        Where they are: the buffer, from which byte on, and how many bytes.
+    """
+
+    def __init__(
+        self, queue: cl.CommandQueue, dtype: np.dtype, *ranges: tuple[cl.Buffer, int, int]
+    ) -> None:
+        self._arrays = [np.empty(size // dtype.itemsize, dtype) for _, _, size in ranges]
+        self._events = [
+            cl.enqueue_copy(queue, array, buffer, src_offset=offset, is_blocking=False)
+            for array, (buffer, offset, _) in zip(self._arrays, ranges, strict=True)
+        ]
+
+    def wait(self) -> list[Array]:
+        """Return the arrays, as float64, when they have come."""
+        cl.wait_for_events(self._events)
+        return [array.astype(np.float64) for array in self._arrays]
+
+
 class OpenCLEngine:
     """A scene on a device.
 
@@ -95,7 +123,8 @@ class OpenCLEngine:
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
         self._n_objectives = 0
-        self._found: tuple[float, Array] | None = None
+        self._found: Transfer | None = None
+        self._is_convolved = False
         self._n_scaled = 0
         self._last_mark: cl.Event | None = None
         self._allocate(n_iter)
@@ -346,7 +375,7 @@ class OpenCLEngine:
         if self._observed is not None:
             extended = np.where(self._observed, extended, 0.0)
         self._upload_pixels("extended", [extended])
-        self._launcher.rows("rfft_rows", self._buffers["spectra"], self._buffers["extended"])()
+        self._transform_estimate()
         if self.scene.n_stars:
             self._upload("star_fluxes", star_fluxes)
         squares = np.zeros(self._buffers["square_sums"].size // self.program.dtype.itemsize)
@@ -358,14 +387,17 @@ class OpenCLEngine:
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
-        self._convolve()
+        if not self._is_convolved:
+            self._convolve()
+        self._is_convolved = False
         self._ratio()
         if self.scene.smoothing:
             self._smooth_buffer("extended")
         self._collect.kernel.set_arg(COLLECT_ITERATION, np.int32(self._n_objectives))
         self._collect()
         self._n_objectives += 1
-        self._found = None
+        # Steps are judged by it: on its way before what comes next, which need not wait for it.
+        self._found = None if self.scaling is None else self._fetch_found()
 
     def _smooth_buffer(self, name: str) -> None:
         """Make the slope and the curvature of these pixels."""
@@ -415,7 +447,12 @@ class OpenCLEngine:
         self._step.kernel.set_arg(STEP_ALPHA, real(alpha))
         self._step.kernel.set_arg(STEP_SHARE, real(share))
         self._step()
-        sums = self._sums("step_sums", 1 + self.scene.n_stars)
+        buffer = self._buffers["step_sums"]
+        transfer = Transfer(self._queue, self.program.dtype, (buffer, 0, buffer.size))
+        self._convolve()  # which the host need not wait for
+        self._is_convolved = True
+        (pairs,) = transfer.wait()
+        sums = self._sum_blocks(pairs, 1 + self.scene.n_stars)
         return float(sums[0]), sums[1:]
 
     def set_star_fluxes(self, star_fluxes: Array) -> None:
@@ -428,19 +465,17 @@ class OpenCLEngine:
         return self._find()[0]
 
     def _find(self) -> tuple[float, Array]:
-        """Return the objective recorded last, and the sums that `ratio` left, in one transfer."""
+        """Return the objective recorded last, and the sums that `ratio` left."""
         if self._found is None:
-            pair = np.empty(2, self.program.dtype)
-            cl.enqueue_copy(
-                self._queue,
-                pair,
-                self._buffers["objectives"],
-                src_offset=(self._n_objectives - 1) * pair.nbytes,
-                is_blocking=False,
-            )
-            sums = self._sums("ratio_sums", 1 + self.scene.n_stars)  # waits for both
-            self._found = float(pair.astype(np.float64).sum()), sums
-        return self._found
+            self._found = self._fetch_found()
+        pair, sums = self._found.wait()
+        return float(pair.sum()), self._sum_blocks(sums, 1 + self.scene.n_stars)
+
+    def _fetch_found(self) -> Transfer:
+        pair = 2 * self.program.dtype.itemsize
+        objective = self._buffers["objectives"], (self._n_objectives - 1) * pair, pair
+        sums = self._buffers["ratio_sums"], 0, self._buffers["ratio_sums"].size
+        return Transfer(self._queue, self.program.dtype, objective, sums)
 
     def forget_objective(self) -> None:
         """Take the objective recorded last off the record."""
@@ -485,9 +520,13 @@ class OpenCLEngine:
         for name in self._stateful:
             if name in state:  # no objective may have been recorded yet
                 cl.enqueue_copy(self._queue, self._buffers[name], state[name])
-        self._launcher.rows("rfft_rows", self._buffers["spectra"], self._buffers["extended"])()
+        self._transform_estimate()
         self._n_objectives = len(state.get("objectives", ())) // 2
-        self._found = None
+
+    def _transform_estimate(self) -> None:
+        """Make the row spectrum of an estimate that came from the host."""
+        self._launcher.rows("rfft_rows", self._buffers["spectra"], self._buffers["extended"])()
+        self._is_convolved, self._found = False, None
 
     def _upload(self, name: str, values: Array) -> None:
         cl.enqueue_copy(self._queue, self._buffers[name], self._rounded(name, values))
@@ -514,7 +553,11 @@ class OpenCLEngine:
     def _sums(self, name: str, n_sums: int) -> Array:
         """Return sums over pixels from the pairs that each block left."""
         n_pairs = self._buffers[name].size // self.program.dtype.itemsize
-        return self._download(name, n_pairs).reshape(-1, n_sums, 2).sum(axis=(0, 2))
+        return self._sum_blocks(self._download(name, n_pairs), n_sums)
+
+    @staticmethod
+    def _sum_blocks(pairs: Array, n_sums: int) -> Array:
+        return pairs.reshape(-1, n_sums, 2).sum(axis=(0, 2))
 
     def _download(self, name: str, count: int) -> Array:
         values = np.empty(count, self.program.dtype)

@@ -143,8 +143,8 @@ def sgp(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int
     """
     steps = steps or Steps()
     engine.ratio()
+    engine.correct()
     for iteration in range(1, n_iter + 1):
-        engine.correct()
         change_step, change_change = engine.gradient()
         if steps.begun:
             length = _barzilai_borwein(change_step, change_change, steps.alpha)
@@ -175,6 +175,7 @@ def _descend(engine: Engine, alpha: float) -> bool:
     for _ in range(MOST_SHORTENED):
         engine.set_star_fluxes(fluxes + share * change)
         engine.ratio()
+        engine.correct()  # before it is known whether it will be needed: the device need not wait
         if engine.objective() <= objective + SUFFICIENT * share * slope:
             return True
         engine.forget_objective()
