@@ -7,7 +7,8 @@ Parts, each a table, written to STEM-PART.ecsv with --output:
 injection  200 stars at random fractional positions on structured emission, of five fluxes, by SGP:
            flux bias and scatter, positions, with the true position fixed, the nearest whole pixel
            refined, and the nearest whole pixel as it is
-sgm        the same for two fluxes by the split-gradient method
+smoothed   the same with the smoothing that held-out counts choose for the first frame
+sgm        the same as the first for two fluxes by the split-gradient method
 held       the iteration that held-out counts choose for those frames, true positions given
 bound      how far the Fisher bound rises when the emission is not known, only its power spectrum
 choices    when positions are refined, the extended source begun anew after it, mu
@@ -157,6 +158,25 @@ def injection(device):
     for flux in FLUXES:
         for mode in MODES:
             yield from measure(flux, mode, (6, 12, 24, 48), solver="sgp", device=device)
+
+
+def smoothed(device):
+    """Yield rows of the part "smoothed"."""
+    for flux in FLUXES:
+        settings = {"solver": "sgp", "device": device, "smoothing": choose_smoothing(flux, device)}
+        for mode in MODES[:2]:
+            for row in measure(flux, mode, (12, 24, 48), **settings):
+                yield {"smoothing": settings["smoothing"]} | row
+
+
+def choose_smoothing(flux, device):
+    """Return what held-out counts choose for the first frame, its stars where they are found."""
+    frame = Frame(0, flux)
+    _, found = frame.deconvolve("refined", (12,), solver="sgp", device=device)[12]
+    observation = Observation(frame.image, PSF, background=BACKGROUND)
+    stars = [tuple(star) for star in found]
+    settings = {"solver": "sgp", "device": device, "smoothing": "auto"}
+    return lnocl.deconvolve(observation, stars, n_iter=24, **settings).smoothing
 
 
 def sgm(device):
@@ -433,7 +453,8 @@ def figure(stem):
 
 
 PARTS = {
-    part.__name__: part for part in (injection, sgm, held, bound, choices, offsets, between, basin)
+    part.__name__: part
+    for part in (injection, smoothed, sgm, held, bound, choices, offsets, between, basin)
 }
 
 
