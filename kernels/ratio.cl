@@ -91,10 +91,10 @@ INLINE vec ratio(vec g, const vec m, vec *term)
     const ivec observed = g >= 0;
     g = observed ? g : (vec)0;
 #endif
-    const ivec guarded = m > (real)LEAST_MODEL;
-    const vec modelled = guarded ? m : (vec)(real)LEAST_MODEL;
+    const ivec dark = m <= (real)LEAST_MODEL; /* which NaN is not: it reaches the objective */
+    const vec modelled = dark ? (vec)(real)LEAST_MODEL : m;
     const vec quotient = g / modelled;
-    const vec r = guarded ? quotient : (vec)0;
+    const vec r = dark ? (vec)0 : quotient;
     *term = divergence(modelled, quotient);
 #if HAS_SENTINEL
     *term = observed ? *term : (vec)0;

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from numbers import Real
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,14 +190,19 @@ class Keeper:
         resume: str | None,
         describe: Callable[[], dict[str, str]],
     ) -> None:
-        self._path, self._saved_at = path, -math.inf
+        for name, file in (("checkpoint", path), ("resume", resume)):
+            if not (file is None or isinstance(file, (str, os.PathLike))):
+                raise InputError(f"{name} must be the name of a file; {file!r} was given")
+        self._path = path
+        self._saved_at = time.monotonic() if path is None else -math.inf
+        self._finite: Arrays = {}
         self._described = describe() if path is not None or resume is not None else {}
         self.saved = None if resume is None else read(resume)
         if self.saved is not None:
             self.saved.refuse_unless(self._described)
-        if not (isinstance(every, Real) and float(every) >= 0):
+        if not (isinstance(every, Real) and cast(float, every) >= 0):
             raise InputError(f"checkpoint_every must be seconds, 0 or more; {every!r} was given")
-        self._every = float(every)
+        self._every = cast(float, every)
         if path is None:
             return
         if os.path.lexists(path) and not (resume and os.path.samefile(path, resume)):
@@ -213,37 +218,68 @@ class Keeper:
         ------
         InputError
             The checkpoint was written on another device.
+        NotFiniteError
+            The start is infinite or not a number.
         """
         self._described["device"] = _describe("device", run.engine.name)
-        if self.saved is None:
-            return ""
-        self.saved.refuse_unless(self._described)
-        run.restore(self.saved.arrays)
-        rule.restore(self.saved.arrays.get("rule", np.zeros(0)).tolist())
-        return "" if self.saved.ended == "callback" else self.saved.ended
+        ended = ""
+        if self.saved is not None:
+            self.saved.refuse_unless(self._described)
+            run.restore(self.saved.arrays)
+            rule.restore(self.saved.arrays.get("rule", np.zeros(0)).tolist())
+            ended = "" if self.saved.ended == "callback" else self.saved.ended
+        self._finite = run.state()
+        return ended
+
+    def redo(self, run: Run) -> None:
+        """Put a run whose objective is not finite where it was the last time, from what was kept.
+
+        The checkpoint stays as it is: a run goes on from it as if nothing had happened.
+
+        Raises
+        ------
+        NotFiniteError
+            There is no such estimate.
+
+        Warns
+        -----
+        LnoclWarning
+            Always.
+        """
+        run.redo(self._finite)
+        warnings.warn(
+            f"the objective became infinite or not a number: the result is that of iteration "
+            f"{run.done}, the last before; scale the scene where its values are large beyond "
+            "measure, else see what lnocl selftest says of the device",
+            LnoclWarning,
+            stacklevel=3,
+        )
 
     def keep(self, run: Run, rule: Rule, choice: Choice, ended: str) -> None:
-        """Write a checkpoint, where it is time to, or the run has ended.
+        """Keep what the run has come to, where it is time to or the run has ended; in the file too.
 
         Raises
         ------
         FileError
-            The first one cannot be written.
+            The first checkpoint cannot be written.
+        NotFiniteError
+            It has come to what is infinite or not a number; the file stays as it is.
 
         Warns
         -----
         LnoclWarning
             A later one cannot be written.
         """
-        if self._path is None:
+        if not ended and time.monotonic() - self._saved_at < self._every:
             return
-        if ended or time.monotonic() - self._saved_at >= self._every:
+        self._finite = run.state()
+        if self._path is not None:
             chosen = [choice.penalty.mu, choice.penalty.smoothing, choice.n_iter]
             curve = [choice.curve[name] for name in CURVE_DTYPE.names or ()]
-            state = {"rule": rule.state(), "choice": chosen, "curve": curve}
-            arrays = {name: np.array(values, np.float64) for name, values in state.items()}
-            self._write(ended, run.state() | arrays)
-            self._saved_at = time.monotonic()
+            besides = {"rule": rule.state(), "choice": chosen, "curve": curve}
+            arrays = {name: np.array(values, np.float64) for name, values in besides.items()}
+            self._write(ended, self._finite | arrays)
+        self._saved_at = time.monotonic()
 
     def _write(self, ended: str, arrays: Arrays) -> None:
         """Write a checkpoint; what cannot be written later on costs no run that has come so far."""

@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from numbers import Real
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.checkpoint import Keeper, describe
-from lnocl.errors import InputError, LnoclWarning
+from lnocl.errors import InputError, LnoclWarning, NotFiniteError
 from lnocl.heldout import CURVE_DTYPE, Choice, Grid, choose, several_mu, several_smoothings
 from lnocl.observation import Array, Observation, numbers
 from lnocl.penalty import Penalty
@@ -25,6 +25,9 @@ from lnocl.stopping import Rule, make_rule
 PRECISIONS = ("single", "double")
 ENGINES = ("opencl", "numpy")
 STOPS = ("discrepancy", "held-out")
+
+# Kernels count iterations in 32 bits.
+MOST_ITERATIONS = 2**31 - 2
 
 # What single precision strays from double, as a share of the extended source, for each iteration of
 # a long run, and the share that is worth a warning (benchmarks/precision.py, docs/precision.md).
@@ -98,8 +101,9 @@ class Result:
         Iterations done.
     stop_reason : str
         ``"n_iter"``, ``"callback"``, the rule that was met (``"change"``, ``"discrepancy"``,
-        ``"held-out"``), or ``"converged"``: no step of ``"sgp"`` lets the objective fall any more,
-        in the precision used.
+        ``"held-out"``), ``"converged"``: no step of ``"sgp"`` lets the objective fall any more,
+        in the precision used; or ``"not finite"``: the objective became infinite or NaN, and the
+        estimate is the last with a finite one.
     device : str
         Name of the device, its platform and driver; ``"numpy"`` for the reference.
     history : ndarray, fields ``iteration`` (int64) and ``objective`` (float64)
@@ -260,8 +264,8 @@ def deconvolve(
         A checkpoint that cannot be written or read, is damaged, or would replace that of another
         run.
     DeviceError
-        No OpenCL device at all, too little memory on it, no double precision, or a compiler that
-        fails.
+        No OpenCL device at all, too little memory on it, no double precision, a compiler or a
+        device that fails; a process that was forked from one that uses OpenCL.
 
     Warns
     -----
@@ -269,7 +273,8 @@ def deconvolve(
         A PSF that is larger than the grid, whose wings wrap round; offsets without `pad`; a PSF
         that rings where it is moved between pixels; so many iterations that single
         precision is expected to stray from double by a thousandth of the extended source; held-out
-        counts of images that are not whole counts, or that chose an iteration too near `n_iter`.
+        counts of images that are not whole counts, or that chose an iteration too near `n_iter`; an
+        objective that is not finite; compiled kernels that cannot be kept, or are damaged.
 
     Notes
     -----
@@ -301,7 +306,7 @@ def deconvolve(
     >>> (result.extended.sum() + result.star_fluxes.sum()).round(6)
     np.float64(612.0)
     """
-    _check_choices(solver, n_iter, stop, precision, engine, device)
+    _check_choices(solver, n_iter, stop, precision, engine, device, refine_positions)
     penalty, grid = _penalties(mu, smoothing)
     if engine == "opencl" and precision == "single":
         _warn_of_straying(int(n_iter))
@@ -322,7 +327,8 @@ def deconvolve(
         ),
     )
     bar = Bar(int(n_iter), progress)
-    with bar:
+    # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
+    with bar, np.errstate(over="ignore", invalid="ignore"):
         if keeper.saved is not None:
             choice = keeper.saved.choice()
         elif grid is not None or stop == "held-out":
@@ -339,10 +345,15 @@ def deconvolve(
         bar.expect(choice.n_iter)
         if not stop_reason:
             keep = partial(keeper.keep, run, rule, choice)
-            stop_reason = _iterate(run, choice.n_iter, rule, callback, bar, keep)
-    if stop == "held-out" and stop_reason == "n_iter":
-        stop_reason = "held-out"
-    return _wrap_up(run, stop_reason, choice)
+            try:
+                stop_reason = _iterate(run, choice.n_iter, rule, callback, bar, keep)
+            except NotFiniteError:
+                stop_reason = "not finite"
+        if stop_reason == "not finite":
+            keeper.redo(run)
+        if stop == "held-out" and stop_reason == "n_iter":
+            stop_reason = "held-out"
+        return _wrap_up(run, stop_reason, choice)
 
 
 def _penalties(mu: Any, smoothing: Any) -> tuple[Penalty, Grid | None]:
@@ -365,7 +376,8 @@ def _check_choices(
     stop: object,
     precision: str,
     engine: str,
-    device: str | None,
+    device: object,
+    refine_positions: object,
 ) -> None:
     choices = {
         "solver": (solver, tuple(SOLVERS)),
@@ -373,15 +385,21 @@ def _check_choices(
         "engine": (engine, ENGINES),
     }
     for name, (value, known) in choices.items():
-        if value not in known:
+        if not (isinstance(value, str) and value in known):
             raise InputError(f"{name} {value!r} is not known; choose from {', '.join(known)}")
+    if not isinstance(refine_positions, (bool, np.bool_)):
+        raise InputError(f"refine_positions must be True or False; {refine_positions!r} was given")
     if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
         raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")
-    is_change = isinstance(stop, Real) and 0 < float(stop) < 1
+    if n_iter > MOST_ITERATIONS:
+        raise InputError(f"n_iter must be {MOST_ITERATIONS} at most; {n_iter} was given")
+    is_change = isinstance(stop, Real) and 0 < cast(float, stop) < 1
     if not (stop is None or is_change or (isinstance(stop, str) and stop in STOPS)):
         raise InputError(
             f"stop {stop!r} is not known; give {', '.join(STOPS)}, or a number between 0 and 1"
         )
+    if not (device is None or isinstance(device, str)):
+        raise InputError(f"device must be text, PLATFORM[:DEVICE]; {device!r} was given")
     if engine == "numpy" and device is not None:
         raise InputError(f"engine numpy uses no device; leave device {device!r} out")
 
@@ -446,6 +464,7 @@ def _iterate(
             break
         keep("")
     stop_reason = stop_reason or ("n_iter" if run.done == n_iter else "converged")
+    run.finish()
     keep(stop_reason)
     return stop_reason
 

@@ -8,7 +8,9 @@ from typing import NamedTuple, TypeVar
 
 import pyopencl as cl
 
+from lnocl import kernelcache
 from lnocl.errors import DeviceError, InputError
+from lnocl.faults import claim_process
 
 T = TypeVar("T")
 
@@ -26,7 +28,8 @@ def find_devices() -> list[cl.Device]:
     Raises
     ------
     DeviceError
-        Where there is no platform, or no device on any.
+        Where there is no platform, or no device on any; in a process that was forked from one
+        that uses OpenCL.
     """
     devices = [device for platform in _usable_platforms() for device in _devices_of(platform)]
     if not devices:
@@ -86,11 +89,13 @@ def has_double(device: cl.Device) -> bool:
 
 def _usable_platforms() -> list[cl.Platform]:
     """Return the platforms that have a device; indices in a specification count these."""
-    try:
-        platforms = cl.get_platforms()
-    except cl.Error:  # the loader's word for "none"
-        return []
-    return [platform for platform in platforms if _devices_of(platform)]
+    claim_process()
+    with kernelcache.private():
+        try:
+            platforms = cl.get_platforms()
+        except cl.Error:  # the loader's word for "none"
+            return []
+        return [platform for platform in platforms if _devices_of(platform)]
 
 
 def _devices_of(platform: cl.Platform) -> list[cl.Device]:

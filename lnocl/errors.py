@@ -1,5 +1,7 @@
 """The errors and the warning that lnocl raises."""
 
+import math
+
 
 class LnoclError(Exception):
     """Anything that lnocl refuses or fails at; its message is one line, meant for the user.
@@ -28,6 +30,19 @@ class FileError(LnoclError, OSError):
 
 class DeviceError(LnoclError, RuntimeError):
     """No usable OpenCL device, or the device cannot do what was asked of it."""
+
+
+class NotFiniteError(DeviceError):
+    """A sum that steers an iteration is infinite or not a number."""
+
+
+def refuse_not_finite(*sums: float) -> None:
+    """Raise NotFiniteError unless all sums are finite."""
+    if not all(map(math.isfinite, sums)):
+        raise NotFiniteError(
+            "the objective is infinite or not a number: scale the scene where its values are large "
+            "beyond measure; else see what lnocl selftest says of the device"
+        )
 
 
 class LnoclWarning(UserWarning):

@@ -182,7 +182,9 @@ class Launch:
     ) -> None:
         self._queue, self.kernel = queue, kernel
         self._global_size, self._local_size = (groups * group,), (group,)
-        kernel.set_args(*arguments)
+        # Not set_args, which writes Python for each kernel and keeps it in a cache on disk.
+        for index, argument in enumerate(arguments):
+            kernel.set_arg(index, argument)
 
     def __call__(self) -> cl.Event:
         """Enqueue the kernel."""

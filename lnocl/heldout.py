@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError, LnoclWarning
+from lnocl.errors import InputError, LnoclWarning, refuse_not_finite
 from lnocl.observation import Array, Observation
 from lnocl.penalty import Penalty
 from lnocl.run import Run
@@ -326,6 +326,7 @@ def _follow(
     """Take a trial as far as is needed, and judge it as the first one was."""
     for iteration in trial.advance():
         excess = trial.excess(first.reference if first else trial.end)
+        refuse_not_finite(*excess)
         least = int(np.argmin(excess))
         allowed = ((1.0 + WITHIN) ** 2 - 1.0) * trial.noise(least)
         chosen = trial.iterations[np.flatnonzero(excess <= excess[least] + allowed)[-1]]

@@ -10,7 +10,8 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from lnocl.device import choose, describe
-from lnocl.errors import DeviceError, InputError
+from lnocl.errors import DeviceError, InputError, refuse_not_finite
+from lnocl.faults import guarded
 from lnocl.fft import READ_WRITE, Launch, Launcher, Layout
 from lnocl.observation import Array
 from lnocl.program import SOURCES, STEP_SOURCES, Program, Tuning
@@ -22,6 +23,9 @@ log = logging.getLogger("lnocl")
 # The host waits once in so many iterations, for those before them: often enough that an interrupt
 # is answered soon, seldom enough that the device never waits for the host.
 ITERATIONS_AHEAD = 4
+# And looks at the objectives once in so many, at those of as many before: a transfer costs the host
+# as much as launching an iteration.
+ITERATIONS_UNSEEN = 64
 
 # Which argument of collect_sums is the iteration, the only one that changes in a run.
 COLLECT_ITERATION = 7
@@ -61,6 +65,7 @@ class Transfer:
         return [array.astype(np.float64) for array in self._arrays]
 
 
+@guarded
 class OpenCLEngine:
     """A scene on a device.
 
@@ -84,7 +89,8 @@ class OpenCLEngine:
     InputError
         No such device, or values too large for the precision.
     DeviceError
-        No device, no double precision where it is asked for, or too little memory.
+        No device, no double precision where it is asked for, or too little memory. Every verb
+        raises it where the device fails, and in a process that was forked from this one.
     """
 
     def __init__(
@@ -96,6 +102,7 @@ class OpenCLEngine:
         tuning: Tuning | None = None,
         scaling: Scaling | None = None,
     ) -> None:
+        self.name, self.bytes_needed, self._n_objectives = "the device", 0, 0
         chosen = choose(device).device
         self.name = describe(chosen)
         self.scene, self.scaling = scene, scaling
@@ -122,17 +129,22 @@ class OpenCLEngine:
         self.bytes_needed = self._refuse_if_too_large(n_iter)
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
-        self._n_objectives = 0
         self._found: Transfer | None = None
         self._is_convolved = False
         self._n_scaled = 0
         self._last_mark: cl.Event | None = None
+        self._unseen: Transfer | None = None
         self._allocate(n_iter)
         self._bind()
         self._upload_scene()
         if scaling is not None:
             self._bind_steps()
             self.set_scaling(scaling)
+
+    @property
+    def is_proven(self) -> bool:
+        """Whether every kernel of an iteration has been launched."""
+        return self._n_objectives > 1
 
     @property
     def _has_background_map(self) -> bool:
@@ -409,13 +421,18 @@ class OpenCLEngine:
         self._correlate()
 
     def scale(self) -> None:
-        """Scale the estimate by its correction."""
+        """Scale the estimate by its correction; look at the objectives of some iterations ago."""
         event = self._scale()
         self._n_scaled += 1
         if self._n_scaled % ITERATIONS_AHEAD == 0:
             if self._last_mark is not None:
                 self._last_mark.wait()
             self._last_mark = event
+        if self._n_scaled % ITERATIONS_UNSEEN == 0:
+            if self._unseen is not None:
+                refuse_not_finite(*self._unseen.wait()[0])
+            unseen = self._last_objectives(ITERATIONS_UNSEEN)
+            self._unseen = Transfer(self._queue, self.program.dtype, unseen)
 
     def gradient(self) -> tuple[float, float]:
         """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""
@@ -472,10 +489,13 @@ class OpenCLEngine:
         return float(pair.sum()), self._sum_blocks(sums, 1 + self.scene.n_stars)
 
     def _fetch_found(self) -> Transfer:
-        pair = 2 * self.program.dtype.itemsize
-        objective = self._buffers["objectives"], (self._n_objectives - 1) * pair, pair
         sums = self._buffers["ratio_sums"], 0, self._buffers["ratio_sums"].size
-        return Transfer(self._queue, self.program.dtype, objective, sums)
+        return Transfer(self._queue, self.program.dtype, self._last_objectives(1), sums)
+
+    def _last_objectives(self, count: int) -> tuple[cl.Buffer, int, int]:
+        """Return where the objectives recorded last are: buffer, first byte, and bytes."""
+        pair = 2 * self.program.dtype.itemsize
+        return self._buffers["objectives"], (self._n_objectives - count) * pair, count * pair
 
     def forget_objective(self) -> None:
         """Take the objective recorded last off the record."""
@@ -508,6 +528,7 @@ class OpenCLEngine:
             state[name] = np.empty(self._buffers[name].size, np.uint8).view(self.program.dtype)
             cl.enqueue_copy(self._queue, state[name], self._buffers[name])
         state["objectives"] = state["objectives"][: 2 * self._n_objectives]
+        state["star_fluxes"] = state["star_fluxes"][: self.scene.n_stars]
         return state
 
     @property
@@ -518,7 +539,7 @@ class OpenCLEngine:
     def restore(self, state: dict[str, NDArray]) -> None:
         """Go on from this state."""
         for name in self._stateful:
-            if name in state:  # no objective may have been recorded yet
+            if name in state and state[name].size:  # there may be no objective yet, and no star
                 cl.enqueue_copy(self._queue, self._buffers[name], state[name])
         self._transform_estimate()
         self._n_objectives = len(state.get("objectives", ())) // 2

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from dataclasses import dataclass
 from numbers import Real
+from typing import Any, cast
 
 from lnocl.errors import InputError
 
 # Of a weight: the most that means anything, beside images scaled to unit mean.
 MOST_WEIGHT = 2.0**64
+
+# To which Python compares an integer of any size without making a float of it.
+MOST = sys.float_info.max
 
 
 @dataclass(frozen=True)
@@ -38,9 +42,9 @@ class Penalty:
     smoothing: float = 0.0
 
     def __post_init__(self) -> None:
-        weights: dict[str, object] = {"mu": self.mu, "smoothing": self.smoothing}
+        weights: dict[str, Any] = {"mu": self.mu, "smoothing": self.smoothing}
         for name, weight in weights.items():
-            if not (isinstance(weight, Real) and math.isfinite(weight) and float(weight) >= 0):
+            if not (isinstance(weight, Real) and 0 <= cast(float, weight) <= MOST):
                 raise InputError(
                     f"{name} must be a number, finite and not negative; {weight!r} was given"
                 )

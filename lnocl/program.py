@@ -9,8 +9,10 @@ from importlib import resources
 import numpy as np
 import pyopencl as cl
 
+from lnocl import kernelcache
 from lnocl.device import describe, has_double
-from lnocl.errors import DeviceError
+from lnocl.errors import DeviceError, LnoclWarning
+from lnocl.faults import build_failure
 
 # In the order in which they build on each other: the transforms by themselves; the split-gradient
 # method; and the scaled gradient projection method.
@@ -171,10 +173,12 @@ class Program:
         }
         definitions = [f"-D{name}={value}" for name, value in constants.items()]
         self.options = ["-cl-std=CL1.2", "-w", *definitions]
-        built = _build(context, source(sources), self.options)
-        # Not by all_kernels: its kernels are retained once too often, and kept with their program.
-        names = str(built.get_info(cl.program_info.KERNEL_NAMES)).split(";")
-        self.kernels = {name: cl.Kernel(built, name) for name in names}
+        text = source(sources)
+        self.kernels = kernelcache.build(
+            self,
+            "\n".join([describe(device), *self.options, text]),
+            lambda: _build(context, text, self.options),
+        )
 
     @property
     def row_blocks(self) -> int:
@@ -200,12 +204,32 @@ def source(names: tuple[str, ...] = SOURCES) -> str:
     )
 
 
-def _build(context: cl.Context, text: str, options: list[str]) -> cl.Program:
+def _build(context: cl.Context, text: str, options: list[str]) -> dict[str, cl.Kernel]:
+    """Return the kernels; caches that cannot be read or written are passed over."""
+    try:
+        return _try_to_build(context, text, options)
+    except DeviceError:
+        raise
+    except Exception as error:  # a cache may raise anything
+        warnings.warn(
+            f"the kernels that PyOpenCL keeps cannot be used ({type(error).__name__}: {error}), "
+            "and are made anew; remove the folders pyopencl and pytools from ~/.cache or from "
+            "XDG_CACHE_HOME, or make them writable",
+            LnoclWarning,
+            stacklevel=5,
+        )
+    with kernelcache.fresh():
+        return _try_to_build(context, text, options)
+
+
+def _try_to_build(context: cl.Context, text: str, options: list[str]) -> dict[str, cl.Kernel]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)
-            return cl.Program(context, text).build(options)
+            built = cl.Program(context, text).build(options)
+            # Not by all_kernels: its kernels are retained once too often, and kept with their
+            # program.
+            names = str(built.get_info(cl.program_info.KERNEL_NAMES)).split(";")
+            return {name: cl.Kernel(built, name) for name in names}
     except cl.RuntimeError as error:
-        device = context.devices[0]
-        log = " ".join(str(error).split())
-        raise DeviceError(f"the kernels do not build on {describe(device)}: {log}") from error
+        raise build_failure(describe(context.devices[0]), error) from error

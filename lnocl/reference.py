@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import xlog1py
 
+from lnocl.errors import refuse_not_finite
 from lnocl.observation import Array
 from lnocl.scaling import Scaling
 from lnocl.scene import LEAST_MODEL, Scene
@@ -77,12 +78,12 @@ def ratio_rows(
     """
     model = irfft_rows(row_spectra) + background
     model += np.einsum("s,sjyx->jyx", star_fluxes, star_images)
-    guarded = model > LEAST_MODEL
-    model = np.where(guarded, model, LEAST_MODEL)
+    dark = model <= LEAST_MODEL  # which NaN is not: it reaches the objective
+    model = np.where(dark, LEAST_MODEL, model)
     ratio = images / model
     # Its terms of first order cancel, those of scipy.special.kl_div only the terms themselves.
     divergence = model * (xlog1py(ratio, ratio - 1.0) - (ratio - 1.0))
-    excess = np.where(guarded, ratio, 0.0) - 1.0
+    excess = np.where(dark, 0.0, ratio) - 1.0
     if weights is not None:
         excess, divergence = weights * excess, weights * divergence
     star_sums = np.einsum("sjyx,jyx->s", star_images, excess)
@@ -225,6 +226,7 @@ class ReferenceEngine:
         self._otfs = np.array([otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)])
         self.move_stars()
         self._inverse_weight = self._invert_weight()
+        self._slope = self._curvature = np.zeros(scene.grid)
         self._objectives: list[float] = []
 
     def set_scaling(self, scaling: Scaling) -> None:
@@ -252,7 +254,6 @@ class ReferenceEngine:
         self._star_fluxes = star_fluxes.copy()
         self._row_spectrum = rfft_rows(self._extended)
         self._squares = float((self._extended**2).sum())
-        self._slope = self._curvature = np.zeros_like(self._extended)
         self._previous = self._extended
         self._gradient = np.zeros_like(self._extended)
 
@@ -287,6 +288,7 @@ class ReferenceEngine:
 
     def scale(self) -> None:
         """Scale the estimate by its correction."""
+        refuse_not_finite(self._objectives[-1])
         self._extended, self._row_spectrum, self._squares, self._star_fluxes = scale_rows(
             self._row_spectrum,
             self._extended,

@@ -6,11 +6,13 @@ import importlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lnocl.errors import refuse_not_finite
 from lnocl.observation import Array, Observation
 from lnocl.penalty import Penalty
 from lnocl.scene import Scene
@@ -96,7 +98,7 @@ class Run:
         scaling = None
         if setup.solver == "sgp":
             star_fluxes, scaling = _prepare(self.scene, model, extended, star_fluxes)
-        self.engine = _make_engine(setup, self.scene, n_iter, scaling)
+        self.engine: Any = _make_engine(setup, self.scene, n_iter, scaling)
         self.engine.start(extended, star_fluxes)
         self.done = 0
         self._begin_stage()
@@ -122,7 +124,13 @@ class Run:
         self._due = min(due, self._n_iter)
 
     def state(self) -> dict[str, NDArray]:
-        """Return what `restore` needs, as it is between iterations."""
+        """Return what `restore` needs, as it is between iterations.
+
+        Raises
+        ------
+        NotFiniteError
+            There are values in it that are infinite or not a number.
+        """
         steps, scaling = self._steps, self.engine.scaling
         state = {
             **self.engine.state(),
@@ -133,6 +141,8 @@ class Run:
         if scaling is not None:
             state |= {"shift": scaling.shift, "reach": scaling.reach}
             state["star_information"] = scaling.star_information
+        for values in state.values():
+            refuse_not_finite(values.sum(initial=0.0, dtype=np.float64))
         return state
 
     def restore(self, state: dict[str, NDArray]) -> None:
@@ -149,6 +159,26 @@ class Run:
         self.engine.restore(state)
         self._forget_end()
 
+    def redo(self, state: dict[str, NDArray]) -> None:
+        """Go from a state to the last estimate whose objective, and those before, were finite.
+
+        On a new engine, as nothing that the old one holds can be trusted.
+
+        Raises
+        ------
+        NotFiniteError
+            There is none.
+        """
+        finite = np.isfinite(self.engine.objectives())
+        last = (len(finite) if finite.all() else int(np.argmin(finite))) - 1
+        scaling, self.engine = self.engine.scaling, None  # the device need not hold both
+        self.engine = _make_engine(self._setup, self.scene, self._n_iter, scaling)
+        self.restore(state)
+        for _ in islice(self, max(last - self.done, 0)):
+            pass
+        self.finish()
+        self.state()  # which is finite
+
     def _restored_scaling(self, state: dict[str, NDArray]) -> Scaling:
         from lnocl.scaling import Scaling
 
@@ -161,6 +191,7 @@ class Run:
         """Move the stars to where the extended source of now makes them most likely."""
         self._forget_end()
         extended = self.engine.extended()
+        refuse_not_finite(extended.sum())
         star_fluxes = self._move_stars(extended, self.engine.star_fluxes())
         if self.engine.scaling is not None:
             star_fluxes, scaling = _prepare(self.scene, self._model, extended, star_fluxes)

@@ -261,7 +261,7 @@ class Scene:
         moment = np.zeros(self.n_stars)
         for j in range(self.n_images):
             stars = np.array([self.star_image(j, s)[weights[j]] for s in range(self.n_stars)])
-            if self.n_stars:
+            if stars.size:  # there are stars, and not all of the image is masked
                 centred = stars - stars.mean(axis=1, keepdims=True)
                 normal += centred @ centred.T
                 moment += centred @ excess[j][weights[j]]

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.errors import refuse_not_finite
 from lnocl.observation import Array
 
 # Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002: the line search shortens a step to
@@ -52,7 +53,13 @@ class Engine(Protocol):
         """Back-project the ratios to the correction."""
 
     def scale(self) -> None:
-        """Scale the estimate by its correction."""
+        """Scale the estimate by its correction.
+
+        Raises
+        ------
+        NotFiniteError
+            An objective, perhaps that of some iterations ago, is infinite or not a number.
+        """
 
     def gradient(self) -> tuple[float, float]:
         """Take the estimate as the base of the next step and the correction for its gradient.
@@ -167,6 +174,7 @@ def _descend(engine: Engine, alpha: float) -> bool:
     objective, fluxes, gradient = engine.objective(), engine.star_fluxes(), engine.star_gradient()
     slope, reached = engine.step(alpha, 1.0)
     assert engine.scaling is not None
+    refuse_not_finite(objective, slope, *gradient, *reached)
     change = engine.scaling.star_step(fluxes, gradient, reached)
     if slope + gradient @ change >= 0:  # following the extended source would lead uphill
         change = engine.scaling.star_step(fluxes, gradient, np.zeros_like(reached))
@@ -176,11 +184,13 @@ def _descend(engine: Engine, alpha: float) -> bool:
         engine.set_star_fluxes(fluxes + share * change)
         engine.ratio()
         engine.correct()  # before it is known whether it will be needed: the device need not wait
-        if engine.objective() <= objective + SUFFICIENT * share * slope:
+        reached_objective = engine.objective()
+        if reached_objective <= objective + SUFFICIENT * share * slope:
             return True
         engine.forget_objective()
         share *= SHORTER
         engine.step(alpha, share)
+    refuse_not_finite(reached_objective)  # however short the step
     engine.step(alpha, 0.0)
     engine.set_star_fluxes(fluxes)
     return False

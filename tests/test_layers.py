@@ -89,10 +89,12 @@ LAYERS = {
     "observation": {"units"},
     "units": set(),
     "reference": {"observation", "scaling", "scene"},
-    "opencl": {"device", "fft", "observation", "program", "scaling", "scene"},
+    "opencl": {"device", "faults", "fft", "observation", "program", "scaling", "scene"},
     "fft": {"program"},
-    "program": {"device"},
-    "device": set(),
+    "program": {"device", "faults", "kernelcache"},
+    "device": {"faults", "kernelcache"},
+    "faults": set(),
+    "kernelcache": set(),
     "errors": set(),
     "frames": {"fitsread", "maps", "observation", "sky", "units"},
     "maps": {"fitsread", "observation"},
@@ -111,7 +113,7 @@ LAYERS = {
     "psf": {"centring", "observation", "repair", "resampling"},
     "simulate": {"fitsread"},
 }
-KNOWS_OPENCL = {"opencl", "fft", "program", "device", "rig", "twins", "selftest"}
+KNOWS_OPENCL = {"opencl", "fft", "program", "device", "faults", "rig", "twins", "selftest"}
 PACKAGE = Path(lnocl.__file__).parent
 MODULES = sorted(
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in PACKAGE.glob("**/*.py")

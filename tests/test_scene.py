@@ -191,6 +191,7 @@ REFUSED = {
     "negative smoothing": ({"smoothing": -1.0}, "smoothing must be a number, finite and not negat"),
     "text for smoothing": ({"smoothing": "some"}, "smoothing 'some' is not known; give a number"),
     "smoothing too large": ({"smoothing": 1e30}, "smoothing 1e+30 is too large for images of"),
+    "too many iterations": ({"n_iter": 10**400}, "n_iter must be 2147483646 at most; 1000"),
     "no iteration": ({"n_iter": 0}, "n_iter must be a whole number, 1 or more; 0 was given"),
     "negative n_iter": ({"n_iter": -1}, "n_iter must be a whole number, 1 or more; -1"),
     "fractional n_iter": ({"n_iter": 1.5}, "n_iter must be a whole number, 1 or more; 1.5"),
@@ -345,3 +346,16 @@ def test_offsets_that_wrap_round_are_warned_of(shape, offsets, pad, warned):
     expected = [f"by up to {int(np.ceil(np.abs(offsets).max()))} pixels"] if warned else []
     assert len(caught) == len(expected)
     assert all(words in str(w.message) for w, words in zip(caught, expected, strict=True))
+
+
+def test_an_image_that_is_all_masked_says_nothing_of_stars():
+    mask = np.zeros((2, 8, 8), bool)
+    mask[0] = True
+    images = np.stack([np.full((8, 8), 1e9), np.full((8, 8), 5.0)])
+    both = lnocl.Observation(images, np.ones((3, 3)), mask=mask)
+    one = lnocl.Observation(images[1:], np.ones((3, 3)))
+    found, expected = (
+        lnocl.deconvolve(observation, stars=[(3, 3)], n_iter=5, engine="numpy")
+        for observation in (both, one)
+    )
+    assert np.allclose(found.star_fluxes, expected.star_fluxes, rtol=1e-10)

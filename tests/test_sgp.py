@@ -98,18 +98,26 @@ class Problem:
         roughness = np.sum(np.hypot(self.differences @ x, self.edge) - self.edge)
         return data_term + 0.5 * self.mu @ x**2 + self.smoothing * roughness
 
+    def ratio(self, x):
+        """Return the images over x; 0 where nothing was counted, whatever is expected there."""
+        return np.divide(self.images, x, out=np.zeros(len(x)), where=self.images > 0)
+
     def gradient(self, x):
         steps = self.differences @ x
         roughness = self.differences.T @ (steps / np.hypot(steps, self.edge))
-        data_term = self.matrix.T @ (self.weights * (1 - self.images / self.model(x)))
+        data_term = self.matrix.T @ (self.weights * (1 - self.ratio(self.model(x))))
         return data_term + self.mu * x + self.smoothing * roughness
 
     def errors(self, x):
-        """Return the standard errors of each unknown by itself, from the second derivatives."""
-        curvature = self.weights * self.images / self.model(x) ** 2
+        """Return the standard errors of each unknown by itself, from the second derivatives.
+
+        That of a star where nothing was counted is infinite.
+        """
+        curvature = self.weights * self.ratio(self.model(x) ** 2)
         bends = self.edge**2 / np.hypot(self.differences @ x, self.edge) ** 3
         roughness = (self.differences**2).T @ bends
-        return 1.0 / np.sqrt((self.matrix**2).T @ curvature + self.mu + self.smoothing * roughness)
+        with np.errstate(divide="ignore"):
+            return ((self.matrix**2).T @ curvature + self.mu + self.smoothing * roughness) ** -0.5
 
     def off_the_minimum(self, x):
         """Return how far the projected gradient moves an unknown at most, in standard errors."""
