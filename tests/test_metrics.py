@@ -154,9 +154,29 @@ def test_width_and_mirror(image, threshold):
 
 
 def test_relative_error_is_nan_where_there_is_none():
-    error = relative_error([1.0, 2.0, np.nan, 3.0, 0.0], [0.0, 4.0, 1.0, np.nan, 0.0])
-    assert np.isnan(error).tolist() == [True, False, True, True, True]
-    assert error[1] == -0.5
+    error = relative_error([1.0, 2.0, np.nan, 3.0, 0.0, 1.0], [0.0, 4.0, 1.0, np.nan, 0.0, -4.0])
+    assert np.isnan(error).tolist() == [True, False, True, True, True, False]
+    assert error[[1, 5]].tolist() == [-0.5, -1.25]
+
+
+@pytest.mark.parametrize("star", [(x, y) for x in range(1, 5) for y in range(1, 3)])
+def test_star_may_be_wherever_its_neighbours_are(star):
+    masked = mask_star(np.ones((4, 6)), star) == 0
+    for axis, at in enumerate(star):
+        assert np.flatnonzero(masked.any(axis=axis)).tolist() == [at - 1, at, at + 1]
+
+
+@pytest.mark.parametrize(
+    ("star", "message"),
+    [
+        *((star, "outside") for star in [(-1, 2), (6, 2), (2, -1), (2, 4)]),
+        *((star, "leave the image") for star in [(0, 2), (5, 2), (2, 0), (2, 3)]),
+        *((star, "between pixels") for star in [(1.5, 2), (1.4, 2), (2, 1.5), (2, 1.4)]),
+    ],
+)
+def test_star_elsewhere_is_refused(star, message):
+    with pytest.raises(InputError, match=message):
+        mask_star(np.ones((4, 6)), star)
 
 
 @pytest.mark.parametrize(
@@ -164,7 +184,9 @@ def test_relative_error_is_nan_where_there_is_none():
     [
         (lambda: restoration_error(np.ones((2, 2)), np.ones((2, 3))), "shape"),
         (lambda: restoration_error(np.ones((2, 2)), np.zeros((2, 2))), "truth is zero"),
+        (lambda: restoration_error(np.ones((2, 3)), np.ones((2, 2))), "shape"),
         (lambda: restoration_error(np.ones(2), np.ones(2)), "1 dimensions"),
+        (lambda: restoration_error(np.ones((1, 2, 2)), np.ones((1, 2, 2))), "3 dimensions"),
         (lambda: restoration_error([[math.nan]], [[1.0]]), "not finite"),
         (lambda: restoration_error([[1j]], [[1.0]]), "complex128"),
         (lambda: mask_star(np.ones((4, 4)), (0, 2)), "leave the image"),
@@ -175,8 +197,12 @@ def test_relative_error_is_nan_where_there_is_none():
         (lambda: star_rows((2, 53), (64, 64)), "do not fit"),
         (lambda: magnitude(-1.0, 1.0), "flux"),
         (lambda: magnitude(1.0, 0.0), "zero_magnitude_flux"),
+        (lambda: magnitude(1.0, -1.0), "zero_magnitude_flux"),
         (lambda: width_profile(np.ones((4, 4)), math.nan), "threshold"),
         (lambda: relative_error([1.0], [1.0, 2.0]), "shape"),
+        (lambda: relative_error([1.0, 2.0], [1.0]), "shape"),
+        (lambda: relative_error([[1.0]], [[1.0]]), "shape"),
+        (lambda: relative_error(1.0, 1.0), "shape"),
     ],
 )
 def test_refuses_in_one_line(call, message):
