@@ -275,7 +275,6 @@ def wait_for_change(path, process, before=None):
     ("solver", "kills"),
     [
         ("sgm", 1),
-        ("sgp", 1),
         pytest.param("sgm", 50, marks=pytest.mark.exhaustive),
         pytest.param("sgp", 50, marks=pytest.mark.exhaustive),
     ],
