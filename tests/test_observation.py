@@ -133,8 +133,9 @@ def test_offsets():
     np.testing.assert_array_equal(observe(offsets=offsets).offsets, offsets)
     wide = lnocl.Observation(np.ones((2, 5)), PSF, offsets=[(4.5, -1.5)])
     np.testing.assert_array_equal(wide.offsets, [(4.5, -1.5)])
-    with pytest.raises(lnocl.InputError, match="the images' 5 by 2 pixels; 2 was given"):
-        lnocl.Observation(np.ones((2, 5)), PSF, offsets=[(4.5, 2)])
+    for offset, given in [((4.5, 2), "2"), ((4.5, -3), "-3"), ((7, 1), "7")]:
+        with pytest.raises(lnocl.InputError, match=f"the images' 5 by 2 pixels; {given} was given"):
+            lnocl.Observation(np.ones((2, 5)), PSF, offsets=[offset])
 
 
 MASK = IMAGES[0] % 3 == 0
