@@ -101,7 +101,8 @@ KERNEL void gradient_rows(
  * squares: sum extended^2.
  * spectra: one array, out: twice the row spectrum. extended: one array of pixels, written.
  * previous (f), gradient, shift: one each, const; inverse_weight, curvature: as for gradient_rows,
- * which has D. reach: N_STARS arrays of pixels. sums: [ROW_BLOCKS][N_SUMS][2]; squares: [ROW_BLOCKS][2] (HAS_MU).
+ * which has D. reach: N_STARS arrays of pixels. sums: [ROW_BLOCKS][N_SUMS][2]; squares:
+ * [ROW_BLOCKS][2] (HAS_MU).
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.step_rows.
  */
 KERNEL void step_rows(

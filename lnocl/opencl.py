@@ -69,6 +69,8 @@ class Transfer:
 class OpenCLEngine:
     """A scene on a device.
 
+    Whatever makes an estimate convolves it too: with steps the host waits for their sums meanwhile.
+
     Parameters
     ----------
     scene : Scene
@@ -130,7 +132,6 @@ class OpenCLEngine:
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
         self._found: Transfer | None = None
-        self._is_convolved = False
         self._n_scaled = 0
         self._last_mark: cl.Event | None = None
         self._unseen: Transfer | None = None
@@ -399,9 +400,6 @@ class OpenCLEngine:
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
-        if not self._is_convolved:
-            self._convolve()
-        self._is_convolved = False
         self._ratio()
         if self.scene.smoothing:
             self._smooth_buffer("extended")
@@ -423,6 +421,7 @@ class OpenCLEngine:
     def scale(self) -> None:
         """Scale the estimate by its correction; look at the objectives of some iterations ago."""
         event = self._scale()
+        self._convolve()
         self._n_scaled += 1
         if self._n_scaled % ITERATIONS_AHEAD == 0:
             if self._last_mark is not None:
@@ -467,7 +466,6 @@ class OpenCLEngine:
         buffer = self._buffers["step_sums"]
         transfer = Transfer(self._queue, self.program.dtype, (buffer, 0, buffer.size))
         self._convolve()  # which the host need not wait for
-        self._is_convolved = True
         (pairs,) = transfer.wait()
         sums = self._sum_blocks(pairs, 1 + self.scene.n_stars)
         return float(sums[0]), sums[1:]
@@ -545,9 +543,10 @@ class OpenCLEngine:
         self._n_objectives = len(state.get("objectives", ())) // 2
 
     def _transform_estimate(self) -> None:
-        """Make the row spectrum of an estimate that came from the host."""
+        """Make the row spectrum of an estimate that came from the host, and convolve it."""
         self._launcher.rows("rfft_rows", self._buffers["spectra"], self._buffers["extended"])()
-        self._is_convolved, self._found = False, None
+        self._convolve()
+        self._found = None
 
     def _upload(self, name: str, values: Array) -> None:
         cl.enqueue_copy(self._queue, self._buffers[name], self._rounded(name, values))
