@@ -306,7 +306,8 @@ def deconvolve(
     >>> (result.extended.sum() + result.star_fluxes.sum()).round(6)
     np.float64(612.0)
     """
-    _check_choices(solver, n_iter, stop, precision, engine, device, refine_positions)
+    _check_choices(solver, n_iter, stop, precision, engine, device)
+    _check_kinds(callback, progress=progress, refine_positions=refine_positions)
     penalty, grid = _penalties(mu, smoothing)
     if engine == "opencl" and precision == "single":
         _warn_of_straying(int(n_iter))
@@ -326,7 +327,9 @@ def deconvolve(
             initial_star_fluxes=initial_star_fluxes,
         ),
     )
-    bar = Bar(int(n_iter), progress)
+    bar = Bar(int(n_iter), bool(progress))
+    if callback is not None:
+        callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
     # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
     with bar, np.errstate(over="ignore", invalid="ignore"):
         if keeper.saved is not None:
@@ -377,7 +380,6 @@ def _check_choices(
     precision: str,
     engine: str,
     device: object,
-    refine_positions: object,
 ) -> None:
     choices = {
         "solver": (solver, tuple(SOLVERS)),
@@ -387,8 +389,6 @@ def _check_choices(
     for name, (value, known) in choices.items():
         if not (isinstance(value, str) and value in known):
             raise InputError(f"{name} {value!r} is not known; choose from {', '.join(known)}")
-    if not isinstance(refine_positions, (bool, np.bool_)):
-        raise InputError(f"refine_positions must be True or False; {refine_positions!r} was given")
     if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
         raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")
     if n_iter > MOST_ITERATIONS:
@@ -402,6 +402,14 @@ def _check_choices(
         raise InputError(f"device must be text, PLATFORM[:DEVICE]; {device!r} was given")
     if engine == "numpy" and device is not None:
         raise InputError(f"engine numpy uses no device; leave device {device!r} out")
+
+
+def _check_kinds(callback: object, **flags: object) -> None:
+    if not (callback is None or callable(callback)):
+        raise InputError(f"callback must be a function or None; {callback!r} was given")
+    for name, flag in flags.items():
+        if not isinstance(flag, (bool, np.bool_)):
+            raise InputError(f"{name} must be True or False; {flag!r} was given")
 
 
 def _warn_of_straying(n_iter: int) -> None:

@@ -141,8 +141,10 @@ def _unpack(archive: Path, own: Path) -> list[str]:
             names = kept.namelist()
             if kept.testzip() is not None:
                 raise zipfile.BadZipFile
-            # What is there may be loaded already.
-            kept.extractall(own, [name for name in names if not (own / name).exists()])
+            with tempfile.TemporaryDirectory(dir=own) as part:  # a full disk cuts files short
+                kept.extractall(part)
+                for name in names:
+                    _put(Path(part) / name, own / name)
     except DAMAGED:
         warnings.warn(
             f"the kernels kept in {archive} are damaged, and are compiled anew",
@@ -155,6 +157,13 @@ def _unpack(archive: Path, own: Path) -> list[str]:
     except OSError:  # none were kept, or they cannot be read
         return []
     return sorted({str(Path(*Path(name).parts[:2])) for name in names})
+
+
+def _put(file: Path, place: Path) -> None:
+    """Move a file to its place, where none is, which may be loaded already."""
+    if not place.exists():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        file.rename(place)
 
 
 _refused: set[Path] = set()

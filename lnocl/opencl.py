@@ -104,7 +104,8 @@ class OpenCLEngine:
         tuning: Tuning | None = None,
         scaling: Scaling | None = None,
     ) -> None:
-        self.name, self.bytes_needed, self._n_objectives = "the device", 0, 0
+        self.name, self.bytes_needed = "the device", 0
+        self._n_objectives = self._n_restored = 0
         chosen = choose(device).device
         self.name = describe(chosen)
         self.scene, self.scaling = scene, scaling
@@ -145,7 +146,7 @@ class OpenCLEngine:
     @property
     def is_proven(self) -> bool:
         """Whether every kernel of an iteration has been launched."""
-        return self._n_objectives > 1
+        return self._n_objectives > self._n_restored + 1
 
     @property
     def _has_background_map(self) -> bool:
@@ -540,7 +541,7 @@ class OpenCLEngine:
             if name in state and state[name].size:  # there may be no objective yet, and no star
                 cl.enqueue_copy(self._queue, self._buffers[name], state[name])
         self._transform_estimate()
-        self._n_objectives = len(state.get("objectives", ())) // 2
+        self._n_objectives = self._n_restored = len(state.get("objectives", ())) // 2
 
     def _transform_estimate(self) -> None:
         """Make the row spectrum of an estimate that came from the host, and convolve it."""

@@ -96,6 +96,23 @@ def test_a_lost_device_is_said_while_it_iterates(monkeypatch, kind, code, solver
     assert "lnocl selftest" in message
 
 
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_too_little_memory_for_a_run_that_goes_on_is_no_lost_device(monkeypatch, tmp_path, solver):
+    saved = str(tmp_path / "run.fits")
+    lnocl.deconvolve(
+        observe(), n_iter=40, solver=solver, checkpoint=saved, callback=lambda k, _: k == 20
+    )
+    error = error_of(cl.RuntimeError, "OUT_OF_RESOURCES", "clEnqueueNDRangeKernel")
+    genuine = opencl.OpenCLEngine.restore
+
+    def restore(engine, state):
+        genuine(engine, state)
+        monkeypatch.setattr(cl, "enqueue_nd_range_kernel", fail_with(error)(None))
+
+    monkeypatch.setattr(opencl.OpenCLEngine, "restore", restore)
+    assert "has too little memory free" in refused(solver=solver, resume=saved)
+
+
 def test_a_device_lost_while_the_host_waits(monkeypatch):
     error = error_of(
         cl.RuntimeError, "EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST", "clWaitForEvents"
@@ -236,6 +253,25 @@ def test_damaged_kernels_are_not_loaded_but_made_anew(warm, tmp_path, damage):
     )
     with zipfile.ZipFile(tmp_path / name) as kept:
         assert kept.testzip() is None
+
+
+def test_a_disk_that_is_full_cuts_no_kernel_short(warm, tmp_path, monkeypatch):
+    """PoCL would load what there is of it, and kill the process."""
+    name, content, _ = warm
+    (tmp_path / name).write_bytes(content)
+    own = tmp_path / "own"
+    own.mkdir()
+
+    def copy(source, target):
+        target.write(source.read(100))
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("shutil.copyfileobj", copy)
+        assert kernelcache._unpack(tmp_path / name, own) == []
+    assert not list(own.iterdir())
+    assert kernelcache._unpack(tmp_path / name, own)
+    assert any(path.name == "scale_rows.so" for path in own.rglob("*"))
 
 
 def test_a_folder_that_cannot_keep_kernels_is_said_once(tmp_path):

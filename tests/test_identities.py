@@ -402,6 +402,12 @@ def test_callback_cannot_change_the_run(engine):
     same(made.deconvolve(n_iter=5, callback=spoil, **engine), made.deconvolve(n_iter=5, **engine))
 
 
+def test_callback_hears_the_warnings_of_numpy():
+    """Which are turned off for the iteration, where what overflows is looked for."""
+    with pytest.warns(RuntimeWarning, match="invalid value"):
+        FULL.make().deconvolve(n_iter=1, callback=lambda *_: np.log(np.array(-1.0)), engine="numpy")
+
+
 # --- What kind of array the input comes as
 
 LAYOUTS = {
