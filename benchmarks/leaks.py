@@ -3,8 +3,9 @@
     python benchmarks/leaks.py [--device SPEC] [--output STEM]
 
 For each solver, on two images of 64 x 64 pixels: so many iterations in as few deconvolutions as
-they take, then so many deconvolutions of ten iterations, all in one process. A tenth of each goes
-before, to warm up. Resident memory, the second number of /proc/self/statm, and the files in
+they take, then so many deconvolutions of ten iterations, and as often their kernels alone, made
+and let go, to see what a runtime keeps of them: all in one process. A tenth of each goes before, to
+warm up. Resident memory, the second number of /proc/self/statm, and the files in
 /proc/self/fd are looked at in twenty places, the first of which is "before"; growth is from the
 least so far. The exit status is 1 where memory grows by more than 1 % or files become more.
 """
@@ -17,8 +18,11 @@ from pathlib import Path
 
 import numpy as np
 import parts
+import pyopencl as cl
 
 import lnocl
+from lnocl.device import choose
+from lnocl.program import SOURCES, STEP_SOURCES, Program
 
 SOLVERS = ("sgm", "sgp")
 SHORT = 10
@@ -79,6 +83,16 @@ def deconvolve(solver, count, device, look):
     return count
 
 
+def build(solver, count, device, look):
+    """Build the kernels so many times, looking after each; return the number of deconvolutions."""
+    chosen, dtype = choose(device).device, np.dtype(np.float32)
+    sources = STEP_SOURCES if solver == "sgp" else SOURCES
+    for done in range(1, count + 1):
+        Program(cl.Context([chosen]), (64, 64), dtype, sources=sources, n_images=2, n_stars=1)
+        look(done)
+    return 0
+
+
 def measure(work, solver, count, device=None):
     """Return a row with what some work holds, and how that grows."""
     work(solver, max(1, count // 10), device, lambda _: None)
@@ -121,7 +135,11 @@ def main():
 
     def measured():
         for solver in SOLVERS:
-            for work, count in ((iterate, given.iterations), (deconvolve, given.deconvolutions)):
+            for work, count in (
+                (iterate, given.iterations),
+                (deconvolve, given.deconvolutions),
+                (build, given.deconvolutions),
+            ):
                 rows.append(measure(work, solver, count, given.device))
                 yield rows[-1]
 
