@@ -141,10 +141,9 @@ def _unpack(archive: Path, own: Path) -> list[str]:
             names = kept.namelist()
             if kept.testzip() is not None:
                 raise zipfile.BadZipFile
-            with tempfile.TemporaryDirectory(dir=own) as part:  # a full disk cuts files short
-                kept.extractall(part)
-                for name in names:
-                    _put(Path(part) / name, own / name)
+            for name in names:
+                if not (own / name).exists():  # else it may be loaded already
+                    _extract(kept, name, own)
     except DAMAGED:
         warnings.warn(
             f"the kernels kept in {archive} are damaged, and are compiled anew",
@@ -159,11 +158,13 @@ def _unpack(archive: Path, own: Path) -> list[str]:
     return sorted({str(Path(*Path(name).parts[:2])) for name in names})
 
 
-def _put(file: Path, place: Path) -> None:
-    """Move a file to its place, where none is, which may be loaded already."""
-    if not place.exists():
-        place.parent.mkdir(parents=True, exist_ok=True)
-        file.rename(place)
+def _extract(kept: zipfile.ZipFile, name: str, own: Path) -> None:
+    """Put a file where it belongs, whole or not at all."""
+    try:
+        kept.extract(name, own)
+    except OSError:  # the disk may be full
+        (own / name).unlink(missing_ok=True)
+        raise
 
 
 _refused: set[Path] = set()
