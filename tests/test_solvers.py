@@ -110,6 +110,7 @@ def test_steps_go_on_from_what_is_remembered():
     [
         pytest.param({}, [], -1.0, id="none"),
         pytest.param({"star": 2.0, "reached": 0.5}, [-2.5], -6.0, id="follows"),
+        pytest.param({"star": 1.0, "reached": -1.5}, [0.5], -0.5, id="follows, barely downhill"),
         pytest.param({"star": 2.0, "reached": -4.0}, [-2.0], -5.0, id="would lead uphill"),
         pytest.param({"star": 1.0, "reached": -2.0}, [-1.0], -2.0, id="would lead nowhere"),
     ],
