@@ -169,7 +169,7 @@ def test_star_may_be_wherever_its_neighbours_are(star):
 @pytest.mark.parametrize(
     ("star", "message"),
     [
-        *((star, "outside") for star in [(-1, 2), (6, 2), (2, -1), (2, 4)]),
+        *((star, "outside") for star in [(-1, 2), (6, 2), (7, 2), (2, -1), (2, 4), (2, 5)]),
         *((star, "leave the image") for star in [(0, 2), (5, 2), (2, 0), (2, 3)]),
         *((star, "between pixels") for star in [(1.5, 2), (1.4, 2), (2, 1.5), (2, 1.4)]),
     ],
@@ -193,7 +193,7 @@ def test_star_elsewhere_is_refused(star, message):
         (lambda: box_flux(np.ones((4, 4)), (2, 3)), "leave the image"),
         (lambda: mask_star(np.ones((4, 4)), (4, 2)), "outside"),
         (lambda: mask_star(np.ones((4, 4)), (1.5, 2)), "between pixels"),
-        (lambda: star_rows((2, 11), (64, 64)), "do not fit"),
+        (lambda: star_rows((2, 11), (64, 48)), "do not fit in 64 rows"),
         (lambda: star_rows((2, 53), (64, 64)), "do not fit"),
         (lambda: magnitude(-1.0, 1.0), "flux"),
         (lambda: magnitude(1.0, 0.0), "zero_magnitude_flux"),
