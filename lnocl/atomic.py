@@ -83,8 +83,8 @@ def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None
     """
     if path.lower().endswith(COMPRESSED):
         raise InputError(f"the output {path} is not compressed; give it a name ending in .fits")
-    target = os.path.realpath(path)
     _check_replaceable(path, overwrite)
+    target = os.path.realpath(path)
     for source in inputs:
         if os.path.exists(target) and os.path.exists(source) and os.path.samefile(source, target):
             raise InputError(f"the output {path} is one of the inputs; give it another name")

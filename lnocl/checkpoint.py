@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from lnocl.atomic import check_output, whole_file
 from lnocl.errors import FileError, InputError, LnoclWarning
-from lnocl.heldout import CURVE_DTYPE, Choice
+from lnocl.heldout import NO_CURVE, Choice, Choosing, curve_of, plain
 from lnocl.observation import Observation, numbers
 from lnocl.penalty import Penalty
-from lnocl.run import Run, Setup
+from lnocl.run import Run, Setup, engine_name
 from lnocl.stopping import Rule
 
 Arrays = dict[str, NDArray[Any]]
@@ -52,14 +52,12 @@ class Checkpoint:
     ended: str
     arrays: Arrays
 
-    def choice(self) -> Choice:
-        """Return what held-out counts had chosen, or what had been given."""
+    def choice(self) -> Choice | None:
+        """Return what held-out counts had chosen, or what had been given; None if not yet."""
+        if "choice" not in self.arrays:
+            return None
         mu, smoothing, n_iter = self.arrays["choice"].tolist()
-        names = CURVE_DTYPE.names or ()
-        columns = self.arrays.get("curve", np.zeros((len(names), 0)))
-        curve = np.zeros(columns.shape[1], CURVE_DTYPE)
-        for name, column in zip(names, columns, strict=True):
-            curve[name] = column
+        curve = curve_of(self.arrays.get("curve", plain(NO_CURVE)))
         return Choice(Penalty(mu, smoothing), int(n_iter), curve)
 
     def refuse_unless(self, described: Mapping[str, str]) -> None:
@@ -86,13 +84,15 @@ def describe(observation: Observation, setup: Setup, **parameters: Any) -> dict[
         **vars(setup),
         **parameters,
     }
-    del bound["device"]  # as it was asked for; it is bound to the one that was chosen
+    bound["device"] = engine_name(setup)
     return {name: _describe(name, value) for name, value in bound.items()}
 
 
 def _describe(name: str, value: Any) -> str:
-    if value is None or isinstance(value, (str, Real)):
-        return repr(value)[:WIDTH]
+    if isinstance(value, (Real, np.bool_)):
+        value = float(value)  # of whatever kind it is
+    if value is None or isinstance(value, (str, float)):
+        return ascii(value)[:WIDTH]
     array = numbers(name, value).astype("<f8")
     digest = hashlib.sha256(repr(array.shape).encode())
     digest.update(np.ascontiguousarray(array).data)
@@ -134,13 +134,19 @@ def _digest(described: Mapping[str, str], ended: str, arrays: Arrays) -> str:
     return digest.hexdigest()
 
 
-def write(path: str, described: Mapping[str, str], ended: str, arrays: Arrays) -> None:
+def write(
+    path: str,
+    described: Mapping[str, str],
+    ended: str,
+    arrays: Arrays,
+    overwrite: bool = True,
+) -> None:
     """Write a checkpoint; a file of that name is replaced once this one is complete.
 
     Raises
     ------
     FileError
-        The file cannot be written.
+        The file cannot be written, or is there and must not be overwritten.
     """
     from astropy.io import fits
 
@@ -151,7 +157,7 @@ def write(path: str, described: Mapping[str, str], ended: str, arrays: Arrays) -
     table = np.array(list(described.items()), [("name", "U32"), ("value", f"U{WIDTH}")])
     images = [fits.ImageHDU(array, name=name.upper()) for name, array in kept.items()]
     hdus = fits.HDUList([primary, fits.BinTableHDU(table, name="RUN"), *images])
-    with whole_file(path, overwrite=True) as stream:
+    with whole_file(path, overwrite) as stream:
         hdus.writeto(stream)
 
 
@@ -185,29 +191,27 @@ class Keeper:
 
     def __init__(
         self,
-        path: str | None,
+        path: object,
         every: object,
-        resume: str | None,
+        resume: object,
         describe: Callable[[], dict[str, str]],
     ) -> None:
-        for name, file in (("checkpoint", path), ("resume", resume)):
-            if not (file is None or isinstance(file, (str, os.PathLike))):
-                raise InputError(f"{name} must be the name of a file; {file!r} was given")
-        self._path = path
+        self._path, source = _file_name("checkpoint", path), _file_name("resume", resume)
         self._saved_at = time.monotonic() if path is None else -math.inf
         self._finite: Arrays = {}
-        self._described = describe() if path is not None or resume is not None else {}
-        self.saved = None if resume is None else read(resume)
-        if self.saved is not None:
-            self.saved.refuse_unless(self._described)
         if not (isinstance(every, Real) and cast(float, every) >= 0):
             raise InputError(f"checkpoint_every must be seconds, 0 or more; {every!r} was given")
         self._every = cast(float, every)
-        if path is None:
-            return
-        if os.path.lexists(path) and not (resume and os.path.samefile(path, resume)):
-            raise FileError(f"the checkpoint {path} exists; resume from it, or remove it")
-        check_output(path, overwrite=True)
+        self.saved = None if source is None else read(source)
+        self._may_replace = False
+        if self._path is not None:
+            check_output(self._path, overwrite=True)
+            self._may_replace = _are_same(self._path, source)
+            if os.path.lexists(self._path) and not self._may_replace:
+                raise FileError(f"the checkpoint {path} exists; resume from it, or remove it")
+        self._described = describe() if self._path is not None or self.saved is not None else {}
+        if self.saved is not None:
+            self.saved.refuse_unless(self._described)
 
     def restore(self, run: Run, rule: Rule) -> str:
         """Put a run where its checkpoint was, if any; return why it had ended, if it had.
@@ -216,15 +220,11 @@ class Keeper:
 
         Raises
         ------
-        InputError
-            The checkpoint was written on another device.
         NotFiniteError
             The start is infinite or not a number.
         """
-        self._described["device"] = _describe("device", run.engine.name)
         ended = ""
-        if self.saved is not None:
-            self.saved.refuse_unless(self._described)
+        if self.saved is not None and self.saved.choice() is not None:
             run.restore(self.saved.arrays)
             rule.restore(self.saved.arrays.get("rule", np.zeros(0)).tolist())
             ended = "" if self.saved.ended == "callback" else self.saved.ended
@@ -270,27 +270,48 @@ class Keeper:
         LnoclWarning
             A later one cannot be written.
         """
-        if not ended and time.monotonic() - self._saved_at < self._every:
-            return
-        self._finite = run.state()
-        if self._path is not None:
+        if ended or self._is_time():
+            self._finite = run.proven_state()
             chosen = [choice.penalty.mu, choice.penalty.smoothing, choice.n_iter]
-            curve = [choice.curve[name] for name in CURVE_DTYPE.names or ()]
-            besides = {"rule": rule.state(), "choice": chosen, "curve": curve}
+            besides = {"rule": rule.state(), "choice": chosen, "curve": plain(choice.curve)}
             arrays = {name: np.array(values, np.float64) for name, values in besides.items()}
             self._write(ended, self._finite | arrays)
-        self._saved_at = time.monotonic()
+
+    def keep_choosing(self, choosing: Choosing) -> None:
+        """Keep what held-out counts have come to, where there is a file and it is time to.
+
+        Raises and warns as `keep`.
+        """
+        if self._path is not None and self._is_time():
+            self._write("", choosing.state())
+
+    def _is_time(self) -> bool:
+        return time.monotonic() - self._saved_at >= self._every
 
     def _write(self, ended: str, arrays: Arrays) -> None:
         """Write a checkpoint; what cannot be written later on costs no run that has come so far."""
-        assert self._path is not None
         try:
-            write(self._path, self._described, ended, arrays)
+            if self._path is not None:
+                write(self._path, self._described, ended, arrays, self._may_replace)
+                self._may_replace = True
         except FileError as error:
             if self._saved_at == -math.inf:
                 raise
             warnings.warn(
-                f"{error}; the run goes on, and the checkpoint before is whole",
+                f"{error}; the run goes on, and what was there before is as it was",
                 LnoclWarning,
                 stacklevel=5,
             )
+        self._saved_at = time.monotonic()
+
+
+def _file_name(name: str, file: object) -> str | None:
+    if file is None:
+        return None
+    if not isinstance(file, (str, os.PathLike)) or not isinstance(os.fspath(file), str):
+        raise InputError(f"{name} must be the name of a file; {file!r} was given")
+    return cast(str, os.fspath(file))
+
+
+def _are_same(path: str, source: str | None) -> bool:
+    return source is not None and os.path.exists(path) and os.path.samefile(path, source)

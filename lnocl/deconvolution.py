@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lnocl.checkpoint import Keeper, describe
 from lnocl.errors import InputError, LnoclWarning, NotFiniteError
-from lnocl.heldout import CURVE_DTYPE, Choice, Grid, choose, several_mu, several_smoothings
+from lnocl.heldout import NO_CURVE, Choice, Choosing, Grid, several_mu, several_smoothings
 from lnocl.observation import Array, Observation, numbers
 from lnocl.penalty import Penalty
 from lnocl.progress import Bar
@@ -332,14 +332,21 @@ def deconvolve(
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
     # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
     with bar, np.errstate(over="ignore", invalid="ignore"):
-        if keeper.saved is not None:
-            choice = keeper.saved.choice()
-        elif grid is not None or stop == "held-out":
-            choice = _choose(
-                setup, observation, penalty, grid, stop, int(n_iter), initial_extended, bar
-            )
-        else:
-            choice = Choice(penalty, int(n_iter), np.zeros(0, CURVE_DTYPE))
+        choice = keeper.saved.choice() if keeper.saved is not None else None
+        if choice is None:
+            choice = Choice(penalty, int(n_iter), NO_CURVE)
+            if grid is not None or stop == "held-out":
+                choice = _choose(
+                    setup,
+                    observation,
+                    penalty,
+                    grid,
+                    stop,
+                    int(n_iter),
+                    initial_extended,
+                    bar,
+                    keeper,
+                )
         run = Run(
             setup, observation, choice.penalty, choice.n_iter, initial_extended, initial_star_fluxes
         )
@@ -432,19 +439,24 @@ def _choose(
     n_iter: int,
     initial_extended: ArrayLike | None,
     bar: Bar,
+    keeper: Keeper,
 ) -> Choice:
     """Have held-out counts choose the penalty and the number of iterations, or one of them."""
     half = None
     if initial_extended is not None:
         half = numbers("initial_extended", initial_extended) / 2.0
-    return choose(
+    choosing = Choosing(
         partial(Run, setup, n_iter=n_iter, initial_extended=half),
         observation,
         penalty,
         grid,
         n_iter,
         stop != "held-out",
-        lambda words: bar.show(0, lambda: words),
+    )
+    if keeper.saved is not None:
+        choosing.restore(keeper.saved.arrays)
+    return choosing.choose(
+        lambda words: bar.show(0, lambda: words), lambda: keeper.keep_choosing(choosing)
     )
 
 
@@ -466,7 +478,7 @@ def _iterate(
                 stop_reason = "callback"
             estimate._close()
         if rule.met(run):
-            stop_reason = stop_reason or rule.reason
+            stop_reason = rule.reason  # it would end here without a callback too
         bar.show(iteration, quantity, last=stop_reason is not None or iteration == n_iter)
         if stop_reason is not None:
             break

@@ -20,6 +20,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,8 @@ CURVE_DTYPE = np.dtype(
         ("error", np.float64),
     ]
 )
+
+NO_CURVE = np.zeros(0, CURVE_DTYPE)
 
 # The last iteration is taken whose error is within a tenth of the least: near a star the estimate
 # goes on improving long after the rest. The least squared error is taken to be the noise alone;
@@ -58,6 +61,10 @@ MU_GRID = 10.0 ** np.arange(-3.0, 0.1, 0.5)
 SMOOTHING_GRID = 10.0 ** np.arange(-1.5, 0.6, 0.5)
 MOST_COUNTS = 2.0**62
 
+# Before the names of what all runs on halves have come to, one behind the other.
+HALVES = "halves_"
+
+Arrays = dict[str, NDArray[Any]]
 Estimate = NDArray[np.float32]
 BeginHalf = Callable[[Observation, Penalty], Run]
 Grid = Callable[[Observation, float], list[Penalty]]
@@ -80,6 +87,19 @@ class Choice:
     penalty: Penalty
     n_iter: int
     curve: NDArray[np.void]
+
+
+def plain(curve: NDArray[np.void]) -> Array:
+    """Return a curve as numbers, a row for each field."""
+    return np.array([curve[name] for name in CURVE_DTYPE.names or ()], np.float64)
+
+
+def curve_of(rows: Array) -> NDArray[np.void]:
+    """Return a curve from its numbers."""
+    curve = np.zeros(rows.shape[1], CURVE_DTYPE)
+    for name, row in zip(CURVE_DTYPE.names or (), rows, strict=True):
+        curve[name] = row
+    return curve
 
 
 def halve(observation: Observation, ways: int = 1) -> list[tuple[Observation, Observation]]:
@@ -188,12 +208,31 @@ class _Trial:
 
     def advance(self) -> Iterator[int]:
         """Go on to the next iteration that is kept, and yield it, until a run ends."""
-        due = 1
+        last = self.iterations[-1] if self.kept else 0
+        due = max(last + 1, math.floor(SPACING * last))
         for iteration, *_ in zip(*(run for pair in self._runs for run in pair), strict=False):
             if iteration == due:
                 self.kept.append((iteration, [(_flat(a), _flat(b)) for a, b in self._runs]))
                 due = max(due + 1, math.floor(SPACING * due))
                 yield iteration
+
+    def state(self) -> Arrays:
+        """Return what `restore` needs, at an iteration that was kept last."""
+        states = [run.state() for pair in self._runs for run in pair]
+        state = {HALVES + name: np.array([each[name] for each in states]) for name in states[0]}
+        state["kept_at"] = np.array(self.iterations)
+        state["kept"] = np.array([pairs for _, pairs in self.kept])
+        return state
+
+    def restore(self, state: Arrays) -> None:
+        """Go on from this state."""
+        mine = {n.removeprefix(HALVES): a for n, a in state.items() if n.startswith(HALVES)}
+        for k, run in enumerate(run for pair in self._runs for run in pair):
+            run.restore({name: each[k] for name, each in mine.items()})
+        self.kept = [
+            (int(at), [(a, b) for a, b in pairs])
+            for at, pairs in zip(state["kept_at"], state["kept"], strict=True)
+        ]
 
     def forget(self, first: float) -> None:
         """Let the estimates before an iteration go."""
@@ -236,16 +275,8 @@ def _flat(run: Run) -> Estimate:
     return run.extended().astype(np.float32).ravel()
 
 
-def choose(
-    begin: BeginHalf,
-    observation: Observation,
-    penalty: Penalty,
-    grid: Grid | None,
-    n_iter: int,
-    at_end: bool,
-    report: Callable[[str], None],
-) -> Choice:
-    """Return the penalty and the number of iterations that held-out counts choose.
+class Choosing:
+    """Held-out counts at work on the choice of the penalty and the number of iterations.
 
     Parameters
     ----------
@@ -263,44 +294,110 @@ def choose(
     at_end : bool
         Whether the reconstruction will go on to `n_iter`, and the penalty is to be the best there;
         else each penalty has its own number of iterations.
-    report : callable
-        Told in a few words how far it is.
 
     Raises
     ------
     InputError
-        No counts to deal out, or too many, or halves of which no iteration betters the start.
+        No counts to deal out, or too many.
 
     Warns
     -----
     LnoclWarning
-        Images that are not whole counts; an iteration chosen too near `n_iter`.
+        Images that are not whole counts.
     """
-    halves = halve(observation, SPLITS)
-    pending = [penalty]
-    trials: list[_Judged] = []
-    while pending:
-        penalty = pending.pop(0)
-        with _quiet():
-            halved = penalty.of_half()
-            trial = _Trial([(begin(a, halved), begin(b, halved)) for a, b in halves])
-        judged = _follow(trial, penalty, at_end, trials[0] if trials else None, report)
-        trials.append(judged)
-        if judged.error > (1.0 + WITHIN) * min(trial.error for trial in trials):
-            break  # the penalty grows, and is too large already
-        if grid is not None and len(trials) == 1:
-            brightest = 2.0 * max(float(half.max()) for half in trial.end[0])
-            pending = grid(observation, brightest) if brightest > 0 else []
-    best = min(trials, key=lambda trial: trial.error)
-    if not at_end and AS_LONG_AGAIN * best.n_iter > n_iter:
-        warnings.warn(
-            f"held-out counts have chosen iteration {best.n_iter} of {n_iter}, too near the end to "
-            f"be sure; give n_iter {AS_LONG_AGAIN * best.n_iter} or more",
-            LnoclWarning,
-            stacklevel=4,
-        )
-    curve = np.concatenate([trial.curve for trial in trials])
-    return Choice(best.penalty, n_iter if at_end else best.n_iter, curve)
+
+    def __init__(
+        self,
+        begin: BeginHalf,
+        observation: Observation,
+        penalty: Penalty,
+        grid: Grid | None,
+        n_iter: int,
+        at_end: bool,
+    ) -> None:
+        self._begin, self._observation = begin, observation
+        self._penalty, self._grid = penalty, grid
+        self._n_iter, self._at_end = n_iter, at_end
+        self._halves = halve(observation, SPLITS)
+        self._judged: list[_Judged] = []
+        self._trial = _Trial([])
+        self._saved: Arrays = {}
+
+    def choose(self, report: Callable[[str], None], keep: Callable[[], None]) -> Choice:
+        """Return the penalty and the number of iterations that held-out counts choose.
+
+        Parameters
+        ----------
+        report : callable
+            Told in a few words how far it is.
+        keep : callable
+            Called where `state` may be taken.
+
+        Raises
+        ------
+        InputError
+            Halves of which no iteration betters the start.
+        NotFiniteError
+            Estimates of halves that are infinite or not a number.
+
+        Warns
+        -----
+        LnoclWarning
+            An iteration chosen too near `n_iter`.
+        """
+        while (penalty := self._next()) is not None:
+            with _quiet():
+                halved = penalty.of_half()
+                self._trial = _Trial(
+                    [(self._begin(a, halved), self._begin(b, halved)) for a, b in self._halves]
+                )
+                if self._saved:
+                    self._trial.restore(self._saved)
+                    self._saved = {}
+            first = self._judged[0] if self._judged else None
+            self._judged.append(_follow(self._trial, penalty, self._at_end, first, report, keep))
+        best = min(self._judged, key=lambda judged: judged.error)
+        if not self._at_end and AS_LONG_AGAIN * best.n_iter > self._n_iter:
+            warnings.warn(
+                f"held-out counts have chosen iteration {best.n_iter} of {self._n_iter}, too near "
+                f"the end to be sure; give n_iter {AS_LONG_AGAIN * best.n_iter} or more",
+                LnoclWarning,
+                stacklevel=3,
+            )
+        curve = np.concatenate([judged.curve for judged in self._judged])
+        return Choice(best.penalty, self._n_iter if self._at_end else best.n_iter, curve)
+
+    def _next(self) -> Penalty | None:
+        """Return the penalty to be tried next, if any."""
+        if not self._judged:
+            return self._penalty
+        least = min(judged.error for judged in self._judged)
+        if self._grid is None or self._judged[-1].error > (1.0 + WITHIN) * least:
+            return None  # the penalty grows, and is too large already
+        brightest = 2.0 * max(float(half.max()) for half in self._judged[0].reference[0])
+        others = self._grid(self._observation, brightest) if brightest > 0 else []
+        return dict(enumerate(others, 1)).get(len(self._judged))
+
+    def state(self) -> Arrays:
+        """Return what `restore` needs."""
+        state = self._trial.state()
+        if self._judged:
+            state["judged"] = np.array([judged.row() for judged in self._judged])
+            state["reference"] = np.array(self._judged[0].reference)
+            state["curves"] = plain(np.concatenate([judged.curve for judged in self._judged]))
+        return state
+
+    def restore(self, state: Arrays) -> None:
+        """Go on from this state."""
+        self._saved = state
+        curves = curve_of(state.get("curves", plain(NO_CURVE)))
+        for mu, smoothing, n_iter, error, zero, truth in state.get("judged", np.zeros((0, 6))):
+            curve = curves[(curves["mu"] == mu) & (curves["smoothing"] == smoothing)]
+            reference = [(a, b) for a, b in state["reference"]]
+            penalty = Penalty(float(mu), float(smoothing))
+            self._judged.append(
+                _Judged(penalty, int(n_iter), error, curve, reference, float(zero), float(truth))
+            )
 
 
 @dataclass
@@ -315,6 +412,11 @@ class _Judged:
     zero: float
     truth: float
 
+    def row(self) -> list[float]:
+        """Return the numbers."""
+        penalty = self.penalty
+        return [penalty.mu, penalty.smoothing, self.n_iter, self.error, self.zero, self.truth]
+
 
 def _follow(
     trial: _Trial,
@@ -322,37 +424,39 @@ def _follow(
     at_end: bool,
     first: _Judged | None,
     report: Callable[[str], None],
+    keep: Callable[[], None],
 ) -> _Judged:
     """Take a trial as far as is needed, and judge it as the first one was."""
     for iteration in trial.advance():
-        excess = trial.excess(first.reference if first else trial.end)
-        refuse_not_finite(*excess)
-        least = int(np.argmin(excess))
-        allowed = ((1.0 + WITHIN) ** 2 - 1.0) * trial.noise(least)
-        chosen = trial.iterations[np.flatnonzero(excess <= excess[least] + allowed)[-1]]
+        _, least, chosen = _judge(trial, first)
         weights = f"mu {penalty.mu:.2g}, smoothing {penalty.smoothing:.2g}"
         report(f"held-out counts, {weights}: iteration {chosen} of {iteration}")
         if not at_end and iteration >= max(FEWEST, AS_LONG_AGAIN * chosen):
             break
         trial.forget(min(FORGOTTEN * chosen, trial.iterations[least]))
+        keep()
     if not trial.kept:
         raise InputError(
             "half of the counts is too little: no iteration betters the start; give n_iter, mu and "
             "smoothing as numbers"
         )
+    excess, least, chosen = _judge(trial, first)
     reference = first.reference if first else trial.end
-    excess = trial.excess(reference)
     # The constant that the excess lacks, and the scale of relative errors.
     zero = first.zero if first else trial.noise(least) - float(excess.min())
     truth = first.truth if first else float(np.mean([4.0 * _dot(a, b) for a, b in reference]))
     errors = np.sqrt(np.maximum(excess + zero, 0.0) / max(truth, zero, np.finfo(float).tiny))
     error = float(errors[-1] if at_end else errors.min())
-    curve = _curve(penalty, trial.iterations, errors)
+    curve = np.zeros(len(errors), CURVE_DTYPE)
+    curve["mu"], curve["smoothing"] = penalty.mu, penalty.smoothing
+    curve["iteration"], curve["error"] = trial.iterations, errors
     return _Judged(penalty, chosen, error, curve, reference, zero, truth)
 
 
-def _curve(penalty: Penalty, iterations: list[int], errors: Array) -> NDArray[np.void]:
-    curve = np.zeros(len(iterations), CURVE_DTYPE)
-    curve["mu"], curve["smoothing"] = penalty.mu, penalty.smoothing
-    curve["iteration"], curve["error"] = iterations, errors
-    return curve
+def _judge(trial: _Trial, first: _Judged | None) -> tuple[Array, int, int]:
+    """Return the excess of what is kept, the place of the least, and the iteration to choose."""
+    excess = trial.excess(first.reference if first else trial.end)
+    refuse_not_finite(*excess)
+    least = int(np.argmin(excess))
+    allowed = ((1.0 + WITHIN) ** 2 - 1.0) * trial.noise(least)
+    return excess, least, trial.iterations[np.flatnonzero(excess <= excess[least] + allowed)[-1]]

@@ -541,7 +541,10 @@ class OpenCLEngine:
             if name in state and state[name].size:  # there may be no objective yet, and no star
                 cl.enqueue_copy(self._queue, self._buffers[name], state[name])
         self._transform_estimate()
-        self._n_objectives = self._n_restored = len(state.get("objectives", ())) // 2
+        n_objectives = len(state.get("objectives", ())) // 2
+        if not self.is_proven:
+            self._n_restored = n_objectives
+        self._n_objectives = n_objectives
 
     def _transform_estimate(self) -> None:
         """Make the row spectrum of an estimate that came from the host, and convolve it."""

@@ -44,7 +44,7 @@ class Penalty:
     def __post_init__(self) -> None:
         weights: dict[str, Any] = {"mu": self.mu, "smoothing": self.smoothing}
         for name, weight in weights.items():
-            if not (isinstance(weight, Real) and 0 <= cast(float, weight) <= MOST):
+            if not (isinstance(weight, Real) and 0 <= float(cast(float, weight)) <= MOST):
                 raise InputError(
                     f"{name} must be a number, finite and not negative; {weight!r} was given"
                 )

@@ -106,11 +106,11 @@ class Run:
     def __iter__(self) -> Iterator[int]:
         solve = SOLVERS[self._setup.solver]
         while self.done < self._n_iter:
-            begin = self.done
+            begin, is_stage_new = self.done, not self._steps.begun
             for iteration in solve(self.engine, self._due - begin, self._steps):
                 self.done = begin + iteration
                 yield self.done
-            was_stuck = begin == self.done < self._due
+            was_stuck = is_stage_new and begin == self.done < self._due
             if was_stuck or not self._refines:
                 return
             if self.done < self._n_iter:
@@ -143,6 +143,22 @@ class Run:
             state["star_information"] = scaling.star_information
         for values in state.values():
             refuse_not_finite(values.sum(initial=0.0, dtype=np.float64))
+        return state
+
+    def proven_state(self) -> dict[str, NDArray]:
+        """Return the state, of an estimate whose objective is finite.
+
+        Raises
+        ------
+        NotFiniteError
+            The objective is infinite or not a number, or values in the state are.
+        """
+        state = self.state()
+        is_recorded = len(self.engine.objectives()) > self.done
+        self.finish()
+        refuse_not_finite(self.engine.objective())
+        if not is_recorded:  # the solver is about to make the same ratios
+            self.engine.restore(state)
         return state
 
     def restore(self, state: dict[str, NDArray]) -> None:
@@ -285,6 +301,22 @@ def _model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Array:
     if scene.has_exposure_map:
         images *= model.weights
     return images[:, :ny, :nx] * scene.scale
+
+
+def engine_name(setup: Setup) -> str:
+    """Return the name of the engine that runs have: the device, its platform and driver.
+
+    Raises
+    ------
+    InputError
+        No such device.
+    DeviceError
+        No device at all.
+    """
+    if setup.engine == "numpy":
+        return str(importlib.import_module("lnocl.reference").ReferenceEngine.name)
+    device = importlib.import_module("lnocl.device")
+    return str(device.describe(device.choose(setup.device).device))
 
 
 def _make_engine(setup: Setup, scene: Scene, n_iter: int, scaling: Any) -> Any:

@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from scenes import ENGINES, Recipe
+from scenes import ENGINES, Recipe, make_smooth_psfs
 
 import lnocl
 from lnocl import checkpoint
 from lnocl.commands.checkpoints import Interrupts
+from lnocl.reference import ReferenceEngine
+from lnocl.run import FIRST_REFINED, Run
 
 STARS = Recipe((16, 32), 2, 2, mu=1e-3, smoothing=0.01, masked=0.05)
 NO_STAR = Recipe((16, 16), 1)
@@ -79,12 +81,96 @@ def test_a_run_that_had_ended_is_as_it_was(solver, tmp_path):
     assert_same(again, whole)
 
 
-def test_checkpoints_do_not_change_the_run(tmp_path):
-    made, path = STARS.make(), str(tmp_path / "run.fits")
-    given = {"solver": "sgp", "n_iter": 9, "engine": "numpy"}
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_checkpoints_do_not_change_the_run(solver, engine, tmp_path):
+    made, path = STARS.make(), tmp_path / "run.fits"
+    given = {"solver": solver, "n_iter": 9, "engine": engine}
     assert_same(
         made.deconvolve(**given, checkpoint=path, checkpoint_every=0), made.deconvolve(**given)
     )
+
+
+def test_a_run_cut_off_where_no_step_was_left_for_the_stars_as_they_were_goes_on(
+    tmp_path, monkeypatch
+):
+    """They are moved, and steps are left again."""
+    refined = []
+    genuine = Run._refine
+
+    def refine(run):
+        refined.append(run.done)
+        genuine(run)
+
+    monkeypatch.setattr(Run, "_refine", refine)
+    (psf,), path = make_smooth_psfs(1, (16, 16)), str(tmp_path / "run.fits")
+    sky = 20.0 + 9000.0 * np.roll(psf / psf.sum(), (-1, 0), (0, 1))
+    images = np.random.default_rng(1).poisson(sky, (2, 16, 16))
+    observation = lnocl.Observation(images, psf, background=5.0)
+    given = {"observation": observation, "stars": [(8.4, 7.3)], "n_iter": 400, "mu": 1e-2}
+    given |= {"solver": "sgp", "refine_positions": True, "engine": "numpy"}
+    whole = lnocl.deconvolve(**given)
+    early = [k for k in refined if k not in (FIRST_REFINED * 2**n for n in range(9))]
+    assert early
+    for cut in (early[0], early[-1]):
+        lnocl.deconvolve(**given, checkpoint=path, callback=lambda k, _, cut=cut: k == cut)
+        assert_same(lnocl.deconvolve(**given, resume=path), whole)
+        os.remove(path)
+
+
+def test_a_callback_that_ends_a_run_where_it_ends_anyway_is_not_heeded(tmp_path):
+    made, path = STARS.make(), str(tmp_path / "run.fits")
+    given = {"n_iter": 400, "stop": 1e-3, "engine": "numpy"}
+    whole = made.deconvolve(**given)
+    assert whole.stop_reason == "change"
+    cut = made.deconvolve(**given, checkpoint=path, callback=lambda k, _: k == whole.n_iter)
+    assert_same(cut, whole)
+    assert_same(made.deconvolve(**given, resume=path), whole)
+
+
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+@pytest.mark.parametrize(
+    ("more", "engine"),
+    [
+        ({"stop": "held-out", "smoothing": "auto", "solver": "sgp"}, "numpy"),
+        ({"stop": "held-out", "smoothing": "auto", "solver": "sgp"}, "opencl"),
+        ({"mu": "auto"}, "numpy"),
+    ],
+    ids=["sgp-numpy", "sgp-opencl", "sgm-numpy"],
+)
+def test_held_out_counts_go_on_from_where_they_were_cut_off(more, engine, tmp_path, monkeypatch):
+    made, path = STARS.make(), str(tmp_path / "run.fits")
+    given = {"n_iter": 16, "mu": 0.0, "engine": engine, "checkpoint": path, "checkpoint_every": 0}
+    given |= more
+    written, corrected, cut = [], [], 0
+    genuine, correct = checkpoint.write, ReferenceEngine.correct
+
+    def write(path, described, ended, arrays, overwrite):
+        written.append("choice" in arrays)
+        if written[0] or len(written) in (1, cut):
+            genuine(path, described, ended, arrays, overwrite)
+        if len(written) == cut:
+            raise KeyboardInterrupt
+
+    def count_and_correct(run):
+        corrected.append(run)
+        correct(run)
+
+    monkeypatch.setattr(checkpoint, "write", write)
+    monkeypatch.setattr(ReferenceEngine, "correct", count_and_correct)
+    whole = made.deconvolve(**given)
+    choosing, corrections = written.index(True), len(corrected)
+    assert choosing > 10
+    for cut in (1, choosing // 2, choosing):  # noqa: B007
+        os.remove(path)
+        written.clear()
+        corrected.clear()
+        with pytest.raises(KeyboardInterrupt):
+            made.deconvolve(**given)
+        assert_same(made.deconvolve(**given, resume=path), whole)
+        # What was done is not done again, but for what six halves begin with.
+        assert written.index(True) == choosing
+        assert len(corrected) <= corrections + 6
 
 
 @pytest.mark.parametrize(
@@ -98,7 +184,7 @@ def test_they_are_written_first_then_when_it_is_time_and_at_the_end(
     given = {"n_iter": 5, "engine": "numpy", "checkpoint": str(tmp_path / "run.fits")}
     STARS.make().deconvolve(**given, checkpoint_every=every)
     assert len(written) == times
-    assert [ended for _, _, ended, _ in written] == [""] * (times - 1) + ["n_iter"]
+    assert [ended for _, _, ended, *_ in written] == [""] * (times - 1) + ["n_iter"]
 
 
 # --- What is refused
@@ -193,6 +279,49 @@ def test_the_checkpoint_of_another_run_is_not_replaced(saved):
     with pytest.raises(lnocl.FileError, match="exists; resume from it, or remove it"):
         STARS.make().deconvolve(n_iter=6, engine="numpy", checkpoint=saved)
     assert Path(saved).read_bytes() == before
+
+
+def test_the_checkpoint_of_a_run_that_began_meanwhile_is_not_replaced(tmp_path):
+    made, path = STARS.make(), tmp_path / "run.fits"
+    given = {"engine": "numpy", "checkpoint": path}
+
+    def other(iteration, estimate):
+        made.deconvolve(n_iter=4, **given)
+
+    with pytest.raises(lnocl.FileError, match=r"the output .* exists"):
+        made.deconvolve(n_iter=7, callback=other, **given)
+    assert checkpoint.read(str(path)).arrays["progress"][0] == 4
+
+
+@pytest.mark.parametrize("name", ["a\0b.fits", "\ud800.fits", "folder/run.fits", ""])
+def test_names_that_files_cannot_have_are_refused(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for keyword in ("checkpoint", "resume"):
+        with pytest.raises(lnocl.FileError):
+            STARS.make().deconvolve(n_iter=1, engine="numpy", **{keyword: name})
+
+
+def test_a_link_to_nothing_takes_no_name(saved, tmp_path):
+    link = tmp_path / "link.fits"
+    link.symlink_to("nothing.fits")
+    with pytest.raises(lnocl.FileError, match="exists; resume from it, or remove it"):
+        STARS.make().deconvolve(n_iter=6, engine="numpy", resume=saved, checkpoint=link)
+
+
+def test_any_letters_may_name_a_device(tmp_path, monkeypatch):
+    monkeypatch.setattr(ReferenceEngine, "name", "Größe ®")
+    made, path = STARS.make(), tmp_path / "run.fits"
+    given = {"n_iter": 3, "engine": "numpy"}
+    whole = made.deconvolve(**given, checkpoint=path)
+    assert_same(made.deconvolve(**given, resume=path), whole)
+
+
+def test_numbers_of_any_kind_are_the_same_parameters(tmp_path):
+    made, path = STARS.make(), tmp_path / "run.fits"
+    given = {"n_iter": 3, "engine": "numpy"}
+    whole = made.deconvolve(**given, mu=np.float64(0.5), checkpoint=path)
+    again = {"n_iter": np.int64(3), "engine": "numpy", "mu": np.float32(0.5)}
+    assert_same(made.deconvolve(**again, resume=path), whole)
 
 
 @pytest.mark.parametrize("every", [-1.0, np.nan, "often"])

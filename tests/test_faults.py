@@ -400,6 +400,31 @@ def poison(engine, what):
         engine._row_spectrum = engine._row_spectrum * np.nan
 
 
+@pytest.mark.parametrize("every", [0.0, 1e9])
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_an_estimate_is_proven_by_its_objective_before_it_is_kept(
+    solver, every, monkeypatch, tmp_path
+):
+    """Where a finite estimate has an infinite objective, again and again."""
+    path, genuine = tmp_path / "run.fits", ReferenceEngine.objective
+
+    def objective(engine):
+        return np.inf if len(engine._objectives) > 6 else genuine(engine)
+
+    def objectives(engine):
+        return np.array([*engine._objectives[:6], *[np.inf] * len(engine._objectives[6:])])
+
+    monkeypatch.setattr(ReferenceEngine, "objective", objective)
+    monkeypatch.setattr(ReferenceEngine, "objectives", objectives)
+    keywords = {"solver": solver, "engine": "numpy", "n_iter": 20}
+    for files in ({"checkpoint": path, "checkpoint_every": every}, {"resume": path}):
+        with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
+            result = lnocl.deconvolve(observe(), **keywords, **files)
+        assert (result.stop_reason, result.n_iter) == ("not finite", 5)
+        assert len(result.history) == 6
+        assert np.isfinite(result.history["objective"]).all()
+
+
 @pytest.mark.parametrize("engine", ["numpy", "opencl"])
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
 @pytest.mark.parametrize(

@@ -226,9 +226,33 @@ class TestHeldOut:
             "the images are not whole counts: they are split as if they were Poisson counts"
         ]
 
+    @pytest.mark.parametrize("n_iter", [7, 10, 20])
+    def test_errors_are_measured_from_the_noise_of_the_best_estimate(self, n_iter):
+        """Some before it are let go, the last time after the last estimate."""
+        rng = np.random.default_rng(1)
+
+        class Trial(heldout._Trial):
+            def advance(self):
+                for k in range(1, n_iter + 1):
+                    # Halves of a truth of 10, first far from it, then noisy; best is iteration 12.
+                    wide = np.float32(5.0 + 0.5 * max(12 - k, 0))
+                    noise = 0.1 * k * rng.standard_normal((2, 4000), np.float32)
+                    self.kept.append((k, [(wide + noise[0], wide + noise[1])]))
+                    yield k
+
+        trial = Trial([])
+        judged = heldout._follow(trial, Penalty(), True, None, lambda _: None, lambda: None)
+        assert trial.iterations[0] > 1
+        excess = trial.excess(trial.end)
+        least = int(np.argmin(excess))
+        a, b = trial.kept[least][1][0]
+        noise = np.linalg.norm(a - b) ** 2
+        expected = np.sqrt(noise / max(judged.truth, noise - excess[least]))
+        assert judged.curve["error"][least] == pytest.approx(expected, rel=1e-6)
+
     def test_halves_that_end_at_once_are_refused(self):
         with pytest.raises(lnocl.InputError, match="no iteration betters the start"):
-            heldout._follow(heldout._Trial([((), ())]), Penalty(), False, None, print)
+            heldout._follow(heldout._Trial([((), ())]), Penalty(), False, None, print, print)
 
     def test_start_that_is_no_number_is_refused(self):
         with pytest.raises(lnocl.InputError, match="initial_extended"):
