@@ -257,9 +257,10 @@ def deconvolve(
     Raises
     ------
     InputError
-        A parameter out of its range or too large for the precision, mu and smoothing both "auto",
-        a star outside the images, no such device, or a device for the reference; held-out counts
-        of images that hold none.
+        An observation that is none; a parameter out of its range, masked or too large for the
+        precision, mu and smoothing both "auto", a star outside the images, no such device, or a
+        device for the reference; images or exposures too large to be summed, or a sky that no
+        number holds; held-out counts of images that hold none.
     FileError
         A checkpoint that cannot be written or read, is damaged, or would replace that of another
         run.
@@ -306,6 +307,7 @@ def deconvolve(
     >>> (result.extended.sum() + result.star_fluxes.sum()).round(6)
     np.float64(612.0)
     """
+    _check_observation(observation)
     _check_choices(solver, n_iter, stop, precision, engine, device)
     _check_kinds(callback, progress=progress, refine_positions=refine_positions)
     penalty, grid = _penalties(mu, smoothing)
@@ -378,6 +380,14 @@ def _penalties(mu: Any, smoothing: Any) -> tuple[Penalty, Grid | None]:
     if isinstance(smoothing, str):
         return Penalty(mu, 0.0), several_smoothings(mu)
     return Penalty(mu, smoothing), None
+
+
+def _check_observation(observation: object) -> None:
+    if not isinstance(observation, Observation):
+        raise InputError(
+            f"observation is of type {type(observation).__name__}; give an lnocl.Observation, as "
+            "lnocl.Observation(images, psfs) makes"
+        )
 
 
 def _check_choices(

@@ -17,7 +17,6 @@ import threading
 import warnings
 import weakref
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
@@ -27,9 +26,6 @@ from lnocl.errors import DeviceError, LnoclWarning
 T = TypeVar("T")
 
 VARIABLE = "POCL_CACHE_DIR"
-# What reading an archive raises that is damaged.
-DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError)
-
 _lock = threading.RLock()
 
 
@@ -144,7 +140,9 @@ def _unpack(archive: Path, own: Path) -> list[str]:
             for name in names:
                 if not (own / name).exists():  # else it may be loaded already
                     _extract(kept, name, own)
-    except DAMAGED:
+    except OSError:  # none were kept, or they cannot be read
+        return []
+    except Exception:  # what is damaged may raise anything
         warnings.warn(
             f"the kernels kept in {archive} are damaged, and are compiled anew",
             LnoclWarning,
@@ -152,8 +150,6 @@ def _unpack(archive: Path, own: Path) -> list[str]:
         )
         with contextlib.suppress(OSError):
             archive.unlink()  # or what is made anew would seem to be kept
-        return []
-    except OSError:  # none were kept, or they cannot be read
         return []
     return sorted({str(Path(*Path(name).parts[:2])) for name in names})
 
@@ -196,7 +192,7 @@ def _keep(archive: Path, own: Path, programs: list[str], process: int) -> None:
     with _lock, contextlib.suppress(OSError):  # what is not kept is compiled again
         files = [file for name in programs for file in (own / name).rglob("*") if file.is_file()]
         names = {str(file.relative_to(own)): file for file in files}
-        with contextlib.suppress(*DAMAGED, OSError), zipfile.ZipFile(archive) as kept:
+        with contextlib.suppress(Exception), zipfile.ZipFile(archive) as kept:
             if set(kept.namelist()) >= set(names):
                 return
         handle, part = tempfile.mkstemp(dir=archive.parent, prefix=archive.stem, suffix=".part")

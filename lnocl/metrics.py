@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError
+from lnocl.observation import numbers, unmasked
 
 Array = NDArray[np.float64]
 
@@ -72,7 +73,7 @@ def mask_star(image: ArrayLike, star: tuple[int, int]) -> Array:
     Raises
     ------
     InputError
-        Where the image is not a plane of finite numbers, or the box leaves it.
+        Where the image is not a plane of finite, unmasked numbers, or the box leaves it.
 
     Examples
     --------
@@ -120,8 +121,8 @@ def restoration_error(
     Raises
     ------
     InputError
-        Where the shapes differ, a value is not finite, the mask leaves the image, or the truth
-        is zero on all that is compared.
+        Where the shapes differ, a value is masked, not finite or too large to be squared, the box
+        around the star leaves the image, or the truth is zero on all that is compared.
 
     References
     ----------
@@ -140,10 +141,13 @@ def restoration_error(
         found, true = mask_star(found, star), mask_star(true, star)
     if rows is not None:
         found, true = found[rows], true[rows]
-    norm = np.linalg.norm(true)
+    with np.errstate(over="ignore"):
+        deviation, norm = float(np.linalg.norm(found - true)), float(np.linalg.norm(true))
+    if not (math.isfinite(deviation) and math.isfinite(norm)):
+        raise InputError("the values are too large to be squared: divide both by a constant")
     if norm == 0:
         raise InputError("the truth is zero on all that is compared; there is no relative error")
-    return float(np.linalg.norm(found - true) / norm)
+    return deviation / norm
 
 
 def box_flux(image: ArrayLike, star: tuple[int, int]) -> float:
@@ -164,7 +168,7 @@ def box_flux(image: ArrayLike, star: tuple[int, int]) -> float:
     Raises
     ------
     InputError
-        Where the image is not a plane of finite numbers, or the box leaves it.
+        Where the image is not a plane of finite, unmasked numbers, or the box leaves it.
 
     Examples
     --------
@@ -230,7 +234,7 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
     Raises
     ------
     InputError
-        Where the image is not a plane of finite numbers, or a masked row lies outside it.
+        Where the image is not a plane of finite, unmasked numbers, or a masked row lies outside it.
 
     References
     ----------
@@ -269,8 +273,8 @@ def width_profile(image: ArrayLike, threshold: float, star: tuple[int, int] | No
     Raises
     ------
     InputError
-        Where the image is not a plane of finite numbers, the threshold is not finite, or a
-        masked row lies outside the image.
+        Where the image is not a plane of finite, unmasked numbers, the threshold is not finite, or
+        a masked row lies outside the image.
 
     References
     ----------
@@ -311,7 +315,7 @@ def relative_error(profile: ArrayLike, reference: ArrayLike) -> Array:
     Raises
     ------
     InputError
-        Where they are not two profiles of one length.
+        Where they are not two profiles of one length, of real numbers, none masked.
 
     Examples
     --------
@@ -319,8 +323,7 @@ def relative_error(profile: ArrayLike, reference: ArrayLike) -> Array:
     >>> relative_error([5.0, 9.0, 1.0], [4.0, 10.0, 0.0])
     array([ 0.25, -0.1 ,   nan])
     """
-    found = np.asarray(profile, dtype=np.float64)
-    true = np.asarray(reference, dtype=np.float64)
+    found, true = numbers("profile", profile), numbers("reference", reference)
     if found.ndim != 1 or found.shape != true.shape:
         raise InputError(f"the profile has shape {found.shape} and the reference {true.shape}")
     error = np.full(found.shape, np.nan)
@@ -329,7 +332,7 @@ def relative_error(profile: ArrayLike, reference: ArrayLike) -> Array:
 
 
 def _plane(name: str, values: ArrayLike) -> Array:
-    array = np.asarray(values)
+    array = unmasked(name, values)
     if array.ndim != 2 or array.dtype.kind not in "biuf":
         raise InputError(
             f"{name} has {array.ndim} dimensions of {array.dtype}; give two, of real numbers"

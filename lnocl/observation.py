@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +11,14 @@ from lnocl import units
 from lnocl.errors import InputError, LnoclWarning
 
 Array = NDArray[np.float64]
+
+# What to do about masked values of these, which only images and frames of stars may have.
+UNMASK = {
+    "psfs": "repair them first, as lnocl.psf.make_psf does",
+    "background": "fill them and add their mask to mask",
+    "read_noise": "fill them and add their mask to mask",
+    "exposure": "fill them and add their mask to mask",
+}
 
 
 class Observation:
@@ -29,6 +36,7 @@ class Observation:
         added are set to zero, and their number is announced. An `astropy.units.Quantity`, an
         `astropy.nddata.NDData` such as a CCDData, or a sequence of these, is taken with its unit
         and mask; counts per time are multiplied by the exposure. Uncertainties are not used.
+        Nothing else may hold masked values.
     psfs : array_like, shape (p, ky, kx) or (ky, kx)
         Point spread functions, centre at ``(ky // 2, kx // 2)``, of any positive sum: they are
         normalised here. One serves all images. Negative pixels are kept and announced.
@@ -66,8 +74,9 @@ class Observation:
     ------
     InputError
         Where an array has the wrong shape, type or unit, is empty, or holds values out of range;
-        where a PSF has no positive sum or is not finite; where no good pixel is left; where an
-        offset leaves nothing of an image.
+        where anything but `images` holds masked values; where a PSF has no positive sum, or it or
+        its sum is not finite; where images or background become infinite by exposure or read
+        noise; where no good pixel is left; where an offset leaves nothing of an image.
 
     Warns
     -----
@@ -100,18 +109,20 @@ class Observation:
     ) -> None:
         has_exposure = exposure is not None
         counts, are_rates = units.plain("images", images, has_exposure)
-        given = _as_array("images", counts, np.ma.asanyarray)
-        self.images = _stack("images", np.ma.getdata(given))
-        self.mask = np.ma.getmaskarray(given).copy().reshape(self.images.shape)
+        given, masked = values_and_mask("images", counts)
+        self.images = _stack("images", given)
+        self.mask = masked.copy().reshape(self.images.shape)
         self.psfs = _check_psfs(units.bare("psfs", psfs), self.n_images)
         self.offsets = self._check_offsets(offsets)
         self._apply_mask(mask)
         self.exposure = self._check_exposure(1.0 if exposure is None else exposure)
-        if are_rates:
-            self.images *= _each_pixel(self.exposure)
         self._refuse_all_masked()
-        self.background = self._check_background(background, has_exposure)
-        self._add_read_noise(read_noise)
+        with np.errstate(over="ignore"):
+            if are_rates:
+                self.images *= _each_pixel(self.exposure)
+            self.background = self._check_background(background, has_exposure)
+            self._add_read_noise(read_noise)
+        self._refuse_overflow()
         self._clip_negative()
 
     @property
@@ -126,7 +137,7 @@ class Observation:
 
     def _apply_mask(self, mask: ArrayLike | None) -> None:
         if mask is not None:
-            given = _as_array("mask", mask)
+            given = unmasked("mask", mask)
             if given.dtype != np.bool_:
                 raise InputError(
                     f"mask is of type {given.dtype}; give booleans, True where a pixel is bad"
@@ -173,13 +184,20 @@ class Observation:
     def _add_read_noise(self, read_noise: ArrayLike) -> None:
         sigma = self._one_or_map("read_noise", units.plain("read_noise", read_noise)[0], 0.0)
         _refuse_unless("read_noise", sigma, "finite and not negative", sigma >= 0)
-        with np.errstate(over="ignore"):
-            variance = sigma**2
+        variance = sigma**2
         _refuse_unless("the square of read_noise", variance, "finite", variance >= 0)
         self.images += np.where(self.mask, 0.0, _each_pixel(variance))
         if variance.ndim != self.background.ndim:
             variance, self.background = _each_pixel(variance), _each_pixel(self.background)
         self.background = self.background + variance
+
+    def _refuse_overflow(self) -> None:
+        for name, values in (("images", self.images), ("background", self.background)):
+            if not np.isfinite(values).all():
+                raise InputError(
+                    f"the {name}, with exposure and the square of read_noise, must be finite: "
+                    "divide the counts and read_noise by a constant"
+                )
 
     def _one_or_map(self, name: str, given: ArrayLike, masked: float) -> Array:
         """Return one number for each image, or for each pixel: one map serves all images."""
@@ -222,18 +240,27 @@ class Observation:
             )
 
 
-def _as_array(
-    name: str, values: ArrayLike, convert: Callable[[ArrayLike], NDArray] = np.asarray
-) -> NDArray:
+def values_and_mask(name: str, values: ArrayLike) -> tuple[NDArray, NDArray[np.bool_]]:
+    """Return values as an array, and where they are masked, by whatever class or in a list."""
     try:
-        return convert(values)
+        array: NDArray = np.ma.asanyarray(values)
     except (TypeError, ValueError):
         raise InputError(f"{name} cannot be read as an array: its rows differ") from None
+    return np.ma.getdata(array, subok=False), np.ma.getmaskarray(array)
+
+
+def unmasked(name: str, values: ArrayLike) -> NDArray:
+    """Return values as an array; refuse masked ones: below a mask there may be anything."""
+    array, masked = values_and_mask(name, values)
+    if n_masked := int(np.count_nonzero(masked)):
+        advice = UNMASK.get(name, "fill them or leave them out")
+        raise InputError(f"{name} has {n_masked} masked values; {advice}")
+    return array
 
 
 def numbers(name: str, values: ArrayLike) -> Array:
-    """Return a float64 copy of real numbers."""
-    array = _as_array(name, values)
+    """Return a float64 copy of real numbers, none of them masked."""
+    array = unmasked(name, values)
     if array.dtype.kind not in "biuf":
         raise InputError(f"{name} holds {array.dtype}; give real numbers")
     return array.astype(np.float64)
@@ -279,10 +306,16 @@ def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
         )
     if not np.isfinite(stack).all():
         raise InputError("psfs hold values that are not finite; repair them first")
-    sums = stack.sum(axis=(1, 2), keepdims=True)
-    if (sums <= 0).any():
-        j = int(np.argmax(sums <= 0))
-        raise InputError(f"psf {j} has the sum {sums.flat[j]:g}; it must be positive")
+    with np.errstate(over="ignore", invalid="ignore"):
+        sums, sizes = (values.sum(axis=(1, 2), keepdims=True) for values in (stack, abs(stack)))
+        # Rounding leaves a sum where values cancel; what overflows is not above itself.
+        unusable = ~(sums > np.finfo(np.float64).eps * sizes)
+    if unusable.any():
+        j = int(np.argmax(unusable))
+        raise InputError(
+            f"psf {j} has the sum {sums.flat[j]:g}; it must be positive, finite and more than the "
+            "rounding of its values"
+        )
     if n_negative := int((stack < 0).sum()):
         warnings.warn(
             f"{n_negative} psf pixels are negative and were kept", LnoclWarning, stacklevel=3

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl import resampling
 from lnocl.centring import FWHM, SEARCH, Mask, Pixel, Point, brightest, fit_gaussian
 from lnocl.errors import InputError, LnoclWarning
-from lnocl.observation import numbers
+from lnocl.observation import numbers, unmasked, values_and_mask
 from lnocl.repair import WINDOW, repair
 
 Array = NDArray[np.float64]
@@ -123,7 +123,7 @@ def make_psf(
     ----------
     frame : array_like, shape (ny, nx)
         Image of a star, in any linear unit. A pixel that is not finite, or that is masked in a
-        `numpy.ma` array, is bad.
+        `numpy.ma` array or a CCDData, is bad. Nothing else may be masked.
     position : tuple of float, optional
         Where the star is: (x, y), 0-based pixels, to `SEARCH` pixels. By default at the brightest
         pixel of the frame after a median filter of 3 x 3 good pixels.
@@ -156,7 +156,8 @@ def make_psf(
     Raises
     ------
     InputError
-        Where an argument has the wrong type, shape or range; where the star is outside the frame
+        Where an argument has the wrong type, shape or range, or, but for the frame, holds masked
+        values; where the star is outside the frame
         or not found; where the crop does not fit in the frame; where no good pixel is left;
         where the star is a hole too wide to be repaired; where nothing is above the
         background.
@@ -331,21 +332,20 @@ def _turn(
 
 def _read(frame: ArrayLike, mask: ArrayLike | None) -> tuple[Array, Mask]:
     """Return a float64 copy with NaN where it is bad, and where that is."""
-    pixels = numbers("frame", frame)
+    given, masked = values_and_mask("frame", frame)
+    pixels = numbers("frame", given)
     if pixels.ndim != 2 or pixels.size == 0:
         raise InputError(f"frame has shape {pixels.shape}; give one image, (ny, nx)")
-    bad = ~np.isfinite(pixels)
-    if np.ma.isMaskedArray(frame):
-        bad |= np.ma.getmaskarray(frame)
+    bad = ~np.isfinite(pixels) | masked
     if mask is not None:
-        given = np.asarray(mask)
-        if given.dtype != np.bool_:
+        more = unmasked("mask", mask)
+        if more.dtype != np.bool_:
             raise InputError(
-                f"mask is of type {given.dtype}; give booleans, True where a pixel is bad"
+                f"mask is of type {more.dtype}; give booleans, True where a pixel is bad"
             )
-        if given.shape != pixels.shape:
-            raise InputError(f"mask has shape {given.shape}; the frame has {pixels.shape}")
-        bad |= given
+        if more.shape != pixels.shape:
+            raise InputError(f"mask has shape {more.shape}; the frame has {pixels.shape}")
+        bad |= more
     pixels[bad] = np.nan
     if (np.abs(pixels) > LARGEST).any():
         raise InputError(f"frame holds values beyond {LARGEST:g}; give it in another unit")

@@ -84,8 +84,9 @@ class Scene:
     Raises
     ------
     InputError
-        A star outside the images or unobserved; penalty or pad out of range; images too large for
-        the transform.
+        A star outside the images, unobserved or masked; penalty or pad out of range; images too
+        large for the transform; images or exposures too large to be summed; a sky, images over
+        exposures, that is no finite number, or 0.
 
     Warns
     -----
@@ -111,11 +112,12 @@ class Scene:
         self.grid = _grid(observation.shape, pad)
         self._warn_of_large_psf()
         self._warn_of_wrapped_offsets()
-        self.scale = _scale(observation.images[~observation.mask])
+        # A power of two just above the mean; 1 where that is 0.
+        self.scale = 2.0 ** math.frexp(_mean("images", observation.images[~observation.mask]))[1]
         exposure = observation.exposure
         has_map = exposure.ndim == 3
-        mean_exposure = float((exposure[~observation.mask] if has_map else exposure).mean())
-        self.unit = self.scale / mean_exposure
+        mean_exposure = _mean("exposures", exposure[~observation.mask] if has_map else exposure)
+        self.unit = self._sky_unit(mean_exposure)
         self.mu = self._scaled("mu", penalty.mu, self.unit / mean_exposure)
         self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / mean_exposure)
         relative = exposure / mean_exposure
@@ -133,7 +135,18 @@ class Scene:
                 f"{name} {weight:g} is too large for images of about {self.scale:g} electrons per "
                 f"pixel; the most that means anything there is {MOST_WEIGHT / factor:g}"
             )
-        return float(weight) * factor
+        return float(weight) * factor if weight else 0.0  # the factor may be infinite
+
+    def _sky_unit(self, mean_exposure: float) -> float:
+        """Return the unit of the sky; refuse one in which its flux is no number, or lost."""
+        unit = self.scale / mean_exposure
+        if unit == 0 or not math.isfinite(unit * math.prod(self.grid)):
+            raise InputError(
+                f"images of about {self.scale:g} electrons per pixel at exposures of about "
+                f"{mean_exposure:g} leave a sky that no number holds: divide or multiply one of "
+                "them by a constant"
+            )
+        return unit
 
     def move_stars(self, stars: ArrayLike) -> None:
         """Give the stars other positions, none farther away than the leeway.
@@ -235,7 +248,7 @@ class Scene:
         Raises
         ------
         InputError
-            Where either has the wrong shape, a negative or non-finite value.
+            Where either has the wrong shape, a negative, masked or non-finite value.
         """
         if extended is None or star_fluxes is None:
             default_fluxes, level = self._read_off()
@@ -352,13 +365,12 @@ class Scene:
             )
 
 
-def _scale(good: Array) -> float:
-    """Return the power of two just above the mean of some pixels; 1 where that is 0."""
+def _mean(name: str, values: Array) -> float:
     with np.errstate(over="ignore"):
-        mean = float(good.mean())
-    if not math.isfinite(mean):
-        raise InputError("the images are too large to be summed: divide them by a constant")
-    return 2.0 ** math.frexp(mean)[1]
+        mean = float(values.mean())
+    if not math.isfinite(2.0 * mean):  # the power of two above it
+        raise InputError(f"the {name} are too large to be summed: divide them by a constant")
+    return mean
 
 
 def _grid(shape: tuple[int, int], pad: object) -> tuple[int, int]:

@@ -22,6 +22,7 @@ from scipy.special import expit
 
 from lnocl import fitsread
 from lnocl.errors import InputError
+from lnocl.observation import unmasked
 
 Array = NDArray[np.float64]
 
@@ -503,12 +504,13 @@ class Target:
     Raises
     ------
     InputError
-        Where the extended source is not a plane of finite numbers, has negative pixels or no
-        flux, or an odd or too small side; where a star lies outside it or between pixels.
+        Where the extended source is not a plane of finite numbers, has masked or negative pixels,
+        no flux or one that is not finite, or an odd or too small side; where a star lies outside
+        it or between pixels.
     """
 
     def __init__(self, extended: ArrayLike, stars: Sequence[Star] = ()) -> None:
-        array = np.asarray(extended)
+        array = unmasked("the extended source", extended)
         if array.ndim != 2 or array.dtype.kind not in "biuf":
             raise InputError(
                 f"the extended source has {array.ndim} dimensions of {array.dtype}; "
@@ -518,7 +520,12 @@ class Target:
         array = array.astype(np.float64)
         if not (np.isfinite(array).all() and (array >= 0).all()):
             raise InputError("the extended source must be finite and not negative everywhere")
-        total = array.sum()
+        with np.errstate(over="ignore"):
+            total = array.sum()
+        if not np.isfinite(total):
+            raise InputError(
+                "the extended source is too large to be summed: divide it by a constant"
+            )
         if total == 0:
             raise InputError("the extended source has no flux: all its pixels are zero")
         self.extended = array / total

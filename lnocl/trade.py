@@ -17,7 +17,7 @@ from tqdm import tqdm
 from lnocl import experiment, metrics
 from lnocl.deconvolution import Estimate, Result, deconvolve
 from lnocl.errors import InputError, LnoclWarning
-from lnocl.observation import Array, Observation
+from lnocl.observation import Array, Observation, numbers
 from lnocl.simulate import Simulation
 
 # Estimates are kept after these shares of the iterations: an eighth, a quarter, half, all.
@@ -175,13 +175,18 @@ def front(seconds: ArrayLike, deviations: ArrayLike) -> NDArray[np.bool_]:
     ndarray of bool, shape (n,)
         True on the front; False where either is NaN.
 
+    Raises
+    ------
+    InputError
+        Where they are no real numbers, or some are masked.
+
     Examples
     --------
     >>> from lnocl.trade import front
     >>> front([1.0, 2.0, 3.0], [0.1, 0.2, 0.0])
     array([ True, False,  True])
     """
-    s, d = np.asarray(seconds, np.float64), np.asarray(deviations, np.float64)
+    s, d = numbers("seconds", seconds), numbers("deviations", deviations)
     no_worse = (s[:, None] <= s) & (d[:, None] <= d)
     better = (s[:, None] < s) | (d[:, None] < d)
     return ~(no_worse & better).any(axis=0) & ~np.isnan(s) & ~np.isnan(d)

@@ -197,7 +197,7 @@ def pixels(name: str, values: Any) -> Any:
     values = _gather(name, values)
     unit = getattr(values, "unit", None)
     if unit is None:
-        return values
+        return values.value if isinstance(values, _Counts) else values
     from astropy import units as u
 
     if not unit.is_equivalent(u.pix):
@@ -208,6 +208,4 @@ def pixels(name: str, values: Any) -> Any:
 def bare(name: str, values: Any) -> Any:
     """Return values without a unit, whatever it is: of PSFs only the shape counts."""
     values = _gather(name, values)
-    if isinstance(values, _Counts):
-        return np.ma.getdata(values.value)
     return getattr(values, "value", values) if hasattr(values, "unit") else values

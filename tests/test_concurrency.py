@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from runtimes import on_pocl
 
 import lnocl
 
@@ -78,6 +79,7 @@ print(hashlib.sha256(result.extended.tobytes()).hexdigest())
 """
 
 
+@on_pocl
 @pytest.mark.parametrize(
     "attempt",
     [pytest.param(i, marks=[pytest.mark.exhaustive] if i >= 1 else []) for i in range(10)],

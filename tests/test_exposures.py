@@ -317,6 +317,45 @@ def test_a_star_where_the_map_saw_nothing_is_refused():
     assert result.star_fluxes > 0
 
 
+@pytest.mark.parametrize("exposure", [[1e308, 1.5e308], np.full(SHAPE, 1e308)])
+def test_exposures_that_cannot_be_summed_are_refused(exposure):
+    observation = lnocl.Observation(np.ones((2, *SHAPE)), np.ones((3, 3)), exposure=exposure)
+    with pytest.raises(
+        lnocl.InputError, match=r"^the exposures are too large to be summed: divide"
+    ):
+        lnocl.deconvolve(observation, n_iter=1, **numpy_alone)
+
+
+def test_an_image_whose_scale_is_beyond_all_numbers_is_refused():
+    observation = lnocl.Observation([[1e308]], [[1.0]])
+    with pytest.raises(lnocl.InputError, match=r"^the images are too large to be summed: divide"):
+        lnocl.deconvolve(observation, n_iter=1, **numpy_alone)
+
+
+@pytest.mark.parametrize(
+    ("counts", "exposure"),
+    [(1.0, 1e-307), (1.0, 5e-324), (1e200, 1e-200), (1e-300, 1e300)],
+)
+def test_a_sky_that_no_number_holds_is_refused(counts, exposure):
+    images = np.full((2, *SHAPE), counts)
+    observation = lnocl.Observation(images, np.ones((3, 3)), exposure=exposure)
+    with pytest.raises(lnocl.InputError, match="leave a sky that no number holds: divide or mult"):
+        lnocl.deconvolve(observation, n_iter=1, **numpy_alone)
+
+
+def test_exposures_whose_square_is_no_number_are_taken():
+    made = EACH.make()
+    ours = {"n_iter": 3, "mu": 0.0, "initial_extended": None, "initial_star_fluxes": None}
+    ours |= numpy_alone
+    expected = made.deconvolve(made.observation(), **ours)
+    # A power of two, so that no digit changes.
+    observation = made.observation(exposure=made.exposure * 2.0**-600)
+    result = made.deconvolve(observation, **ours)
+    np.testing.assert_array_equal(result.extended, expected.extended * 2.0**600)
+    np.testing.assert_array_equal(result.star_fluxes, expected.star_fluxes * 2.0**600)
+    assert result.mu == result.smoothing == 0.0
+
+
 def test_mu_too_large_is_refused_in_terms_of_what_was_given():
     made = EACH.make()
     observation = made.observation(exposure=made.exposure * 1e6)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyopencl as cl
 import pytest
+from runtimes import on_pocl
 from scenes import make_smooth_psfs
 
 import lnocl
@@ -144,6 +145,7 @@ def test_a_compiler_that_fails_leaves_its_whole_log(monkeypatch, tmp_path):
     assert len(said) > len(message)
 
 
+@on_pocl  # with others, PyOpenCL needs a folder for temporary files first
 def test_a_log_that_cannot_be_saved_is_no_other_error(monkeypatch):
     monkeypatch.setattr(program, "source", lambda names: "this is no OpenCL")
     device.choose()  # has made its folder
@@ -204,6 +206,7 @@ def warm(tmp_path_factory):
     return archive.name, archive.read_bytes(), done.stdout
 
 
+@on_pocl
 def test_kernels_are_kept_and_used_again(warm, tmp_path):
     name, content, said = warm
     (tmp_path / name).write_bytes(content)
@@ -225,6 +228,7 @@ def middle(content):
     return content[:at] + bytes(64) + b"\xff" * 64 + content[at + 128 :]
 
 
+@on_pocl
 @pytest.mark.parametrize(
     "damage",
     [
@@ -255,6 +259,29 @@ def test_damaged_kernels_are_not_loaded_but_made_anew(warm, tmp_path, damage):
         assert kept.testzip() is None
 
 
+@on_pocl
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+def test_of_damaged_kernels_no_file_is_unpacked_that_is_not_as_it_was(warm, tmp_path):
+    name, content, _ = warm
+    archive, rng = tmp_path / name, np.random.default_rng(1)
+    archive.write_bytes(content)
+    kernelcache._unpack(archive, tmp_path / "sound")
+    directory = content.index(b"PK\1\2")
+    method = directory + 10  # by which the first file is said to be compressed
+    changes = [(method, 8), (method, 12), (method, 14)]
+    for at in (*rng.integers(0, directory, 60), *rng.integers(directory, len(content), 240)):
+        changes.append((at, content[at] ^ (1 << int(rng.integers(8)))))
+    for k, (at, value) in enumerate(changes):
+        damaged = bytearray(content)
+        damaged[at] = value
+        archive.write_bytes(damaged)
+        own = tmp_path / str(k)
+        kernelcache._unpack(archive, own)
+        for path in own.rglob("*.so"):
+            assert path.read_bytes() == (tmp_path / "sound" / path.relative_to(own)).read_bytes()
+
+
+@on_pocl
 def test_a_disk_that_is_full_cuts_no_kernel_short(warm, tmp_path, monkeypatch):
     """PoCL would load what there is of it, and kill the process."""
     name, content, _ = warm
@@ -274,6 +301,7 @@ def test_a_disk_that_is_full_cuts_no_kernel_short(warm, tmp_path, monkeypatch):
     assert any(path.name == "scale_rows.so" for path in own.rglob("*"))
 
 
+@on_pocl
 def test_a_folder_that_cannot_keep_kernels_is_said_once(tmp_path):
     (tmp_path / "file").touch()
     code = "print(deconvolve(), deconvolve())"
@@ -290,6 +318,7 @@ def test_no_folder_for_kernels_at_all(monkeypatch):
         device.find_devices()
 
 
+@on_pocl
 @pytest.mark.parametrize("broken", ["folder", "garbage"])
 def test_caches_of_pyopencl_that_are_broken(tmp_path, broken, warm):
     name, content, said = warm

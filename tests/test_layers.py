@@ -68,6 +68,7 @@ LAYERS = {
     "heldout": {"observation", "penalty", "run"},
     "stopping": {"model", "observation", "run"},
     "run": {
+        "device",
         "model",
         "observation",
         "opencl",
@@ -105,13 +106,13 @@ LAYERS = {
     "fitswrite": {"atomic"},
     "atomic": set(),
     "kernels.__init__": set(),
-    "metrics": set(),
+    "metrics": {"observation"},
     "plots": {"atomic", "metrics"},
     "centring": set(),
     "repair": set(),
     "resampling": set(),
     "psf": {"centring", "observation", "repair", "resampling"},
-    "simulate": {"fitsread"},
+    "simulate": {"fitsread", "observation"},
 }
 KNOWS_OPENCL = {"opencl", "fft", "program", "device", "faults", "rig", "twins", "selftest"}
 PACKAGE = Path(lnocl.__file__).parent

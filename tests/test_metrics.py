@@ -20,6 +20,7 @@ from lnocl.metrics import (
     width_profile,
 )
 
+MASKED = np.ma.array(np.ones((4, 4)), mask=np.arange(16).reshape(4, 4) > 13)
 planes = arrays(np.float64, (6, 5), elements=st.floats(0, 100))
 
 
@@ -189,6 +190,19 @@ def test_star_elsewhere_is_refused(star, message):
         (lambda: restoration_error(np.ones((1, 2, 2)), np.ones((1, 2, 2))), "3 dimensions"),
         (lambda: restoration_error([[math.nan]], [[1.0]]), "not finite"),
         (lambda: restoration_error([[1j]], [[1.0]]), "complex128"),
+        (lambda: restoration_error(MASKED, np.ones((4, 4))), "reconstruction has 2 masked values"),
+        (lambda: restoration_error(np.ones((4, 4)), MASKED), "truth has 2 masked values; fill"),
+        (lambda: restoration_error([[2e200]], [[1e200]]), "too large to be squared"),
+        (lambda: restoration_error([[1e200]], [[1e200]]), "too large to be squared"),
+        (lambda: restoration_error([[1e200]], [[1.0]]), "too large to be squared"),
+        (lambda: restoration_error([[-1e308]], [[1e308]]), "too large to be squared"),
+        (lambda: mask_star(MASKED, (1, 1)), "image has 2 masked values; fill"),
+        (lambda: box_flux(MASKED, (1, 1)), "image has 2 masked values; fill"),
+        (lambda: flux_profile(MASKED), "image has 2 masked values; fill"),
+        (lambda: width_profile(MASKED, 0.5), "image has 2 masked values; fill"),
+        (lambda: relative_error(MASKED[3], np.ones(4)), "profile has 2 masked values; fill"),
+        (lambda: relative_error(np.ones(4), MASKED[3]), "reference has 2 masked values; fill"),
+        (lambda: relative_error(["a"], [1.0]), "profile holds <U1; give real numbers"),
         (lambda: mask_star(np.ones((4, 4)), (0, 2)), "leave the image"),
         (lambda: box_flux(np.ones((4, 4)), (2, 3)), "leave the image"),
         (lambda: mask_star(np.ones((4, 4)), (4, 2)), "outside"),

@@ -212,6 +212,36 @@ def test_masked_array_is_never_modified():
     assert not np.shares_memory(images.mask, observation.mask)
 
 
+def masked(values, n_masked):
+    """Return values of which the last few are masked."""
+    mask = np.arange(np.size(values)) >= np.size(values) - n_masked
+    return np.ma.array(values, mask=mask.reshape(np.shape(values)))
+
+
+GIVEN = {
+    "psfs": np.array([PSF] * 3),
+    "background": IMAGES,
+    "read_noise": [1.0, 2.0, 3.0],
+    "mask": IMAGES > 40,
+    "exposure": IMAGES,
+    "offsets": np.eye(3, 2),
+}
+
+
+@pytest.mark.parametrize("name", GIVEN)
+def test_masked_arrays_with_nothing_masked_are_plain_arrays(name):
+    expected = vars(observe(**{name: GIVEN[name]}))
+    for given in (np.ma.array(GIVEN[name]), masked(GIVEN[name], 0)):
+        for attribute, values in vars(observe(**{name: given})).items():
+            np.testing.assert_array_equal(values, expected[attribute])
+            assert type(values) is np.ndarray
+
+
+@pytest.mark.parametrize("scale", [1e-300, 5e-324, 1e300])
+def test_psfs_of_any_sum_that_is_a_number_are_normalised_exactly(scale):
+    np.testing.assert_array_equal(observe(psfs=scale * PSF).psfs, [scale * PSF / (8 * scale)] * 3)
+
+
 # --- What it refuses
 
 RAGGED = [[1.0, 2.0], [3.0]]
@@ -235,6 +265,18 @@ REFUSED = {
     "two such PSFs": ({"psfs": [PSF, 0 * PSF, -PSF]}, "psf 1 has the sum 0;"),
     "NaN in a PSF": ({"psfs": [PSF, PSF, PSF * np.nan]}, "psfs hold values that are not finite"),
     "infinite PSF": ({"psfs": np.where(PSF == 4, np.inf, PSF)}, "psfs hold values that are not"),
+    "PSF whose sum overflows": (
+        {"psfs": [PSF, np.full((2, 3), 1e308), PSF]},
+        "psf 1 has the sum inf; it must be positive, finite and more than",
+    ),
+    "PSF with sums that overflow both ways": (
+        {"psfs": [[1e308] * 4 + [-1e308] * 4]},  # a NaN where it is summed in pairs
+        "it must be positive, finite and more than",
+    ),
+    "PSF that cancels but for rounding": (
+        {"psfs": [[1e300, -1e300, 1.0]]},
+        "psf 0 has the sum 1; it must be positive, finite and more than the rounding of its values",
+    ),
     "complex PSF": ({"psfs": PSF + 0j}, "psfs holds complex128"),
     "text for PSFs": ({"psfs": "psf.fits"}, "psfs holds <U8"),
     "ragged PSFs": ({"psfs": RAGGED}, "psfs"),
@@ -277,6 +319,37 @@ REFUSED = {
     "mask of numbers": ({"mask": np.zeros((4, 4))}, "mask is of type float64"),
     "mask of another shape": ({"mask": np.zeros((4, 5), bool)}, "mask has shape (4, 5)"),
     "too few masks": ({"mask": np.zeros((2, 4, 4), bool)}, "mask has shape (2, 4, 4)"),
+    "background beyond all numbers with read noise": (
+        {"background": 1.7e308, "read_noise": 1e154},
+        "the background, with exposure and the square of read_noise, must be finite: divide the",
+    ),
+    "images beyond all numbers with read noise": (
+        {"images": np.where(IMAGES == 7, 1.7e308, 1.0), "read_noise": 1e154},
+        "the images, with exposure and the square of read_noise, must be finite: divide the counts",
+    ),
+    "masked psfs": (
+        {"psfs": masked(PSF, 1)},
+        "psfs has 1 masked values; repair them first, as lnocl.psf.make_psf does",
+    ),
+    "masked psfs in a list": ({"psfs": [PSF, masked(PSF, 2), PSF]}, "psfs has 2 masked values"),
+    "masked background": (
+        {"background": masked([1, 2, 3], 2)},
+        "background has 2 masked values; fill them and add their mask to mask",
+    ),
+    "masked map of read noise": (
+        {"read_noise": masked(IMAGES, 7)},
+        "read_noise has 7 masked values; fill them and add their mask to mask",
+    ),
+    "masked number": ({"read_noise": np.ma.masked}, "read_noise has 1 masked values"),
+    "masked map of exposures": (
+        {"exposure": masked(IMAGES[0], 3)},
+        "exposure has 3 masked values; fill them and add their mask to mask",
+    ),
+    "masked mask": (
+        {"mask": masked(IMAGES > 40, 2)},
+        "mask has 2 masked values; fill them or leave them out",
+    ),
+    "masked offsets": ({"offsets": masked(np.zeros((3, 2)), 1)}, "offsets has 1 masked values"),
     "ragged mask": ({"mask": [[True, False], [True]]}, "mask"),
     "exposure of 0": ({"exposure": 0}, "exposure must be finite and more than zero; 0 was"),
     "negative exposure": (

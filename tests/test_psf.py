@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.nddata import CCDData
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special
@@ -277,6 +278,8 @@ def test_values_of_bad_pixels_do_not_matter():
         spoilt = np.where(bad, value, frame)
         results.append(quiet(spoilt, mask=bad, size=31))
         results.append(quiet(np.ma.array(spoilt, mask=bad), size=31))
+        results.append(quiet(CCDData(spoilt, mask=bad, unit="ct"), size=31))
+        results.append(quiet(list(np.ma.array(spoilt, mask=bad)), size=31))
     results.append(quiet(np.where(bad, np.nan, frame), size=31))
     for star in results[1:]:
         np.testing.assert_array_equal(star.psf, results[0].psf)
@@ -585,6 +588,14 @@ REFUSED = {
         "mask": np.zeros(STAR.shape, np.int64)
     },
     "mask has shape (2, 2); the frame has (61, 70)": {"mask": np.zeros((2, 2), bool)},
+    "mask has 3 masked values; fill them or leave them out": {
+        "mask": np.ma.array(STAR > 1e9, mask=np.eye(*STAR.shape) * np.arange(70) > 57)
+    },
+    "mask cannot be read as an array: its rows differ": {"mask": [[True], [True, False]]},
+    "position has 1 masked values; fill them or leave them out": {
+        "position": np.ma.array([30, 29], mask=[0, 1])
+    },
+    "background has 1 masked values": {"background": np.ma.masked},
     "position is (1,); give two finite numbers, x and y": {"position": (1,)},
     "position is (1, nan); give two finite numbers, x and y": {"position": (1, math.nan)},
     "position (70, 3) is outside the frame of 70 x 61 pixels; give x and y, 0-based": {

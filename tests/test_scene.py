@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from astropy.nddata import CCDData
 from scenes import Recipe, make_psfs
 
 import lnocl
@@ -162,6 +163,17 @@ def test_edge_is_three_times_the_mean_of_the_extended_source(exposure):
 # --- What a run refuses
 
 REFUSED = {
+    "array for an observation": (
+        {"observation": np.ones((2, *SHAPE))},
+        "observation is of type ndarray; give an lnocl.Observation, as lnocl.Observation(images, ",
+    ),
+    "None for an observation": ({"observation": None}, "observation is of type NoneType; give an"),
+    "text for an observation": ({"observation": "x"}, "observation is of type str; give an lnocl."),
+    "class for an observation": ({"observation": lnocl.Observation}, "observation is of type type"),
+    "array for an observation, held out": (
+        {"observation": np.ones((2, *SHAPE)), "stop": "held-out"},
+        "observation is of type ndarray",
+    ),
     "star left of the images": ({"stars": [(3, 4), (-1, 4)]}, "the star at (-1, 4) lies outside"),
     "star right of the images": ({"stars": [(16, 4)]}, "the star at (16, 4) lies outside"),
     "star below the images": ({"stars": [(3, -0.75)]}, "the star at (3, -0.75) lies outside"),
@@ -177,6 +189,14 @@ REFUSED = {
     "stars as a row of numbers": ({"stars": [1, 2, 3, 4]}, "star"),
     "stars of different lengths": ({"stars": [(1, 2), (3,)]}, "star"),
     "text for a star": ({"stars": [("a", "b")]}, "star"),
+    "masked stars": (
+        {"stars": np.ma.array([(3, 4), (5, 6)], mask=[(0, 0), (1, 1)])},
+        "stars has 2 masked values; fill them or leave them out",
+    ),
+    "masked row of stars": (
+        {"stars": [(3, 4), np.ma.array((5, 6), mask=(0, 1))]},
+        "stars has 1 masked values",
+    ),
     "text for stars": ({"stars": "3,4"}, "star"),
     "complex star": ({"stars": [(1j, 2)]}, "star"),
     "number for stars": ({"stars": 5}, "star"),
@@ -239,6 +259,14 @@ REFUSED = {
         "initial_extended must be finite",
     ),
     "complex start": ({"initial_extended": np.full(SHAPE, 1j)}, "initial_extended"),
+    "masked start": (
+        {"initial_extended": np.ma.array(np.ones(SHAPE), mask=np.eye(*SHAPE))},
+        "initial_extended has 8 masked values; fill them or leave them out",
+    ),
+    "CCDData with a mask for a start": (
+        {"initial_extended": CCDData(np.ones(SHAPE), mask=np.eye(*SHAPE) > 0, unit="ct")},
+        "initial_extended has 8 masked values",
+    ),
     "text for a start": ({"initial_extended": "flat"}, "initial_extended"),
     "ragged start": ({"initial_extended": [[1.0, 2.0], [3.0]]}, "initial_extended"),
     "too many fluxes": ({"initial_star_fluxes": [1.0]}, "initial_star_fluxes has shape (1,)"),
@@ -254,6 +282,10 @@ REFUSED = {
         {"initial_star_fluxes": [np.nan], "stars": [(3, 4)]},
         "initial_star_fluxes must be finite and not negative",
     ),
+    "masked flux": (
+        {"initial_star_fluxes": np.ma.array([1.0], mask=True), "stars": [(3, 4)]},
+        "initial_star_fluxes has 1 masked values",
+    ),
     "text for a flux": ({"initial_star_fluxes": ["a"], "stars": [(3, 4)]}, "initial_star_fluxes"),
 }
 
@@ -262,7 +294,7 @@ REFUSED = {
 def test_refused(case):
     changes, message = REFUSED[case]
     with pytest.raises(lnocl.InputError) as caught:
-        lnocl.deconvolve(OBSERVATION, **({"n_iter": 1, "engine": "numpy"} | changes))
+        lnocl.deconvolve(**({"observation": OBSERVATION, "n_iter": 1, "engine": "numpy"} | changes))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 

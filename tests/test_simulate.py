@@ -380,6 +380,11 @@ def flat(**pixels):
         (lambda: Target(np.ones((3, 32, 32))), "3 dimensions"),
         (lambda: Target(flat(first=-1)), "not negative"),
         (lambda: Target(flat(first=math.nan)), "finite"),
+        (lambda: Target(1e306 * flat()), "too large to be summed: divide it by a constant"),
+        (
+            lambda: Target(np.ma.array(flat(), mask=flat(first=2) > 1)),
+            "the extended source has 1 masked values; fill them or leave them out",
+        ),
         (lambda: Target(flat(), [Star(32, 0)]), "outside"),
         (lambda: Target(flat(), [Star(0.5, 0)]), "between pixels"),
         (lambda: Target(flat(), [Star("a", 0)]), "two numbers"),

@@ -339,6 +339,12 @@ class TestCommand:
         assert sorted(os.listdir()) == before
 
 
+def test_the_front_has_no_masked_settings():
+    seconds = np.ma.array([1.0, 2.0, 3.0], mask=[False, True, True])
+    with pytest.raises(lnocl.InputError, match="seconds has 2 masked values; fill them or leave"):
+        trade.front(seconds, [1.0, 2.0, 3.0])
+
+
 def test_the_figure_joins_the_front_and_marks_the_reference():
     pytest.importorskip("matplotlib")
     settings = {

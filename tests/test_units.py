@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.nddata import CCDData, NDData, StdDevUncertainty
+from astropy.utils.masked import Masked
 
 import lnocl
 
@@ -91,8 +92,8 @@ def test_background_may_be_per_time(rate, seconds):
 
 
 def test_masked_rates_stay_masked():
-    images = np.where(MASK, np.nan, IMAGES) / u.s * u.electron
-    exposure = np.where(IMAGES == 7, 0.0, 4.0)
+    images = np.where(MASK, np.inf, IMAGES) / u.s * u.electron
+    exposure = np.where((IMAGES == 7) | (IMAGES == 10), 0.0, 4.0)  # one of them is masked
     observation = observe(images=images, mask=MASK, exposure=exposure * u.s)
     expected = observe(images=4.0 * IMAGES, mask=MASK | (IMAGES == 7), exposure=4.0)
     np.testing.assert_array_equal(observation.images, expected.images)
@@ -112,6 +113,8 @@ def test_masked_rates_stay_masked():
         [CCDData(i, mask=m, unit="electron") for i, m in zip(IMAGES, MASK, strict=True)],
         tuple(NDData(i, mask=m) for i, m in zip(IMAGES, MASK, strict=True)),
         [np.ma.array(i, mask=m) for i, m in zip(IMAGES, MASK, strict=True)],
+        Masked(IMAGES, mask=MASK),
+        Masked(IMAGES, mask=MASK) * u.ct,
         [
             *(NDData(i, mask=m) for i, m in zip(IMAGES[:2], MASK[:2], strict=True)),
             np.ma.array(IMAGES[2], mask=MASK[2]),
@@ -156,7 +159,7 @@ def test_nddata_are_never_modified():
         CCDData(PSF, unit="adu"),
         [CCDData(PSF, unit="adu")] * 3,
         [PSF * u.Jy] * 3,
-        [NDData(PSF, mask=PSF == 1)] * 3,
+        [NDData(PSF, mask=PSF == 9)] * 3,
     ],
 )
 def test_units_of_psfs_do_not_matter(psfs):
@@ -169,9 +172,48 @@ def test_offsets_may_be_pixels(unit):
     expected = observe(offsets=offsets * unit.to(u.pix))
     for given in (offsets * unit, [tuple(pair * unit) for pair in offsets]):
         assert_same(observe(offsets=given), expected)
+    assert_same(observe(offsets=NDData(offsets)), observe(offsets=offsets))
 
 
 # --- What is refused
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        NDData,
+        lambda values, mask: NDData(values, mask=mask, unit=u.dimensionless_unscaled),
+        lambda values, mask: CCDData(values, mask=mask, unit=u.dimensionless_unscaled),
+        lambda values, mask: NDData(np.ma.array(values, mask=mask)),
+        lambda values, mask: [NDData(v, mask=m) for v, m in zip(values, mask, strict=True)],
+        lambda values, mask: Masked(values, mask=mask),
+        lambda values, mask: Masked(values, mask=mask) * u.dimensionless_unscaled,
+    ],
+    ids=["NDData", "with a unit", "CCDData", "NDData of numpy.ma", "list", "Masked", "quantity"],
+)
+@pytest.mark.parametrize("name", ["psfs", "background", "read_noise", "exposure"])
+def test_only_images_may_be_masked(name, wrap):
+    values = IMAGES / 8
+    assert_same(observe(**{name: wrap(values, mask=MASK & False)}), observe(**{name: values}))
+    with pytest.raises(lnocl.InputError, match=f"^{name} has 9 masked values; [^\n]*$"):
+        observe(**{name: wrap(values, mask=MASK)})
+
+
+@pytest.mark.parametrize("wrap", [NDData, Masked, lambda v, mask: Masked(v, mask=mask) * u.pix])
+def test_offsets_may_not_be_masked(wrap):
+    with pytest.raises(lnocl.InputError, match=r"^offsets has 4 masked values; fill them or"):
+        observe(offsets=wrap(np.zeros((3, 2)), mask=np.eye(3, 2) == 0))
+
+
+@pytest.mark.parametrize("rate", [1e200, IMAGES[0] * 1e200, IMAGES * 1e200])
+@pytest.mark.parametrize("name", ["images", "background"])
+def test_counts_of_an_exposure_that_no_number_holds_are_refused(name, rate):
+    given = {"images": IMAGES[:1], "exposure": 1e200 * u.s}
+    rate = rate[:1] if np.ndim(rate) == 3 else rate
+    given[name] = np.broadcast_to(rate, (1, 4, 4)) * u.ct / u.s
+    with pytest.raises(lnocl.InputError, match=f"the {name}, with exposure and the square of read"):
+        observe(**given)
+
 
 REFUSED = {
     "images in adu": (
