@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import signal
 import warnings
 from collections.abc import Sequence
 
 from lnocl import __version__
 from lnocl.commands import bench, deconvolve, demo, devices, messages, plot, psf, selftest, simulate
 from lnocl.commands.arguments import Parser
+from lnocl.commands.signals import Terminated, first_handled, terminate
 from lnocl.errors import LnoclError, LnoclWarning
 
 FAILED = 1
 INTERRUPTED = 130
+TERMINATED = 143
 
 # In the order of the help.
 COMMANDS = {
@@ -39,7 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 terminated.
     """
-    with warnings.catch_warnings():
+    messages.replace_closed_streams()
+    with first_handled([signal.SIGTERM], terminate), warnings.catch_warnings():
         warnings.simplefilter("always", LnoclWarning)
         warnings.showwarning = messages.show_warning
         try:
@@ -51,6 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return messages.fail(
                 "not enough memory; cut the images, or give fewer at a time", FAILED
             )
+        except Terminated:
+            return messages.fail("terminated", TERMINATED)
         except KeyboardInterrupt:
             return messages.fail("interrupted", INTERRUPTED)
         except OSError as error:

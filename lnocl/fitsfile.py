@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import io
 import os
+import stat
 import warnings
 from collections.abc import Iterator
 from typing import IO, Any
@@ -142,8 +144,8 @@ def check_header(path: str, content: IO[bytes], length: int, start: int) -> None
     Raises
     ------
     FileError
-        The header that starts at this byte has more axes or columns than FITS allows, or data
-        that are not there.
+        The header that starts at this byte has more axes or columns than FITS allows, data that
+        are not there, or more rows than the file has bytes.
     Exception
         Whatever astropy raises of what is no header.
     """
@@ -153,6 +155,10 @@ def check_header(path: str, content: IO[bytes], length: int, start: int) -> None
         if card.keyword in COUNTS and not 0 <= card.value <= MAX_COUNT:
             raise FileError(f"{path} is damaged: {card.keyword} is {card.value}")
     check_size(path, length, content.tell(), header.data_size)
+    for rows in (card.value for card in header.cards if card.keyword == "NAXIS2"):
+        # Rows of no bytes are always there, and take as long to read as others.
+        if isinstance(rows, (int, float)) and rows > length:
+            raise FileError(f"{path} is damaged: it has {rows} rows in {length} bytes")
 
 
 def check_size(path: str, length: int, start: int, size: int) -> None:
@@ -170,6 +176,20 @@ def check_size(path: str, length: int, start: int, size: int) -> None:
         raise FileError(
             f"{path} is truncated: it should have {start + size} bytes and has {length}"
         )
+
+
+def open_regular(path: str) -> io.BufferedReader:
+    """Open a file to read, but no device or pipe, which may have no end.
+
+    Raises
+    ------
+    OSError, ValueError
+        As `open`; what has the name is no file.
+    """
+    mode = os.stat(path).st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # open says what a folder is
+        raise OSError(errno.EINVAL, "it is no regular file; save what it gives to one first")
+    return open(path, "rb")
 
 
 @contextlib.contextmanager
@@ -193,7 +213,7 @@ def open_fits(
     Raises
     ------
     FileError
-        A file that is missing, no FITS or damaged.
+        A file that is missing, no regular one, no FITS or damaged.
 
     Warns
     -----
@@ -201,7 +221,7 @@ def open_fits(
         What astropy found wrong and could mend.
     """
     try:
-        stream = open(path, "rb")  # noqa: SIM115
+        stream = open_regular(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FileError(f"{path} cannot be opened: {reason}") from error

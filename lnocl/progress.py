@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 
@@ -11,12 +12,17 @@ from tqdm import tqdm
 PROGRESS_INTERVAL = 0.1
 
 
+def make_bar(total: int, unit: str, progress: bool) -> tqdm:
+    """Return a progress bar of so many steps, quiet where stderr is closed or no terminal."""
+    # disable=None is tqdm's word for "quiet where stderr is no terminal".
+    return tqdm(total=total, unit=unit, disable=None if progress and sys.stderr else True)
+
+
 class Bar:
     """A progress bar that looks at what it shows at most every tenth of a second."""
 
     def __init__(self, n_iter: int, progress: bool) -> None:
-        # disable=None is tqdm's word for "quiet where stderr is no terminal".
-        self._bar = tqdm(total=n_iter, unit="it", disable=None if progress else True)
+        self._bar = make_bar(n_iter, "it", progress)
         self._shown = time.monotonic()
 
     def __enter__(self) -> Bar:

@@ -21,7 +21,7 @@ from astropy.wcs.utils import pixel_to_pixel
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError, LnoclError
-from lnocl.fitsfile import open_fits
+from lnocl.fitsfile import open_fits, open_regular
 from lnocl.headers import make_wcs, quiet_log
 from lnocl.units import parse
 
@@ -178,7 +178,7 @@ def _from_sky(path: str, ra: Any, dec: Any, header: fits.Header, image: str) -> 
 def _read_table(path: str) -> Table:
     try:
         with (
-            open(path, "rb") as stream,
+            open_regular(path) as stream,
             get_readable_fileobj(stream, encoding="binary") as content,
             warnings.catch_warnings(),
         ):

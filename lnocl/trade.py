@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
 from lnocl import experiment, metrics
 from lnocl.deconvolution import Estimate, Result, deconvolve
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.observation import Array, Observation, numbers
+from lnocl.progress import make_bar
 from lnocl.simulate import Simulation
 
 # Estimates are kept after these shares of the iterations: an eighth, a quarter, half, all.
@@ -144,11 +144,7 @@ def compare(
     checkpoints = sorted({n_iter // part for part in PARTS})
     rows: list[dict[str, Any]] = []
     yardstick = None
-    # disable=None is tqdm's word for "quiet where stderr is no terminal".
-    bar = tqdm(
-        total=len(settings) * len(checkpoints), unit="row", disable=None if progress else True
-    )
-    with bar:
+    with make_bar(len(settings) * len(checkpoints), "row", progress) as bar:
         _compile(settings[1:], reconstruct)
         for setting in settings:
             watch = Watch(checkpoints, bar.update)

@@ -1,6 +1,7 @@
 """Runs that were cut off go on as if they had not been, from nothing but their own checkpoints."""
 
 import os
+import pkgutil
 import random
 import signal
 import subprocess
@@ -14,7 +15,7 @@ from astropy.io import fits
 from scenes import ENGINES, Recipe, make_smooth_psfs
 
 import lnocl
-from lnocl import checkpoint
+from lnocl import checkpoint, cli
 from lnocl.commands.checkpoints import Interrupts
 from lnocl.reference import ReferenceEngine
 from lnocl.run import FIRST_REFINED, Run
@@ -468,6 +469,73 @@ def test_more_than_one_signal_ends_it_at_once(command, tmp_path):
     assert process.returncode in (130, -signal.SIGINT)
     assert not (tmp_path / "found.fits").exists()
     assert checkpoint.read(str(saved)).arrays["progress"][0] == 1
+
+
+@pytest.fixture
+def interrupted(command, tmp_path, monkeypatch):
+    """Return what runs the command in this process, and sends signals where it calls something."""
+    monkeypatch.chdir(tmp_path)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which may be ignored here
+    words = [*command[3:], "--engine", "numpy", "--n-iter", "3", "--models", "--residuals"]
+
+    def interrupt(called, numbers, *more):
+        genuine, due = pkgutil.resolve_name(called), list(numbers)
+
+        def stand_in(*given, **options):
+            while due:
+                signal.raise_signal(due.pop(0))
+            return genuine(*given, **options)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(called, stand_in)
+            return cli.main([*words, *more])
+
+    yield interrupt
+    signal.signal(signal.SIGINT, before)
+
+
+def assert_whole(path):
+    with fits.open(path, checksum=True) as hdus:
+        assert [hdu.name for hdu in hdus[1:]] == ["STARS", "HISTORY", "MODELS", "RESIDUALS"]
+        assert (hdus[0].header["STOPPED"], hdus[0].header["NITER"]) == ("n_iter", 3)
+
+
+IN_THE_END = [
+    "lnocl.deconvolution._wrap_up",
+    "lnocl.deconvolution.Result.models",
+    "lnocl.deconvolution.Result.residuals",
+    "lnocl.fitswrite.write_result",
+    "lnocl.atomic.os.fsync",
+]
+
+
+@pytest.mark.parametrize("called", IN_THE_END)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_after_the_last_iteration_costs_nothing(called, number, interrupted, capsys):
+    assert interrupted(called, [number], "-o", "found.fits") == 128 + number
+    assert capsys.readouterr().err == (
+        "lnocl: error: interrupted after the last iteration; the result is in found.fits\n"
+    )
+    assert_whole("found.fits")
+
+
+def test_nor_does_it_where_no_iteration_was_left(interrupted, capsys):
+    checkpoints = ("--checkpoint", "run.fits", "-o", "whole.fits")
+    assert interrupted("lnocl.fitswrite.write_result", [], *checkpoints) == 0
+    resume = ("--resume", "run.fits", "-o", "found.fits")
+    assert interrupted("lnocl.fitswrite.write_result", [signal.SIGINT], *resume) == 130
+    assert_whole("found.fits")
+
+
+@pytest.mark.parametrize("called", ["lnocl.fitswrite.write_result", "lnocl.atomic.os.fsync"])
+@pytest.mark.parametrize(
+    ("second", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")]
+)
+def test_a_second_one_ends_it_with_no_file(called, second, word, interrupted, capsys):
+    before = os.listdir()
+    assert interrupted(called, [signal.SIGINT, second], "-o", "found.fits") == 128 + second
+    assert capsys.readouterr().err == f"lnocl: error: {word}\n"
+    assert os.listdir() == before
 
 
 def test_a_signal_that_was_ignored_stays_so():

@@ -4,8 +4,10 @@ import hashlib
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ import lnocl
 from lnocl import cli, device
 from lnocl.errors import DeviceError
 from lnocl.frames import Known, read_frames
+from lnocl.progress import Bar
 
 SHAPE = (16, 12)
 NUMPY = ("--engine", "numpy")
@@ -693,6 +696,71 @@ class TestProcess:
             done = outside(*self.ARGUMENTS, "-o", "out.fits", stdout=full)
         assert done.returncode == 1
         assert done.stderr == "lnocl: error: [Errno 28] No space left on device\n"
+
+    @pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&- >&- 2>&-"])
+    @pytest.mark.parametrize(("mu", "status"), [("0", 0), ("-1", 2)])
+    def test_nothing_is_said_where_a_stream_is_closed(self, closed, mu, status):
+        words = ["lnocl", *self.ARGUMENTS, "--mu", mu, "-o", "out.fits"]
+        done = self.with_closed(closed, "-m", *words)
+        assert done.returncode == status
+        assert ("Traceback" in done.stderr, os.path.exists("out.fits")) == (False, status == 0)
+
+    def with_closed(self, closed, *words):
+        command = shlex.join([sys.executable, *words])
+        return subprocess.run(["bash", "-c", f"{command} {closed}"], capture_output=True, text=True)
+
+    @pytest.mark.parametrize("command", [["--help"], ["--version"], ["devices"]])
+    def test_nor_by_what_says_nothing_else(self, command):
+        assert self.with_closed(">&-", "-m", "lnocl", *command).returncode == 0
+
+    def test_no_file_gets_the_number_of_a_closed_stream(self):
+        script = (
+            "import os; from lnocl.cli import main\n"
+            "main(['devices']); print(os.open(os.devnull, os.O_RDONLY) > 2)"
+        )
+        done = self.with_closed("<&- 2>&-", "-c", script)
+        assert done.stdout.splitlines()[-1] == "True"
+
+    def test_a_library_s_bar_where_stderr_is_closed(self, monkeypatch):
+        monkeypatch.setattr(sys, "stderr", None)
+        with Bar(1, progress=True) as bar:
+            bar.show(1, lambda: "done", last=True)
+
+    @pytest.mark.parametrize(
+        "command",
+        [["selftest"], ["deconvolve", "a.fits", "--psf", "k1.fits", "--stop", "held-out",
+                        "--n-iter", "100000", "--precision", "double", "-o", "out.fits"]],
+    )  # fmt: skip
+    def test_sigterm_ends_any_command_in_one_line_and_cleans_up(self, tmp_path, command):
+        kernels = tmp_path / "kernels"
+        kernels.mkdir()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "lnocl", *command],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"TMPDIR": str(kernels)},
+        )
+        # What each says first, before the first iteration.
+        (process.stdout if command == ["selftest"] else process.stderr).readline()
+        assert len(list(kernels.glob("lnocl-kernels-*"))) == 1
+        process.send_signal(signal.SIGTERM)
+        _, complaint = process.communicate()
+        assert (process.returncode, complaint) == (143, "lnocl: error: terminated\n")
+        assert list(kernels.iterdir()) == []
+        assert not Path("out.fits").exists()
+
+    def test_signals_do_again_what_they_did(self):
+        before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+        assert run() == 0
+        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+    def test_it_runs_in_a_thread_which_hears_no_signals(self):
+        statuses = []
+        thread = threading.Thread(target=lambda: statuses.append(run("--quiet")))
+        thread.start()
+        thread.join()
+        assert statuses == [0]
 
     def test_a_stdout_of_ascii_shows_what_it_can(self):
         done = outside(*self.ARGUMENTS, "-o", "naïve.fits", PYTHONIOENCODING="ascii")

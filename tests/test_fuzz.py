@@ -18,7 +18,7 @@ from astropy.table import Table
 from scenes import make_psfs
 from test_fitsread import PHYSICAL, SIP
 
-from lnocl import demo, fitsread, fitswrite, plots, simulate, sky
+from lnocl import checkpoint, demo, fitsread, fitswrite, plots, simulate, sky
 from lnocl.errors import FileError, InputError, LnoclError, LnoclWarning
 from lnocl.frames import Known, read_frames
 
@@ -376,6 +376,49 @@ def test_what_a_table_claims_is_not_believed(sound, tmp_path, keyword, name):
     path.write_bytes(content)
     with pytest.raises(FileError, match=rf"{path} is (damaged: {keyword} is|truncated)"):
         (read_stars if name.startswith("star") else read_saved)(sound, str(path), name)
+
+
+NO_BYTES = {
+    "rows of no bytes": {"NAXIS1": 0},
+    "a heap that takes them back": {"NAXIS1": 1, "PCOUNT": -(10**8)},
+    "no groups": {"NAXIS1": 1, "GCOUNT": 0},
+}
+
+
+def read_checkpoint(sound, damaged, name):
+    checkpoint.read(damaged)
+
+
+@pytest.mark.usefixtures("limits")
+@pytest.mark.parametrize("compress", [bytes, gzip.compress])
+@pytest.mark.parametrize("use", [read_stars, read_saved, read_checkpoint])
+@pytest.mark.parametrize("claims", NO_BYTES.values(), ids=NO_BYTES)
+def test_rows_that_take_no_room_are_not_read(sound, tmp_path, use, claims, compress):
+    columns = [fits.Column(name, "0A") for name in ("x", "y", "flux", "name", "value")]
+    name = "RUN" if use is read_checkpoint else "STARS"
+    table = fits.BinTableHDU.from_columns(columns, name=name).header
+    table.update({"NAXIS2": 10**8} | claims)
+    primary = fits.PrimaryHDU(header=fits.Header({"ENDED": "", "DIGEST": ""})).header
+    path = tmp_path / "damaged"
+    path.write_bytes(compress((primary.tostring() + table.tostring()).encode()))
+    began = time.monotonic()
+    with pytest.raises(FileError) as caught:
+        use(sound, str(path), "star_table.dat")
+    assert str(caught.value) == f"{path} is damaged: it has 100000000 rows in 5760 bytes"
+    assert time.monotonic() - began < 2
+
+
+@pytest.mark.usefixtures("limits")
+@pytest.mark.parametrize("use", [read_observation, read_stars, read_saved, read_checkpoint])
+@pytest.mark.parametrize("path", ["/dev/zero", "pipe"])
+def test_what_may_have_no_end_is_not_read(sound, tmp_path, monkeypatch, use, path):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    with pytest.raises(FileError) as caught:
+        use(sound, path, "image.dat")
+    how = "read as a table" if use is read_stars else "opened"
+    why = "it is no regular file; save what it gives to one first"
+    assert str(caught.value) == f"{path} cannot be {how}: {why}"
 
 
 @pytest.mark.usefixtures("limits")

@@ -14,6 +14,7 @@ LAYERS = {
     "__main__": {"cli"},
     "cli": SHARED
     | {
+        "commands.signals",
         "commands.bench",
         "commands.deconvolve",
         "commands.demo",
@@ -26,7 +27,8 @@ LAYERS = {
     "commands.__init__": set(),
     "commands.arguments": set(),
     "commands.messages": set(),
-    "commands.checkpoints": {"commands.arguments"},
+    "commands.signals": set(),
+    "commands.checkpoints": {"commands.arguments", "commands.signals", "deconvolution"},
     "commands.bench": SHARED | {"bench", "device"},
     "commands.deconvolve": SHARED
     | {"atomic", "deconvolution", "device", "edges", "fitsread", "fitswrite", "frames", "metrics"}
@@ -50,7 +52,7 @@ LAYERS = {
     "selftest": {"deconvolution", "device", "observation", "rig", "simulate", "twins"},
     "twins": {"fft", "reference", "rig"},
     "rig": {"fft", "program", "scene"},
-    "trade": {"deconvolution", "experiment", "metrics", "observation", "simulate"},
+    "trade": {"deconvolution", "experiment", "metrics", "observation", "progress", "simulate"},
     "demo": {"atomic", "experiment", "fitsread", "fitswrite", "metrics", "plots", "simulate"},
     "experiment": {"deconvolution", "metrics", "observation", "simulate"},
     "deconvolution": {

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from lnocl.commands.arguments import Arguments, finite
+from lnocl.commands.signals import first_handled
 from lnocl.errors import InputError, LnoclError
+
+if TYPE_CHECKING:
+    from lnocl.deconvolution import Result
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -53,6 +59,8 @@ class RunInterruptedError(LnoclError):
 class Interrupts:
     """Listens for signals from the first iteration on: the first one ends the run, the second all.
 
+    One that comes after the last iteration ends nothing: the result is there, and is written.
+
     Attributes
     ----------
     caught : int
@@ -61,24 +69,28 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.caught = 0
-        self._before: dict[int, object] = {}
+        self._listens = False
+        self._listening = contextlib.ExitStack()
 
     def __enter__(self) -> Interrupts:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._release()
+        self._listening.close()
+
+    def listen(self) -> None:
+        """Listen from now on."""
+        if not self._listens:
+            self._listens = True
+            self._listening.enter_context(first_handled(SIGNALS, self._catch))
 
     def callback(self, iteration: int, estimate: object) -> bool:
         """Return whether the run should end, as `lnocl.deconvolve` asks after each iteration."""
-        if not (self._before or self.caught):
-            for number in SIGNALS:
-                if signal.getsignal(number) != signal.SIG_IGN:  # as in the background of a script
-                    self._before[number] = signal.signal(number, self._catch)
+        self.listen()
         return self.caught != 0
 
-    def explain(self, arguments: argparse.Namespace, n_iter: int) -> None:
-        """Raise what tells of a run that was interrupted, with the status that shells give it.
+    def explain(self, arguments: argparse.Namespace, result: Result) -> None:
+        """Raise what tells of a signal that came, with the status that shells give it.
 
         Raises
         ------
@@ -87,18 +99,16 @@ class Interrupts:
         """
         if not self.caught:
             return
-        words = f"interrupted after {n_iter} iterations; what they gave is in {arguments.output}"
-        if arguments.checkpoint is not None:
-            words += f"; go on with --resume {arguments.checkpoint}"
+        if result.stop_reason == "interrupt":
+            words = f"interrupted after {result.n_iter} iterations; what they gave is in "
+            words += arguments.output
+            if arguments.checkpoint is not None:
+                words += f"; go on with --resume {arguments.checkpoint}"
+        else:
+            words = f"interrupted after the last iteration; the result is in {arguments.output}"
         error = RunInterruptedError(words)
         error.exit_status = 128 + self.caught
         raise error
 
-    def _catch(self, number: int, frame: object) -> None:
+    def _catch(self, number: int) -> None:
         self.caught = number
-        self._release()
-
-    def _release(self) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
-        self._before = {}

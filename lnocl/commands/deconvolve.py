@@ -168,50 +168,51 @@ def _run(arguments: argparse.Namespace) -> None:
     checkpoints.check(arguments, inputs)
     folder = os.getcwd()
     device = _device_spec(arguments)
-    with contextlib.nullcontext() if arguments.quiet else messages.shown_log():
+    log = contextlib.nullcontext() if arguments.quiet else messages.shown_log()
+    with log, checkpoints.Interrupts() as interrupts:
         frames = _read_frames(arguments)
         stars = _stars(arguments, frames.images)
         wcs = fitsread.wcs_cards(frames.images.header)
-        with checkpoints.Interrupts() as interrupts:
-            result = deconvolve(
-                frames.observation,
-                stars=stars,
-                mu=arguments.mu,
-                smoothing=arguments.smoothing,
-                solver=arguments.solver,
-                n_iter=arguments.n_iter,
-                stop=arguments.stop,
-                precision=arguments.precision,
-                engine=arguments.engine,
-                device=device,
-                pad=arguments.pad,
-                progress=not arguments.quiet,
-                refine_positions=arguments.refine,
-                callback=interrupts.callback,
-                checkpoint=arguments.checkpoint,
-                checkpoint_every=arguments.checkpoint_every,
-                resume=arguments.resume,
-            )
-    if interrupts.caught:
-        result = dataclasses.replace(result, stop_reason="interrupt")
-    fitswrite.write_result(
-        arguments.output,
-        result.extended,
-        result.star_positions,
-        result.star_fluxes,
-        result.history,
-        wcs=wcs,
-        cards=_cards(arguments, result, frames),
-        commands=[["cd", folder], _repeating_command(arguments, stars, frames, device)],
-        overwrite=arguments.overwrite,
-        held_out=result.held_out if result.held_out.size else None,
-        per_second=bool(arguments.exposure),
-        star_columns=_star_columns(arguments, result, frames.images.header),
-        cubes=_cubes(arguments, result),
-    )
-    if not arguments.quiet:
-        messages.say(_summary(arguments, result))
-    interrupts.explain(arguments, result.n_iter)
+        result = deconvolve(
+            frames.observation,
+            stars=stars,
+            mu=arguments.mu,
+            smoothing=arguments.smoothing,
+            solver=arguments.solver,
+            n_iter=arguments.n_iter,
+            stop=arguments.stop,
+            precision=arguments.precision,
+            engine=arguments.engine,
+            device=device,
+            pad=arguments.pad,
+            progress=not arguments.quiet,
+            refine_positions=arguments.refine,
+            callback=interrupts.callback,
+            checkpoint=arguments.checkpoint,
+            checkpoint_every=arguments.checkpoint_every,
+            resume=arguments.resume,
+        )
+        interrupts.listen()  # where no iteration was left to do it has not begun to
+        if result.stop_reason == "callback":
+            result = dataclasses.replace(result, stop_reason="interrupt")
+        fitswrite.write_result(
+            arguments.output,
+            result.extended,
+            result.star_positions,
+            result.star_fluxes,
+            result.history,
+            wcs=wcs,
+            cards=_cards(arguments, result, frames),
+            commands=[["cd", folder], _repeating_command(arguments, stars, frames, device)],
+            overwrite=arguments.overwrite,
+            held_out=result.held_out if result.held_out.size else None,
+            per_second=bool(arguments.exposure),
+            star_columns=_star_columns(arguments, result, frames.images.header),
+            cubes=_cubes(arguments, result),
+        )
+        if not arguments.quiet:
+            messages.say(_summary(arguments, result))
+    interrupts.explain(arguments, result)
 
 
 def _input_paths(arguments: argparse.Namespace) -> list[str]:

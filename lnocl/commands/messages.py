@@ -10,6 +10,16 @@ from collections.abc import Iterable, Iterator
 from typing import TextIO
 
 
+def replace_closed_streams() -> None:
+    """Have nothing said where stdin, stdout or stderr is closed, as after ``2>&-``.
+
+    A file that is opened later would get the closed one's number, and what libraries say there.
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r+"))  # noqa: SIM115
+
+
 def say(lines: Iterable[str]) -> None:
     """Write lines to stdout; a reader that has left early is no error."""
     try:
