@@ -18,6 +18,7 @@ from astropy.utils.data import get_readable_fileobj
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError, LnoclError, LnoclWarning
+from lnocl.process import recorded_warnings
 
 # What astropy counts to when it reads a header, and as far as FITS lets it count.
 COUNTS = ("NAXIS", "TFIELDS")
@@ -225,8 +226,7 @@ def open_fits(
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FileError(f"{path} cannot be opened: {reason}") from error
-    with stream, warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with stream, recorded_warnings() as caught:
         try:
             with get_readable_fileobj(stream, encoding="binary") as content:
                 # Of a compressed file this unpacks all of it, and so verifies its checksum.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lnocl.errors import FileError, InputError, LnoclWarning
 from lnocl.fitsfile import open_fits
 from lnocl.headers import make_wcs, number, quiet_log, readable
+from lnocl.process import ignored_warnings
 
 RESULT_TABLES = {
     "STARS": ("x", "y", "flux"),
@@ -130,10 +131,8 @@ def read_keyword(path: str, header: fits.Header, keyword: str) -> str | float | 
     """
     if keyword in header:
         return header[keyword]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # they were shown when the image was read
-        with open_fits(path) as file:
-            primary = readable(next(file.hdus()).header)
+    with ignored_warnings(), open_fits(path) as file:  # shown when the image was read
+        primary = readable(next(file.hdus()).header)
     return primary.get(keyword)
 
 
@@ -162,8 +161,7 @@ def wcs_cards(header: fits.Header) -> fits.Header:
         try:
             # What astropy mends on reading it writes mended.
             wcs = make_wcs(header, key or " ")
-            with warnings.catch_warnings(), quiet_log():
-                warnings.simplefilter("ignore")
+            with ignored_warnings(), quiet_log():
                 if key and not wcs.wcs.ctype[0].endswith("-SIP"):
                     wcs.sip = None  # that of the primary system, which astropy gives to all
                 cards.update(wcs.to_header(relax=True))

@@ -13,6 +13,7 @@ import astropy
 from astropy.io import fits
 
 from lnocl.errors import InputError
+from lnocl.process import ignored_warnings
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
@@ -75,8 +76,7 @@ def make_wcs(header: fits.Header, key: str = " ") -> WCS:
         for pattern, most in _LIMITS:
             if pattern.fullmatch(keyword) and not 0 <= header[keyword] <= most:
                 raise InputError(f"{keyword} is {header[keyword]}, and {most} at most")
-    with warnings.catch_warnings(), quiet_log():
-        warnings.simplefilter("ignore")
+    with ignored_warnings(), quiet_log():
         return WCS(header, key=key, naxis=2)
 
 

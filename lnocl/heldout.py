@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +27,7 @@ from numpy.typing import NDArray
 from lnocl.errors import InputError, LnoclWarning, refuse_not_finite
 from lnocl.observation import Array, Observation
 from lnocl.penalty import Penalty
+from lnocl.process import ignored_warnings
 from lnocl.run import Run
 
 CURVE_DTYPE = np.dtype(
@@ -147,7 +147,7 @@ def halve(observation: Observation, ways: int = 1) -> list[tuple[Observation, Ob
         rng = np.random.default_rng(seed)
         first = rng.binomial(whole.astype(np.int64), 0.5).astype(np.float64)
         first += (images - whole) * rng.integers(0, 2, images.shape)
-        with _quiet():
+        with ignored_warnings(LnoclWarning):  # they are said of the whole observation too
             pairs.append(
                 (
                     Observation(first, observation.psfs, **known),
@@ -155,14 +155,6 @@ def halve(observation: Observation, ways: int = 1) -> list[tuple[Observation, Ob
                 )
             )
     return pairs
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Leave out what would be said of the halves: it is said of the whole observation too."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LnoclWarning)
-        yield
 
 
 Pair = tuple[Estimate, Estimate]
@@ -346,7 +338,7 @@ class Choosing:
             An iteration chosen too near `n_iter`.
         """
         while (penalty := self._next()) is not None:
-            with _quiet():
+            with ignored_warnings(LnoclWarning):  # likewise
                 halved = penalty.of_half()
                 self._trial = _Trial(
                     [(self._begin(a, halved), self._begin(b, halved)) for a, b in self._halves]

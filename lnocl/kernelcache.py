@@ -13,7 +13,6 @@ import os
 import shutil
 import sys
 import tempfile
-import threading
 import warnings
 import weakref
 import zipfile
@@ -22,11 +21,11 @@ from pathlib import Path
 from typing import TypeVar
 
 from lnocl.errors import DeviceError, LnoclWarning
+from lnocl.process import LOCK
 
 T = TypeVar("T")
 
 VARIABLE = "POCL_CACHE_DIR"
-_lock = threading.RLock()
 
 
 class _Folder:
@@ -55,7 +54,7 @@ _fresh: list[_Folder] = []
 @contextlib.contextmanager
 def private() -> Iterator[None]:
     """Have PoCL use a folder of this process's own, if it is first asked for devices in here."""
-    with _lock:
+    with LOCK:
         if _own:
             yield
             return
@@ -67,7 +66,7 @@ def private() -> Iterator[None]:
 @contextlib.contextmanager
 def fresh() -> Iterator[None]:
     """Have PyOpenCL, which follows the XDG standard, use empty caches from now on."""
-    with _lock:
+    with LOCK:
         _fresh.append(_Folder())
         sys.modules.pop("pyopencl.invoker", None)  # it holds a cache open
         with _environment("XDG_CACHE_HOME", _fresh[-1].path):
@@ -111,7 +110,7 @@ def build(owner: object, name: str, make: Callable[[], T]) -> T:
     LnoclWarning
         An archive that is damaged; a folder in which nothing can be kept.
     """
-    with _lock:
+    with LOCK:
         if not _own:
             return make()
         own = _own[0].path
@@ -189,7 +188,7 @@ def _keep(archive: Path, own: Path, programs: list[str], process: int) -> None:
     """Keep all files of some programs' folders, if there are any not kept yet."""
     if os.getpid() != process:
         return
-    with _lock, contextlib.suppress(OSError):  # what is not kept is compiled again
+    with LOCK, contextlib.suppress(OSError):  # what is not kept is compiled again
         files = [file for name in programs for file in (own / name).rglob("*") if file.is_file()]
         names = {str(file.relative_to(own)): file for file in files}
         with contextlib.suppress(Exception), zipfile.ZipFile(archive) as kept:

@@ -13,6 +13,7 @@ from lnocl import kernelcache
 from lnocl.device import describe, has_double
 from lnocl.errors import DeviceError, LnoclWarning
 from lnocl.faults import build_failure
+from lnocl.process import ignored_warnings
 
 # In the order in which they build on each other: the transforms by themselves; the split-gradient
 # method; and the scaled gradient projection method.
@@ -224,8 +225,7 @@ def _build(context: cl.Context, text: str, options: list[str]) -> dict[str, cl.K
 
 def _try_to_build(context: cl.Context, text: str, options: list[str]) -> dict[str, cl.Kernel]:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", cl.CompilerWarning)
+        with ignored_warnings(cl.CompilerWarning):
             built = cl.Program(context, text).build(options)
             # Not by all_kernels: its kernels are retained once too often, and kept with their
             # program.

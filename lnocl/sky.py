@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from typing import IO, Any
 
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from lnocl.errors import FileError, InputError, LnoclError
 from lnocl.fitsfile import open_fits, open_regular
 from lnocl.headers import make_wcs, quiet_log
+from lnocl.process import ignored_warnings
 from lnocl.units import parse
 
 log = logging.getLogger("lnocl")
@@ -56,8 +56,7 @@ def has_celestial(header: fits.Header) -> bool:
 
 
 def _find_wcs(header: fits.Header) -> WCS | None:
-    with warnings.catch_warnings(), quiet_log():
-        warnings.simplefilter("ignore")  # what astropy mends
+    with ignored_warnings(), quiet_log():  # what astropy mends
         try:
             wcs = make_wcs(header)
             assert wcs.pixel_to_world(0, 0).icrs  # the Sun's, say, are not on the sky
@@ -127,8 +126,7 @@ def to_pixels(coordinates: SkyCoord, wcs: WCS, path: str) -> Pairs:
 
 
 def _pixel_to(convert: Callable[..., Any], *given: Any) -> Pairs:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of SIP that does not converge far from the image
+    with ignored_warnings():  # of SIP that does not converge far from the image
         return np.array(convert(*given), float)
 
 
@@ -180,9 +178,8 @@ def _read_table(path: str) -> Table:
         with (
             open_regular(path) as stream,
             get_readable_fileobj(stream, encoding="binary") as content,
-            warnings.catch_warnings(),
+            ignored_warnings(),
         ):
-            warnings.simplefilter("ignore")
             formats = identify_format("read", Table, path, content, [content], {})
             # A name that says nothing of what is in the file is that of a plain text.
             kind = formats[0] if formats else "ascii"

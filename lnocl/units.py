@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 import sys
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from lnocl.errors import InputError
+from lnocl.process import ignored_warnings
 
 COUNTS = ("electron", "photon", "count")
 
@@ -48,8 +48,7 @@ def parse(text: str) -> Any:
 def _parse_as_written(text: str) -> Any:
     from astropy import units as u
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of ways to write that FITS discourages
+    with ignored_warnings():  # of ways to write that FITS discourages
         try:
             unit = u.Unit(text, parse_strict="silent")
             # "1," is a structure; -1 and 1e400 are no sizes.

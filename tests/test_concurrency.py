@@ -4,14 +4,18 @@ import os
 import subprocess
 import sys
 import threading
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from runtimes import on_pocl
 
 import lnocl
+from lnocl.fitsread import read_stack
+from lnocl.heldout import halve
 
 
 def arguments(seed, n):
@@ -65,6 +69,22 @@ def test_one_thread_goes_on_where_another_fails():
         going = pool.submit(lnocl.deconvolve, observation, stars, n_iter=60)
     assert isinstance(failing.exception(), KeyError)
     assert_same(going.result(), lnocl.deconvolve(observation, stars, n_iter=60))
+
+
+def test_threads_leave_warnings_as_they_were(tmp_path):
+    """Both what reads files and what begins halves of counts turns some off for a while."""
+    path = tmp_path / "image.fits"
+    fits.writeto(path, np.ones((8, 8), np.float32))
+    observation, _ = arguments(4, 8)
+
+    def read(_):
+        read_stack([str(path)])
+        halve(observation)
+
+    before = warnings.filters[:], warnings.showwarning, warnings._showwarnmsg_impl
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(read, range(200)))
+    assert (warnings.filters, warnings.showwarning, warnings._showwarnmsg_impl) == before
 
 
 PROGRAM = """

@@ -1,0 +1,27 @@
+"""What belongs to the whole process, and is changed by one thread at a time."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+# One lock for all of it: threads that took one of several could wait for each other.
+LOCK = threading.RLock()
+
+
+@contextmanager
+def ignored_warnings(category: type[Warning] = Warning) -> Iterator[None]:
+    """Leave warnings of a category unsaid."""
+    with LOCK, warnings.catch_warnings():
+        warnings.simplefilter("ignore", category)
+        yield
+
+
+@contextmanager
+def recorded_warnings() -> Iterator[list[warnings.WarningMessage]]:
+    """Yield a list that all warnings go to."""
+    with LOCK, warnings.catch_warnings(record=True) as recorded:
+        warnings.simplefilter("always")
+        yield recorded
