@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from numbers import Real
+from os import PathLike
 from typing import Any, cast
 
 import numpy as np
@@ -170,9 +171,9 @@ def deconvolve(
     progress: bool = False,
     refine_positions: bool = False,
     smoothing: float | str = 0.0,
-    checkpoint: str | None = None,
+    checkpoint: str | PathLike[str] | None = None,
     checkpoint_every: float = 60.0,
-    resume: str | None = None,
+    resume: str | PathLike[str] | None = None,
 ) -> Result:
     """Reconstruct the sky from several images as stars plus an extended source.
 
@@ -239,13 +240,13 @@ def deconvolve(
         with the iterations, most of all beside bright stars; 1e-4 to 1e-3 for stars a hundred times
         as bright as what is beside them (docs/sgp.md). "auto": 0 or one of five values, whichever
         held-out counts choose (see Notes).
-    checkpoint : str, optional
+    checkpoint : str or path, optional
         File for checkpoints (FITS): written after the first iteration, then every
         `checkpoint_every` seconds, and at the end. Each replaces the one before once it is
-        complete.
+        complete. While held-out counts choose it holds six runs and about twenty estimates of each.
     checkpoint_every : float, optional
         Seconds between checkpoints, zero or more.
-    resume : str, optional
+    resume : str or path, optional
         Checkpoint to go on from. Everything else must be as it was when it was written; the result
         is then bit for bit that of a run that was never interrupted.
 

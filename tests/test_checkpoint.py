@@ -402,20 +402,22 @@ def wait_for_change(path, process, before=None):
 
 
 @pytest.mark.parametrize(
-    ("solver", "kills"),
+    ("solver", "kills", "more"),
     [
-        ("sgm", 1),
-        pytest.param("sgm", 50, marks=pytest.mark.exhaustive),
-        pytest.param("sgp", 50, marks=pytest.mark.exhaustive),
+        ("sgm", 1, []),
+        pytest.param("sgm", 50, [], marks=pytest.mark.exhaustive),
+        pytest.param("sgp", 50, [], marks=pytest.mark.exhaustive),
+        pytest.param("sgp", 15, ["--stop", "held-out"], marks=pytest.mark.exhaustive),
     ],
+    ids=["sgm-once", "sgm", "sgp", "sgp-held-out"],
 )
-def test_killed_at_any_moment_it_ends_where_it_would_have(solver, kills, command, tmp_path):
+def test_killed_at_any_moment_it_ends_where_it_would_have(solver, kills, more, command, tmp_path):
     rng = random.Random(solver)
-    command = [*command, "--solver", solver, "--n-iter", "400"]
+    command = [*command, "--solver", solver, "--n-iter", "400", *more]
     whole, found, saved = (tmp_path / f"{name}.fits" for name in ("whole", "found", "run"))
     finish(start(command, tmp_path, "-o", whole.name))
     command = [*command, "-o", found.name, "--checkpoint", saved.name, "--checkpoint-every", "0"]
-    progress, killed = 0, 0
+    progress, killed = (0, 0), 0
     while killed < kills:
         resume = ["--resume", saved.name] if saved.exists() else []
         before = saved.stat().st_mtime_ns if resume else None
@@ -426,14 +428,21 @@ def test_killed_at_any_moment_it_ends_where_it_would_have(solver, kills, command
         process.communicate()
         killed += process.returncode == -signal.SIGKILL
         read = checkpoint.read(str(saved))  # never a half-written one
-        assert read.arrays["progress"][0] >= progress
-        progress = read.arrays["progress"][0]
+        assert progress_of(read) >= progress
+        progress = progress_of(read)
         if read.ended:  # it was too quick: begin anew
             saved.unlink()
-            progress = 0
+            progress = (0, 0)
     finish(start(command, tmp_path, "--resume", saved.name))
     for one, other in zip(results(found), results(whole), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def progress_of(read):
+    """Return how far a run has come, first in what held-out counts choose."""
+    if "choice" in read.arrays:
+        return 1, read.arrays["progress"][0]
+    return 0, read.arrays["kept_at"][-1]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
