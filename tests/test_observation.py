@@ -286,8 +286,8 @@ REFUSED = {
         "background has shape (3, 3, 4)",
     ),
     "negative background": (
-        {"background": [1, -2.5, 3]},
-        "background must be finite and not negative; -2.5",
+        {"background": [1, -0.5, 3]},
+        "background must be finite and not negative; -0.5",
     ),
     "negative map": ({"background": IMAGES - 10}, "background must be finite and not negative; -9"),
     "NaN background": ({"background": np.nan}, "background must be finite and not negative; nan"),
@@ -304,7 +304,7 @@ REFUSED = {
         {"read_noise": IMAGES[:, 1:]},
         "read_noise has shape (3, 3, 4); the images have (3, 4, 4)",
     ),
-    "negative read noise": ({"read_noise": -1}, "read_noise must be finite and not negative; -1"),
+    "negative read noise": ({"read_noise": -0.5}, "read_noise must be finite and not negative; -0"),
     "NaN read noise": (
         {"read_noise": [0, 0, np.nan]},
         "read_noise must be finite and not negative; nan",
@@ -481,6 +481,12 @@ def test_counts_that_read_noise_lifts_above_zero_are_kept_in_silence():
     observation, messages, _ = announced(images=np.full((4, 4), -1.0), read_noise=1.5)
     assert messages == []
     np.testing.assert_array_equal(observation.images, np.full((1, 4, 4), 1.25))
+
+
+def test_without_more_there_is_no_background_and_an_exposure_of_one():
+    observation = lnocl.Observation(IMAGES, PSF)
+    assert observation.background.tolist() == [0.0] * 3
+    assert observation.exposure.tolist() == [1.0] * 3
 
 
 def test_negative_psf_pixels_are_kept_and_counted():
