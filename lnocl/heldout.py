@@ -354,7 +354,7 @@ class Choosing:
                 f"held-out counts have chosen iteration {best.n_iter} of {self._n_iter}, too near "
                 f"the end to be sure; give n_iter {AS_LONG_AGAIN * best.n_iter} or more",
                 LnoclWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         curve = np.concatenate([judged.curve for judged in self._judged])
         return Choice(best.penalty, self._n_iter if self._at_end else best.n_iter, curve)
