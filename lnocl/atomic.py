@@ -90,10 +90,12 @@ def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None
             raise InputError(f"the output {path} is one of the inputs; give it another name")
     if not os.path.isdir(os.path.dirname(target)):
         raise FileError(f"the folder of the output {path} does not exist; create it first")
+    temporary = _temporary_beside(target)
     try:
-        temporary = _temporary_beside(target)
-        _Output(temporary).close()
-        os.unlink(temporary)
+        try:
+            _Output(temporary).close()
+        finally:
+            _remove(temporary)
     except OSError as error:
         raise FileError(
             f"the output {path} cannot be written to its folder: {error.strerror}"
@@ -126,9 +128,9 @@ def whole_file(path: str, overwrite: bool = False) -> Iterator[IO[bytes]]:
     """
     target = os.path.realpath(path)
     temporary = _temporary_beside(target)
-    with _explained(path):
-        output = _Output(temporary)
     try:
+        with _explained(path):
+            output = _Output(temporary)
         with _explained(path, output):
             with io.BufferedWriter(output) as stream:
                 yield stream
@@ -137,8 +139,7 @@ def whole_file(path: str, overwrite: bool = False) -> Iterator[IO[bytes]]:
             _check_replaceable(path, overwrite)
             os.replace(temporary, target)
     except BaseException:
-        with contextlib.suppress(OSError):  # what failed before is what must be told
-            os.unlink(temporary)
+        _remove(temporary)
         raise
 
 
@@ -226,6 +227,11 @@ def _check_replaceable(path: str, overwrite: bool) -> None:
         raise FileError(
             f"the output {path} exists; give another name, or --overwrite to replace it"
         )
+
+
+def _remove(temporary: str) -> None:
+    with contextlib.suppress(OSError):  # what failed before is what must be told
+        os.unlink(temporary)
 
 
 def _temporary_beside(target: str) -> str:

@@ -208,12 +208,17 @@ class Keeper:
         self._may_replace = False
         if self._path is not None:
             check_output(self._path, overwrite=True)
+            self._path = os.path.abspath(self._path)  # wherever the process goes
             self._may_replace = _are_same(self._path, source)
-            if os.path.lexists(self._path) and not self._may_replace:
-                raise FileError(f"the checkpoint {path} exists; resume from it, or remove it")
+            self._refuse_to_replace()
         self._described = describe() if self._path is not None or self.saved is not None else {}
         if self.saved is not None:
             self.saved.refuse_unless(self._described)
+
+    def _refuse_to_replace(self) -> None:
+        assert self._path is not None
+        if os.path.lexists(self._path) and not self._may_replace:
+            raise FileError(f"the checkpoint {self._path} exists; resume from it, or remove it")
 
     def restore(self, run: Run, rule: Rule) -> str:
         """Put a run where its checkpoint was, if any; return why it had ended, if it had.
@@ -294,6 +299,7 @@ class Keeper:
         """Write a checkpoint; what cannot be written later on costs no run that has come so far."""
         try:
             if self._path is not None:
+                self._refuse_to_replace()
                 write(self._path, self._described, ended, arrays, self._may_replace)
                 self._may_replace = True
         except FileError as error:

@@ -43,24 +43,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 terminated.
     """
     messages.replace_closed_streams()
-    with first_handled([signal.SIGTERM], terminate), warnings.catch_warnings():
-        warnings.simplefilter("always", LnoclWarning)
-        warnings.showwarning = messages.show_warning
-        try:
+    try:
+        with first_handled([signal.SIGTERM], terminate), warnings.catch_warnings():
+            warnings.simplefilter("always", LnoclWarning)
+            warnings.showwarning = messages.show_warning
             parsed = _make_parser().parse_args(arguments)
             parsed.command.run(parsed)
-        except LnoclError as error:
-            return messages.fail(str(error), error.exit_status)
-        except MemoryError:
-            return messages.fail(
-                "not enough memory; cut the images, or give fewer at a time", FAILED
-            )
-        except Terminated:
-            return messages.fail("terminated", TERMINATED)
-        except KeyboardInterrupt:
-            return messages.fail("interrupted", INTERRUPTED)
-        except OSError as error:
-            return messages.fail(str(error), FAILED)
+    except LnoclError as error:
+        return messages.fail(str(error), error.exit_status)
+    except MemoryError:
+        return messages.fail("not enough memory; cut the images, or give fewer at a time", FAILED)
+    except Terminated:
+        return messages.fail("terminated", TERMINATED)
+    except KeyboardInterrupt:
+        return messages.fail("interrupted", INTERRUPTED)
+    except OSError as error:
+        return messages.fail(str(error), FAILED)
     return 0
 
 

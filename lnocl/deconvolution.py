@@ -356,8 +356,10 @@ def deconvolve(
         rule = make_rule(stop)
         stop_reason = keeper.restore(run, rule)
         bar.expect(choice.n_iter)
-        if not stop_reason:
-            keep = partial(keeper.keep, run, rule, choice)
+        keep = partial(keeper.keep, run, rule, choice)
+        if stop_reason:
+            keep(stop_reason)  # perhaps in another file
+        else:
             try:
                 stop_reason = _iterate(run, choice.n_iter, rule, callback, bar, keep)
             except NotFiniteError:

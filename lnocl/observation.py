@@ -36,7 +36,7 @@ class Observation:
         added are set to zero, and their number is announced. An `astropy.units.Quantity`, an
         `astropy.nddata.NDData` such as a CCDData, or a sequence of these, is taken with its unit
         and mask; counts per time are multiplied by the exposure. Uncertainties are not used.
-        Nothing else may hold masked values.
+        Maps may be masked where the images are; nothing else may hold masked values.
     psfs : array_like, shape (p, ky, kx) or (ky, kx)
         Point spread functions, centre at ``(ky // 2, kx // 2)``, of any positive sum: they are
         normalised here. One serves all images. Negative pixels are kept and announced.
@@ -201,7 +201,12 @@ class Observation:
 
     def _one_or_map(self, name: str, given: ArrayLike, masked: float) -> Array:
         """Return one number for each image, or for each pixel: one map serves all images."""
-        values = numbers(name, given)
+        array, masked_there = values_and_mask(name, given)
+        if array.shape in (self.images.shape, self.shape):
+            bad = self.mask if array.ndim == 3 else self.mask.all(axis=0)
+            masked_there = masked_there & ~bad  # a new array: it may be the caller's
+        refuse_masked(name, masked_there)
+        values = numbers(name, array)
         if values.ndim < 2:
             return _one_each(name, values, self.n_images)
         if values.shape not in (self.images.shape, self.shape):
@@ -250,12 +255,17 @@ def values_and_mask(name: str, values: ArrayLike) -> tuple[NDArray, NDArray[np.b
 
 
 def unmasked(name: str, values: ArrayLike) -> NDArray:
-    """Return values as an array; refuse masked ones: below a mask there may be anything."""
+    """Return values as an array; refuse masked ones."""
     array, masked = values_and_mask(name, values)
+    refuse_masked(name, masked)
+    return array
+
+
+def refuse_masked(name: str, masked: NDArray[np.bool_]) -> None:
+    """Refuse masked values: below a mask there may be anything."""
     if n_masked := int(np.count_nonzero(masked)):
         advice = UNMASK.get(name, "fill them or leave them out")
         raise InputError(f"{name} has {n_masked} masked values; {advice}")
-    return array
 
 
 def numbers(name: str, values: ArrayLike) -> Array:

@@ -44,7 +44,7 @@ class Penalty:
     def __post_init__(self) -> None:
         weights: dict[str, Any] = {"mu": self.mu, "smoothing": self.smoothing}
         for name, weight in weights.items():
-            if not (isinstance(weight, Real) and 0 <= float(cast(float, weight)) <= MOST):
+            if not (isinstance(weight, Real) and _is_weight(cast(float, weight))):
                 raise InputError(
                     f"{name} must be a number, finite and not negative; {weight!r} was given"
                 )
@@ -55,3 +55,10 @@ class Penalty:
         A half has half the data term and a quarter of the squares; delta is halved too.
         """
         return Penalty(2.0 * self.mu, self.smoothing)
+
+
+def _is_weight(number: float) -> bool:
+    try:
+        return 0 <= float(number) <= MOST
+    except OverflowError:  # of whole numbers
+        return False

@@ -302,9 +302,31 @@ def test_the_checkpoint_of_a_run_that_began_meanwhile_is_not_replaced(tmp_path):
     def other(iteration, estimate):
         made.deconvolve(n_iter=4, **given)
 
-    with pytest.raises(lnocl.FileError, match=r"the output .* exists"):
+    with pytest.raises(lnocl.FileError, match=r"the checkpoint .* exists"):
         made.deconvolve(n_iter=7, callback=other, **given)
     assert checkpoint.read(str(path)).arrays["progress"][0] == 4
+
+
+def test_a_checkpoint_stays_in_its_folder_wherever_the_process_goes(tmp_path, monkeypatch):
+    there, elsewhere = tmp_path / "there", tmp_path / "elsewhere"
+    for folder in (there, elsewhere):
+        folder.mkdir()
+    (elsewhere / "run.fits").write_text("of somebody else")
+    monkeypatch.chdir(there)
+    given = {"n_iter": 3, "engine": "numpy", "checkpoint": "run.fits", "checkpoint_every": 0}
+    STARS.make().deconvolve(**given, callback=lambda *_: os.chdir(elsewhere))
+    assert (elsewhere / "run.fits").read_text() == "of somebody else"
+    assert checkpoint.read(str(there / "run.fits")).arrays["progress"][0] == 3
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_a_run_that_had_ended_is_kept_in_another_file_too(solver, tmp_path):
+    made, first, second = STARS.make(), tmp_path / "first.fits", tmp_path / "second.fits"
+    given = {"n_iter": 3, "engine": "numpy", "solver": solver}
+    whole = made.deconvolve(**given, checkpoint=first)
+    assert_same(made.deconvolve(**given, resume=first, checkpoint=second), whole)
+    assert_same(made.deconvolve(**given, resume=second, checkpoint=second), whole)
+    assert checkpoint.read(str(second)).ended == "n_iter"
 
 
 @pytest.mark.parametrize("name", ["a\0b.fits", "\ud800.fits", "folder/run.fits", ""])

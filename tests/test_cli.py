@@ -690,6 +690,17 @@ class TestProcess:
         assert (done.returncode, done.stderr) == (0, "")
         assert fits.getdata("out.fits").shape == SHAPE
 
+    def test_a_signal_while_an_error_is_told_ends_it_at_once(self):
+        script = (
+            "import os, signal, sys\n"
+            "from lnocl import cli\n"
+            "from lnocl.commands import messages\n"
+            "messages.fail = lambda *_: os.kill(os.getpid(), signal.SIGTERM)\n"
+            "sys.exit(cli.main(['deconvolve', 'no.fits', '--psf', 'k1.fits', '-o', 'out.fits']))\n"
+        )
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
+
     @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
     def test_a_full_stdout_is_one_line(self):
         with open("/dev/full", "w") as full:

@@ -87,6 +87,35 @@ def test_threads_leave_warnings_as_they_were(tmp_path):
     assert (warnings.filters, warnings.showwarning, warnings._showwarnmsg_impl) == before
 
 
+FORK = """
+import os, threading
+from lnocl.process import LOCK
+held = threading.Event()
+def hold():
+    with LOCK:
+        held.set()
+        released.wait(1)
+released = threading.Event()
+threading.Thread(target=hold).start()
+held.wait()
+if os.fork() == 0:
+    with LOCK:
+        os._exit(7)
+print(os.waitstatus_to_exitcode(os.wait()[1]), LOCK.acquire(timeout=5))
+"""
+
+
+def test_a_process_forked_while_a_thread_is_at_work_does_not_wait_for_it():
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", FORK],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        env={**os.environ, "PYTHONPATH": str(Path(lnocl.__file__).parents[1])},
+    )
+    assert (done.stdout, done.stderr) == ("7 True\n", "")
+
+
 PROGRAM = """
 import hashlib, sys
 import numpy as np

@@ -483,6 +483,25 @@ def test_counts_that_read_noise_lifts_above_zero_are_kept_in_silence():
     np.testing.assert_array_equal(observation.images, np.full((1, 4, 4), 1.25))
 
 
+def test_maps_may_be_masked_where_the_images_are():
+    bad = np.zeros(IMAGES.shape, bool)
+    bad[:, 0, 1] = bad[1, 1, 1] = True
+    images = np.ma.array(IMAGES, mask=bad)
+    maps = np.ma.array(np.where(bad, np.nan, 2.0), mask=bad)
+    one_for_all = np.ma.array(np.where(bad[0], np.nan, 2.0), mask=bad[0])
+    for name in ("background", "exposure", "read_noise"):
+        for given in (maps, one_for_all):
+            found = lnocl.Observation(images, PSF, **{name: given})
+            plain = lnocl.Observation(images, PSF, **{name: np.full(given.shape, 2.0)})
+            for made in ("images", "background", "exposure", "mask"):
+                np.testing.assert_array_equal(getattr(found, made), getattr(plain, made))
+        with (
+            pytest.warns(lnocl.LnoclWarning, match="3 image pixels are not finite"),
+            pytest.raises(lnocl.InputError, match=f"{name} has 1 masked values; fill them"),
+        ):
+            lnocl.Observation(np.where(bad[0], np.nan, IMAGES), PSF, **{name: maps})
+
+
 def test_without_more_there_is_no_background_and_an_exposure_of_one():
     observation = lnocl.Observation(IMAGES, PSF)
     assert observation.background.tolist() == [0.0] * 3

@@ -203,6 +203,10 @@ REFUSED = {
     "negative mu": ({"mu": -1e-9}, "mu must be a number, finite and not negative; -1e-09"),
     "NaN mu": ({"mu": np.nan}, "mu must be a number, finite and not negative; nan"),
     "infinite mu": ({"mu": np.inf}, "mu must be a number, finite and not negative; inf"),
+    "mu beyond all numbers": (
+        {"mu": 10**400},
+        "mu must be a number, finite and not negative; 1000",
+    ),
     "text for mu": ({"mu": "0.1"}, "mu"),
     "complex mu": ({"mu": 1j}, "mu"),
     "None for mu": ({"mu": None}, "mu must be a number, finite and not negative; None"),

@@ -30,8 +30,9 @@ def first_handled(numbers: Iterable[int], handle: Callable[[int], None]) -> Iter
     before: dict[int, Any] = {}
 
     def release() -> None:
-        while before:
-            signal.signal(*before.popitem())
+        with contextlib.suppress(KeyError):  # a signal may come in between, and release the last
+            while before:
+                signal.signal(*before.popitem())
 
     def catch(number: int, frame: object) -> None:
         release()
