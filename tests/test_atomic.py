@@ -378,3 +378,24 @@ class TestCommandLine:
         assert cli.main([*self.COMMAND, "-o", "out.fits"]) == 0
         assert names(tmp_path) == ["a.fits", "k.fits", "out.fits"]
         assert not (tmp_path.parent / "stray.fits").exists()
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda path: atomic.check_output(path, overwrite=False),
+        lambda path: atomic.write_text(path, "words"),
+    ],
+    ids=["check", "write"],
+)
+def test_a_signal_that_comes_as_a_file_is_made_leaves_none(work, tmp_path, monkeypatch):
+    class Interrupted(atomic._Output):
+        def __init__(self, path):
+            super().__init__(path)
+            self.close()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(atomic, "_Output", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        work(str(tmp_path / "out.txt"))
+    assert not list(tmp_path.iterdir())
