@@ -29,12 +29,12 @@ import sides
 from astropy.table import Table, vstack
 from machine import bytes_moved, measure, operations
 
-import lnocl.program
-from lnocl.device import choose, describe
-from lnocl.experiment import observe
-from lnocl.penalty import Penalty
-from lnocl.scene import Scene
-from lnocl.simulate import Experiment, hh34, simulate
+import lnocl.opencl.program
+from lnocl.opencl.device import choose, describe
+from lnocl.scene.penalty import Penalty
+from lnocl.scene.scene import Scene
+from lnocl.simulation.simulate import Experiment, hh34, simulate
+from lnocl.studies.experiment import observe
 
 SIZES = (64, 128, 256, 512, 1024, 2048, 4096)
 IMAGES = (1, 2, 3, 4, 5, 6, 7, 8)

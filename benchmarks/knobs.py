@@ -27,10 +27,10 @@ from iteration import facts, rows, take_turns
 from precision import scene
 
 import lnocl
-from lnocl.device import choose, describe
 from lnocl.errors import DeviceError
 from lnocl.metrics import star_rows
-from lnocl.scene import LEAST_MODEL, Scene
+from lnocl.opencl.device import choose, describe
+from lnocl.scene.scene import LEAST_MODEL, Scene
 
 TIMED_SIZE, N_IMAGES = 1024, 4
 ITERATIONS, STAR_ITERATIONS = 1000, 600

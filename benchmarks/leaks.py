@@ -21,8 +21,8 @@ import parts
 import pyopencl as cl
 
 import lnocl
-from lnocl.device import choose
-from lnocl.program import SOURCES, STEP_SOURCES, Program
+from lnocl.opencl.device import choose
+from lnocl.opencl.program import SOURCES, STEP_SOURCES, Program
 
 SOLVERS = ("sgm", "sgp")
 SHORT = 10

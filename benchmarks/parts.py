@@ -3,7 +3,7 @@
 from astropy.table import Table
 
 import lnocl
-from lnocl.device import choose, describe
+from lnocl.opencl.device import choose, describe
 
 
 def report(rows, part, device, output):

@@ -32,13 +32,13 @@ from astropy.table import Table
 from sgp import make
 
 import lnocl
-from lnocl import experiment
 from lnocl.metrics import restoration_error, star_rows
-from lnocl.model import Model
-from lnocl.observation import Observation
-from lnocl.refine import StarFit, Stars
-from lnocl.run import Run
-from lnocl.scene import Scene
+from lnocl.runs.run import Run
+from lnocl.scene.forward_model import Model
+from lnocl.scene.observation import Observation
+from lnocl.scene.scene import Scene
+from lnocl.solvers.positions import StarFit, Stars
+from lnocl.studies import experiment
 
 SIZE, FRAMES, STARS = 128, 8, 25
 FLUXES = (1e4, 3e4, 1e5, 3e5, 1e6)
@@ -261,8 +261,8 @@ def choices(device):
     """Yield rows of the part "choices"."""
     variants = {
         "as it is": contextlib.nullcontext,
-        "first at 1": lambda: patch("lnocl.run.FIRST_REFINED", 1),
-        "first at 12": lambda: patch("lnocl.run.FIRST_REFINED", 12),
+        "first at 1": lambda: patch("lnocl.runs.run.FIRST_REFINED", 1),
+        "first at 12": lambda: patch("lnocl.runs.run.FIRST_REFINED", 12),
         "anew at 3": lambda: begun_anew(3),
         "anew at 3, 6": lambda: begun_anew(6),
         "mu 1e-4": contextlib.nullcontext,

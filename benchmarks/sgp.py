@@ -36,11 +36,12 @@ import sides
 from astropy.io import fits
 
 import lnocl
-from lnocl import demo, experiment, heldout
 from lnocl.metrics import restoration_error, star_rows
-from lnocl.model import Model
-from lnocl.scene import Scene
-from lnocl.simulate import Experiment, Star, Target, hh34, load_target, simulate
+from lnocl.runs import held_out
+from lnocl.scene.forward_model import Model
+from lnocl.scene.scene import Scene
+from lnocl.simulation.simulate import Experiment, Star, Target, hh34, load_target, simulate
+from lnocl.studies import demo, experiment
 
 SGM_ITERATIONS = {"hh34": 8000, "hh211": 2000}
 STARTS = (0.01, 0.1, 0.5, 0.9)
@@ -193,7 +194,7 @@ def random_scene(seed, data):
 
 def likelihood_choice(simulation, device, n_iter=400, every=2):
     """Return the iteration at which the likelihood of a held-out half is best."""
-    ((first, second),) = heldout.halve(experiment.observe(simulation))
+    ((first, second),) = held_out.halve(experiment.observe(simulation))
     scene = Scene(first, simulation.stars)
     model = Model(scene)
     curve = []
@@ -277,7 +278,10 @@ def choices(data, device):
     for name, size, contrast, n_iter in [*cases, ("hh211", 1024, 1.0, 80)]:
         simulation = make(name, size, data, contrast)
         for shift, kept in settings:
-            with patch("lnocl.scaling.SHIFT", shift), patch("lnocl.solvers.STEPS_KEPT", kept):
+            with (
+                patch("lnocl.solvers.scaling.SHIFT", shift),
+                patch("lnocl.solvers.solvers.STEPS_KEPT", kept),
+            ):
                 curve = follow(simulation, "sgp", n_iter, device=device)
             best = curve[np.argmin(curve[:, 2])]
             yield {

@@ -12,10 +12,10 @@ import numpy as np
 import scipy.fft
 
 import lnocl
-from lnocl.model import Model
-from lnocl.opencl import OpenCLEngine
-from lnocl.scaling import prepare
-from lnocl.solvers import sgp
+from lnocl.engines.opencl import OpenCLEngine
+from lnocl.scene.forward_model import Model
+from lnocl.solvers.scaling import prepare
+from lnocl.solvers.solvers import sgp
 
 WORKERS = os.cpu_count()
 
@@ -254,7 +254,7 @@ class VkFFT:
         from pyopencl.elementwise import ElementwiseKernel
         from pyvkfft.opencl import VkFFTApp
 
-        from lnocl.device import choose
+        from lnocl.opencl.device import choose
 
         context = cl.Context([choose(device).device])
         self.queue = cl.CommandQueue(context)

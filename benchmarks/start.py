@@ -18,7 +18,7 @@ import numpy as np
 from sides import Lnocl, observation
 
 import lnocl
-from lnocl.scene import Scene
+from lnocl.scene.scene import Scene
 
 ITERATIONS = 200
 

@@ -15,9 +15,9 @@ import pyopencl as cl
 from iteration import take_turns
 from sides import Lnocl, observation
 
-from lnocl.device import choose, describe
-from lnocl.program import tune
-from lnocl.scene import Scene
+from lnocl.opencl.device import choose, describe
+from lnocl.opencl.program import tune
+from lnocl.scene.scene import Scene
 
 
 def candidates(default, device):

@@ -17,8 +17,11 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
-from lnocl import atomic, demo, experiment, fitsread, fitswrite, metrics, simulate
+from lnocl import metrics
 from lnocl.errors import InputError, LnoclError
+from lnocl.io import atomic, fitsread, fitswrite
+from lnocl.simulation import simulate
+from lnocl.studies import demo, experiment
 
 # La Camera et al. (2012), Table 1: rho' and rho'' in percent, with their iterations.
 PAPER = {

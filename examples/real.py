@@ -16,7 +16,7 @@ from astropy.io import fits
 from scipy.ndimage import convolve1d, shift
 
 import lnocl
-from lnocl.psf import make_psf
+from lnocl.psf.make import make_psf
 
 # The lensed quasar: its images' brightest pixels (x, y), and what its sky's noise is squared.
 IMAGES = ((77, 73), (47, 56), (55, 77), (73, 48))

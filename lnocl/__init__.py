@@ -4,7 +4,7 @@ from importlib.metadata import version
 
 from lnocl.deconvolution import Result, deconvolve
 from lnocl.errors import DeviceError, FileError, InputError, LnoclError, LnoclWarning
-from lnocl.observation import Observation
+from lnocl.scene.observation import Observation
 
 __all__ = [
     "DeviceError",

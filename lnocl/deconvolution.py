@@ -13,15 +13,15 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.checkpoint import Keeper, describe
 from lnocl.errors import InputError, LnoclWarning, NotFiniteError
-from lnocl.heldout import NO_CURVE, Choice, Choosing, Grid, several_mu, several_smoothings
-from lnocl.observation import Array, Observation, numbers
-from lnocl.penalty import Penalty
-from lnocl.progress import Bar
-from lnocl.run import Run, Setup
-from lnocl.solvers import SOLVERS
-from lnocl.stopping import Rule, make_rule
+from lnocl.runs.checkpoint import Keeper, describe
+from lnocl.runs.held_out import NO_CURVE, Choice, Choosing, Grid, several_mu, several_smoothings
+from lnocl.runs.progress import Bar
+from lnocl.runs.run import Run, Setup
+from lnocl.runs.stopping import Rule, make_rule
+from lnocl.scene.observation import Array, Observation, numbers
+from lnocl.scene.penalty import Penalty
+from lnocl.solvers.solvers import SOLVERS
 
 PRECISIONS = ("single", "double")
 ENGINES = ("opencl", "numpy")
@@ -191,7 +191,7 @@ def deconvolve(
     stars : sequence of (x, y), optional
         Positions of the point sources in pixels of an image without offset, 0-based, x along
         columns. Between pixels a star's image is the PSF moved in its spectrum
-        (`lnocl.placement.place`).
+        (`lnocl.scene.shifting.place`).
     mu : float or "auto", optional
         Weight of the Tikhonov term on the extended source, per electron; zero or more. "auto":
         0 or one of seven values, three decades up to p over the brightest pixel, whichever held-out
@@ -212,8 +212,8 @@ def deconvolve(
         OpenCL, or the plain NumPy reference.
     device : str, optional
         OpenCL device as ``PLATFORM[:DEVICE]``, each an index or a part of the name (see
-        `lnocl.device.choose`). By default that of the environment variable PYOPENCL_CTX, else
-        the first GPU, else the first CPU.
+        `lnocl.opencl.device.choose`). By default that of the environment variable PYOPENCL_CTX,
+        else the first GPU, else the first CPU.
     pad : int or "auto", optional
         Unobserved pixels kept round the images, at least; the grid is then the next power of
         two on each axis. With ``pad=0`` and a power-of-two image the model is periodic. "auto",
@@ -233,10 +233,10 @@ def deconvolve(
     refine_positions : bool, optional
         Move the stars to where they are most likely, at most 3 pixels away, by Fisher scoring of
         all fluxes and positions with the extended source held fixed: at the start and after 3, 6,
-        12, 24 ... iterations (`lnocl.refine`).
+        12, 24 ... iterations (`lnocl.solvers.positions`).
     smoothing : float or "auto", optional
-        Weight of an edge-preserving term (`lnocl.penalty.Penalty`), zero or more, without unit;
-        delta is three times the mean of the extended source. It keeps the noise down that grows
+        Weight of an edge-preserving term (`lnocl.scene.penalty.Penalty`), zero or more, without
+        unit; delta is three times the mean of the extended source. It keeps the noise down that grows
         with the iterations, most of all beside bright stars; 1e-4 to 1e-3 for stars a hundred times
         as bright as what is beside them (docs/sgp.md). "auto": 0 or one of five values, whichever
         held-out counts choose (see Notes).
@@ -282,8 +282,8 @@ def deconvolve(
     -----
     Held-out counts: the counts are dealt out at random to two halves, independent observations of
     the same sky. Both are reconstructed side by side, and the error of their sum is estimated from
-    the products of one's estimates with the other's (`lnocl.heldout` has the equation), the mean
-    of three ways to deal. Chosen is the last iteration with an error within a tenth of the least;
+    the products of one's estimates with the other's (`lnocl.runs.held_out` has the equation), the
+    mean of three ways to deal. Chosen is the last iteration with an error within a tenth of the least;
     the halves go on for as long again. The reconstruction itself is then made from all counts. So
     it takes thirteen times as long as if the iteration had been known, and the memory of six runs
     and of about twenty estimates of each.

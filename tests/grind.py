@@ -13,9 +13,10 @@ import numpy as np
 import pyopencl as cl
 from scenes import Recipe, worst
 
-from lnocl import fft, program, rig, twins
-from lnocl.device import choose
-from lnocl.program import Tuning
+from lnocl.opencl import fft, program
+from lnocl.opencl.device import choose
+from lnocl.opencl.program import Tuning
+from lnocl.verify import comparison, harness
 
 DTYPES = {"s": np.float32, "d": np.float64}
 
@@ -26,10 +27,10 @@ DECONVOLUTION = "deconvolution"
 # one for a CPU, of one work-item a group; in a group of several, all barriers count.
 CASES = {
     "smallest grid": ((2, 2), None, "two images, star, mu", "sD"),
-    "an item a block": ((16, 16), None, rig.THREE_IMAGES, "sd"),
+    "an item a block": ((16, 16), None, harness.THREE_IMAGES, "sd"),
     "several vectors a block": ((16, 16), Tuning(4, 8), "exposure map, mu", "Sd"),
     "middle passes and spans": ((128, 4), Tuning(2, 2, chunk=8), "mask, mu, smoothing", "S"),
-    "group": ((16, 32), ON_GPU, rig.THREE_IMAGES, "Sd"),
+    "group": ((16, 32), ON_GPU, harness.THREE_IMAGES, "Sd"),
     "group, exposure map": ((32, 16), Tuning(1, 8, group=4), "exposure map, mu", "sD"),
     "group, mu": ((16, 16), ON_GPU, "two images, star, mu", "sD"),
     "group larger than its work": ((8, 8), Tuning(1, 2, group=16), "mask, mu, smoothing", "sD"),
@@ -54,7 +55,7 @@ class Layout(fft.Layout):
         return packed
 
 
-class Rig(rig.Rig):
+class Rig(harness.Rig):
     """Buffers that end where their values do, and hold nothing where those are NaN."""
 
     def __init__(self, *given, **scene):
@@ -171,14 +172,14 @@ def run_kernels(case, dtype, names):
     grid, tuning, scene, _ = CASES[case]
     context = cl.Context([choose().device])
     tuning = None if tuning == ON_GPU else tuning
-    bare = Rig(context, grid, dtype, tuning, **rig.SCENES[scene])
+    bare = Rig(context, grid, dtype, tuning, **harness.SCENES[scene])
     assert (bare.program.tuning.group > 1) == case.startswith("group")
     assert bare.program.scratch_is_global == (case in DEVICE_OPTIONS)
-    given = rig.inputs(bare)
-    for name in names or twins.kernels_of(bare.scene):
-        for found, expected in twins.KERNELS[name](bare, given):
+    given = harness.inputs(bare)
+    for name in names or comparison.kernels_of(bare.scene):
+        for found, expected in comparison.KERNELS[name](bare, given):
             # Measured over other grids, what is allowed is a little small for some of these.
-            assert twins.relative(found, expected) <= 4 * twins.ALLOWED[dtype], name
+            assert comparison.relative(found, expected) <= 4 * comparison.ALLOWED[dtype], name
 
 
 def run_deconvolution(case, dtype):

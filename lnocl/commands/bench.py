@@ -48,7 +48,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl import bench, device
+    from lnocl.opencl import device
+    from lnocl.studies import bench
 
     source = bench.choose_source(
         arguments.images,

@@ -27,10 +27,10 @@ from lnocl.deconvolution import ENGINES, PRECISIONS, SOLVERS, Result, deconvolve
 if TYPE_CHECKING:
     from astropy.io import fits
 
-    from lnocl.fitsread import Stack
-    from lnocl.fitswrite import StarColumn
-    from lnocl.frames import Frames
-    from lnocl.observation import Observation
+    from lnocl.io.fitsread import Stack
+    from lnocl.io.fitswrite import StarColumn
+    from lnocl.io.frames import Frames
+    from lnocl.scene.observation import Observation
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -159,7 +159,7 @@ def _add_output_arguments(parser: Arguments) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl import atomic, fitsread, fitswrite
+    from lnocl.io import atomic, fitsread, fitswrite
 
     inputs = _input_paths(arguments)
     atomic.check_output(
@@ -233,7 +233,7 @@ def _input_paths(arguments: argparse.Namespace) -> list[str]:
 
 
 def _read_frames(arguments: argparse.Namespace) -> Frames:
-    from lnocl.frames import Known, read_frames
+    from lnocl.io.frames import Known, read_frames
 
     return read_frames(
         arguments.images,
@@ -255,7 +255,7 @@ def _stars(arguments: argparse.Namespace, images: Stack) -> list[tuple[float, fl
     """Return the positions of all stars, in pixels: of --star, --star-sky and --stars."""
     positions = list(arguments.stars)
     if arguments.star_sky or arguments.star_table:
-        from lnocl import sky
+        from lnocl.io import sky
 
         if arguments.star_sky:
             wcs = sky.celestial_wcs(images.header, arguments.images[0])
@@ -272,8 +272,8 @@ def _star_columns(
     arguments: argparse.Namespace, result: Result, header: fits.Header
 ) -> list[StarColumn]:
     """Return what the table of stars holds besides positions and fluxes."""
-    from lnocl import sky
-    from lnocl.fitswrite import StarColumn
+    from lnocl.io import sky
+    from lnocl.io.fitswrite import StarColumn
     from lnocl.metrics import magnitude
 
     columns = []
@@ -308,7 +308,7 @@ def _device_spec(arguments: argparse.Namespace) -> str | None:
     """Return the OpenCL device as indices, so that the run can be repeated on the same."""
     if arguments.engine != "opencl":
         return arguments.device
-    from lnocl import device
+    from lnocl.opencl import device
 
     return device.spec_of(device.choose(arguments.device).device)
 
@@ -362,7 +362,7 @@ def _cards(
 
 
 def _pad(arguments: argparse.Namespace, observation: Observation) -> int:
-    from lnocl.edges import recommend_pad
+    from lnocl.scene.padding import recommend_pad
 
     return recommend_pad(observation) if arguments.pad == "auto" else arguments.pad
 

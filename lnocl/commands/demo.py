@@ -28,7 +28,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl import demo, device
+    from lnocl.opencl import device
+    from lnocl.studies import demo
 
     spec = device.spec_of(device.choose(arguments.device).device)
     for line in demo.run(

@@ -13,7 +13,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl import device
+    from lnocl.opencl import device
 
     found = device.find_devices()
     choice = device.choose(None)

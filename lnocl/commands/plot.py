@@ -22,7 +22,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl import demo
+    from lnocl.studies import demo
 
     for line in demo.draw(
         arguments.output, arguments.results, arguments.truth, arguments.overwrite

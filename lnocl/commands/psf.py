@@ -19,8 +19,8 @@ from lnocl.errors import InputError
 MAX_DRAWN = 16
 
 if TYPE_CHECKING:
-    from lnocl.fitswrite import Card
-    from lnocl.psf import StarPsf
+    from lnocl.io.fitswrite import Card
+    from lnocl.psf.make import StarPsf
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -103,7 +103,8 @@ def _run(arguments: argparse.Namespace) -> None:
     _check_outputs(arguments)
     folder = os.getcwd()
 
-    from lnocl import fitswrite, psf
+    from lnocl import psf
+    from lnocl.io import fitswrite
 
     frame, frame_sum = _read_image(arguments.frame)
     mask, mask_sum = None, None
@@ -145,7 +146,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _check_outputs(arguments: argparse.Namespace) -> None:
     """Check all that can be told before the frame is read."""
-    from lnocl import atomic
+    from lnocl.io import atomic
 
     if len(arguments.stars) > 1:
         raise InputError(
@@ -156,7 +157,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     if arguments.plot is None:
         return
 
-    from lnocl import plots
+    from lnocl.plotting import plots
 
     if not arguments.plot.lower().endswith(".png"):
         raise InputError(
@@ -174,7 +175,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
 
 def _read_image(path: str) -> tuple[NDArray[np.float64], str]:
     """Return the one image of a file, and the file's checksum."""
-    from lnocl import fitsread
+    from lnocl.io import fitsread
 
     stack = fitsread.read_single(path)
     return stack.data[0], stack.sha256[0]
@@ -199,7 +200,7 @@ def _read_mask(path: str, frame_path: str, shape: tuple[int, ...]) -> tuple[NDAr
 
 def _lines(stars: Sequence[StarPsf], angles: Sequence[float]) -> list[str]:
     """Return the steps: those that all PSFs share once, the others of each."""
-    from lnocl.psf import N_SHARED_STEPS
+    from lnocl.psf.make import N_SHARED_STEPS
 
     if len(stars) == 1:
         return list(stars[0].steps)
@@ -259,7 +260,7 @@ def _repeating_command(arguments: argparse.Namespace) -> list[str]:
 
 
 def _draw(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> None:
-    from lnocl import plots
+    from lnocl.plotting import plots
 
     first = stars[0]
     figure = plots.star_psf(

@@ -15,7 +15,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl import device, selftest
+    from lnocl.opencl import device
+    from lnocl.verify import selftest
 
     chosen = device.choose(arguments.device).device
     messages.say(

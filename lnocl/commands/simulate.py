@@ -77,7 +77,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     from astropy import units as u
 
-    from lnocl import atomic, demo, simulate
+    from lnocl.io import atomic
+    from lnocl.simulation import simulate
+    from lnocl.studies import demo
 
     stars = arguments.stars and [simulate.Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
     target = simulate.load_target(arguments.scene, arguments.size, stars)

@@ -1,0 +1,1 @@
+"""The verbs of an iteration on NumPy and on OpenCL."""

@@ -1,0 +1,1 @@
+"""FITS files, headers, maps, sky coordinates and atomic output."""

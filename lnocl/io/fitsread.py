@@ -1,0 +1,307 @@
+"""FITS in: images and PSFs, their coordinates, and results that were saved."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from lnocl.errors import FileError, InputError, LnoclWarning
+from lnocl.io.fitsfile import open_fits
+from lnocl.io.headers import make_wcs, number, quiet_log, readable
+from lnocl.process import ignored_warnings
+
+RESULT_TABLES = {
+    "STARS": ("x", "y", "flux"),
+    "HISTORY": ("iteration", "objective"),
+    "CURVE": ("iteration", "rho", "rho_star", "magnitude"),
+    "HELDOUT": ("mu", "smoothing", "iteration", "error"),
+}
+
+_WCS_KEYWORD = re.compile(r"(?:CTYPE|CRPIX|CRVAL|CDELT)1([A-Z]?)")
+
+
+class Stack(NamedTuple):
+    """Images that were read.
+
+    Attributes
+    ----------
+    data : ndarray of float64, shape (p, ny, nx)
+        Pixels, in the units of the files.
+    headers : list of astropy.io.fits.Header
+        Header of each file.
+    sha256 : list of str
+        SHA-256 checksum of each file, in hexadecimal.
+    """
+
+    data: NDArray[np.float64]
+    headers: list[fits.Header]
+    sha256: list[str]
+
+    @property
+    def header(self) -> fits.Header:
+        """Header of the first image."""
+        return self.headers[0]
+
+
+def read_stack(paths: Sequence[str]) -> Stack:
+    """Read images: one FITS file each, or one file with a cube.
+
+    The image of a file is the first HDU that is an image and has pixels: the primary HDU or an
+    image extension. BSCALE, BZERO and BLANK are applied (a blank pixel is NaN). A file may be
+    compressed as a whole (gzip, bzip2, xz), but not in tiles.
+
+    Parameters
+    ----------
+    paths : sequence of str
+        One file with an image (ny, nx) or a cube (p, ny, nx), or p files with an image each.
+
+    Returns
+    -------
+    Stack
+        The images, the headers and the checksums of the files.
+
+    Raises
+    ------
+    FileError
+        A file that is missing, no FITS, damaged, truncated or tile-compressed, or that holds no
+        image or one that is larger than the memory.
+    InputError
+        An image of another dimension or shape than the others.
+
+    Warns
+    -----
+    LnoclWarning
+        What astropy found wrong with a file and could mend; data that do not match their
+        DATASUM.
+    """
+    images, headers, sha256 = zip(*(_read_file(path) for path in paths), strict=True)
+    for path, image in zip(paths, images, strict=True):
+        _check_shape(path, image.shape, paths[0], images[0].shape, alone=len(paths) == 1)
+    ny, nx = images[0].shape[-2:]
+    data = images[0] if len(images) == 1 else np.stack(images)
+    return Stack(data.reshape(-1, ny, nx), list(headers), list(sha256))
+
+
+def read_single(path: str) -> Stack:
+    """Read the one image of a file.
+
+    Raises
+    ------
+    FileError, InputError
+        As `read_stack`; a cube of several images.
+    """
+    stack = read_stack([path])
+    if len(stack.data) > 1:
+        raise InputError(
+            f"{path} holds {len(stack.data)} images; give a file with one, such as their mean"
+        )
+    return stack
+
+
+def read_extension(path: str, name: str) -> NDArray[np.float64] | None:
+    """Return the image extension of this name of a file, or None where there is none.
+
+    Raises
+    ------
+    FileError
+        As `read_stack`.
+    """
+    try:
+        return _read_file(path, name)[0]
+    except _NoImageError:
+        return None
+
+
+def read_keyword(path: str, header: fits.Header, keyword: str) -> str | float | None:
+    """Return what a keyword says of an image that was read from a file; None where it is missing.
+
+    Of an image in an extension the primary header is asked too, where telescopes leave what holds
+    for the whole file.
+
+    Raises
+    ------
+    FileError
+        As `read_stack`.
+    """
+    if keyword in header:
+        return header[keyword]
+    with ignored_warnings(), open_fits(path) as file:  # shown when the image was read
+        primary = readable(next(file.hdus()).header)
+    return primary.get(keyword)
+
+
+def wcs_cards(header: fits.Header) -> fits.Header:
+    """Return the cards of every coordinate system of an image, as astropy writes them.
+
+    Parameters
+    ----------
+    header : astropy.io.fits.Header
+        Header of a two-dimensional image or of a cube of them.
+
+    Returns
+    -------
+    astropy.io.fits.Header
+        The primary and the alternate systems of the first two axes, with SIP and other
+        distortions that cards can describe. Empty where the image has no coordinates.
+
+    Warns
+    -----
+    LnoclWarning
+        A system that astropy cannot read or that needs tables besides the header (``-TAB``,
+        lookup tables of distortions); it is left out.
+    """
+    cards = fits.Header()
+    for key in sorted({match[1] for match in map(_WCS_KEYWORD.fullmatch, header) if match}):
+        try:
+            # What astropy mends on reading it writes mended.
+            wcs = make_wcs(header, key or " ")
+            with ignored_warnings(), quiet_log():
+                if key and not wcs.wcs.ctype[0].endswith("-SIP"):
+                    wcs.sip = None  # that of the primary system, which astropy gives to all
+                cards.update(wcs.to_header(relax=True))
+        except Exception as error:
+            warnings.warn(
+                f"the coordinates (WCS{key and ' ' + key}) of the first image cannot be kept "
+                f"and are left out: {error}",
+                LnoclWarning,
+                stacklevel=2,
+            )
+    return cards
+
+
+class SavedResult(NamedTuple):
+    """A result, or a truth, that was read.
+
+    Attributes
+    ----------
+    extended : ndarray of float64, shape (ny, nx)
+        Extended source, electrons per pixel.
+    stars : list of (x, y)
+        Positions in pixels, 0-based.
+    star_fluxes : ndarray of float64, shape (n,)
+        Electrons.
+    history, curve, held_out : dict of str to ndarray of float64, or None
+        Columns of the tables ``HISTORY``, ``CURVE`` and ``HELDOUT``; None where there is no such
+        table.
+    header : astropy.io.fits.Header
+        Header of the extended source.
+    path : str
+        The file.
+    """
+
+    extended: NDArray[np.float64]
+    stars: list[tuple[float, float]]
+    star_fluxes: NDArray[np.float64]
+    history: dict[str, NDArray[np.float64]] | None
+    curve: dict[str, NDArray[np.float64]] | None
+    held_out: dict[str, NDArray[np.float64]] | None
+    header: fits.Header
+    path: str
+
+    def number(self, keyword: str) -> float | None:
+        """Return the number that a keyword of the header gives; None where it is missing.
+
+        Raises
+        ------
+        InputError
+            It gives no finite number.
+        """
+        return number(self.path, self.header, keyword)
+
+
+def read_result(path: str) -> SavedResult:
+    """Read what `fitswrite.write_result` has written.
+
+    Parameters
+    ----------
+    path : str
+        File with an image (ny, nx) and a table ``STARS`` with the columns x, y and flux.
+
+    Returns
+    -------
+    SavedResult
+        The extended source, the stars, and the tables that are there.
+
+    Raises
+    ------
+    FileError
+        A file that `read_stack` refuses, or whose tables are not those of a result.
+    """
+    image: tuple[NDArray[np.float64], fits.Header] | None = None
+    tables = {}
+    with open_fits(path) as file:
+        for hdu in file.hdus():
+            if image is None and _has_pixels(hdu):
+                image = file.pixels(hdu), readable(hdu.header)
+            elif isinstance(hdu, fits.BinTableHDU) and hdu.name in RESULT_TABLES:
+                tables[hdu.name] = file.columns(hdu)
+    if image is None:
+        raise _NoImageError(f"{path} holds no image")
+    extended, header = image
+    lacking = [
+        f"{table} {name}"
+        for table, names in RESULT_TABLES.items()
+        for name in names
+        if (table in tables or table == "STARS") and name not in tables.get(table, ())
+    ]
+    if lacking or extended.ndim != 2:
+        what = f"there is no column {lacking[0]}" if lacking else "the image is a cube"
+        raise FileError(f"{path} is no result or truth that lnocl has written: {what}")
+    stars = tables["STARS"]
+    return SavedResult(
+        extended,
+        list(zip(stars["x"].tolist(), stars["y"].tolist(), strict=True)),
+        stars["flux"],
+        tables.get("HISTORY"),
+        tables.get("CURVE"),
+        tables.get("HELDOUT"),
+        header,
+        path,
+    )
+
+
+class _NoImageError(FileError):
+    """A file holds no image, or none of the name that is sought."""
+
+
+def _read_file(
+    path: str, extension: str | None = None
+) -> tuple[NDArray[np.float64], fits.Header, str]:
+    """Return an image in a file, its header and the checksum of the file."""
+    with open_fits(path) as file:
+        for hdu in file.hdus():
+            if extension in (None, hdu.name) and _has_pixels(hdu):
+                return file.pixels(hdu), readable(hdu.header), file.sha256()
+    raise _NoImageError(f"{path} holds no image")
+
+
+def _has_pixels(hdu: Any) -> bool:
+    return hdu.is_image and len(getattr(hdu, "shape", ())) > 0 and 0 not in hdu.shape
+
+
+def _check_shape(
+    path: str,
+    shape: tuple[int, ...],
+    first_path: str,
+    first_shape: tuple[int, ...],
+    alone: bool,
+) -> None:
+    if alone and len(shape) not in (2, 3):
+        raise InputError(
+            f"{path} has an image of {len(shape)} dimensions; two are needed, or three for a cube"
+        )
+    if not alone and len(shape) != 2:
+        raise InputError(
+            f"{path} has an image of {len(shape)} dimensions; several files need two each "
+            "(a cube goes alone)"
+        )
+    if shape != first_shape:
+        raise InputError(
+            f"{path} has the shape {shape} and {first_path} {first_shape}; they must be the same"
+        )

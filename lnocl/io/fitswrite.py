@@ -1,0 +1,260 @@
+"""FITS out: images, and the result with what is needed to repeat the run."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import ArrayLike, NDArray
+
+from lnocl.io.atomic import whole_file
+
+# A HISTORY card holds 72 characters; the last one may be needed for a backslash and a space.
+HISTORY_WIDTH = 70
+
+Card = tuple[str, str | int | float, str]
+
+
+class StarColumn(NamedTuple):
+    """A column of the table of stars."""
+
+    name: str
+    values: ArrayLike
+    unit: str
+    comment: str
+
+
+def write_result(
+    path: str,
+    extended: ArrayLike,
+    stars: ArrayLike,
+    star_fluxes: ArrayLike,
+    history: NDArray[np.void] | None = None,
+    wcs: fits.Header | None = None,
+    cards: Iterable[Card] = (),
+    commands: Iterable[Sequence[str]] = (),
+    overwrite: bool = False,
+    curve: NDArray[np.void] | None = None,
+    held_out: NDArray[np.void] | None = None,
+    per_second: bool = False,
+    star_columns: Sequence[StarColumn] = (),
+    cubes: Mapping[str, tuple[ArrayLike, str]] = MappingProxyType({}),
+) -> None:
+    """Write a result, or a truth: the file is there complete, or not at all.
+
+    The primary HDU holds the extended source, the table ``STARS`` the columns x, y, flux and what
+    else is given, the table ``HISTORY`` iteration and objective, the table ``CURVE`` iteration,
+    rho, rho_star and magnitude, the table ``HELDOUT`` mu, smoothing, iteration and error. All have
+    CHECKSUM and DATASUM.
+
+    Parameters
+    ----------
+    path : str
+        File to write.
+    extended : array_like, shape (ny, nx)
+        Extended source, electrons per pixel.
+    stars : array_like, shape (n, 2)
+        Positions (x, y) in pixels, 0-based.
+    star_fluxes : array_like, shape (n,)
+        Electrons.
+    history : ndarray with fields ``iteration`` and ``objective``, optional
+        The objective after each iteration; none for a truth.
+    wcs : astropy.io.fits.Header, optional
+        Cards of the coordinate systems, from `fitsread.wcs_cards`.
+    cards : iterable of (keyword, value, comment), optional
+        Further cards of the primary header.
+    commands : iterable of sequence of str, optional
+        Shell commands that repeat the run, as words; the HISTORY lines spell them out.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+    curve : ndarray with fields ``iteration``, ``rho``, ``rho_star`` and ``magnitude``, optional
+        Restoration errors and magnitude of the star, where the truth is known.
+    held_out : ndarray with fields ``mu``, ``smoothing``, ``iteration`` and ``error``, optional
+        Relative errors that held-out counts estimate, where they were asked.
+    per_second : bool, optional
+        Whether extended source and fluxes are electrons per second.
+    star_columns : sequence of StarColumn, optional
+        Further columns of the table of stars.
+    cubes : mapping of str to (array_like, str), optional
+        Further images (p, ny, nx), by the name of their extension, with their unit.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written, or exists and must not be overwritten.
+    """
+    coordinates = fits.Header() if wcs is None else wcs
+    header = coordinates.copy()
+    header["BUNIT"] = ("electron/s" if per_second else "electron", "per pixel")
+    header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
+    _add_cards(header, cards)
+    _add_commands(header, commands)
+    hdus = fits.HDUList(
+        [
+            fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
+            _star_table(stars, star_fluxes, per_second, star_columns),
+            *([] if history is None else [_table("HISTORY", history)]),
+            *([] if curve is None else [_table("CURVE", curve)]),
+            *([] if held_out is None else [_table("HELDOUT", held_out)]),
+            *(_cube(name, *cube, coordinates) for name, cube in cubes.items()),
+        ]
+    )
+    with whole_file(path, overwrite) as stream:
+        hdus.writeto(stream, checksum=True)
+
+
+def write_image(
+    path: str,
+    image: ArrayLike,
+    cards: Iterable[Card] = (),
+    overwrite: bool = False,
+    notes: Iterable[str] = (),
+    commands: Iterable[Sequence[str]] = (),
+) -> None:
+    """Write an image; the same image and cards give the same bytes.
+
+    Parameters
+    ----------
+    path : str
+        File to write.
+    image : array_like, shape (ny, nx) or (p, ny, nx)
+        Any image, or a cube of them.
+    cards : iterable of (keyword, value, comment), optional
+        Cards of its header.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+    notes : iterable of str, optional
+        Lines of printable ASCII that say what was done; the HISTORY lines hold them as comments
+        of a shell.
+    commands : iterable of sequence of str, optional
+        Shell commands that repeat the run, as words; the HISTORY lines spell them out.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written, or exists and must not be overwritten.
+    """
+    hdu = fits.PrimaryHDU(np.asarray(image, dtype=np.float64))
+    _add_cards(hdu.header, cards)
+    for note in notes:
+        for line in textwrap.wrap(note, HISTORY_WIDTH - 2):
+            hdu.header.add_history(f"# {line}")
+    _add_commands(hdu.header, commands)
+    hdu.add_checksum(when="")  # astropy would note the time
+    with whole_file(path, overwrite) as stream:
+        fits.HDUList([hdu]).writeto(stream)
+
+
+def history_lines(words: Sequence[str]) -> list[str]:
+    r"""Return a shell command in lines that fit HISTORY cards and can be pasted into a shell.
+
+    All but the last line end in a backslash. Long words are cut into pieces that the shell joins
+    again; bytes that FITS does not allow are written as ``$'\ooo'``, which bash, ksh and zsh
+    read.
+
+    Parameters
+    ----------
+    words : sequence of str
+        The command and its arguments, as the program gets them.
+
+    Returns
+    -------
+    list of str
+        Printable ASCII, 72 characters a line at most.
+
+    Examples
+    --------
+    >>> from lnocl.fitswrite import history_lines
+    >>> history_lines(["lnocl", "deconvolve", "a star.fits", "-o", "naïve.fits"])
+    ["lnocl deconvolve 'a star.fits' -o $'na\\303\\257ve.fits'"]
+    """
+    lines, line = [], ""
+    for word in words:
+        for i, piece in enumerate(_shell_pieces(word)):
+            gap = " " if line and i == 0 else ""
+            if line and len(line + gap + piece) > HISTORY_WIDTH:
+                lines.append(line + gap + "\\")
+                line, gap = "", ""
+            line += gap + piece
+    return [*lines, line]
+
+
+def _add_cards(header: fits.Header, cards: Iterable[Card]) -> None:
+    for keyword, value, comment in cards:
+        header[keyword] = (_ascii(value) if isinstance(value, str) else value, comment)
+
+
+def _add_commands(header: fits.Header, commands: Iterable[Sequence[str]]) -> None:
+    for words in commands:
+        for line in history_lines(words):
+            header.add_history(line)
+
+
+def _star_table(
+    stars: ArrayLike, fluxes: ArrayLike, per_second: bool, others: Sequence[StarColumn]
+) -> fits.BinTableHDU:
+    x, y = np.asarray(stars, dtype=np.float64).reshape(-1, 2).T
+    electrons = "electrons per second" if per_second else "electrons"
+    columns = [
+        StarColumn("x", x, "pix", "column, 0-based"),
+        StarColumn("y", y, "pix", "row, 0-based"),
+        # FITS has no name for electrons, and astropy warns of units that FITS lacks.
+        StarColumn("flux", fluxes, "ct/s" if per_second else "ct", electrons),
+        *others,
+    ]
+    table = fits.BinTableHDU.from_columns(
+        [
+            fits.Column(c.name, "D", unit=c.unit, array=np.asarray(c.values, dtype=np.float64))
+            for c in columns
+        ],
+        name="STARS",
+    )
+    for i, column in enumerate(columns, 1):
+        table.header[f"TTYPE{i}"] = (column.name, column.comment)
+    return table
+
+
+def _cube(name: str, images: ArrayLike, unit: str, coordinates: fits.Header) -> fits.ImageHDU:
+    hdu = fits.ImageHDU(np.asarray(images, dtype=np.float32), coordinates, name=name)
+    if unit:
+        hdu.header["BUNIT"] = unit
+    return hdu
+
+
+def _table(name: str, rows: NDArray[np.void]) -> fits.BinTableHDU:
+    columns = [
+        fits.Column(field, "K" if rows[field].dtype.kind == "i" else "D", array=rows[field])
+        for field in rows.dtype.names or ()
+    ]
+    return fits.BinTableHDU.from_columns(columns, name=name)
+
+
+def _ascii(text: str) -> str:
+    """Return text with what FITS does not allow written as escapes, as in Python."""
+    return text.encode("unicode_escape").decode("ascii")
+
+
+def _shell_pieces(word: str) -> list[str]:
+    """Return a shell word in quoted pieces that fit a line; written together they are the word."""
+    pieces, start, raw = [], 0, os.fsencode(word)
+    for end in range(1, len(raw) + 1):
+        if end == len(raw) or len(_quote(raw[start : end + 1])) > HISTORY_WIDTH:
+            pieces.append(_quote(raw[start:end]))
+            start = end
+    return pieces or [_quote(raw)]
+
+
+def _quote(raw: bytes) -> str:
+    if all(32 <= byte < 127 for byte in raw):
+        return shlex.quote(raw.decode("ascii"))
+    escaped = (
+        chr(byte) if 32 <= byte < 127 and byte not in b"'\\" else f"\\{byte:03o}" for byte in raw
+    )
+    return f"$'{''.join(escaped)}'"

@@ -1,0 +1,315 @@
+"""An observation from FITS files: counts, exposures, backgrounds, masks, offsets."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from astropy.units import dimensionless_unscaled
+from numpy.typing import NDArray
+
+from lnocl.errors import InputError
+from lnocl.io import sky
+from lnocl.io.fitsread import Stack, read_extension, read_keyword, read_stack
+from lnocl.io.maps import Maps, Word
+from lnocl.scene import units
+from lnocl.scene.observation import Array, Observation
+
+log = logging.getLogger("lnocl")
+
+Mask = NDArray[np.bool_]
+
+
+class Known(NamedTuple):
+    """What is known of images in files; words are numbers, names of files, or as said.
+
+    Attributes
+    ----------
+    background : sequence of Word
+        Electrons per pixel, one or one for each image: a number, a map, or ``"auto"``, the
+        sigma-clipped median of the image.
+    read_noise : sequence of Word
+        Standard deviation, electrons: numbers or maps.
+    inverse_variance : sequence of str
+        Maps of one over the variance of all noise but that of the source, in units of the images.
+    exposure : sequence of Word
+        Seconds: numbers, maps, or a keyword of the headers, of the images or their files.
+    mask : sequence of str
+        Maps, not 0 where a pixel is bad; or ``"dq"``, the extension DQ of each image's file.
+    saturation : float, optional
+        Pixels of this value and above, in units of the images, are bad.
+    gain : float, optional
+        Electrons for each adu or count, or whatever else the images are in. Counts per time are
+        still that.
+    align : {"wcs"}, optional
+        Offsets from the headers' coordinates.
+    """
+
+    background: Sequence[Word] = (0.0,)
+    read_noise: Sequence[Word] = (0.0,)
+    inverse_variance: Sequence[str] = ()
+    exposure: Sequence[Word] = ()
+    mask: Sequence[str] = ()
+    saturation: float | None = None
+    gain: float | None = None
+    align: str | None = None
+
+
+class Frames(NamedTuple):
+    """An observation that was read.
+
+    Attributes
+    ----------
+    observation : Observation
+        In electrons; its sky per second where exposures were given.
+    images : Stack
+        The images as they lie in their files.
+    background : list of Word
+        As given, with the numbers that ``"auto"`` found.
+    sha256 : dict of str to list of str
+        Checksums of all files, by what they are: images, psfs, background, ...
+    """
+
+    observation: Observation
+    images: Stack
+    background: list[Word]
+    sha256: dict[str, list[str]]
+
+
+def read_frames(images: Sequence[str], psfs: Sequence[str], known: Known) -> Frames:
+    """Read images and PSFs, and what is known of them.
+
+    What was done to the images is logged, such as how many pixels are masked and why.
+
+    Parameters
+    ----------
+    images, psfs : sequence of str
+        Files, as for `fitsread.read_stack`. The unit of the images is that of their BUNIT; without
+        one they are in electrons.
+    known : Known
+        What is known of them.
+
+    Raises
+    ------
+    FileError, InputError
+        As `fitsread.read_stack` and `Observation`; a unit that is no count; counts per time
+        without exposure; maps that do not fit.
+    """
+    return _Reader(images, psfs, known).frames()
+
+
+class _Reader:
+    """The files of an observation on their way to be one."""
+
+    def __init__(self, images: Sequence[str], psfs: Sequence[str], known: Known) -> None:
+        self._paths, self._known = images, known
+        self._images = read_stack(images)
+        self._psfs = read_stack(psfs)
+        self._maps = Maps(self._images.data.shape)
+
+    def frames(self) -> Frames:
+        """Return the observation that the files are."""
+        factor, are_rates = self._electrons()
+        exposure = self._exposure()
+        if are_rates and exposure is None:
+            raise InputError(
+                f"{self._paths[0]} holds counts per time: give --exposure, in seconds: a number, "
+                "a map, or a keyword of the header such as EXPTIME"
+            )
+        # What a unit of the images is in electrons.
+        each = factor * (_maps(exposure) if are_rates and exposure is not None else 1.0)
+        counts = self._images.data * each
+        inverse = self._inverse_variance()
+        mask = self._mask(exposure, inverse)
+        background = self._background(counts, mask)
+        observation = Observation(
+            counts,
+            self._psfs.data,
+            self._maps.combine("background", background),
+            self._read_noise(each, inverse, mask),
+            mask if mask.any() else None,
+            1.0 if exposure is None else exposure,
+            self._offsets(),
+        )
+        sha256 = {"images": self._images.sha256, "psfs": self._psfs.sha256, **self._maps.sha256}
+        return Frames(observation, self._images, background, sha256)
+
+    def _electrons(self) -> tuple[float, bool]:
+        """Return how many electrons a unit of the images is, and whether per second."""
+        gain = self._known.gain
+        if gain is not None and not (np.isfinite(gain) and gain > 0):
+            raise InputError(f"the gain must be a number more than 0; {gain:g} was given")
+        unit = self._unit()
+        if gain is not None:
+            factor, are_rates = units.count_of(unit, (*units.COUNTS, "adu")) or (1.0, False)
+            return gain * factor, are_rates
+        counts = units.count_of(unit)
+        if counts is None:
+            raise InputError(
+                f"{self._paths[0]} is in {self._images.header['BUNIT']}, which is no count: give "
+                "--gain, the electrons for each unit of it"
+            )
+        return counts
+
+    def _unit(self) -> Any:
+        """Return the unit of the images, without dimension where their headers name none."""
+        first, *others = (
+            units.parse(str(header.get("BUNIT", ""))) for header in self._images.headers
+        )
+        for path, unit in zip(self._paths[1:], others, strict=True):
+            if unit != first:
+                raise InputError(
+                    f"the images come in several units: {self._paths[0]} in {first or 'none'}, "
+                    f"{path} in {unit or 'none'}; give them in one"
+                )
+        return dimensionless_unscaled if first is None else first
+
+    def _exposure(self) -> Array | None:
+        words = self._known.exposure
+        for word in words:
+            if isinstance(word, str):
+                found = [
+                    read_keyword(path, header, word)
+                    for path, header in zip(self._paths, self._images.headers, strict=True)
+                ]
+                if any(value is not None for value in found):
+                    return self._from_headers(word, found)
+        return self._maps.combine("exposure", words) if words else None
+
+    def _from_headers(self, keyword: str, found: Sequence[Word | None]) -> Array:
+        if len(self._known.exposure) > 1:
+            raise InputError(
+                f"the exposure {keyword} is a keyword, of all images' headers: give it alone"
+            )
+        for path, value in zip(self._paths, found, strict=True):
+            if value is None:
+                raise InputError(f"{path} has no {keyword}; give the exposures as numbers")
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise InputError(
+                    f"{keyword} of {path} is {value!r}, no number; give the exposures as numbers"
+                )
+        values = np.array(found, float)
+        log.info("exposure from %s: %s seconds", keyword, ", ".join(f"{v:g}" for v in values))
+        return values
+
+    def _inverse_variance(self) -> Array | None:
+        paths = self._known.inverse_variance
+        if not paths:
+            return None
+        if any(self._known.read_noise):
+            raise InputError("give read noise or inverse variance, which holds it, not both")
+        inverse = self._maps.read("inverse_variance", paths)
+        if (inverse < 0).any():
+            raise InputError(
+                f"the inverse variance {paths[0]} has negative pixels; they must be 0 or more, "
+                "and 0 where a pixel is bad"
+            )
+        return inverse
+
+    def _mask(self, exposure: Array | None, inverse: Array | None) -> Mask:
+        """Return which pixels are bad; say how many, each once, for its first reason."""
+        masked = np.zeros(self._images.data.shape, bool)
+        for why, bad in self._bad_pixels(exposure, inverse):
+            for j, count in enumerate((bad & ~masked).sum(axis=(1, 2)), 1):
+                log.info("image %d: %d pixels masked %s", j, count, why)
+            masked |= bad
+        return masked
+
+    def _bad_pixels(
+        self, exposure: Array | None, inverse: Array | None
+    ) -> Iterator[tuple[str, Mask]]:
+        if paths := [word for word in self._known.mask if word != "dq"]:
+            yield "by the mask", self._maps.read("mask", paths) != 0  # NaN is not 0 either
+        if "dq" in self._known.mask:
+            yield "by the extension DQ", self._data_quality()
+        level = self._known.saturation
+        if level is not None:
+            yield f"as saturated, at {level:g} or above", self._images.data >= level
+        if exposure is not None and exposure.ndim == 3:
+            yield "without exposure", exposure == 0
+        if inverse is not None:
+            yield "without inverse variance", ~np.isfinite(inverse) | (inverse == 0)
+
+    def _data_quality(self) -> Mask:
+        images = self._images.data
+        # A file holds an image, or a cube of all.
+        shapes = images.shape[1:], images.shape if len(self._paths) == 1 else images.shape[1:]
+        flagged = []
+        for path in self._paths:
+            flags = read_extension(path, "DQ")
+            if flags is None:
+                raise InputError(f"{path} has no extension DQ; give a mask file, or leave dq out")
+            if flags.shape not in shapes:
+                raise InputError(
+                    f"the extension DQ of {path} has the shape {flags.shape}, its image "
+                    f"{shapes[-1]}; give a mask file"
+                )
+            flagged.append(flags != 0)
+        return np.broadcast_to(np.array(flagged).reshape(-1, *images.shape[1:]), images.shape)
+
+    def _read_noise(self, each: Array | float, inverse: Array | None, mask: Mask) -> Array:
+        if inverse is None:
+            return self._maps.combine("read_noise", self._known.read_noise)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(mask, 0.0, each / np.sqrt(inverse))
+
+    def _background(self, counts: Array, mask: Mask) -> list[Word]:
+        """Return the background with numbers in the place of "auto"."""
+        words = list(self._known.background)
+        if words == ["auto"]:
+            words *= len(counts)
+        if "auto" in words and len(words) != len(counts):
+            raise InputError(
+                f"{len(words)} values of background for {len(counts)} images; give one, or one "
+                "for each"
+            )
+        return [
+            _clipped_median(j, counts[j - 1], mask[j - 1]) if word == "auto" else word
+            for j, word in enumerate(words, 1)
+        ]
+
+    def _offsets(self) -> Array | None:
+        if self._known.align is None:
+            return None
+        images, headers = self._images.data, self._images.headers
+        if len(headers) != len(images):
+            raise InputError(
+                f"{self._paths[0]} is a cube, with one WCS for all its images; to align them give "
+                "a file for each"
+            )
+        found = sky.offsets(headers, self._paths, images.shape[1:])
+        for j, (dx, dy) in enumerate(found[1:], 2):
+            log.info("image %d: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
+        return found
+
+
+def _maps(values: Array) -> Array:
+    return values if values.ndim == 3 else values[:, None, None]
+
+
+def _clipped_median(j: int, counts: Array, mask: Mask) -> float:
+    """Return the background of image j: the sigma-clipped median of its good pixels."""
+    from astropy.stats import sigma_clipped_stats
+
+    good = counts[~mask & np.isfinite(counts)]
+    if good.size == 0:
+        raise InputError(
+            f"image {j} has no good pixel to find its background from; leave the image out, or "
+            "give --background as a number"
+        )
+    _, median, scatter = sigma_clipped_stats(good)
+    log.info(
+        "image %d: background %.6g electrons per pixel, scatter %.3g (sigma-clipped median)",
+        j,
+        median,
+        scatter,
+    )
+    if median < 0:
+        raise InputError(
+            f"image {j} has a sigma-clipped median of {median:.6g} electrons: its background was "
+            "subtracted already; give --background 0, and its noise as --read-noise or "
+            "--inverse-variance"
+        )
+    return float(median)

@@ -1,0 +1,281 @@
+"""Positions on the sky: stars from their coordinates, offsets between images from their WCS."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from typing import IO, Any
+
+import numpy as np
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.io.registry import identify_format
+from astropy.table import Table
+from astropy.utils.data import get_readable_fileobj
+from astropy.utils.xml.iterparser import get_xml_iterator
+from astropy.wcs import WCS
+from astropy.wcs.utils import pixel_to_pixel
+from numpy.typing import NDArray
+
+from lnocl.errors import FileError, InputError, LnoclError
+from lnocl.io.fitsfile import open_fits, open_regular
+from lnocl.io.headers import make_wcs, quiet_log
+from lnocl.process import ignored_warnings
+from lnocl.scene.units import parse
+
+log = logging.getLogger("lnocl")
+
+# What the offset between two images may differ by over them, in pixels: from rotation, scale and
+# distortion.
+MOST_TURNED = 0.1
+# Points across an image at which the offset is looked at.
+POINTS = 5
+
+Pairs = NDArray[np.float64]
+
+
+def celestial_wcs(header: fits.Header, path: str, advice: str = "give positions in pixels") -> WCS:
+    """Return the celestial coordinates of an image.
+
+    Raises
+    ------
+    InputError
+        An image without celestial coordinates, or with some that astropy cannot use.
+    """
+    wcs = _find_wcs(header)
+    if wcs is None:
+        raise InputError(f"{path} has no sky coordinates (WCS) that can be used; {advice}")
+    return wcs
+
+
+def has_celestial(header: fits.Header) -> bool:
+    """Return whether an image has celestial coordinates."""
+    return _find_wcs(header) is not None
+
+
+def _find_wcs(header: fits.Header) -> WCS | None:
+    with ignored_warnings(), quiet_log():  # what astropy mends
+        try:
+            wcs = make_wcs(header)
+            assert wcs.pixel_to_world(0, 0).icrs  # the Sun's, say, are not on the sky
+            return wcs
+        except Exception:  # whatever a damaged header leads astropy to
+            return None
+
+
+def to_sky(positions: Pairs, header: fits.Header) -> Pairs:
+    """Return right ascension and declination (ICRS, degrees) of pixel positions, shape (n, 2)."""
+    wcs = _find_wcs(header)
+    assert wcs is not None
+    found = wcs.pixel_to_world(*np.reshape(positions, (-1, 2)).T).icrs
+    return np.array([found.ra.deg, found.dec.deg]).T
+
+
+def parse_sky(texts: Sequence[str]) -> SkyCoord:
+    """Return positions RA,DEC (ICRS): degrees, or hours and degrees in sexagesimal.
+
+    Raises
+    ------
+    InputError
+        No such position.
+
+    Examples
+    --------
+    >>> from lnocl.sky import parse_sky
+    >>> parse_sky(["15.25,-3.5", "1:01:00,-3:30:00"]).to_string()
+    ['15.25 -3.5', '15.25 -3.5']
+    """
+    return SkyCoord([_parse_sky(text) for text in texts])
+
+
+def _parse_sky(text: str) -> SkyCoord:
+    ra, _, dec = text.partition(",")
+    try:
+        if _is_number(ra):
+            return SkyCoord(float(ra), float(dec), unit="deg")
+        return SkyCoord(ra, dec, unit=("hourangle", "deg"))
+    except (ValueError, u.UnitsError):
+        raise InputError(f"{text!r} is not RA,DEC in degrees, or as hh:mm:ss,dd:mm:ss") from None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def to_pixels(coordinates: SkyCoord, wcs: WCS, path: str) -> Pairs:
+    """Return the pixel positions (x, y), 0-based, of positions on the sky, shape (n, 2).
+
+    Raises
+    ------
+    InputError
+        A position that the projection of the image does not show.
+    """
+    found = _pixel_to(wcs.world_to_pixel, coordinates).reshape(2, -1).T
+    for position, pixels in zip(coordinates.ravel(), found, strict=True):
+        if not np.isfinite(pixels).all():
+            raise InputError(
+                f"the star at RA, Dec {position.to_string(precision=5)} lies in another part of "
+                f"the sky than {path}"
+            )
+    return found
+
+
+def _pixel_to(convert: Callable[..., Any], *given: Any) -> Pairs:
+    with ignored_warnings():  # of SIP that does not converge far from the image
+        return np.array(convert(*given), float)
+
+
+def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
+    """Return the pixel positions of the stars in a table.
+
+    Parameters
+    ----------
+    path : str
+        Any table that astropy reads, with the columns x and y, in pixels and 0-based, or ra and
+        dec, in their units or else in degrees. Upper or lower case does not matter.
+    header : astropy.io.fits.Header
+        Header of the image, whose coordinates ra and dec need.
+    image : str
+        Its file.
+
+    Raises
+    ------
+    FileError
+        A file that cannot be read.
+    InputError
+        A table without these columns, or ra and dec for an image without WCS.
+    """
+    table = _read_table(path)
+    columns = {name.lower(): table[name] for name in table.colnames}
+    if {"x", "y"} <= columns.keys():
+        found = np.array([_numbers(path, columns[name], u.pix) for name in "xy"]).T
+    elif {"ra", "dec"} <= columns.keys():
+        found = _from_sky(path, columns["ra"], columns["dec"], header, image)
+    else:
+        raise InputError(
+            f"{path} has neither columns x and y nor ra and dec; it has "
+            f"{', '.join(table.colnames) or 'none'}"
+        )
+    log.info("%s: %d stars", path, len(found))
+    return found
+
+
+def _from_sky(path: str, ra: Any, dec: Any, header: fits.Header, image: str) -> Pairs:
+    wcs = celestial_wcs(header, image)
+    degrees = _numbers(path, ra, u.deg), _numbers(path, dec, u.deg)
+    if (abs(degrees[1]) > 90).any():
+        raise InputError(f"column {dec.name} of {path} has rows beyond 90 degrees")
+    return to_pixels(SkyCoord(*degrees, unit="deg"), wcs, image)
+
+
+def _read_table(path: str) -> Table:
+    try:
+        with (
+            open_regular(path) as stream,
+            get_readable_fileobj(stream, encoding="binary") as content,
+            ignored_warnings(),
+        ):
+            formats = identify_format("read", Table, path, content, [content], {})
+            # A name that says nothing of what is in the file is that of a plain text.
+            kind = formats[0] if formats else "ascii"
+            if kind == "fits":
+                return _read_fits_table(path)
+            if kind == "votable":
+                _check_votable(path, content)
+            # Its name would be taken for a table if it held a line break, for an address, ...
+            return Table.read(content, format=kind)
+    except LnoclError:
+        raise
+    except Exception as error:  # astropy raises whatever a file leads its readers to
+        reason = getattr(error, "strerror", None) or str(error).strip().partition("\n")[0]
+        raise FileError(f"{path} cannot be read as a table: {reason}") from error
+
+
+def _read_fits_table(path: str) -> Table:
+    with open_fits(path, "cannot be read as a table") as file:
+        return Table.read(fits.HDUList(list(file.hdus())), format="fits")
+
+
+def _check_votable(path: str, content: IO[bytes]) -> None:
+    """Refuse a table that would have astropy read another file, or fetch one."""
+    with get_xml_iterator(content) as elements:
+        for is_start, tag, attributes, _ in elements:
+            if is_start and tag == "STREAM" and "href" in attributes:
+                raise FileError(
+                    f"{path} has its rows elsewhere, at {attributes['href']}; give a table that "
+                    "holds them"
+                )
+    content.seek(0)
+
+
+def _numbers(path: str, column: Any, unit: u.UnitBase) -> Pairs:
+    try:
+        values = np.array(getattr(column, "unmasked", column), float)
+        given = parse(str(column.unit or unit))
+        values = values * given.to(unit)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"column {column.name} of {path} is no position: {error}") from None
+    if values.ndim != 1:
+        raise InputError(f"column {column.name} of {path} has several numbers in a row")
+    if not np.isfinite(values).all() or np.any(getattr(column, "mask", False)):
+        raise InputError(f"column {column.name} of {path} has rows without a number")
+    return values
+
+
+def offsets(headers: Sequence[fits.Header], paths: Sequence[str], shape: tuple[int, int]) -> Pairs:
+    """Return where each image has what the first one has at (0, 0), shape (p, 2), pixels.
+
+    The mean over the image of ``pixel_j(sky(pixel_1)) - pixel_1``.
+
+    Raises
+    ------
+    InputError
+        An image without sky coordinates; one that shows another part of the sky than the first;
+        one that is rotated or scaled against it, by so much that the offset is not the same over
+        the image within a tenth of a pixel.
+    """
+    first, *others = (
+        celestial_wcs(header, path, "leave --align out")
+        for header, path in zip(headers, paths, strict=True)
+    )
+    found = [np.zeros(2)]
+    for wcs, path in zip(others, paths[1:], strict=True):
+        found.append(_offset(first, wcs, paths[0], path, shape))
+    return np.array(found)
+
+
+def _offset(first: WCS, wcs: WCS, first_path: str, path: str, shape: tuple[int, int]) -> Pairs:
+    ny, nx = shape
+    x, y = np.meshgrid(np.linspace(0, nx - 1, POINTS), np.linspace(0, ny - 1, POINTS))
+    moved = _pixel_to(pixel_to_pixel, first, wcs, x, y)
+    change = moved - (x, y)
+    mean = change.mean(axis=(1, 2))
+    if not (abs(mean) < (nx, ny)).all():  # NaN is where a projection has no pixel
+        raise InputError(
+            f"{path} shows another part of the sky than {first_path}, by its sky coordinates; "
+            "leave one of them out"
+        )
+    spread = abs(change - mean[:, None, None]).max()
+    if spread > MOST_TURNED:
+        raise InputError(
+            f"{path} is {_describe_turn(moved, nx)} against {first_path}, which moves pixels by "
+            f"up to {spread:.2g} besides the offset: images are never resampled; give those of "
+            "one orientation and scale together, or have them reduced to one grid"
+        )
+    return mean
+
+
+def _describe_turn(moved: Pairs, nx: int) -> str:
+    """Say how an image lies to the first, from where the points of that one lie in it."""
+    along_x = moved[:, POINTS // 2, -1] - moved[:, POINTS // 2, 0]
+    along_y = moved[:, -1, POINTS // 2] - moved[:, 0, POINTS // 2]
+    if along_x[0] * along_y[1] - along_x[1] * along_y[0] < 0:
+        return "mirrored"
+    angle = np.degrees(np.arctan2(along_x[1], along_x[0]))
+    scale = np.hypot(*along_x) / max(nx - 1, 1)
+    return f"rotated by {angle:z.2f} degrees and scaled by {scale:.4f}"

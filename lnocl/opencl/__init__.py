@@ -1,0 +1,1 @@
+"""OpenCL devices, programs, layouts, launches and transforms."""

@@ -1,0 +1,124 @@
+"""Finding OpenCL devices and choosing one, without a prompt and without a silent fallback."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
+
+import pyopencl as cl
+
+from lnocl.errors import DeviceError, InputError
+from lnocl.opencl import kernel_cache
+from lnocl.opencl.faults import claim_process
+
+T = TypeVar("T")
+
+
+class Choice(NamedTuple):
+    """A device and why it was chosen."""
+
+    device: cl.Device
+    reason: str
+
+
+def find_devices() -> list[cl.Device]:
+    """Return every OpenCL device, in the order of the platforms.
+
+    Raises
+    ------
+    DeviceError
+        Where there is no platform, or no device on any; in a process that was forked from one
+        that uses OpenCL.
+    """
+    devices = [device for platform in _usable_platforms() for device in _devices_of(platform)]
+    if not devices:
+        raise DeviceError(
+            "no OpenCL device was found; install a runtime, such as pip install 'pyopencl[pocl]'"
+        )
+    return devices
+
+
+def choose(spec: str | None = None) -> Choice:
+    """Choose a device: that of `spec`, else of PYOPENCL_CTX, else the first GPU, else CPU.
+
+    Parameters
+    ----------
+    spec : str, optional
+        ``PLATFORM[:DEVICE]``, as for PYOPENCL_CTX: each the index or a part of the name, in any
+        case. Without ``DEVICE`` the platform's first.
+
+    Raises
+    ------
+    InputError
+        Where the specification fits no device.
+    DeviceError
+        Where there is none at all.
+    """
+    devices = find_devices()
+    if spec is not None:
+        return Choice(_by_spec(spec, "device"), f"asked for as {spec!r}")
+    if environment := os.environ.get("PYOPENCL_CTX"):
+        return Choice(_by_spec(environment, "PYOPENCL_CTX"), f"PYOPENCL_CTX is {environment!r}")
+    for kind, name in ((cl.device_type.GPU, "GPU"), (cl.device_type.CPU, "CPU")):
+        for device in devices:
+            if device.type & kind:
+                return Choice(device, f"the first {name}")
+    return Choice(devices[0], "the first device, neither GPU nor CPU")
+
+
+def describe(device: cl.Device) -> str:
+    """Return the device's name, platform and driver in one line."""
+    name, platform = " ".join(device.name.split()), device.platform.name.strip()
+    return f"{name} ({platform}, {device.driver_version})"
+
+
+def spec_of(device: cl.Device) -> str:
+    """Return the ``PLATFORM:DEVICE`` indices of a device, by which `choose` finds it again."""
+    for p, platform in enumerate(_usable_platforms()):
+        for d, candidate in enumerate(_devices_of(platform)):
+            if candidate == device:
+                return f"{p}:{d}"
+    raise DeviceError(f"{describe(device)} is no longer there")
+
+
+def has_double(device: cl.Device) -> bool:
+    """Return whether the device computes in double precision."""
+    return bool(device.double_fp_config)
+
+
+def _usable_platforms() -> list[cl.Platform]:
+    """Return the platforms that have a device; indices in a specification count these."""
+    claim_process()
+    with kernel_cache.private():
+        try:
+            platforms = cl.get_platforms()
+        except cl.Error:  # the loader's word for "none"
+            return []
+        return [platform for platform in platforms if _devices_of(platform)]
+
+
+def _devices_of(platform: cl.Platform) -> list[cl.Device]:
+    try:
+        return list(platform.get_devices())
+    except cl.Error:  # a platform whose devices are all missing
+        return []
+
+
+def _by_spec(spec: str, source: str) -> cl.Device:
+    platform_part, _, device_part = spec.partition(":")
+    platform = _pick(_usable_platforms(), platform_part, lambda candidate: candidate.name)
+    device = None
+    if platform is not None:
+        device = _pick(_devices_of(platform), device_part or "0", lambda candidate: candidate.name)
+    if device is None:
+        known = "; ".join(f"{spec_of(found)} is {describe(found)}" for found in find_devices())
+        raise InputError(f"{source} {spec!r} fits no OpenCL device; {known}")
+    return device
+
+
+def _pick(candidates: Sequence[T], part: str, name: Callable[[T], str]) -> T | None:
+    if part.isdecimal():
+        return candidates[int(part)] if int(part) < len(candidates) else None
+    named = [found for found in candidates if part and part.lower() in name(found).lower()]
+    return named[0] if named else None

@@ -1,0 +1,1 @@
+"""The NumPy twin of every kernel, in float64."""

@@ -1,0 +1,1 @@
+"""A solver at work: iterations, stopping rules, held-out counts, checkpoints, progress."""

@@ -1,0 +1,188 @@
+"""When to stop, without knowing the truth: rules that look at a run after each iteration."""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import cache
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lnocl.runs.run import Run
+from lnocl.scene.observation import Array
+
+if TYPE_CHECKING:
+    from lnocl.scene.forward_model import Model
+
+# A step of the scaled gradient projection method may be short by chance, ten are not.
+CHANGE_WINDOW = 10
+
+
+class Rule(Protocol):
+    """A rule that ends a run."""
+
+    reason: str
+
+    def met(self, run: Run) -> bool:
+        """Return whether the run should end; asked once after each iteration."""
+
+    def quantity(self, run: Run) -> str:
+        """Return what the rule watches, for the progress bar."""
+
+    def state(self) -> list[float]:
+        """Return what `restore` needs."""
+
+    def restore(self, state: list[float]) -> None:
+        """Go on from this state."""
+
+
+class Never:
+    """No rule: the run goes to its last iteration."""
+
+    reason = "n_iter"
+
+    def met(self, run: Run) -> bool:
+        """Return False."""
+        return False
+
+    def quantity(self, run: Run) -> str:
+        """Return the objective."""
+        return f"objective {run.objective():.6g}"
+
+    def state(self) -> list[float]:
+        """Return nothing."""
+        return []
+
+    def restore(self, state: list[float]) -> None:
+        """Do nothing."""
+
+
+class Change:
+    """The relative change of the objective an iteration, its mean over ten, falls below a bound."""
+
+    reason = "change"
+
+    def __init__(self, least: float) -> None:
+        self._least = least
+        self._recent: deque[float] = deque(maxlen=CHANGE_WINDOW + 1)
+
+    def met(self, run: Run) -> bool:
+        """Return whether the objective has settled."""
+        self._recent.append(run.objective())
+        return len(self._recent) > CHANGE_WINDOW and self._change() < self._least
+
+    def quantity(self, run: Run) -> str:
+        """Return the relative change an iteration."""
+        return f"change {self._change():.2g}"
+
+    def state(self) -> list[float]:
+        """Return the objectives looked at."""
+        return list(self._recent)
+
+    def restore(self, state: list[float]) -> None:
+        """Go on from the objectives looked at."""
+        self._recent.extend(state)
+
+    def _change(self) -> float:
+        first, last = self._recent[0], self._recent[-1]
+        if last == 0 or len(self._recent) < 2:
+            return 0.0
+        return abs(first - last) / (len(self._recent) - 1) / abs(last)
+
+
+class Discrepancy:
+    """The data term falls to what Poisson noise alone would leave.
+
+    ``2 J_0 = sum_j sum_n e(m_j)`` over the observed pixels, with ``e(m)`` the expectation of
+    ``2 (g ln(g / m) + m - g)`` for Poisson counts g of mean m: 1 for many counts (Bertero et al.
+    2010, Inverse Problems 26, 105004), up to 1.15 for about one, and down to 0 for less. The
+    expectation is taken anew at each power of two of iterations, and before the run ends.
+    """
+
+    reason = "discrepancy"
+
+    def __init__(self) -> None:
+        self._model: Model | None = None
+        self._stars: Array | None = None
+        self._expected = np.nan
+
+    def met(self, run: Run) -> bool:
+        """Return whether the data are fitted as well as noise allows."""
+        if run.done & (run.done - 1) == 0:
+            self._expected = self._expect(run)
+        if self._discrepancy(run) > 1.0:
+            return False
+        self._expected = self._expect(run)
+        return self._discrepancy(run) <= 1.0
+
+    def quantity(self, run: Run) -> str:
+        """Return the data term over its expectation."""
+        return f"discrepancy {self._discrepancy(run):.4g}"
+
+    def state(self) -> list[float]:
+        """Return the expectation."""
+        return [self._expected]
+
+    def restore(self, state: list[float]) -> None:
+        """Go on with this expectation."""
+        (self._expected,) = state
+
+    def _discrepancy(self, run: Run) -> float:
+        return 2.0 * run.engine.data_term() * run.scene.scale / self._expected
+
+    def _expect(self, run: Run) -> float:
+        from lnocl.scene.forward_model import Model
+
+        if self._model is None or self._stars is not run.scene.stars:  # they may have moved
+            self._model, self._stars = Model(run.scene), run.scene.stars
+        weights = self._model.weights
+        means = weights * self._model.images(run.engine.extended(), run.engine.star_fluxes())
+        return float(expected_deviance(means * run.scene.scale)[weights > 0].sum())
+
+
+# Above this mean the expectation is 1 + 1 / (6 m), to a part in ten million.
+MANY = 1e3
+
+
+def expected_deviance(mean: ArrayLike) -> Array:
+    """Return ``E[2 (g ln(g / m) + m - g)]`` for Poisson counts g of mean m.
+
+    Parameters
+    ----------
+    mean : array_like
+        m, zero or more.
+
+    Examples
+    --------
+    >>> from lnocl.stopping import expected_deviance
+    >>> expected_deviance([1e-3, 1.0, 1e6]).round(3)
+    array([0.014, 1.147, 1.   ])
+    """
+    mean = np.asarray(mean, np.float64)
+    least, spline = _deviances()
+    few = spline(np.log(np.clip(mean, least, MANY)))
+    return np.where(mean > MANY, 1.0 + 1.0 / (6.0 * np.maximum(mean, 1.0)), few)
+
+
+@cache
+def _deviances() -> tuple[float, Any]:
+    """Return the least mean tabled, and the expectation as a spline over the means' logarithms."""
+    import scipy.interpolate
+    import scipy.special
+    import scipy.stats
+
+    means = np.geomspace(1e-6, MANY, 400)
+    counts = np.arange(2000)[:, None]
+    terms = scipy.special.xlogy(counts, counts / means) + means - counts
+    deviances = 2.0 * (scipy.stats.poisson.pmf(counts, means) * terms).sum(axis=0)
+    return float(means[0]), scipy.interpolate.CubicSpline(np.log(means), deviances)
+
+
+def make_rule(stop: str | float | None) -> Rule:
+    """Return the rule of this name; held-out counts have chosen the iteration beforehand."""
+    if stop == "discrepancy":
+        return Discrepancy()
+    if stop is None or stop == "held-out":
+        return Never()
+    return Change(float(stop))

@@ -1,0 +1,334 @@
+"""Several images of one sky with what is known of each: the door where input is checked."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lnocl.errors import InputError, LnoclWarning
+from lnocl.scene import units
+
+Array = NDArray[np.float64]
+
+# What to do about masked values of these, which only images and frames of stars may have.
+UNMASK = {
+    "psfs": "repair them first, as lnocl.psf.make_psf does",
+    "background": "fill them and add their mask to mask",
+    "read_noise": "fill them and add their mask to mask",
+    "exposure": "fill them and add their mask to mask",
+}
+
+
+class Observation:
+    """Images of one sky, each with its point spread function, background and bad pixels.
+
+    Everything is checked and copied here, once, and held in float64. The data follow
+    ``images[j] ~ Poisson(exposure[j] (psfs[j] * sky) + background[j]) + Normal(0, read_noise[j])``,
+    the sky moved by ``offsets[j]``.
+
+    Parameters
+    ----------
+    images : array_like, shape (p, ny, nx) or (ny, nx)
+        Counts in electrons per pixel. A pixel that is not finite, or that is masked in a
+        `numpy.ma` array, counts as bad. Counts that are negative after the read noise was
+        added are set to zero, and their number is announced. An `astropy.units.Quantity`, an
+        `astropy.nddata.NDData` such as a CCDData, or a sequence of these, is taken with its unit
+        and mask; counts per time are multiplied by the exposure. Uncertainties are not used.
+        Maps may be masked where the images are; nothing else may hold masked values.
+    psfs : array_like, shape (p, ky, kx) or (ky, kx)
+        Point spread functions, centre at ``(ky // 2, kx // 2)``, of any positive sum: they are
+        normalised here. One serves all images. Negative pixels are kept and announced.
+    background : float or array_like, shape (p,) or (p, ny, nx), optional
+        Known background, electrons per pixel, zero or more. A Quantity may be per time.
+    read_noise : float or array_like, shape (p,) or (p, ny, nx), optional
+        Standard deviation of the read noise, electrons, zero or more. Its square is added to
+        images and background (Snyder's approximation of Gaussian noise by Poisson noise). Of a
+        survey's inverse variance of sky and read noise together it is the root of one over it.
+    mask : array_like of bool, shape (p, ny, nx) or (ny, nx), optional
+        True where a pixel is bad, as in `numpy.ma`. One serves all images.
+    exposure : float or array_like, shape (p,), (p, ny, nx) or (ny, nx), optional
+        Exposure of each image, or of each of its pixels, in seconds or relative to any unit: the
+        sky is in electrons per pixel and this unit; by default 1. More than zero; a map is zero
+        where a pixel saw nothing, which counts as bad.
+    offsets : array_like, shape (p, 2), optional
+        ``(dx, dy)`` of each image, pixels: what lies at (x, y) in the sky lies at
+        ``(x + dx, y + dy)`` in the image. They are taken into the PSFs; no counts are resampled.
+
+    Attributes
+    ----------
+    images, background : ndarray of float64
+        Shapes (p, ny, nx), and (p,) or (p, ny, nx); `read_noise` squared is included in both.
+        Bad pixels of the images hold 0.
+    exposure : ndarray of float64, shape (p,) or (p, ny, nx)
+        As given.
+    offsets : ndarray of float64, shape (p, 2)
+        As given.
+    psfs : ndarray of float64, shape (p, ky, kx)
+        Of unit sum.
+    mask : ndarray of bool, shape (p, ny, nx)
+        True where a pixel is bad.
+
+    Raises
+    ------
+    InputError
+        Where an array has the wrong shape, type or unit, is empty, or holds values out of range;
+        where anything but `images` holds masked values; where a PSF has no positive sum, or it or
+        its sum is not finite; where images or background become infinite by exposure or read
+        noise; where no good pixel is left; where an offset leaves nothing of an image.
+
+    Warns
+    -----
+    LnoclWarning
+        Non-finite pixels that were masked, negative counts set to zero, negative PSF pixels.
+
+    References
+    ----------
+    D. L. Snyder, A. M. Hammoud, R. L. White, J. Opt. Soc. Am. A 10, 1014 (1993), for the read
+    noise; La Camera et al. (2012), Eq. 1 and 7, for the model.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> obs = lnocl.Observation(np.full((2, 8, 8), 5.0), np.ones((3, 3)), background=1.0)
+    >>> obs.n_images, obs.shape, obs.psfs[0].sum()
+    (2, (8, 8), np.float64(1.0))
+    """
+
+    def __init__(
+        self,
+        images: ArrayLike,
+        psfs: ArrayLike,
+        background: ArrayLike = 0.0,
+        read_noise: ArrayLike = 0.0,
+        mask: ArrayLike | None = None,
+        exposure: ArrayLike | None = None,
+        offsets: ArrayLike | None = None,
+    ) -> None:
+        has_exposure = exposure is not None
+        counts, are_rates = units.plain("images", images, has_exposure)
+        given, masked = values_and_mask("images", counts)
+        self.images = _stack("images", given)
+        self.mask = masked.copy().reshape(self.images.shape)
+        self.psfs = _check_psfs(units.bare("psfs", psfs), self.n_images)
+        self.offsets = self._check_offsets(offsets)
+        self._apply_mask(mask)
+        self.exposure = self._check_exposure(1.0 if exposure is None else exposure)
+        self._refuse_all_masked()
+        with np.errstate(over="ignore"):
+            if are_rates:
+                self.images *= _each_pixel(self.exposure)
+            self.background = self._check_background(background, has_exposure)
+            self._add_read_noise(read_noise)
+        self._refuse_overflow()
+        self._clip_negative()
+
+    @property
+    def n_images(self) -> int:
+        """Number of images, p."""
+        return self.images.shape[0]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (ny, nx) of each image."""
+        return self.images.shape[1], self.images.shape[2]
+
+    def _apply_mask(self, mask: ArrayLike | None) -> None:
+        if mask is not None:
+            given = unmasked("mask", mask)
+            if given.dtype != np.bool_:
+                raise InputError(
+                    f"mask is of type {given.dtype}; give booleans, True where a pixel is bad"
+                )
+            if given.shape not in (self.images.shape, self.shape):
+                raise InputError(
+                    f"mask has shape {given.shape}; the images have {self.images.shape}"
+                )
+            self.mask |= given
+        non_finite = ~np.isfinite(self.images) & ~self.mask
+        if n_non_finite := int(non_finite.sum()):
+            self.mask |= non_finite
+            warnings.warn(
+                f"{n_non_finite} image pixels are not finite and were masked",
+                LnoclWarning,
+                stacklevel=3,
+            )
+
+    def _refuse_all_masked(self) -> None:
+        if self.mask.all():
+            raise InputError("all pixels are masked; there is nothing to reconstruct from")
+        self.images[self.mask] = 0.0
+
+    def _check_exposure(self, exposure: ArrayLike) -> Array:
+        """Return exposures; what saw nothing is masked."""
+        values = self._one_or_map("exposure", units.seconds(exposure), 1.0)
+        if values.ndim == 1:
+            _refuse_unless("exposure", values, "finite and more than zero", values > 0)
+            return values
+        _refuse_unless("exposure", values, "finite and not negative", values >= 0)
+        self.mask |= values == 0
+        return values
+
+    def _check_background(self, background: ArrayLike, has_exposure: bool) -> Array:
+        given, are_rates = units.plain("background", background, has_exposure)
+        values = self._one_or_map("background", given, 0.0)
+        _refuse_unless("background", values, "finite and not negative", values >= 0)
+        if not are_rates:
+            return values
+        if values.ndim < self.exposure.ndim:
+            values = _each_pixel(values)
+        return values * (_each_pixel(self.exposure) if values.ndim == 3 else self.exposure)
+
+    def _add_read_noise(self, read_noise: ArrayLike) -> None:
+        sigma = self._one_or_map("read_noise", units.plain("read_noise", read_noise)[0], 0.0)
+        _refuse_unless("read_noise", sigma, "finite and not negative", sigma >= 0)
+        variance = sigma**2
+        _refuse_unless("the square of read_noise", variance, "finite", variance >= 0)
+        self.images += np.where(self.mask, 0.0, _each_pixel(variance))
+        if variance.ndim != self.background.ndim:
+            variance, self.background = _each_pixel(variance), _each_pixel(self.background)
+        self.background = self.background + variance
+
+    def _refuse_overflow(self) -> None:
+        for name, values in (("images", self.images), ("background", self.background)):
+            if not np.isfinite(values).all():
+                raise InputError(
+                    f"the {name}, with exposure and the square of read_noise, must be finite: "
+                    "divide the counts and read_noise by a constant"
+                )
+
+    def _one_or_map(self, name: str, given: ArrayLike, masked: float) -> Array:
+        """Return one number for each image, or for each pixel: one map serves all images."""
+        array, masked_there = values_and_mask(name, given)
+        if array.shape in (self.images.shape, self.shape):
+            bad = self.mask if array.ndim == 3 else self.mask.all(axis=0)
+            masked_there = masked_there & ~bad  # a new array: it may be the caller's
+        refuse_masked(name, masked_there)
+        values = numbers(name, array)
+        if values.ndim < 2:
+            return _one_each(name, values, self.n_images)
+        if values.shape not in (self.images.shape, self.shape):
+            raise InputError(
+                f"{name} has shape {values.shape}; the images have {self.images.shape}"
+            )
+        return np.where(self.mask, masked, values)
+
+    def _check_offsets(self, offsets: ArrayLike | None) -> Array:
+        if offsets is None:
+            return np.zeros((self.n_images, 2))
+        values = numbers("offsets", units.pixels("offsets", offsets))
+        if values.shape != (self.n_images, 2):
+            raise InputError(
+                f"offsets has shape {values.shape}; give (dx, dy) for each of the "
+                f"{self.n_images} images"
+            )
+        size = np.array(self.shape[::-1])
+        _refuse_unless(
+            "offsets",
+            values,
+            f"finite, and less than the images' {size[0]} by {size[1]} pixels",
+            abs(values) < size,
+        )
+        return values
+
+    def _clip_negative(self) -> None:
+        negative = self.images < 0
+        if n_negative := int(negative.sum()):
+            self.images[negative] = 0.0
+            warnings.warn(
+                f"{n_negative} image pixels are negative and were set to 0; if the images are "
+                "background-subtracted, add the background back and give it as background",
+                LnoclWarning,
+                stacklevel=3,
+            )
+
+
+def values_and_mask(name: str, values: ArrayLike) -> tuple[NDArray, NDArray[np.bool_]]:
+    """Return values as an array, and where they are masked, by whatever class or in a list."""
+    try:
+        array: NDArray = np.ma.asanyarray(values)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} cannot be read as an array: its rows differ") from None
+    return np.ma.getdata(array, subok=False), np.ma.getmaskarray(array)
+
+
+def unmasked(name: str, values: ArrayLike) -> NDArray:
+    """Return values as an array; refuse masked ones."""
+    array, masked = values_and_mask(name, values)
+    refuse_masked(name, masked)
+    return array
+
+
+def refuse_masked(name: str, masked: NDArray[np.bool_]) -> None:
+    """Refuse masked values: below a mask there may be anything."""
+    if n_masked := int(np.count_nonzero(masked)):
+        advice = UNMASK.get(name, "fill them or leave them out")
+        raise InputError(f"{name} has {n_masked} masked values; {advice}")
+
+
+def numbers(name: str, values: ArrayLike) -> Array:
+    """Return a float64 copy of real numbers, none of them masked."""
+    array = unmasked(name, values)
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{name} holds {array.dtype}; give real numbers")
+    return array.astype(np.float64)
+
+
+def _stack(name: str, values: ArrayLike) -> Array:
+    """Return a float64 copy of one or several two-dimensional arrays, as a stack."""
+    array = numbers(name, values)
+    if array.ndim not in (2, 3):
+        raise InputError(
+            f"{name} has {array.ndim} dimensions; give two, or three for several {name}"
+        )
+    if array.size == 0:
+        raise InputError(f"{name} is empty: its shape is {array.shape}")
+    return array.reshape((-1, *array.shape[-2:]))
+
+
+def _each_pixel(values: Array) -> Array:
+    """Return values that broadcast over images."""
+    return values if values.ndim == 3 else values[:, None, None]
+
+
+def _one_each(name: str, values: Array, n_images: int) -> Array:
+    if values.ndim > 1 or values.size not in (1, n_images):
+        raise InputError(
+            f"{name} has shape {values.shape}; give one number, or one for each of the "
+            f"{n_images} images"
+        )
+    return np.array(np.broadcast_to(values, (n_images,)))
+
+
+def _refuse_unless(name: str, values: Array, requirement: str, holds: NDArray[np.bool_]) -> None:
+    good = holds & np.isfinite(values)
+    if not good.all():
+        raise InputError(f"{name} must be {requirement}; {values[~good].flat[0]:g} was given")
+
+
+def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
+    stack = _stack("psfs", psfs)
+    if stack.shape[0] not in (1, n_images):
+        raise InputError(
+            f"{stack.shape[0]} psfs for {n_images} images; give one, or one for each image"
+        )
+    if not np.isfinite(stack).all():
+        raise InputError("psfs hold values that are not finite; repair them first")
+    with np.errstate(over="ignore", invalid="ignore"):
+        sums, sizes = (values.sum(axis=(1, 2), keepdims=True) for values in (stack, abs(stack)))
+        # Rounding leaves a sum where values cancel; what overflows is not above itself.
+        unusable = ~(sums > np.finfo(np.float64).eps * sizes)
+    if unusable.any():
+        j = int(np.argmax(unusable))
+        raise InputError(
+            f"psf {j} has the sum {sums.flat[j]:g}; it must be positive, finite and more than the "
+            "rounding of its values"
+        )
+    if n_negative := int((stack < 0).sum()):
+        warnings.warn(
+            f"{n_negative} psf pixels are negative and were kept", LnoclWarning, stacklevel=3
+        )
+    stack /= sums
+    return np.repeat(stack, n_images, axis=0) if len(stack) < n_images else stack

@@ -1,0 +1,50 @@
+"""How many unobserved pixels a source that runs over the edge of the images needs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lnocl.scene.observation import Array, Observation
+
+# Share of a PSF's light within the radius that is enough for a pad, and the share of the shorter
+# side of the images beyond which none is asked for (benchmarks/frames.py, docs/frames.md).
+LIGHT = 0.9
+SHARE_OF_SIDE = 0.5
+
+
+def recommend_pad(observation: Observation) -> int:
+    """Return the pad that a source running over the edge needs.
+
+    The largest radius within which the PSFs have nine tenths of their light, in whole pixels; at
+    most half the shorter side of the images, since what lies farther away is smooth.
+
+    Parameters
+    ----------
+    observation : Observation
+        The images and their PSFs.
+
+    Returns
+    -------
+    int
+        Pixels, 1 or more.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> from lnocl.edges import recommend_pad
+    >>> y, x = np.indices((31, 31)) - 15
+    >>> gaussian = np.exp(-(x**2 + y**2) / 18)
+    >>> recommend_pad(lnocl.Observation(np.ones((64, 64)), gaussian))
+    7
+    """
+    most = max(1, int(SHARE_OF_SIDE * min(observation.shape)))
+    return min(max(1, *(_radius(psf, LIGHT) for psf in observation.psfs)), most)
+
+
+def _radius(psf: Array, share: float) -> int:
+    """Return the least whole radius, pixels, that holds this share of a PSF's light."""
+    y, x = np.ogrid[: psf.shape[0], : psf.shape[1]]
+    r = np.ceil(np.hypot(y - psf.shape[0] // 2, x - psf.shape[1] // 2)).astype(int)
+    light = np.cumsum(np.bincount(r.ravel(), weights=psf.ravel()))
+    return int(np.argmax(light >= share))

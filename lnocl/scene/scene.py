@@ -1,0 +1,412 @@
+"""An observation laid on the grid of the transform, at unit mean: what an engine is given."""
+
+from __future__ import annotations
+
+import logging
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lnocl.errors import InputError, LnoclWarning
+from lnocl.scene.observation import Array, Observation, numbers
+from lnocl.scene.padding import recommend_pad
+from lnocl.scene.penalty import MOST_WEIGHT, Penalty
+from lnocl.scene.shifting import MARGIN, Stamp, place
+
+log = logging.getLogger("lnocl")
+
+MAX_AXIS = 8192
+
+# Below this share of its maximum the total weight of a pixel of the extended source is taken as
+# "not observed" (the threshold of Bertero & Boccacci 2005, A&A 437, 369, for boundary effects).
+OBSERVED_SHARE = 0.01
+
+# Of a PSF's peak: what it may ring by, moved by half a pixel, before that is worth a warning.
+# Gaussians do not ring where they are centred on a pixel, sharp ones do where they are not.
+MOST_RINGING = 0.01
+
+# The one division guard: where the model is not above this (images have unit mean) the ratio is
+# taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
+LEAST_MODEL = 2.0**-64
+
+NO_PENALTY = Penalty()
+
+# The edge-preserving term takes for an edge what is this many times the mean of a flat extended
+# source: docs/sgp.md.
+EDGE = 3.0
+
+
+class Scene:
+    """What is modelled, on a grid of powers of two, scaled to images of about unit mean.
+
+    The scale of images and background is a power of two, so that it changes no digit. Exposures
+    are taken relative to their mean: as ``m_j = e_j (K_j * f + sum_s c_s P_js) + b_j`` is linear,
+    one of a whole image goes into its PSF, and a map e_j(n) into the weights, with images and
+    background divided by it, which leaves the objective as it is but for the weights.
+
+    Parameters
+    ----------
+    observation : Observation
+        The images and what is known of them.
+    stars : sequence of (x, y)
+        Positions of the point sources in pixels of the first image less its offset, 0-based, x
+        along columns.
+    penalty : Penalty
+        On the extended source.
+    pad : int or "auto"
+        Unobserved pixels kept round the images, at least; "auto": `edges.recommend_pad`.
+    leeway : float
+        Pixels that a star may be moved later on, by `move_stars`.
+
+    Attributes
+    ----------
+    grid : tuple of int
+        Shape (Ny, Nx) of the grid, powers of two; the images lie at its origin.
+    stars : ndarray of float64, shape (n, 2)
+        Positions.
+    scale : float
+        Electrons per unit of the images.
+    unit : float
+        Electrons per exposure and unit of the estimate.
+    mu, smoothing : float
+        Weights of the penalty, scaled.
+    edge : float
+        delta of the edge-preserving term, scaled; 0 where there is no such term.
+    weights : ndarray of bool or float64, shape (p, Ny, Nx), or None
+        True where a pixel was observed, or its relative exposure where exposures are maps; None
+        where all were observed alike.
+    star_weights : ndarray of float64, shape (n,)
+        ``sum_j <P_js, w_j>``, the share of each star's light that was observed, summed.
+
+    Raises
+    ------
+    InputError
+        A star outside the images, unobserved or masked; penalty or pad out of range; images too
+        large for the transform; images or exposures too large to be summed; a sky, images over
+        exposures, that is no finite number, or 0.
+
+    Warns
+    -----
+    LnoclWarning
+        A PSF that is larger than the grid, whose wings wrap round; offsets larger than what is
+        unobserved beside the images; a PSF that rings where it is moved between pixels.
+    """
+
+    def __init__(
+        self,
+        observation: Observation,
+        stars: ArrayLike = (),
+        penalty: Penalty = NO_PENALTY,
+        pad: int | str = 0,
+        leeway: float = 0.0,
+    ) -> None:
+        self.observation = observation
+        self.stars = _check_stars(stars, observation)
+        self._leeway = leeway
+        if isinstance(pad, str) and pad == "auto":
+            pad = recommend_pad(observation)
+            log.info("pad: %d pixels, by the PSFs", pad)
+        self.grid = _grid(observation.shape, pad)
+        self._warn_of_large_psf()
+        self._warn_of_wrapped_offsets()
+        # A power of two just above the mean; 1 where that is 0.
+        self.scale = 2.0 ** math.frexp(_mean("images", observation.images[~observation.mask]))[1]
+        exposure = observation.exposure
+        has_map = exposure.ndim == 3
+        mean_exposure = _mean("exposures", exposure[~observation.mask] if has_map else exposure)
+        self.unit = self._sky_unit(mean_exposure)
+        self.mu = self._scaled("mu", penalty.mu, self.unit / mean_exposure)
+        self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / mean_exposure)
+        relative = exposure / mean_exposure
+        self._gains = np.ones(self.n_images) if has_map else relative
+        self.weights = self._weigh(relative if has_map else None)
+        self.star_weights = self._weigh_stars()
+        self._refuse_unseen_stars()
+        self._warn_of_ringing()
+        self.edge = EDGE * self._read_off()[1] if self.smoothing else 0.0
+
+    def _scaled(self, name: str, weight: float, factor: float) -> float:
+        """Return a weight of the penalty, scaled; refuse one that is too large for float32."""
+        if weight * factor > MOST_WEIGHT:
+            raise InputError(
+                f"{name} {weight:g} is too large for images of about {self.scale:g} electrons per "
+                f"pixel; the most that means anything there is {MOST_WEIGHT / factor:g}"
+            )
+        return float(weight) * factor if weight else 0.0  # the factor may be infinite
+
+    def _sky_unit(self, mean_exposure: float) -> float:
+        """Return the unit of the sky; refuse one in which its flux is no number, or lost."""
+        unit = self.scale / mean_exposure
+        if unit == 0 or not math.isfinite(unit * math.prod(self.grid)):
+            raise InputError(
+                f"images of about {self.scale:g} electrons per pixel at exposures of about "
+                f"{mean_exposure:g} leave a sky that no number holds: divide or multiply one of "
+                "them by a constant"
+            )
+        return unit
+
+    def move_stars(self, stars: ArrayLike) -> None:
+        """Give the stars other positions, none farther away than the leeway.
+
+        They may leave the images, but a star that would go where all is masked stays where it was.
+        """
+        before, weights = self.stars, self.star_weights
+        self.stars = numbers("stars", stars)
+        self.star_weights = self._weigh_stars()
+        unseen = self.star_weights < OBSERVED_SHARE * self.n_images
+        self.stars = np.where(unseen[:, None], before, self.stars)
+        self.star_weights = np.where(unseen, weights, self.star_weights)
+
+    @property
+    def has_exposure_map(self) -> bool:
+        """Whether the weights are exposures, not only whether a pixel was observed."""
+        return self.weights is not None and self.weights.dtype != np.bool_
+
+    @property
+    def n_images(self) -> int:
+        """Number of images, p."""
+        return self.observation.n_images
+
+    @property
+    def n_stars(self) -> int:
+        """Number of point sources."""
+        return len(self.stars)
+
+    def images(self) -> Array:
+        """Return the images on the grid, scaled, shape (p, Ny, Nx); 0 where not observed."""
+        return self._per_exposure(self._on_grid(self.observation.images / self.scale), 0.0)
+
+    def background(self) -> Array:
+        """Return the background, scaled, shape (p,) or (p, Ny, Nx); 1 where not observed."""
+        background = self.observation.background / self.scale
+        if self.has_exposure_map and background.ndim == 1:
+            background = np.broadcast_to(background[:, None, None], self.observation.images.shape)
+        if background.ndim == 1:
+            return background
+        return self._per_exposure(self._on_grid(background, fill=1.0), 1.0)
+
+    def _per_exposure(self, images: Array, fill: float) -> Array:
+        if not self.has_exposure_map:
+            return images
+        assert self.weights is not None
+        observed = self.weights > 0
+        return np.divide(images, self.weights, out=np.full_like(images, fill), where=observed)
+
+    def psf(self, j: int) -> Array:
+        """Return the PSF of image j on the grid, shape (Ny, Nx), its peak at the offset."""
+        return self._place(j, 0.0, 0.0).on_grid(self.grid)
+
+    def star_image(self, j: int, s: int) -> Array:
+        """Return P_js, the PSF of image j centred on star s, shape (Ny, Nx)."""
+        return self.star_stamp(j, s).on_grid(self.grid)
+
+    def star_stamp(self, j: int, s: int) -> Stamp:
+        """Return P_js, where it is not 0."""
+        return self._place(j, *self.stars[s])
+
+    def scaled_psfs(self) -> list[Array]:
+        """Return the PSFs times the relative exposure of their image, where that is a number."""
+        return list(self._gains[:, None, None] * self.observation.psfs)
+
+    def _place(self, j: int, x: float, y: float) -> Stamp:
+        dx, dy = self.observation.offsets[j]
+        return place(self._gains[j] * self.observation.psfs[j], self.grid, x + dx, y + dy)
+
+    def star_rows(self, s: int) -> NDArray[np.bool_]:
+        """Return the rows of the grid, shape (Ny,), that the images of star s may reach into."""
+        rows = np.zeros(self.grid[0], bool)
+        for j in range(self.n_images):
+            stamp = self.star_stamp(j, s)
+            may_be_lit = (stamp.values != 0).any(axis=1) | (self._leeway > 0)
+            rows[stamp.rows(self.grid)[may_be_lit]] = True
+        if self._leeway:
+            reach = int(np.ceil(self._leeway)) + MARGIN + 1
+            rows = np.any([np.roll(rows, step) for step in range(-reach, reach + 1)], axis=0)
+        return rows
+
+    def observed(self, total_weight: Array) -> NDArray[np.bool_]:
+        """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""
+        return total_weight >= OBSERVED_SHARE * total_weight.max()
+
+    def start(
+        self, extended: ArrayLike | None, star_fluxes: ArrayLike | None
+    ) -> tuple[Array, Array]:
+        """Return the estimate to begin with, on the grid and scaled.
+
+        Parameters
+        ----------
+        extended : array_like, shape (ny, nx), optional
+            Extended source, electrons per pixel, finite and not negative. Beyond the images the
+            grid is filled with its mean. By default flat, with the flux that the stars leave.
+        star_fluxes : array_like, shape (n,), optional
+            Electrons, finite and not negative. By default a least-squares fit of the star
+            images and one constant to the images.
+
+        Raises
+        ------
+        InputError
+            Where either has the wrong shape, a negative, masked or non-finite value.
+        """
+        if extended is None or star_fluxes is None:
+            default_fluxes, level = self._read_off()
+        if star_fluxes is None:
+            fluxes = default_fluxes
+        else:
+            fluxes = _check_start("initial_star_fluxes", star_fluxes, (self.n_stars,)) / self.unit
+        if extended is None:
+            return np.full(self.grid, level), fluxes
+        given = _check_start("initial_extended", extended, self.observation.shape) / self.unit
+        return self._on_grid(given, fill=given.mean()), fluxes
+
+    def _read_off(self) -> tuple[Array, float]:
+        """Read star fluxes and the level of a flat extended source off the data."""
+        images, background = self.images(), self.background()
+        if background.ndim == 1:
+            background = background[:, None, None]
+        weights = np.ones(images.shape, bool) if self.weights is None else self.weights > 0
+        excess = np.where(weights, images - background, 0.0)
+        n_observed = weights.sum()
+        mean = excess.sum() / n_observed
+        normal = np.zeros((self.n_stars, self.n_stars))
+        moment = np.zeros(self.n_stars)
+        for j in range(self.n_images):
+            stars = np.array([self.star_image(j, s)[weights[j]] for s in range(self.n_stars)])
+            if stars.size:  # there are stars, and not all of the image is masked
+                centred = stars - stars.mean(axis=1, keepdims=True)
+                normal += centred @ centred.T
+                moment += centred @ excess[j][weights[j]]
+        # A star or a sky that starts at zero stays there, so each keeps a small share.
+        least = max(1e-3 * mean, np.finfo(np.float32).eps)
+        fluxes = np.maximum(
+            np.linalg.lstsq(normal, moment, rcond=None)[0], least * math.prod(self.grid) / 100
+        )
+        level = mean - float(fluxes @ self.star_weights) / n_observed
+        return fluxes, max(level, least)
+
+    def _weigh_stars(self) -> Array:
+        if self.weights is None:
+            return np.full(self.n_stars, float(self.n_images))
+        return np.array([self._weigh_star(s) for s in range(self.n_stars)])
+
+    def _refuse_unseen_stars(self) -> None:
+        for (x, y), weight in zip(self.stars, self.star_weights, strict=True):
+            if weight < OBSERVED_SHARE * self.n_images:
+                raise InputError(
+                    f"the star at ({x:g}, {y:g}) lies where all images are masked; "
+                    "leave it out or mend the mask"
+                )
+
+    def _weigh_star(self, s: int) -> float:
+        assert self.weights is not None
+        total = 0.0
+        for j, weights in enumerate(self.weights):
+            stamp = self.star_stamp(j, s)
+            seen = weights[np.ix_(stamp.rows(self.grid), stamp.columns(self.grid))]
+            total += float((stamp.values * seen).sum())
+        return total
+
+    def _weigh(self, relative: Array | None) -> NDArray[Any] | None:
+        """Return the weights for relative exposures, where they are a map."""
+        observed = ~self.observation.mask
+        if relative is not None:
+            return self._on_grid(np.where(observed, relative, 0.0))
+        if observed.all() and self.grid == self.observation.shape:
+            return None
+        return self._on_grid(observed)
+
+    def _on_grid(self, array: NDArray, fill: float = 0.0) -> NDArray:
+        ny, nx = self.observation.shape
+        if self.grid == (ny, nx):
+            return array
+        laid = np.full((*array.shape[:-2], *self.grid), fill, dtype=array.dtype)
+        laid[..., :ny, :nx] = array
+        return laid
+
+    def _warn_of_wrapped_offsets(self) -> None:
+        offsets = np.ceil(abs(self.observation.offsets).max(axis=0)).astype(int)[::-1]
+        room = np.subtract(self.grid, self.observation.shape)
+        if (offsets > room).any():
+            warnings.warn(
+                f"the images are shifted by up to {offsets.max()} pixels, and what leaves one edge "
+                f"comes in at the opposite one: give pad {offsets.max()} or more",
+                LnoclWarning,
+                stacklevel=5,
+            )
+
+    def _warn_of_ringing(self) -> None:
+        """Warn of PSFs that are moved between pixels and are sharper than pixels can hold."""
+        for j, (psf, offset) in enumerate(
+            zip(self.observation.psfs, self.observation.offsets, strict=True)
+        ):
+            moved = np.concatenate([[offset], self.stars + offset])
+            may_move = self._leeway > 0 and self.n_stars > 0
+            if not may_move and (moved == np.round(moved)).all():
+                continue
+            dark = min(psf.min(), 0.0) - place(psf, self.grid, 0.5, 0.5).values.min()
+            if dark > MOST_RINGING * psf.max():
+                warnings.warn(
+                    f"psf {j} is sharper than its pixels can hold: moved between pixels it rings "
+                    f"by up to {dark / psf.max():.1%} of its peak, at whole pixels not",
+                    LnoclWarning,
+                    stacklevel=5,
+                )
+
+    def _warn_of_large_psf(self) -> None:
+        psf_shape = self.observation.psfs.shape[1:]
+        if any(k > n for k, n in zip(psf_shape, self.grid, strict=True)):
+            warnings.warn(
+                f"the psf {psf_shape} is larger than the grid {self.grid}: its wings wrap "
+                "round; crop it, or give pad to enlarge the grid",
+                LnoclWarning,
+                stacklevel=5,
+            )
+
+
+def _mean(name: str, values: Array) -> float:
+    with np.errstate(over="ignore"):
+        mean = float(values.mean())
+    if not math.isfinite(2.0 * mean):  # the power of two above it
+        raise InputError(f"the {name} are too large to be summed: divide them by a constant")
+    return mean
+
+
+def _grid(shape: tuple[int, int], pad: object) -> tuple[int, int]:
+    if not (isinstance(pad, (int, np.integer)) and pad >= 0):
+        raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
+    ny, nx = (max(2, 1 << (n + 2 * int(pad) - 1).bit_length()) for n in shape)
+    if max(ny, nx) > MAX_AXIS:
+        raise InputError(
+            f"images of {shape} with pad={pad} need a grid of {(ny, nx)}; "
+            f"the largest axis is {MAX_AXIS}: cut the images or pad less"
+        )
+    return ny, nx
+
+
+def _check_stars(stars: ArrayLike, observation: Observation) -> Array:
+    positions = numbers("stars", stars)
+    if positions.size == 0:
+        return np.zeros((0, 2))
+    if positions.ndim != 2 or positions.shape[1] != 2:
+        raise InputError(f"stars has shape {positions.shape}; give pairs (x, y)")
+    ny, nx = observation.shape
+    for position in positions:
+        x, y = (position + observation.offsets).T
+        if not ((x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)).any():
+            raise InputError(
+                f"the star at ({position[0]:g}, {position[1]:g}) lies outside the images: x must "
+                f"be in [0, {nx - 1}] and y in [0, {ny - 1}]"
+                + (" of one of them, its offset added" if observation.offsets.any() else "")
+            )
+    return positions
+
+
+def _check_start(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = numbers(name, values)
+    if array.shape != shape:
+        raise InputError(f"{name} has shape {array.shape}; it must have {shape}")
+    if not (np.isfinite(array).all() and (array >= 0).all()):
+        raise InputError(f"{name} must be finite and not negative")
+    return array

@@ -1,0 +1,1 @@
+"""Simulated telescopes, targets and images."""

@@ -1,0 +1,1 @@
+"""The iterations, and the fit of star fluxes and positions."""

@@ -1,0 +1,1 @@
+"""The paper's experiment, the demo, and benchmarks of speed against accuracy."""

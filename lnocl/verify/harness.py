@@ -1,0 +1,229 @@
+"""Launching single kernels on arrays in natural order, random ones to begin with."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from lnocl.errors import DeviceError
+from lnocl.opencl.fft import READ_WRITE, Launcher, Layout, bit_reversed
+from lnocl.opencl.program import STEP_SOURCES, Program, Tuning
+from lnocl.scene.scene import LEAST_MODEL
+
+# What scenes have, as `Program` is told; together everything that it can be told.
+THREE_IMAGES = "three images, two stars, mask, background map, smoothing"
+SCENES: dict[str, dict[str, Any]] = {
+    "plain": {"n_images": 1},
+    "two images, star, mu": {"n_images": 2, "n_stars": 1, "has_mu": True},
+    THREE_IMAGES: {
+        "n_images": 3,
+        "n_stars": 2,
+        "has_weights": True,
+        "has_background_map": True,
+        "has_smoothing": True,
+    },
+    "mask, mu, smoothing": {
+        "n_images": 1,
+        "has_weights": True,
+        "has_mu": True,
+        "has_smoothing": True,
+    },
+    "exposure map, mu": {
+        "n_images": 2,
+        "n_stars": 1,
+        "has_mu": True,
+        "has_weights": True,
+        "has_exposure_map": True,
+        "has_background_map": True,
+    },
+}
+
+CANARY = np.frombuffer(b"\xa5" * 64, np.uint8)
+
+
+class Rig:
+    """Puts arrays in natural order on a device, launches kernels, and takes results off it.
+
+    Behind every array lies a canary, which nothing may write to.
+
+    Parameters
+    ----------
+    context : pyopencl.Context
+        Of one device.
+    grid, dtype, tuning
+        As for `lnocl.opencl.program.Program`.
+    **scene
+        What the scene has, as `lnocl.opencl.program.Program` is told, such as one of `SCENES`.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        grid: tuple[int, int],
+        dtype: DTypeLike,
+        tuning: Tuning | None = None,
+        **scene: Any,
+    ) -> None:
+        self.program = Program(
+            context,
+            grid,
+            np.dtype(dtype),
+            tuning,
+            STEP_SOURCES,
+            least_model=LEAST_MODEL,
+            **scene,
+        )
+        self.layout, self.launcher = Layout(self.program), Launcher(self.program)
+        self.dtype, self.grid, self.scene = self.program.dtype, grid, scene
+        self._buffers: list[cl.Buffer] = []
+
+    def put(self, values: ArrayLike, dtype: DTypeLike | None = None) -> cl.Buffer:
+        """Return a buffer that holds values as they lie, and the canary behind them."""
+        packed = np.ascontiguousarray(values, dtype or self.dtype)
+        data = np.concatenate([packed.reshape(-1).view(np.uint8), CANARY])
+        flags = READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+        self._buffers.append(cl.Buffer(self.program.context, flags, hostbuf=data))
+        return self._buffers[-1]
+
+    def take(self, buffer: cl.Buffer, shape: Any) -> NDArray:
+        """Return what a buffer holds, after looking at the canaries of all buffers."""
+        for each in self._buffers:
+            if not np.array_equal(self._bytes(each)[-len(CANARY) :], CANARY):
+                raise DeviceError("written past the end of an array")
+        return self._bytes(buffer)[: -len(CANARY)].view(self.dtype).reshape(shape)
+
+    def forget(self) -> None:
+        """Let go of all buffers put so far."""
+        self._buffers.clear()
+
+    def _bytes(self, buffer: cl.Buffer) -> NDArray[np.uint8]:
+        data = np.empty(buffer.size, np.uint8)
+        cl.enqueue_copy(self.launcher.queue, data, buffer)
+        return data
+
+    def put_pixels(self, pixels: Iterable[NDArray]) -> cl.Buffer:
+        """Return a buffer of arrays of pixels, in the kernels' order."""
+        return self.put([self.layout.pack_pixels(a) for a in pixels])
+
+    def put_spectra(self, row_spectra: Iterable[NDArray]) -> cl.Buffer:
+        """Return a buffer of row spectra, in the kernels' order."""
+        return self.put([self.layout.pack_spectra(a) for a in row_spectra])
+
+    def take_pixels(self, buffer: cl.Buffer) -> NDArray:
+        """Return the one array of pixels (1, Ny, Nx) that a buffer holds."""
+        packed = self.take(buffer, self.layout.pixels_shape)
+        return self.layout.unpack_pixels(packed)[None]
+
+    def take_spectra(self, buffer: cl.Buffer, count: int = 1) -> NDArray:
+        """Return the row spectra (count, Ny, Nx // 2 + 1) that a buffer holds."""
+        packed = self.take(buffer, (count, *self.layout.spectra_shape))
+        return np.array([self.layout.unpack_spectra(a) for a in packed])
+
+    def take_sums(self, buffer: cl.Buffer, n_sums: int) -> NDArray:
+        """Return sums over pixels, of the pairs that each block left in a buffer."""
+        return self.take(buffer, (-1, n_sums, 2)).astype(float).sum(axis=(0, 2))
+
+    def empty_pixels(self) -> cl.Buffer:
+        """Return a buffer for one array of pixels."""
+        return self.put(np.full(self.layout.pixels_shape, np.nan))
+
+    def empty_spectra(self) -> cl.Buffer:
+        """Return a buffer for one array of row spectra."""
+        return self.put(np.full(self.layout.spectra_shape, np.nan))
+
+    def empty_sums(self, n_sums: int, n_arrays: int = 1) -> cl.Buffer:
+        """Return a buffer for the pairs that each block leaves of so many sums."""
+        return self.put(np.full((self.program.row_blocks * n_arrays, n_sums, 2), np.nan))
+
+    def otf_parts(self, otf: NDArray) -> tuple[NDArray, NDArray]:
+        """Return an OTF (Ny, Nx // 2 + 1) as the kernels keep it: columns and edge."""
+        ny = self.grid[0]
+        order = bit_reversed(ny)
+        columns = self.layout.columns_of(otf)
+        columns[:, 0] = (otf[:, 0] + otf[:, -1]) / 2
+        edge = ((otf[:, 0] - otf[:, -1]) / 2)[order]
+        packed = self.layout.pack_columns(columns[order])[:, :ny]
+        return packed, np.stack([edge.real, edge.imag], axis=-1)
+
+
+def rounded(array: ArrayLike, dtype: DTypeLike) -> NDArray:
+    """Round inputs to the precision first, so that only the kernel's own error is left."""
+    array = np.asarray(array)
+    if np.iscomplexobj(array):
+        return rounded(array.real, dtype) + 1j * rounded(array.imag, dtype)
+    return array.astype(dtype).astype(float)
+
+
+def inputs(rig: Rig) -> SimpleNamespace:
+    """Return random inputs for every kernel, in natural order."""
+    rng = np.random.default_rng(rig.grid[0] * 31 + rig.grid[1])
+    ny, nx = rig.grid
+    p, n = rig.program.n_images, rig.program.n_stars
+    has_map, has_weights, has_exposure_map, has_mu, has_smoothing = (
+        rig.scene.get(f"has_{what}", False)
+        for what in ("background_map", "weights", "exposure_map", "mu", "smoothing")
+    )
+    own = functools.partial(rounded, dtype=rig.dtype)
+
+    def half_spectra(count: int) -> NDArray:
+        return own(np.fft.rfft(rng.normal(size=(count, ny, nx)), axis=-1))
+
+    model = rng.uniform(0.5, 3.0, (p, ny, nx))
+    model[:, 0, :2] = -1.0  # the division guard
+    images = rng.poisson(3.0, (p, ny, nx)) / 3.0
+    images[:, 0, :2] = 0.0, 1.0
+    weights = rng.random((p, ny, nx)) > 0.2
+    if has_exposure_map:
+        weights = own(weights * rng.uniform(0.5, 2.0, weights.shape))
+    # One star is seen in all blocks; of two, each in half of them, the first round the edge.
+    row_blocks = rig.program.row_blocks
+    star_blocks = row_blocks if n < 2 else max(1, row_blocks // 2)
+    first_blocks = np.array([row_blocks - 1, 0])[:n]
+    star_images = own(rng.random((n, p, ny, nx)))
+    for images_of_star, first in zip(star_images, first_blocks, strict=True):
+        dark = np.setdiff1d(np.arange(ny), rig.layout.rows_of(first, star_blocks))
+        images_of_star[:, dark] = 0.0
+    return SimpleNamespace(
+        p=p,
+        n=n,
+        pixels=own(rng.normal(size=(1, ny, nx))),
+        columns=own(rng.normal(size=(ny, nx // 2)) + 1j * rng.normal(size=(ny, nx // 2))),
+        spectrum=half_spectra(1),
+        spectra=half_spectra(p),
+        otfs=own(np.fft.rfft2(rng.normal(size=(p, ny, nx))) / (ny * nx)),
+        model_spectra=own(np.fft.rfft(model, axis=-1) / nx),
+        images=own(images),
+        weights=weights if has_weights else None,
+        has_exposure_map=has_exposure_map,
+        background=own(rng.uniform(0.1, 0.2, (p, ny, nx) if has_map else (p, 1, 1))),
+        star_images=star_images,
+        star_blocks=star_blocks,
+        first_blocks=first_blocks,
+        star_fluxes=own(rng.uniform(0.1, 1.0, n)),
+        star_weights=own(rng.uniform(1.0, 2.0, n)),
+        star_corrections=own(rng.uniform(0.9, 1.1, n)),
+        extended=own(rng.random((1, ny, nx))),
+        correction_spectra=own(np.fft.rfft(rng.uniform(-0.1, 2.0, (1, ny, nx)), axis=-1) / nx),
+        inverse_weight=(
+            own(np.where(rng.random((1, ny, nx)) > 0.2, rng.random((1, ny, nx)), 0.0))
+            if has_weights
+            else 1.0 / p
+        ),
+        # A step of so much less than f here, of more there, where the projection cuts it off; most
+        # changes have one sign, so that their sums are not small differences.
+        previous=own(rng.random((1, ny, nx)) * 0.5),
+        gradient=own(rng.uniform(-0.2, 2.0, (1, ny, nx))),
+        shift=own(rng.random((1, ny, nx))),
+        slope=own(rng.uniform(-0.5, 1.0, (1, ny, nx))) if has_smoothing else 0.0,
+        curvature=own(rng.random((1, ny, nx))) if has_smoothing else 0.0,
+        smoothing=float(np.float32(0.4)) if has_smoothing else 0.0,
+        edge=float(np.float32(0.3)),
+        reach=own(rng.uniform(-0.1, 1.0, (n, ny, nx))),
+        mu=float(np.float32(0.25)) if has_mu else 0.0,
+    )

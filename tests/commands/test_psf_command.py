@@ -1,0 +1,385 @@
+"""The command ``lnocl psf``: what it writes, what it says, and what it refuses."""
+
+import hashlib
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.io.fits.scripts import fitscheck
+
+import lnocl
+from lnocl.commands import cli
+from lnocl.psf.make import make_psf, make_psfs
+
+SHAPE = (61, 70)
+Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]]
+
+
+def star(x, y, peak=9000.0, width=2.0):
+    return peak * np.exp(-((X - x) ** 2 + (Y - y) ** 2) / (2 * width**2))
+
+
+FRAME = 40 + star(30.3, 28.8) + star(50, 45, 1500.0) + np.random.default_rng(4).normal(0, 3, SHAPE)
+BAD = np.zeros(SHAPE)
+BAD[29, 31] = 2
+BAD[35, 25] = np.nan
+BAD[36, 25] = -1
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arrays = {
+        "star": FRAME,
+        "cube": [FRAME, FRAME],
+        "one": [FRAME],
+        "mask": BAD,
+        "oblong": BAD.T,
+        "masks": [BAD, BAD],
+        "none": np.ones(SHAPE),
+        "nan": np.full(SHAPE, np.nan),
+        "sharp": star(30.4, 28.6, width=0.4),
+    }
+    for name, array in arrays.items():
+        fits.writeto(f"{name}.fits", np.array(array), fits.Header({"BUNIT": "adu"}))
+    Path("there.fits").write_bytes(b"old")
+    Path("there.png").write_bytes(b"old")
+    return tmp_path
+
+
+def run(*options, frame="star.fits", output="out.fits"):
+    return cli.main(["psf", frame, "-o", output, *options])
+
+
+def complaint(captured):
+    assert captured.out == ""
+    *warned, error = captured.err.splitlines()
+    assert all(line.startswith("lnocl: warning: ") for line in warned)
+    assert error.startswith("lnocl: error: ")
+    return error.removeprefix("lnocl: error: ")
+
+
+OPTIONS = {
+    "nothing": ([], {}),
+    "star": (["--star", "49,46"], {"position": (49, 46)}),
+    "mask": (["--mask", "mask.fits"], {"mask": BAD != 0}),
+    "saturation": (["--saturation", "8000"], {"saturation": 8000.0}),
+    "background": (["--background", "41.5"], {"background": 41.5}),
+    "negative background": (["--background", "-3"], {"background": -3.0}),
+    "auto": (["--background", "auto"], {}),
+    "no recentring": (["--no-recentre"], {"recentre": False}),
+    "rotation": (["--rotate", "-30"], {"rotate": -30.0}),
+    "size": (["--size", "20"], {"size": 20}),
+    "clipping": (["--clip-negative"], {"clip_negative": True}),
+    "all": (
+        [
+            *("--star", "49,46", "--mask", "mask.fits", "--saturation", "1400"),
+            *("--background", "41.5", "--rotate", "30", "--size", "15", "--clip-negative"),
+        ],
+        {
+            "position": (49, 46), "mask": BAD != 0, "saturation": 1400.0, "background": 41.5,
+            "rotate": 30.0, "size": 15, "clip_negative": True,
+        },
+    ),
+}  # fmt: skip
+
+
+class TestWhatItMakes:
+    @pytest.mark.filterwarnings("ignore::lnocl.errors.LnoclWarning")
+    @pytest.mark.parametrize(("given", "meant"), OPTIONS.values(), ids=OPTIONS)
+    def test_each_option_is_that_of_the_function(self, capsys, given, meant):
+        assert run(*given) == 0
+        expected = make_psf(FRAME, **meant)
+        psf = fits.getdata("out.fits")
+        np.testing.assert_array_equal(psf, expected.psf)
+        k = len(psf)
+        assert capsys.readouterr().out.splitlines() == [
+            *expected.steps,
+            f"written to out.fits: a PSF of {k} x {k} pixels, the star's centre at "
+            f"({k // 2}, {k // 2})",
+        ]
+
+    def test_several_angles_give_a_cube(self, capsys):
+        assert run("--rotate", "0", "45", "90", "135", "--size", "20") == 0
+        expected = make_psfs(FRAME, [0, 45, 90, 135], size=20)
+        np.testing.assert_array_equal(
+            fits.getdata("out.fits"), [each.psf for each in expected]
+        )  # fmt: skip
+        lines = []
+        for j, (each, angle) in enumerate(zip(expected, (0, 45, 90, 135), strict=True), 1):
+            lines += [f"PSF {j} of 4, at {angle} degrees:", *each.steps[4:]]
+        assert capsys.readouterr().out.splitlines() == [
+            *expected[0].steps[:4],
+            *lines,
+            "written to out.fits: 4 PSFs of 20 x 20 pixels, the star's centre at (10, 10)",
+        ]
+        assert [line.partition(":")[0] for line in expected[0].steps[:4]] == [
+            "star", "background", "bad pixels", "centre",
+        ]  # fmt: skip
+
+    def test_without_a_size_all_angles_have_the_largest_common_one(self):
+        assert run("--rotate", "0", "45") == 0
+        assert fits.getdata("out.fits").shape[1:] == make_psf(FRAME, rotate=45).psf.shape
+
+    def test_a_cube_of_one_image_will_do(self):
+        assert run(frame="one.fits") == 0
+        assert fits.getdata("out.fits").ndim == 2
+
+    def test_deconvolve_takes_it(self, capsys):
+        assert run("--size", "21", "--rotate", "0", "90", "--clip-negative", "--quiet") == 0
+        image = (
+            "deconvolve",
+            "cube.fits",
+            "--gain",
+            "1",
+            "--psf",
+            "out.fits",
+            "--background",
+            "40",
+        )
+        options = ("--star", "30.3,28.8", "--star", "50,45", "--engine", "numpy", "--n-iter", "30")
+        assert cli.main([*image, *options, "-o", "sky.fits"]) == 0
+        assert capsys.readouterr().err == ""
+        flux = fits.getdata("sky.fits", "STARS")["flux"]
+        expected = 2 * np.pi * 4 * np.array([9000.0, 1500.0])
+        np.testing.assert_allclose(flux, expected, rtol=0.05)
+
+
+class TestTheFile:
+    def test_the_header_says_what_was_done(self):
+        options = ("--mask", "mask.fits", "--saturation", "8900", "--rotate", "0", "30")
+        assert run(*options, "--size", "21", "--star", "30,29", "--clip-negative") == 0
+        assert fitscheck.main(["--compliance", "out.fits"]) == 0
+        stars = make_psfs(
+            FRAME, [0, 30], (30, 29), 21, mask=BAD != 0, saturation=8900.0, clip_negative=True
+        )
+        with fits.open("out.fits", checksum=True) as hdus:
+            header = hdus[0].header
+            assert len(hdus) == 1
+        expected = {
+            "CREATOR": f"lnocl {lnocl.__version__}",
+            "CENTREX": stars[0].centre[0],
+            "CENTREY": stars[0].centre[1],
+            "BKG": stars[0].background,
+            "NBAD": 3,
+            "SATURATE": 8900.0,
+            "RECENTRE": True,
+            "CLIPPED": True,
+            "ANGLE1": 0.0,
+            "ANGLE2": 30.0,
+            "FLUX1": stars[0].flux,
+            "FLUX2": stars[1].flux,
+            "ISUM1": hashlib.sha256(Path("star.fits").read_bytes()).hexdigest(),
+            "MSUM1": hashlib.sha256(Path("mask.fits").read_bytes()).hexdigest(),
+        }
+        assert {name: header[name] for name in expected} == expected
+        assert "BUNIT" not in header
+        notes = [line for line in header["HISTORY"] if line.startswith("# ")]
+        text = " ".join(line.removeprefix("# ") for line in notes)
+        for step in (*stars[0].steps, *stars[1].steps, "PSF 2 of 2, at 30 degrees:"):
+            assert step in text
+        commands = [line for line in header["HISTORY"] if not line.startswith("# ")]
+        assert "".join(commands).replace("\\", "") == (
+            f"cd {os.getcwd()}lnocl psf star.fits --star 30.0,29.0 --mask mask.fits "
+            "--saturation 8900.0 --background auto --rotate 0.0 30.0 --size 21 --clip-negative "
+            "-o out.fits"
+        )
+
+    def test_what_was_not_asked_for_is_not_in_the_header(self):
+        assert run("--no-recentre", "--background", "40", "--clip-negative") == 0
+        header = fits.getheader("out.fits")
+        assert not {"SATURATE", "MSUM1", "ANGLE2", "FLUX2"} & set(header)
+        assert (header["RECENTRE"], header["CLIPPED"], header["NBAD"]) == (False, True, 0)
+        assert (
+            "".join(header["HISTORY"])
+            .replace("\\", "")
+            .endswith(
+                "lnocl psf star.fits --background 40.0 --no-recentre --rotate 0.0 --clip-negative "
+                "-o out.fits"
+            )
+        )
+
+    @pytest.mark.parametrize("name", ["-o ' b.fits", "naïve☃\n.fits"])
+    def test_the_history_run_by_a_shell_makes_the_same_file(self, name):
+        Path("star.fits").rename(name)
+        Path("mask.fits").rename("-mask.fits")
+        options = ["--rotate", "-0.1", "33.3", "--size", "21", "--mask=-mask.fits"]
+        assert cli.main(["psf", *options, "-oout.fits", "--", name]) == 0
+        script = "\n".join(fits.getheader("out.fits")["HISTORY"])
+        first = Path("out.fits").read_bytes()
+        os.unlink("out.fits")
+        python = f'lnocl() {{ {shlex.quote(sys.executable)} -m lnocl "$@"; }}'
+        subprocess.run(
+            ["bash", "-ec", f"{python}\n{script}"], cwd="/", capture_output=True, check=True
+        )
+        assert Path("out.fits").read_bytes() == first
+
+    def test_overwrite(self):
+        assert run("--overwrite", output="there.fits") == 0
+        assert fits.getdata("there.fits").ndim == 2
+
+    def test_a_write_that_fails_leaves_nothing(self, capsys, monkeypatch):
+        def fail(descriptor):
+            raise OSError(28, "No space left on device")
+
+        before = sorted(os.listdir())
+        monkeypatch.setattr(os, "fsync", fail)
+        assert run() == 1
+        assert (
+            complaint(capsys.readouterr()) == "out.fits cannot be written: No space left on device"
+        )
+        assert sorted(os.listdir()) == before
+
+
+class TestMessages:
+    def test_quiet_says_nothing_but_warnings(self, capsys):
+        assert run("--quiet") == 0
+        assert capsys.readouterr() == ("", "")
+        assert run("--quiet", "--saturation", "8000", "--overwrite") == 0
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        (line,) = captured.err.splitlines()
+        assert line.startswith("lnocl: warning: ")
+        assert line.endswith("its core is a guess")
+
+    def test_several_angles_warn_once(self, capsys):
+        assert run("--rotate", "0", "20", "45", "--background", "0", frame="sharp.fits") == 0
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("lnocl: warning: shift and rotation ring: ")
+        assert line.endswith("without recentring its pixels are left as they are")
+
+    def test_the_largest_crop_is_called_so(self, capsys):
+        assert run() == 0
+        k = len(fits.getdata("out.fits"))
+        crop = f"crop: {k} x {k} pixels, the largest square there is"
+        assert crop in capsys.readouterr().out.splitlines()
+
+
+class TestPicture:
+    @pytest.fixture(autouse=True)
+    def _matplotlib(self):
+        pytest.importorskip("matplotlib")
+
+    def test_it_is_drawn(self, capsys, monkeypatch):
+        from lnocl.plotting import plots
+
+        drawn = []
+
+        def draw(*arguments):
+            drawn.append(arguments)
+            return original(*arguments)
+
+        original = plots.star_psf
+        monkeypatch.setattr(plots, "star_psf", draw)
+        assert run("--plot", "a.PNG", "--rotate", "0", "45", "--mask", "mask.fits") == 0
+        assert capsys.readouterr().out.splitlines()[-1] == "drew a.PNG"
+        assert Path("a.PNG").read_bytes().startswith(b"\x89PNG")
+        ((frame, bad, centre, psfs, angles),) = drawn
+        header = fits.getheader("out.fits")
+        np.testing.assert_array_equal(bad, BAD != 0)
+        np.testing.assert_array_equal(frame[~bad], (FRAME - header["BKG"])[~bad])
+        assert centre == (header["CENTREX"], header["CENTREY"])
+        np.testing.assert_array_equal(psfs, fits.getdata("out.fits"))
+        assert angles == [0, 45]
+
+    def test_it_is_no_part_of_the_command_that_repeats(self):
+        assert run("--plot", "a.png") == 0
+        assert "--plot" not in "".join(fits.getheader("out.fits")["HISTORY"])
+
+    def test_overwrite(self):
+        assert run("--plot", "there.png", "--overwrite") == 0
+        assert Path("there.png").read_bytes().startswith(b"\x89PNG")
+
+    def test_without_matplotlib_nothing_is_begun(self, capsys, monkeypatch):
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        assert run("--plot", "a.png", frame="no.fits") == 1
+        assert complaint(capsys.readouterr()) == (
+            "pictures need matplotlib, which is not installed: pip install 'lnocl[plot]'"
+        )
+        assert run() == 0
+        assert not Path("a.png").exists()
+
+
+REFUSED = {
+    "missing": ({"frame": "no.fits"}, [], 1, "no.fits cannot be opened: No such file"),
+    "cube": ({"frame": "cube.fits"}, [], 2, "cube.fits holds 2 images; give a file with one"),
+    "all bad": ({"frame": "nan.fits"}, [], 2, "all pixels of the frame are bad"),
+    "output exists": ({"output": "there.fits"}, [], 1, "there.fits exists; give another name"),
+    "output is input": (
+        {"output": "star.fits"}, ["--overwrite"], 2, "star.fits is one of the inputs",
+    ),
+    "output is mask": (
+        {"output": "mask.fits"}, ["--overwrite", "--mask", "mask.fits"], 2,
+        "mask.fits is one of the inputs",
+    ),
+    "two stars": ({}, ["--star", "1,2", "--star", "3,4"], 2, "one star, and 2 were given"),
+    "star outside": ({}, ["--star", "70,3"], 2, "position (70, 3) is outside the frame"),
+    "star at the edge": ({}, ["--star", "0,3", "--no-recentre"], 2, "at the edge of the frame"),
+    "no star": ({}, ["--star", "5,8", "--background", "40"], 2, "no star is found within 16"),
+    "star of one": ({}, ["--star", "3"], 2, "argument --star: '3' is not X,Y"),
+    "mask missing": ({}, ["--mask", "no.fits"], 1, "no.fits cannot be opened"),
+    "mask shape": (
+        {}, ["--mask", "oblong.fits"], 2,
+        "the mask oblong.fits has the shape (70, 61) and star.fits (61, 70); they must be the same",
+    ),
+    "masks": ({}, ["--mask", "masks.fits"], 2, "masks.fits holds 2 images; give a file with one"),
+    "mask of all": ({}, ["--mask", "none.fits"], 2, "the mask none.fits leaves no good pixel"),
+    "saturation": ({}, ["--saturation", "-1"], 2, "saturation must be positive; -1 was given"),
+    "saturation nan": ({}, ["--saturation", "nan"], 2, "saturation is nan; give one finite"),
+    "background": ({}, ["--background", "sky"], 2, "background is 'sky'; give a number or"),
+    "background inf": ({}, ["--background", "-inf"], 2, "background is -inf; give one finite"),
+    "angle": ({}, ["--rotate", "0", "inf"], 2, "rotate is inf; give one finite number"),
+    "angle of words": ({}, ["--rotate", "x"], 2, "argument --rotate: invalid float value: 'x'"),
+    "size": ({}, ["--size", "2"], 2, "size must be a whole number of 3 or more; 2 was given"),
+    "size large": ({}, ["--size", "60"], 2, "reaches beyond the frame; give a size of 59 or less"),
+    "size rotated": ({}, ["--size", "50", "--rotate", "0", "45"], 2, "rotated by 45 degrees"),
+    "picture name": ({}, ["--plot", "a.pdf"], 2, "a name ending in .png, not a.pdf"),
+    "picture exists": ({}, ["--plot", "there.png"], 1, "there.png exists; give another name"),
+    "picture is output": (
+        {"output": "x.png"}, ["--plot", "./x.png"], 2, "./x.png is the output too",
+    ),
+    "picture is input": (
+        {"frame": "there.png"}, ["--plot", "there.png", "--overwrite"], 2, "one of the inputs",
+    ),
+    "picture folder": ({}, ["--plot", "no/a.png"], 1, "the folder of the output no/a.png"),
+    "pictures": ({}, ["--plot", "a.png", "--rotate", *"1" * 17], 2, "draws 16 PSFs at most"),
+    "abbreviation": ({}, ["--sat", "3"], 2, "unrecognized arguments: --sat"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("where", "options", "status", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_is_refused(capsys, where, options, status, message):
+    before = {path: Path(path).read_bytes() for path in os.listdir()}
+    assert run(*options, **where) == status
+    assert message in complaint(capsys.readouterr())
+    assert {path: Path(path).read_bytes() for path in os.listdir()} == before
+
+
+@pytest.mark.parametrize("options", [["--plot", "there.png"], ["--star", "1,2", "--star", "3,4"]])
+def test_outputs_are_checked_before_the_frame_is_read(capsys, options):
+    assert run(*options, frame="no.fits") in (1, 2)
+    assert "no.fits" not in complaint(capsys.readouterr())
+
+
+def test_wrong_use(capsys):
+    assert cli.main(["psf"]) == 2
+    assert complaint(capsys.readouterr()) == (
+        "the following arguments are required: FRAME, -o/--output; see lnocl psf --help"
+    )
+
+
+def test_the_help_loads_nothing_heavy():
+    script = (
+        "import sys; from lnocl.cli import main\n"
+        "try: main(['psf', '--help'])\n"
+        "finally: print(sorted({'astropy', 'pyopencl', 'scipy', 'matplotlib'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "[]"

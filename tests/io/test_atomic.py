@@ -1,0 +1,406 @@
+"""Outputs: each is there complete or not at all, and what none may be."""
+
+import contextlib
+import errno
+import io
+import os
+import resource
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from matplotlib.figure import Figure
+from scenes import make_psfs
+
+from lnocl.commands import cli
+from lnocl.errors import FileError, InputError
+from lnocl.io import atomic, fitsread, fitswrite
+from lnocl.plotting import plots
+
+IMAGE = np.arange(1.0, 121.0).reshape(10, 12)
+LARGE = np.random.default_rng(3).normal(size=(400, 500))
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+def write_result(path, overwrite=False):
+    cubes = {"MODELS": (LARGE[None], "electron")}
+    fitswrite.write_result(path, LARGE, [(3.0, 4.5)], [17.25], cubes=cubes, overwrite=overwrite)
+
+
+def write_image(path, overwrite=False):
+    fitswrite.write_image(path, LARGE, overwrite=overwrite)
+
+
+def write_text(path, overwrite=False):
+    atomic.write_text(path, "lnocl\n" * 300_000, overwrite)
+
+
+def write_figure(path, overwrite=False):
+    figure = Figure(figsize=(7, 7))
+    figure.add_subplot().imshow(LARGE)
+    plots.save(figure, path, overwrite)
+
+
+# All that the package writes with; each writes 1.5 MB and more, the figure 0.3 MB and more.
+WRITERS = [write_result, write_image, write_text, write_figure]
+
+
+def names(folder):
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def fill_up(monkeypatch, room):
+    """Let a disk have room for so many bytes."""
+
+    class File(io.FileIO):
+        def write(self, data):
+            if self.tell() + memoryview(data).nbytes > room:
+                raise FULL
+            return super().write(data)
+
+    # What atomic opens is of this kind anyway.
+    monkeypatch.setattr(atomic, "open", lambda path, mode, **_: File(path, mode), raising=False)
+
+
+@contextlib.contextmanager
+def small_file_system(folder, options):
+    if os.geteuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("only root can mount a file system")
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", options, "lnocl", folder], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip("this machine lets nobody mount a file system")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+@pytest.mark.parametrize("write", WRITERS)
+class TestEveryWriter:
+    @pytest.mark.parametrize("there", [False, True])
+    @pytest.mark.parametrize("call", ["fsync", "replace"])
+    @pytest.mark.parametrize("error", [FULL, KeyboardInterrupt()])
+    def test_a_failure_leaves_what_was_there(
+        self, tmp_path, monkeypatch, write, there, call, error
+    ):
+        path = tmp_path / "out.fits"
+        if there:
+            path.write_bytes(b"old")
+
+        def fail(*arguments):
+            raise error
+
+        monkeypatch.setattr(os, call, fail)
+        with pytest.raises(FileError if error is FULL else KeyboardInterrupt) as caught:
+            write(str(path), overwrite=True)
+        if error is FULL:
+            assert str(caught.value) == f"{path} cannot be written: No space left on device"
+        assert names(tmp_path) == (["out.fits"] if there else [])
+        assert not there or path.read_bytes() == b"old"
+
+    @pytest.mark.parametrize("room", [0, 3000, 150_000])
+    def test_a_disk_that_fills_up(self, tmp_path, monkeypatch, write, room):
+        path = tmp_path / "out.fits"
+        path.write_bytes(b"old")
+        fill_up(monkeypatch, room)
+        with pytest.raises(FileError) as caught:
+            write(str(path), overwrite=True)
+        assert str(caught.value) == f"{path} cannot be written: No space left on device"
+        assert names(tmp_path) == ["out.fits"]
+        assert path.read_bytes() == b"old"
+
+    def test_a_disk_that_is_full(self, tmp_path, write):
+        folder = tmp_path / "disk"
+        with small_file_system(folder, "size=256k"):
+            path = folder / "out.fits"
+            path.write_bytes(b"old")
+            with pytest.raises(FileError) as caught:
+                write(str(path), overwrite=True)
+            assert str(caught.value) == f"{path} cannot be written: No space left on device"
+            assert names(folder) == ["out.fits"]
+            assert path.read_bytes() == b"old"
+
+    def test_a_limit_on_the_size_of_files(self, tmp_path, write):
+        path = tmp_path / "out.fits"
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+        try:
+            with pytest.raises(FileError) as caught:
+                write(str(path))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert str(caught.value) == f"{path} cannot be written: File too large"
+        assert names(tmp_path) == []
+
+    def test_a_disk_that_becomes_read_only(self, tmp_path, write):
+        folder = tmp_path / "disk"
+        with small_file_system(folder, "size=4m"):
+            path = folder / "out.fits"
+            path.write_bytes(b"old")
+            subprocess.run(["mount", "-o", "remount,ro", folder], check=True)
+            with pytest.raises(FileError) as caught:
+                write(str(path), overwrite=True)
+            assert str(caught.value) == f"{path} cannot be written: Read-only file system"
+            assert path.read_bytes() == b"old"
+
+    def test_a_file_that_came_into_being_meanwhile_is_kept(self, tmp_path, write):
+        path = tmp_path / "out.fits"
+        path.write_bytes(b"old")
+        with pytest.raises(FileError, match="exists"):
+            write(str(path))
+        assert path.read_bytes() == b"old"
+        assert names(tmp_path) == ["out.fits"]
+
+    def test_a_new_file_has_the_permissions_of_any_new_file(self, tmp_path, write):
+        path = tmp_path / "out.fits"
+        before = os.umask(0o027)
+        try:
+            write(str(path))
+        finally:
+            os.umask(before)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o640
+
+    def test_a_link_stays_a_link(self, tmp_path, write):
+        (tmp_path / "other").mkdir()
+        target, link = tmp_path / "other" / "target.fits", tmp_path / "link.fits"
+        target.touch()
+        link.symlink_to(target)
+        write(str(link), overwrite=True)
+        assert link.is_symlink()
+        assert target.stat().st_size > 100_000
+
+
+class TestWholeFile:
+    def test_nothing_is_there_before_it_is_on_the_disk(self, tmp_path, monkeypatch):
+        path = tmp_path / "out.txt"
+        seen = []
+        for call, plain in (("fsync", os.fsync), ("replace", os.replace)):
+
+            def note(*given, call=call, plain=plain):
+                sizes = [entry.stat().st_size for entry in tmp_path.iterdir()]
+                seen.append((call, path.exists(), sizes))
+                plain(*given)
+
+            monkeypatch.setattr(os, call, note)
+        atomic.write_text(str(path), "lnocl")
+        assert seen == [("fsync", False, [5]), ("replace", False, [5])]
+        assert path.read_bytes() == b"lnocl"
+
+    def test_an_error_of_the_writer_stays_what_it_is(self, tmp_path):
+        with pytest.raises(ZeroDivisionError), atomic.whole_file(str(tmp_path / "a")) as stream:
+            stream.write(bytes(1 // 0))
+        assert names(tmp_path) == []
+
+    def test_the_disk_is_blamed_whatever_the_writer_makes_of_it(self, tmp_path, monkeypatch):
+        def write():
+            with atomic.whole_file(str(tmp_path / "a")) as stream:
+                try:
+                    stream.write(bytes(100_000))
+                except OSError:
+                    raise AttributeError("no _file") from None
+
+        fill_up(monkeypatch, 0)
+        with pytest.raises(FileError, match="No space left"):
+            write()
+        assert names(tmp_path) == []
+
+    def test_a_killed_process_leaves_the_earlier_file(self, tmp_path):
+        path = tmp_path / "out.txt"
+        path.write_bytes(b"old")
+        script = (
+            "import os, sys\n"
+            "from lnocl import atomic\n"
+            "with atomic.whole_file(sys.argv[1], True) as stream:\n"
+            "    stream.write(bytes(100_000))\n"
+            "    os.kill(os.getpid(), 9)\n"
+        )
+        done = subprocess.run([sys.executable, "-c", script, path], check=False)
+        assert done.returncode == -9
+        assert path.read_bytes() == b"old"
+
+
+class TestCheckOutput:
+    def test_a_new_name_and_an_overwritten_one_pass(self, tmp_path):
+        path = tmp_path / "out.fits"
+        atomic.check_output(str(path), overwrite=False)
+        assert list(tmp_path.iterdir()) == []
+        path.write_bytes(b"old")
+        atomic.check_output(str(path), overwrite=True)
+        assert path.read_bytes() == b"old"
+
+    @pytest.mark.parametrize(
+        ("name", "error", "message"),
+        [
+            ("there.fits", FileError, "exists; give another name, or --overwrite"),
+            ("missing/out.fits", FileError, "does not exist; create it first"),
+            ("there.fits/out.fits", FileError, "cannot be written: Not a directory"),
+            ("folder", FileError, "is no regular file"),
+            ("n" * 300 + ".fits", FileError, "cannot be written: File name too long"),
+            ("new/", FileError, "names no file"),
+            ("out.fits.gz", InputError, "is not compressed"),
+        ],
+    )
+    def test_unusable_output(self, tmp_path, name, error, message):
+        (tmp_path / "there.fits").touch()
+        (tmp_path / "folder").mkdir()
+        with pytest.raises(error, match=message):
+            atomic.check_output(f"{tmp_path}/{name}", overwrite=False)
+
+    def test_a_folder_that_takes_no_file(self):
+        with pytest.raises(FileError, match=r"cannot be written to its folder"):
+            atomic.check_output("/proc/out.fits", overwrite=False)
+
+    def test_a_device_is_never_replaced(self):
+        with pytest.raises(FileError, match="no regular file"):
+            atomic.check_output(os.devnull, overwrite=True)
+
+    def test_an_input_is_never_replaced(self, tmp_path):
+        path = str(tmp_path / "a.fits")
+        fits.PrimaryHDU(IMAGE).writeto(path)
+        (tmp_path / "link.fits").symlink_to(path)
+        with pytest.raises(InputError, match="is one of the inputs"):
+            atomic.check_output(
+                str(tmp_path / "link.fits"), overwrite=True, inputs=["missing.fits", path]
+            )
+
+
+class TestCommandLine:
+    """Every failure is one line on stderr, leaves earlier files whole, and no other behind."""
+
+    COMMAND = (
+        *("deconvolve", "a.fits", "--psf", "k.fits", "--n-iter", "1", "--engine", "numpy"),
+        *("--exposure", "EXPTIME", "--quiet"),
+    )
+
+    @pytest.fixture(autouse=True)
+    def folder(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        image = np.random.default_rng(1).poisson(20.0, (16, 12)) + 0.0
+        primary = fits.PrimaryHDU(header=fits.Header({"EXPTIME": 30.0}))
+        fits.HDUList([primary, fits.ImageHDU(image)]).writeto("a.fits")
+        fits.writeto("k.fits", make_psfs(1, (7, 7))[0])
+
+    def fails(self, capsys, message, *arguments, command=COMMAND):
+        before = {path: path.read_bytes() for path in Path().glob("**/*") if path.is_file()}
+        assert cli.main([*command, *arguments]) == 1
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err == f"lnocl: error: {message}\n"
+        after = {path: path.read_bytes() for path in Path().glob("**/*") if path.is_file()}
+        assert {path: before[path] for path in after} == after
+        return before.keys() - after.keys()
+
+    def test_a_full_disk(self, capsys, tmp_path):
+        with small_file_system(tmp_path / "disk", "size=4k"):
+            Path("disk/out.fits").write_bytes(b"old")
+            self.fails(
+                capsys,
+                "disk/out.fits cannot be written: No space left on device",
+                *("-o", "disk/out.fits", "--overwrite"),
+            )
+
+    @pytest.mark.parametrize("output", ["out.fits", "disk/out.fits"])
+    def test_no_work_is_done_for_an_output_that_cannot_be(
+        self, capsys, tmp_path, monkeypatch, output
+    ):
+        def work(*arguments, **options):
+            raise AssertionError
+
+        monkeypatch.setattr("lnocl.io.frames.read_frames", work)
+        Path("out.fits").write_bytes(b"old")
+        messages = {
+            "out.fits": "the output out.fits exists; give another name, or --overwrite to replace "
+            "it",
+            "disk/out.fits": "the output disk/out.fits cannot be written to its folder: Read-only "
+            "file system",
+        }
+        with small_file_system(tmp_path / "disk", "size=1m,ro"):
+            self.fails(capsys, messages[output], "-o", output)
+
+    @pytest.mark.parametrize(
+        ("after", "lost"),
+        [
+            ("lnocl.io.atomic.check_output", "a.fits"),
+            ("lnocl.io.atomic.check_output", "k.fits"),
+            (
+                "lnocl.io.frames.read_stack",
+                "a.fits",
+            ),  # the exposure is in another HDU
+        ],
+    )
+    def test_an_input_that_vanishes(self, capsys, monkeypatch, after, lost):
+        module, _, name = after.rpartition(".")
+        plain = getattr(sys.modules[module], name)
+
+        def then_lose(*given, **options):
+            result = plain(*given, **options)
+            Path(lost).unlink(missing_ok=True)
+            return result
+
+        monkeypatch.setattr(after, then_lose)
+        message = f"{lost} cannot be opened: No such file or directory"
+        assert self.fails(capsys, message, "-o", "out.fits") == {Path(lost)}
+
+    @pytest.mark.parametrize(
+        "name",
+        ["a b", "it's", 'say "a"', "line\nbreak", "a[1]", "a.fits[0]", "~root", "$HOME", "`id`",
+         "a;b", "*", "http:", "naïve", "-a"],
+    )  # fmt: skip
+    def test_names_are_names(self, capsys, name):
+        for path in ("a.fits", "k.fits"):
+            os.rename(path, f"{name}{path}")
+        Path(f"{name}.csv").write_text("x,y\n3,4\n")
+        arguments = [
+            "deconvolve", f"./{name}a.fits", "--psf", f"./{name}k.fits", "--stars", f"./{name}.csv",
+            "--n-iter", "1", "--engine", "numpy", "-o", f"./{name}out.fits",
+        ]  # fmt: skip
+        assert cli.main(arguments) == 0
+        assert fitsread.read_result(f"{name}out.fits").stars == [(3.0, 4.0)]
+        ends = [path.removeprefix(name) for path in sorted(os.listdir())]
+        assert ends == sorted([".csv", "a.fits", "k.fits", "out.fits"])
+
+    def test_the_name_of_a_table_is_not_the_table(self, capsys):
+        name = "x y\n1 2\n"
+        message = "x y 1 2 cannot be read as a table: No such file or directory"
+        self.fails(capsys, message, "--stars", name, "-o", "out.fits")
+        Path(name).write_text("x y\n3 4\n")
+        assert cli.main([*self.COMMAND, "--stars", name, "-o", "out.fits"]) == 0
+        assert fitsread.read_result("out.fits").stars == [(3.0, 4.0)]
+
+    def test_paths_in_a_header_lead_nowhere(self, tmp_path):
+        names_of_files = ("EXTNAME", "FILENAME", "OBJECT", "ORIGIN", "CTYPE1", "DP1", "CPDIS1")
+        with fits.open("a.fits", mode="update") as hdus:
+            for hdu in hdus:
+                hdu.header.update(dict.fromkeys(names_of_files, "../stray.fits"))
+        assert cli.main([*self.COMMAND, "-o", "out.fits"]) == 0
+        assert names(tmp_path) == ["a.fits", "k.fits", "out.fits"]
+        assert not (tmp_path.parent / "stray.fits").exists()
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda path: atomic.check_output(path, overwrite=False),
+        lambda path: atomic.write_text(path, "words"),
+    ],
+    ids=["check", "write"],
+)
+def test_a_signal_that_comes_as_a_file_is_made_leaves_none(work, tmp_path, monkeypatch):
+    class Interrupted(atomic._Output):
+        def __init__(self, path):
+            super().__init__(path)
+            self.close()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(atomic, "_Output", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        work(str(tmp_path / "out.txt"))
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,354 @@
+"""FITS in: what is read, what is refused, and where an image lies."""
+
+import gzip
+import hashlib
+import random
+import tracemalloc
+import warnings
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.wcs import WCS
+
+from lnocl.errors import FileError, InputError, LnoclWarning
+from lnocl.io import fitsread, fitswrite
+
+IMAGE = np.arange(1.0, 121.0).reshape(10, 12)
+
+LINEAR = {
+    "CTYPE1": "RA---TAN",
+    "CTYPE2": "DEC--TAN",
+    "CRPIX1": 5.5,
+    "CRPIX2": 4.25,
+    "CRVAL1": 248.62114984968,
+    "CRVAL2": 70.53098794332,
+    "CD1_1": -1.1e-5,
+    "CD1_2": 2.3e-6,
+    "CD2_1": 2.2e-6,
+    "CD2_2": 1.2e-5,
+}
+SIP = LINEAR | {
+    "CTYPE1": "RA---TAN-SIP",
+    "CTYPE2": "DEC--TAN-SIP",
+    "A_ORDER": 2,
+    "A_2_0": 1e-3,
+    "B_ORDER": 2,
+    "B_0_2": -2e-3,
+}
+TPV = LINEAR | {
+    "CTYPE1": "RA---TPV",
+    "CTYPE2": "DEC--TPV",
+    "PV1_1": 1.0,
+    "PV1_4": 40.0,
+    "PV2_1": 1.0,
+}
+PHYSICAL = {f"{name}P": value for name, value in {"CTYPE1": "x", "CTYPE2": "y"}.items()} | {
+    "CRPIX1P": 3.0,
+    "CRPIX2P": -7.5,
+    "CRVAL1P": 4032.5,
+    "CRVAL2P": 3994.5,
+    "CDELT1P": 0.25,
+    "CDELT2P": 0.5,
+}
+
+
+def save(path, *hdus, checksum=False):
+    fits.HDUList(list(hdus)).writeto(path, checksum=checksum)
+    return str(path)
+
+
+def table():
+    return fits.BinTableHDU.from_columns([fits.Column("a", "D", array=np.zeros(3))])
+
+
+class TestReading:
+    @pytest.mark.parametrize("dtype", ["u1", "i2", "u2", "i4", "i8", "f4", "f8"])
+    def test_every_type_of_pixel_becomes_float64_of_this_machine(self, tmp_path, dtype):
+        path = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE.astype(dtype)))
+        data = fitsread.read_stack([path]).data
+        assert data.dtype == np.float64
+        assert data.dtype.isnative
+        np.testing.assert_array_equal(data, IMAGE[None])
+
+    def test_scaling_is_applied_and_blank_pixels_are_nan(self, tmp_path):
+        hdu = fits.PrimaryHDU(IMAGE.astype("i2"))
+        hdu.header.update(BLANK=7, BSCALE=0.5, BZERO=100.0)
+        data = fitsread.read_stack([save(tmp_path / "a.fits", hdu)]).data[0]
+        assert np.isnan(data[0, 6])
+        assert data[0, 7] == 104.0
+        assert np.isnan(data).sum() == 1
+
+    def test_the_first_hdu_with_pixels_is_the_image(self, tmp_path):
+        header = fits.Header(LINEAR)
+        path = save(
+            tmp_path / "a.fits",
+            fits.PrimaryHDU(),
+            table(),
+            fits.ImageHDU(),
+            fits.ImageHDU(np.zeros((3, 0))),
+            fits.ImageHDU(IMAGE, header, name="SCI"),
+            fits.ImageHDU(IMAGE + 1.0, name="ERR"),
+        )
+        stack = fitsread.read_stack([path])
+        np.testing.assert_array_equal(stack.data, IMAGE[None])
+        assert stack.header["EXTNAME"] == "SCI"
+        assert stack.header["CRVAL1"] == LINEAR["CRVAL1"]
+
+    def test_a_cube_and_single_files_are_the_same_stack(self, tmp_path):
+        planes = [IMAGE, 2.0 * IMAGE, 3.0 * IMAGE]
+        cube = save(tmp_path / "cube.fits", fits.PrimaryHDU(np.array(planes)))
+        files = [
+            save(tmp_path / f"{j}.fits", fits.PrimaryHDU(plane)) for j, plane in enumerate(planes)
+        ]
+        np.testing.assert_array_equal(fitsread.read_stack([cube]).data, np.array(planes))
+        np.testing.assert_array_equal(fitsread.read_stack(files).data, np.array(planes))
+
+    def test_a_compressed_file_is_read(self, tmp_path):
+        image = np.random.default_rng(1).normal(size=(200, 150))  # more than a buffer holds
+        plain = save(tmp_path / "a.fits", fits.PrimaryHDU(), fits.ImageHDU(image), checksum=True)
+        packed = tmp_path / "a.fits.gz"
+        packed.write_bytes(gzip.compress((tmp_path / "a.fits").read_bytes()))
+        np.testing.assert_array_equal(
+            fitsread.read_stack([str(packed)]).data, fitsread.read_stack([plain]).data
+        )
+
+    def test_checksums_are_those_of_the_files(self, tmp_path):
+        paths = [save(tmp_path / name, fits.PrimaryHDU(IMAGE)) for name in ("a.fits", "b.fits")]
+        with open(paths[1], "ab") as stream:
+            stream.write(bytes(2880))
+        expected = [
+            hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
+            for name in ("a.fits", "b.fits")
+        ]
+        assert fitsread.read_stack(paths).sha256 == expected
+        assert expected[0] != expected[1]
+
+    def test_a_failed_datasum_is_announced(self, tmp_path):
+        path = tmp_path / "a.fits"
+        save(path, fits.PrimaryHDU(IMAGE), checksum=True)
+        fitsread.read_stack([str(path)])
+        damaged = bytearray(path.read_bytes())
+        damaged[2880 + 8 * 3 + 2] ^= 1
+        path.write_bytes(damaged)
+        with pytest.warns(LnoclWarning, match="a.fits: the data do not match their DATASUM"):
+            fitsread.read_stack([str(path)])
+
+    def test_missing_padding_is_announced(self, tmp_path):
+        path = tmp_path / "a.fits"
+        save(path, fits.PrimaryHDU(IMAGE))
+        path.write_bytes(path.read_bytes()[: 2880 + IMAGE.nbytes])
+        with pytest.warns(LnoclWarning, match="truncated"):
+            data = fitsread.read_stack([str(path)]).data
+        np.testing.assert_array_equal(data, IMAGE[None])
+
+
+def no_image(path):
+    save(path, fits.PrimaryHDU(), table())
+
+
+def text(path):
+    path.write_text("no FITS at all\n" * 400)
+
+
+def truncated(path):
+    save(path, fits.PrimaryHDU(IMAGE))
+    path.write_bytes(path.read_bytes()[: 2880 + IMAGE.nbytes - 1])
+
+
+def truncated_header(path):
+    save(path, fits.PrimaryHDU(IMAGE))
+    path.write_bytes(path.read_bytes()[:2000])
+
+
+def truncated_gzip(path):
+    save(path, fits.PrimaryHDU(np.random.default_rng(1).normal(size=(60, 60))))
+    packed = gzip.compress(path.read_bytes())
+    path.write_bytes(packed[: len(packed) // 2])
+
+
+def tiles(path):
+    save(path, fits.PrimaryHDU(), fits.CompImageHDU(IMAGE), fits.ImageHDU(IMAGE))
+
+
+def random_groups(path):
+    header = fits.Header(
+        {
+            "SIMPLE": True,
+            "BITPIX": -32,
+            "NAXIS": 3,
+            "NAXIS1": 0,
+            "NAXIS2": 3,
+            "NAXIS3": 3,
+            "GROUPS": True,
+            "PCOUNT": 1,
+            "GCOUNT": 2,
+        }
+    )
+    path.write_bytes(header.tostring().encode() + bytes(2880))
+
+
+def circle(path):
+    """Write a file whose second header has a size that leads back to the first."""
+    save(path, fits.PrimaryHDU(), table(), table())
+    content = path.read_bytes()
+    at = content.rindex(b"PCOUNT  =                    0")
+    size = (content.rindex(b"XTENSION") + 2880) + 3 * 8
+    card = b"PCOUNT  = " + f"{-size:20d}".encode()
+    path.write_bytes(content[:at] + card + content[at + len(card) :])
+
+
+class TestRefusedFiles:
+    @pytest.mark.parametrize(
+        ("make", "message"),
+        [
+            (lambda path: None, "cannot be opened: No such file"),
+            (lambda path: path.mkdir(), "cannot be opened: Is a directory"),
+            (lambda path: path.touch(), "is no FITS file, or a damaged one: it ends too early"),
+            (text, "is no FITS file"),
+            (truncated, f"is truncated: it should have {2880 + 960} bytes and has {2880 + 959}"),
+            (truncated_header, "is no FITS file, or a damaged one"),
+            (truncated_gzip, "is no FITS file, or a damaged one"),
+            (no_image, "holds no image"),
+            (random_groups, "holds no image"),
+            (tiles, "is tile-compressed; unpack it"),
+            (circle, "the size of an extension is negative"),
+        ],
+    )
+    def test_unusable_file(self, tmp_path, make, message):
+        path = tmp_path / "a.fits"
+        make(path)
+        with pytest.raises(FileError) as caught:
+            fitsread.read_stack([str(path)])
+        assert str(caught.value).startswith(f"{path} ")
+        assert message in str(caught.value)
+
+    @pytest.mark.parametrize("compress", [bytes, gzip.compress])
+    def test_a_million_by_a_million_pixels_are_refused_before_they_are_allocated(
+        self, tmp_path, compress
+    ):
+        path = tmp_path / "a.fits"
+        header = fits.Header(
+            {"SIMPLE": True, "BITPIX": 16, "NAXIS": 2, "NAXIS1": 10**6, "NAXIS2": 10**6}
+        )
+        path.write_bytes(compress(header.tostring().encode() + bytes(2880)))
+        tracemalloc.start()
+        try:
+            with pytest.raises(FileError, match=r"is truncated|GiB of memory"):
+                fitsread.read_stack([str(path)])
+            assert tracemalloc.get_traced_memory()[1] < 2**24
+        finally:
+            tracemalloc.stop()
+
+    @pytest.mark.parametrize("shape", [(12,), (1, 1, 10, 12)])
+    def test_wrong_dimensions(self, tmp_path, shape):
+        path = save(tmp_path / "a.fits", fits.PrimaryHDU(np.ones(shape)))
+        with pytest.raises(InputError, match=f"a.fits has an image of {len(shape)} dimensions"):
+            fitsread.read_stack([path])
+
+    def test_a_cube_among_several_files(self, tmp_path):
+        image = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE))
+        cube = save(tmp_path / "b.fits", fits.PrimaryHDU(np.array([IMAGE, IMAGE])))
+        with pytest.raises(InputError, match=r"b.fits has an image of 3 dimensions; several"):
+            fitsread.read_stack([image, cube])
+
+    def test_different_shapes(self, tmp_path):
+        one = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE))
+        other = save(tmp_path / "b.fits", fits.PrimaryHDU(IMAGE.T))
+        with pytest.raises(
+            InputError, match=r"b.fits has the shape \(12, 10\) and .*a.fits \(10, 12\)"
+        ):
+            fitsread.read_stack([one, other])
+
+    def test_damage_never_raises_anything_else(self, tmp_path):
+        """Bits flipped, bytes changed in headers, ends cut off; fixed seed, a second of it."""
+        chance = random.Random(20)
+        wcs = fits.Header(SIP | PHYSICAL)
+        sound = []
+        for hdus in (
+            [fits.PrimaryHDU(IMAGE.astype("i2"), wcs)],
+            [fits.PrimaryHDU(), table(), fits.ImageHDU(np.array([IMAGE, IMAGE]), wcs)],
+        ):
+            save(path := tmp_path / f"{len(sound)}.fits", *hdus, checksum=True)
+            sound.append(path.read_bytes())
+        sound.append(gzip.compress(sound[1]))
+        path = tmp_path / "damaged.fits"
+        outcomes = {"read": 0, "refused": 0}
+        for _ in range(300):
+            damaged = bytearray(chance.choice(sound))
+            for _ in range(chance.choice([1, 3, 10])):
+                damaged[chance.randrange(len(damaged))] ^= 1 << chance.randrange(8)
+            at = chance.randrange(min(len(damaged), 8640))
+            damaged[at] = ord(chance.choice("0123456789- ='T"))
+            if chance.random() < 0.3:
+                del damaged[chance.randrange(len(damaged)) :]
+            path.write_bytes(damaged)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", LnoclWarning)
+                try:
+                    stack = fitsread.read_stack([str(path)])
+                    fitsread.wcs_cards(stack.header)
+                    outcomes["read"] += 1
+                except (FileError, InputError):
+                    outcomes["refused"] += 1
+        assert min(outcomes.values()) > 10
+
+
+class TestCoordinates:
+    @pytest.mark.parametrize("cards", [LINEAR, SIP, TPV], ids=["linear", "sip", "tpv"])
+    @pytest.mark.parametrize("shape", [(10, 12), (2, 10, 12)], ids=["image", "cube"])
+    def test_a_result_lies_where_the_image_lies(self, tmp_path, cards, shape):
+        header = fits.Header(cards | PHYSICAL)
+        if len(shape) == 3:
+            header.update(CTYPE3="WAVE", CRVAL3=1e-6, CD3_3=1e-9)
+        source = save(tmp_path / "a.fits", fits.PrimaryHDU(np.ones(shape), header))
+        stack = fitsread.read_stack([source])
+        output = str(tmp_path / "out.fits")
+        fitswrite.write_result(output, IMAGE, [], [], wcs=fitsread.wcs_cards(stack.header))
+        pixels = np.array([[0.0, 0.0], [11.0, 3.0], [-20.0, 50.5]])
+        for key in (" ", "P"):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                before = WCS(stack.header, key=key, naxis=2)
+            after = WCS(fits.getheader(output), key=key)  # pytest lets no warning pass
+            assert list(after.wcs.ctype) == list(before.wcs.ctype)
+            np.testing.assert_allclose(
+                after.all_pix2world(pixels, 0), before.all_pix2world(pixels, 0), rtol=1e-13
+            )
+        assert "CTYPE3" not in fits.getheader(output)
+
+    def test_an_image_without_coordinates_gets_none(self):
+        assert len(fitsread.wcs_cards(fits.PrimaryHDU(IMAGE).header)) == 0
+
+    def test_deprecated_cards_are_written_mended(self):
+        cards = fitsread.wcs_cards(fits.Header(LINEAR | {"RADECSYS": "FK5", "EQUINOX": 2000.0}))
+        assert cards["RADESYS"] == "FK5"
+        WCS(cards)
+
+    def test_sip_without_its_suffix_says_nothing_and_is_kept(self, capfd):
+        cards = fitsread.wcs_cards(fits.Header(SIP | {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN"}))
+        assert capfd.readouterr() == ("", "")
+        assert cards["A_2_0"] == SIP["A_2_0"]
+        assert cards["CTYPE1"] == "RA---TAN-SIP"
+
+    @pytest.mark.parametrize(
+        "broken",
+        [
+            {"CTYPE1": "DEC--TAN"},
+            {"CD1_1": 0.0, "CD1_2": 0.0},
+            {"CPDIS1": "LOOKUP", "DP1": "EXTVER: 1"},
+            {"CTYPE1": "WAVE-TAB", "CTYPE2": "STOKES", "PS1_0": "coordinates"},
+        ],
+        ids=["axes", "singular", "lookup", "tab"],
+    )
+    def test_coordinates_that_cannot_be_kept_are_announced(self, broken):
+        with pytest.warns(LnoclWarning, match="of the first image cannot be kept"):
+            cards = fitsread.wcs_cards(fits.Header(LINEAR | broken))
+        assert len(cards) == 0
+
+    def test_a_broken_system_leaves_the_others(self):
+        with pytest.warns(LnoclWarning, match=r"\(WCS\) of the first image") as caught:
+            cards = fitsread.wcs_cards(fits.Header(LINEAR | {"CTYPE1": "DEC--TAN"} | PHYSICAL))
+        assert len(caught) == 1
+        assert "CTYPE1" not in cards
+        assert cards["CTYPE1P"] == "x"

@@ -1,0 +1,533 @@
+"""Observations from FITS files: units, exposures, backgrounds, noise, masks, offsets."""
+
+import logging
+import warnings
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.stats import sigma_clipped_stats
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lnocl.errors import FileError, InputError, LnoclWarning
+from lnocl.io.frames import Known, read_frames
+from lnocl.scene import units
+
+SHAPE = (10, 12)
+IMAGES = np.random.default_rng(3).poisson(50.0, (2, *SHAPE)).astype(float)
+MAP = np.linspace(1.0, 2.0, IMAGES[0].size).reshape(SHAPE)
+NONE = np.zeros((2, *SHAPE), bool)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Work in a folder of its own, with a PSF."""
+    monkeypatch.chdir(tmp_path)
+    save("psf.fits", np.ones((3, 3)))
+
+
+def save(path, data, **cards):
+    fits.writeto(path, np.asarray(data), fits.Header(cards), overwrite=True)
+    return path
+
+
+def save_images(images=IMAGES, **cards):
+    return [save(f"{j}.fits", image, **cards) for j, image in enumerate(images, 1)]
+
+
+def read(*paths, psf="psf.fits", **known):
+    return read_frames(paths or ("1.fits", "2.fits"), [psf], Known(**known))
+
+
+def observe(*paths, **known):
+    return read(*paths, **known).observation
+
+
+def notes(caplog):
+    return [record.getMessage() for record in caplog.records]
+
+
+@pytest.fixture
+def log(caplog):
+    caplog.set_level(logging.INFO, "lnocl")
+    return caplog
+
+
+ELECTRONS = ["ELECTRONS", "electron", "Electrons", "COUNTS", "count", "ct", "cts", "e-", "E-", "e",
+             "photon", "electron/pix", "e-/pixel", "", "  "]  # fmt: skip
+RATES = ["ELECTRONS/S", "electron/s/pix", "electron/s", "counts/s", "Counts/sec", "COUNTS/SECOND",
+         "e-/s", "e- s-1", "e/s", "electron s^-1", "electrons per second", "cps"]  # fmt: skip
+DIGITAL = ["DN", "adu", "ADU", "dn", "DN/pixel"]
+DIGITAL_RATES = ["ADU/s", "adu s-1", "DN/s", "DN/sec", "DN/s/pix"]
+OTHERS = ["MJy/sr", "mJy", "10**-20 erg/s/cm2", "mag", "UNKNOWN", "total nonsense", "(", "[e-]"]
+
+
+class TestUnits:
+    @pytest.mark.parametrize("unit", ELECTRONS)
+    def test_counts_are_taken_as_they_are_and_times_the_gain(self, unit):
+        save_images(BUNIT=unit)
+        np.testing.assert_array_equal(observe().images, IMAGES)
+        np.testing.assert_array_equal(observe(exposure=[20.0]).images, IMAGES)
+        np.testing.assert_array_equal(observe(gain=2.5).images, 2.5 * IMAGES)
+
+    @pytest.mark.parametrize("unit", RATES)
+    def test_counts_per_second_are_times_the_exposure(self, unit):
+        save_images(BUNIT=unit)
+        observation = observe(exposure=[20.0, 30.0])
+        expected = IMAGES * np.array([20.0, 30.0])[:, None, None]
+        np.testing.assert_array_equal(observation.images, expected)
+        np.testing.assert_array_equal(observation.exposure, [20.0, 30.0])
+        both = observe(exposure=[20.0, 30.0], gain=2.0)
+        np.testing.assert_array_equal(both.images, 2.0 * expected)
+        with pytest.raises(InputError, match=r"1\.fits holds counts per time: give --exposure"):
+            observe()
+        with pytest.raises(InputError, match="holds counts per time"):
+            observe(gain=2.0)
+
+    @pytest.mark.parametrize("unit", [*DIGITAL, *DIGITAL_RATES, *OTHERS])
+    def test_what_is_no_count_needs_the_gain(self, unit):
+        save_images(BUNIT=unit)
+        with pytest.raises(InputError) as caught:
+            observe(exposure=[20.0])
+        assert str(caught.value) == (
+            f"1.fits is in {unit}, which is no count: give --gain, the electrons for each unit of "
+            "it"
+        )
+        expected = IMAGES * (2.0 if unit not in DIGITAL_RATES else 40.0)
+        np.testing.assert_array_equal(observe(exposure=[20.0], gain=2.0).images, expected)
+
+    @pytest.mark.parametrize("unit", DIGITAL_RATES)
+    def test_adu_per_second_need_the_exposure_too(self, unit):
+        save_images(BUNIT=unit)
+        with pytest.raises(InputError, match="holds counts per time"):
+            observe(gain=2.0)
+
+    @pytest.mark.parametrize("unit", ["electron/min", "ADU/min"])
+    def test_a_minute_is_sixty_seconds(self, unit):
+        save_images(BUNIT=unit)
+        found = observe(exposure=[120.0], gain=1.5).images
+        np.testing.assert_allclose(found, 3.0 * IMAGES, rtol=1e-14)
+
+    def test_images_in_several_units_are_refused(self):
+        save("1.fits", IMAGES[0], BUNIT="electron")
+        save("2.fits", IMAGES[1], BUNIT="ADU")
+        with pytest.raises(InputError) as caught:
+            observe(gain=2.0)
+        assert str(caught.value) == (
+            "the images come in several units: 1.fits in electron, 2.fits in adu; give them in one"
+        )
+        save("1.fits", IMAGES[0])
+        with pytest.raises(InputError, match=r"1\.fits in none, 2\.fits in adu"):
+            observe(gain=2.0)
+        save("2.fits", IMAGES[1], BUNIT="E-")
+        save("1.fits", IMAGES[1], BUNIT="ELECTRONS")
+        observe()
+
+    @pytest.mark.parametrize("gain", [0.0, -1.0, np.nan, np.inf])
+    def test_a_gain_out_of_range(self, gain):
+        save_images()
+        with pytest.raises(InputError, match=f"the gain must be a number more than 0; {gain:g} "):
+            observe(gain=gain)
+
+    @pytest.mark.parametrize("unit", ["-1", "1e400 ct", "4t448", "2u14", "1,", "mag(ct)"])
+    def test_what_is_no_unit_at_all(self, unit):
+        assert isinstance(units.parse(unit), u.UnrecognizedUnit)
+        assert units.count_of(units.parse(unit)) is None
+
+    @settings(max_examples=60, deadline=None)
+    @given(text=st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=12))
+    def test_no_text_of_a_header_breaks_it(self, text):
+        unit = units.parse(text)
+        assert (unit is None) == (not text.strip())
+        if unit is not None:
+            assert isinstance(unit, u.UnitBase)
+            counts = units.count_of(unit)
+            assert counts is None or counts[0] > 0
+
+    @settings(max_examples=30, deadline=None)
+    @given(
+        unit=st.sampled_from(["electron", "ct", "adu", "electron / s", "ct / s", "adu / s"]),
+        change=st.sampled_from([str.upper, str.lower, str.title]),
+    )
+    def test_case_does_not_matter(self, unit, change):
+        assert units.parse(change(unit)) == u.Unit(unit)
+
+
+class TestExposure:
+    def test_a_number_numbers_and_a_map(self):
+        save_images()
+        save("map.fits", MAP)
+        np.testing.assert_array_equal(observe(exposure=[7.0]).exposure, [7.0, 7.0])
+        np.testing.assert_array_equal(observe(exposure=[7.0, 8.0]).exposure, [7.0, 8.0])
+        np.testing.assert_array_equal(observe(exposure=["map.fits"]).exposure, [MAP, MAP])
+        mixed = observe(exposure=["map.fits", 5.0]).exposure
+        np.testing.assert_array_equal(mixed, [MAP, np.full(SHAPE, 5.0)])
+
+    def test_rates_are_times_a_map(self):
+        save_images(BUNIT="e-/s")
+        save("map.fits", MAP)
+        np.testing.assert_array_equal(observe(exposure=["map.fits"]).images, IMAGES * MAP)
+
+    def test_where_there_is_none_pixels_are_bad(self, log):
+        save_images(BUNIT="e-/s")
+        exposure = MAP.copy()
+        exposure[2, 3:5] = 0.0
+        save("map.fits", exposure)
+        observation = observe(exposure=["map.fits"])
+        np.testing.assert_array_equal(observation.mask, [exposure == 0] * 2)
+        assert "image 2: 2 pixels masked without exposure" in notes(log)
+
+    def test_a_keyword_of_each_header(self, log):
+        save("1.fits", IMAGES[0], EXPTIME=100.0)
+        save("2.fits", IMAGES[1], EXPTIME=200)
+        np.testing.assert_array_equal(observe(exposure=["EXPTIME"]).exposure, [100.0, 200.0])
+        assert notes(log) == ["exposure from EXPTIME: 100, 200 seconds"]
+
+    def test_a_keyword_of_the_primary_header_where_the_image_is_an_extension(self):
+        for path, image, time in zip(("1.fits", "2.fits"), IMAGES, (30.0, 40.0), strict=True):
+            primary = fits.PrimaryHDU(header=fits.Header({"EXPTIME": time}))
+            fits.HDUList([primary, fits.ImageHDU(image)]).writeto(path)
+        np.testing.assert_array_equal(observe(exposure=["EXPTIME"]).exposure, [30.0, 40.0])
+
+    def test_a_keyword_of_a_cube_holds_for_all_its_images(self):
+        save("cube.fits", IMAGES, EXPTIME=3.0)
+        exposure = observe("cube.fits", exposure=["EXPTIME"]).exposure
+        np.testing.assert_array_equal(exposure, [3.0, 3.0])
+
+    @pytest.mark.parametrize(
+        ("cards", "exposure", "message"),
+        [
+            ([{"EXPTIME": 1.0}, {}], ["EXPTIME"], "2.fits has no EXPTIME; give the exposures as "),
+            ([{}, {"EXPTIME": 1.0}], ["EXPTIME"], "1.fits has no EXPTIME; give the exposures as "),
+            ([{"EXPTIME": 1.0}, {"EXPTIME": "long"}], ["EXPTIME"],
+             "EXPTIME of 2.fits is 'long', no number"),
+            ([{"EXPTIME": True}, {"EXPTIME": 1.0}], ["EXPTIME"],
+             "EXPTIME of 1.fits is True, no number"),
+            ([{}, {}], ["EXPTIME"],
+             "exposure 'EXPTIME' is not a number, a keyword of the images' headers, or a file"),
+            ([{"EXPTIME": 1.0}] * 2, ["EXPTIME", 2.0], "the exposure EXPTIME is a keyword, of all"),
+            ([{"EXPTIME": 1.0}] * 2, [2.0, "EXPTIME"], "the exposure EXPTIME is a keyword, of all"),
+            ([{"EXPTIME": 0.0}] * 2, ["EXPTIME"], "exposure must be finite and more than zero; 0"),
+            ([{}, {}], [1.0, 2.0, 3.0], "exposure has shape (3,)"),
+        ],
+    )  # fmt: skip
+    def test_refusals(self, cards, exposure, message):
+        for j in range(2):
+            save(f"{j + 1}.fits", IMAGES[j], **cards[j])
+        with pytest.raises(InputError) as caught:
+            observe(exposure=exposure)
+        assert message in str(caught.value)
+
+
+class TestBackground:
+    def test_a_number_numbers_a_map_and_a_mixture(self):
+        save_images()
+        save("map.fits", MAP)
+        np.testing.assert_array_equal(observe(background=[7.0]).background, [7.0, 7.0])
+        np.testing.assert_array_equal(observe(background=[7.0, 8.0]).background, [7.0, 8.0])
+        np.testing.assert_array_equal(observe(background=["map.fits"]).background, [MAP, MAP])
+        read_ = read(background=[7.0, "map.fits"])
+        np.testing.assert_array_equal(read_.observation.background, [np.full(SHAPE, 7.0), MAP])
+        assert read_.background == [7.0, "map.fits"]
+        assert len(read_.sha256["background"]) == 1
+
+    def test_auto_is_the_sigma_clipped_median_in_electrons(self, log):
+        images = IMAGES.copy()
+        images[:, 4, 4:7] = 1e4
+        save_images(images, BUNIT="adu/s")
+        found = read(background=["auto"], gain=1.5, exposure=[10.0])
+        stats = [sigma_clipped_stats(15.0 * image) for image in images]
+        assert found.background == [median for _, median, _ in stats]
+        np.testing.assert_array_equal(found.observation.background, found.background)
+        for j, (_, median, scatter) in enumerate(stats, 1):
+            assert (
+                f"image {j}: background {median:.6g} electrons per pixel, scatter {scatter:.3g} "
+                "(sigma-clipped median)"
+            ) in notes(log)
+
+    def test_auto_with_numbers_and_maps(self):
+        save_images()
+        save("map.fits", MAP)
+        median = sigma_clipped_stats(IMAGES[1])[1]
+        assert read(background=[3.0, "auto"]).background == [3.0, median]
+        found = read(background=["map.fits", "auto"]).observation.background
+        np.testing.assert_array_equal(found, [MAP, np.full(SHAPE, median)])
+
+    def test_auto_leaves_bad_pixels_out(self):
+        image = np.full(SHAPE, 5.0)
+        image[:3], image[3:6], image[6] = np.nan, 90.0, 3000.0
+        exposure = np.ones(SHAPE)
+        exposure[7:9] = 0.0
+        save("1.fits", image, BUNIT="e-/s")
+        save("mask.fits", (image == 90.0).astype("u1"))
+        save("exposure.fits", exposure)
+        with pytest.warns(LnoclWarning, match="not finite"):
+            found = read(
+                "1.fits",
+                background=["auto"],
+                mask=["mask.fits"],
+                saturation=3000.0,
+                exposure=["exposure.fits"],
+            )
+        assert found.background == [5.0]
+
+    def test_auto_of_a_subtracted_image_is_refused(self):
+        save_images(IMAGES - 60.0)
+        with pytest.raises(InputError) as caught:
+            observe(background=["auto"])
+        assert str(caught.value).startswith("image 1 has a sigma-clipped median of -")
+        assert "give --background 0, and its noise as --read-noise" in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("background", "message"),
+        [
+            (["auto"] * 3, "3 values of background for 2 images; give one, or one for each"),
+            (["map.fits", 1.0, 2.0], "3 values of background for 2 images"),
+            (["Auto"], "background 'Auto' is not a number, auto, or a file that exists"),
+            (["cube.fits", 1.0], "background cube.fits has the shape (2, 10, 12) and the images"),
+            (["oblong.fits"], "background oblong.fits has the shape (1, 12, 10) and the images "
+             "(2, 10, 12); give one map that fits all images, or one for each"),
+            ([-1.0], "background must be finite and not negative; -1"),
+        ],
+    )  # fmt: skip
+    def test_refusals(self, background, message):
+        save_images()
+        save("map.fits", MAP)
+        save("cube.fits", IMAGES)
+        save("oblong.fits", MAP.T)
+        with pytest.raises(InputError) as caught:
+            observe(background=background)
+        assert message in str(caught.value)
+
+    def test_auto_of_an_image_without_a_good_pixel(self):
+        save_images(np.array([IMAGES[0], np.full(SHAPE, np.nan)]))
+        with pytest.raises(InputError, match="image 2 has no good pixel to find its background"):
+            observe(background=["auto"])
+
+
+class TestNoise:
+    def test_a_number_and_maps_of_read_noise(self):
+        save_images()
+        save("map.fits", MAP)
+        np.testing.assert_array_equal(observe(read_noise=[3.0]).background, [9.0, 9.0])
+        observation = observe(read_noise=["map.fits"])
+        np.testing.assert_array_equal(observation.background, [MAP**2] * 2)
+        np.testing.assert_array_equal(observation.images, IMAGES + MAP**2)
+        mixed = observe(read_noise=[2.0, "map.fits"])
+        np.testing.assert_array_equal(mixed.background, [np.full(SHAPE, 4.0), MAP**2])
+        with pytest.raises(
+            InputError, match="read noise 'none' is not a number, or a file that exists"
+        ):
+            observe(read_noise=["none"])
+
+    @pytest.mark.parametrize(
+        ("cards", "known", "factor"),
+        [
+            ({}, {}, 1.0),
+            ({"BUNIT": "adu"}, {"gain": 1.5}, 1.5),
+            ({"BUNIT": "e-/s"}, {"exposure": [20.0]}, 20.0),
+            ({"BUNIT": "adu/s"}, {"exposure": ["map.fits"], "gain": 2.0}, 2.0 * MAP),
+            ({"BUNIT": "electron"}, {"exposure": [20.0]}, 1.0),
+        ],
+    )
+    def test_inverse_variance_is_in_units_of_the_images(self, cards, known, factor):
+        save_images(**cards)
+        save("map.fits", MAP)
+        save("inverse.fits", 1.0 / MAP)
+        observation = observe(inverse_variance=["inverse.fits"], **known)
+        np.testing.assert_allclose(
+            observation.background, [MAP * factor**2] * 2, rtol=1e-14, atol=0
+        )
+
+    def test_where_it_is_0_or_nan_pixels_are_bad(self, log):
+        save_images()
+        inverse = 1.0 / MAP
+        inverse[0, 1], inverse[2, 3], inverse[4, 5] = 0.0, np.nan, np.inf
+        save("inverse.fits", inverse)
+        save("mask.fits", (np.arange(MAP.size) == 1).reshape(SHAPE).astype(int))
+        observation = observe(inverse_variance=["inverse.fits"], mask=["mask.fits"])
+        bad = (inverse == 0) | ~np.isfinite(inverse)
+        np.testing.assert_array_equal(observation.mask, [bad, bad])
+        np.testing.assert_allclose(observation.background[0][~bad], MAP[~bad], rtol=1e-14)
+        assert "image 1: 1 pixels masked by the mask" in notes(log)
+        assert "image 1: 2 pixels masked without inverse variance" in notes(log)
+
+    def test_one_for_each(self):
+        save_images()
+        save("cube.fits", [1.0 / MAP, 2.0 / MAP])
+        observation = observe(inverse_variance=["cube.fits"])
+        np.testing.assert_allclose(observation.background, [MAP, MAP / 2.0], rtol=1e-14)
+
+    def test_refusals(self):
+        save_images()
+        save("inverse.fits", MAP - 1.5)
+        with pytest.raises(InputError, match=r"the inverse variance inverse\.fits has negative"):
+            observe(inverse_variance=["inverse.fits"])
+        save("inverse.fits", MAP)
+        with pytest.raises(InputError, match="give read noise or inverse variance, which holds it"):
+            observe(inverse_variance=["inverse.fits"], read_noise=[1.0])
+        observe(inverse_variance=["inverse.fits"], read_noise=[0.0])
+        save("inverse.fits", MAP[:-1])
+        with pytest.raises(InputError, match=r"inverse variance inverse\.fits has the shape"):
+            observe(inverse_variance=["inverse.fits"])
+
+
+def save_with_dq(path, image, flags):
+    extensions = [] if flags is None else [fits.ImageHDU(flags, name="DQ")]
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(image, name="SCI"), *extensions]).writeto(path)
+
+
+class TestMask:
+    def test_one_for_all_and_one_for_each(self, log):
+        save_images()
+        masks = NONE.astype(float)
+        masks[0, 1, 2], masks[0, 3, 4], masks[1, 5, 6] = 1.0, np.nan, -7.0
+        save("m1.fits", masks[0])
+        save("m2.fits", masks[1])
+        np.testing.assert_array_equal(observe(mask=["m1.fits"]).mask, [masks[0] != 0] * 2)
+        log.clear()
+        both = read(mask=["m1.fits", "m2.fits"])
+        np.testing.assert_array_equal(both.observation.mask, masks != 0)
+        assert len(both.sha256["mask"]) == 2
+        assert notes(log) == [
+            "image 1: 2 pixels masked by the mask",
+            "image 2: 1 pixels masked by the mask",
+        ]
+
+    def test_dq_of_each_file_and_a_mask_besides(self, log):
+        flags = NONE.astype("i2")
+        flags[0, 2, 2], flags[1, 3, 3] = 4, 4096
+        for j in range(2):
+            save_with_dq(f"{j + 1}.fits", IMAGES[j], flags[j])
+        np.testing.assert_array_equal(observe(mask=["dq"]).mask, flags != 0)
+        log.clear()
+        save("mask.fits", flags[0])
+        found = read(mask=["mask.fits", "dq"])
+        np.testing.assert_array_equal(found.observation.mask, [flags[0] != 0, flags.any(axis=0)])
+        assert notes(log) == [
+            "image 1: 1 pixels masked by the mask",
+            "image 2: 1 pixels masked by the mask",
+            "image 1: 0 pixels masked by the extension DQ",
+            "image 2: 1 pixels masked by the extension DQ",
+        ]
+
+    def test_dq_of_a_cube(self):
+        flags = NONE.astype("i2")
+        flags[0, 2, 2], flags[1, 3, 3] = 4, 4096
+        save_with_dq("cube.fits", IMAGES, flags)
+        save_with_dq("flat.fits", IMAGES, flags[1])
+        np.testing.assert_array_equal(observe("cube.fits", mask=["dq"]).mask, flags != 0)
+        np.testing.assert_array_equal(observe("flat.fits", mask=["dq"]).mask, [flags[1] != 0] * 2)
+
+    def test_dq_that_is_not_there_or_does_not_fit(self):
+        save_with_dq("1.fits", IMAGES[0], NONE[0].astype("i2"))
+        save_with_dq("2.fits", IMAGES[1], None)
+        with pytest.raises(InputError) as caught:
+            observe(mask=["dq"])
+        assert str(caught.value) == "2.fits has no extension DQ; give a mask file, or leave dq out"
+        save_with_dq("3.fits", IMAGES[1], NONE[1].T.astype("i2"))
+        with pytest.raises(InputError) as caught:
+            observe("1.fits", "3.fits", mask=["dq"])
+        assert str(caught.value) == (
+            "the extension DQ of 3.fits has the shape (12, 10), its image (10, 12); give a mask "
+            "file"
+        )
+
+    def test_saturation_is_in_units_of_the_images(self, log):
+        save_images(BUNIT="adu")
+        level = IMAGES.max()
+        observation = observe(gain=7.0, saturation=level)
+        np.testing.assert_array_equal(observation.mask, level == IMAGES)
+        expected = [(image == level).sum() for image in IMAGES]
+        assert notes(log) == [
+            f"image {j}: {count} pixels masked as saturated, at {level:g} or above"
+            for j, count in enumerate(expected, 1)
+        ]
+
+    def test_without_any_nothing_is_masked_or_said(self, log):
+        save_images()
+        assert not observe().mask.any()
+        assert notes(log) == []
+
+    def test_wrong_shape_and_missing_file(self):
+        save_images()
+        save("mask.fits", np.zeros((3, *SHAPE)))
+        with pytest.raises(InputError, match=r"mask mask\.fits has the shape \(3, 10, 12\) and"):
+            observe(mask=["mask.fits"])
+        with pytest.raises(FileError, match=r"no\.fits cannot be opened"):
+            observe(mask=["no.fits"])
+
+    @settings(
+        max_examples=30,
+        deadline=None,
+        suppress_health_check=[HealthCheck.function_scoped_fixture],
+    )
+    @given(data=st.data())
+    def test_a_pixel_is_bad_for_any_reason(self, data):
+        bits = st.lists(st.booleans(), min_size=12, max_size=12)
+        flags, dq, high, unknown = (np.array(data.draw(bits)).reshape(1, 3, 4) for _ in range(4))
+        bad = flags | dq | high | unknown
+        image = np.where(high, 100.0, 5.0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            hdus = [fits.PrimaryHDU(image[0]), fits.ImageHDU(dq[0].astype("i2"), name="DQ")]
+            fits.HDUList(hdus).writeto("image.fits", overwrite=True)
+        save("flags.fits", flags[0].astype("i2"))
+        save("inverse.fits", np.where(unknown, 0.0, 0.25)[0])
+        known = {
+            "mask": ["dq", "flags.fits"],
+            "saturation": 100.0,
+            "inverse_variance": ["inverse.fits"],
+        }
+        if bad.all():
+            with pytest.raises(InputError, match="all pixels are masked"):
+                observe("image.fits", **known)
+        else:
+            observation = observe("image.fits", **known)
+            np.testing.assert_array_equal(observation.mask, bad)
+            np.testing.assert_array_equal(observation.background[~bad], 4.0)
+
+
+WCS = {
+    "CTYPE1": "RA---TAN",
+    "CTYPE2": "DEC--TAN",
+    "CRPIX1": 6.0,
+    "CRPIX2": 5.0,
+    "CRVAL1": 150.0,
+    "CRVAL2": 30.0,
+    "CDELT1": -1e-5,
+    "CDELT2": 1e-5,
+}
+
+
+class TestOffsets:
+    def test_by_the_wcs(self, log):
+        save("1.fits", IMAGES[0], **WCS)
+        save("2.fits", IMAGES[1], **(WCS | {"CRPIX1": 7.25, "CRPIX2": 4.5}))
+        np.testing.assert_array_equal(observe().offsets, 0.0)
+        np.testing.assert_allclose(observe(align="wcs").offsets, [(0, 0), (1.25, -0.5)], atol=1e-6)
+        assert notes(log) == ["image 2: offset 1.250, -0.500 pixels in x, y, from the WCS"]
+
+    def test_a_cube_has_one_wcs(self):
+        save("cube.fits", IMAGES, **WCS)
+        with pytest.raises(InputError) as caught:
+            observe("cube.fits", align="wcs")
+        assert str(caught.value) == (
+            "cube.fits is a cube, with one WCS for all its images; to align them give a file for "
+            "each"
+        )
+
+
+def test_checksums_are_kept_by_what_the_files_are():
+    save_images()
+    save("map.fits", MAP)
+    found = read(background=["map.fits"], exposure=["map.fits"], read_noise=["map.fits"])
+    assert {name: len(sums) for name, sums in found.sha256.items()} == {
+        "images": 2,
+        "psfs": 1,
+        "background": 1,
+        "exposure": 1,
+        "read_noise": 1,
+    }

@@ -1,0 +1,320 @@
+"""Positions on the sky and tables of stars, against astropy, and offsets by the WCS."""
+
+import logging
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.table import MaskedColumn, QTable, Table
+from astropy.wcs import WCS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lnocl.errors import FileError, InputError
+from lnocl.io import sky
+
+SHAPE = (16, 12)
+SCALE = 1e-5
+PLAIN = {
+    "CTYPE1": "RA---TAN",
+    "CTYPE2": "DEC--TAN",
+    "CRPIX1": 6.0,
+    "CRPIX2": 8.0,
+    "CRVAL1": 150.0,
+    "CRVAL2": 30.0,
+}
+
+
+def header(angle=0.0, scale=SCALE, mirror=False, **changes):
+    """Return a header whose x axis is turned by an angle in degrees."""
+    cos, sin = scale * np.cos(np.radians(angle)), scale * np.sin(np.radians(angle))
+    turned = {"CD1_1": -cos, "CD1_2": sin, "CD2_1": sin, "CD2_2": cos}
+    if mirror:
+        turned |= {"CD1_1": cos, "CD2_1": -sin}
+    return fits.Header(PLAIN | turned | changes)
+
+
+def with_sip(**changes):
+    return header(
+        **{
+            "CTYPE1": "RA---TAN-SIP",
+            "CTYPE2": "DEC--TAN-SIP",
+            "A_ORDER": 2,
+            "A_2_0": 1e-3,
+            "B_ORDER": 2,
+            "B_0_2": -2e-3,
+        }
+        | changes
+    )
+
+
+GALACTIC = {"CTYPE1": "GLON-TAN", "CTYPE2": "GLAT-TAN"}
+SOLAR = {"CTYPE1": "HPLN-TAN", "CTYPE2": "HPLT-TAN"}
+HEADERS = {
+    "TAN": header(),
+    "turned": header(angle=37.0),
+    "SIP": with_sip(),
+    "galactic": header(**GALACTIC),
+    "FK5": header(RADESYS="FK5", EQUINOX=1975.0),
+}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Work in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+
+class TestOffsets:
+    @settings(max_examples=30, deadline=None)
+    @given(dx=st.floats(-9, 9), dy=st.floats(-12, 12), angle=st.floats(0, 360))
+    def test_another_reference_pixel_is_the_offset(self, dx, dy, angle):
+        headers = [header(angle), header(angle, CRPIX1=6.0 + dx, CRPIX2=8.0 + dy)]
+        found = sky.offsets(headers, ["a", "b"], SHAPE)
+        np.testing.assert_allclose(found, [(0, 0), (dx, dy)], atol=1e-6)
+
+    @settings(max_examples=30, deadline=None)
+    @given(dx=st.floats(-9, 9), dy=st.floats(-12, 12))
+    def test_so_is_another_reference_value(self, dx, dy):
+        # A telescope that points dx to the left in the image sees everything dx to the right.
+        at = WCS(header()).pixel_to_world(5.0 - dx, 7.0 - dy)
+        headers = [header(), header(CRVAL1=at.ra.deg, CRVAL2=at.dec.deg)]
+        found = sky.offsets(headers, ["a", "b"], SHAPE)
+        np.testing.assert_allclose(found[1], (dx, dy), atol=1e-3)
+
+    def test_with_sip_as_stars_in_the_middle_move(self):
+        mild = {"A_2_0": 3e-4, "B_0_2": -3e-4}
+        headers = [with_sip(**mild), with_sip(**mild, CRPIX1=8.5, CRPIX2=7.25)]
+        found = sky.offsets(headers, ["a", "b"], SHAPE)
+        np.testing.assert_allclose(found[1], (2.5, -0.75), atol=1e-6)
+        at = WCS(headers[0]).pixel_to_world(3.0, 9.0)
+        headers[1] = with_sip(**mild, CRVAL1=at.ra.deg, CRVAL2=at.dec.deg)
+        x, y = np.meshgrid([3.5, 5.5, 7.5], [5.5, 7.5, 9.5])
+        stars = WCS(headers[0]).pixel_to_world(x, y)
+        moved = np.array(WCS(headers[1]).world_to_pixel(stars)) - (x, y)
+        found = sky.offsets(headers, ["a", "b"], SHAPE)
+        np.testing.assert_allclose(found[1], moved.mean(axis=(1, 2)), atol=1e-3)
+
+    def test_several_and_one(self):
+        headers = [header(), header(CRPIX1=7.0), header(CRPIX2=5.0)]
+        found = sky.offsets(headers, ["a", "b", "c"], SHAPE)
+        np.testing.assert_allclose(found, [(0, 0), (1, 0), (0, -3)], atol=1e-6)
+        np.testing.assert_array_equal(sky.offsets(headers[:1], ["a"], SHAPE), [(0, 0)])
+
+    def test_a_little_turn_is_allowed(self):
+        # 0.5 degrees move the corners by 7.5 pixels times 0.0087.
+        found = sky.offsets([header(), header(angle=0.5)], ["a", "b"], SHAPE)
+        np.testing.assert_allclose(found[1], 0.0, atol=0.1)
+
+    @pytest.mark.parametrize(
+        ("other", "message"),
+        [
+            (header(angle=1.0), "b.fits is rotated by -1.00 degrees and scaled by 1.0000 against "
+             "a.fits, which moves pixels by up to 0.13 besides the offset: images are never "
+             "resampled; give those of one orientation and scale together, or have them reduced "
+             "to one grid"),
+            (header(angle=180.0), "180.00 degrees and scaled by 1.0000 against a.fits"),
+            (header(scale=SCALE / 1.1), "b.fits is rotated by 0.00 degrees and scaled by 1.1000"),
+            (header(mirror=True), "b.fits is mirrored against a.fits, which moves pixels by up"),
+            (with_sip(A_2_0=1e-2), "b.fits is rotated by 0.00 degrees and scaled by 0.9960"),
+            (fits.Header(), "b.fits has no sky coordinates (WCS) that can be used; leave --align"),
+            (header(**SOLAR), "b.fits has no sky coordinates (WCS) that can be used"),
+            (header(CRVAL1=152.0), "b.fits shows another part of the sky than a.fits, by its sky "
+             "coordinates; leave one of them out"),
+            (header(CRPIX1=18.0), "b.fits shows another part of the sky than a.fits"),
+            (header(CRPIX2=-9.0), "b.fits shows another part of the sky than a.fits"),
+            (header(CRVAL1=330.0, CRVAL2=-30.0), "b.fits shows another part of the sky than a.fit"),
+            (with_sip(CRVAL1=150.01), "b.fits shows another part of the sky than a.fits"),
+        ],
+    )  # fmt: skip
+    def test_refusals(self, other, message):
+        with pytest.raises(InputError) as caught:
+            sky.offsets([header(), other], ["a.fits", "b.fits"], SHAPE)
+        assert message in str(caught.value)
+
+
+class TestPositions:
+    @pytest.mark.parametrize("given", HEADERS.values(), ids=HEADERS)
+    def test_there_and_back_as_astropy_has_it(self, given):
+        positions = np.array([(0.0, 0.0), (5.25, 7.5), (11.0, 15.0)])
+        wcs = sky.celestial_wcs(given, "a.fits")
+        degrees = sky.to_sky(positions, given)
+        expected = WCS(given).pixel_to_world(*positions.T).icrs
+        np.testing.assert_allclose(degrees, np.array([expected.ra.deg, expected.dec.deg]).T)
+        texts = [f"{ra!r},{dec!r}" for ra, dec in degrees.tolist()]
+        found = sky.to_pixels(sky.parse_sky(texts), wcs, "a.fits")
+        np.testing.assert_allclose(found, positions, atol=1e-6)
+
+    def test_no_positions(self):
+        assert sky.to_sky(np.zeros((0, 2)), header()).shape == (0, 2)
+
+    @settings(max_examples=40, deadline=None)
+    @given(ra=st.floats(0, 359.99), dec=st.floats(-89.99, 89.99), sep=st.sampled_from(": "))
+    def test_degrees_and_sexagesimal_are_the_same(self, ra, dec, sep):
+        position = SkyCoord(ra, dec, unit="deg")
+        ra_text = position.ra.to_string("hour", sep=sep, precision=6)
+        dec_text = position.dec.to_string("deg", sep=sep, precision=6)
+        found = sky.parse_sky([f"{ra!r},{dec!r}", f"{ra_text},{dec_text}"])
+        assert found.separation(position).arcsec.max() < 2e-4
+
+    @pytest.mark.parametrize(
+        "text",
+        ["", "1", "15.25,-3:30:00", "x,y", "10,95", "25:00:00,3:00:00", "1,2,3", "nan,5", "inf,5",
+         "10,", ",10", "1:61:00,5:00:00"],
+    )  # fmt: skip
+    def test_what_is_no_position(self, text):
+        with pytest.raises(InputError) as caught:
+            sky.parse_sky(["1,2", text])
+        assert str(caught.value) == (f"{text!r} is not RA,DEC in degrees, or as hh:mm:ss,dd:mm:ss")
+
+    @pytest.mark.parametrize("given", [header(), with_sip()])
+    def test_what_the_projection_does_not_show(self, given):
+        wcs = sky.celestial_wcs(given, "a.fits")
+        coordinates = sky.parse_sky(["150,30", "330,-30"])
+        with pytest.raises(InputError) as caught:
+            sky.to_pixels(coordinates, wcs, "a.fits")
+        assert str(caught.value) == (
+            "the star at RA, Dec 330.00000 -30.00000 lies in another part of the sky than a.fits"
+        )
+
+    @pytest.mark.parametrize(
+        "given",
+        [fits.Header(), fits.Header({"CTYPE1": "LINEAR", "CTYPE2": "LINEAR"}), header(**SOLAR),
+         header(CD1_1=0.0, CD2_2=0.0, CD1_2=0.0, CD2_1=0.0), header(RADESYS="GAPPT")],
+    )  # fmt: skip
+    def test_coordinates_that_are_none(self, given):
+        assert not sky.has_celestial(given)
+        with pytest.raises(InputError) as caught:
+            sky.celestial_wcs(given, "a.fits")
+        assert str(caught.value) == (
+            "a.fits has no sky coordinates (WCS) that can be used; give positions in pixels"
+        )
+
+
+POSITIONS = np.array([(2.5, 3.0), (7.0, 11.25)])
+ICRS = WCS(header()).pixel_to_world(*POSITIONS.T)
+
+
+def stars(path, given=None):
+    return sky.read_stars(path, header() if given is None else given, "a.fits")
+
+
+def save(path, text):
+    with open(path, "w") as stream:
+        stream.write(text)
+    return path
+
+
+class TestTables:
+    @pytest.mark.parametrize("name", ["t.csv", "t.ecsv", "t.fits", "t.vot"])
+    @pytest.mark.parametrize("kind", [Table, QTable])
+    def test_pixels_in_any_format(self, caplog, name, kind):
+        caplog.set_level(logging.INFO, "lnocl")
+        unit = 1 if name == "t.csv" else u.pix
+        kind({"id": ["a", "b"], "X": POSITIONS[:, 0] * unit, "y": POSITIONS[:, 1] * unit}).write(
+            name, **({"format": "votable"} if name == "t.vot" else {})
+        )
+        np.testing.assert_array_equal(stars(name, fits.Header()), POSITIONS)
+        assert [record.getMessage() for record in caplog.records] == [f"{name}: 2 stars"]
+
+    @pytest.mark.parametrize("name", ["t.ecsv", "t.fits"])
+    @pytest.mark.parametrize("unit", [u.deg, u.rad, u.hourangle, u.arcsec])
+    @pytest.mark.parametrize("kind", [Table, QTable])
+    def test_the_sky_in_any_unit(self, name, unit, kind):
+        if (name, unit) == ("t.fits", u.hourangle):
+            pytest.skip("FITS has no such unit")
+        kind({"RA": ICRS.ra.to(unit), "Dec": ICRS.dec.to(u.deg)}).write(name)
+        np.testing.assert_allclose(stars(name), POSITIONS, atol=1e-4)
+
+    def test_the_sky_without_a_unit_is_in_degrees(self):
+        Table({"ra": ICRS.ra.deg, "dec": ICRS.dec.deg}).write("t.csv")
+        np.testing.assert_allclose(stars("t.csv"), POSITIONS, atol=1e-6)
+
+    def test_pixels_go_before_the_sky(self):
+        save("t.csv", "ra,dec,x,y\n0,0,1,2\n")
+        np.testing.assert_array_equal(stars("t.csv"), [(1, 2)])
+
+    @pytest.mark.parametrize("name", ["t.txt", "t.dat", "stars"])
+    def test_plain_text_of_any_name(self, name):
+        save(name, "x y mag\n1 2.5 17\n3 4 18\n")
+        np.testing.assert_array_equal(stars(name), [(1, 2.5), (3, 4)])
+
+    def test_units_in_other_words(self):
+        columns = [fits.Column("x", "D", unit="pixels", array=[1.0]),
+                   fits.Column("y", "D", unit="PIXEL", array=[2.0])]  # fmt: skip
+        fits.BinTableHDU.from_columns(columns).writeto("t.fits")
+        np.testing.assert_array_equal(stars("t.fits"), [(1, 2)])
+
+    def test_an_empty_table_has_no_stars(self):
+        assert stars(save("t.csv", "x,y\n")).shape == (0, 2)
+        assert stars(save("s.csv", "ra,dec\n")).shape == (0, 2)
+
+    @pytest.mark.parametrize("name", ["t.ecsv", "t.fits", "t.csv"])
+    @pytest.mark.parametrize("kind", [float, int])
+    def test_rows_without_a_number(self, name, kind):
+        if (name, kind) == ("t.fits", int):
+            pytest.skip("FITS masks no whole numbers here")
+        x = MaskedColumn([1, 2], mask=[False, True], dtype=kind)
+        Table({"x": x, "y": [1.0, 2.0]}).write(name)
+        with pytest.raises(InputError) as caught:
+            stars(name)
+        assert str(caught.value) == f"column x of {name} has rows without a number"
+
+    def test_masked_quantities(self):
+        from astropy.utils.masked import Masked
+
+        table = QTable({"x": Masked([1.0, 2.0] * u.pix, mask=[False, True]), "y": [1, 2] * u.pix})
+        table.write("t.ecsv")
+        with pytest.raises(InputError, match=r"column x of t\.ecsv has rows without a number"):
+            stars("t.ecsv")
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("x,mag\n1,2\n", "t.csv has neither columns x and y nor ra and dec; it has x, mag"),
+            ("", "t.csv has neither columns x and y nor ra and dec; it has none"),
+            ("no table\nat all\n", "t.csv has neither columns x and y nor ra and dec; it has no"),
+            ("x,y\na,2\n", "column x of t.csv is no position: could not convert string to float"),
+            ("x,y\nnan,2\n", "column x of t.csv has rows without a number"),
+            ("x,y\n2,inf\n", "column y of t.csv has rows without a number"),
+            ("ra,dec\n10,95\n", "column dec of t.csv has rows beyond 90 degrees"),
+            ("ra,dec\n330,-30\n", "the star at RA, Dec 330.00000 -30.00000 lies in another part"),
+        ],
+    )
+    def test_tables_that_hold_no_stars(self, text, message):
+        with pytest.raises(InputError) as caught:
+            stars(save("t.csv", text))
+        assert message in str(caught.value)
+
+    def test_units_that_are_no_pixels_or_angles(self):
+        Table({"x": [1.0] * u.arcsec, "y": [1.0] * u.arcsec}).write("t.ecsv")
+        with pytest.raises(InputError, match=r"column x of t\.ecsv is no position: 'arcsec'"):
+            stars("t.ecsv")
+
+    def test_columns_of_vectors(self):
+        Table({"x": np.ones((1, 2)), "y": np.ones((1, 2))}).write("t.ecsv")
+        with pytest.raises(InputError, match=r"column x of t\.ecsv has several numbers in a row"):
+            stars("t.ecsv")
+
+    def test_the_sky_of_an_image_without_any(self):
+        save("t.csv", "ra,dec\n150,30\n")
+        with pytest.raises(InputError, match=r"a\.fits has no sky coordinates .* in pixels"):
+            stars("t.csv", fits.Header())
+
+    def test_files_that_are_no_table(self, tmp_path):
+        fits.writeto("image.fits", np.ones((3, 3)))
+        save("uneven.csv", "x,y\n1,2,3,4\n")
+        (tmp_path / "bytes.dat").write_bytes(bytes(range(128, 256)))
+        for path, reason in {
+            "no.csv": "No such file or directory",
+            "no.dat": "No such file or directory",
+            ".": "Is a directory",
+            "image.fits": "No table found",
+            "uneven.csv": "Number of header columns (2) inconsistent with data columns",
+            "bytes.dat": "",
+        }.items():
+            with pytest.raises(FileError) as caught:
+                stars(path)
+            assert str(caught.value).startswith(f"{path} cannot be read as a table: {reason}")

@@ -1,0 +1,211 @@
+"""Choosing a device, and what is said where there is none or it cannot do what is asked."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from scenes import blur
+from scipy.special import kl_div
+
+import lnocl
+from lnocl.engines import opencl
+from lnocl.opencl import device, program
+from lnocl.scene.scene import LEAST_MODEL
+
+GPU = SimpleNamespace(name="Fast GPU", type=cl.device_type.GPU)
+CPU = SimpleNamespace(name="Slow CPU", type=cl.device_type.CPU)
+SECOND_CPU = SimpleNamespace(name="Other CPU", type=cl.device_type.CPU)
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """A machine with two platforms: one with two CPUs, one with a GPU."""
+    platforms = [
+        SimpleNamespace(name="Portable", get_devices=lambda: [CPU, SECOND_CPU]),
+        SimpleNamespace(name="Vendor", get_devices=lambda: [GPU]),
+    ]
+    for platform in platforms:
+        for each in platform.get_devices():
+            monkeypatch.setattr(each, "platform", platform, raising=False)
+            monkeypatch.setattr(each, "driver_version", "1", raising=False)
+    monkeypatch.setattr(cl, "get_platforms", lambda: platforms)
+    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+    return platforms
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        (None, GPU),
+        ("0", CPU),
+        ("0:1", SECOND_CPU),
+        ("portable", CPU),
+        ("PORT:other", SECOND_CPU),
+        ("1:0", GPU),
+        ("vendor:gpu", GPU),
+    ],
+)
+def test_choose(machine, spec, expected):
+    assert device.choose(spec).device is expected
+
+
+def test_first_cpu_where_there_is_no_gpu(machine):
+    machine.pop()
+    assert device.choose().device is CPU
+    assert device.choose().reason == "the first CPU"
+
+
+def test_environment_decides_where_nothing_is_asked_for(machine, monkeypatch):
+    monkeypatch.setenv("PYOPENCL_CTX", "0:1")
+    assert device.choose().device is SECOND_CPU
+    assert "PYOPENCL_CTX" in device.choose().reason
+    assert device.choose("1").device is GPU
+
+
+@pytest.mark.parametrize("spec", ["2", "0:2", "nosuch", "vendor:cpu", "", ":0"])
+def test_unknown_device_is_refused_with_what_there_is(machine, spec):
+    with pytest.raises(lnocl.InputError, match=r"fits no OpenCL device; 0:0 is Slow CPU") as error:
+        device.choose(spec)
+    assert "\n" not in str(error.value)
+
+
+def test_specification_finds_the_device_again(machine):
+    machine.insert(0, SimpleNamespace(name="Empty", get_devices=list))
+    for each in (CPU, SECOND_CPU, GPU):
+        assert device.choose(device.spec_of(each)).device is each
+
+
+def test_no_platform(monkeypatch):
+    def none():
+        raise cl.LogicError("clGetPlatformIDs", -1001, "")
+
+    monkeypatch.setattr(cl, "get_platforms", none)
+    with pytest.raises(lnocl.DeviceError, match=r"no OpenCL device was found; install a runtime"):
+        device.choose()
+
+
+def test_no_double_precision(monkeypatch):
+    monkeypatch.setattr(program, "has_double", lambda device: False)
+    observation = lnocl.Observation(np.ones((8, 8)), np.ones((1, 1)))
+    with pytest.raises(lnocl.DeviceError, match="has no double precision; take precision single"):
+        lnocl.deconvolve(observation, precision="double", n_iter=1)
+    lnocl.deconvolve(observation, precision="single", n_iter=1)
+
+
+def scene(p, n, stars=0):
+    observation = lnocl.Observation(np.ones((p, n, n)), np.ones((n, n)))
+    return opencl.Scene(observation, [(i, i) for i in range(stars)])
+
+
+@pytest.mark.parametrize("limit", ["global_mem_size", "max_mem_alloc_size"])
+def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, limit):
+    found = device.choose().device
+    monkeypatch.setattr(opencl.OpenCLEngine, "_allocate", lambda *_: pytest.fail("allocated"))
+    monkeypatch.setattr(cl.Device, limit, 100_000)
+    with pytest.raises(lnocl.DeviceError, match=r"the scene needs \d+ MiB, .* for star_images"):
+        opencl.OpenCLEngine(scene(2, 64, stars=9), "single", device.spec_of(found), 10)
+
+
+@pytest.mark.parametrize(("height", "tuning"), [(64, None), (8192, program.Tuning(4, 16))])
+def test_memory_estimate_is_what_the_buffers_hold(height, tuning, caplog):
+    """With scratch in local memory, of which 32 KiB will do, and with scratch in global memory."""
+    caplog.set_level("INFO", "lnocl")
+    observation = lnocl.Observation(np.ones((2, height, 64)), np.ones((1, 1)))
+    engine = opencl.OpenCLEngine(opencl.Scene(observation, [(1, 1)]), "single", None, 10, tuning)
+    assert engine.program.scratch_is_global == (tuning is not None)
+    engine.extended()  # waits for the device
+    launcher = engine._launcher
+    held = [*engine._buffers.values(), launcher._row_roots, launcher._column_roots]
+    if engine.program.scratch_is_global:
+        held.append(launcher._scratch)
+    assert engine.bytes_needed == sum(buffer.size for buffer in held)
+    (message,) = caplog.messages
+    assert message == f"{engine.name}: the scene takes {engine.bytes_needed / 2**20:.1f} MiB"
+
+
+@pytest.mark.parametrize(("p", "n"), [(1, 256), (4, 256), (1, 1024), (4, 1024)])
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_memory_is_little_more_than_what_must_be_held(monkeypatch, p, n, precision):
+    """Images, OTFs, one set of spectra, the estimate."""
+    monkeypatch.setattr(opencl.OpenCLEngine, "_allocate", lambda *_: None)
+    monkeypatch.setattr(opencl.OpenCLEngine, "_bind", lambda *_: None)
+    monkeypatch.setattr(opencl.OpenCLEngine, "_upload_scene", lambda *_: None)
+    engine = opencl.OpenCLEngine(scene(p, n), precision, None, 1000)
+    must = (3 * p + 1) * n * n * engine.program.dtype.itemsize
+    assert must < engine.bytes_needed <= 1.04 * must
+
+
+def test_failing_compiler_is_named(monkeypatch):
+    monkeypatch.setattr(program, "source", lambda names: "this is no OpenCL")
+    with pytest.raises(lnocl.DeviceError, match="the kernels do not build on") as error:
+        opencl.OpenCLEngine(scene(1, 8), "single", None, 1)
+    assert "\n" not in str(error.value)
+
+
+def test_the_reference_engine_needs_no_opencl():
+    code = (
+        "import sys; sys.modules['pyopencl'] = None\n"
+        "import numpy, lnocl\n"
+        "obs = lnocl.Observation(numpy.ones((8, 8)), numpy.ones((1, 1)))\n"
+        "print(lnocl.deconvolve(obs, n_iter=1, engine='numpy').device)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "numpy\n"
+
+
+def test_build_options_are_recorded_and_kernels_fetched_once():
+    engine = opencl.OpenCLEngine(scene(1, 32), "single", None, 1)
+    assert "-DREAL=float" in engine.program.options
+    assert "-DNX=32" in engine.program.options
+    kernel = engine.program.kernels["scale_rows"]
+    engine.scale()
+    engine.extended()  # waits for the device
+    assert engine.program.kernels["scale_rows"] is kernel
+
+
+def test_kernels_and_their_program_are_let_go():
+    """PyOpenCL's `Program.all_kernels` gives kernels that keep themselves and their program."""
+    context = cl.Context([device.choose().device])
+    built = program.Program(context, (8, 8), np.dtype(np.float32))
+    assert {kernel.reference_count for kernel in built.kernels.values()} == {1}
+
+
+@pytest.mark.parametrize(
+    ("keywords", "name"),
+    [
+        ({"initial_extended": np.full((8, 8), 1e300)}, "extended"),
+        ({"stars": [(1, 1)], "initial_star_fluxes": [1e300]}, "star fluxes"),
+    ],
+)
+def test_values_too_large_for_single_precision_are_refused(keywords, name):
+    observation = lnocl.Observation(np.ones((8, 8)), np.ones((1, 1)))
+    with pytest.raises(lnocl.InputError, match=f"{name} as large as .* held in float32"):
+        lnocl.deconvolve(observation, n_iter=1, **keywords)
+
+
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.filterwarnings("ignore:.*psf pixels are negative")
+def test_objective_is_finite_where_the_model_is_negative_and_there_are_counts(engine):
+    psf = np.array([[-1.0, 3.0, -1.0]])
+    observation = lnocl.Observation(np.full((8, 8), 3.0), psf)
+    start = np.ones((8, 8))
+    start[2, 5] = 50.0
+    result = lnocl.deconvolve(observation, n_iter=3, initial_extended=start, engine=engine)
+    model = np.maximum(blur(start, psf), 4.0 * LEAST_MODEL)  # images of mean 3 are scaled by 4
+    expected = kl_div(3.0, model).sum()
+    assert result.history["objective"][0] == pytest.approx(expected, rel=1e-6)
+    assert np.isfinite(result.history["objective"]).all()
+    assert np.isfinite(result.extended).all()
+
+
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.filterwarnings("ignore:.*psf pixels are negative")
+def test_star_fluxes_stay_at_zero_or_above_under_negative_psf_pixels(engine):
+    images = np.full((8, 8), 0.5)
+    images[4, 3] = 1e4
+    observation = lnocl.Observation(images, [[-2.0, 5.0, -2.0]], background=1.0)
+    result = lnocl.deconvolve(observation, stars=[(4, 4)], n_iter=3, engine=engine)
+    assert (result.star_fluxes >= 0).all()

@@ -1,0 +1,561 @@
+"""Devices that fail, caches that are broken, forks, and objectives that are not finite."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from runtimes import on_pocl
+from scenes import make_smooth_psfs
+
+import lnocl
+from lnocl.engines import opencl
+from lnocl.opencl import device, kernel_cache, program
+from lnocl.reference.reference import ReferenceEngine
+
+
+def observe(n=16, p=1):
+    rng = np.random.default_rng(n)
+    return lnocl.Observation(rng.poisson(50.0, (p, n, n)), np.ones((3, 3)), background=1.0)
+
+
+def error_of(kind, code, routine):
+    record = cl._cl._ErrorRecord(msg="", code=getattr(cl.status_code, code), routine=routine)
+    return kind(record)
+
+
+def fail_with(error, after=0):
+    """Return a stand-in for a function of pyopencl that fails from some call on."""
+
+    def wrap(function):
+        calls = []
+
+        def stand_in(*arguments, **keywords):
+            calls.append(None)
+            if len(calls) > after:
+                raise error
+            return function(*arguments, **keywords)
+
+        return stand_in
+
+    return wrap
+
+
+def refused(**keywords):
+    """Return the one line that a deconvolution is refused with."""
+    with pytest.raises(lnocl.DeviceError) as caught:
+        lnocl.deconvolve(observe(), **{"n_iter": 40, **keywords})
+    assert "\n" not in str(caught.value)
+    assert caught.value.__cause__ is not None
+    return str(caught.value)
+
+
+SHORT = [
+    (cl.MemoryError, "MEM_OBJECT_ALLOCATION_FAILURE"),
+    (cl.RuntimeError, "OUT_OF_RESOURCES"),
+    (cl.RuntimeError, "OUT_OF_HOST_MEMORY"),
+]
+
+
+@pytest.mark.parametrize(("kind", "code"), SHORT)
+@pytest.mark.parametrize("call", ["Buffer", "enqueue_nd_range_kernel", "enqueue_copy"])
+def test_too_little_memory_is_said_with_what_is_needed(monkeypatch, kind, code, call):
+    error = error_of(kind, code, call)
+    # A new list each time: monkeypatching cl.Buffer hides the class from isinstance elsewhere.
+    monkeypatch.setattr(cl, call, fail_with(error)(getattr(cl, call)))
+    message = refused()
+    assert re.search(r"has too little memory free: the scene takes \d+ MiB there; take", message)
+    assert code in message
+    assert describe() in message
+
+
+def describe():
+    return device.describe(device.choose().device)
+
+
+@pytest.mark.parametrize(
+    ("kind", "code"),
+    [
+        (cl.RuntimeError, "DEVICE_NOT_AVAILABLE"),
+        (cl.RuntimeError, "OUT_OF_RESOURCES"),
+        (cl.LogicError, "INVALID_COMMAND_QUEUE"),
+        (cl.LogicError, "INVALID_CONTEXT"),
+    ],
+)
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_a_lost_device_is_said_while_it_iterates(monkeypatch, kind, code, solver):
+    error = error_of(kind, code, "clEnqueueNDRangeKernel")
+    wrapped = fail_with(error, after=60)(cl.enqueue_nd_range_kernel)
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", wrapped)
+    message = refused(solver=solver)
+    assert f"failed (clEnqueueNDRangeKernel failed: {code}), and what it held is lost" in message
+    assert "lnocl selftest" in message
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_too_little_memory_for_a_run_that_goes_on_is_no_lost_device(monkeypatch, tmp_path, solver):
+    saved = str(tmp_path / "run.fits")
+    lnocl.deconvolve(
+        observe(), n_iter=40, solver=solver, checkpoint=saved, callback=lambda k, _: k == 20
+    )
+    error = error_of(cl.RuntimeError, "OUT_OF_RESOURCES", "clEnqueueNDRangeKernel")
+    genuine = opencl.OpenCLEngine.restore
+
+    def restore(engine, state):
+        genuine(engine, state)
+        monkeypatch.setattr(cl, "enqueue_nd_range_kernel", fail_with(error)(None))
+
+    monkeypatch.setattr(opencl.OpenCLEngine, "restore", restore)
+    assert "has too little memory free" in refused(solver=solver, resume=saved)
+
+
+def test_a_device_lost_while_the_host_waits(monkeypatch):
+    error = error_of(
+        cl.RuntimeError, "EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST", "clWaitForEvents"
+    )
+    monkeypatch.setattr(cl.Event, "wait", fail_with(error)(cl.Event.wait))
+    assert "clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST" in refused()
+
+
+def test_every_public_verb_of_the_engine_is_guarded():
+    public = {name for name, verb in vars(opencl.OpenCLEngine).items() if callable(verb)}
+    unguarded = {
+        name
+        for name in public
+        if not name.startswith("_") and not hasattr(vars(opencl.OpenCLEngine)[name], "__wrapped__")
+    }
+    assert not unguarded
+    assert hasattr(opencl.OpenCLEngine.__init__, "__wrapped__")
+
+
+def test_a_compiler_that_fails_leaves_its_whole_log(monkeypatch, tmp_path):
+    monkeypatch.setattr(program, "source", lambda names: "this is no OpenCL;\nnor this")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    message = refused()
+    (log,) = tmp_path.glob("lnocl-build-*.log")
+    assert f"all it said is in {log}" in message
+    said = log.read_text()
+    assert "error:" in message
+    assert said.count("error:") >= 1
+    assert len(said) > len(message)
+
+
+@on_pocl  # with others, PyOpenCL needs a folder for temporary files first
+def test_a_log_that_cannot_be_saved_is_no_other_error(monkeypatch):
+    monkeypatch.setattr(program, "source", lambda names: "this is no OpenCL")
+    device.choose()  # has made its folder
+    monkeypatch.setattr("tempfile.tempdir", "/nonexistent")
+    assert "could not be saved" in refused()
+
+
+def run_python(code, *arguments, cwd=None, **environment):
+    """Run a program in a process of its own, which has a kernel cache of its own."""
+    return subprocess.run(
+        [sys.executable, "-c", PRELUDE + code, *arguments],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(lnocl.__file__).parents[1]), **environment},
+        cwd=cwd,
+        timeout=120,
+    )
+
+
+PRELUDE = """
+import os, sys
+import numpy as np
+import lnocl
+observation = lnocl.Observation(np.arange(256.0).reshape(16, 16), np.ones((3, 3)))
+def deconvolve(n_iter=3):
+    return lnocl.deconvolve(observation, n_iter=n_iter).extended.sum()
+"""
+
+
+@pytest.mark.exhaustive
+def test_memory_that_is_really_short():
+    code = """
+import resource
+deconvolve()
+large = lnocl.Observation(np.full((2048, 2048), 5.0), np.ones((3, 3)))
+pages = int(open("/proc/self/statm").read().split()[0])
+for room in (170, 200, 230):
+    limit = pages * resource.getpagesize() + room * 2**20
+    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    try:
+        lnocl.deconvolve(large, n_iter=1, precision="double")
+    except lnocl.DeviceError as error:
+        print(error)
+    except MemoryError:
+        pass  # before the device is reached
+"""
+    done = run_python(code)
+    assert done.returncode == 0, done.stderr
+    assert "too little memory free: the scene takes 1" in done.stdout
+
+
+@pytest.fixture(scope="module")
+def warm(tmp_path_factory):
+    """A store with the archive of one program, and what a run with it makes."""
+    folder = tmp_path_factory.mktemp("store")
+    done = run_python("print(deconvolve())", POCL_CACHE_DIR=str(folder))
+    (archive,) = folder.iterdir()
+    return archive.name, archive.read_bytes(), done.stdout
+
+
+@on_pocl
+def test_kernels_are_kept_and_used_again(warm, tmp_path):
+    name, content, said = warm
+    (tmp_path / name).write_bytes(content)
+    begin = time.monotonic()
+    code = "from lnocl import program\nprint(deconvolve())\nprint(os.environ['POCL_CACHE_DIR'])"
+    done = run_python(code, POCL_CACHE_DIR=str(tmp_path))
+    assert time.monotonic() - begin < 30
+    assert done.stdout == f"{said}{tmp_path}\n"
+    assert not done.stderr
+    (archive,) = tmp_path.iterdir()
+    assert archive.read_bytes() == content
+    with zipfile.ZipFile(archive) as kept:
+        assert any(file.endswith("scale_rows.so") for file in kept.namelist())
+
+
+def middle(content):
+    """Return the content with some bytes changed in a file of the archive."""
+    at = content.index(b"\x7fELF") + 2000
+    return content[:at] + bytes(64) + b"\xff" * 64 + content[at + 128 :]
+
+
+@on_pocl
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda content: b"", id="empty", marks=pytest.mark.exhaustive),
+        pytest.param(
+            lambda content: content[: len(content) // 2],
+            id="truncated",
+            marks=pytest.mark.exhaustive,
+        ),
+        pytest.param(
+            lambda content: np.random.default_rng(1).bytes(9999),
+            id="garbage",
+            marks=pytest.mark.exhaustive,
+        ),
+        pytest.param(middle, id="changed"),
+    ],
+)
+def test_damaged_kernels_are_not_loaded_but_made_anew(warm, tmp_path, damage):
+    name, content, said = warm
+    (tmp_path / name).write_bytes(damage(content))
+    done = run_python("print(deconvolve())", POCL_CACHE_DIR=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == said
+    assert (
+        f"the kernels kept in {tmp_path / name} are damaged, and are compiled anew" in done.stderr
+    )
+    with zipfile.ZipFile(tmp_path / name) as kept:
+        assert kept.testzip() is None
+
+
+@on_pocl
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+def test_of_damaged_kernels_no_file_is_unpacked_that_is_not_as_it_was(warm, tmp_path):
+    name, content, _ = warm
+    archive, rng = tmp_path / name, np.random.default_rng(1)
+    archive.write_bytes(content)
+    kernel_cache._unpack(archive, tmp_path / "sound")
+    directory = content.index(b"PK\1\2")
+    method = directory + 10  # by which the first file is said to be compressed
+    changes = [(method, 8), (method, 12), (method, 14)]
+    for at in (*rng.integers(0, directory, 60), *rng.integers(directory, len(content), 240)):
+        changes.append((at, content[at] ^ (1 << int(rng.integers(8)))))
+    for k, (at, value) in enumerate(changes):
+        damaged = bytearray(content)
+        damaged[at] = value
+        archive.write_bytes(damaged)
+        own = tmp_path / str(k)
+        kernel_cache._unpack(archive, own)
+        for path in own.rglob("*.so"):
+            assert path.read_bytes() == (tmp_path / "sound" / path.relative_to(own)).read_bytes()
+
+
+@on_pocl
+def test_a_disk_that_is_full_cuts_no_kernel_short(warm, tmp_path, monkeypatch):
+    """PoCL would load what there is of it, and kill the process."""
+    name, content, _ = warm
+    (tmp_path / name).write_bytes(content)
+    own = tmp_path / "own"
+    own.mkdir()
+
+    def copy(source, target):
+        target.write(source.read(100))
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("shutil.copyfileobj", copy)
+        assert kernel_cache._unpack(tmp_path / name, own) == []
+    assert not [path for path in own.rglob("*") if path.is_file()]
+    assert kernel_cache._unpack(tmp_path / name, own)
+    assert any(path.name == "scale_rows.so" for path in own.rglob("*"))
+
+
+@on_pocl
+def test_a_folder_that_cannot_keep_kernels_is_said_once(tmp_path):
+    (tmp_path / "file").touch()
+    code = "print(deconvolve(), deconvolve())"
+    done = run_python(code, POCL_CACHE_DIR=str(tmp_path / "file" / "folder"))
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("LnoclWarning") == 1
+    assert "(Not a directory), and are compiled anew by every process; set POCL" in done.stderr
+
+
+def test_no_folder_for_kernels_at_all(monkeypatch):
+    monkeypatch.setattr(kernel_cache, "_own", [])
+    monkeypatch.setattr("tempfile.tempdir", "/nonexistent")
+    with pytest.raises(lnocl.DeviceError, match=r"no folder for kernels .* set TMPDIR"):
+        device.find_devices()
+
+
+@on_pocl
+@pytest.mark.parametrize("broken", ["folder", "garbage"])
+def test_caches_of_pyopencl_that_are_broken(tmp_path, broken, warm):
+    name, content, said = warm
+    store = tmp_path / "store"
+    store.mkdir()
+    (store / name).write_bytes(content)
+    cache = tmp_path / "cache"
+    if broken == "folder":
+        cache.touch()
+    else:
+        run_python("deconvolve()", POCL_CACHE_DIR=str(store), XDG_CACHE_HOME=str(cache))
+        (kept,) = cache.glob("pytools/*.sqlite")
+        kept.write_bytes(np.random.default_rng(1).bytes(20000))
+    done = run_python("print(deconvolve())", POCL_CACHE_DIR=str(store), XDG_CACHE_HOME=str(cache))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == said
+    assert done.stderr.count("the kernels that PyOpenCL keeps cannot be used") == 1
+
+
+@pytest.mark.exhaustive
+def test_binaries_of_pyopencl_that_are_broken(monkeypatch, tmp_path):
+    """As on runtimes that have no cache of their own: PyOpenCL keeps binaries for them."""
+    monkeypatch.setattr("pyopencl.characterize.has_src_build_cache", lambda device: False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    expected = lnocl.deconvolve(observe(), n_iter=2).extended
+    binaries = list(tmp_path.rglob("binary"))
+    assert binaries
+    for binary in binaries:
+        binary.write_bytes(b"rubbish")
+    with pytest.warns(lnocl.LnoclWarning, match="the kernels that PyOpenCL keeps cannot be used"):
+        found = lnocl.deconvolve(observe(), n_iter=2).extended
+    assert np.array_equal(found, expected)
+
+
+def test_a_fork_after_opencl_is_refused():
+    """Both a new run and one that was begun before the fork."""
+    code = """
+import multiprocessing
+runs = []
+def begun(iteration, estimate):
+    runs.append(estimate._run)
+lnocl.deconvolve(observation, n_iter=1, callback=begun)
+def child(what):
+    try:
+        deconvolve() if what == "new" else runs[0].extended()
+    except lnocl.DeviceError as error:
+        print(what, error, flush=True)
+for what in ("new", "inherited"):
+    process = multiprocessing.get_context("fork").Process(target=child, args=[what])
+    process.start()
+    process.join(20)
+    print(process.exitcode, flush=True)
+    process.kill()
+print(deconvolve())
+"""
+    done = run_python(code)
+    new, first, inherited, second, parent = done.stdout.splitlines()
+    for line, what in ((new, "new"), (inherited, "inherited")):
+        assert re.match(
+            f"{what} this process was forked .*multiprocessing.get_context.'spawn'", line
+        )
+    assert (first, second) == ("0", "0")
+    assert float(parent) > 0
+
+
+def test_a_fork_before_opencl_works():
+    code = """
+process = os.fork()
+if process == 0:
+    print(deconvolve(), flush=True)
+    os._exit(0)
+assert os.waitpid(process, 0)[1] == 0
+print(deconvolve())
+"""
+    done = run_python(code)
+    assert done.returncode == 0, done.stderr
+    one, other = done.stdout.splitlines()
+    assert one == other
+
+
+def test_a_fork_after_opencl_may_use_the_reference():
+    code = """
+deconvolve()
+process = os.fork()
+if process == 0:
+    lnocl.deconvolve(observation, n_iter=1, engine="numpy")
+    os._exit(0)
+assert os.waitpid(process, 0)[1] == 0
+"""
+    done = run_python(code)
+    assert done.returncode == 0, done.stderr
+
+
+# An objective that is not finite.
+
+
+def poison(engine, what):
+    """Put NaN into a pixel of what an engine holds."""
+    if isinstance(engine, opencl.OpenCLEngine):
+        nan = np.full(1, np.nan, engine.program.dtype)
+        cl.enqueue_copy(engine._queue, engine._buffers[what], nan, dst_offset=16 * nan.nbytes)
+    elif what == "extended":
+        engine._extended = engine._extended.copy()
+        engine._extended[3, 3] = np.nan
+    elif what == "images":
+        engine._images[0, 3, 3] = np.nan
+    else:
+        engine._row_spectrum = engine._row_spectrum * np.nan
+
+
+@pytest.mark.parametrize("every", [0.0, 1e9])
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_an_estimate_is_proven_by_its_objective_before_it_is_kept(
+    solver, every, monkeypatch, tmp_path
+):
+    """Where a finite estimate has an infinite objective, again and again."""
+    path, genuine = tmp_path / "run.fits", ReferenceEngine.objective
+
+    def objective(engine):
+        return np.inf if len(engine._objectives) > 6 else genuine(engine)
+
+    def objectives(engine):
+        return np.array([*engine._objectives[:6], *[np.inf] * len(engine._objectives[6:])])
+
+    monkeypatch.setattr(ReferenceEngine, "objective", objective)
+    monkeypatch.setattr(ReferenceEngine, "objectives", objectives)
+    keywords = {"solver": solver, "engine": "numpy", "n_iter": 20}
+    for files in ({"checkpoint": path, "checkpoint_every": every}, {"resume": path}):
+        with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
+            result = lnocl.deconvolve(observe(), **keywords, **files)
+        assert (result.stop_reason, result.n_iter) == ("not finite", 5)
+        assert len(result.history) == 6
+        assert np.isfinite(result.history["objective"]).all()
+
+
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+@pytest.mark.parametrize(
+    ("what", "at", "n_iter"),
+    [
+        ("extended", 1, 200),
+        ("images", 1, 200),
+        ("extended", 5, 200),
+        ("images", 12, 200),
+        ("extended", 20, 20),
+    ],
+)
+def test_a_run_ends_before_the_objective_is_not_finite(engine, solver, what, at, n_iter):
+    seen = []
+
+    def callback(iteration, estimate):
+        seen.append(iteration)
+        if iteration == at:
+            poison(estimate._run.engine, what)
+
+    keywords = {"solver": solver, "engine": engine, "stars": [(5, 6)]}
+    with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
+        result = lnocl.deconvolve(observe(), n_iter=n_iter, callback=callback, **keywords)
+    assert result.stop_reason == "not finite"
+    assert at - 1 <= result.n_iter <= at
+    assert len(seen) <= min(n_iter, at + 2 * opencl.ITERATIONS_UNSEEN)
+    assert len(result.history) == result.n_iter + 1
+    assert np.isfinite(result.history["objective"]).all()
+    if result.n_iter:
+        expected = lnocl.deconvolve(observe(), n_iter=result.n_iter, **keywords)
+        assert np.array_equal(result.extended, expected.extended)
+        assert np.array_equal(result.star_fluxes, expected.star_fluxes)
+        assert np.array_equal(result.history, expected.history)
+    assert np.isfinite(result.models()).all()
+
+
+@pytest.mark.parametrize(
+    ("engine", "solver"),
+    [
+        ("numpy", "sgm"),
+        ("numpy", "sgp"),
+        ("opencl", "sgp"),
+        pytest.param("opencl", "sgm", marks=pytest.mark.exhaustive),
+    ],
+)
+@pytest.mark.parametrize("at", [6, 9])
+def test_a_run_that_moves_stars_ends_before_the_objective_is_not_finite(engine, solver, at):
+    """Stars have moved by then; with 6, they would next."""
+    keywords = {"solver": solver, "engine": engine, "stars": [(5, 6)], "refine_positions": True}
+    (psf,) = make_smooth_psfs(1, (32, 32))
+    image = 40.0 + 200.0 * np.roll(psf, (-9, -10), (0, 1))
+    rng = np.random.default_rng(3)
+    observation = lnocl.Observation(rng.poisson(image), psf, background=1.0)
+
+    def callback(iteration, estimate):
+        if iteration == at:
+            poison(estimate._run.engine, "extended")
+
+    with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
+        result = lnocl.deconvolve(observation, n_iter=20, callback=callback, **keywords)
+    assert result.stop_reason == "not finite"
+    assert at - 1 <= result.n_iter <= at
+    assert len(result.history) == result.n_iter + 1
+    assert np.isfinite(result.history["objective"]).all()
+    assert np.isfinite(result.extended).all()
+
+
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_a_device_that_always_computes_nan_is_refused(monkeypatch, engine, solver):
+    kind = opencl.OpenCLEngine if engine == "opencl" else ReferenceEngine
+    ratio = kind.ratio
+
+    def poisoned(self):
+        poison(self, "images")
+        ratio(self)
+
+    monkeypatch.setattr(kind, "ratio", poisoned)
+    with pytest.raises(lnocl.DeviceError, match=r"the objective .*is infinite or not"):
+        lnocl.deconvolve(observe(), n_iter=20, engine=engine, solver=solver)
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+@pytest.mark.parametrize("what", ["extended", "images"])
+def test_a_checkpoint_is_not_replaced_by_what_is_not_finite(tmp_path, solver, what):
+    """Resumed, the run ends as if nothing had happened."""
+
+    def callback(iteration, estimate):
+        if iteration == 7:
+            poison(estimate._run.engine, what)
+
+    path = str(tmp_path / "run.fits")
+    keywords = {"solver": solver, "n_iter": 12, "stars": [(5, 6)], "stop": 1e-9}
+    every = {"checkpoint": path, "checkpoint_every": 0}
+    with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
+        result = lnocl.deconvolve(observe(), callback=callback, **every, **keywords)
+    assert result.stop_reason == "not finite"
+    assert 6 <= result.n_iter <= 8
+    resumed, expected = (
+        lnocl.deconvolve(observe(), **keywords, **which) for which in ({"resume": path}, {})
+    )
+    assert resumed.n_iter == expected.n_iter == 12
+    assert np.array_equal(resumed.extended, expected.extended)
+    assert np.array_equal(resumed.history, expected.history)

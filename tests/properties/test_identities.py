@@ -1,0 +1,456 @@
+"""What must hold of any implementation, whatever its arithmetic: identities of the method.
+
+Tolerances are shares of the largest value, about three times the error measured. What is
+promised bit for bit is compared bit for bit.
+"""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import ENGINES, Recipe, blur, make_psfs, same, worst
+
+import lnocl
+from lnocl.reference import reference
+from lnocl.scene.scene import Scene
+
+SHAPE = (16, 32)
+# Few scenes, as an OpenCL program is built for each: what a scene has is fixed when it is built.
+# Without background, stars and mask: Richardson-Lucy for several images as printed.
+BARE = Recipe(SHAPE, 3, background="zero")
+# The same with stars and bad pixels.
+MASKED = Recipe(SHAPE, 3, 2, masked=0.1, background="zero")
+# Everything at once, on the periodic grid and with unobserved pixels round the images.
+FULL = Recipe(SHAPE, 3, 2, mu=1e-3, smoothing=0.01, masked=0.05, background="map")
+PADDED = Recipe((11, 27), 3, 2, mu=1e-3, smoothing=0.01, masked=0.05, background="map", pad=2)
+
+# What rounding leaves after 50 iterations: extended source, star fluxes, objective.
+ROUNDING = {"double": (2.7e-15, 4.4e-16, 8e-16), "single": (1.7e-6, 2.5e-7, 1.2e-7)}
+# What it leaves of a sum over the sky.
+SUM_ROUNDING = {"double": 8.5e-16, "single": 4.4e-7}
+
+every_engine = pytest.mark.parametrize("engine", ENGINES)
+double_engines = pytest.mark.parametrize("engine", ENGINES[:2])
+
+
+def adjoint(pixels, psf):
+    """Return what `blur` is the adjoint of, as a plain sum over the PSF's pixels."""
+    summed = np.zeros(pixels.shape)
+    cy, cx = psf.shape[0] // 2, psf.shape[1] // 2
+    for (y, x), value in np.ndenumerate(psf / psf.sum()):
+        summed += value * np.roll(pixels, (cy - y, cx - x), axis=(0, 1))
+    return summed
+
+
+def assert_close(result, extended, star_fluxes, objective, precision):
+    extended_tolerance, star_tolerance, objective_tolerance = ROUNDING[precision]
+    assert worst(result.extended, extended) <= extended_tolerance
+    assert worst(result.star_fluxes, star_fluxes) <= star_tolerance
+    assert worst(result.history["objective"], objective) <= objective_tolerance
+
+
+def operators(psfs, shape):
+    """Return A, which makes p images of a sky, and its adjoint, as the reference has them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lnocl.LnoclWarning)  # a large PSF wraps round
+        scene = Scene(lnocl.Observation(np.ones((len(psfs), *shape)), psfs))
+    spectra = [reference.rfft_rows(scene.psf(j)) for j in range(len(psfs))]
+    otfs = np.array([reference.otf_columns(spectrum) for spectrum in spectra])
+
+    def forward(sky):
+        return reference.irfft_rows(reference.convolve_columns(reference.rfft_rows(sky), otfs))
+
+    def back(stack):
+        return reference.irfft_rows(reference.correlate_columns(reference.rfft_rows(stack), otfs))
+
+    return forward, back
+
+
+# --- The adjoint
+
+
+@pytest.mark.parametrize("psf_shape", [(1, 1), (3, 4), (4, 7), (5, 11)])
+def test_operators_are_those_of_the_dense_matrix(psf_shape):
+    ny, nx = 4, 8
+    psfs = make_psfs(2, psf_shape)
+    forward, back = operators(psfs, (ny, nx))
+    matrices = np.zeros((2, ny, nx, ny, nx))
+    for (j, ky, kx), value in np.ndenumerate(psfs / psfs.sum(axis=(1, 2), keepdims=True)):
+        for y, x in np.ndindex(ny, nx):
+            to = (y + ky - psf_shape[0] // 2) % ny, (x + kx - psf_shape[1] // 2) % nx
+            matrices[j, *to, y, x] += value
+    rng = np.random.default_rng(2)
+    sky, ratios = rng.normal(size=(ny, nx)), rng.normal(size=(2, ny, nx))
+    assert worst(forward(sky), np.einsum("jabyx,yx->jab", matrices, sky)) <= 1e-15
+    assert worst(back(ratios), np.einsum("jabyx,jab->yx", matrices, ratios)) <= 1e-15
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (2, 64), (64, 2), (32, 32), (128, 16)])
+def test_dot_product(shape):
+    psf_shape = min(shape[0], 9), min(shape[1], 12)
+    forward, back = operators(make_psfs(3, psf_shape), shape)
+    rng = np.random.default_rng(1)
+    sky, ratios = rng.normal(size=shape), rng.normal(size=(3, *shape))
+    images = forward(sky)
+    difference = np.vdot(images, ratios) - np.vdot(sky, back(ratios))
+    assert abs(difference) <= 3.5e-16 * np.linalg.norm(images) * np.linalg.norm(ratios)
+
+
+# --- What is conserved, what stays as it is
+
+
+@every_engine
+def test_flux_is_conserved(engine):
+    made = BARE.make()
+    flux = made.images.sum() / BARE.n_images
+    errors = []
+
+    def measure(iteration, estimate):
+        errors.append(abs(estimate.extended.sum() - flux) / flux)
+
+    made.deconvolve(n_iter=30, callback=measure, **engine)
+    assert len(errors) == 30
+    assert max(errors) <= SUM_ROUNDING[engine["precision"]]
+
+
+@every_engine
+def test_observed_flux_is_conserved_with_stars_and_masks(engine):
+    made = MASKED.make()
+    weights = ~made.mask
+    total_weight = sum(adjoint(w, psf) for w, psf in zip(weights, made.psfs, strict=True))
+    star_weights = np.array([total_weight[y, x] for x, y in made.stars])
+    flux = made.images[weights].sum()
+    errors = []
+
+    def measure(iteration, estimate):
+        given = (total_weight * estimate.extended).sum() + star_weights @ estimate.star_fluxes
+        errors.append(abs(given - flux) / flux)
+
+    made.deconvolve(n_iter=30, callback=measure, **engine)
+    assert len(errors) == 30
+    assert max(errors) <= SUM_ROUNDING[engine["precision"]]
+
+
+@every_engine
+def test_truth_is_a_fixed_point(engine):
+    made = dataclasses.replace(MASKED, background="each").make()
+    sky = made.initial_extended.copy()
+    for (x, y), flux in zip(made.stars, made.initial_star_fluxes, strict=True):
+        sky[y, x] += flux
+    images = np.array([blur(sky, psf) for psf in made.psfs])
+    images += made.background[:, None, None]
+    result = made.deconvolve(made.observation(images=images), n_iter=20, **engine)
+    extended_tolerance, star_tolerance = {"double": (9.5e-15, 8e-16), "single": (4e-6, 2.4e-7)}[
+        engine["precision"]
+    ]
+    assert worst(result.extended, made.initial_extended) <= extended_tolerance
+    assert worst(result.star_fluxes, made.initial_star_fluxes) <= star_tolerance
+
+
+@every_engine
+def test_one_iteration_through_a_single_pixel_averages_the_images(engine):
+    made = BARE.make()
+    observation = lnocl.Observation(made.images, np.ones((1, 1)))
+    result = lnocl.deconvolve(observation, n_iter=1, **engine)
+    tolerance = SUM_ROUNDING[engine["precision"]]
+    assert worst(result.extended, made.images.mean(axis=0)) <= tolerance
+
+
+@every_engine
+def test_dark_images_give_a_dark_sky(engine):
+    made = MASKED.make()
+    result = made.deconvolve(made.observation(images=0.0 * made.images), n_iter=1, **engine)
+    rounding = SUM_ROUNDING[engine["precision"]]
+    assert (result.extended <= rounding * made.initial_extended.max()).all()
+    assert (result.star_fluxes <= rounding * made.initial_star_fluxes).all()
+    before, after = result.history["objective"]
+    assert after <= rounding * before
+
+
+@double_engines
+def test_faint_pixels_are_not_lost_in_a_floor(engine):
+    # Nine orders of magnitude below the mean: nearly all that the transform leaves of double.
+    image = 1.0 + np.arange(512.0).reshape(SHAPE) % 7
+    faint = image.copy()
+    image[5, 9] = 512e9
+    observation = lnocl.Observation([image] * 3, np.ones((1, 1)))
+    result = lnocl.deconvolve(observation, n_iter=5, **engine)
+    result.extended[5, 9] = faint[5, 9]
+    np.testing.assert_allclose(result.extended, faint, rtol=6e-5)
+
+
+@every_engine
+def test_rounding_makes_nothing_negative(engine):
+    # Far from the only bright pixel the correction is 0: what the transform leaves has any sign.
+    image = np.zeros(SHAPE)
+    image[5, 9] = 1000.0
+    observation = lnocl.Observation([image] * 3, make_psfs(3, (2, 2)), background=1.0)
+    result = lnocl.deconvolve(observation, n_iter=1, **engine)
+    assert result.extended.min() == 0.0
+
+
+@pytest.mark.parametrize("recipe", [MASKED, FULL, PADDED], ids=["masked", "full", "padded"])
+@every_engine
+def test_estimates_are_finite_and_not_negative(engine, recipe):
+    lowest = []
+
+    def look(iteration, estimate):
+        assert np.isfinite(estimate.extended).all()
+        assert np.isfinite(estimate.star_fluxes).all()
+        lowest.append(min(estimate.extended.min(), estimate.star_fluxes.min()))
+
+    result = recipe.make().deconvolve(n_iter=50, callback=look, **engine)
+    assert len(lowest) == 50
+    assert min(lowest) >= 0
+    assert np.isfinite(result.history["objective"]).all()
+    assert result.extended.shape == recipe.shape
+    assert result.extended.dtype == result.star_fluxes.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [BARE, dataclasses.replace(MASKED, background="each")],
+    ids=["bare", "stars, mask, background"],
+)
+@double_engines
+def test_objective_never_rises(engine, recipe):
+    objective = recipe.make().deconvolve(n_iter=300, **engine).history["objective"]
+    assert (np.diff(objective) < 0).all()
+
+
+# --- What the answer does not depend on
+
+
+@every_engine
+def test_the_same_image_several_times_is_one_image(engine):
+    times = 3
+    made = dataclasses.replace(FULL, n_images=1).make()
+    once = made.deconvolve(n_iter=50, **engine)
+    again = {
+        name: np.repeat(getattr(made, name), times, axis=0)
+        for name in ("images", "psfs", "background", "mask")
+    }
+    # p images weigh p times as much against the penalty.
+    weights = {"mu": times * made.recipe.mu, "smoothing": times * made.recipe.smoothing}
+    several = made.deconvolve(made.observation(**again), n_iter=50, **weights, **engine)
+    objective = times * once.history["objective"]
+    assert_close(several, once.extended, once.star_fluxes, objective, engine["precision"])
+
+
+@every_engine
+def test_order_of_the_images_does_not_matter(engine):
+    made = FULL.make()
+    order = [2, 0, 1]
+    shuffled = {
+        name: getattr(made, name)[order] for name in ("images", "psfs", "background", "mask")
+    }
+    result = made.deconvolve(n_iter=50, **engine)
+    other = made.deconvolve(made.observation(**shuffled), n_iter=50, **engine)
+    objective = result.history["objective"]
+    assert_close(other, result.extended, result.star_fluxes, objective, engine["precision"])
+
+
+@pytest.mark.parametrize("shift", [(0, 1), (5, 0), (11, 23)])
+@every_engine
+def test_shifted_images_give_a_shifted_sky(engine, shift):
+    made = FULL.make()
+    result = made.deconvolve(n_iter=50, **engine)
+    rolled = {
+        name: np.roll(getattr(made, name), shift, axis=(-2, -1))
+        for name in ("images", "background", "mask")
+    }
+    ny, nx = SHAPE
+    other = made.deconvolve(
+        made.observation(**rolled),
+        n_iter=50,
+        stars=[((x + shift[1]) % nx, (y + shift[0]) % ny) for x, y in made.stars],
+        initial_extended=np.roll(made.initial_extended, shift, axis=(0, 1)),
+        **engine,
+    )
+    extended = np.roll(result.extended, shift, axis=(0, 1))
+    objective = result.history["objective"]
+    assert_close(other, extended, result.star_fluxes, objective, engine["precision"])
+
+
+STARTS = ("initial_extended", "initial_star_fluxes")
+
+
+@pytest.mark.parametrize("start", ["given", "default"])
+@pytest.mark.parametrize("recipe", [FULL, PADDED], ids=["full", "padded"])
+@every_engine
+def test_scaling_by_a_power_of_two_is_bit_for_bit(engine, recipe, start):
+    made = recipe.make()
+    starts = {name: getattr(made, name) if start == "given" else None for name in STARTS}
+    result = made.deconvolve(n_iter=20, **starts, **engine)
+    for factor in (2.0**-60, 2.0**-3, 2.0, 2.0**60):
+        scaled_starts = {
+            name: None if value is None else factor * value for name, value in starts.items()
+        }
+        scaled = made.deconvolve(
+            made.observation(images=factor * made.images, background=factor * made.background),
+            n_iter=20,
+            mu=recipe.mu / factor,
+            **scaled_starts,
+            **engine,
+        )
+        np.testing.assert_array_equal(scaled.extended, factor * result.extended)
+        np.testing.assert_array_equal(scaled.star_fluxes, factor * result.star_fluxes)
+        objective = factor * result.history["objective"]
+        np.testing.assert_array_equal(scaled.history["objective"], objective)
+
+
+@pytest.mark.parametrize("start", ["given", "default"])
+@pytest.mark.parametrize("recipe", [FULL, PADDED], ids=["full", "padded"])
+@every_engine
+def test_masked_pixels_have_no_influence(engine, recipe, start):
+    made = recipe.make()
+    starts = {name: getattr(made, name) if start == "given" else None for name in STARTS}
+
+    def run(**changes):
+        return made.deconvolve(made.observation(**changes), n_iter=20, **starts, **engine)
+
+    result = run()
+    for value in (np.nan, np.inf, -1e30, 1e30):
+        images, background = (
+            np.where(made.mask, value, array) for array in (made.images, made.background)
+        )
+        same(run(images=images, background=background), result)
+    same(run(images=np.ma.array(images, mask=made.mask), mask=None), result)
+
+
+@pytest.mark.parametrize("recipe", [FULL, PADDED], ids=["full", "padded"])
+@every_engine
+def test_runs_repeat_bit_for_bit(engine, recipe):
+    made = recipe.make()
+    same(made.deconvolve(n_iter=50, **engine), made.deconvolve(n_iter=50, **engine))
+
+
+@every_engine
+def test_continued_run_equals_one_run(engine):
+    made = FULL.make()
+    whole = made.deconvolve(n_iter=60, **engine)
+    first = made.deconvolve(n_iter=25, **engine)
+    second = made.deconvolve(
+        n_iter=35,
+        initial_extended=first.extended,
+        initial_star_fluxes=first.star_fluxes,
+        **engine,
+    )
+    np.testing.assert_array_equal(second.extended, whole.extended)
+    np.testing.assert_array_equal(second.star_fluxes, whole.star_fluxes)
+    # The sum of squares of a start is not summed where those of the iterations are.
+    objective = whole.history["objective"][25:]
+    assert worst(second.history["objective"], objective) <= ROUNDING[engine["precision"]][2]
+
+
+# --- The callback
+
+
+@every_engine
+def test_callback_sees_every_iteration(engine):
+    made = FULL.make()
+    seen = []
+    result = made.deconvolve(
+        n_iter=7, callback=lambda iteration, estimate: seen.append(iteration), **engine
+    )
+    assert seen == list(range(1, 8))
+    assert (result.n_iter, result.stop_reason) == (7, "n_iter")
+    same(result, made.deconvolve(n_iter=7, **engine))
+
+
+@pytest.mark.parametrize("last", [1, 4, 9])
+@every_engine
+def test_callback_stops_the_run(engine, last):
+    made = FULL.make()
+    seen = {}
+
+    def stop(iteration, estimate):
+        seen["extended"], seen["star_fluxes"] = estimate.extended, estimate.star_fluxes
+        return iteration == last
+
+    result = made.deconvolve(n_iter=9, callback=stop, **engine)
+    assert (result.n_iter, result.stop_reason) == (last, "callback")
+    np.testing.assert_array_equal(result.extended, seen["extended"])
+    np.testing.assert_array_equal(result.star_fluxes, seen["star_fluxes"])
+    same(result, made.deconvolve(n_iter=last, **engine))
+
+
+@every_engine
+def test_estimate_must_be_read_in_the_callback(engine):
+    kept = []
+    FULL.make().deconvolve(
+        n_iter=2, callback=lambda iteration, estimate: kept.append(estimate), **engine
+    )
+    for estimate in kept:
+        with pytest.raises(RuntimeError, match="before the callback returns"):
+            _ = estimate.extended
+        with pytest.raises(RuntimeError, match="before the callback returns"):
+            _ = estimate.star_fluxes
+
+
+@every_engine
+def test_callback_cannot_change_the_run(engine):
+    made = FULL.make()
+
+    def spoil(iteration, estimate):
+        estimate.extended[:] = -1.0
+        estimate.star_fluxes[:] = -1.0
+
+    same(made.deconvolve(n_iter=5, callback=spoil, **engine), made.deconvolve(n_iter=5, **engine))
+
+
+def test_callback_hears_the_warnings_of_numpy():
+    """Which are turned off for the iteration, where what overflows is looked for."""
+    with pytest.warns(RuntimeWarning, match="invalid value"):
+        FULL.make().deconvolve(n_iter=1, callback=lambda *_: np.log(np.array(-1.0)), engine="numpy")
+
+
+# --- What kind of array the input comes as
+
+LAYOUTS = {
+    "contiguous": lambda a: a,
+    "Fortran": np.asfortranarray,
+    "reversed": lambda a: a[..., ::-1, ::-1].copy()[..., ::-1, ::-1],
+    "every second pixel": lambda a: np.repeat(np.repeat(a, 2, axis=-1), 3, axis=-2)[..., ::3, ::2],
+    "transposed": lambda a: np.ascontiguousarray(a.T).T,
+    "list": lambda a: a.tolist(),
+}
+DTYPES = [">f4", ">i2", ">u2", "<i2", "<u2", "u1", "f2", ">f8", "g", ">i8"]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    shape=st.tuples(st.integers(1, 3), st.integers(1, 9), st.integers(1, 9)),
+    dtype=st.sampled_from(DTYPES),
+    layout=st.sampled_from(sorted(LAYOUTS)),
+    masking=st.sampled_from(["none", "mask", "numpy.ma", "numpy.ma and mask"]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_kind_of_array_does_not_matter(shape, dtype, layout, masking, seed):
+    rng = np.random.default_rng(seed)
+    images = rng.integers(1, 200, shape).astype(float)
+    psfs = make_psfs(shape[0], (1, 1)) + rng.integers(1, 9, (shape[0], 1, 1))
+    bad = rng.random(shape) < 0.3
+    bad.flat[rng.integers(bad.size)] = False
+    bad &= masking != "none"
+    start = {"initial_extended": rng.integers(1, 9, shape[1:]).astype(float)}
+    plain = lnocl.Observation(images, psfs, mask=bad)
+
+    other = LAYOUTS[layout](images.astype(dtype))
+    mask = None
+    if "mask" in masking:
+        mask = LAYOUTS[layout](bad)
+    if "numpy.ma" in masking:
+        other = np.ma.array(other, mask=bad)
+    if masking == "numpy.ma and mask":
+        other = np.ma.array(images.astype(dtype), mask=bad & (rng.random(shape) < 0.5))
+    result = lnocl.deconvolve(
+        lnocl.Observation(other, psfs, mask=mask), n_iter=3, engine="numpy", **start
+    )
+    same(result, lnocl.deconvolve(plain, n_iter=3, engine="numpy", **start))
+    assert result.extended.shape == shape[1:]
+    assert np.isfinite(result.extended).all()
+    assert (result.extended >= 0).all()

@@ -1,0 +1,367 @@
+"""Exposures and offsets: identities of the method, on every engine.
+
+Tolerances are shares of the largest value, two to three times the error measured. What is promised
+bit for bit is compared bit for bit.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scenes import FEWER_ENGINES, Recipe, make_smooth_psfs, moved, same, worst
+
+import lnocl
+from lnocl.scene.scene import Scene
+
+# PSFs here are small, and whole offsets periodic.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:psf . is sharper than its pixels", "ignore:the images are shifted by up to"
+)
+
+SHAPE = (16, 32)
+# Few scenes, as an OpenCL program is built for each. The two differ in what the kernels are given:
+# numbers go into the PSFs, maps are weights.
+EACH = Recipe(SHAPE, 3, 2, mu=1e-3, masked=0.05, background="map", exposure="each", fractions=True)
+MAP = dataclasses.replace(EACH, exposure="map")
+# Without mu and background, where Richardson and Lucy conserve flux.
+BARE = dataclasses.replace(MAP, mu=0.0, background="zero")
+
+WHOLE = np.array([(0, 0), (3, -5), (-31, 15)])
+
+# Of extended source, star fluxes and objective, after 20 iterations. Measured 8.2e-16, 9.9e-17 and
+# 1.2e-16; in single 5.2e-7, 7.6e-8 and 4.3e-8.
+ROUNDING = {"double": (2e-15, 3e-16, 3e-16), "single": (1.3e-6, 2e-7, 1.2e-7)}
+
+every_engine = pytest.mark.parametrize("engine", FEWER_ENGINES)
+every_scene = pytest.mark.parametrize("recipe", [EACH, MAP], ids=["each", "map"])
+numpy_alone = {"engine": "numpy"}
+
+
+def assert_close(result, other, extended, star_fluxes, objective):
+    assert worst(result.extended, other.extended) <= extended
+    assert worst(result.star_fluxes, other.star_fluxes) <= star_fluxes
+    assert worst(result.history["objective"], other.history["objective"]) <= objective
+
+
+# --- Exposures
+
+
+@pytest.mark.parametrize("exponent", [-40, -3, 40])
+@pytest.mark.parametrize("start", ["given", "default"])
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+@every_scene
+def test_a_longer_unit_of_time_is_bit_for_bit(solver, recipe, start, exponent):
+    """Of exposures times k, fluxes are k times less, and mu, a weight of squares, k^2 times more.
+
+    Of J nothing is left to see.
+    """
+    made, factor = recipe.make(), 2.0**exponent
+    starts = {
+        name: getattr(made, name) if start == "given" else None
+        for name in ("initial_extended", "initial_star_fluxes")
+    }
+    result = made.deconvolve(n_iter=10, solver=solver, **starts, **numpy_alone)
+    scaled = made.deconvolve(
+        made.observation(exposure=factor * made.exposure),
+        n_iter=10,
+        solver=solver,
+        mu=factor**2 * recipe.mu,
+        **{k: None if v is None else v / factor for k, v in starts.items()},
+        **numpy_alone,
+    )
+    np.testing.assert_array_equal(scaled.extended, result.extended / factor)
+    np.testing.assert_array_equal(scaled.star_fluxes, result.star_fluxes / factor)
+    np.testing.assert_array_equal(scaled.history["objective"], result.history["objective"])
+
+
+def test_any_other_unit_of_time_scales_the_answer():
+    made, factor = MAP.make(), 37.0
+    result = made.deconvolve(n_iter=30, **numpy_alone)
+    scaled = made.deconvolve(
+        made.observation(exposure=factor * made.exposure),
+        n_iter=30,
+        mu=factor**2 * made.recipe.mu,
+        initial_extended=made.initial_extended / factor,
+        initial_star_fluxes=made.initial_star_fluxes / factor,
+        **numpy_alone,
+    )
+    assert worst(factor * scaled.extended, result.extended) <= 2e-15  # measured 6.4e-16
+    assert worst(factor * scaled.star_fluxes, result.star_fluxes) <= 6e-16  # measured 2.0e-16
+
+
+@every_engine
+def test_a_constant_map_is_a_number(engine):
+    made = EACH.make()
+    as_map = np.broadcast_to(made.exposure[:, None, None], made.images.shape)
+    result = made.deconvolve(n_iter=20, **engine)
+    other = made.deconvolve(made.observation(exposure=as_map), n_iter=20, **engine)
+    assert_close(other, result, *ROUNDING[engine["precision"]])
+
+
+@every_engine
+def test_equal_exposures_are_none(engine):
+    made = dataclasses.replace(EACH, exposure="none").make()
+    result = made.deconvolve(n_iter=10, **engine)
+    for exposure in (1.0, [1.0, 1.0, 1.0]):
+        same(made.deconvolve(made.observation(exposure=exposure), n_iter=10, **engine), result)
+    if engine["engine"] == "numpy":
+        other = made.deconvolve(
+            made.observation(exposure=8.0),
+            n_iter=10,
+            mu=64 * made.recipe.mu,
+            initial_extended=made.initial_extended / 8,
+            initial_star_fluxes=made.initial_star_fluxes / 8,
+            **engine,
+        )
+        np.testing.assert_array_equal(8 * other.extended, result.extended)
+
+
+def test_a_map_of_ones_and_zeros_is_a_mask():
+    made = dataclasses.replace(EACH, exposure="none").make()
+    result = made.deconvolve(n_iter=10, **numpy_alone)
+    ones = np.where(made.mask, 0.0, 1.0)
+    other = made.deconvolve(made.observation(exposure=ones, mask=None), n_iter=10, **numpy_alone)
+    same(other, result)
+    # Zeros as a mask beside a map.
+    made = MAP.make()
+    dead = made.exposure == 0
+    assert dead.any()
+    given = {"exposure": np.where(dead, 3.0, made.exposure), "mask": made.mask | dead}
+    result = made.deconvolve(n_iter=10, **numpy_alone)
+    same(made.deconvolve(made.observation(**given), n_iter=10, **numpy_alone), result)
+
+
+@pytest.mark.parametrize("start", ["given", "default"])
+@every_engine
+def test_what_saw_nothing_has_no_influence(engine, start):
+    made = MAP.make()
+    starts = {} if start == "given" else {"initial_extended": None, "initial_star_fluxes": None}
+    result = made.deconvolve(n_iter=10, **starts, **engine)
+    unseen = made.mask | (made.exposure == 0)
+    for value in (1e30, -1e30, np.nan):
+        changes = {
+            name: np.where(made.mask, value, getattr(made, name))
+            for name in ("background", "exposure")
+        }
+        changes["images"] = np.where(unseen, 0.0 if np.isnan(value) else abs(value), made.images)
+        other = made.deconvolve(made.observation(**changes), n_iter=10, **starts, **engine)
+        same(other, result)
+
+
+@pytest.mark.parametrize("exposure", ["each", "map"])
+def test_modelled_counts_are_those_of_the_images(exposure):
+    """After any iteration: Richardson and Lucy's property, without background and mu.
+
+    Counts are sum_j <e_j, A_j f> = <sum_j A_j^T e_j, f>, here in two ways: by the images of the
+    sky, which NumPy's FFT makes of PSFs folded and moved elsewhere, and of the stars.
+    """
+    made = dataclasses.replace(BARE, exposure=exposure, fractions=False).make()
+    made.offsets = WHOLE  # fractions ring, and what rings below 0 has no light
+    each = made.exposure if made.exposure.ndim == 3 else made.exposure[:, None, None]
+    exposures, (ny, nx) = np.where(made.mask, 0.0, each), SHAPE
+    psfs = np.zeros((3, ny, nx))
+    for (j, y, x), value in np.ndenumerate(made.psfs / made.psfs.sum(axis=(1, 2), keepdims=True)):
+        psfs[j, (y - 3) % ny, (x - 4) % nx] += value
+    counts = made.images[exposures > 0].sum()
+    total = sum(
+        np.fft.ifft2(np.conj(np.fft.fft2(moved(psf, *by))) * np.fft.fft2(e)).real
+        for psf, by, e in zip(psfs, made.offsets, exposures, strict=True)
+    )
+    seen = [
+        sum(
+            (moved(psf, *np.add(star, by)) * e).sum()
+            for psf, by, e in zip(psfs, made.offsets, exposures, strict=True)
+        )
+        for star in made.stars
+    ]
+    errors = []
+
+    def look(_, estimate):
+        given = (total * estimate.extended).sum() + seen @ estimate.star_fluxes
+        errors.append(abs(given / counts - 1.0))
+
+    made.deconvolve(n_iter=20, callback=look, **numpy_alone)
+    assert len(errors) == 20
+    assert max(errors) <= 2e-15
+
+
+@every_scene
+@every_engine
+def test_order_of_the_images_does_not_matter(engine, recipe):
+    made, order = recipe.make(), [2, 0, 1]
+    names = ("images", "psfs", "background", "mask", "exposure", "offsets")
+    shuffled = {name: getattr(made, name)[order] for name in names}
+    result = made.deconvolve(n_iter=20, **engine)
+    other = made.deconvolve(made.observation(**shuffled), n_iter=20, **engine)
+    assert_close(other, result, *ROUNDING[engine["precision"]])
+
+
+def test_images_of_equal_sky_may_be_added():
+    """Of the same sky through the same PSF, exposures of 1 and 3 are one of 4: the mean over them
+    of what each gives by itself, weighted by exposure, is what their sum gives."""
+    made = dataclasses.replace(EACH, n_images=1, exposure="none", masked=0.0, mu=0.0).make()
+    rng = np.random.default_rng(0)
+    parts = rng.binomial(made.images.astype(int), 0.25).astype(float)
+    background = made.background
+    two = lnocl.Observation(
+        np.concatenate([parts, made.images - parts]),
+        made.psfs,
+        np.concatenate([0.25 * background, 0.75 * background]),
+        exposure=[1.0, 3.0],
+    )
+    one = lnocl.Observation(made.images, made.psfs, background, exposure=4.0)
+    # The sum is sufficient where the model of both is the same but for the factor.
+    for solver, tolerance in (("sgm", 3e-14), ("sgp", 4e-12)):
+        results = [
+            made.deconvolve(each, n_iter=20, solver=solver, stars=[(9, 8)],
+                            initial_star_fluxes=[1e3], **numpy_alone)
+            for each in (one, two)
+        ]  # fmt: skip
+        assert worst(results[1].extended, results[0].extended) <= tolerance
+        assert worst(results[1].star_fluxes, results[0].star_fluxes) <= 5e-14  # measured 1.5e-14
+
+
+# --- Offsets
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_whole_offsets_are_rolled_images(solver):
+    made = dataclasses.replace(MAP, fractions=False).make()
+    rolled = {
+        name: np.array(
+            [
+                np.roll(each, (dy, dx), axis=(0, 1))
+                for each, (dx, dy) in zip(getattr(made, name), WHOLE, strict=True)
+            ]
+        )
+        for name in ("images", "background", "mask", "exposure")
+    }
+    result = made.deconvolve(n_iter=10, solver=solver, **numpy_alone)
+    other = made.deconvolve(
+        made.observation(**rolled, offsets=WHOLE), n_iter=10, solver=solver, **numpy_alone
+    )
+    # Measured 4.8e-16 and 1.3e-14, fluxes 1.4e-15: the mean of the rolled map is rounded in
+    # another order, and sgp multiplies that.
+    assert_close(other, result, {"sgm": 1.5e-15, "sgp": 4e-14}[solver], 4e-15, 9e-16)
+
+
+@every_scene
+def test_a_common_offset_moves_the_sky(recipe):
+    made = recipe.make()
+    result = made.deconvolve(n_iter=20, **numpy_alone)
+    dx, dy = 5, -2
+    other = made.deconvolve(
+        made.observation(offsets=made.offsets + np.array([dx, dy])),
+        n_iter=20,
+        stars=[(x - dx, y - dy) for x, y in made.stars],
+        initial_extended=np.roll(made.initial_extended, (-dy, -dx), axis=(0, 1)),
+        **numpy_alone,
+    )
+    moved_back = dataclasses.replace(other, extended=np.roll(other.extended, (dy, dx), axis=(0, 1)))
+    assert_close(moved_back, result, 4e-15, 8e-16, 3e-16)  # measured 1.4e-15, 2.9e-16, 9.7e-17
+
+
+@pytest.mark.parametrize("by", [(0.5, 0.0), (0.25, -0.4), (2.3, 1.7)])
+def test_a_star_and_images_moved_by_a_fraction_give_the_same_flux(by):
+    """Stars alone, through PSFs that pixels hold: the flux is that of where they were."""
+    psfs = make_smooth_psfs(2, (61, 61))
+    alone = lnocl.Observation(np.ones((2, 64, 64)), psfs)
+    stars = np.array([(30.0, 31.0), (21.5, 40.25)])
+    fluxes = np.array([5e4, 8e3])
+    images = np.array(
+        [sum(f * Scene(alone, stars).star_image(j, s) for s, f in enumerate(fluxes))
+         for j in range(2)]
+    ) + 10.0  # fmt: skip
+    start = {
+        "initial_extended": np.full((64, 64), 1e-6),
+        "initial_star_fluxes": 0.5 * fluxes,
+    }
+
+    def fluxes_of(images, stars, **known):
+        observation = lnocl.Observation(images, psfs, 10.0, **known)
+        return lnocl.deconvolve(observation, stars, n_iter=5, **start, **numpy_alone).star_fluxes
+
+    expected = fluxes_of(images, stars)
+    assert 1e-5 < worst(expected, fluxes) < 0.1  # it is on its way
+    # What the images are moved by, stars or offsets are.
+    shifted = moved(images, *by)
+    assert worst(fluxes_of(shifted, stars + by), expected) <= 2e-13  # measured 7.8e-14
+    assert worst(fluxes_of(shifted, stars, offsets=[by, by]), expected) <= 2e-13
+    one = np.array([images[0], shifted[1]])
+    assert worst(fluxes_of(one, stars, offsets=[(0, 0), by]), expected) <= 2e-13
+
+
+# --- Stars beyond some of the images
+
+
+def test_a_star_in_an_image_with_an_offset_is_enough():
+    images, offsets = np.ones((2, *SHAPE)), [(0, 0), (10, 0)]
+    observation = lnocl.Observation(images, np.ones((3, 3)), offsets=offsets)
+    result = lnocl.deconvolve(observation, [(-3, 4), (-10.4, 4)], n_iter=1, **numpy_alone, pad=9)
+    np.testing.assert_array_equal(result.star_positions, [(-3, 4), (-10.4, 4)])
+    for star in ((-10.6, 4), (31.6, 4), (3, -0.6), (3, 15.5)):
+        with pytest.raises(lnocl.InputError, match=r"outside the images: .* its offset added"):
+            lnocl.deconvolve(observation, [(3, 4), star], n_iter=1, **numpy_alone)
+
+
+def test_a_star_where_the_map_saw_nothing_is_refused():
+    exposure = np.ones((2, *SHAPE))
+    exposure[:, 3:9, 5:14] = 0.0
+    observation = lnocl.Observation(np.ones((2, *SHAPE)), np.ones((3, 3)), exposure=exposure)
+    with pytest.raises(lnocl.InputError, match=r"star at \(9, 6\) lies where all images are mask"):
+        lnocl.deconvolve(observation, [(9, 6)], n_iter=1, **numpy_alone)
+    moved_there = lnocl.Observation(
+        np.ones((2, *SHAPE)), np.ones((3, 3)), exposure=exposure, offsets=[(0, 0), (-8, 0)]
+    )
+    result = lnocl.deconvolve(moved_there, [(9, 6)], n_iter=1, **numpy_alone)
+    assert result.star_fluxes > 0
+
+
+@pytest.mark.parametrize("exposure", [[1e308, 1.5e308], np.full(SHAPE, 1e308)])
+def test_exposures_that_cannot_be_summed_are_refused(exposure):
+    observation = lnocl.Observation(np.ones((2, *SHAPE)), np.ones((3, 3)), exposure=exposure)
+    with pytest.raises(
+        lnocl.InputError, match=r"^the exposures are too large to be summed: divide"
+    ):
+        lnocl.deconvolve(observation, n_iter=1, **numpy_alone)
+
+
+def test_an_image_whose_scale_is_beyond_all_numbers_is_refused():
+    observation = lnocl.Observation([[1e308]], [[1.0]])
+    with pytest.raises(lnocl.InputError, match=r"^the images are too large to be summed: divide"):
+        lnocl.deconvolve(observation, n_iter=1, **numpy_alone)
+
+
+@pytest.mark.parametrize(
+    ("counts", "exposure"),
+    [(1.0, 1e-307), (1.0, 5e-324), (1e200, 1e-200), (1e-300, 1e300)],
+)
+def test_a_sky_that_no_number_holds_is_refused(counts, exposure):
+    images = np.full((2, *SHAPE), counts)
+    observation = lnocl.Observation(images, np.ones((3, 3)), exposure=exposure)
+    with pytest.raises(lnocl.InputError, match="leave a sky that no number holds: divide or mult"):
+        lnocl.deconvolve(observation, n_iter=1, **numpy_alone)
+
+
+def test_exposures_whose_square_is_no_number_are_taken():
+    made = EACH.make()
+    ours = {"n_iter": 3, "mu": 0.0, "initial_extended": None, "initial_star_fluxes": None}
+    ours |= numpy_alone
+    expected = made.deconvolve(made.observation(), **ours)
+    # A power of two, so that no digit changes.
+    observation = made.observation(exposure=made.exposure * 2.0**-600)
+    result = made.deconvolve(observation, **ours)
+    np.testing.assert_array_equal(result.extended, expected.extended * 2.0**600)
+    np.testing.assert_array_equal(result.star_fluxes, expected.star_fluxes * 2.0**600)
+    assert result.mu == result.smoothing == 0.0
+
+
+def test_mu_too_large_is_refused_in_terms_of_what_was_given():
+    made = EACH.make()
+    observation = made.observation(exposure=made.exposure * 1e6)
+    with pytest.raises(lnocl.InputError, match=r"mu 1e.40 is too large") as caught:
+        made.deconvolve(observation, mu=1e40, n_iter=1, **numpy_alone)
+    most = float(str(caught.value).rsplit(" ", 1)[-1])
+    made.deconvolve(observation, mu=0.99 * most, n_iter=1, **numpy_alone)
+    with pytest.raises(lnocl.InputError):
+        made.deconvolve(observation, mu=1.01 * most, n_iter=1, **numpy_alone)

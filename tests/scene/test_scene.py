@@ -1,0 +1,400 @@
+"""The scene on its grid, and every parameter of a run that is refused."""
+
+import warnings
+
+import numpy as np
+import pytest
+from astropy.nddata import CCDData
+from scenes import Recipe, make_psfs
+
+import lnocl
+from lnocl.scene.penalty import Penalty
+from lnocl.scene.scene import MAX_AXIS, Scene
+
+SHAPE = (8, 16)
+OBSERVATION = lnocl.Observation(np.full((2, *SHAPE), 5.0), make_psfs(2, (3, 4)))
+
+
+# --- The grid
+
+
+@pytest.mark.parametrize(
+    ("shape", "pad", "grid"),
+    [
+        ((1, 1), 0, (2, 2)),
+        ((2, 3), 0, (2, 4)),
+        ((64, 32), 0, (64, 32)),
+        ((64, 32), 1, (128, 64)),
+        ((60, 30), 1, (64, 32)),
+        ((60, 30), 2, (64, 64)),
+        ((120, 120), 0, (128, 128)),
+        ((1, MAX_AXIS), 0, (2, MAX_AXIS)),
+    ],
+)
+def test_grid_is_the_next_power_of_two(shape, pad, grid):
+    scene = Scene(lnocl.Observation(np.ones(shape), np.ones((1, 1))), pad=pad)
+    assert scene.grid == grid
+    assert (scene.weights is None) == (shape == grid)
+
+
+def test_images_lie_at_the_origin():
+    mask = np.zeros((2, 5, 11), bool)
+    mask[1, 2, 3] = True
+    images = np.arange(110.0).reshape(2, 5, 11)
+    scene = Scene(lnocl.Observation(images, np.ones((1, 1)), images, mask=mask))
+    laid, weights, background = scene.images(), scene.weights, scene.background()
+    np.testing.assert_array_equal(laid[:, :5, :11] * scene.scale, np.where(mask, 0, images))
+    np.testing.assert_array_equal(weights[:, :5, :11], ~mask)
+    np.testing.assert_array_equal(background[:, :5, :11] * scene.scale, np.where(mask, 0, images))
+    for array, beyond in [(laid, 0), (weights, 0), (background, 1)]:
+        assert array.shape == (2, 8, 16)
+        assert (array[:, 5:] == beyond).all()
+        assert (array[:, :, 11:] == beyond).all()
+
+
+@pytest.mark.parametrize("level", [1e-12, 0.99, 1.0, 3.0, 1e12])
+def test_scale_is_a_power_of_two_that_gives_unit_mean(level):
+    mask = np.zeros(SHAPE, bool)
+    mask[0] = True
+    images = np.where(mask, 1e30, level)
+    scene = Scene(lnocl.Observation(images, np.ones((1, 1)), mask=mask), penalty=Penalty(0.7))
+    assert np.frexp(scene.scale)[0] == 0.5
+    assert 0.5 <= scene.images()[0][~mask].mean() < 1
+    assert scene.mu == 0.7 * scene.scale
+
+
+@pytest.mark.parametrize("psf_shape", [(1, 1), (3, 4), (8, 16), (11, 37)])
+def test_psf_is_folded_with_its_peak_at_the_origin(psf_shape):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lnocl.LnoclWarning)  # the largest wraps round
+        scene = Scene(lnocl.Observation(np.ones(SHAPE), make_psfs(1, psf_shape)), [(14, 1)])
+    at_origin, at_star = np.zeros((2, *SHAPE))
+    for (y, x), value in np.ndenumerate(scene.observation.psfs[0]):
+        dy, dx = y - psf_shape[0] // 2, x - psf_shape[1] // 2
+        at_origin[dy % 8, dx % 16] += value
+        at_star[(1 + dy) % 8, (14 + dx) % 16] += value
+    # Wings that wrap round are summed in another order.
+    np.testing.assert_allclose(scene.psf(0), at_origin, rtol=5e-16)
+    np.testing.assert_allclose(scene.star_image(0, 0), at_star, rtol=5e-16)
+
+
+def test_star_weights_are_the_observed_shares():
+    mask = np.zeros((2, *SHAPE), bool)
+    mask[1, :, 8:] = True  # all that the second image sees of the first star
+    stars = [(12, 4), (8, 3), (2, 2)]
+    observation = lnocl.Observation(np.ones((2, *SHAPE)), make_psfs(2, (3, 5)), mask=mask)
+    scene = Scene(observation, stars)
+    expected = [sum(scene.star_image(j, s)[~mask[j]].sum() for j in range(2)) for s in range(3)]
+    np.testing.assert_allclose(scene.star_weights, expected, rtol=3e-16)
+    np.testing.assert_allclose(scene.star_weights[[0, 2]], [1.0, 2.0], rtol=3e-16)
+    assert 1.1 < scene.star_weights[1] < 1.9
+
+
+def test_psf_larger_than_the_grid_is_announced():
+    observation = lnocl.Observation(np.ones(SHAPE), make_psfs(1, (9, 5)))
+    with pytest.warns(lnocl.LnoclWarning, match=r"psf \(9, 5\) is larger than the grid") as caught:
+        lnocl.deconvolve(observation, n_iter=1, engine="numpy")
+    assert [warning.filename for warning in caught] == [__file__]
+    lnocl.deconvolve(observation, n_iter=1, engine="numpy", pad=1)  # fits: nothing announced
+
+
+# --- The start
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        Recipe((16, 32), 2, 2),
+        Recipe((16, 32), 2, 2, background="map", masked=0.1),
+        Recipe((13, 27), 3, 3, background="each", pad=3),
+    ],
+    ids=["periodic", "mask", "pad"],
+)
+def test_default_start_is_read_off_the_data(recipe):
+    made = recipe.make()
+    empty = Scene(made.observation(), made.stars, pad=recipe.pad)
+    fluxes = np.array([300.0, 7.0, 90.0])[: recipe.n_stars]
+    ny, nx = recipe.shape
+    images = np.array(
+        [
+            20.0 + sum(flux * empty.star_image(j, s) for s, flux in enumerate(fluxes))
+            for j in range(recipe.n_images)
+        ]
+    )[:, :ny, :nx]
+    level = np.asarray(made.background)
+    images += level[:, None, None] if level.ndim == 1 else level
+    scene = Scene(made.observation(images=images), made.stars, pad=recipe.pad)
+    extended, star_fluxes = scene.start(None, None)
+    np.testing.assert_allclose(extended * scene.scale, np.full(scene.grid, 20.0), rtol=1e-13)
+    np.testing.assert_allclose(star_fluxes * scene.scale, fluxes, rtol=1e-13)
+
+
+@pytest.mark.parametrize("images", [np.zeros(SHAPE), np.full(SHAPE, 3.0)])
+def test_default_start_never_is_zero(images):
+    observation = lnocl.Observation(images, make_psfs(1, (3, 4)), background=3.0)
+    extended, star_fluxes = Scene(observation, [(3, 4)]).start(None, None)
+    assert (extended > 0).all()
+    assert (star_fluxes > 0).all()
+
+
+def test_given_start():
+    observation = lnocl.Observation(np.full((5, 12), 300.0), make_psfs(1, (3, 4)))
+    scene = Scene(observation, [(3, 4), (7, 1)])
+    given = np.arange(60.0).reshape(5, 12)
+    extended, star_fluxes = scene.start(given, [4.0, 0.0])
+    np.testing.assert_array_equal(extended[:5, :12] * scene.scale, given)
+    assert (extended[5:] * scene.scale == given.mean()).all()
+    assert (extended[:, 12:] * scene.scale == given.mean()).all()
+    np.testing.assert_array_equal(star_fluxes * scene.scale, [4.0, 0.0])
+
+
+@pytest.mark.parametrize("exposure", [None, 2.0], ids=["no exposure", "exposure"])
+def test_edge_is_three_times_the_mean_of_the_extended_source(exposure):
+    images = np.full((2, 8, 16), 8.0)
+    images[:, 3, 4] += 600.0
+    observation = lnocl.Observation(images, np.ones((1, 1)), background=2.0, exposure=exposure)
+    scene = Scene(observation, [(4, 3)], Penalty(0.0, 0.5))
+    np.testing.assert_allclose(scene.edge * scene.unit, 3.0 * 6.0 / (exposure or 1.0))
+    # J is in units of the scale, the estimate in its own.
+    np.testing.assert_allclose(scene.smoothing, 0.5 * scene.unit / scene.scale)
+    assert Scene(observation, [(4, 3)]).edge == 0.0
+
+
+# --- What a run refuses
+
+REFUSED = {
+    "array for an observation": (
+        {"observation": np.ones((2, *SHAPE))},
+        "observation is of type ndarray; give an lnocl.Observation, as lnocl.Observation(images, ",
+    ),
+    "None for an observation": ({"observation": None}, "observation is of type NoneType; give an"),
+    "text for an observation": ({"observation": "x"}, "observation is of type str; give an lnocl."),
+    "class for an observation": ({"observation": lnocl.Observation}, "observation is of type type"),
+    "array for an observation, held out": (
+        {"observation": np.ones((2, *SHAPE)), "stop": "held-out"},
+        "observation is of type ndarray",
+    ),
+    "star left of the images": ({"stars": [(3, 4), (-1, 4)]}, "the star at (-1, 4) lies outside"),
+    "star right of the images": ({"stars": [(16, 4)]}, "the star at (16, 4) lies outside"),
+    "star below the images": ({"stars": [(3, -0.75)]}, "the star at (3, -0.75) lies outside"),
+    "star above the images": ({"stars": [(4, 8)]}, "x must be in [0, 15] and y in [0, 7]"),
+    "x NaN": ({"stars": [(np.nan, 4)]}, "the star at (nan, 4) lies outside"),
+    "y NaN": ({"stars": [(4, np.nan)]}, "the star at (4, nan) lies outside"),
+    "x infinite": ({"stars": [(np.inf, 4)]}, "the star at (inf, 4) lies outside"),
+    "star of three numbers": ({"stars": [(1, 2, 3)]}, "star"),
+    "two stars of three numbers": ({"stars": [(1, 2, 3), (4, 5, 6)]}, "star"),
+    "array of three columns": ({"stars": np.ones((2, 3))}, "star"),
+    "complex array": ({"stars": np.array([[1j, 2]])}, "star"),
+    "star of one number": ({"stars": [(1,), (2,)]}, "star"),
+    "stars as a row of numbers": ({"stars": [1, 2, 3, 4]}, "star"),
+    "stars of different lengths": ({"stars": [(1, 2), (3,)]}, "star"),
+    "text for a star": ({"stars": [("a", "b")]}, "star"),
+    "masked stars": (
+        {"stars": np.ma.array([(3, 4), (5, 6)], mask=[(0, 0), (1, 1)])},
+        "stars has 2 masked values; fill them or leave them out",
+    ),
+    "masked row of stars": (
+        {"stars": [(3, 4), np.ma.array((5, 6), mask=(0, 1))]},
+        "stars has 1 masked values",
+    ),
+    "text for stars": ({"stars": "3,4"}, "star"),
+    "complex star": ({"stars": [(1j, 2)]}, "star"),
+    "number for stars": ({"stars": 5}, "star"),
+    "negative mu": ({"mu": -1e-9}, "mu must be a number, finite and not negative; -1e-09"),
+    "NaN mu": ({"mu": np.nan}, "mu must be a number, finite and not negative; nan"),
+    "infinite mu": ({"mu": np.inf}, "mu must be a number, finite and not negative; inf"),
+    "mu beyond all numbers": (
+        {"mu": 10**400},
+        "mu must be a number, finite and not negative; 1000",
+    ),
+    "text for mu": ({"mu": "0.1"}, "mu"),
+    "complex mu": ({"mu": 1j}, "mu"),
+    "None for mu": ({"mu": None}, "mu must be a number, finite and not negative; None"),
+    "several mu": ({"mu": np.ones((2, 2))}, "mu"),
+    "mu too large for the images": ({"mu": 1e30}, "mu 1e+30 is too large for images of about"),
+    "negative smoothing": ({"smoothing": -1.0}, "smoothing must be a number, finite and not negat"),
+    "text for smoothing": ({"smoothing": "some"}, "smoothing 'some' is not known; give a number"),
+    "smoothing too large": ({"smoothing": 1e30}, "smoothing 1e+30 is too large for images of"),
+    "too many iterations": ({"n_iter": 10**400}, "n_iter must be 2147483646 at most; 1000"),
+    "no iteration": ({"n_iter": 0}, "n_iter must be a whole number, 1 or more; 0 was given"),
+    "negative n_iter": ({"n_iter": -1}, "n_iter must be a whole number, 1 or more; -1"),
+    "fractional n_iter": ({"n_iter": 1.5}, "n_iter must be a whole number, 1 or more; 1.5"),
+    "text for n_iter": ({"n_iter": "5"}, "n_iter must be a whole number, 1 or more; 5"),
+    "None for n_iter": ({"n_iter": None}, "n_iter must be a whole number, 1 or more; None"),
+    "several n_iter": ({"n_iter": np.ones((2, 2), int)}, "n_iter"),
+    "unknown solver": ({"solver": "cg"}, "solver 'cg' is not known; choose from sgm, sgp"),
+    "unknown engine": ({"engine": "cuda"}, "engine 'cuda' is not known; choose from opencl, numpy"),
+    "unknown precision": (
+        {"precision": "half"},
+        "precision 'half' is not known; choose from single, double",
+    ),
+    "unknown mu": ({"mu": "best"}, "mu 'best' is not known; give a number or auto"),
+    "unknown rule": (
+        {"stop": "never"},
+        "stop 'never' is not known; give discrepancy, held-out, or a number between 0 and 1",
+    ),
+    "change of 0": ({"stop": 0.0}, "stop 0.0 is not known"),
+    "change of 1": ({"stop": 1.0}, "stop 1.0 is not known"),
+    "NaN change": ({"stop": np.nan}, "stop nan is not known"),
+    "several rules": ({"stop": ("held-out",)}, "stop ('held-out',) is not known"),
+    "None for mu with held-out counts": (
+        {"mu": None, "stop": "held-out"},
+        "mu must be a number, finite and not negative; None",
+    ),
+    "callback that is none": ({"callback": 3}, "callback must be a function or None; 3 was given"),
+    "progress in words": ({"progress": "no"}, "progress must be True or False; 'no' was given"),
+    "refinement in numbers": ({"refine_positions": 1}, "refine_positions must be True or False; 1"),
+    "negative pad": ({"pad": -1}, "pad must be a whole number, 0 or more, or auto; -1 was given"),
+    "fractional pad": (
+        {"pad": 1.5},
+        "pad must be a whole number, 0 or more, or auto; 1.5",
+    ),
+    "text for pad": ({"pad": "1"}, "pad must be a whole number, 0 or more, or auto; 1 was given"),
+    "several pads": ({"pad": np.ones((2, 2), int)}, "pad"),
+    "pad too large": ({"pad": MAX_AXIS // 2}, "with pad=4096 need a grid of (16384, 16384)"),
+    "start of another shape": (
+        {"initial_extended": np.ones((8, 15))},
+        "initial_extended has shape",
+    ),
+    "negative start": ({"initial_extended": -np.ones(SHAPE)}, "initial_extended must be finite"),
+    "NaN start": ({"initial_extended": np.full(SHAPE, np.nan)}, "initial_extended must be finite"),
+    "infinite start": (
+        {"initial_extended": np.full(SHAPE, np.inf)},
+        "initial_extended must be finite",
+    ),
+    "complex start": ({"initial_extended": np.full(SHAPE, 1j)}, "initial_extended"),
+    "masked start": (
+        {"initial_extended": np.ma.array(np.ones(SHAPE), mask=np.eye(*SHAPE))},
+        "initial_extended has 8 masked values; fill them or leave them out",
+    ),
+    "CCDData with a mask for a start": (
+        {"initial_extended": CCDData(np.ones(SHAPE), mask=np.eye(*SHAPE) > 0, unit="ct")},
+        "initial_extended has 8 masked values",
+    ),
+    "text for a start": ({"initial_extended": "flat"}, "initial_extended"),
+    "ragged start": ({"initial_extended": [[1.0, 2.0], [3.0]]}, "initial_extended"),
+    "too many fluxes": ({"initial_star_fluxes": [1.0]}, "initial_star_fluxes has shape (1,)"),
+    "too few fluxes": (
+        {"initial_star_fluxes": [1.0], "stars": [(3, 4), (5, 6)]},
+        "initial_star_fluxes has shape (1,); it must have (2,)",
+    ),
+    "negative flux": (
+        {"initial_star_fluxes": [-1.0], "stars": [(3, 4)]},
+        "initial_star_fluxes must be finite and not negative",
+    ),
+    "NaN flux": (
+        {"initial_star_fluxes": [np.nan], "stars": [(3, 4)]},
+        "initial_star_fluxes must be finite and not negative",
+    ),
+    "masked flux": (
+        {"initial_star_fluxes": np.ma.array([1.0], mask=True), "stars": [(3, 4)]},
+        "initial_star_fluxes has 1 masked values",
+    ),
+    "text for a flux": ({"initial_star_fluxes": ["a"], "stars": [(3, 4)]}, "initial_star_fluxes"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused(case):
+    changes, message = REFUSED[case]
+    with pytest.raises(lnocl.InputError) as caught:
+        lnocl.deconvolve(**({"observation": OBSERVATION, "n_iter": 1, "engine": "numpy"} | changes))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_image_too_large_for_the_grid_is_refused():
+    observation = lnocl.Observation(np.ones((1, MAX_AXIS + 1)), np.ones((1, 1)))
+    with pytest.raises(lnocl.InputError, match=r"images of \(1, 8193\) .* largest axis is 8192"):
+        lnocl.deconvolve(observation, n_iter=1, engine="numpy")
+
+
+def test_star_that_no_image_observed_is_refused():
+    mask = np.zeros((2, *SHAPE), bool)
+    mask[:, :5, 8:] = True
+    observation = lnocl.Observation(np.ones((2, *SHAPE)), make_psfs(2, (3, 4)), mask=mask)
+    with pytest.raises(lnocl.InputError, match=r"the star at \(11, 2\) lies where all .* masked"):
+        lnocl.deconvolve(observation, stars=[(3, 2), (11, 2)], n_iter=1, engine="numpy")
+    mask[1] = False
+    observation = lnocl.Observation(np.ones((2, *SHAPE)), make_psfs(2, (3, 4)), mask=mask)
+    lnocl.deconvolve(observation, stars=[(3, 2), (11, 2)], n_iter=1, engine="numpy")
+
+
+@pytest.mark.parametrize(
+    "stars", [(), [], np.zeros((0, 2)), [(3, 4)], np.array([[3, 4]]), ((3.0, 4),)]
+)
+def test_stars_are_any_sequence_of_pairs(stars):
+    result = lnocl.deconvolve(OBSERVATION, stars=stars, n_iter=np.int64(2), engine="numpy")
+    assert result.star_fluxes.shape == (len(stars),)
+    assert result.device == "numpy"
+
+
+def gaussian(fwhm, size=15, off=0.0):
+    y, x = np.indices((size, size)) - size // 2 - off
+    return np.exp(-4 * np.log(2) * (x**2 + y**2) / fwhm**2)
+
+
+SHARP = "psf 0 is sharper than its pixels can hold: moved between pixels it rings by up to"
+
+
+@pytest.mark.parametrize(
+    ("fwhm", "off", "given", "warned"),
+    [
+        (1.5, 0.5, {"stars": [(20, 21.5)]}, SHARP),
+        (1.5, 0.5, {"stars": [(20, 21)], "leeway": 3.0}, SHARP),
+        (1.5, 0.5, {"stars": [(20, 21)]}, None),
+        (1.5, 0.5, {}, None),
+        (1.5, 0.5, {"leeway": 3.0}, None),
+        (2.5, 0.5, {"stars": [(20, 21.5)]}, None),
+        (0.8, 0.0, {"stars": [(20, 21.5)]}, None),
+    ],
+)
+def test_psf_that_rings_between_pixels_is_warned_of(fwhm, off, given, warned):
+    """Its centre is between pixels; on a pixel it would not ring."""
+    observation = lnocl.Observation(np.ones((48, 48)), gaussian(fwhm, off=off))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Scene(observation, **given)
+    assert [str(w.message).startswith(str(warned)) for w in caught] == [True] * (warned is not None)
+
+
+def test_what_the_warning_says_of_the_ringing_is_so():
+    observation = lnocl.Observation(np.ones((48, 48)), gaussian(1.5, off=0.5))
+    with pytest.warns(lnocl.LnoclWarning, match="by up to 4.7% of its peak"):
+        scene = Scene(observation, [(20.5, 21.5)])
+    darkest = -scene.star_image(0, 0).min() / observation.psfs.max()
+    assert 0.0465 < darkest < 0.0475
+
+
+@pytest.mark.parametrize(
+    ("shape", "offsets", "pad", "warned"),
+    [
+        ((32, 32), [(0, 0), (2.25, 0)], 0, True),
+        ((32, 32), [(0, 0), (0, -3)], 0, True),
+        ((32, 32), [(0, 0), (0, 0)], 0, False),
+        ((32, 32), [(0, 0), (2.25, 0)], 3, False),
+        ((32, 30), [(0, 0), (2, 0)], 0, False),
+        ((30, 32), [(0, 0), (2, 0)], 0, True),
+    ],
+)
+def test_offsets_that_wrap_round_are_warned_of(shape, offsets, pad, warned):
+    observation = lnocl.Observation(np.ones((2, *shape)), gaussian(3), offsets=offsets)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Scene(observation, pad=pad)
+    expected = [f"by up to {int(np.ceil(np.abs(offsets).max()))} pixels"] if warned else []
+    assert len(caught) == len(expected)
+    assert all(words in str(w.message) for w, words in zip(caught, expected, strict=True))
+
+
+def test_an_image_that_is_all_masked_says_nothing_of_stars():
+    mask = np.zeros((2, 8, 8), bool)
+    mask[0] = True
+    images = np.stack([np.full((8, 8), 1e9), np.full((8, 8), 5.0)])
+    both = lnocl.Observation(images, np.ones((3, 3)), mask=mask)
+    one = lnocl.Observation(images[1:], np.ones((3, 3)))
+    found, expected = (
+        lnocl.deconvolve(observation, stars=[(3, 3)], n_iter=5, engine="numpy")
+        for observation in (both, one)
+    )
+    assert np.allclose(found.star_fluxes, expected.star_fluxes, rtol=1e-10)

@@ -1,0 +1,312 @@
+"""A PSF at any position, against itself elsewhere, a sum of Gaussians and sums over its pixels.
+
+`gaussian_interpolation` (scenes.py) fits the Gaussians and moves them, by matrices, without an FFT.
+Tolerances are shares of the largest value, two to three times what was measured.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import gaussian_interpolation, gaussian_variance, make_psfs, worst
+from scipy.special import erf, j1
+
+from lnocl.scene.shifting import MARGIN, Stamp, fold, place
+
+GRID = (64, 128)
+ROUNDING = 2e-15
+
+
+def gaussian(shape, fwhm, x=0.0, y=0.0):
+    """Return samples of a Gaussian of unit peak about the middle pixel, moved."""
+    rows, columns = (np.arange(n) - n // 2 for n in shape)
+    sigma = fwhm / np.sqrt(8.0 * np.log(2.0))
+    return np.exp(-0.5 * ((rows[:, None] - y) ** 2 + (columns - x) ** 2) / sigma**2)
+
+
+def wrapped(psf, grid, x, y):
+    """Return a PSF on a grid, its middle at (x, y), as a plain sum over its pixels."""
+    laid = np.zeros(grid)
+    for (row, column), value in np.ndenumerate(psf):
+        to = row + y - psf.shape[0] // 2, column + x - psf.shape[1] // 2
+        laid[to[0] % grid[0], to[1] % grid[1]] += value
+    return laid
+
+
+sizes = st.integers(1, 12)
+positions = st.floats(-40.0, 40.0, allow_subnormal=False)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    shape=st.tuples(sizes, sizes),
+    grid=st.tuples(sizes, sizes),
+    x=st.integers(-40, 40),
+    y=st.integers(-40, 40),
+)
+def test_whole_pixels_move_and_wrap_a_psf(shape, grid, x, y):
+    psf = make_psfs(1, shape)[0]
+    stamp = place(psf, grid, x, y)
+    assert all(k <= n for k, n in zip(stamp.values.shape, grid, strict=True))
+    expected = wrapped(psf, grid, x, y)
+    if all(k <= n for k, n in zip(shape, grid, strict=True)):
+        np.testing.assert_array_equal(stamp.on_grid(grid), expected)
+    else:  # wings that wrap round are summed in another order
+        assert worst(stamp.on_grid(grid), expected) <= 8e-16  # measured 2.7e-16
+
+
+def test_whole_pixels_are_moved_bit_for_bit():
+    psf = make_psfs(1, (9, 8))[0]
+    for x, y in [(0, 0), (70, 3), (127, 63), (-5, 200)]:
+        expected = np.roll(place(psf, GRID, 0, 0).on_grid(GRID), (y, x), axis=(0, 1))
+        np.testing.assert_array_equal(place(psf, GRID, x, y).on_grid(GRID), expected)
+        np.testing.assert_array_equal(place(psf, GRID, x, y).values, psf)
+
+
+@settings(max_examples=60, deadline=None)
+@given(shape=st.tuples(sizes, sizes), grid=st.tuples(sizes, sizes), x=positions, y=positions)
+def test_small_grids_have_the_interpolant_of_the_whole_grid(shape, grid, x, y):
+    """Odd and even, PSFs smaller and larger: no margins fit, so the grid's own period counts."""
+    psf = make_psfs(1, shape)[0]
+    rows, columns = (
+        gaussian_interpolation(n, to, gaussian_variance(psf.sum(axis=1 - axis)))
+        for axis, (n, to) in enumerate(zip(grid, (y, x), strict=True))
+    )
+    expected = rows @ wrapped(psf, grid, 0, 0) @ columns.T
+    found = place(psf, grid, x, y).on_grid(grid)
+    assert np.abs(found - expected).max() <= 1e-14 * psf.sum()  # measured 4e-15
+
+
+@pytest.mark.parametrize("shape", [(9, 8), (8, 9), (1, 1), (2, 95), (40, 7)])
+@pytest.mark.parametrize(("x", "y"), [(0.5, 0.25), (70.3, 3), (5, -0.49), (127.9, 63.7)])
+def test_fractions_are_the_interpolant_of_the_psf_in_its_margins(shape, x, y):
+    psf = make_psfs(1, shape)[0]
+    stamp = place(psf, GRID, x, y)
+    whole = np.floor(y + 0.5), np.floor(x + 0.5)
+    laid, matrices = psf, []
+    for axis, (n, at) in enumerate(zip(GRID, (y, x), strict=True)):
+        fits = shape[axis] + 2 * MARGIN < n
+        size = shape[axis] + 2 * MARGIN if fits else n
+        assert stamp.values.shape[axis] == size
+        before = MARGIN if fits else size // 2 - shape[axis] // 2
+        pads = [(0, 0), (0, 0)]
+        pads[axis] = before, size - shape[axis] - before
+        laid = np.pad(laid, pads)
+        variance = gaussian_variance(psf.sum(axis=1 - axis))
+        matrices.append(gaussian_interpolation(size, at - whole[axis], variance))
+    expected = matrices[0] @ laid @ matrices[1].T
+    assert worst(stamp.values, expected) <= 2e-14  # measured 6e-15, the matrices' own rounding
+    assert (stamp.y, stamp.x) == tuple(
+        at - size // 2 for at, size in zip(whole, expected.shape, strict=True)
+    )
+
+
+def normal(n, at, sigma):
+    """Return a Gaussian of unit light integrated over n pixels, `at` from the middle one."""
+    edges = (np.arange(n + 1) - n // 2 - 0.5 - at) / (sigma * np.sqrt(2.0))
+    return np.diff(erf(edges)) / 2
+
+
+def pixel_gaussian(n, fwhm, x=0.0, y=0.0):
+    sigma = fwhm / np.sqrt(8.0 * np.log(2.0))
+    return np.outer(normal(n, y, sigma), normal(n, x, sigma))
+
+
+def over_pixels(profile, n, x, y):
+    """Return a function of the radius integrated over n x n pixels, by Gauss-Legendre."""
+    at, weights = np.polynomial.legendre.leggauss(10)
+    total = 0.0
+    for dy, wy in zip(at / 2, weights / 2, strict=True):
+        for dx, wx in zip(at / 2, weights / 2, strict=True):
+            k = np.arange(n) - n // 2
+            total = total + wx * wy * profile(np.hypot(k[:, None] + dy - y, k + dx - x))
+    return total
+
+
+def moffat(n, fwhm, x=0.0, y=0.0, beta=2.5):
+    width = fwhm / 2 / np.sqrt(2 ** (1 / beta) - 1)
+    return over_pixels(lambda r: (1 + (r / width) ** 2) ** -beta, n, x, y)
+
+
+def airy(n, resolution, x=0.0, y=0.0):
+    def profile(r):
+        r = np.maximum(np.pi * r / resolution, 1e-9)
+        return (2 * j1(r) / r) ** 2
+
+    return over_pixels(profile, n, x, y)
+
+
+@pytest.mark.parametrize("fwhm", [2.0, 3.0, 4.0, 6.0])
+@pytest.mark.parametrize("shape", [(41, 41), (40, 42)])
+def test_gaussians_go_where_they_are_put(shape, fwhm):
+    sigma, grid = fwhm / np.sqrt(8.0 * np.log(2.0)), (128, 128)
+    psf = np.outer(*(normal(n, 0, sigma) for n in shape))
+    errors = []
+    for dx, dy in [(0.5, 0.5), (0.3, -0.2), (0.0, 0.5), (-0.25, 0.01)]:
+        found = place(psf, grid, 64 + dx, 64 + dy).on_grid(grid)
+        errors.append(worst(found, np.outer(normal(128, dy, sigma), normal(128, dx, sigma))))
+    assert max(errors) <= 1.5e-13  # measured 6e-14, for the edges of the widest; else 4e-15
+
+
+@pytest.mark.parametrize(("fwhm", "tolerance"), [(1.5, 0.013), (2.0, 8e-4), (3.0, 5e-5)])
+def test_samples_of_gaussians_go_nearly_there(fwhm, tolerance):
+    """They are not integrated over pixels. By phases alone the errors are 0.048, 0.008, 7e-5."""
+    grid, errors = (128, 128), []
+    for dx, dy in [(0.5, 0.5), (0.3, -0.2), (0.0, 0.5), (-0.25, 0.01)]:
+        found = place(gaussian((41, 41), fwhm), grid, 64 + dx, 64 + dy).on_grid(grid)
+        errors.append(worst(found, gaussian(grid, fwhm, dx, dy)))
+    assert max(errors) <= tolerance
+
+
+@pytest.mark.parametrize(
+    ("make", "width", "error", "darkest"),
+    [
+        (pixel_gaussian, 1.0, 2.4e-5, 5e-7),
+        (pixel_gaussian, 1.5, 7e-10, 2e-11),
+        (pixel_gaussian, 2.0, 4e-16, 0.0),
+        (pixel_gaussian, 3.0, 4e-16, 0.0),
+        (moffat, 1.5, 0.015, 2e-8),
+        (airy, 1.0, 0.014, 2e-7),
+        (airy, 4 / 3, 0.014, 6e-7),
+        (airy, 2.0, 2.4e-4, 6e-6),
+        (airy, 2.8, 4e-7, 1e-5),
+    ],
+)
+def test_errors_are_what_the_docstring_says(make, width, error, darkest):
+    """In the middle; what of the wings the PSF's edges have cut off is not found by moving it."""
+    psf, n = make(61, width), 61
+    found = place(psf, (128, 128), 64.5, 64.5).on_grid((128, 128))
+    middle = np.s_[10 : n - 10, 10 : n - 10]
+    moved = found[64 - n // 2 :, 64 - n // 2 :][:n, :n]
+    missed = np.abs(moved - make(n, width, 0.5, 0.5))[middle].max() / psf.max()
+    assert missed == pytest.approx(error, rel=0.1, abs=1e-15)
+    assert -found.min() / psf.max() == pytest.approx(darkest, rel=0.2, abs=1e-15)
+
+
+@pytest.mark.parametrize(("make", "width"), [(pixel_gaussian, 1.5), (moffat, 1.5), (airy, 1.5)])
+def test_sharp_psfs_keep_their_centre(make, width):
+    """Along each axis: 3e-2 to 9e-2 pixels off where phases alone moved them."""
+    for x, y in [(0.5, 0.5), (0.25, -0.4)]:
+        found = place(make(61, width), (128, 128), 64 + x, 64 + y).on_grid((128, 128))
+        offsets = []
+        for image, middle in [(found, 64), (make(61, width, x, y), 30)]:
+            core = image[middle - 8 : middle + 9, middle - 8 : middle + 9]
+            at = np.arange(-8, 9)
+            offsets.append(np.array([at @ core.sum(axis=0), at @ core.sum(axis=1)]) / core.sum())
+        assert np.abs(offsets[0] - offsets[1]).max() <= 5e-3  # measured 2.0e-3
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    shape=st.tuples(sizes, sizes),
+    x=positions,
+    y=positions,
+    dx=st.integers(-70, 70),
+    dy=st.integers(-70, 70),
+)
+def test_whole_pixels_more_roll_the_grid(shape, x, y, dx, dy):
+    # The fraction of a sum differs by rounding, and a half may go to either side.
+    x, y = np.round(64 * x) / 64, np.round(64 * y) / 64
+    psf = make_psfs(1, shape)[0]
+    expected = np.roll(place(psf, GRID, x, y).on_grid(GRID), (dy, dx), axis=(0, 1))
+    np.testing.assert_array_equal(place(psf, GRID, x + dx, y + dy).on_grid(GRID), expected)
+
+
+@settings(max_examples=60, deadline=None)
+@given(shape=st.tuples(sizes, sizes), grid=st.tuples(sizes, sizes), x=positions, y=positions)
+def test_the_sum_is_kept(shape, grid, x, y):
+    psf = make_psfs(1, shape)[0]
+    total = place(psf, grid, x, y).values.sum()
+    assert total == pytest.approx(psf.sum(), rel=2e-15)  # measured 6e-16
+
+
+@pytest.mark.parametrize("shape", [(9, 9), (9, 41), (31, 9)])
+def test_a_mirrored_psf_moves_as_its_mirror_image(shape):
+    """Along y as along x, and where the size is even, which leaves one frequency without sign."""
+    psf = make_psfs(1, shape)[0]
+    for grid in [(128, 128), (32, 32), (32, 128)]:
+        centre = grid[0] // 2, grid[1] // 2
+        found = place(psf, grid, centre[1] + 0.3, centre[0] - 0.2).on_grid(grid)
+        turned = place(psf.T, grid[::-1], centre[0] - 0.2, centre[1] + 0.3).on_grid(grid[::-1])
+        assert worst(turned.T, found) <= ROUNDING  # measured 7e-16
+        for axis, x, y in [(0, 0.3, 0.2), (1, -0.3, -0.2)]:
+            mirrored = np.flip(psf, axis)  # the sizes are odd: the middle stays
+            mirror = place(mirrored, grid, centre[1] + x, centre[0] + y).on_grid(grid)
+            back = np.roll(np.flip(mirror, axis), 1 - grid[axis] % 2, axis)
+            assert worst(back, found) <= ROUNDING
+
+
+def test_a_psf_of_opposite_signs_is_taken_for_one_pixel():
+    """It alternates more than its own light, which no Gaussian does."""
+    psf = np.array([[-1.0, 4.0, -1.0]])
+    row = gaussian_interpolation(64, 0.5, gaussian_variance(np.ones(1)))
+    expected = row @ np.pad(psf[0], (31, 30))
+    found = place(psf, (1, 64), 32.5, 0).on_grid((1, 64))[0]
+    assert worst(found, expected) <= 2e-14
+
+
+class TestDerivative:
+    @pytest.mark.parametrize("grid", [(128, 128), (32, 64), (31, 63)])
+    @pytest.mark.parametrize("axis", [0, 1])
+    @pytest.mark.parametrize(("x", "y"), [(12.0, 17.0), (12.3, 16.6), (12.45, 17.0)])
+    def test_is_that_of_what_is_placed(self, grid, axis, x, y):
+        """Of any PSF, sharp ones too: the difference of what `place` returns itself."""
+        psf, h = make_psfs(1, (6, 7))[0], 1e-3
+        expected = 0.0
+        for step, weight in ((-2 * h, 1), (-h, -8), (h, 8), (2 * h, -1)):
+            to = (x + step, y) if axis else (x, y + step)
+            expected = expected + weight / (12 * h) * place(psf, grid, *to).on_grid(grid)
+        assert (
+            worst(place(psf, grid, x, y, axis).on_grid(grid), expected) <= 5e-12
+        )  # measured 1.8e-12
+
+    @pytest.mark.parametrize("fwhm", [1.5, 2.0, 6.0])
+    @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.5, 0.25), (-0.3, 0.1)])
+    def test_of_a_gaussian(self, x, y, fwhm):
+        grid, sigma = (128, 128), fwhm / np.sqrt(8.0 * np.log(2.0))
+
+        def slope(at):
+            edges = (np.arange(129) - 64.5 - at) / sigma
+            return -np.diff(np.exp(-(edges**2) / 2)) / (sigma * np.sqrt(2 * np.pi))
+
+        for axis in (0, 1):
+            along = [normal(128, y, sigma), normal(128, x, sigma)]
+            along[axis] = slope((y, x)[axis])
+            found = place(pixel_gaussian(41, fwhm), grid, 64 + x, 64 + y, axis).on_grid(grid)
+            assert worst(found, np.outer(*along)) <= (2e-8 if fwhm < 2 else 4e-14)
+
+    @pytest.mark.parametrize("axis", [0, 1])
+    def test_has_no_light(self, axis):
+        stamp = place(make_psfs(1, (6, 7))[0], GRID, 3.3, 4.2, axis)
+        assert abs(stamp.values.sum()) <= 5e-16  # measured 1.5e-16
+
+
+class TestStamp:
+    @settings(max_examples=60, deadline=None)
+    @given(
+        shape=st.tuples(sizes, sizes),
+        more=st.tuples(sizes, sizes),
+        y=st.integers(-60, 60),
+        x=st.integers(-60, 60),
+    )
+    def test_rows_and_columns_are_where_the_values_lie(self, shape, more, y, x):
+        grid = shape[0] + more[0], shape[1] + more[1]
+        values = 1.0 + np.arange(shape[0] * shape[1], dtype=float).reshape(shape)
+        stamp = Stamp(values, y, x)
+        on_grid = stamp.on_grid(grid)
+        assert on_grid.sum() == values.sum()
+        chosen = on_grid[np.ix_(stamp.rows(grid), stamp.columns(grid))]
+        np.testing.assert_array_equal(chosen, values)
+        assert on_grid[y % grid[0], x % grid[1]] == 1.0
+
+
+@given(k=st.integers(1, 40), n=st.integers(1, 12), axis=st.integers(0, 1))
+def test_fold_wraps_wings_round(k, n, axis):
+    psf = np.random.default_rng(k).integers(-9, 9, (k, 2)).astype(float)
+    psf = psf.T if axis else psf
+    folded = fold(psf, n, axis)
+    expected = np.zeros_like(folded)
+    for i in range(k):
+        to = (i - k // 2 + n // 2) % n
+        np.moveaxis(expected, axis, 0)[to] += np.moveaxis(psf, axis, 0)[i]
+    np.testing.assert_array_equal(folded, expected)

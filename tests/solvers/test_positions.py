@@ -1,0 +1,525 @@
+"""Star positions and fluxes: the fit against SciPy, its errors against noise, and whole runs.
+
+Tolerances are two to three times what was measured, which stands beside them.
+"""
+
+import dataclasses
+import functools
+import warnings
+
+import numpy as np
+import pytest
+from scenes import ENGINES, Recipe, worst
+from scipy.optimize import minimize
+from scipy.special import kl_div
+
+import lnocl
+from lnocl.runs.run import Run, Setup
+from lnocl.scene.forward_model import Model
+from lnocl.scene.penalty import Penalty
+from lnocl.scene.scene import Scene
+from lnocl.solvers import positions, scaling
+from lnocl.solvers.positions import RADIUS, StarFit, Stars
+
+# PSFs here are small, and whole offsets periodic.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:psf . is sharper than its pixels", "ignore:the images are shifted by up to"
+)
+
+SHAPE = (32, 32)
+SIGMA = 3.0 / np.sqrt(8.0 * np.log(2.0))
+numpy_alone = {"engine": "numpy"}
+
+
+def gaussian(x, y, shape=SHAPE):
+    """Return a Gaussian star of unit flux and FWHM 3 pixels."""
+    rows, columns = np.indices(shape)
+    return np.exp(-0.5 * ((columns - x) ** 2 + (rows - y) ** 2) / SIGMA**2) / (2 * np.pi * SIGMA**2)
+
+
+PSF = gaussian(7, 7, (15, 15))
+
+# --- The fit
+
+RECIPES = {
+    "two stars": Recipe(SHAPE, 2, 2, psf_shape=(9, 9), background="each"),
+    "exposures, offsets, mask, noise": Recipe(
+        (32, 16),
+        3,
+        2,
+        masked=0.1,
+        background="map",
+        read_noise=1.0,
+        exposure="each",
+        fractions=True,
+    ),
+    "exposure map, three stars, room for margins": Recipe(
+        (32, 128), 2, 3, psf_shape=(11, 12), exposure="map", fractions=True
+    ),
+}
+# Of the standard errors, and in standard errors: measured 2.9e-5 and 1.5e-3.
+LOST_TO_WINGS = 9e-5, 4.5e-3
+every_recipe = pytest.mark.parametrize("name", RECIPES)
+
+
+@pytest.fixture
+def whole_psfs(monkeypatch):
+    """Look at all pixels that a star lights, not only at those that say much of its position."""
+    monkeypatch.setattr(positions, "INFORMATION_SHARE", 1.0)
+
+
+def fit_of(name, fluxes=(2.5e3, 1.1e3, 3e3)):
+    """Return the recipe's arrays, its scene, the fit, and stars off the truth."""
+    made = RECIPES[name].make()
+    scene = Scene(made.observation(), made.stars, leeway=RADIUS)
+    extended, _ = scene.start(made.sky, None)
+    n = len(made.stars)
+    off = np.array([(0.42, -0.73), (-1.15, 0.3), (0.0, 0.55)])[:n]
+    stars = Stars(np.array(fluxes[:n]) / scene.unit, scene.stars + off)
+    return made, scene, StarFit(scene, Model(scene), extended, scene.stars), stars, extended
+
+
+def as_vector(stars):
+    return np.concatenate([stars.fluxes, *stars.positions.T])
+
+
+def as_stars(vector):
+    n = len(vector) // 3
+    return Stars(vector[:n], vector[n:].reshape(2, n).T)
+
+
+def differences(function, vector):
+    """Return the derivatives of a function along each unknown, by differences of fourth order."""
+    columns = []
+    for i, value in enumerate(vector):
+        h = 1e-3 * (value if i < len(vector) // 3 else 1.0)
+        unit = np.eye(len(vector))[i]
+        columns.append(
+            sum(
+                weight * function(as_stars(vector + step * h * unit))
+                for step, weight in ((-2, 1), (-1, -8), (1, 8), (2, -1))
+            )
+            / (12 * h)
+        )
+    return np.array(columns)
+
+
+def models(scene, extended, stars):
+    """Return images, models and weights of all pixels, by the scene's own PSFs moved there."""
+    other = Scene(scene.observation, stars.positions)
+    otfs = [np.fft.rfft2(other.psf(j)) for j in range(other.n_images)]
+    model = np.array([np.fft.irfft2(otf * np.fft.rfft2(extended), other.grid) for otf in otfs])
+    for j in range(other.n_images):
+        for s, flux in enumerate(stars.fluxes):
+            model[j] += flux * other.star_image(j, s)
+    background = other.background()
+    background = background if background.ndim == 3 else background[:, None, None]
+    weights = np.ones(model.shape) if other.weights is None else other.weights.astype(float)
+    return other.images(), model + background, weights
+
+
+@pytest.mark.usefixtures("whole_psfs")
+@every_recipe
+def test_objective_is_the_data_term(name):
+    """But for what no star lights."""
+    _, scene, fit, stars, extended = fit_of(name)
+    further = Stars(1.3 * stars.fluxes, stars.positions + 0.3)
+    terms = []
+    for each in (stars, further):
+        images, model, weights = models(scene, extended, each)
+        terms.append((weights * kl_div(images, model)).sum())
+    difference = fit.objective(further) - fit.objective(stars)
+    assert abs(difference - (terms[1] - terms[0])) <= 1e-13 * abs(terms[1] - terms[0])
+
+
+@every_recipe
+def test_gradient_is_that_of_the_objective(name):
+    *_, fit, stars, _ = fit_of(name)
+    gradient, information = fit.derivatives(stars)
+    errors = 1.0 / np.sqrt(np.diag(information))
+    expected = differences(fit.objective, as_vector(stars))
+    # In units of the least the objective could be bent by.
+    assert worst(gradient * errors, expected * errors) <= 3e-11  # measured 1.2e-11
+
+
+@pytest.mark.usefixtures("whole_psfs")
+@every_recipe
+def test_information_is_that_of_the_model(name):
+    _, scene, fit, stars, extended = fit_of(name)
+    _, model, weights = models(scene, extended, stars)
+    columns = differences(lambda each: models(scene, extended, each)[1], as_vector(stars))
+    columns = columns.reshape(len(columns), -1)
+    expected = (columns * (weights / model).ravel()) @ columns.T
+    _, information = fit.derivatives(stars)
+    errors = 1.0 / np.sqrt(np.diag(expected))
+    assert (
+        worst(information * errors * errors[:, None], expected * errors * errors[:, None]) <= 1e-9
+    )
+
+
+@pytest.mark.usefixtures("whole_psfs")
+@every_recipe
+def test_minimum_is_that_of_scipy(name):
+    """On J itself, summed over all pixels, in standard errors."""
+    _, scene, fit, stars, extended = fit_of(name)
+    found = as_vector(fit.minimise(stars))
+    errors = as_vector(fit.errors(as_stars(found)))
+
+    def objective(z):
+        images, model, weights = models(scene, extended, as_stars(z * errors))
+        return (weights * kl_div(images, np.maximum(model, 1e-12))).sum()
+
+    best = minimize(objective, as_vector(stars) / errors, method="BFGS", options={"gtol": 1e-7})
+    assert abs(found / errors - best.x).max() * np.sqrt(scene.scale) <= 1e-4  # measured 3.9e-5
+    assert objective(found / errors) <= best.fun * (1 + 1e-11)
+    assert abs(found / errors - as_vector(stars) / errors).max() > 1.0
+
+
+@every_recipe
+def test_far_wings_say_little(name, monkeypatch):
+    """The squares that are looked at, against all pixels: errors, and the minimum in errors."""
+    *_, fit, stars, _ = fit_of(name)
+    monkeypatch.setattr(positions, "INFORMATION_SHARE", 1.0)
+    *_, whole, _, _ = fit_of(name)
+    found, best = (as_vector(each.minimise(stars)) for each in (fit, whole))
+    errors, least = (as_vector(each.errors(as_stars(best))) for each in (fit, whole))
+    assert (abs(errors / least - 1.0) <= LOST_TO_WINGS[0]).all()
+    assert (abs(found - best) <= LOST_TO_WINGS[1] * least).all()
+
+
+def test_fluxes_and_positions_may_be_of_any_size():
+    """A star of 1e9 and one of 1e-3 of the sky: neither is lost in the inverse of F."""
+    information = np.array([[4.0, 1.0, 0.0], [1.0, 9.0, 0.0], [0.0, 0.0, 0.0]])
+    units = np.array([1e-12, 1e9, 1.0])
+    inverse = positions._invert(information * units * units[:, None])
+    expected = np.zeros((3, 3))
+    expected[:2, :2] = np.linalg.inv(information[:2, :2])
+    np.testing.assert_allclose(inverse * units * units[:, None], expected, rtol=1e-15, atol=0)
+
+
+# --- A star on a flat sky: noise
+
+
+def flat_sky(x, y, flux, level, seed, **known):
+    mean = flux * gaussian(x, y) + level
+    return lnocl.Observation(np.random.default_rng(seed).poisson(mean), PSF, level, **known)
+
+
+def fitted(observation, given, level, flux):
+    scene = Scene(observation, [given], leeway=RADIUS)
+    fit = StarFit(scene, Model(scene), np.zeros(scene.grid), scene.stars)
+    stars = fit.minimise(Stars(np.array([flux / scene.unit]), scene.stars))
+    errors = fit.errors(stars)
+    root = np.sqrt(scene.scale)
+    values = np.array([stars.fluxes[0] * scene.unit, *stars.positions[0]])
+    return values, np.array([errors.fluxes[0] * scene.unit, *errors.positions[0]]) / root
+
+
+def test_scatter_is_what_the_errors_say():
+    """Of 100 realisations; the sum of squares over the errors' has a chi-square distribution."""
+    truth, level, n = np.array([2000.0, 15.3, 16.4]), 5.0, 100
+    pulls = []
+    for seed in range(n):
+        observation = flat_sky(*truth[1:], truth[0], level, seed)
+        values, errors = fitted(observation, (15, 17), level, 0.7 * truth[0])
+        pulls.append((values - truth) / errors)
+    pulls = np.array(pulls)
+    # Four standard errors of the mean and of the variance.
+    assert (abs(pulls.mean(axis=0)) <= 4.0 / np.sqrt(n)).all()
+    assert (abs((pulls**2).mean(axis=0) - 1.0) <= 4.0 * np.sqrt(2.0 / n)).all()
+
+
+def test_errors_are_those_of_theory():
+    """From sums over the pixels; a star alone has sqrt(N) in flux, sigma / sqrt(N) in position."""
+    flux = 1e4
+    for level, seed in ((0.5, 0), (1e4, 1)):
+        _, errors = fitted(flat_sky(15.3, 16.4, flux, level, seed), (15, 16), level, flux)
+        star, h = gaussian(15.3, 16.4), 1e-4
+        slope = flux * (gaussian(15.3 + h, 16.4) - gaussian(15.3 - h, 16.4)) / (2 * h)
+        mean = flux * star + level
+        expected = [((d**2 / mean).sum()) ** -0.5 for d in (star, slope, slope)]
+        np.testing.assert_allclose(errors, expected, rtol=0.03)
+        if level < 1:
+            np.testing.assert_allclose(errors, np.array([flux, SIGMA, SIGMA]) / flux**0.5, rtol=0.1)
+    assert expected[1] > 3 * SIGMA / np.sqrt(flux)
+
+
+@pytest.mark.parametrize("factor", [4.0, 100.0])
+def test_errors_fall_as_the_root_of_the_counts(factor):
+    """The very same image, of more counts: and exposure for counts."""
+    mean = 500.0 * gaussian(15.3, 16.4) + 2.0
+    start = {"stars": [(15, 16)], "initial_star_fluxes": [500.0], "n_iter": 1}
+
+    def errors(images, **known):
+        return lnocl.deconvolve(
+            lnocl.Observation(images, PSF, 2.0 * images.sum() / mean.sum(), **known),
+            refine_positions=True, initial_extended=np.full(SHAPE, 1e-9), **start, **numpy_alone,
+        )  # fmt: skip
+
+    one, more = errors(mean), errors(factor * mean)
+    exposed = errors(factor * mean, exposure=factor)
+    for result in (more, exposed):
+        np.testing.assert_allclose(
+            result.star_position_errors * np.sqrt(factor), one.star_position_errors, rtol=1e-3
+        )
+    scale = more.star_flux_errors / np.sqrt(factor)
+    np.testing.assert_allclose(scale, one.star_flux_errors, rtol=1e-3)
+    np.testing.assert_allclose(
+        exposed.star_flux_errors * np.sqrt(factor), one.star_flux_errors, rtol=1e-3
+    )
+
+
+def test_a_star_keeps_within_its_radius():
+    observation = flat_sky(15.0, 16.0, 5000.0, 5.0, 0)
+    for given, away in (((20, 16), 5.0), ((12.0, 12.0), 5.0), ((17.5, 16), 0.0)):
+        values, _ = fitted(observation, given, 5.0, 5000.0)
+        gone = np.hypot(*(values[1:] - given))
+        if away:
+            assert gone == pytest.approx(RADIUS, abs=1e-12)
+        else:
+            assert np.hypot(*(values[1:] - (15, 16))) <= 0.1
+    result = lnocl.deconvolve(
+        observation, [(20, 16)], n_iter=20, refine_positions=True, **numpy_alone
+    )
+    assert np.hypot(*(result.star_positions[0] - (20, 16))) <= RADIUS + 1e-12
+
+
+def test_a_star_without_light_is_left_alone():
+    """Its flux ends at 0, where its position means nothing and its error is infinite."""
+    observation = lnocl.Observation(np.zeros(SHAPE), PSF, 3.0)
+    result = lnocl.deconvolve(
+        observation, [(15, 16)], n_iter=3, refine_positions=True, initial_star_fluxes=[0.0],
+        **numpy_alone,
+    )  # fmt: skip
+    np.testing.assert_array_equal(result.star_positions, [(15, 16)])
+    np.testing.assert_array_equal(result.star_fluxes, [0.0])
+    assert np.isinf(result.star_position_errors).all()
+    assert np.isfinite(result.star_flux_errors).all()
+
+
+def test_a_star_may_leave_the_images_but_not_go_where_all_is_masked():
+    """It must not end the run."""
+    observation = flat_sky(-1.2, 16.0, 3000.0, 5.0, 0)
+    result = lnocl.deconvolve(
+        observation, [(0, 16)], n_iter=6, pad=8, refine_positions=True, **numpy_alone
+    )
+    assert result.star_positions[0, 0] < -0.5
+    mask = np.zeros(SHAPE, bool)
+    mask[:, 16:] = True
+    observation = flat_sky(17.5, 16.0, 3e5, 5.0, 0, mask=mask)
+    scene = Scene(observation, [(14.0, 16.0), (5.0, 5.0)], leeway=30.0)
+    weights = scene.star_weights
+    scene.move_stars([(25.0, 16.0), (6.0, 5.5)])
+    np.testing.assert_array_equal(scene.stars, [(14.0, 16.0), (6.0, 5.5)])
+    np.testing.assert_array_equal(scene.star_weights[0], weights[0])
+    expected = Scene(observation, [(6.0, 5.5)]).star_weights
+    np.testing.assert_array_equal(scene.star_weights[1:], expected)
+
+
+@pytest.mark.parametrize("shape", [(128, 64), (16, 128)])
+def test_rows_that_a_star_may_light_hold_it_wherever_it_goes(shape):
+    """The engine keeps those rows alone; an undersampled PSF rings to the end of its margins."""
+    psf = np.zeros((9, 5))
+    psf[4, 2] = 1.0  # the rest of it is empty
+    observation = lnocl.Observation(np.ones((2, *shape)), psf, offsets=[(0, 0), (1.5, -3.25)])
+    for given in ((30.0, 10.0), (30.5, 10.5), (30.2, 0.0)):
+        scene = Scene(observation, [given], leeway=RADIUS)
+        rows = scene.star_rows(0)
+        fit = StarFit(scene, Model(scene), np.ones(scene.grid), scene.stars)
+        for angle in np.linspace(0, 2 * np.pi, 17):
+            position = np.array(given) + RADIUS * np.array([np.cos(angle), np.sin(angle)])
+            scene.move_stars([position])
+            for j in range(2):
+                assert rows[scene.star_stamp(j, 0).rows(scene.grid)].all()
+            for k in range(3):
+                # Pixels that the fit has no place for would fall on others, or on one another.
+                pixels, values = fit._light(k, position)
+                assert len(np.unique(pixels)) == len(pixels) == len(values)
+    if shape[0] == 128:
+        assert not rows.all()
+
+
+# --- Runs
+
+RUN = Recipe((16, 32), 2, 1, mu=1e-3, background="each", masked=0.03, psf_shape=(9, 9))
+OFF = np.array([(0.6, -0.4)])
+
+
+def run(recipe=RUN, engine=ENGINES[0].values[0], **changes):
+    made = recipe.make()
+    given = {"stars": made.stars + OFF, "n_iter": 13, "refine_positions": True, **engine}
+    return made, made.deconvolve(**(given | changes))
+
+
+@functools.cache
+def reference_run(solver, n_iter=13):
+    return run(solver=solver, n_iter=n_iter)[1]
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_positions_are_found_in_a_run(solver):
+    made, result = run(solver=solver, n_iter=50)
+    off = result.star_positions - made.stars
+    assert abs(off / result.star_position_errors).max() <= 4.0
+    _, without = run(solver=solver, n_iter=50, refine_positions=False)
+    np.testing.assert_array_equal(without.star_positions, made.stars + OFF)
+    np.testing.assert_array_equal(without.star_flux_errors, [0.0])
+    np.testing.assert_array_equal(without.star_position_errors, np.zeros((1, 2)))
+    assert result.history["objective"][-1] < without.history["objective"][-1]
+    away = without.star_positions - made.stars
+    assert (np.hypot(*off.T) < 0.2 * np.hypot(*away.T)).all()
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_objectives_never_rise_and_are_one_for_each_iteration(solver):
+    """Those after which stars were moved are of the moved stars: J falls by that, too."""
+    for n_iter in (1, 3, 4, 6, 13):
+        _, result = run(solver=solver, n_iter=n_iter)
+        np.testing.assert_array_equal(result.history["iteration"], np.arange(n_iter + 1))
+        assert (np.diff(result.history["objective"]) < 0).all()
+    # Not those of iteration 3 and 6 as the solver left them: stars were moved then.
+    before = run(solver=solver, n_iter=3)[1].history["objective"]
+    np.testing.assert_array_equal(before[:3], result.history["objective"][:3])
+    assert result.history["objective"][3] < before[3]
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_stars_are_moved_after_3_6_and_12_iterations(solver):
+    """And before the first: as if runs were begun anew from there."""
+    seen = []
+
+    def look(iteration, estimate):
+        seen.append(tuple(estimate._live().star_positions()[0]))
+
+    run(solver=solver, n_iter=14, callback=look)
+    changed = [i for i in range(1, 14) if seen[i] != seen[i - 1]]  # seen[i]: iteration i + 1
+    assert changed == [3, 6, 12]
+    assert seen[0] != tuple((RUN.make().stars + OFF)[0])
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+@pytest.mark.parametrize("engine", ENGINES[1:])
+def test_engines_agree(engine, solver):
+    expected = reference_run(solver)
+    _, result = run(engine=engine, solver=solver)
+    found = {
+        "extended": worst(result.extended, expected.extended),
+        "fluxes": worst(result.star_fluxes, expected.star_fluxes),
+        "positions": abs(result.star_positions - expected.star_positions).max(),
+        "flux errors": worst(result.star_flux_errors, expected.star_flux_errors),
+        "position errors": worst(result.star_position_errors, expected.star_position_errors),
+        "objective": worst(result.history["objective"], expected.history["objective"]),
+    }
+    # Measured 4.5e-14, 1.2e-15, 3.6e-15, 4.7e-16, 1.6e-15 and 3.5e-16; in single 2.9e-5, 9.1e-7,
+    # 2.2e-6, 8.0e-8, 1.1e-6 and 2.2e-7.
+    tolerances = {
+        "double": (1.3e-13, 3.5e-15, 1e-14, 1.4e-15, 4e-15, 1e-15),
+        "single": (9e-5, 2.8e-6, 7e-6, 2.5e-7, 3.5e-6, 7e-7),
+    }[engine["precision"]]
+    assert (np.array(list(found.values())) <= tolerances).all(), found
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+@pytest.mark.parametrize("exponent", [-30, 30])
+def test_scaling_by_a_power_of_two_is_bit_for_bit(solver, exponent):
+    made, factor = RUN.make(), 2.0**exponent
+    expected = reference_run(solver)
+    result = made.deconvolve(
+        made.observation(images=factor * made.images, background=factor * made.background),
+        stars=made.stars + OFF,
+        n_iter=13,
+        solver=solver,
+        mu=made.recipe.mu / factor,
+        initial_extended=factor * made.initial_extended,
+        initial_star_fluxes=factor * made.initial_star_fluxes,
+        refine_positions=True,
+        **numpy_alone,
+    )
+    np.testing.assert_array_equal(result.star_positions, expected.star_positions)
+    np.testing.assert_array_equal(result.extended, factor * expected.extended)
+    np.testing.assert_array_equal(result.star_fluxes, factor * expected.star_fluxes)
+    root = 2.0 ** (exponent // 2)
+    np.testing.assert_array_equal(root * result.star_position_errors, expected.star_position_errors)
+    np.testing.assert_array_equal(result.star_flux_errors, root * expected.star_flux_errors)
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_without_stars_there_is_nothing_to_refine(solver):
+    made = dataclasses.replace(RUN, n_stars=0).make()
+    results = [
+        made.deconvolve(n_iter=13, solver=solver, refine_positions=refined, **numpy_alone)
+        for refined in (False, True)
+    ]
+    np.testing.assert_array_equal(results[1].extended, results[0].extended)
+    np.testing.assert_array_equal(results[1].history, results[0].history)
+    assert results[1].star_positions.shape == results[1].star_position_errors.shape == (0, 2)
+
+
+# --- With the rules
+
+FULL = dataclasses.replace(RUN, n_images=3, exposure="map", fractions=True, mu=0.0)
+
+
+@pytest.mark.parametrize("recipe", [FULL, dataclasses.replace(FULL, exposure="each")])
+@pytest.mark.parametrize("stop", ["held-out", "discrepancy", 1e-3])
+def test_rules_go_with_refinement_exposures_and_offsets(stop, recipe):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lnocl.LnoclWarning)
+        made, result = run(recipe, solver="sgp", stop=stop, n_iter=200)
+    reason = "change" if stop == 1e-3 else stop
+    assert result.stop_reason == reason
+    assert 1 < result.n_iter < 200
+    assert len(result.history) == result.n_iter + 1
+    truth = np.round(made.stars)  # the data are of whole pixels
+    assert abs(result.star_positions - truth).max() <= 0.2
+
+
+def test_discrepancy_knows_where_the_stars_are():
+    """Its expectation at the end is that of the last model."""
+    from lnocl.runs.stopping import Discrepancy, expected_deviance
+
+    ratios = []
+    rule = Discrepancy()
+
+    def look(iteration, estimate):
+        going = estimate._live()
+        rule.met(going)
+        _, model, weights = models(
+            going.scene,
+            going.engine.extended(),
+            Stars(going.engine.star_fluxes(), going.scene.stars),
+        )
+        seen = weights > 0
+        means = (weights * model)[seen] * going.scene.scale
+        ratios.append(rule._expected / expected_deviance(means).sum() if iteration in (1, 4) else 1)
+
+    # Stars are moved after 3 iterations: what is expected after 4 is of where they are then.
+    run(solver="sgp", n_iter=4, callback=look)
+    assert abs(np.array(ratios) - 1.0).max() <= 1e-12
+
+
+def test_steps_are_measured_anew_where_stars_have_moved(monkeypatch):
+    made, prepared, prepare = RUN.make(), [], scaling.prepare
+
+    def prepare_and_note(*given):
+        prepared.append(prepare(*given))
+        return prepared[-1]
+
+    monkeypatch.setattr(scaling, "prepare", prepare_and_note)
+    setup = Setup(made.stars + OFF, 0, "sgp", "double", "numpy", None, refine_positions=True)
+    run = Run(setup, made.observation(), Penalty(), 7)
+    assert list(run) == list(range(1, 8))
+    assert len(prepared) == 3  # at the start, after 3 and after 6
+    assert run.engine.scaling is prepared[-1][1]
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 3.0, 30.0])
+def test_no_step_leads_uphill(share, monkeypatch):
+    """One step at a time, from fluxes and positions far off."""
+    monkeypatch.setattr(positions, "MOST_STEPS", 1)
+    monkeypatch.setattr(positions, "LONGEST_STEP", 6.0)  # far beyond the parabola
+    for name in RECIPES:
+        *_, fit, stars, _ = fit_of(name)
+        for far in np.random.default_rng(0).uniform(-2, 2, (10, *stars.positions.shape)):
+            begin = Stars(share * stars.fluxes, stars.positions + far)
+            assert fit.objective(fit.minimise(begin)) <= fit.objective(begin)

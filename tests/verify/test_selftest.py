@@ -1,0 +1,248 @@
+"""The self-test passes where the kernels are right, and names those that are not."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lnocl import __version__
+from lnocl.commands import cli
+from lnocl.errors import DeviceError
+from lnocl.opencl import device, program
+from lnocl.verify import comparison, harness, selftest
+from lnocl.verify.selftest import Row
+
+CHOSEN = device.choose().device
+NAME = device.describe(CHOSEN)
+ADVICE = "do not trust its results; try another driver or --engine numpy"
+SCENE = "exposure map, mu"
+TRIED = comparison.kernels_of(harness.SCENES[SCENE])
+
+# In the source of the kernels, once each: what is there, and a fault to put in its place.
+FAULTS = {
+    "correlate_columns": ("edge[0], -edge[1], z, t", "edge[0], edge[1], z, t"),
+    "elsewhere": (
+        "finish_columns(columns, total, column_roots);",
+        "finish_columns(columns, total, column_roots);"
+        "finish_columns(columns + SPECTRA_SIZE, total, column_roots);",
+    ),
+    "step_rows": (
+        "KERNEL void step_rows",
+        "__kernel __attribute__((reqd_work_group_size(2, 1, 1))) void step_rows",
+    ),
+    "not built": ("KERNEL void step_rows", "#error planted\nKERNEL void step_rows"),
+}
+
+
+@pytest.fixture
+def plant(monkeypatch):
+    """Put faults into the source of the kernels, of one small case in single precision."""
+    genuine = program.source
+    monkeypatch.setattr(selftest, "has_double", lambda _: False)
+    monkeypatch.setattr(selftest, "CASES", (((16, 32), SCENE),))
+
+    def plant(*names, runs=()):
+        def source(files):
+            text = genuine(files)
+            for old, new in (FAULTS[name] for name in names):
+                assert genuine(program.STEP_SOURCES).count(old) == 1
+                text = text.replace(old, new)
+            return text
+
+        monkeypatch.setattr(program, "source", source)
+        monkeypatch.setattr(selftest, "RUNS", {name: selftest.RUNS[name] for name in runs})
+
+    return plant
+
+
+def outcome(capsys, *arguments):
+    """Return exit status, stdout and stderr, both in lines."""
+    status = cli.main(["selftest", *arguments])
+    out, err = capsys.readouterr()
+    return status, out.splitlines(), err.splitlines()
+
+
+def verdicts(table):
+    """Return right or WRONG by name."""
+    rows = (line.split() for line in table)
+    return {words[0]: words[-1] for words in rows if words[-1] in ("right", "WRONG")}
+
+
+def is_right(capsys):
+    status, out, err = outcome(capsys, "--device", device.spec_of(CHOSEN))
+    assert (status, err) == (0, [])
+    first, header, *table, unit, last = out
+    assert first.startswith(f"lnocl {__version__} on {NAME}, {CHOSEN.version}")
+    assert header.split() == ["kernel", "or", "solver", "worst", "in", "deviation", "allowed"]
+    assert unit.startswith("deviation: largest difference")
+    assert verdicts(table) == dict.fromkeys([*comparison.KERNELS, "sgm", "sgp"], "right")
+    assert last == f"all 13 kernels and 4 deconvolutions are right on {NAME}"
+
+
+@pytest.mark.skipif(not device.has_double(CHOSEN), reason="no double precision here")
+def test_a_good_device_is_right(capsys, monkeypatch):
+    monkeypatch.setattr(selftest, "CASES", selftest.CASES[:2])
+    is_right(capsys)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.skipif(not device.has_double(CHOSEN), reason="no double precision here")
+def test_a_good_device_is_right_at_all_sizes(capsys):
+    is_right(capsys)
+
+
+def test_the_cases_have_every_option():
+    told = {option for _, scene in selftest.CASES for option in harness.SCENES[scene]}
+    assert told == {option for scene in harness.SCENES.values() for option in scene}
+    assert {harness.SCENES[scene].get("has_weights", False) for _, scene in selftest.CASES} == {
+        True,
+        False,
+    }
+
+
+@pytest.mark.skipif(not device.has_double(CHOSEN), reason="no double precision here")
+def test_what_is_tried(monkeypatch):
+    """All cases in each precision, then all deconvolutions, on the device that was chosen."""
+    rigs, runs = [], []
+
+    def deconvolve(observation, **how):
+        runs.append(how)
+        history = np.ones(1, [("objective", float)])
+        return SimpleNamespace(extended=np.ones(4), star_fluxes=np.ones(2), history=history)
+
+    monkeypatch.setattr(selftest, "Rig", lambda *given, **scene: rigs.append((*given, scene)))
+    monkeypatch.setattr(selftest, "inputs", lambda _: None)
+    monkeypatch.setattr(selftest, "deviation", lambda *_: 0.0)
+    monkeypatch.setattr(selftest, "deconvolve", deconvolve)
+    rows = selftest.run(CHOSEN)
+    assert all(context.devices == [CHOSEN] for context, *_ in rigs)
+    assert [given for _, *given in rigs] == [
+        *([grid, np.float32, harness.SCENES[scene]] for grid, scene in selftest.CASES),
+        *([grid[::-1], np.float64, harness.SCENES[scene]] for grid, scene in selftest.CASES),
+    ]
+    tried = sum(len(comparison.kernels_of(harness.SCENES[scene])) for _, scene in selftest.CASES)
+    assert len(rows) == 2 * tried + 4
+    assert {row.allowed for row in rows[:-4]} == {1e-6, 3.7e-15}
+    spec = device.spec_of(CHOSEN)
+    on_the_device = [{"precision": p, "device": spec} for p in ("single", "double")]
+    assert [(how.pop("solver"), how.pop("n_iter"), len(how.pop("stars")), how) for how in runs] == [
+        (solver, n_iter, 2, how)
+        for solver, n_iter in (("sgm", 30), ("sgp", 10))
+        for how in ({"engine": "numpy"}, *on_the_device)
+    ]
+
+
+def test_what_is_deconvolved_has_built_its_kernels_before():
+    observation, stars = selftest._observe()
+    ((grid, scene),) = (case for case in selftest.CASES if case[1] == harness.THREE_IMAGES)
+    assert harness.SCENES[scene]["n_images"] == len(observation.images)
+    assert harness.SCENES[scene]["n_stars"] == len(stars)
+    assert observation.images.shape[1:] == grid == (selftest.SIZE, selftest.SIZE)
+    assert observation.background.shape == observation.images.shape
+    assert 0.01 < observation.mask.mean() < 0.03
+
+
+@pytest.mark.parametrize("field", ["extended", "star_fluxes", "history"])
+def test_a_deconvolution_strays_by_the_worst_of_what_it_returns(field):
+    def result(**changed):
+        fields = dict.fromkeys(("extended", "star_fluxes", "history"), np.full(3, 2.0)) | changed
+        fields["history"] = fields["history"].view([("objective", float)])
+        return SimpleNamespace(**fields)
+
+    found = result(**{field: np.array([2.0, 2.001, 2.0])})
+    assert selftest._strays(lambda: found, result()) == pytest.approx(5e-4)
+
+
+def test_a_wrong_kernel_is_named(capsys, plant):
+    plant("correlate_columns")
+    status, out, err = outcome(capsys)
+    assert status == 1
+    assert err == [f"lnocl: error: WRONG on {NAME}: correlate_columns (single): {ADVICE}"]
+    assert verdicts(out) == dict.fromkeys(TRIED, "right") | {"correlate_columns": "WRONG"}
+    assert out[-1] == "the device has no double precision, so none was tried"
+
+
+def test_kernels_that_write_where_they_must_not_or_do_not_start_are_named(capsys, plant):
+    plant("elsewhere", "step_rows")
+    status, out, err = outcome(capsys)
+    assert status == 1
+    named = "correlate_columns (single), step_rows (single)"
+    assert err == [f"lnocl: error: WRONG on {NAME}: {named}: {ADVICE}"]
+    assert sum(" failed " in line for line in out) == 2
+    of_correlate, of_step = out[-2:]
+    assert of_correlate == "correlate_columns (single, 16 x 32): others than array 0 are written"
+    assert of_step.startswith("step_rows (single, 16 x 32): ")
+    assert "INVALID_WORK_GROUP_SIZE" in of_step
+
+
+def test_a_wrong_kernel_spoils_deconvolutions(monkeypatch, plant):
+    plant("correlate_columns", runs=("sgm",))
+    monkeypatch.setattr(selftest, "CASES", ())
+    (found,) = selftest.run(CHOSEN)
+    assert (found.what, found.precision, found.right, found.fault) == ("sgm", "single", False, "")
+
+
+def test_kernels_that_do_not_build_are_named_and_the_rest_is_tried(capsys, plant):
+    plant("not built", runs=("sgm", "sgp"))
+    status, out, err = outcome(capsys)
+    assert status == 1
+    assert err == [f"lnocl: error: WRONG on {NAME}: build (single), sgp (single): {ADVICE}"]
+    assert verdicts(out) == {"build": "WRONG", "sgm": "right", "sgp": "WRONG"}
+    of_build, of_sgp = out[-2:]
+    start = f"the kernels do not build on {NAME}: "
+    assert of_build.startswith(f"build (single, 16 x 32): {start}")
+    assert of_sgp.startswith(f"sgp (single, 64 x 64): {start}")
+    assert "step.cl" in of_build
+    assert "planted" in of_build
+    assert len(of_build) < 600
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--device", "no such"], "device 'no such' fits no OpenCL device"),
+        (["all"], "unrecognized arguments: all"),
+    ],
+)
+def test_wrong_use(capsys, arguments, message):
+    status, out, (err,) = outcome(capsys, *arguments)
+    assert (status, out) == (2, [])
+    assert err.startswith(f"lnocl: error: {message}")
+
+
+def row(what="fft_columns", precision="single", measured=0.0, **others):
+    return Row(what, precision, (8, 16), measured, 1e-6, **others)
+
+
+@pytest.mark.parametrize("measured", [1.01e-6, math.inf, math.nan])
+def test_too_much_and_no_number_are_wrong(measured):
+    assert not row(measured=measured).right
+    assert row(measured=1e-6).right
+
+
+def test_the_table_has_the_worst_row_of_each(capsys):
+    rows = [row(measured=m) for m in (1e-7, math.nan, 0.5)]
+    rows += [row("sgm", "double", 8e-7), row("sgm", "single", 9e-7)]
+    _, first, second, *_ = selftest.table(rows)
+    assert first.split() == ["fft_columns", "single,", "8", "x", "16", "nan", "8.4", "WRONG"]
+    assert second.split() == ["sgm", "single,", "8", "x", "16", "7.5", "8.4", "right"]
+
+
+def test_the_verdict_names_each_once_with_its_precisions():
+    rows = [
+        row(precision=precision, measured=measured)
+        for precision in ("single", "double")
+        for measured in (1.0, 2.0)
+    ]
+    with pytest.raises(DeviceError) as raised:
+        selftest.verdict([*rows, row("sgm"), row("build", fault="no")], CHOSEN)
+    assert str(raised.value) == f"WRONG on {NAME}: fft_columns (single, double): {ADVICE}"
+
+
+def test_what_is_not_there_is_no_small_deviation():
+    assert comparison.relative([], []) == 0.0
+    assert comparison.relative([0.0], [0.0]) == 0.0
+    assert comparison.relative([1e-9], [0.0]) == math.inf
+    assert comparison.relative([1.0, 2.5], [-4.0, 2.0]) == 1.25
+    assert math.isnan(comparison.relative([1.0, np.nan], [1.0, 2.0]))
