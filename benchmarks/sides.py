@@ -15,7 +15,7 @@ import lnocl
 from lnocl.engines.opencl import OpenCLEngine
 from lnocl.scene.forward_model import Model
 from lnocl.solvers.scaling import prepare
-from lnocl.solvers.solvers import sgp
+from lnocl.solvers.sgp import sgp
 
 WORKERS = os.cpu_count()
 

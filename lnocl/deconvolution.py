@@ -21,7 +21,7 @@ from lnocl.runs.run import Run, Setup
 from lnocl.runs.stopping import Rule, make_rule
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.penalty import Penalty
-from lnocl.solvers.solvers import SOLVERS
+from lnocl.solvers import SOLVERS
 
 PRECISIONS = ("single", "double")
 ENGINES = ("opencl", "numpy")
@@ -236,10 +236,10 @@ def deconvolve(
         12, 24 ... iterations (`lnocl.solvers.positions`).
     smoothing : float or "auto", optional
         Weight of an edge-preserving term (`lnocl.scene.penalty.Penalty`), zero or more, without
-        unit; delta is three times the mean of the extended source. It keeps the noise down that grows
-        with the iterations, most of all beside bright stars; 1e-4 to 1e-3 for stars a hundred times
-        as bright as what is beside them (docs/sgp.md). "auto": 0 or one of five values, whichever
-        held-out counts choose (see Notes).
+        unit; delta is three times the mean of the extended source. It keeps the noise down that
+        grows with the iterations, most of all beside bright stars; 1e-4 to 1e-3 for stars a
+        hundred times as bright as what is beside them (docs/sgp.md). "auto": 0 or one of five
+        values, whichever held-out counts choose (see Notes).
     checkpoint : str or path, optional
         File for checkpoints (FITS): written after the first iteration, then every
         `checkpoint_every` seconds, and at the end. Each replaces the one before once it is
@@ -283,10 +283,10 @@ def deconvolve(
     Held-out counts: the counts are dealt out at random to two halves, independent observations of
     the same sky. Both are reconstructed side by side, and the error of their sum is estimated from
     the products of one's estimates with the other's (`lnocl.runs.held_out` has the equation), the
-    mean of three ways to deal. Chosen is the last iteration with an error within a tenth of the least;
-    the halves go on for as long again. The reconstruction itself is then made from all counts. So
-    it takes thirteen times as long as if the iteration had been known, and the memory of six runs
-    and of about twenty estimates of each.
+    mean of three ways to deal. Chosen is the last iteration with an error within a tenth of the
+    least; the halves go on for as long again. The reconstruction itself is then made from all
+    counts. So it takes thirteen times as long as if the iteration had been known, and the memory
+    of six runs and of about twenty estimates of each.
 
     References
     ----------

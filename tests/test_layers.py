@@ -11,8 +11,8 @@ import lnocl
 FLOORS = [
     {"errors", "process", "kernels"},
     {"scene"},
-    {"metrics", "psf", "io", "reference", "opencl"},
-    {"solvers", "simulation", "plotting"},
+    {"metrics", "psf", "io", "reference", "solvers", "opencl"},
+    {"simulation", "plotting"},
     {"engines"},
     {"runs"},
     {"deconvolution"},

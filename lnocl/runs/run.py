@@ -16,7 +16,8 @@ from lnocl.errors import refuse_not_finite
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
-from lnocl.solvers.solvers import SOLVERS, Steps
+from lnocl.solvers import SOLVERS
+from lnocl.solvers.sgp import Steps
 
 if TYPE_CHECKING:
     from lnocl.scene.forward_model import Model
@@ -314,7 +315,7 @@ def engine_name(setup: Setup) -> str:
         No device at all.
     """
     if setup.engine == "numpy":
-        return str(importlib.import_module("lnocl.reference.reference").ReferenceEngine.name)
+        return str(importlib.import_module("lnocl.engines.numpy").ReferenceEngine.name)
     device = importlib.import_module("lnocl.opencl.device")
     return str(device.describe(device.choose(setup.device).device))
 
@@ -322,6 +323,6 @@ def engine_name(setup: Setup) -> str:
 def _make_engine(setup: Setup, scene: Scene, n_iter: int, scaling: Any) -> Any:
     # Imported where it is chosen: the reference runs where no OpenCL is installed.
     if setup.engine == "numpy":
-        return importlib.import_module("lnocl.reference.reference").ReferenceEngine(scene, scaling)
+        return importlib.import_module("lnocl.engines.numpy").ReferenceEngine(scene, scaling)
     opencl = importlib.import_module("lnocl.engines.opencl")
     return opencl.OpenCLEngine(scene, setup.precision, setup.device, n_iter, scaling=scaling)

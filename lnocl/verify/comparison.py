@@ -1,4 +1,4 @@
-"""Every kernel against its twin in `lnocl.reference.reference`, on random arrays, on any device."""
+"""Every kernel against its twin in `lnocl.reference`, on random arrays, on any device."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import ArrayLike, NDArray
 
+from lnocl import reference
 from lnocl.errors import DeviceError
 from lnocl.opencl.fft import bit_reversed
-from lnocl.reference import reference
 from lnocl.verify.harness import Rig, rounded
 
 # What a kernel made, and what its twin made of the same.

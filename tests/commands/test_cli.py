@@ -694,7 +694,7 @@ class TestProcess:
     def test_a_signal_while_an_error_is_told_ends_it_at_once(self):
         script = (
             "import os, signal, sys\n"
-            "from lnocl import cli\n"
+            "from lnocl.commands import cli\n"
             "from lnocl.commands import messages\n"
             "messages.fail = lambda *_: os.kill(os.getpid(), signal.SIGTERM)\n"
             "sys.exit(cli.main(['deconvolve', 'no.fits', '--psf', 'k1.fits', '-o', 'out.fits']))\n"

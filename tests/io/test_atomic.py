@@ -217,7 +217,7 @@ class TestWholeFile:
         path.write_bytes(b"old")
         script = (
             "import os, sys\n"
-            "from lnocl import atomic\n"
+            "from lnocl.io import atomic\n"
             "with atomic.whole_file(sys.argv[1], True) as stream:\n"
             "    stream.write(bytes(100_000))\n"
             "    os.kill(os.getpid(), 9)\n"

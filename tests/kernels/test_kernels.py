@@ -6,10 +6,10 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
+from lnocl import reference
 from lnocl.errors import DeviceError
 from lnocl.opencl.device import choose
 from lnocl.opencl.program import Tuning
-from lnocl.reference import reference
 from lnocl.scene.scene import LEAST_MODEL
 from lnocl.verify.comparison import ALLOWED, KERNELS, deviation, kernels_of
 from lnocl.verify.harness import SCENES, THREE_IMAGES, Rig, inputs, rounded

@@ -16,8 +16,8 @@ from scenes import make_smooth_psfs
 
 import lnocl
 from lnocl.engines import opencl
+from lnocl.engines.numpy import ReferenceEngine
 from lnocl.opencl import device, kernel_cache, program
-from lnocl.reference.reference import ReferenceEngine
 
 
 def observe(n=16, p=1):
@@ -212,7 +212,7 @@ def test_kernels_are_kept_and_used_again(warm, tmp_path):
     name, content, said = warm
     (tmp_path / name).write_bytes(content)
     begin = time.monotonic()
-    code = "from lnocl import program\nprint(deconvolve())\nprint(os.environ['POCL_CACHE_DIR'])"
+    code = "from lnocl.opencl import program\nprint(deconvolve())\nprint(os.environ['POCL_CACHE_DIR'])"
     done = run_python(code, POCL_CACHE_DIR=str(tmp_path))
     assert time.monotonic() - begin < 30
     assert done.stdout == f"{said}{tmp_path}\n"

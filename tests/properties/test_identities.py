@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scenes import ENGINES, Recipe, blur, make_psfs, same, worst
 
 import lnocl
-from lnocl.reference import reference
+from lnocl import reference
 from lnocl.scene.scene import Scene
 
 SHAPE = (16, 32)

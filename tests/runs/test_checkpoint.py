@@ -17,7 +17,7 @@ from scenes import ENGINES, Recipe, make_smooth_psfs
 import lnocl
 from lnocl.commands import cli
 from lnocl.commands.checkpoints import Interrupts
-from lnocl.reference.reference import ReferenceEngine
+from lnocl.engines.numpy import ReferenceEngine
 from lnocl.runs import checkpoint
 from lnocl.runs.run import FIRST_REFINED, Run
 

@@ -17,8 +17,8 @@ from scipy.optimize import minimize
 from scipy.special import kl_div
 
 import lnocl
+from lnocl.engines import numpy as reference
 from lnocl.engines import opencl
-from lnocl.reference import reference
 from lnocl.scene.forward_model import Model
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene

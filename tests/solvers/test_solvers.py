@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from lnocl.errors import NotFiniteError
-from lnocl.solvers.solvers import Steps, sgm, sgp
+from lnocl.solvers.sgm import sgm
+from lnocl.solvers.sgp import Steps, sgp
 
 
 class Scripted:

@@ -1,0 +1,198 @@
+"""The iteration's verbs in plain NumPy: the engine ``"numpy"``."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lnocl.errors import refuse_not_finite
+from lnocl.reference.convolve import convolve_columns, correlate_columns, otf_columns
+from lnocl.reference.fft import irfft_rows, rfft_rows
+from lnocl.reference.ratio import ratio_rows
+from lnocl.reference.scale import scale_rows
+from lnocl.reference.smooth import smooth
+from lnocl.reference.step import gradient_rows, step_rows
+from lnocl.reference.sums import collect_sums
+from lnocl.scene.observation import Array
+from lnocl.scene.scene import Scene
+from lnocl.solvers.scaling import Scaling
+
+
+class ReferenceEngine:
+    """The iteration's verbs in plain NumPy, float64: the engine ``"numpy"``.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is modelled.
+    scaling : Scaling, optional
+        For the scaled gradient projection method.
+    """
+
+    name = "numpy"
+
+    def __init__(self, scene: Scene, scaling: Scaling | None = None) -> None:
+        self.scene, self.scaling = scene, scaling
+        self._images = scene.images()
+        background = scene.background()
+        self._background = background if background.ndim == 3 else background[:, None, None]
+        self._otfs = np.array([otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)])
+        self.move_stars()
+        self._inverse_weight = self._invert_weight()
+        self._slope = self._curvature = np.zeros(scene.grid)
+        self._objectives: list[float] = []
+
+    def set_scaling(self, scaling: Scaling) -> None:
+        """Measure steps with this from now on."""
+        self.scaling = scaling
+
+    def move_stars(self) -> None:
+        """Put the stars where the scene has them now."""
+        scene = self.scene
+        self._star_images = np.array(
+            [[scene.star_image(j, s) for j in range(scene.n_images)] for s in range(scene.n_stars)]
+        ).reshape(scene.n_stars, *self._images.shape)
+
+    def _invert_weight(self) -> Array | float:
+        if self.scene.weights is None:
+            return 1.0 / self.scene.n_images
+        row_spectra = rfft_rows(self.scene.weights.astype(np.float64))
+        total = irfft_rows(correlate_columns(row_spectra, self._otfs))
+        observed = self.scene.observed(total)
+        return np.divide(1.0, total, out=np.zeros_like(total), where=observed)
+
+    def start(self, extended: Array, star_fluxes: Array) -> None:
+        """Begin from this estimate, on the grid and scaled; unobserved pixels are set to 0."""
+        self._extended = np.where(np.asarray(self._inverse_weight) > 0, extended, 0.0)
+        self._star_fluxes = star_fluxes.copy()
+        self._row_spectrum = rfft_rows(self._extended)
+        self._squares = float((self._extended**2).sum())
+        self._previous = self._extended
+        self._gradient = np.zeros_like(self._extended)
+
+    def ratio(self) -> None:
+        """Make the ratios of the estimate; record its objective."""
+        self._ratio_row_spectra, self._data_term, self._star_sums = ratio_rows(
+            convolve_columns(self._row_spectrum, self._otfs),
+            self._images,
+            self.scene.weights,
+            self._background,
+            self._star_images,
+            self._star_fluxes,
+        )
+        smoothness = 0.0
+        if self.scene.smoothing:
+            self._slope, self._curvature, smoothness = smooth(
+                self._extended, self.scene.smoothing, self.scene.edge
+            )
+        objective, self._star_corrections = collect_sums(
+            self._data_term,
+            self._squares,
+            smoothness,
+            self._star_sums,
+            self.scene.star_weights,
+            self.scene.mu,
+        )
+        self._objectives.append(objective)
+
+    def correct(self) -> None:
+        """Back-project the ratios to the correction."""
+        self._row_spectrum = correlate_columns(self._ratio_row_spectra, self._otfs)
+
+    def scale(self) -> None:
+        """Scale the estimate by its correction."""
+        refuse_not_finite(self._objectives[-1])
+        self._extended, self._row_spectrum, self._squares, self._star_fluxes = scale_rows(
+            self._row_spectrum,
+            self._extended,
+            self._inverse_weight,
+            self.scene.mu,
+            self._star_fluxes,
+            self._star_corrections,
+            self._slope,
+            self._curvature,
+        )
+
+    def gradient(self) -> tuple[float, float]:
+        """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""
+        assert self.scaling is not None
+        self._gradient, change_step, change_change = gradient_rows(
+            self._row_spectrum,
+            self._extended,
+            self._previous,
+            self._gradient,
+            self.scaling.shift,
+            self._inverse_weight,
+            self.scene.mu,
+            self._slope,
+            self._curvature,
+        )
+        self._previous, self._base_curvature = self._extended, self._curvature
+        return change_step, change_change
+
+    def star_gradient(self) -> Array:
+        """Return the gradient of the objective in the star fluxes."""
+        return -self._star_sums
+
+    def step(self, alpha: float, share: float) -> tuple[float, Array]:
+        """Step from the base; return ``<gradient, d>`` and ``<reach_s, d>``."""
+        assert self.scaling is not None
+        self._extended, self._row_spectrum, self._squares, slope, reached = step_rows(
+            self._previous,
+            self._gradient,
+            self.scaling.shift,
+            self._inverse_weight,
+            self.scaling.reach,
+            self.scene.mu,
+            alpha,
+            share,
+            self._base_curvature,
+        )
+        return slope, reached
+
+    def set_star_fluxes(self, star_fluxes: Array) -> None:
+        """Make these the star fluxes."""
+        self._star_fluxes = star_fluxes.copy()
+
+    def objective(self) -> float:
+        """Return the objective recorded last."""
+        return self._objectives[-1]
+
+    def forget_objective(self) -> None:
+        """Take the objective recorded last off the record."""
+        self._objectives.pop()
+
+    def extended(self) -> Array:
+        """Return the extended source, on the grid and scaled."""
+        return self._extended.copy()
+
+    def star_fluxes(self) -> Array:
+        """Return the star fluxes, scaled."""
+        return self._star_fluxes.copy()
+
+    def data_term(self) -> float:
+        """Return the data term of the objective recorded last, scaled."""
+        return self._data_term
+
+    def objectives(self) -> Array:
+        """Return the objectives recorded so far, scaled."""
+        return np.array(self._objectives)
+
+    def state(self) -> dict[str, Array]:
+        """Return what `restore` needs, as it is between iterations."""
+        return {
+            "extended": self._extended,
+            "star_fluxes": self._star_fluxes,
+            "square_sums": np.array([self._squares]),
+            "objectives": self.objectives(),
+            "previous": self._previous,
+            "gradient": self._gradient,
+        }
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Go on from this state."""
+        self._extended, self._previous = state["extended"], state["previous"]
+        self._gradient = state["gradient"]
+        self._star_fluxes = state.get("star_fluxes", np.zeros(0))
+        self._row_spectrum = rfft_rows(self._extended)
+        self._squares = float(state["square_sums"][0])
+        self._objectives = state.get("objectives", np.zeros(0)).tolist()

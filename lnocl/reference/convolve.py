@@ -1,0 +1,27 @@
+"""Convolution and its adjoint, as products of spectra: the twins of kernels/convolve.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lnocl.reference.fft import ComplexArray, fft_columns, ifft_columns
+
+
+def otf_columns(row_spectra: ComplexArray) -> ComplexArray:
+    """Return the optical transfer function, from the row spectra of a PSF (peak at the origin).
+
+    The spectrum divided by what the transforms leave in: Ny Nx of the two inverse ones, 2 of
+    each of the two forward ones.
+    """
+    ny, nx = row_spectra.shape[-2], 2 * (row_spectra.shape[-1] - 1)
+    return fft_columns(row_spectra) / (4.0 * ny * nx)
+
+
+def convolve_columns(row_spectrum: ComplexArray, otfs: ComplexArray) -> ComplexArray:
+    """Return the row spectra of ``A_j f``, shape (p, Ny, Nx // 2 + 1), from that of f."""
+    return ifft_columns(otfs * fft_columns(row_spectrum))
+
+
+def correlate_columns(row_spectra: ComplexArray, otfs: ComplexArray) -> ComplexArray:
+    """Return the row spectrum of ``sum_j A_j^T (r_j - w_j)`` from those of the r_j - w_j."""
+    return ifft_columns((np.conj(otfs) * fft_columns(row_spectra)).sum(axis=0))

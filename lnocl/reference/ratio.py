@@ -1,0 +1,41 @@
+"""Model, ratio and data term: the twin of kernels/ratio.cl."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import xlog1py
+
+from lnocl.reference.fft import ComplexArray, irfft_rows, rfft_rows
+from lnocl.scene.observation import Array
+from lnocl.scene.scene import LEAST_MODEL
+
+
+def ratio_rows(
+    row_spectra: ComplexArray,
+    images: Array,
+    weights: NDArray[Any] | None,
+    background: Array,
+    star_images: Array,
+    star_fluxes: Array,
+) -> tuple[ComplexArray, float, Array]:
+    """Return the row spectra of ``r_j - w_j``, the objective's data term, and the star sums.
+
+    ``m_j = A_j f + sum_s c_s P_js + b_j``, ``r_j = w_j g_j / m_j``, ``sum_j <P_js, r_j - w_j>`` and
+    ``J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j)``; La Camera et al. (2012), Eq. 7 and 9.
+    Where ``m_j`` is not above `LEAST_MODEL`, ``r_j = 0`` and ``m_j = LEAST_MODEL`` in J_0.
+    """
+    model = irfft_rows(row_spectra) + background
+    model += np.einsum("s,sjyx->jyx", star_fluxes, star_images)
+    dark = model <= LEAST_MODEL  # which NaN is not: it reaches the objective
+    model = np.where(dark, LEAST_MODEL, model)
+    ratio = images / model
+    # Its terms of first order cancel, those of scipy.special.kl_div only the terms themselves.
+    divergence = model * (xlog1py(ratio, ratio - 1.0) - (ratio - 1.0))
+    excess = np.where(dark, 0.0, ratio) - 1.0
+    if weights is not None:
+        excess, divergence = weights * excess, weights * divergence
+    star_sums = np.einsum("sjyx,jyx->s", star_images, excess)
+    return rfft_rows(excess), float(divergence.sum()), star_sums

@@ -1,0 +1,99 @@
+"""The scaled gradient projection method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lnocl.errors import refuse_not_finite
+from lnocl.solvers.engine import Engine
+
+# Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002: the line search shortens a step to
+# this share until the objective falls by so much of what the slope promises; steps keep in these
+# bounds.
+SHORTER = 0.4
+SUFFICIENT = 1e-4
+ALPHA_BOUNDS = 1e-5, 1e5
+# Barzilai-Borwein steps among which the smallest is taken: docs/sgp.md.
+STEPS_KEPT = 2
+# A step this often shortened is lost in rounding.
+MOST_SHORTENED = 12
+
+
+@dataclass
+class Steps:
+    """What the scaled gradient projection method remembers from one iteration to the next.
+
+    Attributes
+    ----------
+    alpha : float
+        The last step.
+    lengths : list of float
+        The Barzilai-Borwein steps among which the smallest is taken.
+    begun : bool
+        Whether there was an iteration.
+    """
+
+    alpha: float = 1.0
+    lengths: list[float] = field(default_factory=lambda: [ALPHA_BOUNDS[1]] * STEPS_KEPT)
+    begun: bool = False
+
+
+def sgp(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int]:
+    """Iterate the scaled gradient projection method, yielding the number of iterations done.
+
+    ``f <- f + share d``, ``d = P(f - alpha D grad J) - f``, P the projection on ``f >= 0`` and D
+    the shifted scaling of `lnocl.solvers.scaling` (Bonettini, Zanella & Zanni 2009, Inverse
+    Problems 25, 015002). alpha is the smaller of the last two steps of Barzilai and Borwein (1988,
+    IMA J. Numer. Anal. 8, 141), their second, in the metric of D. The star fluxes follow the
+    extended source, by `Scaling.star_step`. The share is 1, shortened until the objective falls
+    enough; it never rises. Ends early where no step lets it fall any more.
+    """
+    steps = steps or Steps()
+    engine.ratio()
+    engine.correct()
+    for iteration in range(1, n_iter + 1):
+        change_step, change_change = engine.gradient()
+        if steps.begun:
+            length = _barzilai_borwein(change_step, change_change, steps.alpha)
+            steps.lengths = [*steps.lengths[1:], length]
+            steps.alpha = min(steps.lengths)
+        steps.begun = True
+        if not _descend(engine, steps.alpha):
+            return
+        yield iteration
+
+
+def _barzilai_borwein(change_step: float, change_change: float, alpha: float) -> float:
+    """Return the next alpha from ``<D y, s>`` and ``<D y, D y>``; longer where J bends down."""
+    step = change_step / change_change if min(change_step, change_change) > 0 else 10.0 * alpha
+    return float(np.clip(step, *ALPHA_BOUNDS))
+
+
+def _descend(engine: Engine, alpha: float) -> bool:
+    """Step along the projected gradient as far as the objective falls; return whether it fell."""
+    objective, fluxes, gradient = engine.objective(), engine.star_fluxes(), engine.star_gradient()
+    slope, reached = engine.step(alpha, 1.0)
+    assert engine.scaling is not None
+    refuse_not_finite(objective, slope, *gradient, *reached)
+    change = engine.scaling.star_step(fluxes, gradient, reached)
+    if slope + gradient @ change >= 0:  # following the extended source would lead uphill
+        change = engine.scaling.star_step(fluxes, gradient, np.zeros_like(reached))
+    slope += float(gradient @ change)
+    share = 1.0
+    for _ in range(MOST_SHORTENED):
+        engine.set_star_fluxes(fluxes + share * change)
+        engine.ratio()
+        engine.correct()  # before it is known whether it will be needed: the device need not wait
+        reached_objective = engine.objective()
+        if reached_objective <= objective + SUFFICIENT * share * slope:
+            return True
+        engine.forget_objective()
+        share *= SHORTER
+        engine.step(alpha, share)
+    refuse_not_finite(reached_objective)  # however short the step
+    engine.step(alpha, 0.0)
+    engine.set_star_fluxes(fluxes)
+    return False
