@@ -194,7 +194,7 @@ def random_scene(seed, data):
 
 def likelihood_choice(simulation, device, n_iter=400, every=2):
     """Return the iteration at which the likelihood of a held-out half is best."""
-    ((first, second),) = held_out.halve(experiment.observe(simulation))
+    ((first, second),) = held_out.split_counts(experiment.observe(simulation))
     scene = Scene(first, simulation.stars)
     model = Model(scene)
     curve = []

@@ -49,17 +49,17 @@ KERNEL void scale_rows(
                 const int pixel = q * INNER(NX) + x;
                 const cvec f = LOAD(source + lane, pixel);
                 const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel);
-                const cvec bend = smoothing_at(curvature + at + lane, pixel);
+                const cvec curved = smoothing_at(curvature + at + lane, pixel);
 #if HAS_SMOOTHING
                 const cvec down = smoothing_at(slope + at + lane, pixel);
-                a[q].re += bend.re * f.re - down.re;
-                a[q].im += bend.im * f.im - down.im;
+                a[q].re += curved.re * f.re - down.re;
+                a[q].im += curved.im * f.im - down.im;
 #endif
                 a[q].re = f.re * not_below_0(1 + weight.re * a[q].re);
                 a[q].im = f.im * not_below_0(1 + weight.im * a[q].im);
 #if HAS_PENALTY
-                a[q].re /= 1 + penalty_weight(mu, bend.re) * f.re * weight.re;
-                a[q].im /= 1 + penalty_weight(mu, bend.im) * f.im * weight.im;
+                a[q].re /= 1 + penalty_weight(mu, curved.re) * f.re * weight.re;
+                a[q].im /= 1 + penalty_weight(mu, curved.im) * f.im * weight.im;
 #endif
 #if HAS_MU
                 part += a[q].re * a[q].re + a[q].im * a[q].im;

@@ -20,10 +20,10 @@ INLINE cvec scaling_at(
 {
     const cvec seen = LOAD(shift, pixel);
     const cvec weight = inverse_weight_at(inverse_weight, pixel);
-    const cvec bend = smoothing_at(curvature, pixel);
+    const cvec curved = smoothing_at(curvature, pixel);
     return (cvec){
-        shifted_scaling(f.re, seen.re, weight.re, bend.re, mu),
-        shifted_scaling(f.im, seen.im, weight.im, bend.im, mu)
+        shifted_scaling(f.re, seen.re, weight.re, curved.re, mu),
+        shifted_scaling(f.im, seen.im, weight.im, curved.im, mu)
     };
 }
 
@@ -101,7 +101,7 @@ KERNEL void gradient_rows(
  * squares: sum extended^2.
  * spectra: one array, out: twice the row spectrum. extended: one array of pixels, written.
  * previous (f), gradient, shift: one each, const; inverse_weight, curvature: as for gradient_rows,
- * which has D. reach: N_STARS arrays of pixels. sums: [ROW_BLOCKS][N_SUMS][2]; squares:
+ * which has D. cross_information: N_STARS arrays of pixels. sums: [ROW_BLOCKS][N_SUMS][2]; squares:
  * [ROW_BLOCKS][2] (HAS_MU).
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.step_rows.
  */
@@ -110,7 +110,7 @@ KERNEL void step_rows(
     __global real *restrict sums, __global real *restrict squares,
     __global const vec *restrict previous, __global const vec *restrict gradient,
     __global const vec *restrict shift, __global const vec *restrict inverse_weight,
-    __global const vec *restrict curvature, __global const vec *restrict reach,
+    __global const vec *restrict curvature, __global const vec *restrict cross_information,
     const real mu, const real alpha, const real share,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
@@ -139,7 +139,7 @@ KERNEL void step_rows(
             STORE(extended + at + lane, pixel, trial);
             ACCUMULATE(totals[0], g.re * d.re + g.im * d.im);
             for (int s = 0; s < N_STARS; ++s) {
-                const cvec r = LOAD(reach + (size_t)s * PIXELS_SIZE + at + lane, pixel);
+                const cvec r = LOAD(cross_information + (size_t)s * PIXELS_SIZE + at + lane, pixel);
                 ACCUMULATE(totals[1 + s], r.re * d.re + r.im * d.im);
             }
 #if HAS_MU

@@ -14,8 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, LnoclWarning, NotFiniteError
-from lnocl.runs.checkpoint import Keeper, describe
-from lnocl.runs.held_out import NO_CURVE, Choice, Choosing, Grid, several_mu, several_smoothings
+from lnocl.runs.checkpoint import Checkpointer, describe
+from lnocl.runs.held_out import (
+    NO_CURVE,
+    Choice,
+    Grid,
+    HeldOutSelection,
+    several_mu,
+    several_smoothings,
+)
 from lnocl.runs.progress import Bar
 from lnocl.runs.run import Run, Setup
 from lnocl.runs.stopping import Rule, make_rule
@@ -315,7 +322,7 @@ def deconvolve(
     if engine == "opencl" and precision == "single":
         _warn_of_straying(int(n_iter))
     setup = Setup(stars, pad, solver, precision, engine, device, refine_positions)
-    keeper = Keeper(
+    checkpointer = Checkpointer(
         checkpoint,
         checkpoint_every,
         resume,
@@ -335,7 +342,7 @@ def deconvolve(
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
     # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
     with bar, np.errstate(over="ignore", invalid="ignore"):
-        choice = keeper.saved.choice() if keeper.saved is not None else None
+        choice = checkpointer.saved.choice() if checkpointer.saved is not None else None
         if choice is None:
             choice = Choice(penalty, int(n_iter), NO_CURVE)
             if grid is not None or stop == "held-out":
@@ -348,15 +355,15 @@ def deconvolve(
                     int(n_iter),
                     initial_extended,
                     bar,
-                    keeper,
+                    checkpointer,
                 )
         run = Run(
             setup, observation, choice.penalty, choice.n_iter, initial_extended, initial_star_fluxes
         )
         rule = make_rule(stop)
-        stop_reason = keeper.restore(run, rule)
+        stop_reason = checkpointer.restore(run, rule)
         bar.expect(choice.n_iter)
-        keep = partial(keeper.keep, run, rule, choice)
+        keep = partial(checkpointer.keep, run, rule, choice)
         if stop_reason:
             keep(stop_reason)  # perhaps in another file
         else:
@@ -365,7 +372,7 @@ def deconvolve(
             except NotFiniteError:
                 stop_reason = "not finite"
         if stop_reason == "not finite":
-            keeper.redo(run)
+            checkpointer.redo(run)
         if stop == "held-out" and stop_reason == "n_iter":
             stop_reason = "held-out"
         return _wrap_up(run, stop_reason, choice)
@@ -452,13 +459,13 @@ def _choose(
     n_iter: int,
     initial_extended: ArrayLike | None,
     bar: Bar,
-    keeper: Keeper,
+    checkpointer: Checkpointer,
 ) -> Choice:
     """Have held-out counts choose the penalty and the number of iterations, or one of them."""
     half = None
     if initial_extended is not None:
         half = numbers("initial_extended", initial_extended) / 2.0
-    choosing = Choosing(
+    selection = HeldOutSelection(
         partial(Run, setup, n_iter=n_iter, initial_extended=half),
         observation,
         penalty,
@@ -466,10 +473,10 @@ def _choose(
         n_iter,
         stop != "held-out",
     )
-    if keeper.saved is not None:
-        choosing.restore(keeper.saved.arrays)
-    return choosing.choose(
-        lambda words: bar.show(0, lambda: words), lambda: keeper.keep_choosing(choosing)
+    if checkpointer.saved is not None:
+        selection.restore(checkpointer.saved.arrays)
+    return selection.choose(
+        lambda words: bar.show(0, lambda: words), lambda: checkpointer.keep_choosing(selection)
     )
 
 

@@ -1,9 +1,8 @@
-"""A kernel cache of its own for each test process: PoCL's is not safe to share."""
+"""One store of compiled kernels for all test processes and later runs."""
 
-import atexit
 import os
-import shutil
-import tempfile
+from pathlib import Path
 
-os.environ["POCL_CACHE_DIR"] = tempfile.mkdtemp(prefix="lnocl-pocl-")
-atexit.register(shutil.rmtree, os.environ["POCL_CACHE_DIR"], ignore_errors=True)
+os.environ.setdefault(
+    "POCL_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "kernels")
+)

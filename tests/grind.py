@@ -55,7 +55,7 @@ class Layout(fft.Layout):
         return packed
 
 
-class Rig(harness.Rig):
+class KernelHarness(harness.KernelHarness):
     """Buffers that end where their values do, and hold nothing where those are NaN."""
 
     def __init__(self, *given, **scene):
@@ -172,7 +172,7 @@ def run_kernels(case, dtype, names):
     grid, tuning, scene, _ = CASES[case]
     context = cl.Context([choose().device])
     tuning = None if tuning == ON_GPU else tuning
-    bare = Rig(context, grid, dtype, tuning, **harness.SCENES[scene])
+    bare = KernelHarness(context, grid, dtype, tuning, **harness.SCENES[scene])
     assert (bare.program.tuning.group > 1) == case.startswith("group")
     assert bare.program.scratch_is_global == (case in DEVICE_OPTIONS)
     given = harness.inputs(bare)

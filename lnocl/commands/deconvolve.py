@@ -233,12 +233,12 @@ def _input_paths(arguments: argparse.Namespace) -> list[str]:
 
 
 def _read_frames(arguments: argparse.Namespace) -> Frames:
-    from lnocl.io.frames import Known, read_frames
+    from lnocl.io.frames import Calibration, read_frames
 
     return read_frames(
         arguments.images,
         arguments.psfs,
-        Known(
+        Calibration(
             background=arguments.background or [0.0],
             read_noise=arguments.read_noise or [0.0],
             inverse_variance=arguments.inverse_variance,

@@ -136,18 +136,18 @@ class ReferenceEngine:
     def step(self, alpha: float, share: float) -> tuple[float, Array]:
         """Step from the base; return ``<gradient, d>`` and ``<reach_s, d>``."""
         assert self.scaling is not None
-        self._extended, self._row_spectrum, self._squares, slope, reached = step_rows(
+        self._extended, self._row_spectrum, self._squares, slope, coupling = step_rows(
             self._previous,
             self._gradient,
             self.scaling.shift,
             self._inverse_weight,
-            self.scaling.reach,
+            self.scaling.cross_information,
             self.scene.mu,
             alpha,
             share,
             self._base_curvature,
         )
-        return slope, reached
+        return slope, coupling
 
     def set_star_fluxes(self, star_fluxes: Array) -> None:
         """Make these the star fluxes."""

@@ -132,7 +132,7 @@ class OpenCLEngine:
         self.bytes_needed = self._refuse_if_too_large(n_iter)
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
-        self._found: Transfer | None = None
+        self._pending_objective: Transfer | None = None
         self._n_scaled = 0
         self._last_mark: cl.Event | None = None
         self._unseen: Transfer | None = None
@@ -188,7 +188,7 @@ class OpenCLEngine:
             "previous": layout.pixels_bytes,
             "gradient": layout.pixels_bytes,
             "shift": layout.pixels_bytes,
-            "reach": max(program.n_stars * layout.pixels_bytes, pair),
+            "cross_information": max(program.n_stars * layout.pixels_bytes, pair),
             "change_sums": program.row_blocks * 2 * pair,
             "step_sums": program.row_blocks * (1 + program.n_stars) * pair,
         }
@@ -302,7 +302,7 @@ class OpenCLEngine:
             buffers["shift"],
             buffers["inverse_weight"],
             buffers["curvature"],
-            buffers["reach"],
+            buffers["cross_information"],
             real(self.scene.mu),
             real(0),
             real(0),
@@ -333,7 +333,7 @@ class OpenCLEngine:
         """Measure steps with this from now on."""
         self.scaling = scaling
         self._upload_pixels("shift", [scaling.shift])
-        self._upload_pixels("reach", scaling.reach)
+        self._upload_pixels("cross_information", scaling.cross_information)
 
     def move_stars(self) -> None:
         """Put the stars where the scene has them now."""
@@ -408,7 +408,7 @@ class OpenCLEngine:
         self._collect()
         self._n_objectives += 1
         # Steps are judged by it: on its way before what comes next, which need not wait for it.
-        self._found = None if self.scaling is None else self._fetch_found()
+        self._pending_objective = None if self.scaling is None else self._fetch_objective()
 
     def _smooth_buffer(self, name: str) -> None:
         """Make the slope and the curvature of these pixels."""
@@ -454,7 +454,7 @@ class OpenCLEngine:
         """Return the gradient of the objective in the star fluxes."""
         if not self.scene.n_stars:
             return np.zeros(0)  # without waiting for the device
-        return -self._find()[1][1:]
+        return -self._wait_for_objective()[1][1:]
 
     def step(self, alpha: float, share: float) -> tuple[float, Array]:
         """Step from the base; return ``<gradient, d>`` and ``<reach_s, d>``."""
@@ -478,16 +478,16 @@ class OpenCLEngine:
 
     def objective(self) -> float:
         """Return the objective recorded last, scaled."""
-        return self._find()[0]
+        return self._wait_for_objective()[0]
 
-    def _find(self) -> tuple[float, Array]:
+    def _wait_for_objective(self) -> tuple[float, Array]:
         """Return the objective recorded last, and the sums that `ratio` left."""
-        if self._found is None:
-            self._found = self._fetch_found()
-        pair, sums = self._found.wait()
+        if self._pending_objective is None:
+            self._pending_objective = self._fetch_objective()
+        pair, sums = self._pending_objective.wait()
         return float(pair.sum()), self._sum_blocks(sums, 1 + self.scene.n_stars)
 
-    def _fetch_found(self) -> Transfer:
+    def _fetch_objective(self) -> Transfer:
         sums = self._buffers["ratio_sums"], 0, self._buffers["ratio_sums"].size
         return Transfer(self._queue, self.program.dtype, self._last_objectives(1), sums)
 
@@ -499,7 +499,7 @@ class OpenCLEngine:
     def forget_objective(self) -> None:
         """Take the objective recorded last off the record."""
         self._n_objectives -= 1
-        self._found = None
+        self._pending_objective = None
 
     def extended(self) -> Array:
         """Return the extended source, on the grid and scaled."""
@@ -513,7 +513,7 @@ class OpenCLEngine:
 
     def data_term(self) -> float:
         """Return the data term of the objective recorded last, scaled."""
-        return float(self._find()[1][0])
+        return float(self._wait_for_objective()[1][0])
 
     def objectives(self) -> Array:
         """Return the objectives recorded so far, scaled."""
@@ -550,7 +550,7 @@ class OpenCLEngine:
         """Make the row spectrum of an estimate that came from the host, and convolve it."""
         self._launcher.rows("rfft_rows", self._buffers["spectra"], self._buffers["extended"])()
         self._convolve()
-        self._found = None
+        self._pending_objective = None
 
     def _upload(self, name: str, values: Array) -> None:
         cl.enqueue_copy(self._queue, self._buffers[name], self._rounded(name, values))

@@ -22,7 +22,7 @@ log = logging.getLogger("lnocl")
 Mask = NDArray[np.bool_]
 
 
-class Known(NamedTuple):
+class Calibration(NamedTuple):
     """What is known of images in files; words are numbers, names of files, or as said.
 
     Attributes
@@ -78,7 +78,7 @@ class Frames(NamedTuple):
     sha256: dict[str, list[str]]
 
 
-def read_frames(images: Sequence[str], psfs: Sequence[str], known: Known) -> Frames:
+def read_frames(images: Sequence[str], psfs: Sequence[str], known: Calibration) -> Frames:
     """Read images and PSFs, and what is known of them.
 
     What was done to the images is logged, such as how many pixels are masked and why.
@@ -88,7 +88,7 @@ def read_frames(images: Sequence[str], psfs: Sequence[str], known: Known) -> Fra
     images, psfs : sequence of str
         Files, as for `fitsread.read_stack`. The unit of the images is that of their BUNIT; without
         one they are in electrons.
-    known : Known
+    known : Calibration
         What is known of them.
 
     Raises
@@ -103,7 +103,7 @@ def read_frames(images: Sequence[str], psfs: Sequence[str], known: Known) -> Fra
 class _Reader:
     """The files of an observation on their way to be one."""
 
-    def __init__(self, images: Sequence[str], psfs: Sequence[str], known: Known) -> None:
+    def __init__(self, images: Sequence[str], psfs: Sequence[str], known: Calibration) -> None:
         self._paths, self._known = images, known
         self._images = read_stack(images)
         self._psfs = read_stack(psfs)

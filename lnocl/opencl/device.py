@@ -1,4 +1,4 @@
-"""Finding OpenCL devices and choosing one, without a prompt and without a silent fallback."""
+"""Finding OpenCL devices and selection one, without a prompt and without a silent fallback."""
 
 from __future__ import annotations
 

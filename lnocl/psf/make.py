@@ -281,13 +281,13 @@ def _make(
     steps.append(line)
     light = np.where(unusable, 0.0, pixels - level)
     region = _region(pixels.shape, start, half)
-    hollow, line = _repair(light, unusable, saturated, region)
+    unrepairable, line = _repair(light, unusable, saturated, region)
     steps.append(line)
     centre, line = _centre(light, region, start, level) if recentre else _stay(start)
     steps.append(line)
     pixel = _nearest(centre)
     side = min(_fit(given.shape, pixel, side, angle) for angle in angles)
-    if hollow[pixel]:
+    if unrepairable[pixel]:
         raise InputError(
             f"the star at {_at(pixel)} is a hole: only few of the {WINDOW} x {WINDOW} pixels "
             "there are good; take a frame with a shorter exposure"
@@ -446,17 +446,17 @@ def _repair(
     """Interpolate the bad pixels of a region in place; return those that are too far inside."""
     if not bad.any():
         return bad, "bad pixels: none"
-    repaired, hollow = repair(light, bad, region)
-    if n_hollow := int(hollow.sum()):
+    repaired, unrepairable = repair(light, bad, region)
+    if n_unrepairable := int(unrepairable.sum()):
         warnings.warn(
-            f"{n_hollow} bad pixels around the star have too few good ones beside them and were "
-            "set to the background",
+            f"{n_unrepairable} bad pixels around the star have too few good ones beside them and "
+            "were set to the background",
             LnoclWarning,
             stacklevel=4,
         )
-    return hollow, (
+    return unrepairable, (
         f"bad pixels: {bad.sum()} in the frame, {saturated.sum()} of them saturated; "
-        f"{repaired.sum()} around the star repaired, {n_hollow} set to the background"
+        f"{repaired.sum()} around the star repaired, {n_unrepairable} set to the background"
     )
 
 

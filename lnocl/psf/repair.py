@@ -31,7 +31,7 @@ def repair(image: Array, bad: Mask, region: tuple[slice, slice]) -> tuple[Mask, 
 
     Returns
     -------
-    repaired, hollow : ndarray of bool, shape (ny, nx)
+    repaired, unrepairable : ndarray of bool, shape (ny, nx)
         The bad pixels of the region that were interpolated, and those that have too few good
         ones around them and were left as they are.
     """
@@ -40,11 +40,11 @@ def repair(image: Array, bad: Mask, region: tuple[slice, slice]) -> tuple[Mask, 
         n_good = convolve1d(n_good, np.ones(WINDOW, int), axis, mode="constant")
     inside = np.zeros_like(bad)
     inside[region] = True
-    hollow = bad & inside & (n_good < MIN_GOOD)
-    wanted = bad & inside & ~hollow
+    unrepairable = bad & inside & (n_good < MIN_GOOD)
+    wanted = bad & inside & ~unrepairable
     near = maximum_filter(wanted, 2 * WINDOW + 1) & ~bad
     if wanted.any():
         image[wanted] = RBFInterpolator(
             np.argwhere(near), image[near], NEIGHBOURS, kernel="quintic"
         )(np.argwhere(wanted))
-    return wanted, hollow
+    return wanted, unrepairable

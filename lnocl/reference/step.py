@@ -43,7 +43,7 @@ def step_rows(
     gradient: Array,
     shift: Array,
     inverse_weight: Array | float,
-    reach: Array,
+    cross_information: Array,
     mu: float,
     alpha: float,
     share: float,
@@ -58,5 +58,5 @@ def step_rows(
     direction = np.maximum(extended - alpha * scaling * gradient, 0.0) - extended
     trial = np.maximum(extended + share * direction, 0.0)
     slope = float((gradient * direction).sum())
-    reached = (reach * direction).sum(axis=(-2, -1))
-    return trial, rfft_rows(trial), float((trial**2).sum()), slope, reached
+    coupling = (cross_information * direction).sum(axis=(-2, -1))
+    return trial, rfft_rows(trial), float((trial**2).sum()), slope, coupling

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError, LnoclWarning
 from lnocl.io.atomic import check_output, whole_file
-from lnocl.runs.held_out import NO_CURVE, Choice, Choosing, curve_of, plain
+from lnocl.runs.held_out import NO_CURVE, Choice, HeldOutSelection, curve_of, plain
 from lnocl.runs.run import Run, Setup, engine_name
 from lnocl.runs.stopping import Rule
 from lnocl.scene.observation import Observation, numbers
@@ -163,7 +163,7 @@ def write(
         hdus.writeto(stream)
 
 
-class Keeper:
+class Checkpointer:
     """Keeps the checkpoints of a run, and finds the one that it goes on from.
 
     Parameters
@@ -284,13 +284,13 @@ class Keeper:
             arrays = {name: np.array(values, np.float64) for name, values in besides.items()}
             self._write(ended, self._finite | arrays)
 
-    def keep_choosing(self, choosing: Choosing) -> None:
+    def keep_choosing(self, selection: HeldOutSelection) -> None:
         """Keep what held-out counts have come to, where there is a file and it is time to.
 
         Raises and warns as `keep`.
         """
         if self._path is not None and self._is_time():
-            self._write("", choosing.state())
+            self._write("", selection.state())
 
     def _is_time(self) -> bool:
         return time.monotonic() - self._saved_at >= self._every

@@ -102,7 +102,7 @@ def curve_of(rows: Array) -> NDArray[np.void]:
     return curve
 
 
-def halve(observation: Observation, ways: int = 1) -> list[tuple[Observation, Observation]]:
+def split_counts(observation: Observation, ways: int = 1) -> list[tuple[Observation, Observation]]:
     """Return two halves of an observation, the counts dealt out at random, in so many ways.
 
     Whole counts are dealt out one by one, so that the halves of a Poisson count are independent
@@ -267,7 +267,7 @@ def _flat(run: Run) -> Estimate:
     return run.extended().astype(np.float32).ravel()
 
 
-class Choosing:
+class HeldOutSelection:
     """Held-out counts at work on the choice of the penalty and the number of iterations.
 
     Parameters
@@ -310,8 +310,8 @@ class Choosing:
         self._begin, self._observation = begin, observation
         self._penalty, self._grid = penalty, grid
         self._n_iter, self._at_end = n_iter, at_end
-        self._halves = halve(observation, SPLITS)
-        self._judged: list[_Judged] = []
+        self._halves = split_counts(observation, SPLITS)
+        self._judged: list[_Candidate] = []
         self._trial = _Trial([])
         self._saved: Arrays = {}
 
@@ -388,12 +388,12 @@ class Choosing:
             reference = [(a, b) for a, b in state["reference"]]
             penalty = Penalty(float(mu), float(smoothing))
             self._judged.append(
-                _Judged(penalty, int(n_iter), error, curve, reference, float(zero), float(truth))
+                _Candidate(penalty, int(n_iter), error, curve, reference, float(zero), float(truth))
             )
 
 
 @dataclass
-class _Judged:
+class _Candidate:
     """What a trial has come to: the error where the reconstruction would end, and who judged."""
 
     penalty: Penalty
@@ -414,10 +414,10 @@ def _follow(
     trial: _Trial,
     penalty: Penalty,
     at_end: bool,
-    first: _Judged | None,
+    first: _Candidate | None,
     report: Callable[[str], None],
     keep: Callable[[], None],
-) -> _Judged:
+) -> _Candidate:
     """Take a trial as far as is needed, and judge it as the first one was."""
     for iteration in trial.advance():
         _, least, chosen = _judge(trial, first)
@@ -442,10 +442,10 @@ def _follow(
     curve = np.zeros(len(errors), CURVE_DTYPE)
     curve["mu"], curve["smoothing"] = penalty.mu, penalty.smoothing
     curve["iteration"], curve["error"] = trial.iterations, errors
-    return _Judged(penalty, chosen, error, curve, reference, zero, truth)
+    return _Candidate(penalty, chosen, error, curve, reference, zero, truth)
 
 
-def _judge(trial: _Trial, first: _Judged | None) -> tuple[Array, int, int]:
+def _judge(trial: _Trial, first: _Candidate | None) -> tuple[Array, int, int]:
     """Return the excess of what is kept, the place of the least, and the iteration to choose."""
     excess = trial.excess(first.reference if first else trial.end)
     refuse_not_finite(*excess)

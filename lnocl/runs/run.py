@@ -107,7 +107,7 @@ class Run:
     def __iter__(self) -> Iterator[int]:
         solve = SOLVERS[self._setup.solver]
         while self.done < self._n_iter:
-            begin, is_stage_new = self.done, not self._steps.begun
+            begin, is_stage_new = self.done, not self._steps.has_iterated
             for iteration in solve(self.engine, self._due - begin, self._steps):
                 self.done = begin + iteration
                 yield self.done
@@ -135,12 +135,12 @@ class Run:
         steps, scaling = self._steps, self.engine.scaling
         state = {
             **self.engine.state(),
-            "progress": np.array([self.done, self._due, steps.begun]),
+            "progress": np.array([self.done, self._due, steps.has_iterated]),
             "steps": np.array([steps.alpha, *steps.lengths]),
             "positions": self.scene.stars,
         }
         if scaling is not None:
-            state |= {"shift": scaling.shift, "reach": scaling.reach}
+            state |= {"shift": scaling.shift, "cross_information": scaling.cross_information}
             state["star_information"] = scaling.star_information
         for values in state.values():
             refuse_not_finite(values.sum(initial=0.0, dtype=np.float64))
@@ -200,9 +200,9 @@ class Run:
         from lnocl.solvers.scaling import Scaling
 
         n, grid = self.scene.n_stars, self.scene.grid
-        reach = state.get("reach", np.zeros(0)).reshape(n, *grid)
+        cross_information = state.get("cross_information", np.zeros(0)).reshape(n, *grid)
         information = state.get("star_information", np.zeros(0)).reshape(n, n)
-        return Scaling(state["shift"], information, reach)
+        return Scaling(state["shift"], information, cross_information)
 
     def _refine(self) -> None:
         """Move the stars to where the extended source of now makes them most likely."""

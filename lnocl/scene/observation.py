@@ -41,7 +41,7 @@ class Observation:
         Point spread functions, centre at ``(ky // 2, kx // 2)``, of any positive sum: they are
         normalised here. One serves all images. Negative pixels are kept and announced.
     background : float or array_like, shape (p,) or (p, ny, nx), optional
-        Known background, electrons per pixel, zero or more. A Quantity may be per time.
+        Calibration background, electrons per pixel, zero or more. A Quantity may be per time.
     read_noise : float or array_like, shape (p,) or (p, ny, nx), optional
         Standard deviation of the read noise, electrons, zero or more. Its square is added to
         images and background (Snyder's approximation of Gaussian noise by Poisson noise). Of a

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from lnocl.solvers import sgm, sgp
 from lnocl.solvers.engine import Engine
-from lnocl.solvers.sgm import sgm
-from lnocl.solvers.sgp import Steps, sgp
 
-Solver = Callable[[Engine, int, Steps], Iterator[int]]
-SOLVERS: dict[str, Solver] = {"sgm": sgm, "sgp": sgp}
+Solver = Callable[[Engine, int, sgp.Steps], Iterator[int]]
+SOLVERS: dict[str, Solver] = {"sgm": sgm.sgm, "sgp": sgp.sgp}

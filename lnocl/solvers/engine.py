@@ -12,7 +12,7 @@ from lnocl.scene.observation import Array
 class StarSteps(Protocol):
     """How star fluxes follow the extended source."""
 
-    def star_step(self, fluxes: Array, gradient: Array, reached: Array) -> Array:
+    def star_step(self, fluxes: Array, gradient: Array, coupling: Array) -> Array:
         """Return the change of the star fluxes for their gradient and what a step reaches."""
 
 

@@ -18,7 +18,7 @@ from lnocl.scene.scene import LEAST_MODEL, Scene
 # in docs/sgp.md.
 SHIFT = 0.1
 # Of the images' mean: what a pixel is taken to see at least.
-LEAST_SEEN = 2.0**-20
+MIN_BACKGROUND = 2.0**-20
 
 # A star's flux falls to this share at most in one step, so that it never reaches 0 by a step that
 # was too long.
@@ -42,22 +42,23 @@ class Scaling:
         stars and background.
     star_information : ndarray of float64, shape (n, n)
         Fisher information of the star fluxes, ``sum_j <P_js, w_j P_jt / m_j>`` at the start.
-    reach : ndarray of float64, shape (n, Ny, Nx)
+    cross_information : ndarray of float64, shape (n, Ny, Nx)
         Fisher information between each star flux and the extended source,
         ``sum_j A_j^T (w_j P_js / m_j)`` at the start.
     """
 
     shift: Array
     star_information: Array
-    reach: Array
+    cross_information: Array
 
-    def star_step(self, fluxes: Array, gradient: Array, reached: Array) -> Array:
+    def star_step(self, fluxes: Array, gradient: Array, coupling: Array) -> Array:
         """Return the change of the star fluxes that follows a step d of the extended source.
 
-        ``-F^-1 (gradient + <reach, d>)``: to the fluxes that are best where the step leads, to
-        second order, with the information F of the start; none falls by more than nine tenths.
+        ``-F^-1 (gradient + <cross_information, d>)``: to the fluxes that are best where the step
+        leads, to second order, with the information F of the start; none falls by more than nine
+        tenths.
         """
-        return _star_step(self.star_information, self._inverse, gradient + reached, fluxes)
+        return _star_step(self.star_information, self._inverse, gradient + coupling, fluxes)
 
     @cached_property
     def _inverse(self) -> NDArray:
@@ -165,7 +166,7 @@ def _make_scaling(
     def what_is_seen() -> Iterator[Array]:
         for light, background in zip(model.starlight(fluxes), model.background, strict=True):
             light += background
-            yield np.maximum(light, LEAST_SEEN, out=light)
+            yield np.maximum(light, MIN_BACKGROUND, out=light)
 
     inverse = model.adjoint(w / seen for w, seen in zip(model.weights, what_is_seen(), strict=True))
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
@@ -175,11 +176,13 @@ def _make_scaling(
     ):
         total = _above_guard(light, others)
         np.divide(_weights_above_guard(weights, total), total, out=ratio)
-    reach = np.empty((scene.n_stars, *scene.grid))
+    cross_information = np.empty((scene.n_stars, *scene.grid))
     for s, unit in enumerate(np.eye(scene.n_stars)):
         lights = model.starlight(unit)
-        reach[s] = model.adjoint(x * light for x, light in zip(ratios, lights, strict=True))
+        cross_information[s] = model.adjoint(
+            x * light for x, light in zip(ratios, lights, strict=True)
+        )
     information = sum(
         stars.information(x.ravel()) for x, stars in zip(ratios, model.stars, strict=True)
     )
-    return Scaling(SHIFT * np.maximum(shift, 0.0), np.asarray(information), reach)
+    return Scaling(SHIFT * np.maximum(shift, 0.0), np.asarray(information), cross_information)

@@ -32,13 +32,13 @@ class Steps:
         The last step.
     lengths : list of float
         The Barzilai-Borwein steps among which the smallest is taken.
-    begun : bool
+    has_iterated : bool
         Whether there was an iteration.
     """
 
     alpha: float = 1.0
     lengths: list[float] = field(default_factory=lambda: [ALPHA_BOUNDS[1]] * STEPS_KEPT)
-    begun: bool = False
+    has_iterated: bool = False
 
 
 def sgp(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int]:
@@ -56,11 +56,11 @@ def sgp(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int
     engine.correct()
     for iteration in range(1, n_iter + 1):
         change_step, change_change = engine.gradient()
-        if steps.begun:
+        if steps.has_iterated:
             length = _barzilai_borwein(change_step, change_change, steps.alpha)
             steps.lengths = [*steps.lengths[1:], length]
             steps.alpha = min(steps.lengths)
-        steps.begun = True
+        steps.has_iterated = True
         if not _descend(engine, steps.alpha):
             return
         yield iteration
@@ -75,12 +75,12 @@ def _barzilai_borwein(change_step: float, change_change: float, alpha: float) ->
 def _descend(engine: Engine, alpha: float) -> bool:
     """Step along the projected gradient as far as the objective falls; return whether it fell."""
     objective, fluxes, gradient = engine.objective(), engine.star_fluxes(), engine.star_gradient()
-    slope, reached = engine.step(alpha, 1.0)
+    slope, coupling = engine.step(alpha, 1.0)
     assert engine.scaling is not None
-    refuse_not_finite(objective, slope, *gradient, *reached)
-    change = engine.scaling.star_step(fluxes, gradient, reached)
+    refuse_not_finite(objective, slope, *gradient, *coupling)
+    change = engine.scaling.star_step(fluxes, gradient, coupling)
     if slope + gradient @ change >= 0:  # following the extended source would lead uphill
-        change = engine.scaling.star_step(fluxes, gradient, np.zeros_like(reached))
+        change = engine.scaling.star_step(fluxes, gradient, np.zeros_like(coupling))
     slope += float(gradient @ change)
     share = 1.0
     for _ in range(MOST_SHORTENED):

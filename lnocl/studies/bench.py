@@ -13,7 +13,7 @@ from astropy.table import Table
 from lnocl import __version__
 from lnocl.errors import InputError, LnoclError
 from lnocl.io import atomic, frames
-from lnocl.io.frames import Known, Word
+from lnocl.io.frames import Calibration, Word
 from lnocl.plotting import plots
 from lnocl.scene.observation import Observation
 from lnocl.simulation.simulate import Simulation, load_target, simulate
@@ -102,7 +102,7 @@ class Files(NamedTuple):
 
     def load(self) -> Problem:
         """Read them."""
-        known = Known(self.background, self.read_noise)
+        known = Calibration(self.background, self.read_noise)
         read = frames.read_frames(self.images, self.psfs, known)
         inputs = {
             "images": dict(zip(self.images, read.sha256["images"], strict=True)),
@@ -129,7 +129,7 @@ def choose_source(
     images, psfs : sequence of str
         Paths of FITS files.
     background, read_noise : sequence of float or str, optional
-        As for `frames.Known`; by default 0.
+        As for `frames.Calibration`; by default 0.
     stars : sequence of (x, y)
         Positions in pixels, 0-based.
     mu : float, optional

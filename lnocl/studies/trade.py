@@ -152,7 +152,7 @@ def compare(
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", LnoclWarning)  # the first run has said it
                 result = reconstruct(setting, n_iter, watch)
-            yardstick = yardstick or Yardstick.of(result, stars, accuracy, simulation)
+            yardstick = yardstick or ReferenceSolution.of(result, stars, accuracy, simulation)
             rows += _rows(setting, watch, result, yardstick)
             yield _tabulate(rows, device=result.device, n_iter=n_iter, accuracy=accuracy)
 
@@ -292,7 +292,7 @@ class Watch:
 
 
 @dataclass(frozen=True)
-class Yardstick:
+class ReferenceSolution:
     """What estimates are measured by: the reference and, where it is known, the truth.
 
     Attributes
@@ -325,7 +325,7 @@ class Yardstick:
         stars: Sequence[tuple[float, float]],
         accuracy: float,
         simulation: Simulation | None,
-    ) -> Yardstick:
+    ) -> ReferenceSolution:
         """Return the yardstick that a reference makes."""
         extended = reference.extended
         if not extended.any():
@@ -380,7 +380,7 @@ def _compile(settings: Sequence[Setting], reconstruct: Callable[[Setting, int], 
 
 
 def _rows(
-    setting: Setting, watch: Watch, result: Result, yardstick: Yardstick
+    setting: Setting, watch: Watch, result: Result, yardstick: ReferenceSolution
 ) -> Iterator[dict[str, Any]]:
     each = watch.seconds_each
     for iterations, (extended, star_fluxes) in watch.kept.items():

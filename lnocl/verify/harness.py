@@ -47,7 +47,7 @@ SCENES: dict[str, dict[str, Any]] = {
 CANARY = np.frombuffer(b"\xa5" * 64, np.uint8)
 
 
-class Rig:
+class KernelHarness:
     """Puts arrays in natural order on a device, launches kernels, and takes results off it.
 
     Behind every array lies a canary, which nothing may write to.
@@ -160,16 +160,16 @@ def rounded(array: ArrayLike, dtype: DTypeLike) -> NDArray:
     return array.astype(dtype).astype(float)
 
 
-def inputs(rig: Rig) -> SimpleNamespace:
+def inputs(harness: KernelHarness) -> SimpleNamespace:
     """Return random inputs for every kernel, in natural order."""
-    rng = np.random.default_rng(rig.grid[0] * 31 + rig.grid[1])
-    ny, nx = rig.grid
-    p, n = rig.program.n_images, rig.program.n_stars
+    rng = np.random.default_rng(harness.grid[0] * 31 + harness.grid[1])
+    ny, nx = harness.grid
+    p, n = harness.program.n_images, harness.program.n_stars
     has_map, has_weights, has_exposure_map, has_mu, has_smoothing = (
-        rig.scene.get(f"has_{what}", False)
+        harness.scene.get(f"has_{what}", False)
         for what in ("background_map", "weights", "exposure_map", "mu", "smoothing")
     )
-    own = functools.partial(rounded, dtype=rig.dtype)
+    own = functools.partial(rounded, dtype=harness.dtype)
 
     def half_spectra(count: int) -> NDArray:
         return own(np.fft.rfft(rng.normal(size=(count, ny, nx)), axis=-1))
@@ -182,12 +182,12 @@ def inputs(rig: Rig) -> SimpleNamespace:
     if has_exposure_map:
         weights = own(weights * rng.uniform(0.5, 2.0, weights.shape))
     # One star is seen in all blocks; of two, each in half of them, the first round the edge.
-    row_blocks = rig.program.row_blocks
+    row_blocks = harness.program.row_blocks
     star_blocks = row_blocks if n < 2 else max(1, row_blocks // 2)
     first_blocks = np.array([row_blocks - 1, 0])[:n]
     star_images = own(rng.random((n, p, ny, nx)))
     for images_of_star, first in zip(star_images, first_blocks, strict=True):
-        dark = np.setdiff1d(np.arange(ny), rig.layout.rows_of(first, star_blocks))
+        dark = np.setdiff1d(np.arange(ny), harness.layout.rows_of(first, star_blocks))
         images_of_star[:, dark] = 0.0
     return SimpleNamespace(
         p=p,
@@ -224,6 +224,6 @@ def inputs(rig: Rig) -> SimpleNamespace:
         curvature=own(rng.random((1, ny, nx))) if has_smoothing else 0.0,
         smoothing=float(np.float32(0.4)) if has_smoothing else 0.0,
         edge=float(np.float32(0.3)),
-        reach=own(rng.uniform(-0.1, 1.0, (n, ny, nx))),
+        cross_information=own(rng.uniform(-0.1, 1.0, (n, ny, nx))),
         mu=float(np.float32(0.25)) if has_mu else 0.0,
     )

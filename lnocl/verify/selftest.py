@@ -19,7 +19,7 @@ from lnocl.opencl.device import describe, has_double, spec_of
 from lnocl.scene.observation import Observation
 from lnocl.simulation.simulate import Experiment, Star, load_target, simulate
 from lnocl.verify.comparison import ALLOWED, KERNELS, deviation, kernels_of, relative
-from lnocl.verify.harness import SCENES, THREE_IMAGES, Rig, inputs
+from lnocl.verify.harness import SCENES, THREE_IMAGES, KernelHarness, inputs
 
 DTYPES: dict[str, type[np.floating[Any]]] = {"single": np.float32, "double": np.float64}
 
@@ -164,13 +164,13 @@ def _try_kernels(
     if precision == "double":
         grid = grid[1], grid[0]
     try:
-        rig = Rig(context, grid, dtype, **SCENES[scene])
+        harness = KernelHarness(context, grid, dtype, **SCENES[scene])
     except FAULTS as error:
         yield Row("build", precision, grid, math.nan, allowed, _fault(error))
         return
-    given = inputs(rig)
+    given = inputs(harness)
     for kernel in kernels_of(SCENES[scene]):
-        measure = functools.partial(deviation, rig, given, kernel)
+        measure = functools.partial(deviation, harness, given, kernel)
         yield _row(kernel, precision, grid, measure, allowed)
 
 

@@ -20,7 +20,7 @@ from scenes import make_psfs
 import lnocl
 from lnocl.commands import cli
 from lnocl.errors import DeviceError
-from lnocl.io.frames import Known, read_frames
+from lnocl.io.frames import Calibration, read_frames
 from lnocl.opencl import device
 from lnocl.runs.progress import Bar
 
@@ -503,7 +503,7 @@ class TestFrames:
 
     def test_it_is_what_the_library_makes_of_the_files(self):
         assert self.run(*self.OPTIONS, *self.sky_option, "--quiet") == 0
-        known = Known(
+        known = Calibration(
             background=["auto", "level.fits"],
             inverse_variance=["inverse.fits"],
             exposure=["EXPTIME"],

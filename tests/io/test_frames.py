@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lnocl.errors import FileError, InputError, LnoclWarning
-from lnocl.io.frames import Known, read_frames
+from lnocl.io.frames import Calibration, read_frames
 from lnocl.scene import units
 
 SHAPE = (10, 12)
@@ -38,7 +38,7 @@ def save_images(images=IMAGES, **cards):
 
 
 def read(*paths, psf="psf.fits", **known):
-    return read_frames(paths or ("1.fits", "2.fits"), [psf], Known(**known))
+    return read_frames(paths or ("1.fits", "2.fits"), [psf], Calibration(**known))
 
 
 def observe(*paths, **known):

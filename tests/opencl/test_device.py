@@ -1,4 +1,4 @@
-"""Choosing a device, and what is said where there is none or it cannot do what is asked."""
+"""HeldOutSelection a device, and what is said where there is none or it cannot do what is asked."""
 
 import subprocess
 import sys

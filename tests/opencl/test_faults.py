@@ -212,7 +212,9 @@ def test_kernels_are_kept_and_used_again(warm, tmp_path):
     name, content, said = warm
     (tmp_path / name).write_bytes(content)
     begin = time.monotonic()
-    code = "from lnocl.opencl import program\nprint(deconvolve())\nprint(os.environ['POCL_CACHE_DIR'])"
+    code = (
+        "from lnocl.opencl import program\nprint(deconvolve())\nprint(os.environ['POCL_CACHE_DIR'])"
+    )
     done = run_python(code, POCL_CACHE_DIR=str(tmp_path))
     assert time.monotonic() - begin < 30
     assert done.stdout == f"{said}{tmp_path}\n"

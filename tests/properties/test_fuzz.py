@@ -20,7 +20,7 @@ from test_fitsread import PHYSICAL, SIP
 
 from lnocl.errors import FileError, InputError, LnoclError, LnoclWarning
 from lnocl.io import fitsread, fitswrite, sky
-from lnocl.io.frames import Known, read_frames
+from lnocl.io.frames import Calibration, read_frames
 from lnocl.plotting import plots
 from lnocl.runs import checkpoint
 from lnocl.simulation import simulate
@@ -133,7 +133,7 @@ def read_observation(sound, damaged, name):
     frames = read_frames(
         [files["telescope"]] * 2 if is_telescope else [files["image"], str(sound["image.dat"])],
         [files["psfs"]],
-        Known(
+        Calibration(
             background=[files.get("tiles", "auto")],
             exposure=["EXPTIME"],
             mask=["dq" if is_telescope else files["mask"]],

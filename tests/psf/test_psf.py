@@ -346,16 +346,18 @@ def test_large_holes_are_set_to_the_background_and_announced():
     bad = np.isnan(frame)
     good = np.pad(~bad, half)
     n_good = np.lib.stride_tricks.sliding_window_view(good, (WINDOW, WINDOW)).sum(axis=(2, 3))
-    hollow = bad & (n_good < MIN_GOOD)
-    n_bad, n_hollow = int(bad.sum()), int(hollow.sum())
-    assert len(frame) < n_hollow < n_bad
-    with pytest.warns(LnoclWarning, match=rf"^{n_hollow} bad pixels .* set to the background"):
+    unrepairable = bad & (n_good < MIN_GOOD)
+    n_bad, n_unrepairable = int(bad.sum()), int(unrepairable.sum())
+    assert len(frame) < n_unrepairable < n_bad
+    with pytest.warns(
+        LnoclWarning, match=rf"^{n_unrepairable} bad pixels .* set to the background"
+    ):
         star = make_psf(frame, background=40.0, recentre=False, position=(30, 29))
     assert line(star, "bad pixels") == (
-        f"bad pixels: {n_bad} in the frame, 0 of them saturated; {n_bad - n_hollow} around the "
-        f"star repaired, {n_hollow} set to the background"
+        f"bad pixels: {n_bad} in the frame, 0 of them saturated; {n_bad - n_unrepairable} around "
+        f"the star repaired, {n_unrepairable} set to the background"
     )
-    np.testing.assert_array_equal(star.psf == 0, hollow[:59, 1:60])
+    np.testing.assert_array_equal(star.psf == 0, unrepairable[:59, 1:60])
 
 
 def test_what_is_beside_a_large_hole_is_repaired_from_good_pixels_alone():

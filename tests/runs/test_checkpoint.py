@@ -161,9 +161,9 @@ def test_held_out_counts_go_on_from_where_they_were_cut_off(more, engine, tmp_pa
     monkeypatch.setattr(checkpoint, "write", write)
     monkeypatch.setattr(ReferenceEngine, "correct", count_and_correct)
     whole = made.deconvolve(**given)
-    choosing, corrections = written.index(True), len(corrected)
-    assert choosing > 10
-    for cut in (1, choosing // 2, choosing):  # noqa: B007
+    selection, corrections = written.index(True), len(corrected)
+    assert selection > 10
+    for cut in (1, selection // 2, selection):  # noqa: B007
         os.remove(path)
         written.clear()
         corrected.clear()
@@ -171,7 +171,7 @@ def test_held_out_counts_go_on_from_where_they_were_cut_off(more, engine, tmp_pa
             made.deconvolve(**given)
         assert_same(made.deconvolve(**given, resume=path), whole)
         # What was done is not done again, but for what six halves begin with.
-        assert written.index(True) == choosing
+        assert written.index(True) == selection
         assert len(corrected) <= corrections + 6
 
 

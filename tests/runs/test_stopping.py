@@ -110,7 +110,7 @@ def test_discrepancy_stops_where_noise_is_reached(mask, solver):
 class TestHalves:
     def test_are_whole_counts_that_add_up(self):
         observation, *_ = scene()
-        ((first, second),) = held_out.halve(observation)
+        ((first, second),) = held_out.split_counts(observation)
         np.testing.assert_array_equal(first.images + second.images, observation.images)
         assert (first.images == np.floor(first.images)).all()
         assert min(first.images.min(), second.images.min()) >= 0
@@ -123,7 +123,7 @@ class TestHalves:
         images = np.random.default_rng(5).poisson(mean, (n, n)) + fraction
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LnoclWarning)
-            ((first, second),) = held_out.halve(lnocl.Observation(images, np.ones((1, 1))))
+            ((first, second),) = held_out.split_counts(lnocl.Observation(images, np.ones((1, 1))))
         covariance = np.cov(first.images.ravel(), second.images.ravel())
         allowed = 6.0 * mean / 2.0 * np.sqrt(2.0) / n
         # Of a fraction, which is no count, 1/4 of its square goes to each.
@@ -133,7 +133,7 @@ class TestHalves:
 
     def test_leave_masked_pixels_out(self):
         observation, *_ = scene(mask=True)
-        ((first, second),) = held_out.halve(observation)
+        ((first, second),) = held_out.split_counts(observation)
         np.testing.assert_array_equal(first.mask, observation.mask)
         assert first.images[observation.mask].max() == second.images[observation.mask].max() == 0
 
@@ -142,7 +142,7 @@ class TestHalves:
         observation = lnocl.Observation(
             np.full((2, 4, 4), 9.0), np.ones((1, 1)), exposure=exposure, offsets=[(0, 0), (1, -0.5)]
         )
-        for half in held_out.halve(observation)[0]:
+        for half in held_out.split_counts(observation)[0]:
             seen = ~observation.mask
             np.testing.assert_array_equal(half.mask, observation.mask)
             np.testing.assert_array_equal(half.offsets, observation.offsets)
@@ -151,7 +151,7 @@ class TestHalves:
     def test_say_that_images_are_no_whole_counts(self):
         observation = lnocl.Observation(np.full((4, 4), 2.5), np.ones((1, 1)))
         with pytest.warns(LnoclWarning, match="the images are not whole counts"):
-            held_out.halve(observation)
+            held_out.split_counts(observation)
 
     @pytest.mark.parametrize(
         ("value", "message"),
@@ -163,7 +163,7 @@ class TestHalves:
     def test_refuse_what_cannot_be_dealt_out(self, value, message):
         observation = lnocl.Observation(np.full((4, 4), value), np.ones((1, 1)))
         with pytest.raises(lnocl.InputError, match=message):
-            held_out.halve(observation)
+            held_out.split_counts(observation)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

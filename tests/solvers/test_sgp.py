@@ -22,7 +22,7 @@ from lnocl.engines import opencl
 from lnocl.scene.forward_model import Model
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
-from lnocl.solvers import scaling, solvers
+from lnocl.solvers import scaling
 
 every_engine = pytest.mark.parametrize("engine", FEWER_ENGINES)
 
@@ -503,7 +503,7 @@ def test_estimate_is_the_last_good_one_where_no_step_is_left(engine, monkeypatch
 
     def refuse_all_steps(iteration, _):
         if iteration == 3:
-            monkeypatch.setattr(solvers, "SUFFICIENT", 1e300)
+            monkeypatch.setattr("lnocl.solvers.sgp.SUFFICIENT", 1e300)
 
     expected = run(name, n_iter=3, **engine)
     result = run(name, n_iter=9, callback=refuse_all_steps, **engine)
@@ -582,7 +582,7 @@ def test_scaling_is_that_of_the_matrix():
     weighted = unit * (weights / problem.model(x))[:, None] * stars
     # Measured 8.0e-15, 4.9e-16 and 1.6e-16.
     assert worst(steps.shift.ravel(), shift / unit) <= 2.4e-14
-    assert worst(steps.reach.reshape(2, -1), (sky.T @ weighted).T) <= 1.5e-15
+    assert worst(steps.cross_information.reshape(2, -1), (sky.T @ weighted).T) <= 1.5e-15
     assert worst(steps.star_information, stars.T @ weighted) <= 5e-16
 
 

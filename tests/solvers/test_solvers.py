@@ -17,12 +17,12 @@ class Scripted:
     Its stars have the information 1 each.
     """
 
-    def __init__(self, changes=(), objectives=(), slope=-1.0, star=None, reached=0.0):
+    def __init__(self, changes=(), objectives=(), slope=-1.0, star=None, coupling=0.0):
         self.changes = chain(changes, repeat((1.0, 1.0)))
         self.to_record = chain(objectives, map(float, range(0, -1000, -1)))
         self.slope, self.scaling = slope, self
         self.gradients = np.array([] if star is None else [star])
-        self.reached = np.full(self.gradients.shape, reached)
+        self.coupling = np.full(self.gradients.shape, coupling)
         self.fluxes = np.full(self.gradients.shape, 100.0)
         self.recorded, self.steps, self.calls = [], [], []
 
@@ -42,12 +42,12 @@ class Scripted:
     def star_gradient(self):
         return self.gradients
 
-    def star_step(self, fluxes, gradient, reached):
-        return -(gradient + reached)
+    def star_step(self, fluxes, gradient, coupling):
+        return -(gradient + coupling)
 
     def step(self, alpha, share):
         self.steps.append((alpha, share))
-        return self.slope, self.reached
+        return self.slope, self.coupling
 
     def set_star_fluxes(self, star_fluxes):
         self.fluxes = star_fluxes
@@ -110,10 +110,10 @@ def test_steps_go_on_from_what_is_remembered():
     ("stars", "change", "slope"),
     [
         pytest.param({}, [], -1.0, id="none"),
-        pytest.param({"star": 2.0, "reached": 0.5}, [-2.5], -6.0, id="follows"),
-        pytest.param({"star": 1.0, "reached": -1.5}, [0.5], -0.5, id="follows, barely downhill"),
-        pytest.param({"star": 2.0, "reached": -4.0}, [-2.0], -5.0, id="would lead uphill"),
-        pytest.param({"star": 1.0, "reached": -2.0}, [-1.0], -2.0, id="would lead nowhere"),
+        pytest.param({"star": 2.0, "coupling": 0.5}, [-2.5], -6.0, id="follows"),
+        pytest.param({"star": 1.0, "coupling": -1.5}, [0.5], -0.5, id="follows, barely downhill"),
+        pytest.param({"star": 2.0, "coupling": -4.0}, [-2.0], -5.0, id="would lead uphill"),
+        pytest.param({"star": 1.0, "coupling": -2.0}, [-1.0], -2.0, id="would lead nowhere"),
     ],
 )
 def test_a_step_is_shortened_until_the_objective_falls_enough(stars, change, slope):
@@ -142,7 +142,7 @@ def test_it_ends_at_the_base_where_no_step_lets_the_objective_fall():
         {"objectives": [0.0, *[math.nan] * 100]},
         {"slope": math.nan},
         {"star": math.inf},
-        {"star": 1.0, "reached": math.nan},
+        {"star": 1.0, "coupling": math.nan},
     ],
 )
 def test_what_is_not_finite_is_refused(given):

@@ -15,7 +15,7 @@ from runtimes import on_pocl
 
 import lnocl
 from lnocl.io.fitsread import read_stack
-from lnocl.runs.held_out import halve
+from lnocl.runs.held_out import split_counts
 
 
 def arguments(seed, n):
@@ -79,7 +79,7 @@ def test_threads_leave_warnings_as_they_were(tmp_path):
 
     def read(_):
         read_stack([str(path)])
-        halve(observation)
+        split_counts(observation)
 
     before = warnings.filters[:], warnings.showwarning, warnings._showwarnmsg_impl
     with ThreadPoolExecutor(4) as pool:

@@ -111,7 +111,9 @@ def test_what_is_tried(monkeypatch):
         history = np.ones(1, [("objective", float)])
         return SimpleNamespace(extended=np.ones(4), star_fluxes=np.ones(2), history=history)
 
-    monkeypatch.setattr(selftest, "Rig", lambda *given, **scene: rigs.append((*given, scene)))
+    monkeypatch.setattr(
+        selftest, "KernelHarness", lambda *given, **scene: rigs.append((*given, scene))
+    )
     monkeypatch.setattr(selftest, "inputs", lambda _: None)
     monkeypatch.setattr(selftest, "deviation", lambda *_: 0.0)
     monkeypatch.setattr(selftest, "deconvolve", deconvolve)
