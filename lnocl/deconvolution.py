@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -13,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.errors import InputError, LnoclWarning, NotFiniteError
+from lnocl.errors import InputError, NotFiniteError, warn
 from lnocl.runs.checkpoint import Checkpointer, describe
 from lnocl.runs.held_out import (
     NO_CURVE,
@@ -442,11 +441,9 @@ def _check_kinds(callback: object, **flags: object) -> None:
 def _warn_of_straying(n_iter: int) -> None:
     stray = STRAY_PER_ITERATION * n_iter
     if stray > STRAY_WORTH_A_WARNING:
-        warnings.warn(
+        warn(
             f"single precision is expected to stray from double by {stray:.1g} of the extended "
-            f"source after {n_iter} iterations; take precision double, or fewer iterations",
-            LnoclWarning,
-            stacklevel=3,
+            f"source after {n_iter} iterations; take precision double, or fewer iterations"
         )
 
 

@@ -1,6 +1,12 @@
-"""The errors and the warning that lnocl raises."""
+"""The errors that lnocl raises, its warning, and the one way to warn."""
 
 import math
+import os
+import sys
+import warnings
+from pathlib import Path
+
+PACKAGE = str(Path(__file__).parent) + os.sep
 
 
 class LnoclError(Exception):
@@ -47,3 +53,11 @@ def refuse_not_finite(*sums: float) -> None:
 
 class LnoclWarning(UserWarning):
     """Something was changed or left out of the data, and the user should know."""
+
+
+def warn(message: str) -> None:
+    """Warn with an `LnoclWarning` that points to the caller's line, the nearest outside lnocl."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(PACKAGE):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, LnoclWarning, stacklevel=level)

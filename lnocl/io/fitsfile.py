@@ -8,7 +8,6 @@ import hashlib
 import io
 import os
 import stat
-import warnings
 from collections.abc import Iterator
 from typing import IO, Any
 
@@ -17,7 +16,7 @@ from astropy.io import fits
 from astropy.utils.data import get_readable_fileobj
 from numpy.typing import NDArray
 
-from lnocl.errors import FileError, LnoclError, LnoclWarning
+from lnocl.errors import FileError, LnoclError, warn
 from lnocl.process import recorded_warnings
 
 # What astropy counts to when it reads a header, and as far as FITS lets it count.
@@ -85,7 +84,7 @@ class FitsFile:
             except FileError:
                 raise
             except Exception as error:
-                warnings.warn(f"what follows byte {end} is left out: {error}", stacklevel=2)
+                warn(f"what follows byte {end} is left out: {error}")
                 return
 
     def pixels(self, hdu: Any) -> NDArray[np.float64]:
@@ -242,9 +241,9 @@ def open_fits(
             reason = str(error).partition(". ")[0] or "it ends too early"
             raise FileError(f"{path} {complaint}: {reason}") from error
     for warning in caught:
-        warnings.warn(f"{path}: {warning.message}", LnoclWarning, stacklevel=5)
+        warn(f"{path}: {warning.message}")
 
 
 def _verify(hdu: Any) -> None:
     if "DATASUM" in hdu.header and hdu.verify_datasum() == 0:
-        warnings.warn("the data do not match their DATASUM; the file may be damaged", stacklevel=2)
+        warn("the data do not match their DATASUM; the file may be damaged")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +10,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from lnocl.errors import FileError, InputError, LnoclWarning
+from lnocl.errors import FileError, InputError, warn
 from lnocl.io.fitsfile import open_fits
 from lnocl.io.headers import make_wcs, number, quiet_log, readable
 from lnocl.process import ignored_warnings
@@ -166,11 +165,9 @@ def wcs_cards(header: fits.Header) -> fits.Header:
                     wcs.sip = None  # that of the primary system, which astropy gives to all
                 cards.update(wcs.to_header(relax=True))
         except Exception as error:
-            warnings.warn(
+            warn(
                 f"the coordinates (WCS{key and ' ' + key}) of the first image cannot be kept "
-                f"and are left out: {error}",
-                LnoclWarning,
-                stacklevel=2,
+                f"and are left out: {error}"
             )
     return cards
 

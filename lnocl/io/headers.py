@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import astropy
 from astropy.io import fits
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, warn
 from lnocl.process import ignored_warnings
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ def readable(header: fits.Header) -> fits.Header:
             _ = card.value
         except Exception as error:  # whatever a damaged card leads astropy to
             reason = str(error).partition(", ")[0]
-            warnings.warn(f"a card of the header is left out: {reason}", stacklevel=2)
+            warn(f"a card of the header is left out: {reason}")
             del kept[i]
     return kept
 

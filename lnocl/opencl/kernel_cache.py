@@ -13,14 +13,13 @@ import os
 import shutil
 import sys
 import tempfile
-import warnings
 import weakref
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from lnocl.errors import DeviceError, LnoclWarning
+from lnocl.errors import DeviceError, warn
 from lnocl.process import LOCK
 
 T = TypeVar("T")
@@ -142,11 +141,7 @@ def _unpack(archive: Path, own: Path) -> list[str]:
     except OSError:  # none were kept, or they cannot be read
         return []
     except Exception:  # what is damaged may raise anything
-        warnings.warn(
-            f"the kernels kept in {archive} are damaged, and are compiled anew",
-            LnoclWarning,
-            stacklevel=4,
-        )
+        warn(f"the kernels kept in {archive} are damaged, and are compiled anew")
         with contextlib.suppress(OSError):
             archive.unlink()  # or what is made anew would seem to be kept
         return []
@@ -175,11 +170,9 @@ def _can_keep(folder: Path) -> bool:
         reason = str(error.strerror)
     if folder not in _refused:
         _refused.add(folder)
-        warnings.warn(
+        warn(
             f"kernels cannot be kept in {folder} ({reason}), and are compiled anew by every "
-            f"process; set {VARIABLE} to a folder that can be written to",
-            LnoclWarning,
-            stacklevel=4,
+            f"process; set {VARIABLE} to a folder that can be written to"
         )
     return False
 

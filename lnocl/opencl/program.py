@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from importlib import resources
 
 import numpy as np
 import pyopencl as cl
 
-from lnocl.errors import DeviceError, LnoclWarning
+from lnocl.errors import DeviceError, warn
 from lnocl.opencl import kernel_cache
 from lnocl.opencl.device import describe, has_double
 from lnocl.opencl.faults import build_failure
@@ -212,12 +211,10 @@ def _build(context: cl.Context, text: str, options: list[str]) -> dict[str, cl.K
     except DeviceError:
         raise
     except Exception as error:  # a cache may raise anything
-        warnings.warn(
+        warn(
             f"the kernels that PyOpenCL keeps cannot be used ({type(error).__name__}: {error}), "
             "and are made anew; remove the folders pyopencl and pytools from ~/.cache or from "
-            "XDG_CACHE_HOME, or make them writable",
-            LnoclWarning,
-            stacklevel=5,
+            "XDG_CACHE_HOME, or make them writable"
         )
     with kernel_cache.fresh():
         return _try_to_build(context, text, options)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import operator
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +14,7 @@ import numpy as np
 from astropy.stats import sigma_clipped_stats
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.errors import InputError, LnoclWarning
+from lnocl.errors import InputError, warn
 from lnocl.psf import resampling
 from lnocl.psf.centring import FWHM, SEARCH, Mask, Pixel, Point, brightest, fit_gaussian
 from lnocl.psf.repair import WINDOW, repair
@@ -448,11 +447,9 @@ def _repair(
         return bad, "bad pixels: none"
     repaired, unrepairable = repair(light, bad, region)
     if n_unrepairable := int(unrepairable.sum()):
-        warnings.warn(
+        warn(
             f"{n_unrepairable} bad pixels around the star have too few good ones beside them and "
-            "were set to the background",
-            LnoclWarning,
-            stacklevel=4,
+            "were set to the background"
         )
     return unrepairable, (
         f"bad pixels: {bad.sum()} in the frame, {saturated.sum()} of them saturated; "
@@ -561,11 +558,9 @@ def _crop(work: Array, side: int, light: Array, pixel: Pixel, level: float) -> t
 def _warn_of_guess(saturated: Mask, light: Array) -> None:
     if n_saturated := int(saturated.sum()):
         share = light[saturated].sum() / light.sum()
-        warnings.warn(
+        warn(
             f"{n_saturated} saturated pixels of the PSF were repaired, and hold "
-            f"{_percent(share)} of its flux: its core is a guess",
-            LnoclWarning,
-            stacklevel=4,
+            f"{_percent(share)} of its flux: its core is a guess"
         )
 
 
@@ -573,12 +568,10 @@ def _warn_of_ringing(shares: Sequence[tuple[float, float]]) -> None:
     """Warn of the worst, of shares of the flux in negative pixels before and after."""
     before, after = max(shares, key=lambda share: share[1] - (1 + OF_NOISE) * share[0])
     if after > RINGING + (1 + OF_NOISE) * before:
-        warnings.warn(
+        warn(
             f"shift and rotation ring: negative pixels hold {_percent(after)} of the flux, "
             f"{_percent(before)} before; the star is undersampled, and without recentring its "
-            "pixels are left as they are",
-            LnoclWarning,
-            stacklevel=4,
+            "pixels are left as they are"
         )
 
 

@@ -6,7 +6,6 @@ import hashlib
 import math
 import os
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -16,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.errors import FileError, InputError, LnoclWarning
+from lnocl.errors import FileError, InputError, warn
 from lnocl.io.atomic import check_output, whole_file
 from lnocl.runs.held_out import NO_CURVE, Choice, HeldOutSelection, curve_of, plain
 from lnocl.runs.run import Run, Setup, engine_name
@@ -254,12 +253,10 @@ class Checkpointer:
             Always.
         """
         run.redo(self._finite)
-        warnings.warn(
+        warn(
             f"the objective became infinite or not a number: the result is that of iteration "
             f"{run.done}, the last before; scale the scene where its values are large beyond "
-            "measure, else see what lnocl selftest says of the device",
-            LnoclWarning,
-            stacklevel=3,
+            "measure, else see what lnocl selftest says of the device"
         )
 
     def keep(self, run: Run, rule: Rule, choice: Choice, ended: str) -> None:
@@ -305,11 +302,7 @@ class Checkpointer:
         except FileError as error:
             if self._saved_at == -math.inf:
                 raise
-            warnings.warn(
-                f"{error}; the run goes on, and what was there before is as it was",
-                LnoclWarning,
-                stacklevel=5,
-            )
+            warn(f"{error}; the run goes on, and what was there before is as it was")
         self._saved_at = time.monotonic()
 
 

@@ -16,7 +16,6 @@ over most of the run and ends it two to four times too early: docs/sgp.md.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError, LnoclWarning, refuse_not_finite
+from lnocl.errors import InputError, LnoclWarning, refuse_not_finite, warn
 from lnocl.process import ignored_warnings
 from lnocl.runs.run import Run
 from lnocl.scene.observation import Array, Observation
@@ -131,11 +130,7 @@ def split_counts(observation: Observation, ways: int = 1) -> list[tuple[Observat
         )
     whole = np.floor(images)
     if (whole != images).any():
-        warnings.warn(
-            "the images are not whole counts: they are split as if they were Poisson counts",
-            LnoclWarning,
-            stacklevel=5,
-        )
+        warn("the images are not whole counts: they are split as if they were Poisson counts")
     known = {
         "background": observation.background / 2.0,
         "mask": observation.mask,
@@ -350,11 +345,9 @@ class HeldOutSelection:
             self._judged.append(_follow(self._trial, penalty, self._at_end, first, report, keep))
         best = min(self._judged, key=lambda judged: judged.error)
         if not self._at_end and AS_LONG_AGAIN * best.n_iter > self._n_iter:
-            warnings.warn(
+            warn(
                 f"held-out counts have chosen iteration {best.n_iter} of {self._n_iter}, too near "
-                f"the end to be sure; give n_iter {AS_LONG_AGAIN * best.n_iter} or more",
-                LnoclWarning,
-                stacklevel=4,
+                f"the end to be sure; give n_iter {AS_LONG_AGAIN * best.n_iter} or more"
             )
         curve = np.concatenate([judged.curve for judged in self._judged])
         return Choice(best.penalty, self._n_iter if self._at_end else best.n_iter, curve)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.errors import InputError, LnoclWarning
+from lnocl.errors import InputError, warn
 from lnocl.scene import units
 
 Array = NDArray[np.float64]
@@ -150,11 +148,7 @@ class Observation:
         non_finite = ~np.isfinite(self.images) & ~self.mask
         if n_non_finite := int(non_finite.sum()):
             self.mask |= non_finite
-            warnings.warn(
-                f"{n_non_finite} image pixels are not finite and were masked",
-                LnoclWarning,
-                stacklevel=3,
-            )
+            warn(f"{n_non_finite} image pixels are not finite and were masked")
 
     def _refuse_all_masked(self) -> None:
         if self.mask.all():
@@ -237,11 +231,9 @@ class Observation:
         negative = self.images < 0
         if n_negative := int(negative.sum()):
             self.images[negative] = 0.0
-            warnings.warn(
+            warn(
                 f"{n_negative} image pixels are negative and were set to 0; if the images are "
-                "background-subtracted, add the background back and give it as background",
-                LnoclWarning,
-                stacklevel=3,
+                "background-subtracted, add the background back and give it as background"
             )
 
 
@@ -327,8 +319,6 @@ def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
             "rounding of its values"
         )
     if n_negative := int((stack < 0).sum()):
-        warnings.warn(
-            f"{n_negative} psf pixels are negative and were kept", LnoclWarning, stacklevel=3
-        )
+        warn(f"{n_negative} psf pixels are negative and were kept")
     stack /= sums
     return np.repeat(stack, n_images, axis=0) if len(stack) < n_images else stack

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import logging
 import math
-import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.errors import InputError, LnoclWarning
+from lnocl.errors import InputError, warn
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.penalty import MOST_WEIGHT, Penalty
@@ -329,11 +328,9 @@ class Scene:
         offsets = np.ceil(abs(self.observation.offsets).max(axis=0)).astype(int)[::-1]
         room = np.subtract(self.grid, self.observation.shape)
         if (offsets > room).any():
-            warnings.warn(
+            warn(
                 f"the images are shifted by up to {offsets.max()} pixels, and what leaves one edge "
-                f"comes in at the opposite one: give pad {offsets.max()} or more",
-                LnoclWarning,
-                stacklevel=5,
+                f"comes in at the opposite one: give pad {offsets.max()} or more"
             )
 
     def _warn_of_ringing(self) -> None:
@@ -347,21 +344,17 @@ class Scene:
                 continue
             dark = min(psf.min(), 0.0) - place(psf, self.grid, 0.5, 0.5).values.min()
             if dark > MOST_RINGING * psf.max():
-                warnings.warn(
+                warn(
                     f"psf {j} is sharper than its pixels can hold: moved between pixels it rings "
-                    f"by up to {dark / psf.max():.1%} of its peak, at whole pixels not",
-                    LnoclWarning,
-                    stacklevel=5,
+                    f"by up to {dark / psf.max():.1%} of its peak, at whole pixels not"
                 )
 
     def _warn_of_large_psf(self) -> None:
         psf_shape = self.observation.psfs.shape[1:]
         if any(k > n for k, n in zip(psf_shape, self.grid, strict=True)):
-            warnings.warn(
+            warn(
                 f"the psf {psf_shape} is larger than the grid {self.grid}: its wings wrap "
-                "round; crop it, or give pad to enlarge the grid",
-                LnoclWarning,
-                stacklevel=5,
+                "round; crop it, or give pad to enlarge the grid"
             )
 
 
