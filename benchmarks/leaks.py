@@ -22,7 +22,7 @@ import pyopencl as cl
 
 import lnocl
 from lnocl.opencl.device import choose
-from lnocl.opencl.program import SOURCES, STEP_SOURCES, Program
+from lnocl.opencl.program import Program, forget_programs
 
 SOLVERS = ("sgm", "sgp")
 SHORT = 10
@@ -86,9 +86,9 @@ def deconvolve(solver, count, device, look):
 def build(solver, count, device, look):
     """Build the kernels so many times, looking after each; return the number of deconvolutions."""
     chosen, dtype = choose(device).device, np.dtype(np.float32)
-    sources = STEP_SOURCES if solver == "sgp" else SOURCES
     for done in range(1, count + 1):
-        Program(cl.Context([chosen]), (64, 64), dtype, sources=sources, n_images=2, n_stars=1)
+        Program(cl.Context([chosen]), (64, 64), dtype, n_stars=1)
+        forget_programs()
         look(done)
     return 0
 

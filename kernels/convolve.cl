@@ -3,7 +3,7 @@
  * Column 0 carries two Hermitian spectra, A (k_x = 0) and B (k_x = Nx / 2), as P = A + i B. Its
  * product with the two OTFs K_A and K_B needs the opposite point too:
  *     K_A A + i K_B B = (K_A + K_B) / 2 P(k) + (K_A - K_B) / 2 conj(P(-k)).
- * The first factor is kept in column 0 of the OTF, the second in `otf_edge`, [NY][2] reals an
+ * The first factor is kept in column 0 of the OTF, the second in `otf_edges`, [NY][2] reals an
  * image. Position t of the bit-reversed order has its opposite at MIRROR(t).
  */
 
@@ -18,23 +18,23 @@ INLINE cvec add_edge(
     return (cvec){a.re + FIRST_LANE * (re * x + im * y), a.im + FIRST_LANE * (im * x - re * y)};
 }
 
-/* otf = FFT(spectra) / (4 NX NY) along the columns, made from the row spectra of a PSF: 1 / (NX NY)
+/* otfs_image = FFT(spectra) / (4 NX NY) along the columns, made from the row spectra of a PSF: 1 / (NX NY)
  * for the inverse transforms, 1 / 4 for the two factors 2 that rfft_rows leaves. Column 0 and
- * otf_edge get (K_A + K_B) / 2 and (K_A - K_B) / 2.
- * spectra: one array, const. otf: N_IMAGES arrays, that of `image` is written, and so is its part
- * of otf_edge, [N_IMAGES][NY][2].
+ * otf_edges get (K_A + K_B) / 2 and (K_A - K_B) / 2.
+ * spectra: one array, const. otfs: n_images arrays; that of `image` is written, and its part
+ * of otf_edges, [n_images][NY][2].
  * Launch: up to COLUMN_BLOCKS groups. Out of place. Scratch: NY points.
  * Twin: reference.otf_columns.
  */
 KERNEL void otf_columns(
-    __global vec *restrict otf, __global real *restrict otf_edge,
+    __global vec *restrict otfs, __global real *restrict otf_edges,
     __global const vec *restrict spectra, const int image,
     __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
 {
     const real norm = (real)1 / 4 / NX / NY;
     SCRATCH vec *z = OWN_SCRATCH(scratch, NY);
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
-        __global vec *k = otf + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
+        __global vec *k = otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
         forward_columns(z, spectra + (size_t)block * ROWS * 2 * SIDE, column_roots);
         FOR_EACH(i, NY * 2 * SIDE)
             k[i] = z[i] * norm;
@@ -48,23 +48,23 @@ KERNEL void otf_columns(
                 __global real *column_0 = (__global real *)k + 2 * t * BLOCK;
                 column_0[0] = (a_re + b_re) * norm / 4;
                 column_0[BLOCK] = (a_im + b_im) * norm / 4;
-                otf_edge[2 * (image * NY + t)] = (a_re - b_re) * norm / 4;
-                otf_edge[2 * (image * NY + t) + 1] = (a_im - b_im) * norm / 4;
+                otf_edges[2 * (image * NY + t)] = (a_re - b_re) * norm / 4;
+                otf_edges[2 * (image * NY + t) + 1] = (a_im - b_im) * norm / 4;
             }
         }
         BARRIER;
     }
 }
 
-/* spectra_j <- IFFT(otf_j FFT(spectra_0)) along the columns: the row spectra of A_j f from f's.
- * spectra: N_IMAGES arrays, written but for their padding. otf: N_IMAGES arrays, const;
- * otf_edge: [N_IMAGES][NY][2].
+/* spectra_j <- IFFT(otfs_j FFT(spectra_0)) along the columns: the row spectra of A_j f from f's.
+ * spectra: n_images arrays, written but for their padding. otfs: n_images arrays, const;
+ * otf_edges: [n_images][NY][2].
  * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: 2 NY points.
  * Twin: reference.convolve_columns.
  */
 KERNEL void convolve_columns(
-    __global vec *restrict spectra, __global const vec *restrict otf,
-    __global const real *restrict otf_edge,
+    __global vec *restrict spectra, __global const vec *restrict otfs,
+    __global const real *restrict otf_edges, const int n_images,
     __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *source = OWN_SCRATCH(scratch, 2 * NY);
@@ -72,9 +72,9 @@ KERNEL void convolve_columns(
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
         forward_columns(source, columns, column_roots);
-        for (int image = 0; image < N_IMAGES; ++image) {
+        for (int image = 0; image < n_images; ++image) {
             __global const vec *k =
-                otf + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
+                otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
             for (int start = 0; start < NY; start += SPAN(NY)) {
                 FOR_EACH(piece, SPAN(NY) / LAST(NY) * SIDE) {
                     const int t = start + piece / SIDE * LAST(NY), lane = piece % SIDE;
@@ -83,7 +83,7 @@ KERNEL void convolve_columns(
                     for (int q = 0; q < LAST(NY); ++q)
                         a[q] = multiply(LOAD(source + lane, t + q), LOAD(k + lane, t + q));
                     if (block == 0 && lane == 0) {
-                        __global const real *edge = otf_edge + 2 * (image * NY + t);
+                        __global const real *edge = otf_edges + 2 * (image * NY + t);
                         UNROLL
                         for (int q = 0; q < LAST(NY); ++q)
                             a[q] = add_edge(a[q], edge[2 * q], edge[2 * q + 1], source, t + q);
@@ -102,30 +102,30 @@ KERNEL void convolve_columns(
     }
 }
 
-/* spectra_0 <- IFFT(sum_j conj(otf_j) FFT(spectra_j)) along the columns: the row spectrum of
+/* spectra_0 <- IFFT(sum_j conj(otfs_j) FFT(spectra_j)) along the columns: the row spectrum of
  * sum_j A_j^T (r_j - w_j) from those of the r_j - w_j. Shapes as in convolve_columns; array 0 alone
  * is written.
  * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: 2 NY points.
  * Twin: reference.correlate_columns.
  */
 KERNEL void correlate_columns(
-    __global vec *restrict spectra, __global const vec *restrict otf,
-    __global const real *restrict otf_edge,
+    __global vec *restrict spectra, __global const vec *restrict otfs,
+    __global const real *restrict otf_edges, const int n_images,
     __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *total = OWN_SCRATCH(scratch, 2 * NY);
     SCRATCH vec *z = total + 2 * NY * SIDE;
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
-        for (int image = 0; image < N_IMAGES; ++image) {
+        for (int image = 0; image < n_images; ++image) {
             __global const vec *k =
-                otf + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
+                otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
             forward_columns(z, columns + (size_t)image * SPECTRA_SIZE, column_roots);
             FOR_EACH(piece, NY * SIDE) {
                 const int t = piece / SIDE, lane = piece % SIDE;
                 cvec product = multiply_conjugate(LOAD(z + lane, t), LOAD(k + lane, t));
                 if (block == 0 && lane == 0) {
-                    __global const real *edge = otf_edge + 2 * (image * NY + t);
+                    __global const real *edge = otf_edges + 2 * (image * NY + t);
                     product = add_edge(product, edge[0], -edge[1], z, t);
                 }
                 if (image > 0)

@@ -10,7 +10,7 @@
  *   SCRATCH_IS_GLOBAL   0 or 1: where a block lies while it is transformed
  *   NX, NY          the grid, powers of two from 2 to 8192; BLOCK divides NX / 2 and NY / 2
  *   ROWS            rows that a block of spectra takes in memory: NY and some padding
- *   N_IMAGES, N_STARS
+ *   MAX_STARS       room for stars: the scene has no more than these
  *   HAS_MU, HAS_SMOOTHING, HAS_WEIGHTS, HAS_BACKGROUND_MAP, HAS_EXPOSURE_MAP    0 or 1: what the
  *                   scene has
  *   LEAST_MODEL     the division guard

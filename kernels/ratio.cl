@@ -52,31 +52,6 @@ INLINE vec divergence(const vec m, const vec r)
     return m * (r * (e * LN_2) + (1 - power) + power * w2 * (even + w * odd));
 }
 
-/* The stars whose images reach into a block of row pairs. */
-typedef struct {
-    int count;
-    int star[N_SUMS];
-    __global const vec *image[N_SUMS];
-} near_stars;
-
-INLINE near_stars stars_near(
-    __global const vec *star_images, __global const int *first_blocks, const int n_blocks,
-    const int image, const int block)
-{
-    near_stars near;
-    near.count = 0;
-    for (int s = 0; s < N_STARS; ++s) {
-        const int k = (block - first_blocks[s]) & (ROW_BLOCKS - 1);
-        if (k < n_blocks) {
-            near.star[near.count] = s;
-            near.image[near.count] =
-                star_images + ((size_t)(s * N_IMAGES + image) * n_blocks + k) * (NX * 2 * SIDE);
-            ++near.count;
-        }
-    }
-    return near;
-}
-
 /* How a pixel is known that was not observed: by its value, or by its exposure. */
 #define HAS_SENTINEL (HAS_WEIGHTS && !HAS_EXPOSURE_MAP)
 
@@ -105,42 +80,44 @@ INLINE vec ratio(vec g, const vec m, vec *term)
 }
 
 /* m_j = A_j f + sum_s c_s P_js + b_j;  r_j = w_j g_j / m_j;  spectra <- row spectra of r_j - w_j;
- * sums: J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j) and <P_js, r_j - w_j>.
- * spectra: N_IMAGES arrays, in: row spectra of A_j f, out: twice the row spectra of r_j - w_j.
- * images: N_IMAGES arrays of pixels, negative where not observed (HAS_WEIGHTS).
- * background: [N_IMAGES], or N_IMAGES arrays of pixels (HAS_BACKGROUND_MAP).
- * exposure: N_IMAGES arrays of pixels, w (HAS_EXPOSURE_MAP; then no image is negative).
- * star_images: [N_STARS][N_IMAGES] times star_blocks blocks of pixels, from block first_blocks_s on,
- * round the edge; beyond them P_js is 0. first_blocks, star_fluxes: [N_STARS].
- * sums: [ROW_BLOCKS][N_IMAGES][N_SUMS][2].
- * Launch: up to ROW_BLOCKS N_IMAGES groups. In place. Scratch: NX points.
+ * ratio_sums: J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j); star_sums: <P_js, r_j - w_j>.
+ * spectra: n_images arrays, in: row spectra of A_j f, out: twice the row spectra of r_j - w_j.
+ * images: n_images arrays of pixels, negative where not observed (HAS_WEIGHTS).
+ * background: [n_images], or n_images arrays of pixels (HAS_BACKGROUND_MAP).
+ * exposure: n_images arrays of pixels, w (HAS_EXPOSURE_MAP; then no image is negative).
+ * star_images: [n_stars][n_images], a window of star_blocks blocks of pixels each, see stars.cl.
+ * first_blocks, star_fluxes: [n_stars].
+ * ratio_sums: [ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
+ * Launch: up to ROW_BLOCKS n_images groups. In place. Scratch: NX points.
  * Twin: reference.ratio_rows.
  */
 KERNEL void ratio_rows(
-    __global vec *restrict spectra, __global real *restrict sums,
-    __global const vec *restrict images, __global const real *restrict background,
-    __global const vec *restrict exposure, __global const vec *restrict star_images,
-    __global const int *restrict first_blocks, const int star_blocks,
-    __global const real *restrict star_fluxes,
+    __global vec *restrict spectra, __global real *restrict ratio_sums,
+    __global real *restrict star_sums, __global const vec *restrict images,
+    __global const real *restrict background, __global const vec *restrict exposure,
+    __global const vec *restrict star_images, __global const int *restrict first_blocks,
+    __global const real *restrict star_fluxes, const int n_images, const int n_stars,
+    const int star_blocks,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
-    FOR_EACH_BLOCK(unit, ROW_BLOCKS * N_IMAGES) {
-        const int block = unit / N_IMAGES, image = unit % N_IMAGES;
+    FOR_EACH_BLOCK(unit, ROW_BLOCKS * n_images) {
+        const int block = unit / n_images, image = unit % n_images;
         __global vec *row_spectra = spectra + (size_t)image * SPECTRA_SIZE;
         const size_t at = (size_t)image * PIXELS_SIZE + (size_t)block * NX * 2 * SIDE;
         read_tiles(z, row_spectra, block);
         dit_inner(z, NX, row_roots);
-        const near_stars near = stars_near(star_images, first_blocks, star_blocks, image, block);
-        vec_sum objective = {0, 0}, products[N_SUMS];
-        for (int s = 0; s < N_STARS; ++s)
+        const near_stars near =
+            stars_near(first_blocks, n_stars, n_images, star_blocks, image, block);
+        vec_sum objective = {0, 0}, products[MAX_STARS];
+        for (int s = 0; s < near.count; ++s)
             products[s] = (vec_sum){0, 0};
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[8];
             load_inverse(a, z + lane, x, NX, row_roots);
-            vec terms = 0, part[N_SUMS];
+            vec terms = 0, part[MAX_STARS];
             for (int s = 0; s < near.count; ++s)
                 part[s] = 0;
             /* Left rolled: unrolled, the pixelwise work runs out of registers and is slower. */
@@ -154,7 +131,7 @@ KERNEL void ratio_rows(
                 a[q].im += background[image];
 #endif
                 for (int s = 0; s < near.count; ++s) {
-                    const cvec p = LOAD(near.image[s] + lane, pixel);
+                    const cvec p = LOAD(WINDOW_BLOCK(star_images, near.block[s]) + lane, pixel);
                     a[q].re += star_fluxes[near.star[s]] * p.re;
                     a[q].im += star_fluxes[near.star[s]] * p.im;
                 }
@@ -170,19 +147,18 @@ KERNEL void ratio_rows(
 #endif
                 terms += term.re + term.im;
                 for (int s = 0; s < near.count; ++s) {
-                    const cvec p = LOAD(near.image[s] + lane, pixel);
+                    const cvec p = LOAD(WINDOW_BLOCK(star_images, near.block[s]) + lane, pixel);
                     part[s] += p.re * a[q].re + p.im * a[q].im;
                 }
             }
             ACCUMULATE(objective, terms);
             for (int s = 0; s < near.count; ++s)
-                ACCUMULATE(products[near.star[s]], part[s]);
+                ACCUMULATE(products[s], part[s]);
             store_forward(z + lane, a, x, NX, row_roots);
         }
-        __global real *unit_sums = sums + 2 * (size_t)unit * N_SUMS;
-        store_pair(unit_sums, sum_group(sum_lanes(objective), shared));
-        for (int s = 0; s < N_STARS; ++s)
-            store_pair(unit_sums + 2 * (1 + s), sum_group(sum_lanes(products[s]), shared));
+        store_pair(ratio_sums + 2 * unit, sum_group(sum_lanes(objective), shared));
+        for (int s = 0; s < near.count; ++s)
+            store_pair(star_sums + 2 * near.block[s], sum_group(sum_lanes(products[s]), shared));
         BARRIER;
         dif_inner(z, NX, row_roots);
         write_tiles(row_spectra, z, block);

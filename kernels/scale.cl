@@ -5,31 +5,33 @@ INLINE vec not_below_0(const vec x)
     return x < 0 ? (vec)0 : x;
 }
 
-/* a = 1 / sum_j A_j^T w_j of a point. */
-INLINE cvec inverse_weight_at(__global const vec *inverse_weight, const int pixel)
+/* a = 1 / sum_j A_j^T w_j of a point: `from` is where its block and lane begin. */
+INLINE cvec inverse_weight_at(
+    __global const real *inverse_weight, const size_t from, const int pixel)
 {
 #if HAS_WEIGHTS
-    return LOAD(inverse_weight, pixel);
+    return LOAD((__global const vec *)inverse_weight + from, pixel);
 #else
-    return (cvec){(real)1 / N_IMAGES, (real)1 / N_IMAGES};
+    return (cvec){inverse_weight[0], inverse_weight[0]};
 #endif
 }
 
 /* f <- f (1 + a u) / (1 + (mu + curvature) f a), u = c + curvature f - slope,
  * c = sum_j A_j^T (r_j - w_j), a = 1 / sum_j A_j^T w_j, and 1 + a u not below 0;
- * spectra <- row spectrum of the new f; sums: sum f^2; c_s <- c_s star_corrections_s.
+ * spectra <- row spectrum of the new f; square_sums: sum f^2; c_s <- c_s star_corrections_s.
  * spectra: one array, in: row spectrum of c, out: twice the row spectrum of f.
- * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; where
- * there are none a = 1 / N_IMAGES). slope, curvature: one array of pixels each, const, those of f
- * (HAS_SMOOTHING; else they count as 0). sums: [ROW_BLOCKS][2] (HAS_MU).
- * star_fluxes, star_corrections: [N_STARS].
+ * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; else
+ * [1]). slope, curvature: one array of pixels each, const, those of f
+ * (HAS_SMOOTHING; else they count as 0). square_sums: [ROW_BLOCKS][2] (HAS_MU).
+ * star_fluxes, star_corrections: [n_stars].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.scale_rows.
  */
 KERNEL void scale_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
-    __global real *restrict sums, __global real *restrict star_fluxes,
-    __global const vec *restrict inverse_weight, __global const real *restrict star_corrections,
-    __global const vec *restrict slope, __global const vec *restrict curvature, const real mu, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global real *restrict square_sums, __global real *restrict star_fluxes,
+    __global const real *restrict inverse_weight, __global const real *restrict star_corrections,
+    __global const vec *restrict slope, __global const vec *restrict curvature, const real mu,
+    const int n_stars, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
@@ -48,7 +50,7 @@ KERNEL void scale_rows(
             for (int q = 0; q < OUTER(NX); ++q) {
                 const int pixel = q * INNER(NX) + x;
                 const cvec f = LOAD(source + lane, pixel);
-                const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel);
+                const cvec weight = inverse_weight_at(inverse_weight, at + lane, pixel);
                 const cvec curved = smoothing_at(curvature + at + lane, pixel);
 #if HAS_SMOOTHING
                 const cvec down = smoothing_at(slope + at + lane, pixel);
@@ -72,14 +74,14 @@ KERNEL void scale_rows(
             store_forward(z + lane, a, x, NX, row_roots);
         }
 #if HAS_MU
-        store_pair(sums + 2 * block, sum_group(sum_lanes(total), shared));
+        store_pair(square_sums + 2 * block, sum_group(sum_lanes(total), shared));
 #endif
         BARRIER;
         dif_inner(z, NX, row_roots);
         write_tiles(spectra, z, block);
     }
     if (get_group_id(0) == 0) {
-        FOR_EACH(s, N_STARS)
+        FOR_EACH(s, n_stars)
             star_fluxes[s] *= star_corrections[s];
     }
 }

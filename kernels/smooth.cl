@@ -77,14 +77,15 @@ INLINE vec psi(const vec t, const real delta)
 }
 
 /* slope = beta sum over the four neighbours of psi'(f - f'), curvature = beta sum of psi'(t) / t;
- * sums: beta sum of psi over all pairs.
+ * smooth_sums: beta sum of psi over all pairs.
  * extended: one array of pixels, const, f. slope, curvature: one array of pixels each, written.
- * sums: [ROW_BLOCKS][2].
+ * smooth_sums: [ROW_BLOCKS][2]. smoothing: beta. edge: delta.
  * Launch: up to ROW_BLOCKS groups. Out of place. Twin: reference.smooth.
  */
 KERNEL void smooth(
-    __global vec *restrict slope, __global vec *restrict curvature, __global real *restrict sums,
-    __global const vec *restrict extended, const real beta, const real delta)
+    __global vec *restrict slope, __global vec *restrict curvature,
+    __global real *restrict smooth_sums, __global const vec *restrict extended,
+    const real smoothing, const real edge)
 {
     SHARED_SUMS(shared);
     __global const real *pixels = (__global const real *)extended;
@@ -99,23 +100,23 @@ KERNEL void smooth(
             const vec above = lanes_above(pixels, block, x, 1, lane * LANES);
             const vec below = lanes_below(pixels, block, x, 0, lane * LANES);
             cvec s = {0, 0}, c = {0, 0};
-            add_pair(&s.re, &c.re, f.re - left.re, delta);
-            add_pair(&s.im, &c.im, f.im - left.im, delta);
-            add_pair(&s.re, &c.re, f.re - right.re, delta);
-            add_pair(&s.im, &c.im, f.im - right.im, delta);
-            add_pair(&s.re, &c.re, f.re - above, delta);
-            add_pair(&s.im, &c.im, f.im - f.re, delta);
-            add_pair(&s.re, &c.re, f.re - f.im, delta);
-            add_pair(&s.im, &c.im, f.im - below, delta);
-            const cvec scaled_slope = {beta * s.re, beta * s.im};
-            const cvec scaled_curvature = {beta * c.re, beta * c.im};
+            add_pair(&s.re, &c.re, f.re - left.re, edge);
+            add_pair(&s.im, &c.im, f.im - left.im, edge);
+            add_pair(&s.re, &c.re, f.re - right.re, edge);
+            add_pair(&s.im, &c.im, f.im - right.im, edge);
+            add_pair(&s.re, &c.re, f.re - above, edge);
+            add_pair(&s.im, &c.im, f.im - f.re, edge);
+            add_pair(&s.re, &c.re, f.re - f.im, edge);
+            add_pair(&s.im, &c.im, f.im - below, edge);
+            const cvec scaled_slope = {smoothing * s.re, smoothing * s.im};
+            const cvec scaled_curvature = {smoothing * c.re, smoothing * c.im};
             STORE(slope + at + lane, x, scaled_slope);
             STORE(curvature + at + lane, x, scaled_curvature);
             ACCUMULATE(
-                total, beta * (psi(f.re - right.re, delta) + psi(f.im - right.im, delta)
-                               + psi(f.re - f.im, delta) + psi(f.im - below, delta)));
+                total, smoothing * (psi(f.re - right.re, edge) + psi(f.im - right.im, edge)
+                               + psi(f.re - f.im, edge) + psi(f.im - below, edge)));
         }
-        store_pair(sums + 2 * block, sum_group(sum_lanes(total), shared));
+        store_pair(smooth_sums + 2 * block, sum_group(sum_lanes(total), shared));
     }
 }
 

@@ -15,15 +15,15 @@ INLINE vec shifted_scaling(
  * Made twice, from what it is made of: to write it and read it back is slower.
  */
 INLINE cvec scaling_at(
-    const cvec f, __global const vec *shift, __global const vec *inverse_weight,
-    __global const vec *curvature, const int pixel, const real mu)
+    const cvec f, __global const vec *shift, __global const real *inverse_weight,
+    __global const vec *curvature, const size_t from, const int pixel, const real mu)
 {
-    const cvec seen = LOAD(shift, pixel);
-    const cvec weight = inverse_weight_at(inverse_weight, pixel);
-    const cvec curved = smoothing_at(curvature, pixel);
+    const cvec z = LOAD(shift + from, pixel);
+    const cvec weight = inverse_weight_at(inverse_weight, from, pixel);
+    const cvec curved = smoothing_at(curvature + from, pixel);
     return (cvec){
-        shifted_scaling(f.re, seen.re, weight.re, curved.re, mu),
-        shifted_scaling(f.im, seen.im, weight.im, curved.im, mu)
+        shifted_scaling(f.re, z.re, weight.re, curved.re, mu),
+        shifted_scaling(f.im, z.im, weight.im, curved.im, mu)
     };
 }
 
@@ -40,19 +40,19 @@ INLINE vec next_gradient(const vec correction, const vec f, const vec slope, con
 }
 
 /* gradient' = mu f + slope - c, c = sum_j A_j^T (r_j - w_j);
- * sums: <D y, s> and <D y, D y>, y = gradient' - gradient, s = f - previous,
+ * change_sums: <D y, s> and <D y, D y>, y = gradient' - gradient, s = f - previous,
  * D = (f + shift) a / (1 + (mu + curvature) (f + shift) a), a = 1 / sum_j A_j^T w_j.
  * spectra: one array, const, row spectrum of c. gradient: one array of pixels, updated. extended
- * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (HAS_WEIGHTS; where
- * there are none a = 1 / N_IMAGES). slope, curvature: one array of pixels each, const, those of f
- * (HAS_SMOOTHING; else they count as 0). sums: [ROW_BLOCKS][2][2].
+ * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (HAS_WEIGHTS; else
+ * [1]). slope, curvature: one array of pixels each, const, those of f (HAS_SMOOTHING; else they
+ * count as 0). change_sums: [ROW_BLOCKS][2][2].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.gradient_rows.
  */
 KERNEL void gradient_rows(
-    __global const vec *restrict spectra, __global real *restrict sums,
+    __global const vec *restrict spectra, __global real *restrict change_sums,
     __global vec *restrict gradient, __global const vec *restrict extended,
     __global const vec *restrict previous, __global const vec *restrict shift,
-    __global const vec *restrict inverse_weight,
+    __global const real *restrict inverse_weight,
     __global const vec *restrict slope, __global const vec *restrict curvature, const real mu,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
@@ -75,9 +75,8 @@ KERNEL void gradient_rows(
                 const cvec before = LOAD(previous + at + lane, pixel);
                 const cvec g = LOAD(gradient + at + lane, pixel);
                 const cvec down = smoothing_at(slope + at + lane, pixel);
-                const cvec d = scaling_at(
-                    f, shift + at + lane, inverse_weight + at + lane, curvature + at + lane, pixel,
-                    mu);
+                const cvec d =
+                    scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu);
                 const cvec next = {
                     next_gradient(a[q].re, f.re, down.re, mu),
                     next_gradient(a[q].im, f.im, down.im, mu)
@@ -90,37 +89,41 @@ KERNEL void gradient_rows(
             ACCUMULATE(change_step, step_part);
             ACCUMULATE(change_change, change_part);
         }
-        store_pair(sums + 4 * block, sum_group(sum_lanes(change_step), shared));
-        store_pair(sums + 4 * block + 2, sum_group(sum_lanes(change_change), shared));
+        store_pair(change_sums + 4 * block, sum_group(sum_lanes(change_step), shared));
+        store_pair(change_sums + 4 * block + 2, sum_group(sum_lanes(change_change), shared));
         BARRIER;
     }
 }
 
 /* d = P(f - alpha D gradient) - f, P the projection on f >= 0; extended = f + share d;
- * spectra <- row spectrum of extended; sums: <gradient, d> and <reach_s, d>;
- * squares: sum extended^2.
+ * spectra <- row spectrum of extended; step_sums: <gradient, d>;
+ * coupling_sums: <cross_information_s, d>; square_sums: sum extended^2.
  * spectra: one array, out: twice the row spectrum. extended: one array of pixels, written.
  * previous (f), gradient, shift: one each, const; inverse_weight, curvature: as for gradient_rows,
- * which has D. cross_information: N_STARS arrays of pixels. sums: [ROW_BLOCKS][N_SUMS][2]; squares:
- * [ROW_BLOCKS][2] (HAS_MU).
+ * which has D. cross_information: [n_stars], a window of cross_blocks blocks of pixels each, see
+ * stars.cl; cross_first_blocks: [n_stars]; coupling_sums: [n_stars][cross_blocks][2].
+ * step_sums, square_sums (HAS_MU): [ROW_BLOCKS][2].
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.step_rows.
  */
 KERNEL void step_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
-    __global real *restrict sums, __global real *restrict squares,
+    __global real *restrict step_sums, __global real *restrict coupling_sums,
+    __global real *restrict square_sums,
     __global const vec *restrict previous, __global const vec *restrict gradient,
-    __global const vec *restrict shift, __global const vec *restrict inverse_weight,
+    __global const vec *restrict shift, __global const real *restrict inverse_weight,
     __global const vec *restrict curvature, __global const vec *restrict cross_information,
-    const real mu, const real alpha, const real share,
+    __global const int *restrict cross_first_blocks, const real mu, const real alpha,
+    const real share, const int n_stars, const int cross_blocks,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
     FOR_EACH_BLOCK(block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
-        vec_sum totals[N_SUMS], square_total = {0, 0};
-        for (int i = 0; i < N_SUMS; ++i)
-            totals[i] = (vec_sum){0, 0};
+        const near_stars near = stars_near(cross_first_blocks, n_stars, 1, cross_blocks, 0, block);
+        vec_sum slope_total = {0, 0}, square_total = {0, 0}, couplings[MAX_STARS];
+        for (int s = 0; s < near.count; ++s)
+            couplings[s] = (vec_sum){0, 0};
         /* A pass of its own over the pixels in their order, which prefetching follows: inside the
          * transform they come from too many places at once.
          */
@@ -128,8 +131,8 @@ KERNEL void step_rows(
             const int pixel = piece / SIDE, lane = piece % SIDE;
             const cvec f = LOAD(previous + at + lane, pixel);
             const cvec g = LOAD(gradient + at + lane, pixel);
-            const cvec scale = scaling_at(
-                f, shift + at + lane, inverse_weight + at + lane, curvature + at + lane, pixel, mu);
+            const cvec scale =
+                scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu);
             const cvec d = {
                 not_below_0(f.re - alpha * scale.re * g.re) - f.re,
                 not_below_0(f.im - alpha * scale.im * g.im) - f.im
@@ -137,10 +140,11 @@ KERNEL void step_rows(
             /* f + d is not below 0 but for rounding. */
             const cvec trial = {not_below_0(f.re + share * d.re), not_below_0(f.im + share * d.im)};
             STORE(extended + at + lane, pixel, trial);
-            ACCUMULATE(totals[0], g.re * d.re + g.im * d.im);
-            for (int s = 0; s < N_STARS; ++s) {
-                const cvec r = LOAD(cross_information + (size_t)s * PIXELS_SIZE + at + lane, pixel);
-                ACCUMULATE(totals[1 + s], r.re * d.re + r.im * d.im);
+            ACCUMULATE(slope_total, g.re * d.re + g.im * d.im);
+            for (int s = 0; s < near.count; ++s) {
+                const cvec r =
+                    LOAD(WINDOW_BLOCK(cross_information, near.block[s]) + lane, pixel);
+                ACCUMULATE(couplings[s], r.re * d.re + r.im * d.im);
             }
 #if HAS_MU
             ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
@@ -154,10 +158,12 @@ KERNEL void step_rows(
                 a[q] = LOAD(extended + at + lane, q * INNER(NX) + x);
             store_forward(z + lane, a, x, NX, row_roots);
         }
-        for (int i = 0; i < N_SUMS; ++i)
-            store_pair(sums + 2 * (N_SUMS * block + i), sum_group(sum_lanes(totals[i]), shared));
+        store_pair(step_sums + 2 * block, sum_group(sum_lanes(slope_total), shared));
+        for (int s = 0; s < near.count; ++s)
+            store_pair(
+                coupling_sums + 2 * near.block[s], sum_group(sum_lanes(couplings[s]), shared));
 #if HAS_MU
-        store_pair(squares + 2 * block, sum_group(sum_lanes(square_total), shared));
+        store_pair(square_sums + 2 * block, sum_group(sum_lanes(square_total), shared));
 #endif
         BARRIER;
         dif_inner(z, NX, row_roots);

@@ -73,49 +73,52 @@ INLINE void store_pair(__global real *out, const real_sum total)
     }
 }
 
-/* This item's share of the sum of n pairs, `stride` reals apart. */
-INLINE real_sum sum_pairs(__global const real *pairs, const int n, const int stride)
+/* This item's share of the sum of n pairs. */
+INLINE real_sum sum_pairs(__global const real *pairs, const int n)
 {
     real_sum all = {0, 0};
     for (int i = ITEM; i < n; i += GROUP) {
-        const real_sum pair = {pairs[i * stride], pairs[i * stride + 1]};
+        const real_sum pair = {pairs[2 * i], pairs[2 * i + 1]};
         MERGE(all, pair);
     }
     return all;
 }
 
-#define N_SUMS (1 + N_STARS)
-
-/* objective = sum of the data terms + mu / 2 sum f^2 + the edge-preserving term;
- * star_corrections_s = 1 + sum <P_js, r_j - w_j> / star_weights_s, not below 0 (negative PSF
- * pixels).
+/* J_0 = sum of the data terms; objective = J_0 + mu / 2 sum f^2 + the edge-preserving term;
+ * star_totals_s = sum_j <P_js, r_j - w_j>; star_corrections_s = 1 + star_totals_s / star_weights_s,
+ * not below 0 (negative PSF pixels).
  * objectives: [iterations][2], a compensated pair each; entry `iteration` is written.
- * ratio_sums: [ROW_BLOCKS][N_IMAGES][N_SUMS][2]; square_sums (HAS_MU), smooth_sums
- * (HAS_SMOOTHING): [ROW_BLOCKS][2].
- * star_corrections, star_weights: [N_STARS].
+ * data_term: [2], J_0. star_totals: [n_stars][2]. star_corrections, star_weights: [n_stars].
+ * ratio_sums: [ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
+ * square_sums (HAS_MU), smooth_sums (HAS_SMOOTHING): [ROW_BLOCKS][2].
  * Launch: one group. Out of place. Twin: reference.collect_sums.
  */
 KERNEL void collect_sums(
-    __global real *restrict objectives, __global real *restrict star_corrections,
-    __global const real *restrict ratio_sums, __global const real *restrict square_sums,
-    __global const real *restrict smooth_sums, __global const real *restrict star_weights, const real mu, const int iteration)
+    __global real *restrict objectives, __global real *restrict data_term,
+    __global real *restrict star_totals, __global real *restrict star_corrections,
+    __global const real *restrict ratio_sums, __global const real *restrict star_sums,
+    __global const real *restrict square_sums, __global const real *restrict smooth_sums,
+    __global const real *restrict star_weights, const real mu, const int n_images,
+    const int n_stars, const int star_blocks, const int iteration)
 {
     SHARED_SUMS(shared);
-    const int n = ROW_BLOCKS * N_IMAGES;
-    real_sum objective = sum_group(sum_pairs(ratio_sums, n, 2 * N_SUMS), shared);
+    real_sum objective = sum_group(sum_pairs(ratio_sums, ROW_BLOCKS * n_images), shared);
+    store_pair(data_term, objective);
 #if HAS_MU
-    real_sum squares = sum_group(sum_pairs(square_sums, ROW_BLOCKS, 2), shared);
+    real_sum squares = sum_group(sum_pairs(square_sums, ROW_BLOCKS), shared);
     squares.sum *= mu / 2;
     squares.lost *= mu / 2;
     MERGE(objective, squares);
 #endif
 #if HAS_SMOOTHING
-    const real_sum smooth = sum_group(sum_pairs(smooth_sums, ROW_BLOCKS, 2), shared);
+    const real_sum smooth = sum_group(sum_pairs(smooth_sums, ROW_BLOCKS), shared);
     MERGE(objective, smooth);
 #endif
     store_pair(objectives + 2 * iteration, objective);
-    for (int s = 0; s < N_STARS; ++s) {
-        const real_sum star = sum_group(sum_pairs(ratio_sums + 2 * (1 + s), n, 2 * N_SUMS), shared);
+    const int n_units = n_images * star_blocks;
+    for (int s = 0; s < n_stars; ++s) {
+        const real_sum star = sum_group(sum_pairs(star_sums + 2 * s * n_units, n_units), shared);
+        store_pair(star_totals + 2 * s, star);
         const real correction = 1 + (star.sum + star.lost) / star_weights[s];
         if (ITEM == 0)
             star_corrections[s] = correction < 0 ? 0 : correction;

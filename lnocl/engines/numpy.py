@@ -6,8 +6,8 @@ import numpy as np
 
 from lnocl.errors import refuse_not_finite
 from lnocl.reference.convolve import convolve_columns, correlate_columns, otf_columns
-from lnocl.reference.fft import irfft_rows, rfft_rows
 from lnocl.reference.ratio import ratio_rows
+from lnocl.reference.rows import irfft_rows, rfft_rows
 from lnocl.reference.scale import scale_rows
 from lnocl.reference.smooth import smooth
 from lnocl.reference.step import gradient_rows, step_rows
@@ -32,6 +32,8 @@ class ReferenceEngine:
 
     def __init__(self, scene: Scene, scaling: Scaling | None = None) -> None:
         self.scene, self.scaling = scene, scaling
+        if scaling is not None:
+            self.set_scaling(scaling)
         self._images = scene.images()
         background = scene.background()
         self._background = background if background.ndim == 3 else background[:, None, None]
@@ -44,6 +46,8 @@ class ReferenceEngine:
     def set_scaling(self, scaling: Scaling) -> None:
         """Measure steps with this from now on."""
         self.scaling = scaling
+        stamps = [stamp.on_grid(self.scene.grid) for stamp in scaling.cross_information]
+        self._cross_information = np.array(stamps).reshape(len(stamps), *self.scene.grid)
 
     def move_stars(self) -> None:
         """Put the stars where the scene has them now."""
@@ -141,7 +145,7 @@ class ReferenceEngine:
             self._gradient,
             self.scaling.shift,
             self._inverse_weight,
-            self.scaling.cross_information,
+            self._cross_information,
             self.scene.mu,
             alpha,
             share,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
@@ -71,6 +72,12 @@ def describe(device: cl.Device) -> str:
     """Return the device's name, platform and driver in one line."""
     name, platform = " ".join(device.name.split()), device.platform.name.strip()
     return f"{name} ({platform}, {device.driver_version})"
+
+
+@functools.cache
+def context_of(device: cl.Device) -> cl.Context:
+    """Return the context of a device, one for the whole process."""
+    return cl.Context([device])
 
 
 def spec_of(device: cl.Device) -> str:

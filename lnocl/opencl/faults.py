@@ -75,9 +75,18 @@ def _guard(verb: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return verb(self, *arguments, **keywords)
         except (cl.Error, MemoryError) as error:
+            _forget_contexts()
             raise DeviceError(_explain(error, self)) from error
 
     return guard
+
+
+def _forget_contexts() -> None:
+    """Have later engines begin anew: the context of a device that failed may be lost."""
+    from lnocl.opencl import device, program  # which import this module
+
+    program.forget_programs()
+    device.context_of.cache_clear()
 
 
 def _explain(error: Exception, engine: OnDevice) -> str:

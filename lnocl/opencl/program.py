@@ -2,37 +2,62 @@
 
 from __future__ import annotations
 
+import os
+import re
+import weakref
+from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pyopencl as cl
 
-from lnocl.errors import DeviceError, warn
+from lnocl.errors import DeviceError
 from lnocl.opencl import kernel_cache
 from lnocl.opencl.device import describe, has_double
 from lnocl.opencl.faults import build_failure
-from lnocl.process import ignored_warnings
+from lnocl.process import LOCK, ignored_warnings
 
-# In the order in which they build on each other: the transforms by themselves; the split-gradient
-# method; and the scaled gradient projection method.
-TRANSFORMS = ("precision.cl", "complex.cl", "fft.cl", "rows.cl", "columns.cl")
-SOURCES = (*TRANSFORMS, "convolve.cl", "sums.cl", "ratio.cl", "smooth.cl", "scale.cl")
-STEP_SOURCES = (*SOURCES, "step.cl")
+# In the order in which they build on each other.
+SOURCES = (
+    "precision.cl",
+    "complex.cl",
+    "fft.cl",
+    "rows.cl",
+    "columns.cl",
+    "convolve.cl",
+    "sums.cl",
+    "stars.cl",
+    "ratio.cl",
+    "smooth.cl",
+    "scale.cl",
+    "step.cl",
+)
+
+# Rooms for stars that programs are built with: another star builds another program seldom.
+STAR_ROOMS = (8, 64, 512, 4096)
+
+# Built programs that a process holds, the last used; each takes some 3 MiB.
+MAX_PROGRAMS = 16
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """How the kernels are cut to a device; kernels/precision.cl says what each constant is.
+    """The cut of the kernels to a device; kernels/precision.cl explains each constant.
 
     Attributes
     ----------
     lanes, block, group, chunk : int
         Reals in a vector; columns transformed together; work-items that share a block; points
-        of a transform finished before the next are begun.
+        of a transform that are finished before the next ones.
     padding : int
-        Rows of padding behind a block of spectra, which keep neighbouring blocks from falling
-        on the same cache sets.
+        Rows of padding behind a block of spectra. They keep neighbouring blocks from falling on
+        the same cache sets.
+    scratch_is_global : bool
+        Whether a block lies in global memory while it is transformed, not in local memory.
     """
 
     lanes: int
@@ -40,6 +65,7 @@ class Tuning:
     group: int = 1
     chunk: int = 128
     padding: int = 16
+    scratch_is_global: bool = False
 
 
 def radices(n: int) -> tuple[int, int]:
@@ -60,9 +86,23 @@ def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
     most = min(grid) // 2
     if device.type & cl.device_type.CPU:
         lanes = min(32 // dtype.itemsize, most)  # 256 bits, benchmarks/tune.py
-        return Tuning(lanes=lanes, block=lanes)
-    group = max(1, min(128, min(grid) // 8, _power_of_2_up_to(device.max_work_group_size)))
-    return Tuning(lanes=1, block=min(8, most), group=group)
+        block, group = lanes, 1
+    else:
+        lanes, block = 1, min(8, most)
+        group = max(1, min(128, min(grid) // 8, _power_of_2_up_to(device.max_work_group_size)))
+    needed = local_bytes(grid, dtype, block, group)
+    return Tuning(lanes, block, group, scratch_is_global=needed > device.local_mem_size)
+
+
+def local_bytes(grid: tuple[int, int], dtype: np.dtype, block: int, group: int) -> int:
+    """Return the bytes of local memory of a work-group: its block, and a sum for each item."""
+    sums = 2 * group if group > 1 else 0
+    return (scratch_points(grid) * 2 * block + sums) * dtype.itemsize
+
+
+def scratch_points(grid: tuple[int, int]) -> int:
+    """Return the points of a block that a work-group holds while it transforms."""
+    return max(grid[1], 2 * grid[0])
 
 
 def _power_of_2_up_to(n: int) -> int:
@@ -70,7 +110,10 @@ def _power_of_2_up_to(n: int) -> int:
 
 
 class Program:
-    """The kernels built for one device, grid and scene; each is fetched once.
+    """The kernels for one device, grid and scene.
+
+    A process builds each program once; every instance has kernels of its own, which hold their
+    own arguments.
 
     Parameters
     ----------
@@ -82,37 +125,31 @@ class Program:
         float32 or float64.
     tuning : Tuning, optional
         By default that of `tune`.
-    sources : tuple of str, optional
-        Files of kernels to build, `SOURCES`, `TRANSFORMS` or `STEP_SOURCES`.
-    n_images, n_stars : int, optional
-        What the scene has.
+    n_stars : int, optional
+        Stars of the scene, at most 4096; the program has room for more.
     has_mu, has_smoothing, has_weights, has_background_map, has_exposure_map : bool, optional
-        What the scene has.
+        Parts that the scene has.
     least_model : float, optional
         The division guard.
 
     Attributes
     ----------
-    kernels : dict of str to pyopencl.Kernel
-        Every kernel of the program by name.
     options : list of str
         The build options.
+    arguments : dict of str to tuple of str
+        The names of each kernel's arguments, in the order of its declaration.
     row_radices, column_radices : tuple of int
         Radices of the outer and the last pass.
     rows : int
         Rows that a block of spectra takes in memory.
-    scratch_points : int
-        Points of a block that a work-group keeps while it transforms.
-    scratch_is_global : bool
-        Whether a block is too large for the device's local memory.
-    most_groups : int
+    max_groups : int
         Work-groups that have a scratch in global memory; 0 where it is local.
 
     Raises
     ------
     DeviceError
-        Where the device has no double precision and float64 is asked of it, or where the
-        device's compiler fails.
+        The device has no double precision and float64 is asked of it, its compiler fails, or the
+        scene has more than 4096 stars.
     """
 
     def __init__(
@@ -121,9 +158,7 @@ class Program:
         grid: tuple[int, int],
         dtype: np.dtype,
         tuning: Tuning | None = None,
-        sources: tuple[str, ...] = SOURCES,
         *,
-        n_images: int = 1,
         n_stars: int = 0,
         has_mu: bool = False,
         has_smoothing: bool = False,
@@ -134,7 +169,6 @@ class Program:
     ) -> None:
         device = context.devices[0]
         self.context, self.grid, self.dtype = context, grid, dtype
-        self.n_images, self.n_stars = n_images, n_stars
         if dtype == np.float64 and not has_double(device):
             raise DeviceError(
                 f"{describe(device)} has no double precision; take precision single, or another "
@@ -142,9 +176,7 @@ class Program:
             )
         self.tuning = tuning or tune(device, dtype, grid)
         self.rows = grid[0] + self.tuning.padding
-        self.scratch_points = max(grid[1], 2 * grid[0])
-        self.scratch_is_global = self.scratch_bytes > device.local_mem_size
-        self.most_groups = device.max_compute_units if self.scratch_is_global else 0
+        self.max_groups = device.max_compute_units if self.tuning.scratch_is_global else 0
         self.row_radices = radices(grid[1])
         self.column_radices = radices(grid[0])
         constants = {
@@ -158,12 +190,11 @@ class Program:
             "COLUMN_OUTER": self.column_radices[0],
             "COLUMN_LAST": self.column_radices[1],
             "CHUNK": self.tuning.chunk,
-            "SCRATCH_IS_GLOBAL": int(self.scratch_is_global),
+            "SCRATCH_IS_GLOBAL": int(self.tuning.scratch_is_global),
             "NX": grid[1],
             "NY": grid[0],
             "ROWS": self.rows,
-            "N_IMAGES": n_images,
-            "N_STARS": n_stars,
+            "MAX_STARS": _room_for(n_stars),
             "HAS_MU": int(has_mu),
             "HAS_SMOOTHING": int(has_smoothing),
             "HAS_WEIGHTS": int(has_weights),
@@ -173,12 +204,18 @@ class Program:
         }
         definitions = [f"-D{name}={value}" for name, value in constants.items()]
         self.options = ["-cl-std=CL1.2", "-w", *definitions]
-        text = source(sources)
-        self.kernels = kernel_cache.build(
-            self,
-            "\n".join([describe(device), *self.options, text]),
-            lambda: _build(context, text, self.options),
-        )
+        text = source()
+        self._built = _build(context, text, tuple(self.options))
+        self.arguments = _arguments(text, self._built.kernel_names)
+        self._kernels: dict[str, cl.Kernel] = {}
+        weakref.finalize(self, _Built.store, self._built)
+
+    def kernel(self, name: str) -> cl.Kernel:
+        """Return a kernel, always the same one."""
+        if name not in self._kernels:
+            self._kernels[name] = cl.Kernel(self._built.program, name)
+            self._built.used.add(name)
+        return self._kernels[name]
 
     @property
     def row_blocks(self) -> int:
@@ -193,40 +230,101 @@ class Program:
     @property
     def scratch_bytes(self) -> int:
         """Bytes that a work-group needs for its block."""
-        return self.scratch_points * 2 * self.tuning.block * self.dtype.itemsize
+        return scratch_points(self.grid) * 2 * self.tuning.block * self.dtype.itemsize
 
 
-def source(names: tuple[str, ...] = SOURCES) -> str:
-    """Return the OpenCL source of some or all files of kernels."""
-    folder = resources.files("lnocl.kernels")
-    return "".join(
-        f'#line 1 "{name}"\n{(folder / name).read_text(encoding="ascii")}' for name in names
+def _room_for(n_stars: int) -> int:
+    for room in STAR_ROOMS:
+        if n_stars <= room:
+            return room
+    raise DeviceError(
+        f"{n_stars} stars are too many for the kernels, which have room for {STAR_ROOMS[-1]}: "
+        "give fewer stars, or take engine numpy"
     )
 
 
-def _build(context: cl.Context, text: str, options: list[str]) -> dict[str, cl.Kernel]:
-    """Return the kernels; caches that cannot be read or written are passed over."""
-    try:
-        return _try_to_build(context, text, options)
-    except DeviceError:
-        raise
-    except Exception as error:  # a cache may raise anything
-        warn(
-            f"the kernels that PyOpenCL keeps cannot be used ({type(error).__name__}: {error}), "
-            "and are made anew; remove the folders pyopencl and pytools from ~/.cache or from "
-            "XDG_CACHE_HOME, or make them writable"
-        )
-    with kernel_cache.fresh():
-        return _try_to_build(context, text, options)
+def source() -> str:
+    """Return the OpenCL source of all kernels."""
+    folder = resources.files("lnocl.kernels")
+    return "".join(
+        f'#line 1 "{name}"\n{(folder / name).read_text(encoding="ascii")}' for name in SOURCES
+    )
 
 
-def _try_to_build(context: cl.Context, text: str, options: list[str]) -> dict[str, cl.Kernel]:
+def _arguments(text: str, kernel_names: list[str]) -> Mapping[str, tuple[str, ...]]:
+    """Return the names of the arguments that the source declares for each kernel."""
+    declared = dict(re.findall(r"^KERNEL void (\w+)\(([^)]*)\)", text, re.MULTILINE))
+    return {
+        name: tuple(re.findall(r"(\w+)\s*(?:,|$)", declared[name].strip())) for name in kernel_names
+    }
+
+
+class _Built:
+    """A built program, and the file of its binary."""
+
+    def __init__(self, program: cl.Program, file: Path, binary: bytes) -> None:
+        self.program, self._file, self._binary = program, file, binary
+        self._process = os.getpid()
+        # Not by all_kernels: its kernels are retained once too often, and stay with their program.
+        self.kernel_names = str(program.get_info(cl.program_info.KERNEL_NAMES)).split(";")
+        self.used: set[str] = set()
+        self._looked_at: set[str] = set()
+
+    def store(self) -> None:
+        """Store the binary, if it has more: PoCL compiles each kernel as it is first launched."""
+        if self.used <= self._looked_at or os.getpid() != self._process:
+            return
+        with LOCK:
+            self._looked_at |= self.used
+            (binary,) = cast(list[bytes], self.program.get_info(cl.program_info.BINARIES))
+            if binary != self._binary and kernel_cache.can_write(self._file.parent):
+                kernel_cache.write(self._file, binary)
+                self._binary = binary
+
+
+_programs: OrderedDict[tuple[cl.Context, str, tuple[str, ...]], _Built] = OrderedDict()
+
+
+def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
+    """Return a program that the process has, that a file holds, or that is compiled now."""
+    key = context, text, options
+    with LOCK:
+        if key not in _programs:
+            name = "\n".join([describe(context.devices[0]), *options, text])
+            file = kernel_cache.file_of(name)
+            _programs[key] = _load(context, options, file) or _compile(context, text, options, file)
+            while len(_programs) > MAX_PROGRAMS:
+                _programs.popitem(last=False)
+        _programs.move_to_end(key)
+        return _programs[key]
+
+
+def forget_programs() -> None:
+    """Let all programs go, as after a fault of a device, whose context may be lost."""
+    with LOCK:
+        _programs.clear()
+
+
+def _load(context: cl.Context, options: tuple[str, ...], file: Path) -> _Built | None:
+    binary = kernel_cache.read(file)
+    if binary is None:
+        return None
     try:
-        with ignored_warnings(cl.CompilerWarning):
-            built = cl.Program(context, text).build(options)
-            # Not by all_kernels: its kernels are retained once too often, and kept with their
-            # program.
-            names = str(built.get_info(cl.program_info.KERNEL_NAMES)).split(";")
-            return {name: cl.Kernel(built, name) for name in names}
+        program = cl.Program(context, context.devices, [binary])
+        return _Built(_quietly_built(program, options), file, binary)
+    except cl.Error:
+        kernel_cache.discard(file)
+        return None
+
+
+def _compile(context: cl.Context, text: str, options: tuple[str, ...], file: Path) -> _Built:
+    try:
+        return _Built(_quietly_built(cl.Program(context, text), options), file, b"")
     except cl.RuntimeError as error:
         raise build_failure(describe(context.devices[0]), error) from error
+
+
+def _quietly_built(program: cl.Program, options: tuple[str, ...]) -> cl.Program:
+    with ignored_warnings():
+        program.int_ptr  # noqa: B018  makes PyOpenCL build without its own cache, and warn of it
+        return program.build(list(options))

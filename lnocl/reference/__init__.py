@@ -1,12 +1,13 @@
 """The NumPy twin of every kernel, in float64, under the kernel's name.
 
 A twin takes and returns arrays in their natural order, where the kernel has its own layout
-(`lnocl.opencl.fft`). Row spectra are half spectra along x alone, shape (..., Ny, Nx // 2 + 1).
+(`lnocl.opencl.layout`). Row spectra are half spectra along x alone, shape (..., Ny, Nx // 2 + 1).
 """
 
+from lnocl.reference.columns import fft_columns, ifft_columns
 from lnocl.reference.convolve import convolve_columns, correlate_columns, otf_columns
-from lnocl.reference.fft import fft_columns, ifft_columns, irfft_rows, rfft_rows
 from lnocl.reference.ratio import ratio_rows
+from lnocl.reference.rows import irfft_rows, rfft_rows
 from lnocl.reference.scale import scale_rows
 from lnocl.reference.smooth import smooth
 from lnocl.reference.step import gradient_rows, step_rows

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lnocl.reference.fft import ComplexArray, fft_columns, ifft_columns
+from lnocl.reference.columns import fft_columns, ifft_columns
+from lnocl.reference.rows import ComplexArray
 
 
 def otf_columns(row_spectra: ComplexArray) -> ComplexArray:

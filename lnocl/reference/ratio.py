@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import xlog1py
 
-from lnocl.reference.fft import ComplexArray, irfft_rows, rfft_rows
+from lnocl.reference.rows import ComplexArray, irfft_rows, rfft_rows
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import LEAST_MODEL
 

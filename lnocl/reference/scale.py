@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lnocl.reference.fft import ComplexArray, irfft_rows, rfft_rows
+from lnocl.reference.rows import ComplexArray, irfft_rows, rfft_rows
 from lnocl.scene.observation import Array
 
 

@@ -16,6 +16,7 @@ from lnocl.errors import refuse_not_finite
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
+from lnocl.scene.shifting import Stamp
 from lnocl.solvers import SOLVERS
 from lnocl.solvers.sgp import Steps
 
@@ -140,7 +141,10 @@ class Run:
             "positions": self.scene.stars,
         }
         if scaling is not None:
-            state |= {"shift": scaling.shift, "cross_information": scaling.cross_information}
+            state |= {
+                "shift": scaling.shift,
+                "cross_information": np.array([s.values for s in scaling.cross_information]),
+            }
             state["star_information"] = scaling.star_information
         for values in state.values():
             refuse_not_finite(values.sum(initial=0.0, dtype=np.float64))
@@ -202,7 +206,9 @@ class Run:
         n, grid = self.scene.n_stars, self.scene.grid
         cross_information = state.get("cross_information", np.zeros(0)).reshape(n, *grid)
         information = state.get("star_information", np.zeros(0)).reshape(n, n)
-        return Scaling(state["shift"], information, cross_information)
+        return Scaling(
+            state["shift"], information, [Stamp(each, 0, 0) for each in cross_information]
+        )
 
     def _refine(self) -> None:
         """Move the stars to where the extended source of now makes them most likely."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import LEAST_MODEL, Scene
+from lnocl.scene.shifting import Stamp
 
 # What a pixel sees of star and background shifts its scaling by this share. With all of it the
 # empty sky takes up noise from the first steps on, without any it is stuck where it is 0: measured
@@ -42,14 +43,14 @@ class Scaling:
         stars and background.
     star_information : ndarray of float64, shape (n, n)
         Fisher information of the star fluxes, ``sum_j <P_js, w_j P_jt / m_j>`` at the start.
-    cross_information : ndarray of float64, shape (n, Ny, Nx)
+    cross_information : list of Stamp
         Fisher information between each star flux and the extended source,
         ``sum_j A_j^T (w_j P_js / m_j)`` at the start.
     """
 
     shift: Array
     star_information: Array
-    cross_information: Array
+    cross_information: list[Stamp]
 
     def star_step(self, fluxes: Array, gradient: Array, coupling: Array) -> Array:
         """Return the change of the star fluxes that follows a step d of the extended source.
@@ -176,12 +177,11 @@ def _make_scaling(
     ):
         total = _above_guard(light, others)
         np.divide(_weights_above_guard(weights, total), total, out=ratio)
-    cross_information = np.empty((scene.n_stars, *scene.grid))
-    for s, unit in enumerate(np.eye(scene.n_stars)):
+    cross_information = []
+    for unit in np.eye(scene.n_stars):
         lights = model.starlight(unit)
-        cross_information[s] = model.adjoint(
-            x * light for x, light in zip(ratios, lights, strict=True)
-        )
+        seen = model.adjoint(x * light for x, light in zip(ratios, lights, strict=True))
+        cross_information.append(Stamp(seen, 0, 0))
     information = sum(
         stars.information(x.ravel()) for x, stars in zip(ratios, model.stars, strict=True)
     )

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lnocl import reference
 from lnocl.errors import DeviceError
-from lnocl.opencl.fft import bit_reversed
+from lnocl.opencl.layout import bit_reversed
 from lnocl.verify.harness import KernelHarness, rounded
 
 # What a kernel made, and what its twin made of the same.
@@ -66,26 +66,27 @@ def relative(found: ArrayLike, expected: ArrayLike) -> float:
 
 def _run_rfft_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     out = harness.empty_spectra()
-    harness.launcher.rows("rfft_rows", out, harness.put_pixels(given.pixels))()
+    harness.launch("rfft_rows", spectra=out, pixels=harness.put_pixels(given.pixels))
     yield harness.take_spectra(out), reference.rfft_rows(given.pixels)
 
 
 def _run_irfft_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     out = harness.empty_pixels()
-    harness.launcher.rows("irfft_rows", out, harness.put_spectra(given.spectrum))()
+    harness.launch("irfft_rows", pixels=out, spectra=harness.put_spectra(given.spectrum))
     yield harness.take_pixels(out), reference.irfft_rows(given.spectrum)
 
 
 def _run_fft_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     out = harness.put(harness.layout.pack_columns(given.columns))
-    harness.launcher.columns("fft_columns", out)()
+    harness.launch("fft_columns", spectra=out)
     found = harness.layout.unpack_columns(harness.take(out, harness.layout.spectra_shape))
     yield found, reference.fft_columns(given.columns)[bit_reversed(harness.grid[0])]
 
 
 def _run_ifft_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    out = harness.put(harness.layout.pack_columns(given.columns[bit_reversed(harness.grid[0])]))
-    harness.launcher.columns("ifft_columns", out)()
+    order = bit_reversed(harness.grid[0])
+    out = harness.put(harness.layout.pack_columns(given.columns[order]))
+    harness.launch("ifft_columns", spectra=out)
     found = harness.layout.unpack_columns(harness.take(out, harness.layout.spectra_shape))
     yield found, reference.ifft_columns(given.columns)
 
@@ -94,31 +95,38 @@ def _run_otf_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     packed, edge = harness.otf_parts(reference.otf_columns(given.spectrum[0]))
     packed, edge = np.stack([packed] * given.p), np.stack([edge] * given.p)
     packed[:-1], edge[:-1] = 2.0, 2.0  # the other images' parts stay as they are
-    out, out_edge = harness.put(np.full(packed.shape, 2.0)), harness.put(np.full(edge.shape, 2.0))
-    harness.launcher.columns(
-        "otf_columns", out, out_edge, harness.put_spectra(given.spectrum), np.int32(given.p - 1)
-    )()
-    yield harness.take(out, packed.shape)[-1], packed[-1]
-    yield harness.take(out, packed.shape)[:-1], packed[:-1]
-    yield harness.take(out_edge, edge.shape), edge
+    otfs, edges = harness.put(np.full(packed.shape, 2.0)), harness.put(np.full(edge.shape, 2.0))
+    harness.launch(
+        "otf_columns",
+        otfs=otfs,
+        otf_edges=edges,
+        spectra=harness.put_spectra(given.spectrum),
+        image=given.p - 1,
+    )
+    yield harness.take(otfs, packed.shape)[-1], packed[-1]
+    yield harness.take(otfs, packed.shape)[:-1], packed[:-1]
+    yield harness.take(edges, edge.shape), edge
 
 
-def _put_otfs(harness: KernelHarness, given: SimpleNamespace) -> tuple[cl.Buffer, cl.Buffer]:
+def _put_otfs(harness: KernelHarness, given: SimpleNamespace) -> dict[str, cl.Buffer]:
     parts = [harness.otf_parts(otf) for otf in given.otfs]
-    return harness.put([columns for columns, _ in parts]), harness.put([edge for _, edge in parts])
+    return {
+        "otfs": harness.put([columns for columns, _ in parts]),
+        "otf_edges": harness.put([edge for _, edge in parts]),
+    }
 
 
 def _run_convolve_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     others = np.full((given.p - 1, *given.spectrum.shape[1:]), np.nan)
     out = harness.put_spectra([*given.spectrum, *others])
-    harness.launcher.columns("convolve_columns", out, *_put_otfs(harness, given))()
+    harness.launch("convolve_columns", spectra=out, **_put_otfs(harness, given))
     expected = _real_edges(reference.convolve_columns(given.spectrum[0], given.otfs))
     yield harness.take_spectra(out, given.p), expected
 
 
 def _run_correlate_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     out = harness.put_spectra(given.spectra)
-    harness.launcher.columns("correlate_columns", out, *_put_otfs(harness, given))()
+    harness.launch("correlate_columns", spectra=out, **_put_otfs(harness, given))
     found = harness.take_spectra(out, given.p)
     yield found[0], _real_edges(reference.correlate_columns(given.spectra, given.otfs))
     if not np.array_equal(found[1:], _real_edges(given.spectra[1:])):
@@ -140,34 +148,38 @@ def _run_ratio_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         given.star_images,
         given.star_fluxes,
     )
-    images, exposure = given.images, harness.put(np.zeros(1))
+    images, exposure = given.images, {}
     if given.has_exposure_map:
-        exposure = harness.put_pixels(given.weights)
+        exposure = {"exposure": harness.put_pixels(given.weights)}
     elif given.weights is not None:
         images = np.where(given.weights, given.images, -1.0)
     put = harness.put_pixels if given.background.size > given.p else harness.put
     out = harness.put_spectra(given.model_spectra)
-    sums = harness.empty_sums(1 + given.n, given.p)
-    stars = (
-        image[harness.layout.rows_of(first, given.star_blocks)]
-        for star_images, first in zip(given.star_images, given.first_blocks, strict=True)
-        for image in star_images
-    )
-    harness.launcher.rows(
+    sums = harness.put(np.full((harness.program.row_blocks * given.p, 2), np.nan))
+    sums_of_stars = harness.put(np.full((given.n, given.p * given.star_blocks, 2), np.nan))
+    harness.launch(
         "ratio_rows",
-        out,
-        sums,
-        harness.put_pixels(images),
-        put(given.background),
-        exposure,
-        harness.put_pixels(stars),
-        harness.put(given.first_blocks, np.int32),
-        np.int32(given.star_blocks),
-        harness.put(given.star_fluxes),
-        blocks=harness.program.row_blocks * given.p,
-    )()
+        spectra=out,
+        ratio_sums=sums,
+        star_sums=sums_of_stars,
+        images=harness.put_pixels(images),
+        background=put(given.background),
+        star_images=harness.put_windows(given.star_images, given),
+        first_blocks=harness.put(given.first_blocks, np.int32),
+        star_blocks=given.star_blocks,
+        star_fluxes=harness.put(given.star_fluxes),
+        **exposure,
+    )
     yield harness.take_spectra(out, given.p), _real_edges(spectra)
-    yield harness.take_sums(sums, 1 + given.n), np.array([objective, *star_sums])
+    yield harness.take_sums(sums, 1), np.array([objective])
+    yield _take_star_sums(harness, given, sums_of_stars), star_sums
+
+
+def _take_star_sums(harness: KernelHarness, given: SimpleNamespace, sums: cl.Buffer) -> NDArray:
+    """Return for each star the sum of the pairs that the blocks of its window left."""
+    if not given.n:
+        return np.zeros(0)
+    return harness.take(sums, (given.n, -1)).astype(float).sum(axis=1)
 
 
 def _run_scale_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
@@ -181,22 +193,19 @@ def _run_scale_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         given.slope,
         given.curvature,
     )
-    out, extended = (
-        harness.put_spectra(given.correction_spectra),
-        harness.put_pixels(given.extended),
-    )
-    sums, star_fluxes = harness.empty_sums(1), harness.put(given.star_fluxes)
-    harness.launcher.rows(
+    out = harness.put_spectra(given.correction_spectra)
+    extended = harness.put_pixels(given.extended)
+    sums, star_fluxes = harness.empty_sums(), harness.put(given.star_fluxes)
+    harness.launch(
         "scale_rows",
-        out,
-        extended,
-        sums,
-        star_fluxes,
-        _put_inverse_weight(harness, given),
-        harness.put(given.star_corrections),
-        *_put_smoothing(harness, given),
-        harness.dtype.type(given.mu),
-    )()
+        spectra=out,
+        extended=extended,
+        square_sums=sums,
+        star_fluxes=star_fluxes,
+        star_corrections=harness.put(given.star_corrections),
+        mu=given.mu,
+        **_put_weights(harness, given),
+    )
     yield harness.take_pixels(extended), scaled
     yield harness.take_spectra(out), spectrum
     yield harness.take(star_fluxes, -1), fluxes
@@ -206,9 +215,16 @@ def _run_scale_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 
 def _run_smooth(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     slope, curvature, value = reference.smooth(given.extended, given.smoothing, given.edge)
-    outs, sums = (harness.empty_pixels(), harness.empty_pixels()), harness.empty_sums(1)
-    weights = harness.dtype.type(given.smoothing), harness.dtype.type(given.edge)
-    harness.launcher.blocks("smooth", *outs, sums, harness.put_pixels(given.extended), *weights)()
+    outs, sums = (harness.empty_pixels(), harness.empty_pixels()), harness.empty_sums()
+    harness.launch(
+        "smooth",
+        slope=outs[0],
+        curvature=outs[1],
+        smooth_sums=sums,
+        extended=harness.put_pixels(given.extended),
+        smoothing=given.smoothing,
+        edge=given.edge,
+    )
     yield harness.take_pixels(outs[0]), slope
     yield harness.take_pixels(outs[1]), curvature
     yield harness.take_sums(sums, 1), np.array([value])
@@ -217,34 +233,42 @@ def _run_smooth(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 def _run_collect_sums(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     rng = np.random.default_rng(7)
     blocks = harness.program.row_blocks
-    ratio_sums = rounded(rng.normal(size=(blocks * given.p, 1 + given.n, 2)) + 1, harness.dtype)
-    ratio_sums[:, 2:] *= -1.0  # the correction of a second star counts as 0
+    ratio_sums = rounded(rng.normal(size=(blocks * given.p, 2)) + 1, harness.dtype)
+    star_sums = rng.normal(size=(given.n, given.p * given.star_blocks, 2)) + 1
+    star_sums[1:] *= -1.0  # the correction of a second star counts as 0
+    star_sums = rounded(star_sums, harness.dtype)
     square_sums = rounded(rng.random((blocks, 2)), harness.dtype)
     smooth_sums = rounded(rng.random((blocks, 2)), harness.dtype)
-    totals = ratio_sums.sum(axis=(0, 2))
     objective, corrections = reference.collect_sums(
-        totals[0],
+        ratio_sums.sum(),
         square_sums.sum(),
         smooth_sums.sum() if given.smoothing else 0.0,
-        totals[1:],
+        star_sums.sum(axis=(1, 2)),
         given.star_weights,
         given.mu,
     )
-    objectives = harness.put(np.full((3, 2), -1.0))
+    objectives, data_term = harness.put(np.full((3, 2), -1.0)), harness.put(np.zeros(2))
+    star_totals = harness.put(np.zeros((given.n, 2)))
     star_corrections = harness.put(np.zeros(given.n))
-    harness.launcher.one_group(
+    harness.launch(
         "collect_sums",
-        objectives,
-        star_corrections,
-        harness.put(ratio_sums),
-        harness.put(square_sums),
-        harness.put(smooth_sums),
-        harness.put(given.star_weights),
-        harness.dtype.type(given.mu),
-        np.int32(1),
-    )()
+        objectives=objectives,
+        data_term=data_term,
+        star_totals=star_totals,
+        star_corrections=star_corrections,
+        ratio_sums=harness.put(ratio_sums),
+        star_sums=harness.put(star_sums),
+        square_sums=harness.put(square_sums),
+        smooth_sums=harness.put(smooth_sums),
+        star_weights=harness.put(given.star_weights),
+        mu=given.mu,
+        star_blocks=given.star_blocks,
+        iteration=1,
+    )
     found = harness.take(objectives, (3, 2)).astype(float)
     yield found.sum(axis=1), np.array([-2.0, objective, -2.0])
+    yield harness.take(data_term, -1).sum(), ratio_sums.sum()
+    yield _take_star_sums(harness, given, star_totals), star_sums.sum(axis=(1, 2))
     yield harness.take(star_corrections, -1), corrections
 
 
@@ -261,18 +285,17 @@ def _run_gradient_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         given.curvature,
     )
     gradient, sums = harness.put_pixels(given.gradient), harness.empty_sums(2)
-    harness.launcher.rows(
+    harness.launch(
         "gradient_rows",
-        harness.put_spectra(given.correction_spectra),
-        sums,
-        gradient,
-        harness.put_pixels(given.extended),
-        harness.put_pixels(given.previous),
-        harness.put_pixels(given.shift),
-        _put_inverse_weight(harness, given),
-        *_put_smoothing(harness, given),
-        harness.dtype.type(given.mu),
-    )()
+        spectra=harness.put_spectra(given.correction_spectra),
+        change_sums=sums,
+        gradient=gradient,
+        extended=harness.put_pixels(given.extended),
+        previous=harness.put_pixels(given.previous),
+        shift=harness.put_pixels(given.shift),
+        mu=given.mu,
+        **_put_weights(harness, given),
+    )
     yield harness.take_pixels(gradient), expected
     yield harness.take_sums(sums, 2), np.array([change_step, change_change])
 
@@ -280,7 +303,7 @@ def _run_gradient_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     alpha = float(np.float32(1.3))
     for share in (1.0, float(np.float32(0.4))):
-        extended, spectrum, squares, slope, coupling = reference.step_rows(
+        extended, spectrum, squares, slope, couplings = reference.step_rows(
             given.extended,
             given.gradient,
             given.shift,
@@ -292,38 +315,44 @@ def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
             given.curvature,
         )
         out, trial = harness.empty_spectra(), harness.empty_pixels()
-        sums, square_sums = harness.empty_sums(1 + given.n), harness.empty_sums(1)
-        harness.launcher.rows(
+        sums, square_sums = harness.empty_sums(), harness.empty_sums()
+        coupling_sums = harness.put(np.full((given.n, given.star_blocks, 2), np.nan))
+        harness.launch(
             "step_rows",
-            out,
-            trial,
-            sums,
-            square_sums,
-            harness.put_pixels(given.extended),
-            harness.put_pixels(given.gradient),
-            harness.put_pixels(given.shift),
-            _put_inverse_weight(harness, given),
-            _put_smoothing(harness, given)[1],
-            harness.put_pixels(given.cross_information) if given.n else harness.put(np.zeros(1)),
-            *(harness.dtype.type(value) for value in (given.mu, alpha, share)),
-        )()
+            spectra=out,
+            extended=trial,
+            step_sums=sums,
+            coupling_sums=coupling_sums,
+            square_sums=square_sums,
+            previous=harness.put_pixels(given.extended),
+            gradient=harness.put_pixels(given.gradient),
+            shift=harness.put_pixels(given.shift),
+            cross_information=harness.put_windows(given.cross_information, given),
+            cross_first_blocks=harness.put(given.first_blocks, np.int32),
+            cross_blocks=given.star_blocks,
+            mu=given.mu,
+            alpha=alpha,
+            share=share,
+            **_put_weights(harness, given),
+        )
         yield harness.take_pixels(trial), extended
         yield harness.take_spectra(out), spectrum
-        yield harness.take_sums(sums, 1 + given.n), np.array([slope, *coupling])
+        yield harness.take_sums(sums, 1), np.array([slope])
+        yield _take_star_sums(harness, given, coupling_sums), couplings
         if given.mu:
             yield harness.take_sums(square_sums, 1), np.array([squares])
 
 
-def _put_inverse_weight(harness: KernelHarness, given: SimpleNamespace) -> cl.Buffer:
+def _put_weights(harness: KernelHarness, given: SimpleNamespace) -> dict[str, cl.Buffer]:
+    """Return the inverse weight, and slope and curvature where the scene is smoothed."""
     if given.weights is None:
-        return harness.put(np.zeros(1))
-    return harness.put_pixels(given.inverse_weight)
-
-
-def _put_smoothing(harness: KernelHarness, given: SimpleNamespace) -> tuple[cl.Buffer, cl.Buffer]:
-    if not given.smoothing:
-        return harness.put(np.zeros(1)), harness.put(np.zeros(1))
-    return harness.put_pixels(given.slope), harness.put_pixels(given.curvature)
+        buffers = {"inverse_weight": harness.put([given.inverse_weight])}
+    else:
+        buffers = {"inverse_weight": harness.put_pixels(given.inverse_weight)}
+    if given.smoothing:
+        buffers["slope"] = harness.put_pixels(given.slope)
+        buffers["curvature"] = harness.put_pixels(given.curvature)
+    return buffers
 
 
 KERNELS: dict[str, Callable[[KernelHarness, SimpleNamespace], Pairs]] = {

@@ -12,11 +12,12 @@ import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from lnocl.errors import DeviceError
-from lnocl.opencl.fft import READ_WRITE, Launcher, Layout, bit_reversed
-from lnocl.opencl.program import STEP_SOURCES, Program, Tuning
+from lnocl.opencl.launch import READ_WRITE, Launcher
+from lnocl.opencl.layout import Layout, bit_reversed
+from lnocl.opencl.program import Program, Tuning
 from lnocl.scene.scene import LEAST_MODEL
 
-# What scenes have, as `Program` is told; together everything that it can be told.
+# Scenes with all parts, together, that a program can have.
 THREE_IMAGES = "three images, two stars, mask, background map, smoothing"
 SCENES: dict[str, dict[str, Any]] = {
     "plain": {"n_images": 1},
@@ -59,7 +60,7 @@ class KernelHarness:
     grid, dtype, tuning
         As for `lnocl.opencl.program.Program`.
     **scene
-        What the scene has, as `lnocl.opencl.program.Program` is told, such as one of `SCENES`.
+        Parts of the scene, as for `lnocl.opencl.program.Program`, and n_images: one of `SCENES`.
     """
 
     def __init__(
@@ -70,14 +71,10 @@ class KernelHarness:
         tuning: Tuning | None = None,
         **scene: Any,
     ) -> None:
+        self.n_images, self.n_stars = scene.get("n_images", 1), scene.get("n_stars", 0)
+        parts = {name: has for name, has in scene.items() if name != "n_images"}
         self.program = Program(
-            context,
-            grid,
-            np.dtype(dtype),
-            tuning,
-            STEP_SOURCES,
-            least_model=LEAST_MODEL,
-            **scene,
+            context, grid, np.dtype(dtype), tuning, least_model=LEAST_MODEL, **parts
         )
         self.layout, self.launcher = Layout(self.program), Launcher(self.program)
         self.dtype, self.grid, self.scene = self.program.dtype, grid, scene
@@ -98,6 +95,18 @@ class KernelHarness:
                 raise DeviceError("written past the end of an array")
         return self._bytes(buffer)[: -len(CANARY)].view(self.dtype).reshape(shape)
 
+    def launch(self, kernel: str, **arguments: Any) -> None:
+        """Launch a kernel with arguments by name; those it needs for the scene's counts are known.
+
+        Arguments that the scene has no use for are small arrays.
+        """
+        counts = {"n_images": self.n_images, "n_stars": self.n_stars}
+        given = {**counts, **arguments}
+        for name in self.program.arguments[kernel]:
+            if name not in given and name not in self.launcher.own:
+                given[name] = self.put(np.zeros(2))
+        self.launcher.bind(kernel, given)()
+
     def forget(self) -> None:
         """Let go of all buffers put so far."""
         self._buffers.clear()
@@ -114,6 +123,14 @@ class KernelHarness:
     def put_spectra(self, row_spectra: Iterable[NDArray]) -> cl.Buffer:
         """Return a buffer of row spectra, in the kernels' order."""
         return self.put([self.layout.pack_spectra(a) for a in row_spectra])
+
+    def put_windows(self, arrays: Iterable[NDArray], given: SimpleNamespace) -> cl.Buffer:
+        """Return a buffer of windows of arrays, [n_stars] or [n_stars][n_images]."""
+        return self.put_pixels(
+            each[self.layout.rows_of(first, given.star_blocks)]
+            for stack, first in zip(arrays, given.first_blocks, strict=True)
+            for each in np.reshape(stack, (-1, *self.grid))
+        )
 
     def take_pixels(self, buffer: cl.Buffer) -> NDArray:
         """Return the one array of pixels (1, Ny, Nx) that a buffer holds."""
@@ -137,9 +154,9 @@ class KernelHarness:
         """Return a buffer for one array of row spectra."""
         return self.put(np.full(self.layout.spectra_shape, np.nan))
 
-    def empty_sums(self, n_sums: int, n_arrays: int = 1) -> cl.Buffer:
+    def empty_sums(self, n_sums: int = 1) -> cl.Buffer:
         """Return a buffer for the pairs that each block leaves of so many sums."""
-        return self.put(np.full((self.program.row_blocks * n_arrays, n_sums, 2), np.nan))
+        return self.put(np.full((self.program.row_blocks, n_sums, 2), np.nan))
 
     def otf_parts(self, otf: NDArray) -> tuple[NDArray, NDArray]:
         """Return an OTF (Ny, Nx // 2 + 1) as the kernels keep it: columns and edge."""
@@ -164,7 +181,7 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
     """Return random inputs for every kernel, in natural order."""
     rng = np.random.default_rng(harness.grid[0] * 31 + harness.grid[1])
     ny, nx = harness.grid
-    p, n = harness.program.n_images, harness.program.n_stars
+    p, n = harness.n_images, harness.n_stars
     has_map, has_weights, has_exposure_map, has_mu, has_smoothing = (
         harness.scene.get(f"has_{what}", False)
         for what in ("background_map", "weights", "exposure_map", "mu", "smoothing")
@@ -186,9 +203,11 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
     star_blocks = row_blocks if n < 2 else max(1, row_blocks // 2)
     first_blocks = np.array([row_blocks - 1, 0])[:n]
     star_images = own(rng.random((n, p, ny, nx)))
-    for images_of_star, first in zip(star_images, first_blocks, strict=True):
+    cross_information = own(rng.uniform(-0.1, 1.0, (n, ny, nx)))
+    for s, first in enumerate(first_blocks):
         dark = np.setdiff1d(np.arange(ny), harness.layout.rows_of(first, star_blocks))
-        images_of_star[:, dark] = 0.0
+        star_images[s, :, dark] = 0.0
+        cross_information[s, dark] = 0.0
     return SimpleNamespace(
         p=p,
         n=n,
@@ -224,6 +243,6 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         curvature=own(rng.random((1, ny, nx))) if has_smoothing else 0.0,
         smoothing=float(np.float32(0.4)) if has_smoothing else 0.0,
         edge=float(np.float32(0.3)),
-        cross_information=own(rng.uniform(-0.1, 1.0, (n, ny, nx))),
+        cross_information=cross_information,
         mu=float(np.float32(0.25)) if has_mu else 0.0,
     )

@@ -15,7 +15,7 @@ from astropy import units as u
 
 from lnocl.deconvolution import Result, deconvolve
 from lnocl.errors import DeviceError, LnoclError
-from lnocl.opencl.device import describe, has_double, spec_of
+from lnocl.opencl.device import context_of, describe, has_double, spec_of
 from lnocl.scene.observation import Observation
 from lnocl.simulation.simulate import Experiment, Star, load_target, simulate
 from lnocl.verify.comparison import ALLOWED, KERNELS, deviation, kernels_of, relative
@@ -108,7 +108,7 @@ def run(device: cl.Device) -> list[Row]:
         for each solver and precision.
     """
     precisions = [each for each in DTYPES if each == "single" or has_double(device)]
-    context = cl.Context([device])
+    context = context_of(device)
     return [
         row
         for precision in precisions

@@ -7,7 +7,7 @@ import pyopencl as cl
 import pytest
 
 from lnocl.opencl.device import choose
-from lnocl.opencl.fft import READ_WRITE
+from lnocl.opencl.launch import READ_WRITE
 from lnocl.opencl.program import Program, source
 
 pytestmark = pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")

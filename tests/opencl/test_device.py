@@ -1,4 +1,4 @@
-"""HeldOutSelection a device, and what is said where there is none or it cannot do what is asked."""
+"""Choosing a device, and what is said where there is none or it cannot do what is asked."""
 
 import subprocess
 import sys
@@ -103,24 +103,23 @@ def scene(p, n, stars=0):
 @pytest.mark.parametrize("limit", ["global_mem_size", "max_mem_alloc_size"])
 def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, limit):
     found = device.choose().device
-    monkeypatch.setattr(opencl.OpenCLEngine, "_allocate", lambda *_: pytest.fail("allocated"))
+    monkeypatch.setattr(opencl.Memory, "allocate", lambda *_, **__: pytest.fail("allocated"))
     monkeypatch.setattr(cl.Device, limit, 100_000)
     with pytest.raises(lnocl.DeviceError, match=r"the scene needs \d+ MiB, .* for star_images"):
         opencl.OpenCLEngine(scene(2, 64, stars=9), "single", device.spec_of(found), 10)
 
 
-@pytest.mark.parametrize(("height", "tuning"), [(64, None), (8192, program.Tuning(4, 16))])
-def test_memory_estimate_is_what_the_buffers_hold(height, tuning, caplog):
+@pytest.mark.parametrize("tuning", [None, program.Tuning(4, 16, scratch_is_global=True)])
+def test_memory_estimate_is_what_the_buffers_hold(tuning, caplog):
     """With scratch in local memory, of which 32 KiB will do, and with scratch in global memory."""
     caplog.set_level("INFO", "lnocl")
-    observation = lnocl.Observation(np.ones((2, height, 64)), np.ones((1, 1)))
+    observation = lnocl.Observation(np.ones((2, 64, 64)), np.ones((1, 1)))
     engine = opencl.OpenCLEngine(opencl.Scene(observation, [(1, 1)]), "single", None, 10, tuning)
-    assert engine.program.scratch_is_global == (tuning is not None)
     engine.extended()  # waits for the device
     launcher = engine._launcher
-    held = [*engine._buffers.values(), launcher._row_roots, launcher._column_roots]
-    if engine.program.scratch_is_global:
-        held.append(launcher._scratch)
+    held = [*engine._memory.buffers.values(), *launcher.own.values()]
+    if tuning is None:
+        held.remove(launcher.own["scratch"])
     assert engine.bytes_needed == sum(buffer.size for buffer in held)
     (message,) = caplog.messages
     assert message == f"{engine.name}: the scene takes {engine.bytes_needed / 2**20:.1f} MiB"
@@ -130,8 +129,8 @@ def test_memory_estimate_is_what_the_buffers_hold(height, tuning, caplog):
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_memory_is_little_more_than_what_must_be_held(monkeypatch, p, n, precision):
     """Images, OTFs, one set of spectra, the estimate."""
-    monkeypatch.setattr(opencl.OpenCLEngine, "_allocate", lambda *_: None)
-    monkeypatch.setattr(opencl.OpenCLEngine, "_bind", lambda *_: None)
+    monkeypatch.setattr(opencl.Memory, "allocate", lambda *_, **__: None)
+    monkeypatch.setattr(opencl.OpenCLEngine, "_bind_iteration", lambda *_: None)
     monkeypatch.setattr(opencl.OpenCLEngine, "_upload_scene", lambda *_: None)
     engine = opencl.OpenCLEngine(scene(p, n), precision, None, 1000)
     must = (3 * p + 1) * n * n * engine.program.dtype.itemsize
@@ -139,7 +138,7 @@ def test_memory_is_little_more_than_what_must_be_held(monkeypatch, p, n, precisi
 
 
 def test_failing_compiler_is_named(monkeypatch):
-    monkeypatch.setattr(program, "source", lambda names: "this is no OpenCL")
+    monkeypatch.setattr(program, "source", lambda: "this is no OpenCL")
     with pytest.raises(lnocl.DeviceError, match="the kernels do not build on") as error:
         opencl.OpenCLEngine(scene(1, 8), "single", None, 1)
     assert "\n" not in str(error.value)
@@ -160,17 +159,7 @@ def test_build_options_are_recorded_and_kernels_fetched_once():
     engine = opencl.OpenCLEngine(scene(1, 32), "single", None, 1)
     assert "-DREAL=float" in engine.program.options
     assert "-DNX=32" in engine.program.options
-    kernel = engine.program.kernels["scale_rows"]
-    engine.scale()
-    engine.extended()  # waits for the device
-    assert engine.program.kernels["scale_rows"] is kernel
-
-
-def test_kernels_and_their_program_are_let_go():
-    """PyOpenCL's `Program.all_kernels` gives kernels that keep themselves and their program."""
-    context = cl.Context([device.choose().device])
-    built = program.Program(context, (8, 8), np.dtype(np.float32))
-    assert {kernel.reference_count for kernel in built.kernels.values()} == {1}
+    assert engine.program.kernel("scale_rows") is engine.program.kernel("scale_rows")
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,10 @@ import pytest
 import scipy.fft
 
 from lnocl.opencl.device import choose
-from lnocl.opencl.fft import Transform, bit_reversed, roots
+from lnocl.opencl.launch import roots
+from lnocl.opencl.layout import bit_reversed
 from lnocl.opencl.program import radices
+from lnocl.opencl.transform import Transform
 
 SQUARES = [(n, n) for n in (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)]
 OBLONGS = [

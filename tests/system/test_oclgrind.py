@@ -55,8 +55,8 @@ def run(case, dtype, *planted):
     """
     command = ["oclgrind", *OPTIONS, *grind.DEVICE_OPTIONS.get(case, [])]
     command += ["--build-options", BUILD_OPTIONS, sys.executable, str(HERE / "grind.py")]
-    # From PyOpenCL's cache of programs there would come some that were built with other options.
-    environment = {**os.environ, "PYOPENCL_NO_CACHE": "1"}
+    # Stored programs were built with other options.
+    environment = {**os.environ, "POCL_CACHE_DIR": os.devnull}
     environment.pop("PYOPENCL_CTX", None)
     done = subprocess.run(
         [*command, case, dtype, *planted],

@@ -1,4 +1,4 @@
-"""The transforms along rows and columns: the twins of kernels/rows.cl and kernels/columns.cl."""
+"""The transforms along rows: the twins of kernels/rows.cl."""
 
 from __future__ import annotations
 
@@ -13,16 +13,6 @@ ComplexArray = NDArray[np.complex128]
 def rfft_rows(pixels: Array) -> ComplexArray:
     """Return twice the half spectrum of each row: ``2 sum_x f(x) exp(-2 pi i k x / Nx)``."""
     return 2.0 * np.fft.rfft(pixels, axis=-1)
-
-
-def fft_columns(spectra: ComplexArray) -> ComplexArray:
-    """Return the spectrum of each column: ``sum_y F(y) exp(-2 pi i k y / Ny)``."""
-    return np.fft.fft(spectra, axis=-2)
-
-
-def ifft_columns(spectra: ComplexArray) -> ComplexArray:
-    """Return ``sum_k F(k) exp(+2 pi i k y / Ny)`` of each column, not divided by Ny."""
-    return np.fft.ifft(spectra, axis=-2, norm="forward")
 
 
 def irfft_rows(row_spectra: ComplexArray) -> Array:

@@ -1,0 +1,144 @@
+"""Launching kernels: arguments bound by name, the roots of unity, the scratch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from lnocl.opencl.layout import bit_reversed
+from lnocl.opencl.program import Program
+
+READ_WRITE = cl.mem_flags.READ_WRITE
+
+
+def roots(n: int, outer: int, last: int) -> NDArray[np.float64]:
+    """Return the twiddles of all passes of a transform of n points, as kernels/fft.cl has them.
+
+    A pass over subtransforms of length L with radix R has, for j < L / R and 0 < q < R, the root
+    ``exp(-2 pi i j reversed(q) / L)``, real and imaginary part. The passes have radix `outer`,
+    then 8; that of radix `last` has none.
+    """
+    length, radix = n, outer
+    tables = []
+    while length == n or length > last:
+        j, q = np.arange(length // radix)[:, None], bit_reversed(radix)[None, 1:]
+        # In long double, where there is one: a rounded angle would cost a digit in double.
+        angle = -8.0 * np.arctan(np.longdouble(1.0)) * (j * q) / length
+        tables.append(np.stack([np.cos(angle), np.sin(angle)], axis=-1).ravel())
+        length, radix = length // radix, 8
+    return np.concatenate(tables).astype(np.float64)
+
+
+class Launch:
+    """A kernel bound to its arguments, which each call launches; it costs the host little.
+
+    A kernel has one set of arguments at a time: binding it anew changes earlier launches of it.
+
+    Parameters
+    ----------
+    queue : pyopencl.CommandQueue
+        Where it is launched.
+    program : Program
+        Which has the kernel.
+    name : str
+        The kernel's.
+    arguments : mapping of str
+        Buffers, local memory and numbers by the names that the kernel declares; others are
+        ignored.
+    groups : int
+        Work-groups.
+    """
+
+    def __init__(
+        self,
+        queue: cl.CommandQueue,
+        program: Program,
+        name: str,
+        arguments: Mapping[str, Any],
+        groups: int,
+    ) -> None:
+        self._queue, self._kernel = queue, program.kernel(name)
+        self._real = program.dtype.type
+        self._index = {each: index for index, each in enumerate(program.arguments[name])}
+        group = program.tuning.group
+        self._global_size, self._local_size = (groups * group,), (group,)
+        self.set(**{each: arguments[each] for each in self._index})
+
+    def set(self, **arguments: Any) -> None:
+        """Give some arguments other values."""
+        for name, value in arguments.items():
+            if isinstance(value, int):
+                value = np.int32(value)
+            elif isinstance(value, float):
+                value = self._real(value)
+            # Not set_args, which writes Python for each kernel and stores it in a cache on disk.
+            self._kernel.set_arg(self._index[name], value)
+
+    def __call__(self) -> cl.Event:
+        """Enqueue the kernel."""
+        return cl.enqueue_nd_range_kernel(
+            self._queue, self._kernel, self._global_size, self._local_size
+        )
+
+
+class Launcher:
+    """The kernels of a program with a queue, and the arguments that no scene changes.
+
+    Parameters
+    ----------
+    program : Program
+        Whose kernels are launched.
+
+    Attributes
+    ----------
+    queue : pyopencl.CommandQueue
+        In order.
+    own : dict of str
+        The roots of unity and the scratch, by their names as arguments.
+    """
+
+    def __init__(self, program: Program) -> None:
+        context = program.context
+        self.program = program
+        self.queue = cl.CommandQueue(context)
+        ny, nx = program.grid
+        constant = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+        row_roots, column_roots = (
+            roots(n, *split).astype(program.dtype)
+            for n, split in ((nx, program.row_radices), (ny, program.column_radices))
+        )
+        self.own = {
+            "row_roots": cl.Buffer(context, constant, hostbuf=row_roots),
+            "column_roots": cl.Buffer(context, constant, hostbuf=column_roots),
+            "scratch": (
+                cl.Buffer(context, READ_WRITE, program.max_groups * program.scratch_bytes)
+                if program.tuning.scratch_is_global
+                else cl.LocalMemory(program.scratch_bytes)
+            ),
+        }
+
+    @staticmethod
+    def bytes_needed(program: Program) -> int:
+        """Return the bytes that a launcher takes on the device."""
+        ny, nx = program.grid
+        n_roots = len(roots(nx, *program.row_radices)) + len(roots(ny, *program.column_radices))
+        return n_roots * program.dtype.itemsize + program.max_groups * program.scratch_bytes
+
+    def bind(self, name: str, arguments: Mapping[str, Any] | None = None, **others: Any) -> Launch:
+        """Bind a kernel to arguments by name, some of them in a mapping for several kernels."""
+        given = {**self.own, **(arguments or {}), **others}
+        blocks = self._blocks(name, given)
+        groups = min(blocks, self.program.max_groups or blocks)
+        return Launch(self.queue, self.program, name, given, groups)
+
+    def _blocks(self, name: str, arguments: Mapping[str, Any]) -> int:
+        """Return the number of work-groups that a kernel has work for."""
+        if name == "collect_sums":
+            return 1
+        if name == "ratio_rows":
+            return self.program.row_blocks * int(arguments["n_images"])
+        return self.program.column_blocks if name.endswith("_columns") else self.program.row_blocks

@@ -1,0 +1,143 @@
+"""Layouts of pixels and spectra on the device."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.opencl.program import Program
+
+
+def bit_reversed(n: int) -> NDArray[np.int64]:
+    """Return the bit-reversed order of n points, n a power of two: [0, n/2, n/4, 3n/4, ...]."""
+    order = np.zeros(1, np.int64)
+    while len(order) < n:
+        order = np.concatenate([2 * order, 2 * order + 1])
+    return order
+
+
+class Layout:
+    """Converts arrays between their natural order and that of the kernels.
+
+    Parameters
+    ----------
+    program : Program
+        Whose grid, tuning and precision are meant.
+
+    Notes
+    -----
+    kernels/precision.cl says what the layouts are, kernels/rows.cl how half spectra are packed.
+    """
+
+    def __init__(self, program: Program) -> None:
+        self.dtype = program.dtype
+        self.grid = program.grid
+        ny, nx = program.grid
+        block = program.tuning.block
+        self.pixels_shape = (ny // 2 // block, nx, 2, block)
+        self.spectra_shape = (nx // 2 // block, program.rows, 2, block)
+        column = np.arange(1, nx // 2)
+        high_bit = 1 << np.frexp(column)[1] - 1
+        position = bit_reversed(nx)[column + high_bit]
+        opposite = position > nx // 2
+        self._kept = np.where(opposite, nx - position, position)
+        self._conjugated = opposite
+
+    @property
+    def block_bytes(self) -> int:
+        """Bytes of one block of row pairs in an array of pixels."""
+        return self.pixels_bytes // self.pixels_shape[0]
+
+    @property
+    def pixels_bytes(self) -> int:
+        """Bytes of one array of pixels."""
+        return int(np.prod(self.pixels_shape)) * self.dtype.itemsize
+
+    @property
+    def spectra_bytes(self) -> int:
+        """Bytes of one array of spectra."""
+        return int(np.prod(self.spectra_shape)) * self.dtype.itemsize
+
+    def pack_pixels(self, pixels: NDArray) -> NDArray:
+        """Return pixels (..., Ny, Nx), or some blocks' rows of them, in the kernels' order."""
+        _, nx, _, block = self.pixels_shape
+        pairs = pixels.reshape(*pixels.shape[:-2], -1, block, 2, nx)
+        return np.ascontiguousarray(np.swapaxes(pairs, -3, -1), dtype=self.dtype)
+
+    def window(self, rows: NDArray[np.bool_]) -> tuple[int, int]:
+        """Return first and number of the blocks, round the edge, that hold some rows (Ny,)."""
+        row_blocks = self.pixels_shape[0]
+        held = np.flatnonzero(rows.reshape(row_blocks, -1).any(axis=1))
+        gaps = np.diff(held, append=held[0] + row_blocks)
+        widest = int(np.argmax(gaps))
+        return int(held[(widest + 1) % len(held)]), row_blocks - int(gaps[widest]) + 1
+
+    def rows_of(self, first: int, count: int) -> NDArray[np.int64]:
+        """Return the rows that some blocks hold, round the edge."""
+        rows = 2 * self.pixels_shape[-1]
+        return np.arange(first * rows, (first + count) * rows) % self.grid[0]
+
+    def unpack_pixels(self, packed: NDArray) -> NDArray[np.float64]:
+        """Return the pixels (Ny, Nx) of an array in the kernels' order."""
+        return np.swapaxes(packed, -3, -1).reshape(self.grid).astype(np.float64)
+
+    def pack_spectra(self, row_spectra: NDArray) -> NDArray:
+        """Return row spectra (Ny, Nx // 2 + 1) in the kernels' order and precision.
+
+        Column 0 gets the real parts of columns 0 and Nx / 2, as row spectra of real pixels have
+        no others.
+        """
+        ny, nx = self.grid
+        kept = np.empty((ny, nx // 2), np.complex128)
+        kept[:, 0] = row_spectra[:, 0].real + 1j * row_spectra[:, -1].real
+        kept[:, 1:] = row_spectra[:, self._kept]
+        kept[:, 1:][:, self._conjugated] = kept[:, 1:][:, self._conjugated].conj()
+        return self.pack_columns(kept)
+
+    def unpack_spectra(self, packed: NDArray) -> NDArray[np.complex128]:
+        """Return the row spectra (Ny, Nx // 2 + 1) of an array in the kernels' order."""
+        ny, nx = self.grid
+        kept = self.unpack_columns(packed)
+        row_spectra = np.empty((ny, nx // 2 + 1), np.complex128)
+        row_spectra[:, 0], row_spectra[:, -1] = kept[:, 0].real, kept[:, 0].imag
+        columns = kept[:, 1:]
+        row_spectra[:, self._kept] = np.where(self._conjugated, columns.conj(), columns)
+        return row_spectra
+
+    def half_spectrum(self, columns: NDArray) -> NDArray[np.complex128]:
+        """Return the half spectrum (Ny, Nx // 2 + 1) of real pixels from their kept columns.
+
+        Column 0 holds ``A + i B`` with A and B the Hermitian spectra of columns 0 and Nx / 2;
+        the others hold k or, where conjugated, -k: ``F(-k) = conj(F(k))`` in both axes.
+        """
+        ny, nx = self.grid
+        opposite = columns[-np.arange(ny)].conj()
+        spectrum = np.empty((ny, nx // 2 + 1), np.complex128)
+        spectrum[:, 0] = (columns[:, 0] + opposite[:, 0]) / 2
+        spectrum[:, -1] = (columns[:, 0] - opposite[:, 0]) / 2j
+        spectrum[:, self._kept] = np.where(self._conjugated, opposite[:, 1:], columns[:, 1:])
+        return spectrum
+
+    def columns_of(self, spectrum: NDArray) -> NDArray[np.complex128]:
+        """Return the columns (Ny, Nx / 2) that are kept of a half spectrum of real pixels."""
+        ny, nx = self.grid
+        columns = np.empty((ny, nx // 2), np.complex128)
+        columns[:, 0] = spectrum[:, 0] + 1j * spectrum[:, -1]
+        kept = spectrum[:, self._kept]
+        columns[:, 1:] = np.where(self._conjugated, kept[-np.arange(ny)].conj(), kept)
+        return columns
+
+    def pack_columns(self, columns: NDArray) -> NDArray:
+        """Return complex columns (Ny, Nx / 2) in the kernels' order, as they are."""
+        column_blocks, _, _, block = self.spectra_shape
+        ny = self.grid[0]
+        packed = np.zeros(self.spectra_shape, self.dtype)
+        blocks = columns.reshape(ny, column_blocks, block).transpose(1, 0, 2)
+        packed[:, :ny, 0], packed[:, :ny, 1] = blocks.real, blocks.imag
+        return packed
+
+    def unpack_columns(self, packed: NDArray) -> NDArray[np.complex128]:
+        """Return the complex columns (Ny, Nx / 2) of an array in the kernels' order."""
+        ny, nx = self.grid
+        parts = packed[:, :ny].astype(np.float64)
+        return (parts[:, :, 0] + 1j * parts[:, :, 1]).transpose(1, 0, 2).reshape(ny, nx // 2)

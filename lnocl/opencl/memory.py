@@ -1,0 +1,171 @@
+"""Named buffers on a device, and numbers on their way between it and the host."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from lnocl.errors import DeviceError, InputError
+from lnocl.opencl.device import describe
+from lnocl.opencl.launch import READ_WRITE
+from lnocl.opencl.layout import Layout
+from lnocl.scene.observation import Array
+
+log = logging.getLogger("lnocl")
+
+
+class Transfer:
+    """Numbers on their way from the device, which works on meanwhile.
+
+    Parameters
+    ----------
+    queue : pyopencl.CommandQueue
+        In whose order they are read.
+    dtype : numpy.dtype
+        Of the numbers.
+    *ranges : tuple of (pyopencl.Buffer, int, int)
+        Places of the numbers: the buffer, the first byte, and the number of bytes.
+    """
+
+    def __init__(
+        self, queue: cl.CommandQueue, dtype: np.dtype, *ranges: tuple[cl.Buffer, int, int]
+    ) -> None:
+        self._arrays = [np.empty(size // dtype.itemsize, dtype) for _, _, size in ranges]
+        self._events = [
+            cl.enqueue_copy(queue, array, buffer, src_offset=offset, is_blocking=False)
+            for array, (buffer, offset, _) in zip(self._arrays, ranges, strict=True)
+        ]
+
+    def wait(self) -> list[Array]:
+        """Return the arrays, as float64, when they have arrived."""
+        cl.wait_for_events(self._events)
+        return [array.astype(np.float64) for array in self._arrays]
+
+
+class Memory:
+    """The buffers of a scene on a device, by name.
+
+    Parameters
+    ----------
+    queue : pyopencl.CommandQueue
+        For transfers.
+    layout : Layout
+        Of arrays of pixels.
+    scale : float
+        Electrons per unit, for messages.
+
+    Attributes
+    ----------
+    buffers : dict of str to pyopencl.Buffer
+        All of them.
+    """
+
+    def __init__(self, queue: cl.CommandQueue, layout: Layout, scale: float) -> None:
+        self._queue, self._layout, self._scale = queue, layout, scale
+        self.buffers: dict[str, cl.Buffer] = {}
+
+    def allocate(self, **sizes: int) -> None:
+        """Make buffers of so many bytes, in the place of those with the same names."""
+        for name, size in sizes.items():
+            self.buffers[name] = cl.Buffer(self._queue.context, READ_WRITE, size)
+
+    def exchange(self, one: str, other: str) -> None:
+        """Exchange the names of two buffers."""
+        buffers = self.buffers
+        buffers[one], buffers[other] = buffers[other], buffers[one]
+
+    def upload(self, name: str, values: NDArray) -> None:
+        """Copy numbers to a buffer, in the precision of the device."""
+        if np.size(values):
+            cl.enqueue_copy(self._queue, self.buffers[name], self._rounded(name, values))
+
+    def upload_integers(self, name: str, values: NDArray) -> None:
+        """Copy whole numbers of 32 bits to a buffer."""
+        if len(values):
+            cl.enqueue_copy(self._queue, self.buffers[name], values.astype(np.int32))
+
+    def upload_pixels(self, name: str, arrays: Iterable[NDArray]) -> None:
+        """Copy arrays of pixels, or of some blocks' rows, to a buffer, one behind the other."""
+        offset = 0
+        for array in arrays:
+            packed = self._layout.pack_pixels(self._rounded(name, array))
+            cl.enqueue_copy(self._queue, self.buffers[name], packed, dst_offset=offset)
+            offset += packed.nbytes
+
+    def download(self, name: str, count: int) -> Array:
+        """Return the first numbers in a buffer, as float64."""
+        values = np.empty(count, self._layout.dtype)
+        if count:
+            cl.enqueue_copy(self._queue, values, self.buffers[name])
+        return values.astype(np.float64)
+
+    def download_pixels(self, name: str) -> Array:
+        """Return the one array of pixels that a buffer holds, as float64."""
+        packed = np.empty(self._layout.pixels_shape, self._layout.dtype)
+        cl.enqueue_copy(self._queue, packed, self.buffers[name])
+        return self._layout.unpack_pixels(packed)
+
+    def download_raw(self, name: str) -> NDArray:
+        """Return all of a buffer as it lies on the device."""
+        values = np.empty(self.count(name), self._layout.dtype)
+        cl.enqueue_copy(self._queue, values, self.buffers[name])
+        return values
+
+    def upload_raw(self, name: str, values: NDArray) -> None:
+        """Copy what `download_raw` returned, or the first of it, back."""
+        if values.size:
+            cl.enqueue_copy(self._queue, self.buffers[name], values)
+
+    def fetch(self, *names: str) -> Transfer:
+        """Send for all that some buffers hold."""
+        return self.fetch_ranges(*((name, 0, self.count(name)) for name in names))
+
+    def fetch_ranges(self, *ranges: tuple[str, int, int]) -> Transfer:
+        """Send for ranges of buffers: name, first number, and how many numbers."""
+        item = self._layout.dtype.itemsize
+        return Transfer(
+            self._queue,
+            self._layout.dtype,
+            *((self.buffers[name], first * item, count * item) for name, first, count in ranges),
+        )
+
+    def count(self, name: str) -> int:
+        """Return how many numbers a buffer holds."""
+        return int(self.buffers[name].size) // self._layout.dtype.itemsize
+
+    def _rounded(self, name: str, values: NDArray | float) -> NDArray:
+        """Return values in the precision of the device; refuse values too large for it."""
+        dtype = self._layout.dtype
+        with np.errstate(over="ignore"):
+            rounded = np.asarray(values).astype(dtype)
+        if not np.isfinite(rounded).all():
+            raise InputError(
+                f"{name.replace('_', ' ')} as large as {np.abs(values).max() * self._scale:g} "
+                f"cannot be held in {dtype}: scale the scene, or take precision double"
+            )
+        return rounded
+
+
+def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int]) -> int:
+    """Return the bytes of all buffers together, and log them.
+
+    Raises
+    ------
+    DeviceError
+        The device has too little memory, or gives too little at once for the largest buffer.
+    """
+    total = sum(sizes.values())
+    largest = max(sizes, key=lambda name: sizes[name])
+    if total > device.global_mem_size or sizes[largest] > device.max_mem_alloc_size:
+        raise DeviceError(
+            f"the scene needs {total / 2**20:.0f} MiB, {sizes[largest] / 2**20:.0f} MiB of it "
+            f"for {largest}; {describe(device)} has {device.global_mem_size / 2**20:.0f} MiB and "
+            f"gives {device.max_mem_alloc_size / 2**20:.0f} MiB at once: take fewer or "
+            "smaller images, fewer stars, precision single, or another device"
+        )
+    log.info("%s: the scene takes %.1f MiB", describe(device), total / 2**20)
+    return total

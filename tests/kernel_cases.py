@@ -1,0 +1,81 @@
+"""The cases that kernels are compared with their twins on: grids, tunings, scenes, precisions."""
+
+import functools
+import re
+from pathlib import Path
+
+import lnocl.kernels
+import numpy as np
+import pytest
+
+from lnocl.opencl.device import choose, context_of
+from lnocl.opencl.program import Tuning
+from lnocl.verify.comparison import ALLOWED, deviation, kernels_of
+from lnocl.verify.harness import SCENES, THREE_IMAGES, KernelHarness, inputs
+
+# Name: (grid, tuning, scene, precisions), a capital letter for one that only CI tests. Each grid
+# is the smallest that takes some path of kernels/fft.cl; tunings other than the default share a
+# block among work-items, as a GPU does.
+# (PoCL 3 miscompiles vectors of 2 in groups of several work-items; no tuning has them.)
+CASES = {
+    "outer radix 2": ((2, 2), None, "plain", "sd"),
+    "outer radix 4": ((4, 4), None, "plain", "S"),
+    "outer radix 8": ((8, 8), None, "mask, mu, smoothing", "s"),
+    "radices 4, 4 and 8, 4": ((16, 32), None, THREE_IMAGES, "sD"),
+    "radices 8, 8 and 4, 8, 4": ((64, 128), None, "two images, star, mu", "Sd"),
+    "radices 8, 8, 4": ((256, 16), None, "plain", "S"),
+    "exposure map": ((32, 16), None, "exposure map, mu", "sD"),
+    "exposure map, group": ((32, 16), Tuning(1, 8, group=4), "exposure map, mu", "S"),
+    "radices 8, 8, 8": ((8, 512), None, "plain", "S"),
+    "radices 4, 8, 8, 4, middle pass": ((32, 1024), None, "plain", "SD"),
+    "middle pass along y": ((2048, 4), None, "plain", "d"),
+    "global scratch": ((64, 32), Tuning(4, 16, scratch_is_global=True), "plain", "s"),
+    "several vectors a block": ((64, 32), Tuning(4, 8), "mask, mu, smoothing", "S"),
+    "group": ((64, 32), Tuning(1, 8, group=4), THREE_IMAGES, "sD"),
+    "group, middle pass": ((2048, 16), Tuning(1, 2, group=64), "plain", "D"),
+    "group, global scratch": (
+        (256, 64),
+        Tuning(4, 32, group=8, scratch_is_global=True),
+        "mask, mu, smoothing",
+        "S",
+    ),
+}
+DTYPES = {"s": np.float32, "d": np.float64}
+RUNS = [
+    pytest.param(
+        case,
+        DTYPES[d.lower()],
+        marks=[pytest.mark.exhaustive] if d.isupper() else [],
+        id=f"{case}-{d}",
+    )
+    for case, (*_, precisions) in CASES.items()
+    for d in precisions
+]
+
+FOLDER = Path(lnocl.kernels.__file__).parent
+
+
+def kernels_in(file):
+    """Return the kernels that a source file has."""
+    text = (FOLDER / file).read_text(encoding="ascii")
+    return re.findall(r"^KERNEL void (\w+)\(", text, re.MULTILINE)
+
+
+@functools.cache
+def harness_of(case, dtype):
+    grid, tuning, scene, _ = CASES[case]
+    return KernelHarness(context_of(choose().device), grid, dtype, tuning, **SCENES[scene])
+
+
+def agree_with_twins(file):
+    """Return a test for each kernel of a source file, in each case."""
+
+    @pytest.mark.parametrize("kernel", kernels_in(file))
+    @pytest.mark.parametrize(("case", "dtype"), RUNS)
+    def test(case, dtype, kernel):
+        harness = harness_of(case, dtype)
+        if kernel not in kernels_of(harness.scene):
+            pytest.skip("the scene has no such kernel")
+        assert deviation(harness, inputs(harness), kernel) <= ALLOWED[dtype]
+
+    return test

@@ -1,0 +1,42 @@
+"""Kernel, twin and test stand under one name each; what the comparison itself relies on."""
+
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from kernel_cases import FOLDER, harness_of, kernels_in
+
+from lnocl import reference
+from lnocl.errors import DeviceError
+from lnocl.verify.comparison import KERNELS
+
+FILES = sorted(path.stem for path in FOLDER.glob("*.cl") if kernels_in(path.name))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_kernel_twin_and_test_have_one_name(name):
+    twins = Path(reference.__file__).parent / f"{name}.py"
+    assert (Path(__file__).parent / f"test_{name}.py").is_file()
+    for kernel in kernels_in(f"{name}.cl"):
+        assert f"def {kernel}(" in twins.read_text(encoding="utf-8")
+        assert callable(getattr(reference, kernel))
+    assert f"| `{name}.cl` |" in (FOLDER / "README.md").read_text(encoding="utf-8")
+
+
+def test_every_kernel_is_compared():
+    kernels = {kernel for name in FILES for kernel in kernels_in(f"{name}.cl")}
+    assert kernels == set(KERNELS)
+    assert set(harness_of("radices 4, 4 and 8, 4", np.float32).program.arguments) == kernels
+
+
+def test_writes_past_the_end_of_an_array_are_found():
+    harness = harness_of("outer radix 2", np.float32)
+    harness.forget()
+    written, other = harness.put(np.zeros(4)), harness.put(np.zeros(4))
+    assert not harness.take(other, 4).any()
+    cl.enqueue_copy(harness.launcher.queue, written, np.ones(1, np.uint8), dst_offset=16)
+    with pytest.raises(DeviceError, match="written past the end of an array"):
+        harness.take(other, 4)
+    harness.forget()
+    assert not harness.take(other, 4).any()

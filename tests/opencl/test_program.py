@@ -1,0 +1,115 @@
+"""Which programs are built, with which tuning, and which of them a process holds."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import lnocl
+from lnocl.opencl import program
+from lnocl.opencl.device import choose, context_of
+from lnocl.opencl.program import Program, Tuning, tune
+
+KIB = 1024
+
+
+def device(kind, local_kib):
+    return SimpleNamespace(type=kind, local_mem_size=local_kib * KIB, max_work_group_size=256)
+
+
+@pytest.mark.parametrize("local_kib", [256, 1024, 2048, 65536])
+@pytest.mark.parametrize(
+    ("grid", "dtype", "needed_kib"),
+    [
+        ((64, 64), np.float32, 8),
+        ((1024, 1024), np.float32, 128),
+        ((2048, 4096), np.float32, 256),
+        ((8192, 64), np.float64, 1024),
+        ((8192, 8192), np.float64, 1024),
+    ],
+)
+def test_scratch_is_global_where_a_block_does_not_fit_in_local_memory(
+    grid, dtype, needed_kib, local_kib
+):
+    tuning = tune(device(cl.device_type.CPU, local_kib), np.dtype(dtype), grid)
+    assert tuning.block * np.dtype(dtype).itemsize == 32
+    assert tuning.scratch_is_global == (needed_kib > local_kib)
+
+
+def test_a_group_needs_room_for_its_sums_beside_the_block():
+    """A block of 64 KiB, and 128 sums: no more than the block would fit."""
+    gpu = device(cl.device_type.GPU, 64)
+    tuning = tune(gpu, np.dtype(np.float32), (512, 1024))
+    assert (tuning.block, tuning.group) == (8, 64)
+    assert tuning.scratch_is_global
+    gpu.local_mem_size += 2 * 64 * 4
+    assert not tune(gpu, np.dtype(np.float32), (512, 1024)).scratch_is_global
+
+
+@pytest.fixture
+def context():
+    return context_of(choose().device)
+
+
+@pytest.fixture
+def compiled(monkeypatch):
+    """The options of the programs that are compiled, which takes no time."""
+    options = []
+
+    def compile_nothing(context, text, given, file):
+        options.append(given)
+        return SimpleNamespace(kernel_names=["rfft_rows"], used=set(), store=lambda: None)
+
+    monkeypatch.setattr(program, "_programs", type(program._programs)())
+    monkeypatch.setattr(program, "_load", lambda *_: None)
+    monkeypatch.setattr(program, "_compile", compile_nothing)
+    monkeypatch.setattr(program.weakref, "finalize", lambda *_: None)
+    return options
+
+
+def build(context, grid=(8, 8), **scene):
+    return Program(context, grid, np.dtype(np.float32), Tuning(4, 4), **scene)
+
+
+def test_a_process_builds_a_program_once(context, compiled):
+    for _ in range(3):
+        build(context)
+    assert len(compiled) == 1
+
+
+@pytest.mark.parametrize("n_stars", [[0, 1, 8], [9, 64], [65, 200, 512]])
+def test_a_star_more_is_no_other_program(context, compiled, n_stars):
+    for n in n_stars:
+        build(context, n_stars=n)
+    assert len(compiled) == 1
+
+
+def test_more_stars_than_there_is_room_for_are_refused(context):
+    with pytest.raises(lnocl.DeviceError, match="5000 stars are too many for the kernels"):
+        build(context, n_stars=5000)
+
+
+def test_the_programs_used_last_are_held(context, compiled):
+    sizes = [(2**k, 2**m) for k in range(3, 8) for m in range(3, 8)][: program.MAX_PROGRAMS + 1]
+    for size in sizes[:-1]:
+        build(context, size)
+    build(context, sizes[0])
+    build(context, sizes[-1])
+    assert len(program._programs) == program.MAX_PROGRAMS
+    build(context, sizes[0])
+    assert len(compiled) == len(sizes)
+    build(context, sizes[1])
+    assert len(compiled) == len(sizes) + 1
+
+
+def test_the_names_of_arguments_are_those_that_the_kernels_declare(context):
+    arguments = Program(context, (16, 32), np.dtype(np.float32)).arguments
+    assert arguments["rfft_rows"] == ("spectra", "pixels", "row_roots", "scratch")
+    assert arguments["fft_columns"] == ("spectra", "column_roots", "scratch")
+
+
+def test_kernels_and_their_program_are_let_go(context):
+    """PyOpenCL's `Program.all_kernels` gives kernels that keep themselves and their program."""
+    built = Program(context, (16, 32), np.dtype(np.float32))
+    assert built.kernel("rfft_rows").reference_count == 1
