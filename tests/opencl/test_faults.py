@@ -1,23 +1,18 @@
 """Devices that fail, caches that are broken, forks, and objectives that are not finite."""
 
-import os
 import re
-import subprocess
-import sys
-import time
-import zipfile
-from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
 import pytest
+from processes import run_python
 from runtimes import on_pocl
 from scenes import make_smooth_psfs
 
 import lnocl
 from lnocl.engines import opencl
 from lnocl.engines.numpy import ReferenceEngine
-from lnocl.opencl import device, kernel_cache, program
+from lnocl.opencl import device, program
 
 
 def observe(n=16, p=1):
@@ -135,7 +130,7 @@ def test_every_public_verb_of_the_engine_is_guarded():
 
 
 def test_a_compiler_that_fails_leaves_its_whole_log(monkeypatch, tmp_path):
-    monkeypatch.setattr(program, "source", lambda names: "this is no OpenCL;\nnor this")
+    monkeypatch.setattr(program, "source", lambda: "this is no OpenCL;\nnor this")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     message = refused()
     (log,) = tmp_path.glob("lnocl-build-*.log")
@@ -148,32 +143,10 @@ def test_a_compiler_that_fails_leaves_its_whole_log(monkeypatch, tmp_path):
 
 @on_pocl  # with others, PyOpenCL needs a folder for temporary files first
 def test_a_log_that_cannot_be_saved_is_no_other_error(monkeypatch):
-    monkeypatch.setattr(program, "source", lambda names: "this is no OpenCL")
+    monkeypatch.setattr(program, "source", lambda: "this is no OpenCL")
     device.choose()  # has made its folder
     monkeypatch.setattr("tempfile.tempdir", "/nonexistent")
     assert "could not be saved" in refused()
-
-
-def run_python(code, *arguments, cwd=None, **environment):
-    """Run a program in a process of its own, which has a kernel cache of its own."""
-    return subprocess.run(
-        [sys.executable, "-c", PRELUDE + code, *arguments],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(lnocl.__file__).parents[1]), **environment},
-        cwd=cwd,
-        timeout=120,
-    )
-
-
-PRELUDE = """
-import os, sys
-import numpy as np
-import lnocl
-observation = lnocl.Observation(np.arange(256.0).reshape(16, 16), np.ones((3, 3)))
-def deconvolve(n_iter=3):
-    return lnocl.deconvolve(observation, n_iter=n_iter).extended.sum()
-"""
 
 
 @pytest.mark.exhaustive
@@ -196,164 +169,6 @@ for room in (170, 200, 230):
     done = run_python(code)
     assert done.returncode == 0, done.stderr
     assert "too little memory free: the scene takes 1" in done.stdout
-
-
-@pytest.fixture(scope="module")
-def warm(tmp_path_factory):
-    """A store with the archive of one program, and what a run with it makes."""
-    folder = tmp_path_factory.mktemp("store")
-    done = run_python("print(deconvolve())", POCL_CACHE_DIR=str(folder))
-    (archive,) = folder.iterdir()
-    return archive.name, archive.read_bytes(), done.stdout
-
-
-@on_pocl
-def test_kernels_are_kept_and_used_again(warm, tmp_path):
-    name, content, said = warm
-    (tmp_path / name).write_bytes(content)
-    begin = time.monotonic()
-    code = (
-        "from lnocl.opencl import program\nprint(deconvolve())\nprint(os.environ['POCL_CACHE_DIR'])"
-    )
-    done = run_python(code, POCL_CACHE_DIR=str(tmp_path))
-    assert time.monotonic() - begin < 30
-    assert done.stdout == f"{said}{tmp_path}\n"
-    assert not done.stderr
-    (archive,) = tmp_path.iterdir()
-    assert archive.read_bytes() == content
-    with zipfile.ZipFile(archive) as kept:
-        assert any(file.endswith("scale_rows.so") for file in kept.namelist())
-
-
-def middle(content):
-    """Return the content with some bytes changed in a file of the archive."""
-    at = content.index(b"\x7fELF") + 2000
-    return content[:at] + bytes(64) + b"\xff" * 64 + content[at + 128 :]
-
-
-@on_pocl
-@pytest.mark.parametrize(
-    "damage",
-    [
-        pytest.param(lambda content: b"", id="empty", marks=pytest.mark.exhaustive),
-        pytest.param(
-            lambda content: content[: len(content) // 2],
-            id="truncated",
-            marks=pytest.mark.exhaustive,
-        ),
-        pytest.param(
-            lambda content: np.random.default_rng(1).bytes(9999),
-            id="garbage",
-            marks=pytest.mark.exhaustive,
-        ),
-        pytest.param(middle, id="changed"),
-    ],
-)
-def test_damaged_kernels_are_not_loaded_but_made_anew(warm, tmp_path, damage):
-    name, content, said = warm
-    (tmp_path / name).write_bytes(damage(content))
-    done = run_python("print(deconvolve())", POCL_CACHE_DIR=str(tmp_path))
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == said
-    assert (
-        f"the kernels kept in {tmp_path / name} are damaged, and are compiled anew" in done.stderr
-    )
-    with zipfile.ZipFile(tmp_path / name) as kept:
-        assert kept.testzip() is None
-
-
-@on_pocl
-@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
-def test_of_damaged_kernels_no_file_is_unpacked_that_is_not_as_it_was(warm, tmp_path):
-    name, content, _ = warm
-    archive, rng = tmp_path / name, np.random.default_rng(1)
-    archive.write_bytes(content)
-    kernel_cache._unpack(archive, tmp_path / "sound")
-    directory = content.index(b"PK\1\2")
-    method = directory + 10  # by which the first file is said to be compressed
-    changes = [(method, 8), (method, 12), (method, 14)]
-    for at in (*rng.integers(0, directory, 60), *rng.integers(directory, len(content), 240)):
-        changes.append((at, content[at] ^ (1 << int(rng.integers(8)))))
-    for k, (at, value) in enumerate(changes):
-        damaged = bytearray(content)
-        damaged[at] = value
-        archive.write_bytes(damaged)
-        own = tmp_path / str(k)
-        kernel_cache._unpack(archive, own)
-        for path in own.rglob("*.so"):
-            assert path.read_bytes() == (tmp_path / "sound" / path.relative_to(own)).read_bytes()
-
-
-@on_pocl
-def test_a_disk_that_is_full_cuts_no_kernel_short(warm, tmp_path, monkeypatch):
-    """PoCL would load what there is of it, and kill the process."""
-    name, content, _ = warm
-    (tmp_path / name).write_bytes(content)
-    own = tmp_path / "own"
-    own.mkdir()
-
-    def copy(source, target):
-        target.write(source.read(100))
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patched:
-        patched.setattr("shutil.copyfileobj", copy)
-        assert kernel_cache._unpack(tmp_path / name, own) == []
-    assert not [path for path in own.rglob("*") if path.is_file()]
-    assert kernel_cache._unpack(tmp_path / name, own)
-    assert any(path.name == "scale_rows.so" for path in own.rglob("*"))
-
-
-@on_pocl
-def test_a_folder_that_cannot_keep_kernels_is_said_once(tmp_path):
-    (tmp_path / "file").touch()
-    code = "print(deconvolve(), deconvolve())"
-    done = run_python(code, POCL_CACHE_DIR=str(tmp_path / "file" / "folder"))
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count("LnoclWarning") == 1
-    assert "(Not a directory), and are compiled anew by every process; set POCL" in done.stderr
-
-
-def test_no_folder_for_kernels_at_all(monkeypatch):
-    monkeypatch.setattr(kernel_cache, "_own", [])
-    monkeypatch.setattr("tempfile.tempdir", "/nonexistent")
-    with pytest.raises(lnocl.DeviceError, match=r"no folder for kernels .* set TMPDIR"):
-        device.find_devices()
-
-
-@on_pocl
-@pytest.mark.parametrize("broken", ["folder", "garbage"])
-def test_caches_of_pyopencl_that_are_broken(tmp_path, broken, warm):
-    name, content, said = warm
-    store = tmp_path / "store"
-    store.mkdir()
-    (store / name).write_bytes(content)
-    cache = tmp_path / "cache"
-    if broken == "folder":
-        cache.touch()
-    else:
-        run_python("deconvolve()", POCL_CACHE_DIR=str(store), XDG_CACHE_HOME=str(cache))
-        (kept,) = cache.glob("pytools/*.sqlite")
-        kept.write_bytes(np.random.default_rng(1).bytes(20000))
-    done = run_python("print(deconvolve())", POCL_CACHE_DIR=str(store), XDG_CACHE_HOME=str(cache))
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == said
-    assert done.stderr.count("the kernels that PyOpenCL keeps cannot be used") == 1
-
-
-@pytest.mark.exhaustive
-def test_binaries_of_pyopencl_that_are_broken(monkeypatch, tmp_path):
-    """As on runtimes that have no cache of their own: PyOpenCL keeps binaries for them."""
-    monkeypatch.setattr("pyopencl.characterize.has_src_build_cache", lambda device: False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    expected = lnocl.deconvolve(observe(), n_iter=2).extended
-    binaries = list(tmp_path.rglob("binary"))
-    assert binaries
-    for binary in binaries:
-        binary.write_bytes(b"rubbish")
-    with pytest.warns(lnocl.LnoclWarning, match="the kernels that PyOpenCL keeps cannot be used"):
-        found = lnocl.deconvolve(observe(), n_iter=2).extended
-    assert np.array_equal(found, expected)
 
 
 def test_a_fork_after_opencl_is_refused():
