@@ -628,7 +628,8 @@ def test_memory_estimate_is_what_the_buffers_hold(name):
     engine = engine_of(name, "single", takes_steps=True)
     engine.extended()  # waits for the device
     launcher = engine._launcher
-    held = [*engine._buffers.values(), launcher._row_roots, launcher._column_roots]
+    held = [*engine._memory.buffers.values()]
+    held += [launcher.own[name] for name in ("row_roots", "column_roots")]
     assert engine.bytes_needed == sum(buffer.size for buffer in held)
 
 
