@@ -205,17 +205,19 @@ class _Trial:
 
     def state(self) -> Arrays:
         """Return what `restore` needs, at an iteration that was kept last."""
-        states = [run.state() for pair in self._runs for run in pair]
-        state = {HALVES + name: np.array([each[name] for each in states]) for name in states[0]}
+        runs = enumerate(run for pair in self._runs for run in pair)
+        state = {f"{HALVES}{k}_{name}": a for k, run in runs for name, a in run.state().items()}
         state["kept_at"] = np.array(self.iterations)
         state["kept"] = np.array([pairs for _, pairs in self.kept])
         return state
 
     def restore(self, state: Arrays) -> None:
         """Go on from this state."""
-        mine = {n.removeprefix(HALVES): a for n, a in state.items() if n.startswith(HALVES)}
         for k, run in enumerate(run for pair in self._runs for run in pair):
-            run.restore({name: each[k] for name, each in mine.items()})
+            prefix = f"{HALVES}{k}_"
+            run.restore(
+                {n.removeprefix(prefix): a for n, a in state.items() if n.startswith(prefix)}
+            )
         self.kept = [
             (int(at), [(a, b) for a, b in pairs])
             for at, pairs in zip(state["kept_at"], state["kept"], strict=True)

@@ -16,7 +16,6 @@ from lnocl.errors import refuse_not_finite
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
-from lnocl.scene.shifting import Stamp
 from lnocl.solvers import SOLVERS
 from lnocl.solvers.sgp import Steps
 
@@ -141,11 +140,7 @@ class Run:
             "positions": self.scene.stars,
         }
         if scaling is not None:
-            state |= {
-                "shift": scaling.shift,
-                "cross_information": np.array([s.values for s in scaling.cross_information]),
-            }
-            state["star_information"] = scaling.star_information
+            state |= scaling.state()
         for values in state.values():
             refuse_not_finite(values.sum(initial=0.0, dtype=np.float64))
         return state
@@ -173,7 +168,6 @@ class Run:
         self._steps = Steps(alpha, lengths, bool(state["progress"][2]))
         if self._refines:
             self.scene.move_stars(state["positions"])
-            self._model.move_stars(self.scene)
             self.engine.move_stars()
         if self.engine.scaling is not None:
             self.engine.set_scaling(self._restored_scaling(state))
@@ -203,12 +197,7 @@ class Run:
     def _restored_scaling(self, state: dict[str, NDArray]) -> Scaling:
         from lnocl.solvers.scaling import Scaling
 
-        n, grid = self.scene.n_stars, self.scene.grid
-        cross_information = state.get("cross_information", np.zeros(0)).reshape(n, *grid)
-        information = state.get("star_information", np.zeros(0)).reshape(n, n)
-        return Scaling(
-            state["shift"], information, [Stamp(each, 0, 0) for each in cross_information]
-        )
+        return Scaling.from_state(state)
 
     def _refine(self) -> None:
         """Move the stars to where the extended source of now makes them most likely."""
@@ -231,7 +220,6 @@ class Run:
         starts = [given, fit.look_round(given)] if look_round else [given]
         stars = min(map(fit.minimise, starts), key=fit.objective)
         self.scene.move_stars(stars.positions)
-        self._model.move_stars(self.scene)
         return stars.fluxes
 
     def star_positions(self) -> Array:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -10,6 +11,10 @@ from numpy.typing import NDArray
 
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
+from lnocl.scene.shifting import Stamp
+
+# Of the largest value: what an FFT leaves where there is nothing.
+ROUNDING = 1e-16
 
 
 class Model:
@@ -23,8 +28,6 @@ class Model:
         Its relative exposure where a pixel was observed, else 0.
     background : ndarray of float64, shape (p, 1, 1) or (p, Ny, Nx)
         b_j.
-    stars : list of StarImages
-        The P_js of each image.
 
     Notes
     -----
@@ -33,7 +36,9 @@ class Model:
     """
 
     def __init__(self, scene: Scene) -> None:
+        self._scene = scene
         self.shape = (scene.n_images, *scene.grid)
+        self._window_otfs: dict[Any, NDArray[np.complex128]] = {}
         self._otfs = [scipy.fft.rfft2(scene.psf(j), workers=-1) for j in range(scene.n_images)]
         self.weights = np.broadcast_to(
             np.float64(1.0) if scene.weights is None else scene.weights.astype(np.float64),
@@ -41,11 +46,6 @@ class Model:
         )
         background = scene.background()
         self.background = background if background.ndim == 3 else background[:, None, None]
-        self.move_stars(scene)
-
-    def move_stars(self, scene: Scene) -> None:
-        """Put the stars where the scene has them now."""
-        self.stars = [_star_images(scene, j) for j in range(scene.n_images)]
 
     def forward(self, extended: Array) -> Array:
         """Return the ``A_j f``, shape (p, Ny, Nx)."""
@@ -62,10 +62,37 @@ class Model:
             spectrum += otf.conj() * scipy.fft.rfft2(array, workers=-1)
         return scipy.fft.irfft2(spectrum, self.shape[1:], workers=-1, overwrite_x=True)
 
+    def adjoint_of_stamps(self, stamps: Sequence[Stamp]) -> Stamp:
+        """Return ``sum_j A_j^T x_j`` of arrays x_j that are 0 beyond a stamp, one an image.
+
+        It is computed in the window that it lies in, where that is smaller than the grid. Outer
+        rows and columns below the rounding of its largest value are cut off.
+        """
+        psfs = [self._scene.psf_stamp(j) for j in range(len(stamps))]
+        first, size = _window_of_correlations(stamps, psfs)
+        if (size >= self.shape[1:]).any():
+            total = self.adjoint(stamp.on_grid(self.shape[1:]) for stamp in stamps)
+            return _without_rounding(Stamp(total, 0, 0))
+        shape = tuple(scipy.fft.next_fast_len(int(n), real=True) for n in size)
+        spectrum: Any = 0.0
+        for j, (stamp, psf) in enumerate(zip(stamps, psfs, strict=True)):
+            laid = np.zeros(shape)
+            y, x = stamp.y - psf.y - first[0], stamp.x - psf.x - first[1]
+            laid[y : y + stamp.values.shape[0], x : x + stamp.values.shape[1]] = stamp.values
+            spectrum = spectrum + self._window_otf(j, shape).conj() * scipy.fft.rfft2(laid)
+        total = scipy.fft.irfft2(spectrum, shape)[: size[0], : size[1]]
+        return _without_rounding(Stamp(total, int(first[0]), int(first[1])))
+
+    def _window_otf(self, j: int, shape: tuple[int, ...]) -> NDArray[np.complex128]:
+        if (j, shape) not in self._window_otfs:
+            values = self._scene.psf_stamp(j).values
+            self._window_otfs[j, shape] = scipy.fft.rfft2(values, shape)
+        return self._window_otfs[j, shape]
+
     def starlight(self, star_fluxes: Array) -> Iterator[Array]:
-        """Yield ``sum_s c_s P_js`` of each image, shape (Ny, Nx)."""
-        for stars in self.stars:
-            yield stars.light(star_fluxes).reshape(self.shape[1:])
+        """Yield ``sum_s c_s P_js`` of each image, shape (Ny, Nx), the stars where they are now."""
+        for j in range(self.shape[0]):
+            yield self._scene.star_field.light(j, star_fluxes)
 
     def images(self, extended: Array, star_fluxes: Array) -> Array:
         """Return the m_j, not below 0."""
@@ -79,68 +106,18 @@ class Model:
         return images
 
 
-# All pixels are a slice, which takes no gathering and scattering.
-Pixels = NDArray[np.int64] | slice
+def _window_of_correlations(
+    stamps: Sequence[Stamp], psfs: Sequence[Stamp]
+) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """Return first pixel and shape of the window that correlations of stamps with PSFs lie in."""
+    first, last = [], []
+    for stamp, psf in zip(stamps, psfs, strict=True):
+        corner = np.array([stamp.y - psf.y, stamp.x - psf.x])
+        first.append(corner - psf.values.shape + 1)
+        last.append(corner + stamp.values.shape)
+    start = np.min(first, axis=0)
+    return start, np.max(last, axis=0) - start
 
 
-class StarImages:
-    """Images of stars over some pixels, in one dimension, of which they light few or all.
-
-    Attributes
-    ----------
-    size : int
-        Number of pixels.
-    lit : list of (ndarray of int64 or slice, ndarray of float64)
-        For each star the pixels that it lights, and P there.
-    """
-
-    def __init__(self, size: int, lit: list[tuple[Pixels, Array]]) -> None:
-        self.size, self.lit = size, lit
-
-    def __len__(self) -> int:
-        return len(self.lit)
-
-    def light(self, fluxes: Array) -> Array:
-        """Return ``sum_s c_s P_s``."""
-        total = np.zeros(self.size)
-        for flux, (pixels, values) in zip(fluxes, self.lit, strict=True):
-            total[pixels] += flux * values
-        return total
-
-    def products(self, x: Array) -> Array:
-        """Return the ``<P_s, x>``."""
-        return np.array([values @ x[pixels] for pixels, values in self.lit])
-
-    def information(self, weights: Array) -> Array:
-        """Return the ``<P_s, w P_t>``."""
-        rows = []
-        for pixels, values in self.lit:
-            weighted = np.zeros(self.size)
-            weighted[pixels] = weights[pixels] * values
-            rows.append(self.products(weighted))
-        return np.array(rows).reshape(len(self), len(self))
-
-    def on_lit_pixels(self) -> tuple[Pixels, StarImages]:
-        """Return the pixels that any star lights, and the images over these alone."""
-        is_lit = np.zeros(self.size, bool)
-        for pixels, _ in self.lit:
-            is_lit[pixels] = True
-        if is_lit.all():
-            return slice(None), self
-        size = int(is_lit.sum())
-        place = np.cumsum(is_lit) - 1
-        lit = [(_unless_all(place[pixels], size), values) for pixels, values in self.lit]
-        return np.flatnonzero(is_lit), StarImages(size, lit)
-
-
-def _unless_all(pixels: NDArray[np.int64], size: int) -> Pixels:
-    return slice(None) if len(pixels) == size else pixels
-
-
-def _star_images(scene: Scene, j: int) -> StarImages:
-    lit: list[tuple[Pixels, Array]] = []
-    for s in range(scene.n_stars):
-        star = scene.star_image(j, s).ravel()
-        pixels = np.flatnonzero(star)
-        lit.append((_unless_all(pixels, star.size), star[pixels]))
-    return StarImages(scene.grid[0] * scene.grid[1], lit)
+def _without_rounding(stamp: Stamp) -> Stamp:
+    return stamp.trimmed(ROUNDING * float(abs(stamp.values).max()))

@@ -10,10 +10,10 @@ from typing import Any, cast
 from lnocl.errors import InputError
 
 # Of a weight: the most that means anything, beside images scaled to unit mean.
-MOST_WEIGHT = 2.0**64
+MAX_WEIGHT = 2.0**64
 
 # To which Python compares an integer of any size without making a float of it.
-MOST = sys.float_info.max
+MAX_FLOAT = sys.float_info.max
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,6 @@ class Penalty:
 
 def _is_weight(number: float) -> bool:
     try:
-        return 0 <= float(number) <= MOST
+        return 0 <= float(number) <= MAX_FLOAT
     except OverflowError:  # of whole numbers
         return False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl.errors import InputError, warn
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.padding import recommend_pad
-from lnocl.scene.penalty import MOST_WEIGHT, Penalty
-from lnocl.scene.shifting import MARGIN, Stamp, place
+from lnocl.scene.penalty import MAX_WEIGHT, Penalty
+from lnocl.scene.shifting import MovablePsf, Stamp
+from lnocl.scene.stars import StarField, rows_within
 
 log = logging.getLogger("lnocl")
 
@@ -25,7 +27,7 @@ OBSERVED_SHARE = 0.01
 
 # Of a PSF's peak: what it may ring by, moved by half a pixel, before that is worth a warning.
 # Gaussians do not ring where they are centred on a pixel, sharp ones do where they are not.
-MOST_RINGING = 0.01
+MAX_RINGING = 0.01
 
 # The one division guard: where the model is not above this (images have unit mean) the ratio is
 # taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
@@ -103,7 +105,7 @@ class Scene:
         leeway: float = 0.0,
     ) -> None:
         self.observation = observation
-        self.stars = _check_stars(stars, observation)
+        positions = _check_stars(stars, observation)
         self._leeway = leeway
         if isinstance(pad, str) and pad == "auto":
             pad = recommend_pad(observation)
@@ -121,18 +123,20 @@ class Scene:
         self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / mean_exposure)
         relative = exposure / mean_exposure
         self._gains = np.ones(self.n_images) if has_map else relative
+        self._psfs = [MovablePsf(psf, self.grid) for psf in self.scaled_psfs()]
         self.weights = self._weigh(relative if has_map else None)
-        self.star_weights = self._weigh_stars()
-        self._refuse_unseen_stars()
+        self._field = self._place_stars(positions)
+        self.star_weights, is_observed = self._weigh_stars(self._field)
+        self._refuse_unobserved_stars(is_observed)
         self._warn_of_ringing()
-        self.edge = EDGE * self._read_off()[1] if self.smoothing else 0.0
+        self.edge = EDGE * self._rough_fit[1] if self.smoothing else 0.0
 
     def _scaled(self, name: str, weight: float, factor: float) -> float:
         """Return a weight of the penalty, scaled; refuse one that is too large for float32."""
-        if weight * factor > MOST_WEIGHT:
+        if weight * factor > MAX_WEIGHT:
             raise InputError(
                 f"{name} {weight:g} is too large for images of about {self.scale:g} electrons per "
-                f"pixel; the most that means anything there is {MOST_WEIGHT / factor:g}"
+                f"pixel; the most that means anything there is {MAX_WEIGHT / factor:g}"
             )
         return float(weight) * factor if weight else 0.0  # the factor may be infinite
 
@@ -150,14 +154,23 @@ class Scene:
     def move_stars(self, stars: ArrayLike) -> None:
         """Give the stars other positions, none farther away than the leeway.
 
-        They may leave the images, but a star that would go where all is masked stays where it was.
+        They may leave the images, but a star stays where it was rather than go where no image has
+        observed its light.
         """
         before, weights = self.stars, self.star_weights
-        self.stars = numbers("stars", stars)
-        self.star_weights = self._weigh_stars()
-        unseen = self.star_weights < OBSERVED_SHARE * self.n_images
-        self.stars = np.where(unseen[:, None], before, self.stars)
-        self.star_weights = np.where(unseen, weights, self.star_weights)
+        self._field = self._place_stars(numbers("stars", stars))
+        self.star_weights, is_observed = self._weigh_stars(self._field)
+        if not is_observed.all():
+            self._field = self._place_stars(np.where(is_observed[:, None], self.stars, before))
+            self.star_weights = np.where(is_observed, self.star_weights, weights)
+
+    def _place_stars(self, positions: Array) -> StarField:
+        return StarField(self._psfs, self.observation.offsets, self.grid, positions)
+
+    @property
+    def stars(self) -> Array:
+        """Positions of the stars, shape (n, 2)."""
+        return self._field.positions
 
     @property
     def has_exposure_map(self) -> bool:
@@ -196,7 +209,11 @@ class Scene:
 
     def psf(self, j: int) -> Array:
         """Return the PSF of image j on the grid, shape (Ny, Nx), its peak at the offset."""
-        return self._place(j, 0.0, 0.0).on_grid(self.grid)
+        return self.psf_stamp(j).on_grid(self.grid)
+
+    def psf_stamp(self, j: int) -> Stamp:
+        """Return the PSF of image j, its peak at the offset, where it is not 0."""
+        return self._psfs[j].at(*self.observation.offsets[j])
 
     def star_image(self, j: int, s: int) -> Array:
         """Return P_js, the PSF of image j centred on star s, shape (Ny, Nx)."""
@@ -204,27 +221,21 @@ class Scene:
 
     def star_stamp(self, j: int, s: int) -> Stamp:
         """Return P_js, where it is not 0."""
-        return self._place(j, *self.stars[s])
+        return self._field.stamps[j][s]
+
+    @property
+    def star_field(self) -> StarField:
+        """The stars where they are now."""
+        return self._field
 
     def scaled_psfs(self) -> list[Array]:
         """Return the PSFs times the relative exposure of their image, where that is a number."""
         return list(self._gains[:, None, None] * self.observation.psfs)
 
-    def _place(self, j: int, x: float, y: float) -> Stamp:
-        dx, dy = self.observation.offsets[j]
-        return place(self._gains[j] * self.observation.psfs[j], self.grid, x + dx, y + dy)
-
     def star_rows(self, s: int) -> NDArray[np.bool_]:
-        """Return the rows of the grid, shape (Ny,), that the images of star s may reach into."""
-        rows = np.zeros(self.grid[0], bool)
-        for j in range(self.n_images):
-            stamp = self.star_stamp(j, s)
-            may_be_lit = (stamp.values != 0).any(axis=1) | (self._leeway > 0)
-            rows[stamp.rows(self.grid)[may_be_lit]] = True
-        if self._leeway:
-            reach = int(np.ceil(self._leeway)) + MARGIN + 1
-            rows = np.any([np.roll(rows, step) for step in range(-reach, reach + 1)], axis=0)
-        return rows
+        """Return the rows of the grid, shape (Ny,), that the images of star s may light."""
+        stamps = [self.star_stamp(j, s) for j in range(self.n_images)]
+        return rows_within(stamps, self.grid, self._leeway)
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
         """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""
@@ -249,34 +260,36 @@ class Scene:
         InputError
             Where either has the wrong shape, a negative, masked or non-finite value.
         """
-        if extended is None or star_fluxes is None:
-            default_fluxes, level = self._read_off()
         if star_fluxes is None:
-            fluxes = default_fluxes
+            fluxes = self._rough_fit[0].copy()
         else:
             fluxes = _check_start("initial_star_fluxes", star_fluxes, (self.n_stars,)) / self.unit
         if extended is None:
-            return np.full(self.grid, level), fluxes
+            return np.full(self.grid, self._rough_fit[1]), fluxes
         given = _check_start("initial_extended", extended, self.observation.shape) / self.unit
         return self._on_grid(given, fill=given.mean()), fluxes
 
-    def _read_off(self) -> tuple[Array, float]:
-        """Read star fluxes and the level of a flat extended source off the data."""
+    @cached_property
+    def _rough_fit(self) -> tuple[Array, float]:
+        """Star fluxes and the level of a flat extended source, by linear least squares."""
         images, background = self.images(), self.background()
         if background.ndim == 1:
             background = background[:, None, None]
-        weights = np.ones(images.shape, bool) if self.weights is None else self.weights > 0
-        excess = np.where(weights, images - background, 0.0)
-        n_observed = weights.sum()
+        observed = np.ones(images.shape, bool) if self.weights is None else self.weights > 0
+        excess = np.where(observed, images - background, 0.0)
+        n_observed = observed.sum()
         mean = excess.sum() / n_observed
         normal = np.zeros((self.n_stars, self.n_stars))
         moment = np.zeros(self.n_stars)
-        for j in range(self.n_images):
-            stars = np.array([self.star_image(j, s)[weights[j]] for s in range(self.n_stars)])
-            if stars.size:  # there are stars, and not all of the image is masked
-                centred = stars - stars.mean(axis=1, keepdims=True)
-                normal += centred @ centred.T
-                moment += centred @ excess[j][weights[j]]
+        for j in range(self.n_images if self.n_stars else 0):
+            n_there = observed[j].sum()
+            if not n_there:
+                continue
+            lit = self._field.lit(j)
+            stars, weights = self._field.images(j, lit), observed[j][lit].astype(np.float64)
+            sums = stars.products(weights)[0]
+            normal += stars.information(weights) - np.outer(sums, sums / n_there)
+            moment += stars.products(weights * (excess[j][lit] - excess[j].sum() / n_there))[0]
         # A star or a sky that starts at zero stays there, so each keeps a small share.
         least = max(1e-3 * mean, np.finfo(np.float32).eps)
         fluxes = np.maximum(
@@ -285,27 +298,30 @@ class Scene:
         level = mean - float(fluxes @ self.star_weights) / n_observed
         return fluxes, max(level, least)
 
-    def _weigh_stars(self) -> Array:
+    def _weigh_stars(self, field: StarField) -> tuple[Array, NDArray[np.bool_]]:
+        """Return ``sum_j <P_js, w_j>`` for each star, and whether any image observed it.
+
+        An image did where `OBSERVED_SHARE` of the star's light falls on its good pixels, however
+        short the exposure: it may be the only one that is not saturated. A sum that negative pixels
+        of a PSF make negative counts as 0.
+        """
         if self.weights is None:
-            return np.full(self.n_stars, float(self.n_images))
-        return np.array([self._weigh_star(s) for s in range(self.n_stars)])
-
-    def _refuse_unseen_stars(self) -> None:
-        for (x, y), weight in zip(self.stars, self.star_weights, strict=True):
-            if weight < OBSERVED_SHARE * self.n_images:
-                raise InputError(
-                    f"the star at ({x:g}, {y:g}) lies where all images are masked; "
-                    "leave it out or mend the mask"
-                )
-
-    def _weigh_star(self, s: int) -> float:
-        assert self.weights is not None
-        total = 0.0
+            return np.full(len(field), float(self.n_images)), np.ones(len(field), bool)
+        total, is_observed = np.zeros(len(field)), np.zeros(len(field), bool)
         for j, weights in enumerate(self.weights):
-            stamp = self.star_stamp(j, s)
-            seen = weights[np.ix_(stamp.rows(self.grid), stamp.columns(self.grid))]
-            total += float((stamp.values * seen).sum())
-        return total
+            windows = [(stamp, weights[stamp.window(self.grid)]) for stamp in field.stamps[j]]
+            light = np.array([float((stamp.values * w).sum()) for stamp, w in windows])
+            on_good = np.array([float((stamp.values * (w > 0)).sum()) for stamp, w in windows])
+            total += np.maximum(light, 0.0)
+            is_observed |= (on_good >= OBSERVED_SHARE * self._gains[j]) & (light > 0)
+        return total, is_observed
+
+    def _refuse_unobserved_stars(self, is_observed: NDArray[np.bool_]) -> None:
+        for x, y in self.stars[~is_observed]:
+            raise InputError(
+                f"the star at ({x:g}, {y:g}) lies where all images are masked; "
+                "leave it out or mend the mask"
+            )
 
     def _weigh(self, relative: Array | None) -> NDArray[Any] | None:
         """Return the weights for relative exposures, where they are a map."""
@@ -335,15 +351,14 @@ class Scene:
 
     def _warn_of_ringing(self) -> None:
         """Warn of PSFs that are moved between pixels and are sharper than pixels can hold."""
-        for j, (psf, offset) in enumerate(
-            zip(self.observation.psfs, self.observation.offsets, strict=True)
-        ):
+        for j, offset in enumerate(self.observation.offsets):
             moved = np.concatenate([[offset], self.stars + offset])
             may_move = self._leeway > 0 and self.n_stars > 0
             if not may_move and (moved == np.round(moved)).all():
                 continue
-            dark = min(psf.min(), 0.0) - place(psf, self.grid, 0.5, 0.5).values.min()
-            if dark > MOST_RINGING * psf.max():
+            psf, moved_psf = self.observation.psfs[j], self._psfs[j].at(0.5, 0.5).values
+            dark = min(psf.min(), 0.0) - moved_psf.min() / self._gains[j]
+            if dark > MAX_RINGING * psf.max():
                 warn(
                     f"psf {j} is sharper than its pixels can hold: moved between pixels it rings "
                     f"by up to {dark / psf.max():.1%} of its peak, at whole pixels not"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,11 @@ from lnocl.scene.observation import Array
 MARGIN = 16
 # Aliases of a frequency, 1 / pixel, that are told apart: more would be lost in rounding.
 ALIASES = np.arange(-6, 7)
-# The least share of the light at the highest frequency that is taken for more than rounding.
-LEAST_NYQUIST = 1e-16
+# A smaller share of the light at the highest frequency is taken for rounding.
+MIN_NYQUIST = 1e-16
+
+# Rows and columns of an array: slices, or arrays of indices where they wrap round its edge.
+Window = tuple[Any, Any]
 
 
 class Stamp(NamedTuple):
@@ -28,8 +32,12 @@ class Stamp(NamedTuple):
     def on_grid(self, grid: tuple[int, int]) -> Array:
         """Return the values on the whole grid, 0 elsewhere."""
         laid = np.zeros(grid)
-        laid[: self.values.shape[0], : self.values.shape[1]] = self.values
-        return np.roll(laid, (self.y, self.x), axis=(0, 1))
+        laid[self.window(grid)] = self.values
+        return laid
+
+    def window(self, grid: tuple[int, int]) -> Window:
+        """Return where the values lie, as an index of arrays on the grid."""
+        return window(self.y, self.x, self.values.shape, grid)
 
     def rows(self, grid: tuple[int, int]) -> NDArray[np.int_]:
         """Return the rows of the grid that the values lie in."""
@@ -38,6 +46,84 @@ class Stamp(NamedTuple):
     def columns(self, grid: tuple[int, int]) -> NDArray[np.int_]:
         """Return the columns of the grid that the values lie in."""
         return (self.x + np.arange(self.values.shape[1])) % grid[1]
+
+    def aligned(self, grid: tuple[int, int]) -> Stamp:
+        """Return the same values, those that fill an axis of the grid beginning at its origin."""
+        y, x = (
+            (first, 0) if size == n else (0, first)
+            for first, size, n in zip((self.y, self.x), self.values.shape, grid, strict=True)
+        )
+        values = np.roll(self.values, (y[0], x[0]), axis=(0, 1)) if y[0] or x[0] else self.values
+        return Stamp(values, y[1], x[1])
+
+    def trimmed(self, least: float) -> Stamp:
+        """Return the stamp without outer rows and columns whose values all are this or less.
+
+        One pixel is left, at least.
+        """
+        large = abs(self.values) > least
+        rows, columns = (np.flatnonzero(large.any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
+            return Stamp(self.values[:1, :1], self.y, self.x)
+        inner = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        values = np.ascontiguousarray(self.values[inner])
+        return Stamp(values, self.y + int(rows[0]), self.x + int(columns[0]))
+
+
+def window(y: int, x: int, shape: tuple[int, ...], grid: tuple[int, int]) -> Window:
+    """Return the index of a window of this shape on a periodic grid, its first pixel at (y, x)."""
+    first = y % grid[0], x % grid[1]
+    last = first[0] + shape[0], first[1] + shape[1]
+    if last[0] <= grid[0] and last[1] <= grid[1]:
+        return slice(first[0], last[0]), slice(first[1], last[1])
+    rows, columns = (np.arange(a, b) % n for a, b, n in zip(first, last, grid, strict=True))
+    return rows[:, None], columns
+
+
+class MovablePsf:
+    """A PSF to be placed at several positions of a grid; what these share is made once.
+
+    Parameters
+    ----------
+    psf : ndarray of float64, shape (ky, kx)
+        Of any size; where it is larger than the grid it is wrapped round.
+    grid : tuple of int
+        Shape (Ny, Nx).
+    """
+
+    def __init__(self, psf: Array, grid: tuple[int, int]) -> None:
+        self._psf, self._grid = psf, grid
+
+    def at(self, x: float, y: float, axis: int | None = None) -> Stamp:
+        """Return the PSF at a position, or a derivative, as `place` does."""
+        whole = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+        fraction = y - whole[0], x - whole[1]
+        is_moved = any(fraction) or axis is not None
+        values = self._spectrum.moved(fraction, axis) if is_moved else self._folded
+        return Stamp(values, *(i - n // 2 for i, n in zip(whole, values.shape, strict=True)))
+
+    def with_slopes(self, x: float, y: float) -> tuple[Stamp, Array]:
+        """Return the PSF at a position, and it and its derivatives along x and y, (3, h, w)."""
+        whole = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+        values = self._spectrum.with_slopes((y - whole[0], x - whole[1]))
+        first = (i - n // 2 for i, n in zip(whole, values.shape[1:], strict=True))
+        return Stamp(values[0], *first), values
+
+    @cached_property
+    def _folded(self) -> Array:
+        psf = self._psf
+        for i, n in enumerate(self._grid):
+            if psf.shape[i] > n:
+                psf = fold(psf, n, i)
+        return psf
+
+    @cached_property
+    def _spectrum(self) -> _Spectrum:
+        psf = self._psf
+        for i, n in enumerate(self._grid):
+            psf = _widen(psf, n, i)
+        variances = _variance(self._psf.sum(axis=1)), _variance(self._psf.sum(axis=0))
+        return _Spectrum(psf, variances)
 
 
 def place(psf: Array, grid: tuple[int, int], x: float, y: float, axis: int | None = None) -> Stamp:
@@ -86,56 +172,71 @@ def place(psf: Array, grid: tuple[int, int], x: float, y: float, axis: int | Non
     All of it is for PSFs whose peak is in the middle of a pixel. A Gaussian of 1.5 pixels that is a
     quarter of a pixel off along both axes has an error of 0.10, by the phase alone 0.066.
     """
-    whole = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
-    fraction = y - whole[0], x - whole[1]
-    if any(fraction) or axis is not None:
-        variances = _variance(psf.sum(axis=1)), _variance(psf.sum(axis=0))
-        for i, n in enumerate(grid):
-            psf = _widen(psf, n, i)
-        psf = _move(psf, fraction, variances, axis)
-    first = []
-    for i, n in enumerate(grid):
-        if psf.shape[i] > n:
-            psf = fold(psf, n, i)
-        first.append(whole[i] - psf.shape[i] // 2)
-    return Stamp(psf, *first)
+    return MovablePsf(psf, grid).at(x, y, axis)
 
 
 def _variance(profile: Array) -> float:
-    """Return the sigma^2 of the Gaussian, seen by pixels, that has as much at the frequency 1 / 2.
+    """Return the sigma^2 of the Gaussian, integrated over pixels, with as much at 1 / 2 per pixel.
 
     It and its alias -1 / 2 have ``2 sinc(1 / 2) exp(-pi^2 sigma^2 / 2)`` together, of unit light.
     """
     signs = 1 - 2 * (np.arange(len(profile)) % 2)
-    seen = abs(float(signs @ profile)) / float(profile.sum())
-    return 2.0 / np.pi**2 * float(np.log(4.0 / np.pi / np.clip(seen, LEAST_NYQUIST, 1.0)))
+    share = abs(float(signs @ profile)) / float(profile.sum())
+    return 2.0 / np.pi**2 * float(np.log(4.0 / np.pi / np.clip(share, MIN_NYQUIST, 1.0)))
 
 
-def _move(
-    psf: Array, fraction: tuple[float, float], variances: tuple[float, float], axis: int | None
-) -> Array:
-    import scipy.fft  # it takes a twentieth of a second, which stars on whole pixels need not spend
+class _Spectrum:
+    """The spectrum of a PSF in its margins, and how its frequencies move along each axis."""
 
-    y, x = (_phases(n, fraction[i], variances[i], i == axis) for i, n in enumerate(psf.shape))
-    spectrum = scipy.fft.rfft2(psf) * y[:, None] * x[: len(x) // 2 + 1]
-    return scipy.fft.irfft2(spectrum, psf.shape)
+    def __init__(self, psf: Array, variances: tuple[float, float]) -> None:
+        # Imported here: it takes a twentieth of a second, which stars on whole pixels need not.
+        import scipy.fft
+
+        self._shape, self._inverse = psf.shape, scipy.fft.irfft2
+        self._values = scipy.fft.rfft2(psf)
+        self._phases = [_Phases(n, each) for n, each in zip(psf.shape, variances, strict=True)]
+
+    def moved(self, fraction: tuple[float, float], axis: int | None) -> Array:
+        """Return the PSF moved by fractions of a pixel (dy, dx), or a derivative of that."""
+        y, x = (p.at(fraction[i], i == axis) for i, p in enumerate(self._phases))
+        moved: Array = self._inverse(self._values * y[:, None] * _half(x), self._shape)
+        return moved
+
+    def with_slopes(self, fraction: tuple[float, float]) -> Array:
+        """Return the PSF moved and its derivatives along x and y, shape (3, h, w)."""
+        y, x = (p.at(fraction[i], False) for i, p in enumerate(self._phases))
+        slope_y, slope_x = (p.at(fraction[i], True) for i, p in enumerate(self._phases))
+        along = np.array([y, y, slope_y])[:, :, None]
+        across = np.array([_half(x), _half(slope_x), _half(x)])[:, None, :]
+        values: Array = self._inverse(self._values * along * across, self._shape)
+        return values
 
 
-def _phases(n: int, fraction: float, variance: float, derivative: bool) -> NDArray[np.complex128]:
-    """Return what moves a spectrum of n frequencies, or the derivative of that.
+def _half(phases: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return the factors of the frequencies that a real transform holds."""
+    return phases[: len(phases) // 2 + 1]
+
+
+class _Phases:
+    """What moves a spectrum of n frequencies along an axis.
 
     The highest frequency of an even number has no sign: it and its alias share it equally, so that
     a mirrored PSF moves as its mirror image does.
     """
-    own = np.fft.fftfreq(n)[:, None]
-    frequencies = own + ALIASES
-    shares = np.sinc(frequencies) * np.exp(-2.0 * variance * (np.pi * frequencies) ** 2)
-    shares /= shares.sum(axis=1, keepdims=True)
-    if derivative:
-        shares = shares * (-2j * np.pi * frequencies)
-    moved = np.exp(-2j * np.pi * fraction * own[:, 0])
-    phases: NDArray[np.complex128] = moved * (shares @ np.exp(-2j * np.pi * fraction * ALIASES))
-    return phases
+
+    def __init__(self, n: int, variance: float) -> None:
+        self._own = np.fft.fftfreq(n)
+        frequencies = self._own[:, None] + ALIASES
+        shares = np.sinc(frequencies) * np.exp(-2.0 * variance * (np.pi * frequencies) ** 2)
+        self._shares = shares / shares.sum(axis=1, keepdims=True)
+        self._slopes = self._shares * (-2j * np.pi * frequencies)
+
+    def at(self, fraction: float, derivative: bool) -> NDArray[np.complex128]:
+        """Return the factors for a fraction of a pixel, or the derivatives of these."""
+        moved = np.exp(-2j * np.pi * fraction * self._own)
+        aliases = np.exp(-2j * np.pi * fraction * ALIASES)
+        factors: NDArray[np.complex128] = (self._slopes if derivative else self._shares) @ aliases
+        return moved * factors
 
 
 def fold(psf: Array, n: int, axis: int) -> Array:

@@ -2,35 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
-from lnocl.scene.forward_model import Model
+from lnocl.scene.forward_model import ROUNDING, Model
 from lnocl.scene.observation import Array
-from lnocl.scene.scene import LEAST_MODEL, Scene
-from lnocl.scene.shifting import MARGIN, place
+from lnocl.scene.scene import Scene
+from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
+from lnocl.scene.stars import Piece, StarImages, light_up, overlap, places
+from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood
 
 # How far from where it was given a star may go, in pixels.
 RADIUS = 3.0
 # And in one step: the likelihood is a parabola in a part of the PSF's core only.
-LONGEST_STEP = 0.5
-# No flux falls to less than this share in one step.
-MOST_FADING = 0.1
+MAX_STEP = 0.5
 # Share of what the data say of a position that the pixels which are looked at must hold: far wings
 # say little and are many.
 INFORMATION_SHARE = 0.99
 # Of a PSF's peak: what its darkest pixels are taken for there, which may be 0 or less.
-LEAST_LIT = 1e-6
+MIN_LIT = 1e-6
 # Steps end where they are less than this share of a standard error that images of unit mean would
 # give: of a tenth of their own up to a mean of a million electrons.
 FINISHED = 1e-4
-MOST_STEPS = 30
+MAX_STEPS = 30
 # Before the first, each star is tried this far along x and y too: fringes make false minima.
-TRIED = 1.5
-MOST_HALVED = 10
+TRIAL_STEP = 1.5
+MAX_HALVED = 10
 
 
 class Stars(NamedTuple):
@@ -40,14 +41,24 @@ class Stars(NamedTuple):
     positions: Array
 
 
+@dataclass(frozen=True)
+class _Trial:
+    """Stars, their images with derivatives along x and y, the m_j and J_0."""
+
+    stars: Stars
+    images: list[StarImages]
+    models: list[Array]
+    objective: float
+
+
 class StarFit:
     """The likelihood of stars, for an extended source that is known.
 
     ``J_0(c, x, y)`` with ``m_j = A_j f + sum_s c_s P_j(x_s, y_s) + b_j`` is minimised by Fisher
-    scoring over all of them together, ``F = sum_j <D_j, w_j D_j / m_j>``, D the derivatives of the
-    m_j: ``P_js``, and ``c_s`` times its derivatives with respect to x_s and y_s. Looked at are
-    squares round the stars that hold 99 % of the information on positions; the light of PSFs beyond
-    them stays where the stars of the scene put it.
+    scoring over all of them together, D in `StarLikelihood` being ``P_js``, and ``c_s`` times its
+    derivatives with respect to x_s and y_s. It is summed over squares round the stars that hold
+    99 % of the information on positions; the light of PSFs beyond them stays where the stars of the
+    scene put it.
 
     Parameters
     ----------
@@ -62,117 +73,103 @@ class StarFit:
     """
 
     def __init__(self, scene: Scene, model: Model, extended: Array, given: Array) -> None:
-        self._scene, self._given = scene, given
-        self._psfs = _cut(scene.scaled_psfs())
-        lit = self._lit_pixels()
-        self._place = np.cumsum(lit) - 1
-        self._n_lit = int(lit.sum())
-        self._images = scene.images().ravel()[lit]
-        self._diffuse = (model.forward(extended) + model.background).ravel()[lit]
-        self._weights = model.weights.ravel()[lit]
-        units = np.eye(scene.n_stars)
-        whole = [np.array([*model.starlight(unit)]).ravel()[lit] for unit in units]
-        self._beyond = np.array(whole).T - self._columns(0, scene.stars).toarray()
+        self._given, self._offsets = given, scene.observation.offsets
+        psfs = _cut(scene.scaled_psfs())
+        squares = [
+            [_square(psf.shape, position + offset, scene.grid) for position in given]
+            for psf, offset in zip(psfs, self._offsets, strict=True)
+        ]
+        lit = [light_up(each, scene.grid) for each in squares]
+        diffuse = model.forward(extended) + model.background
+        self._likelihood = StarLikelihood.of_scene(scene, model, diffuse, lit)
+        self._stars = [
+            _MovableStars(MovablePsf(psf, scene.grid), where, scene.stars + offset, whole, around)
+            for psf, offset, where, whole, around in zip(
+                psfs, self._offsets, lit, scene.star_field.stamps, squares, strict=True
+            )
+        ]
 
-    def _lit_pixels(self) -> NDArray[np.bool_]:
-        """Return which pixels of the images a star may light, wherever it goes."""
-        grid, reach = self._scene.grid, int(np.ceil(RADIUS)) + MARGIN + 1
-        lit = np.zeros((self._scene.n_images, *grid), bool)
-        for j, psf in enumerate(self._psfs):
-            for position in self._given:
-                x, y = np.floor(position + self._scene.observation.offsets[j] + 0.5)
-                stamp = place(np.pad(psf, reach), grid, x, y)
-                lit[j][np.ix_(stamp.rows(grid), stamp.columns(grid))] = True
-        return lit.ravel()
-
-    def _columns(self, k: int, positions: Array) -> Any:
-        """Return as sparse columns the ``P_js`` of all stars, or derivatives of them."""
-        lit = [self._light(k, position) for position in positions]
-        ends = np.cumsum([0] + [len(values) for _, values in lit])
-        pixels, values = (np.concatenate([each[i] for each in lit]) for i in range(2))
-        return sparse.csc_array((values, pixels, ends), (self._n_lit, len(lit)))
-
-    def _light(self, k: int, position: Array) -> tuple[NDArray[np.int64], Array]:
-        ny, nx = self._scene.grid
-        pixels, values = [], []
-        for j, psf in enumerate(self._psfs):
-            x, y = position + self._scene.observation.offsets[j]
-            stamp = place(psf, (ny, nx), x, y, (None, 1, 0)[k])
-            rows, columns = stamp.rows((ny, nx)), stamp.columns((ny, nx))
-            pixels.append(((j * ny + rows)[:, None] * nx + columns).ravel())
-            values.append(stamp.values.ravel())
-        return self._place[np.concatenate(pixels)], np.concatenate(values)
-
-    def _light_of(self, positions: Array) -> Any:
-        """Return the ``P_js`` of all stars as sparse columns, what lies beyond the squares too."""
-        return self._columns(0, positions) + sparse.csc_array(self._beyond)
-
-    def _data_term(self, model: Array) -> float:
-        model = np.maximum(model, LEAST_MODEL)
-        return float(self._weights @ (model - self._images * np.log(model)))
+    def _try(self, stars: Stars) -> _Trial:
+        images = [
+            movable.at(stars.positions + offset)
+            for movable, offset in zip(self._stars, self._offsets, strict=True)
+        ]
+        models = self._likelihood.models([each.light(stars.fluxes) for each in images])
+        return _Trial(stars, images, models, self._likelihood.objective(models))
 
     def objective(self, stars: Stars) -> float:
         """Return J_0 over the pixels that stars may light, but for a constant."""
-        return self._data_term(self._diffuse + self._light_of(stars.positions) @ stars.fluxes)
+        return self._try(stars).objective
 
     def derivatives(self, stars: Stars) -> tuple[Array, Array]:
         """Return gradient and Fisher information of J_0 in (c_1 ... c_n, x_1 ..., y_1 ...)."""
-        light = self._light_of(stars.positions)
-        moved = [self._columns(k, stars.positions) for k in (1, 2)]
-        model = np.maximum(self._diffuse + light @ stars.fluxes, LEAST_MODEL)
-        columns = sparse.hstack([light, *(each * stars.fluxes for each in moved)], format="csc")
-        weights = np.where(model > LEAST_MODEL, self._weights, 0.0)  # the guard does not move
-        gradient = columns.T @ (weights * (1.0 - self._images / model))
-        weighted = columns * (weights / model)[:, None]
-        return gradient, (columns.T @ weighted).toarray()
+        return self._derivatives(self._try(stars))
+
+    def _derivatives(self, trial: _Trial) -> tuple[Array, Array]:
+        fluxes = trial.stars.fluxes
+        units = np.concatenate([np.ones_like(fluxes), fluxes, fluxes])
+        gradient = self._likelihood.gradient(trial.images, trial.models).ravel()
+        information = self._likelihood.information(trial.images, trial.models)
+        return units * gradient, units[:, None] * units * information
 
     def look_round(self, stars: Stars) -> Stars:
         """Return each star at the best of nine places, the others where they are, and its flux."""
-        light = self._light_of(stars.positions)
+        lights = [each.light(stars.fluxes) for each in self._try(stars).images]
         fluxes, positions = stars.fluxes.copy(), stars.positions.copy()
-        steps = TRIED * np.array([(dx, dy) for dx in (0, -1, 1) for dy in (0, -1, 1)])
+        steps = TRIAL_STEP * np.array([(dx, dy) for dx in (0, -1, 1) for dy in (0, -1, 1)])
         for s, position in enumerate(stars.positions):
-            others = self._diffuse + light @ np.where(np.arange(len(fluxes)) == s, 0.0, fluxes)
-            least = MOST_FADING * fluxes[s]
-            tried = [self._try(s, position + step, others, least) for step in steps]
+            pixels = [each.around[s] for each in self._stars]
+            images = self._images_around(s, position)
+            others = [
+                light[there] - stars.fluxes[s] * image
+                for light, there, image in zip(lights, pixels, images, strict=True)
+            ]
+            alone = self._likelihood.of_one(pixels, others)
+            tried = []
+            for step in steps:
+                images = self._images_around(s, position + step)
+                flux = max(alone.linear_flux(images), MAX_FADING * stars.fluxes[s])
+                models = alone.models([flux * image for image in images])
+                tried.append((alone.objective(models), flux))
             best = int(np.argmin([objective for objective, _ in tried]))
             positions[s], fluxes[s] = position + steps[best], tried[best][1]
         return Stars(fluxes, positions)
 
-    def _try(self, s: int, position: Array, others: Array, least: float) -> tuple[float, float]:
-        """Return J_0 with star s there, and its flux by weighted least squares, or the least."""
-        star = self._columns(0, position[None]).toarray()[:, 0] + self._beyond[:, s]
-        weighted = self._weights * star / np.maximum(np.maximum(self._images, others), LEAST_MODEL)
-        norm = float(weighted @ star)
-        flux = max(float(weighted @ (self._images - others)) / norm if norm > 0 else 0.0, least)
-        return self._data_term(others + flux * star), flux
+    def _images_around(self, s: int, position: Array) -> list[Array]:
+        return [
+            movable.image_around(s, position + offset)
+            for movable, offset in zip(self._stars, self._offsets, strict=True)
+        ]
 
     def minimise(self, stars: Stars) -> Stars:
         """Return the stars that are most likely, sought from these."""
-        objective = self.objective(stars)
-        for _ in range(MOST_STEPS):
-            gradient, information = self.derivatives(stars)
+        trial = self._try(stars)
+        for _ in range(MAX_STEPS):
+            gradient, information = self._derivatives(trial)
             step = -_invert(information) @ gradient
-            for _ in range(MOST_HALVED):
-                following = self._follow(stars, step)
-                lower = self.objective(following)
-                if lower <= objective:
+            for _ in range(MAX_HALVED):
+                following = self._try(self._follow(trial.stars, step))
+                if following.objective <= trial.objective:
                     break
                 step = step / 2.0
             else:
-                return stars
-            moves = following.positions - stars.positions
-            change = np.concatenate([following.fluxes - stars.fluxes, *moves.T])
-            stars, objective = following, lower
+                return trial.stars
+            change = np.concatenate(
+                [
+                    following.stars.fluxes - trial.stars.fluxes,
+                    *(following.stars.positions - trial.stars.positions).T,
+                ]
+            )
+            trial = following
             if (abs(change) * np.sqrt(np.diag(information)) < FINISHED).all():
                 break
-        return stars
+        return trial.stars
 
     def _follow(self, stars: Stars, step: Array) -> Stars:
         """Return stars a step farther, within what is allowed."""
         n = len(stars.fluxes)
-        fluxes = np.maximum(stars.fluxes + step[:n], MOST_FADING * stars.fluxes)
-        moves = _shorten(step[n:].reshape(2, n).T, LONGEST_STEP)
+        fluxes = np.maximum(stars.fluxes + step[:n], MAX_FADING * stars.fluxes)
+        moves = _shorten(step[n:].reshape(2, n).T, MAX_STEP)
         return Stars(fluxes, self._given + _shorten(stars.positions + moves - self._given, RADIUS))
 
     def errors(self, stars: Stars) -> Stars:
@@ -182,6 +179,97 @@ class StarFit:
         roots = np.sqrt(np.maximum(np.diag(_invert(information)), 0.0))
         errors: Array = np.where(np.diag(information) > 0, roots, np.inf)
         return Stars(errors[:n], errors[n:].reshape(2, n).T)
+
+
+class _MovableStars:
+    """The images of stars over the lit pixels of one image of the sky, at whatever positions.
+
+    Parameters
+    ----------
+    psf : MovablePsf
+        The part of the PSF that moves with a star.
+    lit : ndarray of bool, shape (Ny, Nx)
+        The pixels.
+    positions : ndarray of float64, shape (n, 2)
+        On the grid, where the stars have their whole PSF.
+    whole : sequence of Stamp
+        That whole PSF, for each star.
+    squares : sequence of Stamp
+        The part of the grid that each star may light, wherever it goes.
+
+    Attributes
+    ----------
+    around : list of ndarray of int
+        For each star the pixels that it may light.
+    """
+
+    def __init__(
+        self,
+        psf: MovablePsf,
+        lit: NDArray[np.bool_],
+        positions: Array,
+        whole: Sequence[Stamp],
+        squares: Sequence[Stamp],
+    ) -> None:
+        n, self._grid = len(positions), (lit.shape[0], lit.shape[1])
+        self._psf, self._places = psf, places(lit)
+        both = overlap([*squares, *whole], self._grid).reshape(2, n, 2, n)
+        self._overlap: NDArray[np.bool_] = np.any(both, axis=(0, 2))
+        self._size = int(lit.sum())
+        # One number more, which the dark pixels share: their place is -1.
+        self._image = np.zeros(self._size + 1)
+        self.around: list[NDArray[np.intp]] = []
+        self._beyond: list[Piece] = []
+        for position, stamp, square in zip(positions, whole, squares, strict=True):
+            reached = np.zeros(self._size + 1, bool)
+            for each in (stamp, square):
+                reached[self._places[each.window(self._grid)]] = True
+            self.around.append(np.flatnonzero(reached[:-1]))
+            self._beyond.append(self._find_beyond(position, stamp))
+
+    def _find_beyond(self, position: Array, whole: Stamp) -> Piece:
+        """Return the whole PSF of a star less the part that moves."""
+        at = self._places[whole.window(self._grid)]
+        self._image[at] = whole.values
+        pixels, values = self._moving(position)
+        self._image[pixels] -= values[0]
+        beyond = self._image[at].ravel()
+        self._image[at] = self._image[pixels] = 0.0
+        is_left = (abs(beyond) > ROUNDING * whole.values.max()) & (at.ravel() >= 0)
+        values = np.zeros((3, int(is_left.sum())))
+        values[0] = beyond[is_left]
+        return at.ravel()[is_left], values
+
+    def _moving(self, position: Array) -> Piece:
+        """Return the part of the PSF that moves, and its derivatives along x and y."""
+        stamp, values = self._psf.with_slopes(*position)
+        return self._places[stamp.window(self._grid)].ravel(), values.reshape(3, -1)
+
+    def at(self, positions: Array) -> StarImages:
+        """Return the images of the stars and their derivatives along x and y."""
+        pieces = [
+            [self._moving(position), beyond]
+            for position, beyond in zip(positions, self._beyond, strict=True)
+        ]
+        return StarImages(self._size, pieces, self._overlap)
+
+    def image_around(self, s: int, position: Array) -> Array:
+        """Return the image of star s, there, over the pixels that it may light."""
+        pieces = [self._moving(position), self._beyond[s]]
+        for pixels, values in pieces:
+            self._image[pixels] += values[0]
+        image = self._image[self.around[s]]
+        for pixels, _ in pieces:
+            self._image[pixels] = 0.0
+        return image
+
+
+def _square(shape: tuple[int, ...], position: Array, grid: tuple[int, int]) -> Stamp:
+    """Return the part of the grid that a star may light, wherever it goes from a position."""
+    margin = int(np.ceil(RADIUS)) + MARGIN + 1
+    height, width = (min(k + 2 * margin, n) for k, n in zip(shape, grid, strict=True))
+    x, y = np.floor(position + 0.5).astype(int).tolist()
+    return Stamp(np.broadcast_to(1.0, (height, width)), y - height // 2, x - width // 2)
 
 
 def _invert(information: Array) -> Array:
@@ -201,7 +289,7 @@ def _cut(psfs: list[Array]) -> list[Array]:
     # Where the star's own light is the noise, a pixel says |grad P|^2 / P of a position.
     information = sum(
         (np.square(np.gradient(np.pad(psf, 1))).sum(axis=0)[1:-1, 1:-1])
-        / np.maximum(psf, LEAST_LIT * psf.max())
+        / np.maximum(psf, MIN_LIT * psf.max())
         for psf in psfs
     )
     middle = np.array(psfs[0].shape) // 2

@@ -10,7 +10,7 @@ from scenes import ENGINES, blur, make_psfs, worst
 
 import lnocl
 from lnocl.opencl import program
-from lnocl.scene.penalty import MOST_WEIGHT
+from lnocl.scene.penalty import MAX_WEIGHT
 
 SHAPE = (16, 32)
 PSFS = make_psfs(2, (7, 8))
@@ -76,7 +76,7 @@ def expose(counts, contrast, background, seed=0):
 def test_counts_contrast_background_and_mu(engine, counts, contrast, share, mu, seed):
     background = share * counts
     images = expose(counts, contrast, background, seed)
-    if mu * 2.0 ** np.frexp(images[~MASK].mean())[1] <= MOST_WEIGHT:
+    if mu * 2.0 ** np.frexp(images[~MASK].mean())[1] <= MAX_WEIGHT:
         deconvolve(engine, images, mask=MASK, background=background, mu=mu)
     else:
         with pytest.raises(lnocl.InputError, match=r"mu .* is too large for images"):

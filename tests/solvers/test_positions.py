@@ -331,10 +331,10 @@ def test_rows_that_a_star_may_light_hold_it_wherever_it_goes(shape):
             scene.move_stars([position])
             for j in range(2):
                 assert rows[scene.star_stamp(j, 0).rows(scene.grid)].all()
-            for k in range(3):
-                # Pixels that the fit has no place for would fall on others, or on one another.
-                pixels, values = fit._light(k, position)
-                assert len(np.unique(pixels)) == len(pixels) == len(values)
+            for movable, offset in zip(fit._stars, observation.offsets, strict=True):
+                pixels, values = movable._moving(position + offset)
+                assert (pixels >= 0).all()  # else the fit has no place for them
+                assert len(np.unique(pixels)) == len(pixels) == values.shape[1]
     if shape[0] == 128:
         assert not rows.all()
 
@@ -516,8 +516,8 @@ def test_steps_are_measured_anew_where_stars_have_moved(monkeypatch):
 @pytest.mark.parametrize("share", [0.01, 0.3, 3.0, 30.0])
 def test_no_step_leads_uphill(share, monkeypatch):
     """One step at a time, from fluxes and positions far off."""
-    monkeypatch.setattr(positions, "MOST_STEPS", 1)
-    monkeypatch.setattr(positions, "LONGEST_STEP", 6.0)  # far beyond the parabola
+    monkeypatch.setattr(positions, "MAX_STEPS", 1)
+    monkeypatch.setattr(positions, "MAX_STEP", 6.0)  # far beyond the parabola
     for name in RECIPES:
         *_, fit, stars, _ = fit_of(name)
         for far in np.random.default_rng(0).uniform(-2, 2, (10, *stars.positions.shape)):

@@ -1,0 +1,162 @@
+"""Stars on the grid of a scene: their images, and sums over the pixels that these light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.scene.observation import Array
+from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
+
+# Pixels of a flattened array: a slice where they are all of it, which takes no gathering.
+Pixels = NDArray[np.intp] | slice
+
+# Some pixels, and k values at each of them, shape (k, number of pixels).
+Piece = tuple[Pixels, Array]
+
+
+class StarImages:
+    """k linear functions of the pixels for each star: its image, and perhaps derivatives of it.
+
+    Parameters
+    ----------
+    size : int
+        Number of pixels.
+    pieces : list of lists of (pixels, ndarray of float64, shape (k, m))
+        The image of each star is the sum of its pieces, each over m pixels.
+    overlap : ndarray of bool, shape (n, n)
+        Which stars may light the same pixels as which.
+    """
+
+    def __init__(self, size: int, pieces: list[list[Piece]], overlap: NDArray[np.bool_]) -> None:
+        self._size, self._pieces, self._overlap = size, pieces, overlap
+        self._k = pieces[0][0][1].shape[0] if pieces else 1
+
+    def light(self, fluxes: Array) -> Array:
+        """Return ``sum_s c_s P_s``, shape (size,)."""
+        total = np.zeros(self._size)
+        for flux, pieces in zip(fluxes, self._pieces, strict=True):
+            for pixels, values in pieces:
+                total[pixels] += flux * values[0]
+        return total
+
+    def products(self, x: Array) -> Array:
+        """Return the ``<P_s, x>``, shape (k, n)."""
+        products = [sum(values @ x[pixels] for pixels, values in each) for each in self._pieces]
+        return np.array(products).reshape(len(self._pieces), self._k).T
+
+    def information(self, weights: Array) -> Array:
+        """Return the ``<P_s, w P_t>``, shape (k n, k n), all stars for each of the k in turn."""
+        k, n = self._k, len(self._pieces)
+        information = np.zeros((k, n, k, n))
+        weighted = np.zeros((k, self._size))
+        for s, pieces in enumerate(self._pieces):
+            for pixels, values in pieces:
+                weighted[:, pixels] += weights[pixels] * values
+            for t in s + np.flatnonzero(self._overlap[s, s:]):
+                block = sum(weighted[:, pixels] @ values.T for pixels, values in self._pieces[t])
+                information[:, s, :, t] = block
+                information[:, t, :, s] = np.transpose(block)
+            for pixels, _ in pieces:
+                weighted[:, pixels] = 0.0
+        return information.reshape(k * n, k * n)
+
+
+class StarField:
+    """Stars at their positions; the image of each through each PSF is made once.
+
+    Parameters
+    ----------
+    psfs : sequence of MovablePsf, length p
+        One an image.
+    offsets : ndarray of float64, shape (p, 2)
+        Of the images, pixels.
+    grid : tuple of int
+        Shape (Ny, Nx).
+    positions : ndarray of float64, shape (n, 2)
+        Pixels of an image without offset.
+    """
+
+    def __init__(
+        self,
+        psfs: Sequence[MovablePsf],
+        offsets: Array,
+        grid: tuple[int, int],
+        positions: Array,
+    ) -> None:
+        self.positions = positions
+        self._psfs, self._offsets, self._grid = psfs, offsets, grid
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @cached_property
+    def stamps(self) -> list[list[Stamp]]:
+        """P_js for each image j and star s."""
+        return [
+            [psf.at(*(position + offset)).aligned(self._grid) for position in self.positions]
+            for psf, offset in zip(self._psfs, self._offsets, strict=True)
+        ]
+
+    def light(self, j: int, fluxes: Array) -> Array:
+        """Return ``sum_s c_s P_js``, shape (Ny, Nx)."""
+        total = np.zeros(self._grid)
+        for flux, stamp in zip(fluxes, self.stamps[j], strict=True):
+            if flux:
+                total[stamp.window(self._grid)] += flux * stamp.values
+        return total
+
+    def lit(self, j: int) -> NDArray[np.bool_]:
+        """Return the pixels of image j that any star lights, shape (Ny, Nx)."""
+        return light_up(self.stamps[j], self._grid)
+
+    def images(self, j: int, lit: NDArray[np.bool_]) -> StarImages:
+        """Return the P_js over these pixels, to which all that any star lights must belong."""
+        place, size = places(lit), int(lit.sum())
+        pieces: list[list[Piece]] = []
+        for stamp in self.stamps[j]:
+            window = stamp.window(self._grid)
+            fills = stamp.values.size == size and isinstance(window[0], slice)
+            pixels = slice(None) if fills else place[window].ravel()
+            pieces.append([(pixels, stamp.values.reshape(1, -1))])
+        return StarImages(size, pieces, overlap(self.stamps[j], self._grid))
+
+
+def light_up(stamps: Sequence[Stamp], grid: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return the pixels of the grid that stamps lie on."""
+    lit = np.zeros(grid, bool)
+    for stamp in stamps:
+        lit[stamp.window(grid)] = True
+    return lit
+
+
+def places(lit: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the place of each pixel that is lit among all that are, -1 where it is dark."""
+    return np.where(lit, np.cumsum(lit).reshape(lit.shape) - 1, -1)
+
+
+def overlap(stamps: Sequence[Stamp], grid: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return which stamps overlap which, shape (n, n)."""
+    overlap = np.ones((len(stamps), len(stamps)), bool)
+    for axis, n in enumerate(grid):
+        first = np.array([stamp[1 + axis] for stamp in stamps], int)
+        size = np.array([stamp.values.shape[axis] for stamp in stamps], int)
+        distance = np.subtract.outer(first, first)
+        overlap &= (distance % n < size) | (-distance % n < size[:, None])
+    return overlap
+
+
+def rows_within(stamps: Sequence[Stamp], grid: tuple[int, int], leeway: float) -> NDArray[np.bool_]:
+    """Return the rows of the grid, shape (Ny,), that stamps light, moved by up to the leeway."""
+    rows = np.zeros(grid[0], bool)
+    for stamp in stamps:
+        may_be_lit = (stamp.values != 0).any(axis=1) | (leeway > 0)
+        rows[stamp.rows(grid)[may_be_lit]] = True
+    if leeway:
+        distance = int(np.ceil(leeway)) + MARGIN + 1
+        steps = range(-distance, distance + 1)
+        rows = np.any([np.roll(rows, step) for step in steps], axis=0)
+    return rows

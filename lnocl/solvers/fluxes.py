@@ -1,0 +1,165 @@
+"""The likelihood of stars where the extended source is known, and their most likely fluxes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.scene.forward_model import Model
+from lnocl.scene.observation import Array
+from lnocl.scene.scene import LEAST_MODEL, Scene
+from lnocl.scene.stars import Pixels, StarImages
+
+# A star's flux falls to this share at most in one step, so that it never reaches 0 by a step that
+# was too long.
+MAX_FADING = 0.1
+# The fit of the fluxes ends where they change by less of their standard error.
+FIT_CHANGE = 1e-6
+FIT_ROUNDS = 50
+# A larger relative change of a flux has the information computed anew.
+INFORMATION_CHANGE = 0.01
+
+
+class StarLikelihood:
+    """J_0 as a function of the stars, over the pixels that they may light.
+
+    ``J_0 = sum_j <w_j, m_j - g_j ln m_j>`` but for a constant,
+    ``m_j = A_j f + sum_s c_s P_js + b_j``. Its Fisher information is
+    ``F = sum_j <D_j, w_j D_j / m_j>``, D the derivatives of the m_j.
+
+    Parameters
+    ----------
+    images : list of three ndarray of float64, length p
+        For each image the g_j, the ``A_j f + b_j`` and the w_j of these pixels, in one dimension.
+    """
+
+    def __init__(self, images: list[tuple[Array, Array, Array]]) -> None:
+        self._images = images
+
+    @classmethod
+    def of_scene(
+        cls, scene: Scene, model: Model, diffuse: Array, lit: Sequence[NDArray[np.bool_]]
+    ) -> StarLikelihood:
+        """Return that of a scene and its model, over the pixels that are lit.
+
+        `diffuse` holds the ``A_j f + b_j``, shape (p, Ny, Nx).
+        """
+        images = []
+        for where, *arrays in zip(lit, scene.images(), diffuse, model.weights, strict=True):
+            pixels = slice(None) if where.all() else where.ravel()
+            g, known, w = (array.ravel()[pixels] for array in arrays)
+            images.append((g, known, w))
+        return cls(images)
+
+    def of_one(self, pixels: Sequence[Pixels], others: Sequence[Array]) -> StarLikelihood:
+        """Return that of one star, over the pixels that it may light, beside the light of others.
+
+        Parameters
+        ----------
+        pixels : sequence of pixels, length p
+            Of those that this likelihood is over.
+        others : sequence of ndarray of float64, length p
+            The light of the other stars there.
+        """
+        return StarLikelihood(
+            [
+                (image[there], diffuse[there] + light, weights[there])
+                for (image, diffuse, weights), there, light in zip(
+                    self._images, pixels, others, strict=True
+                )
+            ]
+        )
+
+    def models(self, lights: Iterable[Array]) -> list[Array]:
+        """Return the m_j for the light of the stars, not below the guard of divisions."""
+        return [
+            np.maximum(light + diffuse, LEAST_MODEL)
+            for (_, diffuse, _), light in zip(self._images, lights, strict=True)
+        ]
+
+    def objective(self, models: Sequence[Array]) -> float:
+        """Return J_0 over these pixels, but for a constant."""
+        return sum(
+            float(weights @ (model - image * np.log(model)))
+            for (image, _, weights), model in zip(self._images, models, strict=True)
+        )
+
+    def gradient(self, stars: Sequence[StarImages], models: Sequence[Array]) -> Array:
+        """Return the gradient in the k unknowns of each star, shape (k, n)."""
+        gradients = [
+            there.products(movable_weights(weights, model) * (1.0 - image / model))
+            for (image, _, weights), there, model in zip(self._images, stars, models, strict=True)
+        ]
+        return np.sum(gradients, axis=0)
+
+    def information(self, stars: Sequence[StarImages], models: Sequence[Array]) -> Array:
+        """Return the Fisher information, shape (k n, k n)."""
+        information = [
+            there.information(movable_weights(weights, model) / model)
+            for (_, _, weights), there, model in zip(self._images, stars, models, strict=True)
+        ]
+        return np.sum(information, axis=0)
+
+    def linear_flux(self, lights: Sequence[Array]) -> float:
+        """Return the flux of one star of these images by least squares, weighted by the counts."""
+        moment = norm = 0.0
+        for (image, diffuse, weights), light in zip(self._images, lights, strict=True):
+            weighted = weights * light / np.maximum(np.maximum(image, diffuse), LEAST_MODEL)
+            norm += float(weighted @ light)
+            moment += float(weighted @ (image - diffuse))
+        return moment / norm if norm > 0 else 0.0
+
+
+def movable_weights(weights: Array, model: Array) -> Array:
+    """Return weights without the pixels where the model is the guard: no star moves it there.
+
+    PSFs with negative pixels make it so; one such pixel would have all of the information.
+    """
+    return np.where(model > LEAST_MODEL, weights, 0.0)
+
+
+def fit_fluxes(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Array:
+    """Return the star fluxes that minimise J_0, by Fisher scoring from these."""
+    if not len(fluxes):
+        return fluxes
+    lit = [scene.star_field.lit(j) for j in range(scene.n_images)]
+    likelihood = StarLikelihood.of_scene(scene, model, diffuse, lit)
+    stars = [scene.star_field.images(j, where) for j, where in enumerate(lit)]
+    step = np.full_like(fluxes, np.inf)
+    for _ in range(FIT_ROUNDS):
+        models = likelihood.models([each.light(fluxes) for each in stars])
+        if (abs(step) > INFORMATION_CHANGE * fluxes).any():
+            information = likelihood.information(stars, models)
+            inverse = pseudo_inverse(information)
+        step = bounded_step(information, inverse, likelihood.gradient(stars, models)[0], fluxes)
+        fluxes = fluxes + step
+        if (abs(step) * np.sqrt(np.diag(information)) <= FIT_CHANGE).all():
+            break
+    return fluxes
+
+
+def pseudo_inverse(information: Array) -> Array:
+    """Return the pseudo-inverse: two stars at one place have a singular matrix."""
+    return np.asarray(np.linalg.pinv(information, hermitian=True), np.float64)
+
+
+def bounded_step(information: Array, inverse: Array, gradient: Array, fluxes: Array) -> Array:
+    """Return the change of the fluxes by Newton's method, none falling by more than nine tenths.
+
+    Where one would, the others are those that are best with it held there: the step minimises
+    ``<gradient, step> + <step, F step> / 2`` within those bounds, so that it never leads uphill.
+    """
+    least = (MAX_FADING - 1.0) * fluxes
+    step = -inverse @ gradient
+    if (step >= least).all():
+        return step
+    import scipy.optimize  # half a second, for what is seldom needed
+
+    values, vectors = np.linalg.eigh(information)
+    determined = values > values.max() * len(fluxes) * np.finfo(np.float64).eps
+    root = np.sqrt(values[determined])
+    matrix = root[:, None] * vectors[:, determined].T
+    target = -(vectors[:, determined].T @ gradient) / root
+    return least + scipy.optimize.nnls(matrix, target - matrix @ least)[0]
