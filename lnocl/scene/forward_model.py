@@ -39,7 +39,8 @@ class Model:
         self._scene = scene
         self.shape = (scene.n_images, *scene.grid)
         self._window_otfs: dict[Any, NDArray[np.complex128]] = {}
-        self._otfs = [scipy.fft.rfft2(scene.psf(j), workers=-1) for j in range(scene.n_images)]
+        self._psfs = [scene.psf_stamp(j) for j in range(scene.n_images)]
+        self._otfs = [scipy.fft.rfft2(psf.on_grid(scene.grid), workers=-1) for psf in self._psfs]
         self.weights = np.broadcast_to(
             np.float64(1.0) if scene.weights is None else scene.weights.astype(np.float64),
             self.shape,
@@ -68,14 +69,13 @@ class Model:
         It is computed in the window that it lies in, where that is smaller than the grid. Outer
         rows and columns below the rounding of its largest value are cut off.
         """
-        psfs = [self._scene.psf_stamp(j) for j in range(len(stamps))]
-        first, size = _window_of_correlations(stamps, psfs)
+        first, size = _window_of_correlations(stamps, self._psfs)
         if (size >= self.shape[1:]).any():
             total = self.adjoint(stamp.on_grid(self.shape[1:]) for stamp in stamps)
             return _without_rounding(Stamp(total, 0, 0))
         shape = tuple(scipy.fft.next_fast_len(int(n), real=True) for n in size)
         spectrum: Any = 0.0
-        for j, (stamp, psf) in enumerate(zip(stamps, psfs, strict=True)):
+        for j, (stamp, psf) in enumerate(zip(stamps, self._psfs, strict=True)):
             laid = np.zeros(shape)
             y, x = stamp.y - psf.y - first[0], stamp.x - psf.x - first[1]
             laid[y : y + stamp.values.shape[0], x : x + stamp.values.shape[1]] = stamp.values
@@ -85,8 +85,7 @@ class Model:
 
     def _window_otf(self, j: int, shape: tuple[int, ...]) -> NDArray[np.complex128]:
         if (j, shape) not in self._window_otfs:
-            values = self._scene.psf_stamp(j).values
-            self._window_otfs[j, shape] = scipy.fft.rfft2(values, shape)
+            self._window_otfs[j, shape] = scipy.fft.rfft2(self._psfs[j].values, shape)
         return self._window_otfs[j, shape]
 
     def starlight(self, star_fluxes: Array) -> Iterator[Array]:

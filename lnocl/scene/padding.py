@@ -32,7 +32,7 @@ def recommend_pad(observation: Observation) -> int:
     --------
     >>> import numpy as np
     >>> import lnocl
-    >>> from lnocl.edges import recommend_pad
+    >>> from lnocl.scene.padding import recommend_pad
     >>> y, x = np.indices((31, 31)) - 15
     >>> gaussian = np.exp(-(x**2 + y**2) / 18)
     >>> recommend_pad(lnocl.Observation(np.ones((64, 64)), gaussian))

@@ -58,7 +58,8 @@ class Scene:
     penalty : Penalty
         On the extended source.
     pad : int or "auto"
-        Unobserved pixels kept round the images, at least; "auto": `edges.recommend_pad`.
+        Unobserved pixels round the images, at least; "auto": those of
+        `lnocl.scene.padding.recommend_pad`.
     leeway : float
         Pixels that a star may be moved later on, by `move_stars`.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,9 @@ from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
 
 # Pixels of a flattened array: a slice where they are all of it, which takes no gathering.
 Pixels = NDArray[np.intp] | slice
+
+# Pixels that are taken together where images light all of them: as many as a cache holds.
+CHUNK = 1 << 14
 
 # Some pixels, and k values at each of them, shape (k, number of pixels).
 Piece = tuple[Pixels, Array]
@@ -51,6 +55,8 @@ class StarImages:
     def information(self, weights: Array) -> Array:
         """Return the ``<P_s, w P_t>``, shape (k n, k n), all stars for each of the k in turn."""
         k, n = self._k, len(self._pieces)
+        if all(isinstance(pixels, slice) for each in self._pieces for pixels, _ in each):
+            return self._information_of_full_images(weights)
         information = np.zeros((k, n, k, n))
         weighted = np.zeros((k, self._size))
         for s, pieces in enumerate(self._pieces):
@@ -63,6 +69,16 @@ class StarImages:
             for pixels, _ in pieces:
                 weighted[:, pixels] = 0.0
         return information.reshape(k * n, k * n)
+
+    def _information_of_full_images(self, weights: Array) -> Array:
+        """Return the information of images that light all pixels: a product of matrices."""
+        information: Any = 0.0
+        for first in range(0, self._size, CHUNK):
+            part = slice(first, first + CHUNK)
+            images = np.array([sum(v[:, part] for _, v in pieces) for pieces in self._pieces])
+            columns = images.swapaxes(0, 1).reshape(-1, images.shape[2])
+            information = information + (columns * weights[part]) @ columns.T
+        return np.asarray(information, np.float64)
 
 
 class StarField:

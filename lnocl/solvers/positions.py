@@ -14,7 +14,7 @@ from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
 from lnocl.scene.stars import Piece, StarImages, light_up, overlap, places
-from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood
+from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood, invert
 
 # How far from where it was given a star may go, in pixels.
 RADIUS = 3.0
@@ -146,7 +146,7 @@ class StarFit:
         trial = self._try(stars)
         for _ in range(MAX_STEPS):
             gradient, information = self._derivatives(trial)
-            step = -_invert(information) @ gradient
+            step = -invert(information) @ gradient
             for _ in range(MAX_HALVED):
                 following = self._try(self._follow(trial.stars, step))
                 if following.objective <= trial.objective:
@@ -176,7 +176,7 @@ class StarFit:
         """Return standard errors, the roots of the diagonal of ``F^-1``; infinite where F is 0."""
         n = len(stars.fluxes)
         _, information = self.derivatives(stars)
-        roots = np.sqrt(np.maximum(np.diag(_invert(information)), 0.0))
+        roots = np.sqrt(np.maximum(np.diag(invert(information)), 0.0))
         errors: Array = np.where(np.diag(information) > 0, roots, np.inf)
         return Stars(errors[:n], errors[n:].reshape(2, n).T)
 
@@ -270,18 +270,6 @@ def _square(shape: tuple[int, ...], position: Array, grid: tuple[int, int]) -> S
     height, width = (min(k + 2 * margin, n) for k, n in zip(shape, grid, strict=True))
     x, y = np.floor(position + 0.5).astype(int).tolist()
     return Stamp(np.broadcast_to(1.0, (height, width)), y - height // 2, x - width // 2)
-
-
-def _invert(information: Array) -> Array:
-    """Return the inverse, in units of its diagonal's: those of fluxes and positions are far apart.
-
-    What is not known at all, such as the position of a star of no flux, has rows of 0.
-    """
-    roots = np.sqrt(np.diag(information))
-    units = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > 0)
-    units = units[:, None] * units
-    inverse = np.asarray(np.linalg.pinv(information * units, hermitian=True), np.float64)
-    return inverse * units
 
 
 def _cut(psfs: list[Array]) -> list[Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,7 +13,7 @@ from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import LEAST_MODEL, Scene
 from lnocl.scene.shifting import Stamp
-from lnocl.solvers.fluxes import bounded_step, fit_fluxes, movable_weights, pseudo_inverse
+from lnocl.solvers.fluxes import bounded_step, fit_fluxes, invert, movable_weights
 
 # What a pixel sees of star and background shifts its scaling by this share. With all of it the
 # empty sky takes up noise from the first steps on, without any it is stuck where it is 0: measured
@@ -31,18 +31,54 @@ class Scaling:
     ----------
     shift : ndarray of float64, shape (Ny, Nx)
         z in the scaling ``D = (f + z) / (alpha + mu (f + z))``, ``alpha = sum_j A_j^T w_j``: a
-        share of ``alpha / sum_j A_j^T (w_j / (sum_s c_s P_js + b_j))``, what the pixel sees of
-        stars and background.
+        share of ``alpha / sum_j A_j^T (w_j / (sum_s c_s P_js + b_j))``, the light of stars and
+        background that reaches the pixel.
     star_information : ndarray of float64, shape (n, n)
         Fisher information of the star fluxes, ``sum_j <P_js, w_j P_jt / m_j>`` at the start.
-    cross_information : list of Stamp, length n
-        Fisher information between each star flux and the extended source,
-        ``sum_j A_j^T (w_j P_js / m_j)`` at the start, where it is not 0.
+    cross_values : ndarray of float64
+        The values of `cross_information`, one stamp after the other.
+    cross_windows : ndarray of int32, shape (n, 4)
+        For each stamp y, x, height and width.
     """
 
     shift: Array
     star_information: Array
-    cross_information: list[Stamp]
+    cross_values: Array
+    cross_windows: NDArray[np.int32]
+
+    @classmethod
+    def of_stamps(cls, shift: Array, star_information: Array, stamps: Sequence[Stamp]) -> Scaling:
+        """Return the scaling with this cross information, a stamp for each star."""
+        values = np.concatenate([np.zeros(0), *(stamp.values.ravel() for stamp in stamps)])
+        windows = [(stamp.y, stamp.x, *stamp.values.shape) for stamp in stamps]
+        return cls(shift, star_information, values, np.array(windows, np.int32).reshape(-1, 4))
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, NDArray]) -> Scaling:
+        """Return the scaling of a state, which without stars may lack all but the shift."""
+        return cls(
+            state["shift"],
+            state.get("star_information", np.zeros((0, 0))),
+            state.get("cross_values", np.zeros(0)),
+            state.get("cross_windows", np.zeros((0, 4), np.int32)),
+        )
+
+    def state(self) -> dict[str, NDArray]:
+        """Return what `from_state` needs."""
+        return dict(vars(self))
+
+    @property
+    def cross_information(self) -> list[Stamp]:
+        """Fisher information between each star flux and the extended source, where it is not 0.
+
+        ``sum_j A_j^T (w_j P_js / m_j)`` at the start.
+        """
+        windows = self.cross_windows.tolist()
+        ends = np.cumsum([height * width for _, _, height, width in windows], dtype=int)
+        return [
+            Stamp(self.cross_values[end - height * width : end].reshape(height, width), y, x)
+            for end, (y, x, height, width) in zip(ends, windows, strict=True)
+        ]
 
     def star_step(self, fluxes: Array, gradient: Array, coupling: Array) -> Array:
         """Return the change of the star fluxes that follows a step d of the extended source.
@@ -55,33 +91,7 @@ class Scaling:
 
     @cached_property
     def _inverse(self) -> Array:
-        return pseudo_inverse(self.star_information)
-
-    def state(self) -> dict[str, NDArray]:
-        """Return what `from_state` needs: of the stamps all values in one row, and their windows.
-
-        A window is y, x, height and width.
-        """
-        stamps = self.cross_information
-        windows = [(stamp.y, stamp.x, *stamp.values.shape) for stamp in stamps]
-        return {
-            "shift": self.shift,
-            "star_information": self.star_information,
-            "cross_information": np.concatenate([np.zeros(0), *(s.values.ravel() for s in stamps)]),
-            "cross_windows": np.array(windows, np.int32).reshape(-1, 4),
-        }
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, NDArray]) -> Scaling:
-        """Return the scaling of a state; one without stars may lack all but the shift."""
-        windows = state.get("cross_windows", np.zeros((0, 4), np.int32)).tolist()
-        ends = np.cumsum([height * width for _, _, height, width in windows])
-        values = np.split(state.get("cross_information", np.zeros(0)), ends[:-1])
-        stamps = [
-            Stamp(each.reshape(height, width), y, x)
-            for each, (y, x, height, width) in zip(values, windows, strict=False)
-        ]
-        return cls(state["shift"], state.get("star_information", np.zeros((0, 0))), stamps)
+        return invert(self.star_information)
 
 
 def prepare(
@@ -130,7 +140,7 @@ def _make_scaling(
         model.adjoint_of_stamps([_times(scene.star_stamp(j, s), x) for j, x in enumerate(ratios)])
         for s in range(scene.n_stars)
     ]
-    return Scaling(SHIFT * np.maximum(shift, 0.0), information, cross_information)
+    return Scaling.of_stamps(SHIFT * np.maximum(shift, 0.0), information, cross_information)
 
 
 def _times(stamp: Stamp, x: Array) -> Stamp:

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from astropy.nddata import CCDData
-from scenes import Recipe, make_psfs
+from scenes import FEWER_ENGINES, Recipe, make_psfs
 
 import lnocl
 from lnocl.scene.penalty import Penalty
@@ -318,6 +318,63 @@ def test_star_that_no_image_observed_is_refused():
     mask[1] = False
     observation = lnocl.Observation(np.ones((2, *SHAPE)), make_psfs(2, (3, 4)), mask=mask)
     lnocl.deconvolve(observation, stars=[(3, 2), (11, 2)], n_iter=1, engine="numpy")
+
+
+def hidden_star(case):
+    """Return an observation in one image of which alone its star is good, and its flux."""
+    flux, sky, (x, y) = 5e4, 3.0, (15, 17)
+    p, exposure = (101, 1.0) if case == "one image of many" else (2, np.array([1000.0, 1.0]))
+    psf = gaussian(3.0, 9)
+    mean = np.full((p, 32, 32), sky)
+    mean[:, y - 4 : y + 5, x - 4 : x + 5] += flux * psf / psf.sum()
+    mask = np.zeros(mean.shape, bool)
+    mask[:-1, y - 4 : y + 5, x - 4 : x + 5] = True
+    mean *= np.reshape(exposure, (-1, 1, 1))
+    if case == "short exposure, map":
+        exposure = exposure[:, None, None] * np.ones((32, 32))
+    images = np.where(mask, 0.0, mean)
+    return lnocl.Observation(images, psf, mask=mask, exposure=exposure), (x, y), flux
+
+
+HIDDEN = ["one image of many", "short exposure", "short exposure, map"]
+
+
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+@pytest.mark.parametrize("case", HIDDEN)
+@pytest.mark.parametrize("engine", FEWER_ENGINES)
+def test_star_that_one_image_observed_is_found(engine, case, solver):
+    """Each image is judged alone: it once took a hundredth of all exposures together."""
+    if engine["engine"] == "opencl" and (case, solver) != ("short exposure", "sgm"):
+        pytest.skip("a program is built for each")
+    observation, star, flux = hidden_star(case)
+    scene = Scene(observation, [star])
+    assert 0 < scene.star_weights[0] < 0.01 * scene.n_images
+    result = lnocl.deconvolve(observation, [star], solver=solver, n_iter=30, **engine)
+    np.testing.assert_allclose(
+        result.star_fluxes, [flux], rtol=1.5e-3
+    )  # measured 7e-4, of the sky below it
+
+
+def test_stars_are_moved_to_where_one_image_observed_them():
+    observation, (x, y), _ = hidden_star("one image of many")
+    scene = Scene(observation, [(x - 10.0, y)], leeway=10.0)
+    scene.move_stars([(x, y)])
+    np.testing.assert_array_equal(scene.stars, [(x, y)])
+
+
+def test_negative_pixels_leave_the_weight_of_a_star_positive():
+    """All that the long exposure has of it is a negative pixel, a thousand times heavier."""
+    psf = gaussian(3.0, 9)
+    psf[0, 0] = -0.05 * psf.sum()
+    mask = np.zeros((2, 32, 32), bool)
+    mask[0, 4:, 4:] = True
+    with pytest.warns(lnocl.LnoclWarning, match="1 psf pixels are negative"):
+        observation = lnocl.Observation(
+            np.ones((2, 32, 32)), psf, mask=mask, exposure=[1000.0, 1.0]
+        )
+    scene = Scene(observation, [(7, 7)])
+    expected = scene.star_stamp(1, 0).values.sum()
+    np.testing.assert_allclose(scene.star_weights, [expected], rtol=1e-14)
 
 
 @pytest.mark.parametrize(

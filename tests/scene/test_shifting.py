@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scenes import gaussian_interpolation, gaussian_variance, make_psfs, worst
 from scipy.special import erf, j1
 
-from lnocl.scene.shifting import MARGIN, Stamp, fold, place
+from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp, fold, place
 
 GRID = (64, 128)
 ROUNDING = 2e-15
@@ -275,6 +275,15 @@ class TestDerivative:
             found = place(pixel_gaussian(41, fwhm), grid, 64 + x, 64 + y, axis).on_grid(grid)
             assert worst(found, np.outer(*along)) <= (2e-8 if fwhm < 2 else 4e-14)
 
+    @pytest.mark.parametrize("grid", [(128, 128), (32, 64)])
+    @pytest.mark.parametrize(("x", "y"), [(12.0, 17.0), (12.3, -0.4)])
+    def test_is_made_with_the_psf_and_the_other_one(self, grid, x, y):
+        psf = make_psfs(1, (6, 7))[0]
+        stamp, values = MovablePsf(psf, grid).with_slopes(x, y)
+        for axis, found in zip((None, 1, 0), values, strict=True):
+            expected = place(psf, grid, x, y, axis).on_grid(grid)
+            assert worst(Stamp(found, stamp.y, stamp.x).on_grid(grid), expected) <= 3e-15
+
     @pytest.mark.parametrize("axis", [0, 1])
     def test_has_no_light(self, axis):
         stamp = place(make_psfs(1, (6, 7))[0], GRID, 3.3, 4.2, axis)
@@ -285,7 +294,7 @@ class TestStamp:
     @settings(max_examples=60, deadline=None)
     @given(
         shape=st.tuples(sizes, sizes),
-        more=st.tuples(sizes, sizes),
+        more=st.tuples(st.integers(0, 9), st.integers(0, 9)),
         y=st.integers(-60, 60),
         x=st.integers(-60, 60),
     )
@@ -298,6 +307,23 @@ class TestStamp:
         chosen = on_grid[np.ix_(stamp.rows(grid), stamp.columns(grid))]
         np.testing.assert_array_equal(chosen, values)
         assert on_grid[y % grid[0], x % grid[1]] == 1.0
+        np.testing.assert_array_equal(on_grid[stamp.window(grid)], values)
+        aligned = stamp.aligned(grid)
+        np.testing.assert_array_equal(aligned.on_grid(grid), on_grid)
+        for axis in (0, 1):
+            if shape[axis] == grid[axis]:
+                assert aligned[1 + axis] == 0
+
+    @pytest.mark.parametrize("place_of_values", [(0, 0), (2, 3), (5, 6)])
+    def test_trimmed_has_all_values_above_the_least(self, place_of_values):
+        values = np.full((6, 7), 1e-3)
+        values[place_of_values], values[3, 4] = -1.0, 2.0
+        stamp = Stamp(values, -2, 30).trimmed(1e-3)
+        expected = np.where(abs(values) > 1e-3, values, 0.0)
+        found = np.where(abs(stamp.on_grid((16, 40))) > 1e-3, stamp.on_grid((16, 40)), 0.0)
+        np.testing.assert_array_equal(found, Stamp(expected, -2, 30).on_grid((16, 40)))
+        assert stamp.values.size < values.size
+        assert Stamp(values, 1, 1).trimmed(9.0).values.shape == (1, 1)
 
 
 @given(k=st.integers(1, 40), n=st.integers(1, 12), axis=st.integers(0, 1))

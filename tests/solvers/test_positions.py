@@ -18,7 +18,7 @@ from lnocl.runs.run import Run, Setup
 from lnocl.scene.forward_model import Model
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
-from lnocl.solvers import positions, scaling
+from lnocl.solvers import fluxes, positions, scaling
 from lnocl.solvers.positions import RADIUS, StarFit, Stars
 
 # PSFs here are small, and whole offsets periodic.
@@ -191,7 +191,7 @@ def test_fluxes_and_positions_may_be_of_any_size():
     """A star of 1e9 and one of 1e-3 of the sky: neither is lost in the inverse of F."""
     information = np.array([[4.0, 1.0, 0.0], [1.0, 9.0, 0.0], [0.0, 0.0, 0.0]])
     units = np.array([1e-12, 1e9, 1.0])
-    inverse = positions._invert(information * units * units[:, None])
+    inverse = fluxes.invert(information * units * units[:, None])
     expected = np.zeros((3, 3))
     expected[:2, :2] = np.linalg.inv(information[:2, :2])
     np.testing.assert_allclose(inverse * units * units[:, None], expected, rtol=1e-15, atol=0)

@@ -587,6 +587,45 @@ def test_scaling_is_that_of_the_matrix():
     assert worst(steps.star_information, stars.T @ weighted) <= 5e-16
 
 
+@pytest.mark.parametrize("psf_shape", [(9, 11), (40, 9), (128, 128)])
+@pytest.mark.parametrize("offsets", [[(0, 0), (0, 0)], [(1.4, -0.7), (-3, 2)]])
+@pytest.mark.filterwarnings("ignore:the images are shifted", "ignore:psf . is sharper")
+def test_cross_information_lies_in_a_window(psf_shape, offsets):
+    """It is that of the whole grid, but for rounding; larger PSFs do not fit into a smaller one."""
+    rng, stars = np.random.default_rng(5), [(60, 50), (70.3, 120.6), (0.2, 1.0)]
+    images = rng.poisson(9.0, (2, 128, 128)).astype(float)
+    mask = rng.random(images.shape) < 0.1
+    psfs = make_psfs(2, psf_shape)
+    scene = Scene(lnocl.Observation(images, psfs, 2.0, mask=mask, offsets=offsets), stars)
+    model = Model(scene)
+    extended, fluxes = scene.start(None, None)
+    fluxes, steps = scaling.prepare(scene, model, extended, fluxes)
+    lit = np.where(scene.observed(model.adjoint(model.weights)), extended, 0.0)
+    ratios = model.weights / model.images(lit, fluxes)
+    for s, stamp in enumerate(steps.cross_information):
+        expected = model.adjoint(x * scene.star_image(j, s) for j, x in enumerate(ratios))
+        found = stamp.on_grid(scene.grid)
+        assert worst(found, expected) <= 1.5e-15
+        assert psf_shape != (9, 11) or stamp.values.size < found.size / 2
+
+
+@pytest.mark.parametrize("n_stars", [0, 2])
+def test_scaling_is_restored_from_its_state(n_stars):
+    """A checkpoint holds no arrays of size 0."""
+    made = TINY.make()
+    _, _, steps, _ = prepared(made, made.stars[:n_stars], [1e3, 1e3][:n_stars])
+    state = {name: array for name, array in steps.state().items() if array.size}
+    other = scaling.Scaling.from_state(state)
+    for name, array in steps.state().items():
+        np.testing.assert_array_equal(other.state()[name], array)
+    stamps = zip(other.cross_information, steps.cross_information, strict=True)
+    for found, expected in stamps:
+        np.testing.assert_array_equal(found.values, expected.values)
+        assert (found.y, found.x) == (expected.y, expected.x)
+    change = other.star_step(np.ones(n_stars), np.ones(n_stars), np.zeros(n_stars))
+    assert change.shape == (n_stars,)
+
+
 def test_dot_product_of_the_model():
     made = TINY.make()
     model = Model(Scene(made.observation(), made.stars))
