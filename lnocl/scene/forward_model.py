@@ -1,4 +1,4 @@
-"""The model of a scene on the host, in double precision: for what is needed once or seldom."""
+"""The model of a scene on the host, in double precision, for use outside the iterations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import Stamp
 
-# Of the largest value: what an FFT leaves where there is nothing.
+# Rounding of an FFT, as a share of the largest value.
 ROUNDING = 1e-16
 
 

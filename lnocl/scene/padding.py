@@ -7,7 +7,7 @@ import numpy as np
 from lnocl.scene.observation import Array, Observation
 
 # Share of a PSF's light within the radius that is enough for a pad, and the share of the shorter
-# side of the images beyond which none is asked for (benchmarks/frames.py, docs/frames.md).
+# side of the images that the pad is at most (benchmarks/frames.py, docs/frames.md).
 LIGHT = 0.9
 SHARE_OF_SIDE = 0.5
 
@@ -16,7 +16,7 @@ def recommend_pad(observation: Observation) -> int:
     """Return the pad that a source running over the edge needs.
 
     The largest radius within which the PSFs have nine tenths of their light, in whole pixels; at
-    most half the shorter side of the images, since what lies farther away is smooth.
+    most half the shorter side of the images, since light from farther away is smooth.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from lnocl.errors import InputError
 
-# Of a weight: the most that means anything, beside images scaled to unit mean.
+# A larger weight leaves nothing of the data term of images at unit mean.
 MAX_WEIGHT = 2.0**64
 
 # To which Python compares an integer of any size without making a float of it.
@@ -35,7 +35,7 @@ class Penalty:
     Raises
     ------
     InputError
-        A weight that is none.
+        A weight that is not a number, negative or not finite.
     """
 
     mu: float = 0.0

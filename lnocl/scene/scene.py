@@ -1,4 +1,4 @@
-"""An observation laid on the grid of the transform, at unit mean: what an engine is given."""
+"""An observation on the grid of the transform, at unit mean, as engines take it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ MAX_AXIS = 8192
 # "not observed" (the threshold of Bertero & Boccacci 2005, A&A 437, 369, for boundary effects).
 OBSERVED_SHARE = 0.01
 
-# Of a PSF's peak: what it may ring by, moved by half a pixel, before that is worth a warning.
-# Gaussians do not ring where they are centred on a pixel, sharp ones do where they are not.
+# A PSF that rings by more than this share of its peak, moved by half a pixel, is warned of.
+# Gaussians do not ring where they are centred on a pixel; sharp ones do where they are not.
 MAX_RINGING = 0.01
 
 # The one division guard: where the model is not above this (images have unit mean) the ratio is
@@ -35,8 +35,7 @@ LEAST_MODEL = 2.0**-64
 
 NO_PENALTY = Penalty()
 
-# The edge-preserving term takes for an edge what is this many times the mean of a flat extended
-# source: docs/sgp.md.
+# delta of the edge-preserving term, in means of a flat extended source: docs/sgp.md.
 EDGE = 3.0
 
 
@@ -81,12 +80,13 @@ class Scene:
         True where a pixel was observed, or its relative exposure where exposures are maps; None
         where all were observed alike.
     star_weights : ndarray of float64, shape (n,)
-        ``sum_j <P_js, w_j>``, the share of each star's light that was observed, summed.
+        ``sum_j <P_js, w_j>``, of each image not less than 0: the shares of the star's light that
+        were observed, summed.
 
     Raises
     ------
     InputError
-        A star outside the images, unobserved or masked; penalty or pad out of range; images too
+        A star outside the images, or masked in all of them; penalty or pad out of range; images too
         large for the transform; images or exposures too large to be summed; a sky, images over
         exposures, that is no finite number, or 0.
 
@@ -259,7 +259,7 @@ class Scene:
         Raises
         ------
         InputError
-            Where either has the wrong shape, a negative, masked or non-finite value.
+            Either has the wrong shape, a negative, masked or non-finite value.
         """
         if star_fluxes is None:
             fluxes = self._rough_fit[0].copy()

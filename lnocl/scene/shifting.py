@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lnocl.scene.observation import Array
 
-# Pixels that a PSF is given on each side before it is moved by a fraction: what rings beyond the
-# edges of its array dies out in them.
+# Pixels added on each side of a PSF before it is moved by a fraction: ringing beyond the edges of
+# its array dies out in them.
 MARGIN = 16
 # Aliases of a frequency, 1 / pixel, that are told apart: more would be lost in rounding.
 ALIASES = np.arange(-6, 7)
@@ -81,7 +81,7 @@ def window(y: int, x: int, shape: tuple[int, ...], grid: tuple[int, int]) -> Win
 
 
 class MovablePsf:
-    """A PSF to be placed at several positions of a grid; what these share is made once.
+    """A PSF to be placed at several positions of a grid; its spectrum is made once.
 
     Parameters
     ----------
@@ -130,11 +130,11 @@ def place(psf: Array, grid: tuple[int, int], x: float, y: float, axis: int | Non
     """Return a PSF with its middle, pixel ``(ky // 2, kx // 2)``, at a position of a grid.
 
     Whole pixels move it as it is; the fraction left, at most half a pixel, by the phase
-    ``exp(-2 pi i (kx dx / nx + ky dy / ny))`` of its spectrum. Its sum is kept to rounding.
+    ``exp(-2 pi i (kx dx / nx + ky dy / ny))`` of its spectrum. Its sum stays, but for rounding.
 
-    Each frequency f that the pixels can hold has in it what the light has at f + 1, f - 1 ... per
-    pixel, which moves by other phases. It is shared out among these, along each axis, in the ratio
-    of ``sinc(f) exp(-2 pi^2 sigma^2 f^2)``, a Gaussian's that is seen by pixels, with the sigma
+    Each frequency f that the pixels can hold includes the light at its aliases f + 1, f - 1 ... per
+    pixel, which move by other phases. It is shared out among these, along each axis, in the ratio
+    of ``sinc(f) exp(-2 pi^2 sigma^2 f^2)``, a Gaussian's integrated over pixels, with the sigma
     that the PSF shows at the highest frequency. So a PSF is taken for a sum of Gaussians, one on
     each pixel, which are moved as they are; one that has nothing at the highest frequency is moved
     by its phase alone, exact where it is limited to the frequencies that its pixels can hold.

@@ -175,7 +175,7 @@ def bounded_step(information: Array, inverse: Array, gradient: Array, fluxes: Ar
     step = -inverse @ gradient
     if (step >= least).all():
         return step
-    import scipy.optimize  # half a second, for what is seldom needed
+    import scipy.optimize  # it takes half a second, and few fits need it
 
     values, vectors = np.linalg.eigh(information)
     determined = values > values.max() * len(fluxes) * np.finfo(np.float64).eps

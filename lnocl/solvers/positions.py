@@ -20,10 +20,10 @@ from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood, invert
 RADIUS = 3.0
 # And in one step: the likelihood is a parabola in a part of the PSF's core only.
 MAX_STEP = 0.5
-# Share of what the data say of a position that the pixels which are looked at must hold: far wings
-# say little and are many.
+# Share of the information on a position that the pixels of the fit must hold: far wings say little
+# and are many.
 INFORMATION_SHARE = 0.99
-# Of a PSF's peak: what its darkest pixels are taken for there, which may be 0 or less.
+# Floor of a PSF in the estimate of that information, as a share of its peak: it may be negative.
 MIN_LIT = 1e-6
 # Steps end where they are less than this share of a standard error that images of unit mean would
 # give: of a tenth of their own up to a mean of a million electrons.
@@ -166,7 +166,7 @@ class StarFit:
         return trial.stars
 
     def _follow(self, stars: Stars, step: Array) -> Stars:
-        """Return stars a step farther, within what is allowed."""
+        """Return the stars after a step, none beyond its bounds."""
         n = len(stars.fluxes)
         fluxes = np.maximum(stars.fluxes + step[:n], MAX_FADING * stars.fluxes)
         moves = _shorten(step[n:].reshape(2, n).T, MAX_STEP)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -15,11 +15,11 @@ from lnocl.scene.scene import LEAST_MODEL, Scene
 from lnocl.scene.shifting import Stamp
 from lnocl.solvers.fluxes import bounded_step, fit_fluxes, invert, movable_weights
 
-# What a pixel sees of star and background shifts its scaling by this share. With all of it the
+# Share of the light of stars and background that shifts the scaling. With all of it the
 # empty sky takes up noise from the first steps on, without any it is stuck where it is 0: measured
 # in docs/sgp.md.
 SHIFT = 0.1
-# Of the images' mean: what a pixel is taken to see at least.
+# Least light of stars and background in a pixel, as a share of the images' mean.
 MIN_BACKGROUND = 2.0**-20
 
 
@@ -65,7 +65,7 @@ class Scaling:
 
     def state(self) -> dict[str, NDArray]:
         """Return what `from_state` needs."""
-        return dict(vars(self))
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @property
     def cross_information(self) -> list[Stamp]:

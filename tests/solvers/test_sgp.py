@@ -624,6 +624,7 @@ def test_scaling_is_restored_from_its_state(n_stars):
         assert (found.y, found.x) == (expected.y, expected.x)
     change = other.star_step(np.ones(n_stars), np.ones(n_stars), np.zeros(n_stars))
     assert change.shape == (n_stars,)
+    assert set(other.state()) == set(steps.state())  # whatever was computed meanwhile
 
 
 def test_dot_product_of_the_model():
