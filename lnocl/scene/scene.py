@@ -15,7 +15,7 @@ from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
 from lnocl.scene.shifting import MovablePsf, Stamp
-from lnocl.scene.stars import StarField, rows_within
+from lnocl.scene.stars import StarField, check_positions, rows_within
 
 log = logging.getLogger("lnocl")
 
@@ -106,7 +106,7 @@ class Scene:
         leeway: float = 0.0,
     ) -> None:
         self.observation = observation
-        positions = _check_stars(stars, observation)
+        positions = check_positions(stars, observation)
         self._leeway = leeway
         if isinstance(pad, str) and pad == "auto":
             pad = recommend_pad(observation)
@@ -392,24 +392,6 @@ def _grid(shape: tuple[int, int], pad: object) -> tuple[int, int]:
             f"the largest axis is {MAX_AXIS}: cut the images or pad less"
         )
     return ny, nx
-
-
-def _check_stars(stars: ArrayLike, observation: Observation) -> Array:
-    positions = numbers("stars", stars)
-    if positions.size == 0:
-        return np.zeros((0, 2))
-    if positions.ndim != 2 or positions.shape[1] != 2:
-        raise InputError(f"stars has shape {positions.shape}; give pairs (x, y)")
-    ny, nx = observation.shape
-    for position in positions:
-        x, y = (position + observation.offsets).T
-        if not ((x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)).any():
-            raise InputError(
-                f"the star at ({position[0]:g}, {position[1]:g}) lies outside the images: x must "
-                f"be in [0, {nx - 1}] and y in [0, {ny - 1}]"
-                + (" of one of them, its offset added" if observation.offsets.any() else "")
-            )
-    return positions
 
 
 def _check_start(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -7,9 +7,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from lnocl.scene.observation import Array
+from lnocl.errors import InputError
+from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
 
 # Pixels of a flattened array: a slice where they are all of it, which takes no gathering.
@@ -176,3 +177,28 @@ def rows_within(stamps: Sequence[Stamp], grid: tuple[int, int], leeway: float) -
         steps = range(-distance, distance + 1)
         rows = np.any([np.roll(rows, step) for step in steps], axis=0)
     return rows
+
+
+def check_positions(stars: ArrayLike, observation: Observation) -> Array:
+    """Return the positions of stars, shape (n, 2).
+
+    Raises
+    ------
+    InputError
+        They are not pairs of numbers, or one lies outside all images.
+    """
+    positions = numbers("stars", stars)
+    if positions.size == 0:
+        return np.zeros((0, 2))
+    if positions.ndim != 2 or positions.shape[1] != 2:
+        raise InputError(f"stars has shape {positions.shape}; give pairs (x, y)")
+    ny, nx = observation.shape
+    for position in positions:
+        x, y = (position + observation.offsets).T
+        if not ((x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)).any():
+            raise InputError(
+                f"the star at ({position[0]:g}, {position[1]:g}) lies outside the images: x must "
+                f"be in [0, {nx - 1}] and y in [0, {ny - 1}]"
+                + (" of one of them, its offset added" if observation.offsets.any() else "")
+            )
+    return positions
