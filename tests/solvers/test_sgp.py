@@ -697,12 +697,13 @@ def test_a_shortened_step_has_the_scaling_of_its_base():
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
-def test_only_steps_take_three_images_more_and_one_for_each_star(precision):
+def test_steps_take_three_images_more_and_at_most_one_for_each_star(precision):
     name = "four images, three stars"
     without = engine_of(name, precision, takes_steps=False)
     more = engine_of(name, precision, takes_steps=True).bytes_needed - without.bytes_needed
     images = (3 + 3) * without.layout.pixels_bytes
-    assert images < more <= 1.02 * images  # measured 1.008
+    # Stars in windows take less than an image each, where they are smaller than the grid.
+    assert 0.5 * images < more <= 1.02 * images  # measured 0.76 and 1.008
 
 
 # --- Extremes
