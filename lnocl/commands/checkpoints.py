@@ -9,7 +9,7 @@ import signal
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from lnocl.commands.arguments import Arguments, finite
+from lnocl.commands.options import finite, option
 from lnocl.commands.signals import first_handled
 from lnocl.errors import InputError, LnoclError
 
@@ -19,34 +19,40 @@ if TYPE_CHECKING:
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-def add_arguments(parser: Arguments) -> None:
-    """Add the options of checkpoints."""
-    parser.add_argument(
+OPTIONS = [
+    option(
         "--checkpoint",
         metavar="FILE",
-        help="write what the run has come to, every so many seconds, at the end and on Ctrl-C",
-    )
-    parser.add_argument(
+        is_repeated=False,
+        help="save the state of the run at regular times, at the end and on Ctrl-C",
+    ),
+    option(
         "--checkpoint-every",
         type=finite,
         default=60.0,
         metavar="SECONDS",
+        is_repeated=False,
         help="time between checkpoints (default: %(default)s)",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--resume",
         metavar="FILE",
-        help="go on from a checkpoint of the same inputs and parameters; the result is bit for bit "
-        "that of a run that was never interrupted",
-    )
+        is_input=True,
+        is_repeated=False,
+        help="continue from a checkpoint of the same inputs and parameters; the result is bit for "
+        "bit that of a run that was never interrupted",
+    ),
+]
 
 
 def check(arguments: argparse.Namespace, inputs: Iterable[str]) -> None:
     """Refuse a checkpoint that would take the place of the output or an input."""
     if arguments.checkpoint is None:
         return
-    named = os.path.realpath(arguments.checkpoint)
-    if named in [os.path.realpath(path) for path in (arguments.output, *inputs)]:
+    taken = {os.path.realpath(path) for path in (arguments.output, *inputs)}
+    if arguments.resume is not None:  # which the checkpoint may replace
+        taken.discard(os.path.realpath(arguments.resume))
+    if os.path.realpath(arguments.checkpoint) in taken:
         raise InputError(
             f"the checkpoint {arguments.checkpoint} is the output or an input; give it another name"
         )

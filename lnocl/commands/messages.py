@@ -5,9 +5,14 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TextIO
+
+# Words before a parameter's name that is an ordinary word as well, such as pad; else it begins the
+# message.
+BEFORE_NAMES = ("and", "as", "give", "leave", "take", "with")
 
 
 def replace_closed_streams() -> None:
@@ -39,7 +44,29 @@ def fail(message: str, exit_status: int) -> int:
     return exit_status
 
 
+def name_options(message: str, flags: Mapping[str, str]) -> str:
+    """Return a message of the library that names options as they are typed in a shell.
+
+    Parameters
+    ----------
+    message : str
+        It names parameters, such as ``n_iter``.
+    flags : mapping of str to str
+        The flag of each parameter, such as ``--n-iter``. A name that is a plural, such as psfs,
+        stays as it is.
+    """
+    places = "|".join(["^", *(rf"(?<=\b{word} )" for word in BEFORE_NAMES)])
+    for name, flag in flags.items():
+        if "_" in name:
+            message = re.sub(rf"(?<![\w./'-]){name}(?![\w./'-])", flag, message)
+        elif flag == f"--{name}":
+            message = re.sub(rf"(?:{places}){name}\b(?![./'-])", flag, message)
+            message = message.replace(f"{flag}=", f"{flag} ")
+    return message
+
+
 def show_warning(
+    flags: Mapping[str, str],
     message: Warning | str,
     category: type[Warning],
     filename: str,
@@ -47,8 +74,8 @@ def show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """Write a warning to stderr, in place of `warnings.showwarning`."""
-    _complain("warning", str(message))
+    """Write a warning to stderr, with `name_options`, in place of `warnings.showwarning`."""
+    _complain("warning", name_options(str(message), flags))
 
 
 @contextlib.contextmanager

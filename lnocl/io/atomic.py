@@ -13,6 +13,7 @@ from typing import IO, Any
 from lnocl.errors import FileError, InputError
 
 COMPRESSED = (".gz", ".bz2", ".xz", ".zip", ".z", ".fz")
+FITS_ENDINGS = (".fits", ".fit", ".fts")
 
 
 def check_folder(
@@ -100,6 +101,19 @@ def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None
         raise FileError(
             f"the output {path} cannot be written to its folder: {error.strerror}"
         ) from error
+
+
+def check_fits_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None:
+    """Check that a FITS file can be written, before any work is done for it.
+
+    Raises
+    ------
+    FileError, InputError
+        As `check_output`; a name that does not end in .fits, .fit or .fts.
+    """
+    if os.path.basename(path) and not path.lower().endswith((*FITS_ENDINGS, *COMPRESSED)):
+        raise InputError(f"the output is a FITS file; give it a name ending in .fits, not {path}")
+    check_output(path, overwrite, inputs)
 
 
 @contextlib.contextmanager
