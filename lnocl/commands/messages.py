@@ -10,9 +10,9 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TextIO
 
-# Words before a parameter's name that is an ordinary word as well, such as pad; else it begins the
-# message.
-BEFORE_NAMES = ("and", "as", "give", "leave", "take", "with")
+# A parameter whose name is an ordinary word, such as pad, is meant where it begins a message or
+# follows one of these.
+BEFORE_NAMES = ("as", "give", "leave", "take", "with")
 
 
 def replace_closed_streams() -> None:
@@ -55,14 +55,18 @@ def name_options(message: str, flags: Mapping[str, str]) -> str:
         The flag of each parameter, such as ``--n-iter``. A name that is a plural, such as psfs,
         stays as it is.
     """
-    places = "|".join(["^", *(rf"(?<=\b{word} )" for word in BEFORE_NAMES)])
-    for name, flag in flags.items():
-        if "_" in name:
-            message = re.sub(rf"(?<![\w./'-]){name}(?![\w./'-])", flag, message)
-        elif flag == f"--{name}":
-            message = re.sub(rf"(?:{places}){name}\b(?![./'-])", flag, message)
-            message = message.replace(f"{flag}=", f"{flag} ")
-    return message
+    ordinary = [name for name, flag in flags.items() if flag == f"--{name}"]
+    special = [name for name in flags if "_" in name]
+    place = "|".join(["^", *(rf"(?<=\b{word} )" for word in BEFORE_NAMES)])
+    name = rf"(?:{'|'.join(ordinary + special)})\b(?![./'-])"
+    for pattern in (
+        rf"(?:{place}){name}(?:(?:, | and ){name})*",
+        rf"(?<![\w./'-])(?:{'|'.join(special)})(?![\w./'-])",
+    ):
+        message = re.sub(
+            pattern, lambda found: re.sub(name, lambda each: flags[each[0]], found[0]), message
+        )
+    return re.sub(r"(--[\w-]+)=", r"\1 ", message)
 
 
 def show_warning(

@@ -171,7 +171,7 @@ def history_lines(words: Sequence[str]) -> list[str]:
 
     Examples
     --------
-    >>> from lnocl.fitswrite import history_lines
+    >>> from lnocl.io.fitswrite import history_lines
     >>> history_lines(["lnocl", "deconvolve", "a star.fits", "-o", "naïve.fits"])
     ["lnocl deconvolve 'a star.fits' -o $'na\\303\\257ve.fits'"]
     """

@@ -83,7 +83,7 @@ def parse_sky(texts: Sequence[str]) -> SkyCoord:
 
     Examples
     --------
-    >>> from lnocl.sky import parse_sky
+    >>> from lnocl.io.sky import parse_sky
     >>> parse_sky(["15.25,-3.5", "1:01:00,-3:30:00"]).to_string()
     ['15.25 -3.5', '15.25 -3.5']
     """

@@ -211,13 +211,14 @@ class TestFrames:
         said = capsys.readouterr()
         level = fits.getheader("out.fits")["BKG1"]
         assert [line.removeprefix("lnocl: ") for line in said.err.splitlines()] == [
-            "exposure from EXPTIME: 30, 60 seconds",
-            "image 1: 1 pixels masked by the mask",
-            "image 2: 1 pixels masked by the mask",
-            "image 1: 1 pixels masked by the extension DQ",
-            "image 2: 1 pixels masked by the extension DQ",
-            "image 1: 1 pixels masked as saturated, at 1000 or above",
-            "image 2: 1 pixels masked as saturated, at 1000 or above",
+            "image 1: exposure 30 seconds, from EXPTIME",
+            "image 2: exposure 60 seconds, from EXPTIME",
+            "image 1: 1 pixel masked by the mask",
+            "image 2: 1 pixel masked by the mask",
+            "image 1: 1 pixel masked by the extension DQ",
+            "image 2: 1 pixel masked by the extension DQ",
+            "image 1: 1 pixel masked as saturated, at 1000 or above",
+            "image 2: 1 pixel masked as saturated, at 1000 or above",
             "image 1: 0 pixels masked without inverse variance",
             "image 2: 0 pixels masked without inverse variance",
             next(line for line in said.err.splitlines() if "sigma-clipped" in line)[7:],

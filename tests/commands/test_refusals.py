@@ -69,16 +69,20 @@ BAD_ARGUMENTS = {
     "read noise a word": (
         ["--read-noise", "some"],
         2,
-        "read noise 'some' is not a number, or a file",
+        "--read-noise 'some' is not a number, or a file",
     ),
     "background a word": (
         ["--background", "Auto"],
         2,
-        "background 'Auto' is not a number, auto, or a",
+        "--background 'Auto' is not a number, auto, or a",
     ),
-    "exposure a word": (["--exposure", "TEXP"], 2, "exposure 'TEXP' is not a number, a keyword of"),
+    "exposure a word": (
+        ["--exposure", "TEXP"],
+        2,
+        "--exposure 'TEXP' is not a number, a keyword of",
+    ),
     "exposure zero": (["--exposure", "0"], 2, "--exposure must be finite and more than zero; 0"),
-    "gain": (["--gain", "-1"], 2, "the gain must be a number more than 0; -1 was given"),
+    "gain": (["--gain", "-1"], 2, "--gain must be more than 0; -1 was given"),
     "gain a word": (["--gain", "GAIN"], 2, "argument --gain: 'GAIN' is not a finite number"),
     "saturation": (
         ["--saturation", "nan"],
