@@ -1,4 +1,4 @@
-"""What the command line does for long runs: checkpoints, and an end on Ctrl-C or SIGTERM."""
+"""Long runs on the command line: checkpoints, and an orderly end on Ctrl-C or SIGTERM."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from lnocl.commands.options import finite, option
 from lnocl.commands.signals import first_handled
-from lnocl.errors import InputError, LnoclError
+from lnocl.errors import InputError, LnoclError, counted
 
 if TYPE_CHECKING:
     from lnocl.deconvolution import Result
@@ -65,7 +65,7 @@ class RunInterruptedError(LnoclError):
 class Interrupts:
     """Listens for signals from the first iteration on: the first one ends the run, the second all.
 
-    One that comes after the last iteration ends nothing: the result is there, and is written.
+    After the last iteration a signal changes nothing: the result is complete, and is written.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Interrupts:
         return self.caught != 0
 
     def explain(self, arguments: argparse.Namespace, result: Result) -> None:
-        """Raise what tells of a signal that came, with the status that shells give it.
+        """Raise an error that tells of a signal that came, with its exit status in shells.
 
         Raises
         ------
@@ -106,10 +106,10 @@ class Interrupts:
         if not self.caught:
             return
         if result.stop_reason == "interrupt":
-            words = f"interrupted after {result.n_iter} iterations; what they gave is in "
+            words = f"interrupted after {counted(result.n_iter, 'iteration')}; their result is in "
             words += arguments.output
             if arguments.checkpoint is not None:
-                words += f"; go on with --resume {arguments.checkpoint}"
+                words += f"; continue with --resume {arguments.checkpoint}"
         else:
             words = f"interrupted after the last iteration; the result is in {arguments.output}"
         error = RunInterruptedError(words)

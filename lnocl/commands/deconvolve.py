@@ -258,7 +258,7 @@ def _given(values: Mapping[str, Any], names: Any) -> dict[str, Any]:
 
 
 def _repeated(given: Mapping[str, Any], calibration: Calibration, frames: Frames) -> dict[str, Any]:
-    """Return what the command that repeats the run has in the place of what was given."""
+    """Return the values of the command that repeats the run, where others were given."""
     return {
         "background": frames.background,
         "read_noise": list(calibration.read_noise),
@@ -269,7 +269,7 @@ def _repeated(given: Mapping[str, Any], calibration: Calibration, frames: Frames
 
 
 def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[str, Any]:
-    """Return what was computed with, in the place of rules and keywords that chose it."""
+    """Return the values that were computed with, where rules and keywords were given."""
     from lnocl.scene.padding import recommend_pad
 
     exposure = frames.observation.exposure

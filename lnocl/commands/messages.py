@@ -16,9 +16,9 @@ BEFORE_NAMES = ("as", "give", "leave", "take", "with")
 
 
 def replace_closed_streams() -> None:
-    """Have nothing said where stdin, stdout or stderr is closed, as after ``2>&-``.
+    """Replace a closed stdin, stdout or stderr, as after ``2>&-``, by one that discards output.
 
-    A file that is opened later would get the closed one's number, and what libraries say there.
+    Otherwise a file opened later would get its number, and the output of libraries.
     """
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
@@ -26,13 +26,13 @@ def replace_closed_streams() -> None:
 
 
 def say(lines: Iterable[str]) -> None:
-    """Write lines to stdout; a reader that has left early is no error."""
+    """Write lines to stdout; a reader that has left early is not an error."""
     try:
         for line in lines:
             sys.stdout.write(_one_line(line, sys.stdout) + "\n")
         sys.stdout.flush()
     except OSError as error:
-        # What is still buffered would fail again when the interpreter ends.
+        # The rest of the buffer would fail again when the interpreter ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
             raise
@@ -84,7 +84,7 @@ def show_warning(
 
 @contextlib.contextmanager
 def shown_log() -> Iterator[None]:
-    """Show on stderr what the library logs."""
+    """Show the notes that the library logs on stderr."""
     log, handler = logging.getLogger("lnocl"), _Notes()
     level = log.level
     log.addHandler(handler)
@@ -107,7 +107,7 @@ def _note(message: str) -> None:
 
 
 class _Notes(logging.Handler):
-    """Shows what the library logs, once where it says the same of several runs."""
+    """Handler that shows each note once, where several runs log the same."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ class _Notes(logging.Handler):
 
 
 def _one_line(text: str, stream: TextIO) -> str:
-    """Return text in one line, with escapes for what a terminal should not or cannot show."""
+    """Return text in one line, with escapes for characters that a terminal cannot show."""
     joined = " ".join(part.strip() for part in text.splitlines())
     shown = "".join(c if c.isprintable() else _escape(c) for c in joined)
     encoding = stream.encoding or "ascii"

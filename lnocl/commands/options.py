@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-# The value with which an argument that takes none is on the command line.
+# The values for which a switch is on the command line.
 SWITCHES = {"store_true": True, "store_false": False}
 # The keywords of an option that takes several values and may be repeated.
 SEVERAL: dict[str, Any] = {"nargs": "+", "action": "extend"}
@@ -68,7 +68,7 @@ class Option:
         return dataclasses.replace(self, keywords={**self.keywords, **keywords})
 
     def words(self, value: Any) -> list[str]:
-        """Return the words of a command line that give it a value; those of None are no words."""
+        """Return the words of a command line that give it a value; for None there are none."""
         flag = [] if self.is_positional else [self.flags[0]]
         action = self.keywords.get("action")
         if action in SWITCHES:
@@ -95,7 +95,7 @@ def option(
     is_repeated: bool = True,
     **keywords: Any,
 ) -> Option:
-    """Return an `Option`; what it does not know are keywords for the parser."""
+    """Return an `Option`; all further keywords are for the parser."""
     return Option(flags, keywords, card, checksum, is_input or bool(checksum), is_repeated)
 
 

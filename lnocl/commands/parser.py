@@ -72,7 +72,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Raise what argparse would print before it ends the program."""
+        """Raise the error with which argparse would end the program."""
         advice = self._swallowed() if "arguments are required" in message else ""
         raise InputError(f"{message}{advice}; see {self.prog} --help")
 

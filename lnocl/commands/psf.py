@@ -1,4 +1,4 @@
-"""The command ``psf``: make PSFs from a frame of a star, and say what was done to it."""
+"""The command ``psf``: make PSFs from a frame of a star, and report each step."""
 
 from __future__ import annotations
 

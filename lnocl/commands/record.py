@@ -32,7 +32,7 @@ def make_cards(
     sha256 : mapping of str to sequence of str
         Checksums of the files of an option, by its name.
     results : iterable of (keyword, value, comment), optional
-        Cards of what was found.
+        Cards of measured quantities.
     """
     options = list(options)
     return [

@@ -1,4 +1,4 @@
-"""FITS out: images, and the result with what is needed to repeat the run."""
+"""FITS out: images and results, with the commands that make them again."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def write_result(
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
-    The primary HDU holds the extended source, the table ``STARS`` the columns x, y, flux and what
-    else is given, the table ``HISTORY`` iteration and objective, the table ``CURVE`` iteration,
+    The primary HDU holds the extended source, the table ``STARS`` the columns x, y, flux and any
+    others given, the table ``HISTORY`` iteration and objective, the table ``CURVE`` iteration,
     rho, rho_star and magnitude, the table ``HELDOUT`` mu, smoothing, iteration and error. All have
     CHECKSUM and DATASUM.
 
@@ -65,7 +65,7 @@ def write_result(
     star_fluxes : array_like, shape (n,)
         Electrons.
     history : ndarray with fields ``iteration`` and ``objective``, optional
-        The objective after each iteration; none for a truth.
+        The objective after each iteration; a truth has no history.
     wcs : astropy.io.fits.Header, optional
         Cards of the coordinate systems, from `fitsread.wcs_cards`.
     cards : iterable of (keyword, value, comment), optional
@@ -131,7 +131,7 @@ def write_image(
     overwrite : bool, optional
         Whether an existing file may be replaced.
     notes : iterable of str, optional
-        Lines of printable ASCII that say what was done; the HISTORY lines hold them as comments
+        Steps of the making, in lines of printable ASCII; the HISTORY lines hold them as comments
         of a shell.
     commands : iterable of sequence of str, optional
         Shell commands that repeat the run, as words; the HISTORY lines spell them out.
@@ -237,7 +237,7 @@ def _table(name: str, rows: NDArray[np.void]) -> fits.BinTableHDU:
 
 
 def _ascii(text: str) -> str:
-    """Return text with what FITS does not allow written as escapes, as in Python."""
+    """Return text in ASCII, as FITS needs, with escapes as in Python."""
     return text.encode("unicode_escape").decode("ascii")
 
 

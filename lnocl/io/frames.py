@@ -69,7 +69,7 @@ class Frames(NamedTuple):
     background : list of Word
         As given, with the numbers that ``"auto"`` found.
     sha256 : dict of str to list of str
-        Checksums of all files, by what they are: images, psfs, background, ...
+        Checksums of all files, by the option they belong to: images, psfs, background, ...
     """
 
     observation: Observation

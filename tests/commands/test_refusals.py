@@ -14,10 +14,10 @@ from lnocl.opencl import device
 BAD_FILES = {
     "missing": ({"image": "no.fits"}, 1, "no.fits cannot be opened: No such file"),
     "folder": ({"image": "."}, 1, ". cannot be opened: Is a directory"),
-    "not FITS": ({"image": "text.fits"}, 1, "text.fits is no FITS file"),
+    "not FITS": ({"image": "text.fits"}, 1, "text.fits is not a FITS file"),
     "truncated": ({"image": "cut.fits"}, 1, "cut.fits is truncated"),
     "no image": ({"image": "table.fits"}, 1, "table.fits holds no image"),
-    "one dimension": ({"image": "line.fits"}, 2, "line.fits has an image of 1 dimensions"),
+    "one dimension": ({"image": "line.fits"}, 2, "line.fits has an image of 1 dimension"),
     "four dimensions": ({"image": "four.fits"}, 2, "four.fits has an image of 4 dimensions"),
     "all masked": ({"image": "nan.fits"}, 2, "all pixels are masked"),
     "other shape": (

@@ -242,9 +242,9 @@ class TestCheckOutput:
             ("there.fits", FileError, "exists; give another name, or --overwrite"),
             ("missing/out.fits", FileError, "does not exist; create it first"),
             ("there.fits/out.fits", FileError, "cannot be written: Not a directory"),
-            ("folder", FileError, "is no regular file"),
+            ("folder", FileError, "is not a regular file"),
             ("n" * 300 + ".fits", FileError, "cannot be written: File name too long"),
-            ("new/", FileError, "names no file"),
+            ("new/", FileError, "is not the name of a file"),
             ("out.fits.gz", InputError, "is not compressed"),
         ],
     )
@@ -259,7 +259,7 @@ class TestCheckOutput:
             atomic.check_output("/proc/out.fits", overwrite=False)
 
     def test_a_device_is_never_replaced(self):
-        with pytest.raises(FileError, match="no regular file"):
+        with pytest.raises(FileError, match="not a regular file"):
             atomic.check_output(os.devnull, overwrite=True)
 
     def test_an_input_is_never_replaced(self, tmp_path):

@@ -204,11 +204,11 @@ class TestRefusedFiles:
         [
             (lambda path: None, "cannot be opened: No such file"),
             (lambda path: path.mkdir(), "cannot be opened: Is a directory"),
-            (lambda path: path.touch(), "is no FITS file, or a damaged one: it ends too early"),
-            (text, "is no FITS file"),
+            (lambda path: path.touch(), "is not a FITS file, or is damaged: it ends too early"),
+            (text, "is not a FITS file"),
             (truncated, f"is truncated: it should have {2880 + 960} bytes and has {2880 + 959}"),
-            (truncated_header, "is no FITS file, or a damaged one"),
-            (truncated_gzip, "is no FITS file, or a damaged one"),
+            (truncated_header, "is not a FITS file, or is damaged"),
+            (truncated_gzip, "is not a FITS file, or is damaged"),
             (no_image, "holds no image"),
             (random_groups, "holds no image"),
             (tiles, "is tile-compressed; unpack it"),
@@ -243,13 +243,15 @@ class TestRefusedFiles:
     @pytest.mark.parametrize("shape", [(12,), (1, 1, 10, 12)])
     def test_wrong_dimensions(self, tmp_path, shape):
         path = save(tmp_path / "a.fits", fits.PrimaryHDU(np.ones(shape)))
-        with pytest.raises(InputError, match=f"a.fits has an image of {len(shape)} dimensions"):
+        with pytest.raises(InputError, match=f"a.fits has an image of {len(shape)} dimension"):
             fitsread.read_stack([path])
 
     def test_a_cube_among_several_files(self, tmp_path):
         image = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE))
         cube = save(tmp_path / "b.fits", fits.PrimaryHDU(np.array([IMAGE, IMAGE])))
-        with pytest.raises(InputError, match=r"b.fits has an image of 3 dimensions; several"):
+        with pytest.raises(
+            InputError, match=r"b.fits has an image of 3 dimensions; each of several"
+        ):
             fitsread.read_stack([image, cube])
 
     def test_different_shapes(self, tmp_path):
@@ -342,7 +344,7 @@ class TestCoordinates:
         ids=["axes", "singular", "lookup", "tab"],
     )
     def test_coordinates_that_cannot_be_kept_are_announced(self, broken):
-        with pytest.warns(LnoclWarning, match="of the first image cannot be kept"):
+        with pytest.warns(LnoclWarning, match="of the first image cannot be copied"):
             cards = fitsread.wcs_cards(fits.Header(LINEAR | broken))
         assert len(cards) == 0
 

@@ -115,7 +115,8 @@ class TestUnits:
         with pytest.raises(InputError) as caught:
             observe(gain=2.0)
         assert str(caught.value) == (
-            "the images have several units: 1.fits has electron, 2.fits has adu; convert them to one"
+            "the images have several units: 1.fits has electron, 2.fits has adu; convert them to "
+            "one"
         )
         save("1.fits", IMAGES[0])
         with pytest.raises(InputError, match=r"1\.fits has no unit, 2\.fits has adu"):
@@ -209,8 +210,8 @@ class TestExposure:
     @pytest.mark.parametrize(
         ("cards", "exposure", "message"),
         [
-            ([{"EXPTIME": 1.0}, {}], ["EXPTIME"], "image 2 has no EXPTIME; give exposure as numbers"),
-            ([{}, {"EXPTIME": 1.0}], ["EXPTIME"], "image 1 has no EXPTIME; give exposure as numbers"),
+            ([{"EXPTIME": 1.0}, {}], ["EXPTIME"], "image 2 has no EXPTIME; give exposure as nu"),
+            ([{}, {"EXPTIME": 1.0}], ["EXPTIME"], "image 1 has no EXPTIME; give exposure as nu"),
             ([{"EXPTIME": 1.0}, {"EXPTIME": "long"}], ["EXPTIME"],
              "EXPTIME of 2.fits is 'long', not a number"),
             ([{"EXPTIME": True}, {"EXPTIME": 1.0}], ["EXPTIME"],

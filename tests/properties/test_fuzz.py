@@ -421,7 +421,7 @@ def test_what_may_have_no_end_is_not_read(sound, tmp_path, monkeypatch, use, pat
     with pytest.raises(FileError) as caught:
         use(sound, path, "image.dat")
     how = "read as a table" if use is read_stars else "opened"
-    why = "it is no regular file; save what it gives to one first"
+    why = "it is not a regular file; save its content to one first"
     assert str(caught.value) == f"{path} cannot be {how}: {why}"
 
 
@@ -430,7 +430,9 @@ def test_what_may_have_no_end_is_not_read(sound, tmp_path, monkeypatch, use, pat
 def test_what_coordinates_claim_is_not_believed(keyword):
     header = fits.Header(SIP | {keyword: 10**5})
     began = time.monotonic()
-    with pytest.warns(LnoclWarning, match=f"cannot be kept and are left out: {keyword} is 100000"):
+    with pytest.warns(
+        LnoclWarning, match=f"cannot be copied and are left out: {keyword} is 100000"
+    ):
         assert len(fitsread.wcs_cards(header)) == 0
     assert not sky.has_celestial(header)
     assert time.monotonic() - began < 2
@@ -484,9 +486,9 @@ def test_errors_of_ours_are_not_taken_for_the_file_s(sound, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"MU": "large"}, "MU of {} is 'large', no finite number"),
-        ({"PIXSCALE": "wide", "OF": "truth"}, "PIXSCALE of {} is 'wide', no finite number"),
-        ({"OF": "truth", "MAGZERO": "bright"}, "MAGZERO of {} is 'bright', no finite number"),
+        ({"MU": "large"}, "MU of {} is 'large', not a finite number"),
+        ({"PIXSCALE": "wide", "OF": "truth"}, "PIXSCALE of {} is 'wide', not a finite number"),
+        ({"OF": "truth", "MAGZERO": "bright"}, "MAGZERO of {} is 'bright', not a finite number"),
     ],
 )
 def test_what_should_be_numbers_in_a_header(sound, tmp_path, quick_figures, changes, message):

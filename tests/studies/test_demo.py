@@ -127,7 +127,7 @@ BAD_SIMULATE = {
     "odd": (["hh34", "--size", "129"], 2, "the image is 129 x 129 pixels; each side must be"),
     "small": (["hh34", "--size", "32"], 2, "each side must be even and 64 or more"),
     "no flux": (["dark.fits"], 2, "the extended source has no flux"),
-    "no FITS": (["text.fits"], 1, "text.fits is no FITS file"),
+    "no FITS": (["text.fits"], 1, "text.fits is not a FITS file"),
     "size of a file": (["dark.fits", *SMALL], 2, "which has its own; leave it out"),
     "strehl 0": (["hh34", "--strehl", "0"], 2, "strehl must be in (0, 1]; 0.0 was given"),
     "strehl 2": (["hh34", "--strehl", "2"], 2, "strehl must be in (0, 1]"),
@@ -329,7 +329,7 @@ class TestPlot:
         [
             (["no.fits"], 1, "no.fits cannot be opened"),
             (["a.fits", "--truth", "no.fits"], 1, "no.fits cannot be opened"),
-            (["image.fits"], 1, "image.fits is no result or truth that lnocl has written"),
+            (["image.fits"], 1, "image.fits is not a result or truth written by lnocl"),
             (["a.fits", "b.fits"], 2, "b.fits has the shape (8, 8) and a.fits (9, 8)"),
             (["b.fits", "--truth", "a.fits"], 2, "b.fits has the shape (8, 8) and a.fits (9, 8)"),
             (["nan.fits"], 2, "nan.fits holds values that are not finite, or no flux"),
