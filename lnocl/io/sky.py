@@ -240,7 +240,7 @@ def offsets(headers: Sequence[fits.Header], paths: Sequence[str], shape: tuple[i
         the image within a tenth of a pixel.
     """
     first, *others = (
-        celestial_wcs(header, path, "leave --align out")
+        celestial_wcs(header, path, "leave align out")
         for header, path in zip(headers, paths, strict=True)
     )
     found = [np.zeros(2)]

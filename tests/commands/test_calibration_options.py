@@ -16,6 +16,8 @@ import lnocl
 from lnocl.commands import cli
 from lnocl.io.frames import Calibration, read_frames
 
+pytestmark = pytest.mark.usefixtures("command_folder")
+
 
 class TestFrames:
     """Two frames as a telescope leaves them: adu per second, an offset, bad pixels."""
@@ -44,7 +46,7 @@ class TestFrames:
     )
 
     @pytest.fixture(autouse=True)
-    def frames(self, folder):
+    def frames(self, command_folder):
         y, x = np.indices((15, 15)) - 7
         smooth = np.exp(-(x**2 + y**2) / 3.0)  # wide enough to be moved between pixels
         fits.writeto("psfs.fits", np.array([smooth, smooth.T**1.2]), overwrite=True)

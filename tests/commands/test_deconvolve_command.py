@@ -16,6 +16,8 @@ import lnocl
 from lnocl.commands import cli
 from lnocl.opencl import device
 
+pytestmark = pytest.mark.usefixtures("command_folder")
+
 
 class TestDeconvolve:
     ARGUMENTS = (

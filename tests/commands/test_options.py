@@ -12,6 +12,8 @@ from lnocl.commands import cli, deconvolve, messages, psf, record
 from lnocl.commands.options import option, position
 from lnocl.io.frames import Calibration
 
+pytestmark = pytest.mark.usefixtures("command_folder")
+
 # Options of lnocl deconvolve that no function takes as they are.
 OF_THE_SHELL = {"images", "output", "overwrite", "quiet", "models", "residuals", "star_sky",
                 "star_table", "zero_point"}  # fmt: skip

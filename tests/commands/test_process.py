@@ -17,6 +17,8 @@ from lnocl.commands import cli
 from lnocl.opencl import device
 from lnocl.runs.progress import Bar
 
+pytestmark = pytest.mark.usefixtures("command_folder")
+
 
 class TestProcess:
     ARGUMENTS = ("deconvolve", "a.fits", "--psf", "k1.fits", "--n-iter", "1", *NUMPY)

@@ -11,6 +11,8 @@ from lnocl.commands import cli
 from lnocl.errors import DeviceError
 from lnocl.opencl import device
 
+pytestmark = pytest.mark.usefixtures("command_folder")
+
 BAD_FILES = {
     "missing": ({"image": "no.fits"}, 1, "no.fits cannot be opened: No such file"),
     "folder": ({"image": "."}, 1, ". cannot be opened: Is a directory"),

@@ -111,15 +111,15 @@ class TestOffsets:
     @pytest.mark.parametrize(
         ("other", "message"),
         [
-            (header(angle=1.0), "b.fits is rotated by -1.00 degrees and scaled by 1.0000 against "
-             "a.fits, which moves pixels by up to 0.13 besides the offset: images are never "
-             "resampled; give those of one orientation and scale together, or have them reduced "
-             "to one grid"),
+            (header(angle=1.0), "b.fits is rotated by -1.00 degrees and scaled by 1.0000 relative "
+             "to a.fits, which moves pixels by up to 0.13 besides the offset: images are never "
+             "resampled; give only images of one orientation and scale, or reduce them to one "
+             "grid"),
             (header(angle=180.0), "180.00 degrees and scaled by 1.0000 relative to a.fits"),
             (header(scale=SCALE / 1.1), "b.fits is rotated by 0.00 degrees and scaled by 1.1000"),
-            (header(mirror=True), "b.fits is mirrored relative to a.fits, which moves pixels by up"),
+            (header(mirror=True), "b.fits is mirrored relative to a.fits, which moves pixels by"),
             (with_sip(A_2_0=1e-2), "b.fits is rotated by 0.00 degrees and scaled by 0.9960"),
-            (fits.Header(), "b.fits has no sky coordinates (WCS) that can be used; leave --align"),
+            (fits.Header(), "b.fits has no sky coordinates (WCS) that can be used; leave align"),
             (header(**SOLAR), "b.fits has no sky coordinates (WCS) that can be used"),
             (header(CRVAL1=152.0), "b.fits shows another part of the sky than a.fits, by its sky "
              "coordinates; leave one of them out"),
