@@ -11,7 +11,6 @@ from sound_files import PATIENCE, draw, read_observation, read_saved, read_scene
 
 from lnocl.errors import LnoclError, LnoclWarning
 
-
 BLOCK = 2880
 
 USES = [

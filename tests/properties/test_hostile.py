@@ -25,7 +25,6 @@ from wcs_headers import SIP
 from lnocl.errors import FileError, InputError, LnoclWarning
 from lnocl.io import fitsread, fitswrite, sky
 
-
 BLOCK = 2880
 BIG = 10**12
 CLAIMS = {
