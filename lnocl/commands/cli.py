@@ -76,7 +76,7 @@ def _make_parser() -> Parser:
         epilog="Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 terminated.",
     )
     parser.add_argument("--version", action="version", version=f"lnocl {__version__}")
-    subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
         subparser = subparsers.add_parser(name, help=command.summary, description=command.summary)
         command.add_arguments(subparser)

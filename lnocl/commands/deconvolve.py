@@ -48,7 +48,7 @@ OPTIONS = {
         option(
             "--models",
             action="store_true",
-            help="add a cube of the models of the images, electrons",
+            help="add a cube with the model of each image, in electrons",
         ),
         option(
             "--residuals",

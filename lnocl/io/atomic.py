@@ -52,6 +52,8 @@ def check_folder(
         there = os.listdir(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
+        if isinstance(error, FileExistsError):
+            reason = "it is not a folder"
         raise FileError(f"the output folder {path} cannot be used: {reason}") from error
     if names is None and there and not overwrite:
         raise FileError(

@@ -94,8 +94,7 @@ def write_result(
     header = coordinates.copy()
     header["BUNIT"] = ("electron/s" if per_second else "electron", "per pixel")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
-    _add_cards(header, cards)
-    _add_commands(header, commands)
+    _add_provenance(header, cards, (), commands)
     hdus = fits.HDUList(
         [
             fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
@@ -142,11 +141,7 @@ def write_image(
         The file cannot be written, or exists and must not be overwritten.
     """
     hdu = fits.PrimaryHDU(np.asarray(image, dtype=np.float64))
-    _add_cards(hdu.header, cards)
-    for note in notes:
-        for line in textwrap.wrap(note, HISTORY_WIDTH - 2):
-            hdu.header.add_history(f"# {line}")
-    _add_commands(hdu.header, commands)
+    _add_provenance(hdu.header, cards, notes, commands)
     hdu.add_checksum(when="")  # astropy would note the time
     with whole_file(path, overwrite) as stream:
         fits.HDUList([hdu]).writeto(stream)
@@ -186,12 +181,18 @@ def history_lines(words: Sequence[str]) -> list[str]:
     return [*lines, line]
 
 
-def _add_cards(header: fits.Header, cards: Iterable[Card]) -> None:
+def _add_provenance(
+    header: fits.Header,
+    cards: Iterable[Card],
+    notes: Iterable[str],
+    commands: Iterable[Sequence[str]],
+) -> None:
+    """Add the cards, and HISTORY lines with the notes, as comments, and the commands."""
     for keyword, value, comment in cards:
         header[keyword] = (_ascii(value) if isinstance(value, str) else value, comment)
-
-
-def _add_commands(header: fits.Header, commands: Iterable[Sequence[str]]) -> None:
+    for note in notes:
+        for line in textwrap.wrap(note, HISTORY_WIDTH - 2):
+            header.add_history(f"# {line}")
     for words in commands:
         for line in history_lines(words):
             header.add_history(line)

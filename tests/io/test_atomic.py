@@ -404,3 +404,11 @@ def test_a_signal_that_comes_as_a_file_is_made_leaves_none(work, tmp_path, monke
     with pytest.raises(KeyboardInterrupt):
         work(str(tmp_path / "out.txt"))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_in_the_place_of_an_output_folder(tmp_path):
+    path = tmp_path / "out"
+    path.write_text("old")
+    with pytest.raises(FileError) as caught:
+        atomic.check_folder(str(path), overwrite=True)
+    assert str(caught.value) == f"the output folder {path} cannot be used: it is not a folder"
