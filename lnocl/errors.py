@@ -51,6 +51,11 @@ def refuse_not_finite(*sums: float) -> None:
         )
 
 
+def counted(n: int, noun: str) -> str:
+    """Return a number with a noun that agrees with it: ``1 image``, ``2 images``."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
 class LnoclWarning(UserWarning):
     """Something was changed or left out of the data, and the user should know."""
 

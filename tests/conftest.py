@@ -14,3 +14,6 @@ if size := os.environ.get("LNOCL_TEST_LOCAL_MEMORY"):
     import pyopencl as cl
 
     cl.Device.local_mem_size = property(lambda device: int(size))
+
+# Fixtures that several folders of tests share.
+pytest_plugins = ["commandline", "frame_files", "sound_files"]

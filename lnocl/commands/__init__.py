@@ -1,1 +1,1 @@
-"""The subcommands: a module each, and what several of them share."""
+"""The subcommands, a module each, and their common parts."""

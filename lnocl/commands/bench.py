@@ -4,47 +4,51 @@ from __future__ import annotations
 
 import argparse
 
-from lnocl.commands import messages
-from lnocl.commands.arguments import Command, add_device, add_input_arguments, add_star
+from lnocl.commands import messages, options
+from lnocl.commands.options import option
+from lnocl.commands.parser import Command
 
-
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Without IMAGE the demo's scene is taken, whose truth is known."
-    add_input_arguments(parser, required=False)
-    add_star(parser)
-    parser.add_argument(
-        "--mu",
-        type=float,
-        help="weight of the Tikhonov term on the extended source, per electron (default: 0; "
-        "that of lnocl demo for its scene)",
-    )
-    parser.add_argument(
-        "--size",
-        type=int,
-        metavar="N",
-        help="pixels along each side of the demo's scene (default: 256)",
-    )
-    parser.add_argument(
+OPTIONS = [
+    options.IMAGES.but(nargs="*"),
+    options.PSFS,
+    options.BACKGROUND,
+    options.READ_NOISE,
+    options.STARS,
+    option(
         "--n-iter",
         type=int,
         default=400,
         metavar="N",
-        help="most iterations, 8 or more; N/8, N/4 and N/2 are measured too (default: %(default)s)",
-    )
-    parser.add_argument(
+        help="largest number of iterations, 8 or more; N/8, N/4 and N/2 are measured too "
+        "(default: %(default)s)",
+    ),
+    option(
+        "--mu",
+        type=float,
+        help="weight of the Tikhonov term on the extended source, per electron (default: 0; "
+        "that of lnocl demo for its scene)",
+    ),
+    option(
         "--accuracy",
         type=float,
         default=1e-3,
         metavar="A",
         help="deviation from double precision that the advice may have, and excess of the "
         "objective over that of double precision that the table times (default: %(default)s)",
-    )
-    add_device(parser)
-    parser.add_argument(
+    ),
+    option(
+        "--size",
+        type=int,
+        metavar="N",
+        help="pixels along each side of the demo's scene (default: 256)",
+    ),
+    options.DEVICE,
+    option(
         "-o", "--output", metavar="STEM", help="write the table to STEM.ecsv, a plot to STEM.png"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace these files")
-    parser.add_argument("--quiet", action="store_true", help="show no progress")
+    ),
+    options.OVERWRITE.but(help="replace these files"),
+    options.QUIET.but(help="show no progress"),
+]
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -75,6 +79,7 @@ def _run(arguments: argparse.Namespace) -> None:
 COMMAND = Command(
     "time single and double precision, padding and iterations, measure how far each strays "
     "from double precision, and say which to take",
-    _add_arguments,
+    {"": OPTIONS},
     _run,
+    "Without IMAGE the demo's scene is taken, whose truth is known.",
 )

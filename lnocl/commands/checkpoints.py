@@ -1,4 +1,4 @@
-"""What the command line does for long runs: checkpoints, and an end on Ctrl-C or SIGTERM."""
+"""Long runs on the command line: checkpoints, and an orderly end on Ctrl-C or SIGTERM."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import signal
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from lnocl.commands.arguments import Arguments, finite
+from lnocl.commands.options import finite, option
 from lnocl.commands.signals import first_handled
-from lnocl.errors import InputError, LnoclError
+from lnocl.errors import InputError, LnoclError, counted
 
 if TYPE_CHECKING:
     from lnocl.deconvolution import Result
@@ -19,34 +19,40 @@ if TYPE_CHECKING:
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-def add_arguments(parser: Arguments) -> None:
-    """Add the options of checkpoints."""
-    parser.add_argument(
+OPTIONS = [
+    option(
         "--checkpoint",
         metavar="FILE",
-        help="write what the run has come to, every so many seconds, at the end and on Ctrl-C",
-    )
-    parser.add_argument(
+        is_repeated=False,
+        help="save the state of the run at regular times, at the end and on Ctrl-C",
+    ),
+    option(
         "--checkpoint-every",
         type=finite,
         default=60.0,
         metavar="SECONDS",
+        is_repeated=False,
         help="time between checkpoints (default: %(default)s)",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--resume",
         metavar="FILE",
-        help="go on from a checkpoint of the same inputs and parameters; the result is bit for bit "
-        "that of a run that was never interrupted",
-    )
+        is_input=True,
+        is_repeated=False,
+        help="continue from a checkpoint of the same inputs and parameters; the result is bit for "
+        "bit that of a run that was never interrupted",
+    ),
+]
 
 
 def check(arguments: argparse.Namespace, inputs: Iterable[str]) -> None:
     """Refuse a checkpoint that would take the place of the output or an input."""
     if arguments.checkpoint is None:
         return
-    named = os.path.realpath(arguments.checkpoint)
-    if named in [os.path.realpath(path) for path in (arguments.output, *inputs)]:
+    taken = {os.path.realpath(path) for path in (arguments.output, *inputs)}
+    if arguments.resume is not None:  # which the checkpoint may replace
+        taken.discard(os.path.realpath(arguments.resume))
+    if os.path.realpath(arguments.checkpoint) in taken:
         raise InputError(
             f"the checkpoint {arguments.checkpoint} is the output or an input; give it another name"
         )
@@ -59,7 +65,7 @@ class RunInterruptedError(LnoclError):
 class Interrupts:
     """Listens for signals from the first iteration on: the first one ends the run, the second all.
 
-    One that comes after the last iteration ends nothing: the result is there, and is written.
+    After the last iteration a signal changes nothing: the result is complete, and is written.
 
     Attributes
     ----------
@@ -90,7 +96,7 @@ class Interrupts:
         return self.caught != 0
 
     def explain(self, arguments: argparse.Namespace, result: Result) -> None:
-        """Raise what tells of a signal that came, with the status that shells give it.
+        """Raise an error that tells of a signal that came, with its exit status in shells.
 
         Raises
         ------
@@ -100,10 +106,10 @@ class Interrupts:
         if not self.caught:
             return
         if result.stop_reason == "interrupt":
-            words = f"interrupted after {result.n_iter} iterations; what they gave is in "
+            words = f"interrupted after {counted(result.n_iter, 'iteration')}; their result is in "
             words += arguments.output
             if arguments.checkpoint is not None:
-                words += f"; go on with --resume {arguments.checkpoint}"
+                words += f"; continue with --resume {arguments.checkpoint}"
         else:
             words = f"interrupted after the last iteration; the result is in {arguments.output}"
         error = RunInterruptedError(words)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import signal
+import sys
 import warnings
 from collections.abc import Sequence
+from functools import partial
 
 from lnocl import __version__
 from lnocl.commands import bench, deconvolve, demo, devices, messages, plot, psf, selftest, simulate
-from lnocl.commands.arguments import Parser
+from lnocl.commands.parser import Parser
 from lnocl.commands.signals import Terminated, first_handled, terminate
-from lnocl.errors import LnoclError, LnoclWarning
+from lnocl.errors import InputError, LnoclError, LnoclWarning
 
 FAILED = 1
 INTERRUPTED = 130
@@ -18,11 +20,11 @@ TERMINATED = 143
 
 # In the order of the help.
 COMMANDS = {
-    "demo": demo.COMMAND,
     "deconvolve": deconvolve.COMMAND,
     "psf": psf.COMMAND,
-    "simulate": simulate.COMMAND,
     "plot": plot.COMMAND,
+    "demo": demo.COMMAND,
+    "simulate": simulate.COMMAND,
     "bench": bench.COMMAND,
     "devices": devices.COMMAND,
     "selftest": selftest.COMMAND,
@@ -43,12 +45,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 terminated.
     """
     messages.replace_closed_streams()
+    words = sys.argv[1:] if arguments is None else arguments
+    flags: dict[str, str] = {}
     try:
         with first_handled([signal.SIGTERM], terminate), warnings.catch_warnings():
             warnings.simplefilter("always", LnoclWarning)
-            warnings.showwarning = messages.show_warning
-            parsed = _make_parser().parse_args(arguments)
+            warnings.showwarning = partial(messages.show_warning, flags)
+            parsed = _make_parser().parse_args(words)
+            flags |= parsed.command.flags(words)
             parsed.command.run(parsed)
+    except InputError as error:
+        return messages.fail(messages.name_options(str(error), flags), error.exit_status)
     except LnoclError as error:
         return messages.fail(str(error), error.exit_status)
     except MemoryError:
@@ -69,7 +76,7 @@ def _make_parser() -> Parser:
         epilog="Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 terminated.",
     )
     parser.add_argument("--version", action="version", version=f"lnocl {__version__}")
-    subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
         subparser = subparsers.add_parser(name, help=command.summary, description=command.summary)
         command.add_arguments(subparser)

@@ -5,196 +5,228 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import inspect
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from lnocl import __version__
-from lnocl.commands import checkpoints, messages
-from lnocl.commands.arguments import (
-    Arguments,
-    Command,
-    add_device,
-    add_frame_arguments,
-    add_input_arguments,
-    add_star,
-    as_path,
-    finite,
-    number_or_word,
-)
+from lnocl.commands import checkpoints, messages, options, record
+from lnocl.commands.options import SEVERAL, finite, number_or_word, option, whole_or_word
+from lnocl.commands.parser import Command
 from lnocl.deconvolution import ENGINES, PRECISIONS, SOLVERS, Result, deconvolve
+from lnocl.errors import counted
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
     from lnocl.io.fitsread import Stack
-    from lnocl.io.fitswrite import StarColumn
-    from lnocl.io.frames import Frames
-    from lnocl.scene.observation import Observation
+    from lnocl.io.fitswrite import Card, StarColumn
+    from lnocl.io.frames import Calibration, Frames
+
+PARAMETERS = {
+    name: parameter.default for name, parameter in inspect.signature(deconvolve).parameters.items()
+}
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_input_arguments(parser.add_argument_group("images"), required=True)
-    add_frame_arguments(parser.add_argument_group("what real images need besides"))
-    stars = parser.add_argument_group("stars")
-    add_star(stars)
-    _add_star_arguments(stars)
-    _add_run_arguments(parser.add_argument_group("reconstruction"))
-    _add_output_arguments(parser.add_argument_group("output"))
-    checkpoints.add_arguments(parser.add_argument_group("long runs"))
+def _parameter(flag: str, **keywords: Any) -> options.Option:
+    """Return the option for a parameter of `lnocl.deconvolve`, with the same default."""
+    given = option(flag, **keywords)
+    return given.but(default=PARAMETERS[given.name])
 
 
-def _add_star_arguments(parser: Arguments) -> None:
-    parser.add_argument(
-        "--star-sky",
-        action="append",
-        default=[],
-        metavar="RA,DEC",
-        help="position of a star on the sky (ICRS), in degrees or as hh:mm:ss,dd:mm:ss; may be "
-        "repeated",
-    )
-    parser.add_argument(
-        "--stars",
-        metavar="FILE",
-        dest="star_table",
-        help="table of stars, any that astropy reads: columns x and y, or ra and dec",
-    )
-    parser.add_argument(
-        "--refine",
-        action="store_true",
-        help="move the stars to where they are most likely, at most 3 pixels away",
-    )
-    parser.add_argument(
-        "--zero-point",
-        type=finite,
-        metavar="MAG",
-        help="magnitude of one electron, or of one per second where exposures are given: adds a "
-        "column mag to the table of stars",
-    )
-
-
-def _add_run_arguments(parser: Arguments) -> None:
-    parser.add_argument(
-        "--mu",
-        type=number_or_word,
-        default=0.0,
-        metavar="MU",
-        help="weight of the Tikhonov term on the extended source, per electron, or auto: chosen by "
-        "held-out counts (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--smoothing",
-        type=number_or_word,
-        default=0.0,
-        metavar="WEIGHT",
-        help="weight of an edge-preserving term that keeps noise down, 1e-4 to 1e-3 beside bright "
-        "stars, or auto: chosen by held-out counts (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--solver",
-        choices=tuple(SOLVERS),
-        default="sgm",
-        help="split-gradient method, or scaled gradient projection, which needs a tenth of the "
-        "iterations and less (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--n-iter",
-        type=int,
-        default=1000,
-        metavar="N",
-        help="iterations to do, at most (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--stop",
-        type=number_or_word,
-        metavar="RULE",
-        help="stop before N: held-out, at the iteration that held-out counts choose; discrepancy, "
-        "when the data are fitted as well as noise allows; or a number below 1, when an iteration "
-        "changes the objective by a smaller share of it",
-    )
-    parser.add_argument(
-        "--pad",
-        type=_whole_or_word,
-        default=0,
-        metavar="N",
-        help="unobserved pixels kept round the images, at least; auto, where sources run over the "
-        "edge: as many as the PSFs need (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--precision",
-        choices=PRECISIONS,
-        default="single",
-        help="arithmetic on the OpenCL device (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--engine",
-        choices=ENGINES,
-        default="opencl",
-        help="OpenCL, or the plain NumPy reference, which computes in double "
-        "(default: %(default)s)",
-    )
-    add_device(parser)
-
-
-def _add_output_arguments(parser: Arguments) -> None:
-    parser.add_argument(
-        "-o",
-        "--output",
-        required=True,
-        metavar="OUT.fits",
-        help="file for the extended source, the stars and the history of the objective",
-    )
-    parser.add_argument(
-        "--models",
-        action="store_true",
-        help="write a cube with the model of each image too, in electrons",
-    )
-    parser.add_argument(
-        "--residuals",
-        action="store_true",
-        help="write a cube with (image - model) / sqrt(model) of each image too",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace OUT.fits if it exists")
-    parser.add_argument("--quiet", action="store_true", help="show warnings and errors only")
+OPTIONS = {
+    "input": [options.IMAGES, options.PSFS.but(required=True)],
+    "output": [
+        option(
+            "-o",
+            "--output",
+            required=True,
+            metavar="OUT.fits",
+            help="FITS file for the extended source, the stars and the history of the objective",
+        ),
+        options.OVERWRITE.but(help="replace OUT.fits if it exists"),
+        option(
+            "--models",
+            action="store_true",
+            help="add a cube with the model of each image, in electrons",
+        ),
+        option(
+            "--residuals",
+            action="store_true",
+            help="add a cube with the residuals of each image, (image - model) / sqrt(model)",
+        ),
+        options.QUIET,
+    ],
+    "calibration": [
+        options.BACKGROUND,
+        options.READ_NOISE,
+        option(
+            "--exposure",
+            **SEVERAL,
+            type=number_or_word,
+            metavar="T",
+            card=("EXP", "exposure, seconds"),
+            checksum="ESUM",
+            help="seconds, a FITS file with a map of them, or a keyword of the images' headers "
+            "such as EXPTIME; one for all images or one for each; the result is then in electrons "
+            "per second",
+        ),
+        option(
+            "--gain",
+            type=finite,
+            metavar="G",
+            card=("GAIN", "electrons for each unit of the images"),
+            help="electrons for each adu, or for each of whatever unit the images have",
+        ),
+        option(
+            "--mask",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="MSUM",
+            help="FITS file that is not 0 where a pixel is bad, or dq, the extension DQ of each "
+            "image; one for all images or one for each",
+        ),
+        options.SATURATION,
+        option(
+            "--inverse-variance",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="VSUM",
+            help="FITS file with 1 / variance of sky and read noise, in units of the images, 0 "
+            "where a pixel is bad; one for all images or one for each",
+        ),
+        option(
+            "--align",
+            choices=("wcs",),
+            help="take the offsets between the images from their sky coordinates",
+        ),
+    ],
+    "stars": [
+        options.STARS,
+        option(
+            "--star-sky",
+            action="append",
+            default=[],
+            metavar="RA,DEC",
+            help="position of a star on the sky (ICRS), in degrees or as hh:mm:ss,dd:mm:ss; may "
+            "be repeated",
+        ),
+        option(
+            "--stars",
+            metavar="FILE",
+            dest="star_table",
+            is_input=True,
+            help="table of stars in any format of astropy, with columns x and y, or ra and dec",
+        ),
+        option(
+            "--refine",
+            action="store_true",
+            default=None,  # for no card where it is not given
+            dest="refine_positions",
+            card=("REFINED", "star positions"),
+            help="fit the positions of the stars too, each within 3 pixels of the one given",
+        ),
+        option(
+            "--zero-point",
+            type=finite,
+            metavar="MAG",
+            card=("ZEROPT", "magnitude of one electron (per second)"),
+            help="magnitude of one electron, or of one per second where exposures are given; adds "
+            "a column mag to the table of stars",
+        ),
+    ],
+    "reconstruction": [
+        _parameter(
+            "--n-iter",
+            type=int,
+            metavar="N",
+            card=("NITER", "iterations done"),
+            help="largest number of iterations (default: %(default)s)",
+        ),
+        _parameter(
+            "--stop",
+            type=number_or_word,
+            metavar="RULE",
+            card=("STOPPED", "why it stopped"),
+            help="when to stop before N iterations: held-out, at the iteration that held-out "
+            "counts choose; discrepancy, when the data are fitted as well as noise allows; or a "
+            "number below 1, when the objective changes relatively by less in an iteration",
+        ),
+        _parameter(
+            "--solver",
+            choices=tuple(SOLVERS),
+            card=("SOLVER", "iteration"),
+            help="split-gradient method, or scaled gradient projection, which needs a tenth of "
+            "the iterations or fewer (default: %(default)s)",
+        ),
+        _parameter(
+            "--mu",
+            type=number_or_word,
+            metavar="MU",
+            card=("MU", "weight of the Tikhonov term, per electron"),
+            help="weight of the Tikhonov term on the extended source, per electron, or auto: "
+            "chosen by held-out counts (default: %(default)s)",
+        ),
+        _parameter(
+            "--smoothing",
+            type=number_or_word,
+            metavar="WEIGHT",
+            card=("SMOOTHIN", "weight of the edge-preserving term"),
+            help="weight of an edge-preserving term against noise, 1e-4 to 1e-3 beside bright "
+            "stars, or auto: chosen by held-out counts (default: %(default)s)",
+        ),
+        _parameter(
+            "--pad",
+            type=whole_or_word,
+            metavar="N",
+            card=("PAD", "least unobserved pixels round the images"),
+            help="smallest number of unobserved pixels round the images; auto, for sources that "
+            "run over the edge: as many as the PSFs need (default: %(default)s)",
+        ),
+        _parameter(
+            "--precision",
+            choices=PRECISIONS,
+            card=("PRECISIO", "precision of the arithmetic"),
+            help="arithmetic on the OpenCL device (default: %(default)s)",
+        ),
+        options.DEVICE,
+        _parameter(
+            "--engine",
+            choices=ENGINES,
+            card=("ENGINE", "engine"),
+            help="OpenCL, or the NumPy reference, which computes in double (default: %(default)s)",
+        ),
+    ],
+    "long runs": checkpoints.OPTIONS,
+}
+ALL_OPTIONS = [each for group in OPTIONS.values() for each in group]
 
 
 def _run(arguments: argparse.Namespace) -> None:
     from lnocl.io import atomic, fitsread, fitswrite
+    from lnocl.io.frames import Calibration, read_frames
 
-    inputs = _input_paths(arguments)
-    atomic.check_output(
-        arguments.output, arguments.overwrite, [*inputs, *_if_given(arguments.resume)]
-    )
+    inputs = options.input_paths(ALL_OPTIONS, vars(arguments))
+    atomic.check_fits_output(arguments.output, arguments.overwrite, inputs)
     checkpoints.check(arguments, inputs)
     folder = os.getcwd()
-    device = _device_spec(arguments)
+    given = {**vars(arguments), "device": _device_spec(arguments)}
     log = contextlib.nullcontext() if arguments.quiet else messages.shown_log()
     with log, checkpoints.Interrupts() as interrupts:
-        frames = _read_frames(arguments)
-        stars = _stars(arguments, frames.images)
+        calibration = Calibration(**_given(given, Calibration._fields))
+        frames = read_frames(arguments.images, arguments.psfs, calibration)
+        given["stars"] = _stars(arguments, frames.images)
         wcs = fitsread.wcs_cards(frames.images.header)
         result = deconvolve(
             frames.observation,
-            stars=stars,
-            mu=arguments.mu,
-            smoothing=arguments.smoothing,
-            solver=arguments.solver,
-            n_iter=arguments.n_iter,
-            stop=arguments.stop,
-            precision=arguments.precision,
-            engine=arguments.engine,
-            device=device,
-            pad=arguments.pad,
+            **_given(given, PARAMETERS),
             progress=not arguments.quiet,
-            refine_positions=arguments.refine,
             callback=interrupts.callback,
-            checkpoint=arguments.checkpoint,
-            checkpoint_every=arguments.checkpoint_every,
-            resume=arguments.resume,
         )
-        interrupts.listen()  # where no iteration was left to do it has not begun to
+        interrupts.listen()  # a run that was resumed at its end has no iteration to start from
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
+        repeated = given | _repeated(given, calibration, frames)
         fitswrite.write_result(
             arguments.output,
             result.extended,
@@ -202,8 +234,13 @@ def _run(arguments: argparse.Namespace) -> None:
             result.star_fluxes,
             result.history,
             wcs=wcs,
-            cards=_cards(arguments, result, frames),
-            commands=[["cd", folder], _repeating_command(arguments, stars, frames, device)],
+            cards=record.make_cards(
+                ALL_OPTIONS,
+                repeated | _used(repeated, frames, result),
+                frames.sha256,
+                _offset_cards(frames) if arguments.align else [],
+            ),
+            commands=record.make_commands("deconvolve", ALL_OPTIONS, repeated, folder),
             overwrite=arguments.overwrite,
             held_out=result.held_out if result.held_out.size else None,
             per_second=bool(arguments.exposure),
@@ -215,40 +252,44 @@ def _run(arguments: argparse.Namespace) -> None:
     interrupts.explain(arguments, result)
 
 
-def _input_paths(arguments: argparse.Namespace) -> list[str]:
-    """Return what is named on the command line and may be a file to read."""
+def _given(values: Mapping[str, Any], names: Any) -> dict[str, Any]:
+    """Return the values that are given, of these names; the others have defaults elsewhere."""
+    return {name: values[name] for name in names if values.get(name) is not None}
+
+
+def _repeated(given: Mapping[str, Any], calibration: Calibration, frames: Frames) -> dict[str, Any]:
+    """Return the values of the command that repeats the run, where others were given."""
+    return {
+        "background": frames.background,
+        "read_noise": list(calibration.read_noise),
+        "star_sky": [],
+        "star_table": None,
+        "precision": given["precision"] if given["engine"] == "opencl" else "double",
+    }
+
+
+def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[str, Any]:
+    """Return the values that were computed with, where rules and keywords were given."""
+    from lnocl.scene.padding import recommend_pad
+
+    exposure = frames.observation.exposure
+    return {
+        "n_iter": result.n_iter,
+        "stop": result.stop_reason,
+        "mu": result.mu,
+        "smoothing": result.smoothing,
+        "device": result.device,
+        "pad": recommend_pad(frames.observation) if repeated["pad"] == "auto" else repeated["pad"],
+        **({"exposure": exposure.tolist()} if repeated["exposure"] and exposure.ndim == 1 else {}),
+    }
+
+
+def _offset_cards(frames: Frames) -> list[Card]:
     return [
-        *arguments.images,
-        *arguments.psfs,
-        *arguments.inverse_variance,
-        *arguments.mask,
-        *(
-            word
-            for words in (arguments.background, arguments.read_noise, arguments.exposure)
-            for word in words or ()
-            if isinstance(word, str)
-        ),
-        *([] if arguments.star_table is None else [arguments.star_table]),
+        (f"OFF{axis}{j}", float(offset), "offset of the image, pixels")
+        for j, offsets in enumerate(frames.observation.offsets, 1)
+        for axis, offset in zip("XY", offsets, strict=True)
     ]
-
-
-def _read_frames(arguments: argparse.Namespace) -> Frames:
-    from lnocl.io.frames import Calibration, read_frames
-
-    return read_frames(
-        arguments.images,
-        arguments.psfs,
-        Calibration(
-            background=arguments.background or [0.0],
-            read_noise=arguments.read_noise or [0.0],
-            inverse_variance=arguments.inverse_variance,
-            exposure=arguments.exposure or [],
-            mask=arguments.mask,
-            saturation=arguments.saturation,
-            gain=arguments.gain,
-            align=arguments.align,
-        ),
-    )
 
 
 def _stars(arguments: argparse.Namespace, images: Stack) -> list[tuple[float, float]]:
@@ -271,13 +312,13 @@ def _stars(arguments: argparse.Namespace, images: Stack) -> list[tuple[float, fl
 def _star_columns(
     arguments: argparse.Namespace, result: Result, header: fits.Header
 ) -> list[StarColumn]:
-    """Return what the table of stars holds besides positions and fluxes."""
+    """Return the columns of the table of stars after positions and fluxes."""
     from lnocl.io import sky
     from lnocl.io.fitswrite import StarColumn
     from lnocl.metrics import magnitude
 
     columns = []
-    if arguments.refine:
+    if arguments.refine_positions:
         x_error, y_error = result.star_position_errors.T
         unit = "ct/s" if arguments.exposure else "ct"
         columns += [
@@ -313,137 +354,6 @@ def _device_spec(arguments: argparse.Namespace) -> str | None:
     return device.spec_of(device.choose(arguments.device).device)
 
 
-# Keywords of the cards that hold the checksum of each file, by what the files are.
-CHECKSUM_KEYWORDS = {
-    "images": "ISUM",
-    "psfs": "PSUM",
-    "background": "BSUM",
-    "read_noise": "RSUM",
-    "inverse_variance": "VSUM",
-    "exposure": "ESUM",
-    "mask": "MSUM",
-}
-
-
-def _cards(
-    arguments: argparse.Namespace, result: Result, frames: Frames
-) -> list[tuple[str, str | int | float, str]]:
-    """Return the cards that say what was run; a checksum leaves no room for a comment."""
-    observation = frames.observation
-    return [
-        ("CREATOR", f"lnocl {__version__}", "program that wrote this file"),
-        ("SOLVER", arguments.solver, "iteration"),
-        ("NITER", result.n_iter, "iterations done"),
-        ("STOPPED", result.stop_reason, "why it stopped"),
-        ("MU", result.mu, "weight of the Tikhonov term, per electron"),
-        ("SMOOTHIN", result.smoothing, "weight of the edge-preserving term"),
-        ("PAD", _pad(arguments, observation), "least unobserved pixels round the images"),
-        ("PRECISIO", _precision(arguments), "precision of the arithmetic"),
-        ("ENGINE", arguments.engine, "engine"),
-        ("DEVICE", result.device, "device"),
-        *_numbered("BKG", frames.background, "background, electrons"),
-        *_numbered("RON", arguments.read_noise or [0.0], "read noise, electrons"),
-        *_numbered("EXP", _exposures(arguments, frames), "exposure, seconds"),
-        *_given("GAIN", arguments.gain, "electrons for each unit of the images"),
-        *_given("SATLEVEL", arguments.saturation, "saturation, in units of the images"),
-        *_given("ZEROPT", arguments.zero_point, "magnitude of one electron (per second)"),
-        *([("REFINED", True, "star positions")] if arguments.refine else []),
-        *(
-            (f"OFF{axis}{j}", float(offset), "offset of the image, pixels")
-            for j, offsets in enumerate(observation.offsets if arguments.align else [], 1)
-            for axis, offset in zip("XY", offsets, strict=True)
-        ),
-        *(
-            (f"{CHECKSUM_KEYWORDS[what]}{j}", digest, "")
-            for what, digests in frames.sha256.items()
-            for j, digest in enumerate(digests, 1)
-        ),
-    ]
-
-
-def _pad(arguments: argparse.Namespace, observation: Observation) -> int:
-    from lnocl.scene.padding import recommend_pad
-
-    return recommend_pad(observation) if arguments.pad == "auto" else arguments.pad
-
-
-def _exposures(arguments: argparse.Namespace, frames: Frames) -> Sequence[float | str]:
-    """Return the exposure of each image, or the files of maps."""
-    if not arguments.exposure or frames.observation.exposure.ndim == 3:
-        return arguments.exposure or []
-    return [float(exposure) for exposure in frames.observation.exposure]
-
-
-def _numbered(
-    keyword: str, values: Sequence[float | str], comment: str
-) -> list[tuple[str, float | str, str]]:
-    """Return a card for each value; of a file its name."""
-    return [
-        (f"{keyword}{j}", value if isinstance(value, float) else os.path.basename(value), comment)
-        for j, value in enumerate(values, 1)
-    ]
-
-
-def _given(keyword: str, value: float | None, comment: str) -> list[tuple[str, float, str]]:
-    return [] if value is None else [(keyword, value, comment)]
-
-
-def _repeating_command(
-    arguments: argparse.Namespace,
-    stars: Sequence[tuple[float, float]],
-    frames: Frames,
-    device: str | None,
-) -> list[str]:
-    """Return the words of the command that makes the same result, every parameter spelled out."""
-    return [
-        "lnocl",
-        "deconvolve",
-        *map(as_path, arguments.images),
-        *_option("--psf", map(as_path, arguments.psfs)),
-        *_option("--background", map(_as_word, frames.background)),
-        *_option("--read-noise", map(_as_word, arguments.read_noise or [0.0])),
-        *_option("--exposure", map(_as_word, arguments.exposure or [])),
-        *_option("--gain", _if_given(arguments.gain)),
-        *_option("--inverse-variance", map(as_path, arguments.inverse_variance)),
-        *_option("--mask", map(as_path, arguments.mask)),
-        *_option("--saturation", _if_given(arguments.saturation)),
-        *_option("--align", _if_given(arguments.align)),
-        *(word for x, y in stars for word in ("--star", f"{x!r},{y!r}")),
-        *(["--refine"] if arguments.refine else []),
-        *_option("--mu", [str(arguments.mu)]),
-        *_option("--smoothing", [str(arguments.smoothing)]),
-        *_option("--solver", [arguments.solver]),
-        *_option("--n-iter", [str(arguments.n_iter)]),
-        *_option("--stop", _if_given(arguments.stop)),
-        *_option("--pad", [str(arguments.pad)]),
-        *_option("--precision", [_precision(arguments)]),
-        *_option("--engine", [arguments.engine]),
-        *_option("--device", _if_given(device)),
-        *_option("--zero-point", _if_given(arguments.zero_point)),
-        *(["--models"] if arguments.models else []),
-        *(["--residuals"] if arguments.residuals else []),
-        *_option("-o", [as_path(arguments.output)]),
-    ]
-
-
-def _option(name: str, values: Iterable[str]) -> list[str]:
-    """Return the words of an option; none where it has no value."""
-    words = list(values)
-    return [name, *words] if words else []
-
-
-def _if_given(value: object) -> list[str]:
-    return [] if value is None else [str(value)]
-
-
-def _as_word(value: float | str) -> str:
-    return repr(value) if isinstance(value, float) else as_path(value)
-
-
-def _precision(arguments: argparse.Namespace) -> str:
-    return arguments.precision if arguments.engine == "opencl" else "double"
-
-
 def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
     objective = result.history["objective"][-1]
     electrons = "electrons per second" if arguments.exposure else "electrons"
@@ -453,7 +363,7 @@ def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
     )
     reason = f"stopped by {result.stop_reason}"
     return [
-        f"{result.n_iter} iterations on {result.device}, objective {objective:.6g}",
+        f"{counted(result.n_iter, 'iteration')} on {result.device}, objective {objective:.6g}",
         *([] if result.stop_reason == "n_iter" else [reason]),
         *([f"mu chosen: {result.mu:.3g}"] if arguments.mu == "auto" else []),
         *([f"smoothing chosen: {result.smoothing:.3g}"] if arguments.smoothing == "auto" else []),
@@ -463,15 +373,6 @@ def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
     ]
 
 
-def _whole_or_word(text: str) -> int | str:
-    try:
-        return int(text)
-    except ValueError:
-        return text
-
-
 COMMAND = Command(
-    "reconstruct the sky from images of it, as stars plus an extended source",
-    _add_arguments,
-    _run,
+    "reconstruct the sky from images of it, as stars plus an extended source", OPTIONS, _run
 )

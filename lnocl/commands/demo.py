@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import argparse
 
-from lnocl.commands import messages
-from lnocl.commands.arguments import Command, add_device, add_folder
+from lnocl.commands import messages, options
+from lnocl.commands.options import option, output_folder
+from lnocl.commands.parser import Command
 
-
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_folder(parser, "images, results and pictures", default="lnocl_demo")
-    parser.add_argument(
+OPTIONS = [
+    *output_folder("images, results and pictures", default="lnocl_demo"),
+    option(
         "--size",
         type=int,
         default=256,
         metavar="N",
         help="pixels along each side (default: %(default)s)",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--seed",
         type=int,
         default=0,
         metavar="N",
-        help="of residual phases and noise (default: %(default)s)",
-    )
-    add_device(parser)
+        help="seed of residual phases and noise (default: %(default)s)",
+    ),
+    options.DEVICE,
+]
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -41,6 +42,6 @@ def _run(arguments: argparse.Namespace) -> None:
 COMMAND = Command(
     "simulate a jet and its star, reconstruct them with and without the star as a component, "
     "and show the difference in a table and pictures",
-    _add_arguments,
+    {"": OPTIONS},
     _run,
 )

@@ -5,11 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lnocl.commands import messages
-from lnocl.commands.arguments import Command
-
-
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    pass
+from lnocl.commands.parser import Command
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -25,8 +21,4 @@ def _run(arguments: argparse.Namespace) -> None:
     )
 
 
-COMMAND = Command(
-    "list the OpenCL devices, and say which one is used and why",
-    _add_arguments,
-    _run,
-)
+COMMAND = Command("list the OpenCL devices, and say which one is used and why", {}, _run)

@@ -5,15 +5,20 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TextIO
+
+# A parameter whose name is an ordinary word, such as pad, is meant where it begins a message or
+# follows one of these.
+BEFORE_NAMES = ("as", "give", "leave", "take", "with")
 
 
 def replace_closed_streams() -> None:
-    """Have nothing said where stdin, stdout or stderr is closed, as after ``2>&-``.
+    """Replace a closed stdin, stdout or stderr, as after ``2>&-``, by one that discards output.
 
-    A file that is opened later would get the closed one's number, and what libraries say there.
+    Otherwise a file opened later would get its number, and the output of libraries.
     """
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
@@ -21,13 +26,13 @@ def replace_closed_streams() -> None:
 
 
 def say(lines: Iterable[str]) -> None:
-    """Write lines to stdout; a reader that has left early is no error."""
+    """Write lines to stdout; a reader that has left early is not an error."""
     try:
         for line in lines:
             sys.stdout.write(_one_line(line, sys.stdout) + "\n")
         sys.stdout.flush()
     except OSError as error:
-        # What is still buffered would fail again when the interpreter ends.
+        # The rest of the buffer would fail again when the interpreter ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
             raise
@@ -39,7 +44,33 @@ def fail(message: str, exit_status: int) -> int:
     return exit_status
 
 
+def name_options(message: str, flags: Mapping[str, str]) -> str:
+    """Return a message of the library that names options as they are typed in a shell.
+
+    Parameters
+    ----------
+    message : str
+        It names parameters, such as ``n_iter``.
+    flags : mapping of str to str
+        The flag of each parameter, such as ``--n-iter``. A name that is a plural, such as psfs,
+        stays as it is.
+    """
+    ordinary = [name for name, flag in flags.items() if flag == f"--{name}"]
+    special = [name for name in flags if "_" in name]
+    place = "|".join(["^", *(rf"(?<=\b{word} )" for word in BEFORE_NAMES)])
+    name = rf"(?:{'|'.join(ordinary + special)})\b(?![./'-])"
+    for pattern in (
+        rf"(?:{place}){name}(?:(?:, | and ){name})*",
+        rf"(?<![\w./'-])(?:{'|'.join(special)})(?![\w./'-])",
+    ):
+        message = re.sub(
+            pattern, lambda found: re.sub(name, lambda each: flags[each[0]], found[0]), message
+        )
+    return re.sub(r"(--[\w-]+)=", r"\1 ", message)
+
+
 def show_warning(
+    flags: Mapping[str, str],
     message: Warning | str,
     category: type[Warning],
     filename: str,
@@ -47,13 +78,13 @@ def show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """Write a warning to stderr, in place of `warnings.showwarning`."""
-    _complain("warning", str(message))
+    """Write a warning to stderr, with `name_options`, in place of `warnings.showwarning`."""
+    _complain("warning", name_options(str(message), flags))
 
 
 @contextlib.contextmanager
 def shown_log() -> Iterator[None]:
-    """Show on stderr what the library logs."""
+    """Show the notes that the library logs on stderr."""
     log, handler = logging.getLogger("lnocl"), _Notes()
     level = log.level
     log.addHandler(handler)
@@ -76,7 +107,7 @@ def _note(message: str) -> None:
 
 
 class _Notes(logging.Handler):
-    """Shows what the library logs, once where it says the same of several runs."""
+    """Handler that shows each note once, where several runs log the same."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -90,7 +121,7 @@ class _Notes(logging.Handler):
 
 
 def _one_line(text: str, stream: TextIO) -> str:
-    """Return text in one line, with escapes for what a terminal should not or cannot show."""
+    """Return text in one line, with escapes for characters that a terminal cannot show."""
     joined = " ".join(part.strip() for part in text.splitlines())
     shown = "".join(c if c.isprintable() else _escape(c) for c in joined)
     encoding = stream.encoding or "ascii"

@@ -5,20 +5,19 @@ from __future__ import annotations
 import argparse
 
 from lnocl.commands import messages
-from lnocl.commands.arguments import Command, add_folder
+from lnocl.commands.options import option, output_folder
+from lnocl.commands.parser import Command
 
-
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+OPTIONS = [
+    option(
         "results",
         nargs="+",
         metavar="RESULT",
         help="FITS file that lnocl deconvolve, lnocl demo or examples/hh34_table.py has written",
-    )
-    parser.add_argument(
-        "--truth", metavar="TRUTH", help="FITS file with the true source, of lnocl simulate"
-    )
-    add_folder(parser, "the figures, PNG files", required=True)
+    ),
+    *output_folder("the figures, PNG files", required=True),
+    option("--truth", metavar="TRUTH", help="FITS file with the true source, of lnocl simulate"),
+]
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -32,6 +31,6 @@ def _run(arguments: argparse.Namespace) -> None:
 
 COMMAND = Command(
     "draw the paper's figures from results: objects, errors, magnitude and profiles",
-    _add_arguments,
+    {"": OPTIONS},
     _run,
 )

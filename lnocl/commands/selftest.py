@@ -5,13 +5,8 @@ from __future__ import annotations
 import argparse
 
 from lnocl import __version__
-from lnocl.commands import messages
-from lnocl.commands.arguments import Command, add_device
-
-
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Exit status: 0 all is right, 1 something is wrong, 2 wrong use."
-    add_device(parser)
+from lnocl.commands import messages, options
+from lnocl.commands.parser import Command
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -32,6 +27,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 COMMAND = Command(
     "try every kernel and short deconvolutions on a device, and say whether they are right",
-    _add_arguments,
+    {"": [options.DEVICE]},
     _run,
+    "Exit status: 0 all is right, 1 something is wrong, 2 wrong use.",
 )

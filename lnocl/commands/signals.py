@@ -1,4 +1,4 @@
-"""Signals: what ends a command, once, and what it does then."""
+"""Signals that end a command, the first of them in an orderly way."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def first_handled(numbers: Iterable[int], handle: Callable[[int], None]) -> Iterator[None]:
-    """Have the first of some signals handled; the next one does what it did before.
+    """Handle the first of some signals; the next one has its former effect.
 
-    Signals that are ignored stay so, as in the background of a script. Python sets handlers in the
-    main thread only: elsewhere nothing is changed.
+    Ignored signals stay ignored, as in the background of a script. In other threads than the main
+    one, where Python sets no handlers, this has no effect.
 
     Parameters
     ----------

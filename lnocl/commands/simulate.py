@@ -6,42 +6,29 @@ import argparse
 import shlex
 
 from lnocl.commands import messages
-from lnocl.commands.arguments import Command, add_folder
+from lnocl.commands.options import option, output_folder
+from lnocl.commands.parser import Command
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+def _star(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, magnitude = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not X,Y,MAG") from None
+    return x, y, magnitude
+
+
+OPTIONS = [
+    option(
         "scene",
         metavar="SCENE",
         help="hh34, a jet like the paper's, or a FITS file whose first image is the extended "
-        "source; the header keywords STARX and STARY, 0-based, name its star",
-    )
-    add_folder(parser, "images, PSFs, truth and record.json", required=True)
-    parser.add_argument(
-        "--size", type=int, metavar="N", help="pixels along each side of hh34 (default: 1024)"
-    )
-    parser.add_argument(
-        "--angle",
-        nargs="+",
-        type=float,
-        dest="angles",
-        metavar="DEG",
-        help="angles of the baseline from the x axis towards the y axis, one for each image "
-        "(default: 0 45 90 135)",
-    )
-    parser.add_argument(
-        "--exposure-time", metavar="TIME", help='of each image, with unit (default: "30 min")'
-    )
-    parser.add_argument(
-        "--strehl", type=float, metavar="S", help="Strehl ratio in (0, 1] (default: 0.7)"
-    )
-    parser.add_argument(
-        "--throughput",
-        type=float,
-        metavar="T",
-        help="electrons per photon that reaches the telescope, in (0, 1] (default: 0.3)",
-    )
-    parser.add_argument(
+        "source; its header keywords STARX and STARY, 0-based, give the position of a star",
+    ),
+    *output_folder("images, PSFs, truth and record.json", required=True),
+    option("--size", type=int, metavar="N", help="pixels along each side of hh34 (default: 1024)"),
+    option("--seed", type=int, metavar="N", help="seed of residual phases and noise (default: 0)"),
+    option(
         "--star",
         action="append",
         type=_star,
@@ -49,29 +36,48 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X,Y,MAG",
         help="whole pixels, 0-based, and magnitude of a star, instead of those of the scene; may "
         "be repeated",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--extended-magnitude",
         type=float,
         metavar="M",
         help="integrated magnitude of the extended source (default: 13)",
-    )
-    parser.add_argument(
+    ),
+    option(
+        "--exposure-time",
+        metavar="TIME",
+        help='exposure time of each image, with unit (default: "30 min")',
+    ),
+    option(
+        "--angle",
+        nargs="+",
+        type=float,
+        dest="angles",
+        metavar="DEG",
+        help="angle of the baseline in each image, from the x axis towards the y axis (default: "
+        "0 45 90 135)",
+    ),
+    option("--strehl", type=float, metavar="S", help="Strehl ratio in (0, 1] (default: 0.7)"),
+    option(
+        "--throughput",
+        type=float,
+        metavar="T",
+        help="electrons per photon that reaches the telescope, in (0, 1] (default: 0.3)",
+    ),
+    option(
         "--sky",
         type=float,
         dest="sky_brightness",
         metavar="MAG",
         help="brightness of the sky, magnitude per square arcsecond (default: 13.5)",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--read-noise",
         type=float,
         metavar="S",
         help="standard deviation in electrons (default: 10)",
-    )
-    parser.add_argument(
-        "--seed", type=int, metavar="N", help="of residual phases and noise (default: 0)"
-    )
+    ),
+]
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -109,16 +115,8 @@ def _run(arguments: argparse.Namespace) -> None:
     )
 
 
-def _star(text: str) -> tuple[float, float, float]:
-    try:
-        x, y, magnitude = map(float, text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not X,Y,MAG") from None
-    return x, y, magnitude
-
-
 COMMAND = Command(
     "simulate images of a scene as the paper's interferometer would take them",
-    _add_arguments,
+    {"": OPTIONS},
     _run,
 )

@@ -1,4 +1,4 @@
-"""Output files: what they may be, and that each is there complete or not at all."""
+"""Output files: checks of their names, and writing that leaves a whole file or no file."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from typing import IO, Any
 from lnocl.errors import FileError, InputError
 
 COMPRESSED = (".gz", ".bz2", ".xz", ".zip", ".z", ".fz")
+FITS_ENDINGS = (".fits", ".fit", ".fts")
 
 
 def check_folder(
     path: str, overwrite: bool, names: Iterable[str] | None = None, make: bool = True
 ) -> None:
-    """Make the folder that files go to, and check that none is lost, before any work is done.
+    """Make the folder for output files, and check that no file is lost, before any work is done.
 
     Parameters
     ----------
@@ -34,16 +35,16 @@ def check_folder(
     Raises
     ------
     FileError
-        The path is no folder, cannot be made or written to, or holds files that must not be
+        The path is not a folder, cannot be made or written to, or holds files that must not be
         overwritten.
     """
     if not (make or os.path.lexists(path)):
-        # What can be told now of a folder that is not there yet.
+        # The folder does not exist yet; its nearest parent that does must allow it.
         parent = os.path.dirname(os.path.abspath(path))
         while not os.path.lexists(parent):
             parent = os.path.dirname(parent)
         if not os.path.isdir(parent):
-            raise FileError(f"the output folder {path} cannot be used: {parent} is no folder")
+            raise FileError(f"the output folder {path} cannot be used: {parent} is not a folder")
         check_output(os.path.join(parent, ".lnocl"), overwrite=True)
         return
     try:
@@ -51,6 +52,8 @@ def check_folder(
         there = os.listdir(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
+        if isinstance(error, FileExistsError):
+            reason = "it is not a folder"
         raise FileError(f"the output folder {path} cannot be used: {reason}") from error
     if names is None and there and not overwrite:
         raise FileError(
@@ -102,6 +105,19 @@ def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None
         ) from error
 
 
+def check_fits_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None:
+    """Check that a FITS file can be written, before any work is done for it.
+
+    Raises
+    ------
+    FileError, InputError
+        As `check_output`; a name that does not end in .fits, .fit or .fts.
+    """
+    if os.path.basename(path) and not path.lower().endswith((*FITS_ENDINGS, *COMPRESSED)):
+        raise InputError(f"the output is a FITS file; give it a name ending in .fits, not {path}")
+    check_output(path, overwrite, inputs)
+
+
 @contextlib.contextmanager
 def whole_file(path: str, overwrite: bool = False) -> Iterator[IO[bytes]]:
     """Yield a stream whose content becomes the file once it is complete and on the disk.
@@ -151,7 +167,7 @@ def write_text(path: str, text: str, overwrite: bool = False) -> None:
     path : str
         File to write.
     text : str
-        What it shall hold.
+        Its content.
     overwrite : bool, optional
         Whether an existing file may be replaced.
 
@@ -165,9 +181,9 @@ def write_text(path: str, text: str, overwrite: bool = False) -> None:
 
 
 class _Output(io.RawIOBase):
-    """A new file that remembers why it could not be written.
+    """A new file that remembers the error with which a write failed.
 
-    Those who write may make something else of that: astropy raises AttributeError on a full disk.
+    Its writer may raise another one: astropy raises AttributeError on a full disk.
     """
 
     def __init__(self, path: str) -> None:
@@ -198,7 +214,7 @@ class _Output(io.RawIOBase):
 
 @contextlib.contextmanager
 def _explained(path: str, output: _Output | None = None) -> Iterator[None]:
-    """Raise what the operating system refuses as FileError; let all else pass."""
+    """Raise errors of the operating system as FileError; let all others pass."""
     try:
         yield
     except FileError:
@@ -215,14 +231,14 @@ def _check_replaceable(path: str, overwrite: bool) -> None:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
         if not os.path.basename(path):
-            raise FileError(f"the output {path!r} names no file") from None
+            raise FileError(f"the output {path!r} is not the name of a file") from None
         return
     except (OSError, ValueError) as error:
         raise FileError(
             f"the output {path} cannot be written: {getattr(error, 'strerror', None) or error}"
         ) from error
     if not stat.S_ISREG(mode):
-        raise FileError(f"the output {path} exists and is no regular file; give another name")
+        raise FileError(f"the output {path} exists and is not a regular file; give another name")
     if not overwrite:
         raise FileError(
             f"the output {path} exists; give another name, or --overwrite to replace it"
@@ -230,7 +246,7 @@ def _check_replaceable(path: str, overwrite: bool) -> None:
 
 
 def _remove(temporary: str) -> None:
-    with contextlib.suppress(OSError):  # what failed before is what must be told
+    with contextlib.suppress(OSError):  # the error to report is the one before
         os.unlink(temporary)
 
 

@@ -1,4 +1,4 @@
-"""An open FITS file: the one place where what astropy raises of a file becomes our error."""
+"""An open FITS file: the one place where astropy's errors on a file become ours."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lnocl.errors import FileError, LnoclError, warn
 from lnocl.process import recorded_warnings
 
-# What astropy counts to when it reads a header, and as far as FITS lets it count.
+# Keywords whose value astropy counts to when it reads a header, and the largest that FITS allows.
 COUNTS = ("NAXIS", "TFIELDS")
 MAX_COUNT = 999
 
@@ -34,7 +34,7 @@ class FitsFile:
     stream : binary stream
         The file as it lies on the disk.
     content : binary stream
-        What it holds, unpacked where it is compressed as a whole.
+        Its content, unpacked where it is compressed as a whole.
     hdus : astropy.io.fits.HDUList
         The same, read.
     length : int
@@ -54,7 +54,7 @@ class FitsFile:
         self._length = length
 
     def hdus(self) -> Iterator[Any]:
-        """Yield the HDUs, each after a look whether the file holds as much as its header claims.
+        """Yield the HDUs, each after a check that the file holds as much as its header claims.
 
         Raises
         ------
@@ -64,14 +64,14 @@ class FitsFile:
         Warns
         -----
         UserWarning
-            The end of the file is no HDU, and left out.
+            The end of the file is not an HDU, and is left out.
         """
         for hdu in self._hdus:
             where = hdu.fileinfo()
             # With a keyword given twice it may be another size than that of check_header.
             check_size(self.path, self._length, where["datLoc"], hdu.size)
             if hdu.header.get("ZIMAGE") is True:
-                # Decompressing damaged tiles corrupts the memory (seen with astropy 8.0).
+                # Decompressing damaged tiles corrupts the memory (so in astropy 8.0).
                 raise FileError(
                     f"{self.path} is tile-compressed; unpack it first, such as with funpack"
                 )
@@ -84,7 +84,7 @@ class FitsFile:
             except FileError:
                 raise
             except Exception as error:
-                warn(f"what follows byte {end} is left out: {error}")
+                warn(f"everything after byte {end} is left out: {error}")
                 return
 
     def pixels(self, hdu: Any) -> NDArray[np.float64]:
@@ -133,7 +133,7 @@ class FitsFile:
         return columns
 
     def sha256(self) -> str:
-        """Return the checksum of the file, in hexadecimal; nothing can be read after it."""
+        """Return the checksum of the file, in hexadecimal; call it last."""
         self._stream.seek(0)
         return hashlib.file_digest(self._stream, "sha256").hexdigest()
 
@@ -147,7 +147,7 @@ def check_header(path: str, content: IO[bytes], length: int, start: int) -> None
         The header that starts at this byte has more axes or columns than FITS allows, data that
         are not there, or more rows than the file has bytes.
     Exception
-        Whatever astropy raises of what is no header.
+        Any error of astropy on bytes that are not a header.
     """
     content.seek(start)
     header = fits.Header.fromfile(content)
@@ -179,46 +179,46 @@ def check_size(path: str, length: int, start: int, size: int) -> None:
 
 
 def open_regular(path: str) -> io.BufferedReader:
-    """Open a file to read, but no device or pipe, which may have no end.
+    """Open a file to read; devices and pipes may have no end, and are refused.
 
     Raises
     ------
     OSError, ValueError
-        As `open`; what has the name is no file.
+        As `open`; the path is a device or a pipe.
     """
     mode = os.stat(path).st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # open says what a folder is
-        raise OSError(errno.EINVAL, "it is no regular file; save what it gives to one first")
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # open refuses a folder
+        raise OSError(errno.EINVAL, "it is not a regular file; save its content to one first")
     return open(path, "rb")
 
 
 @contextlib.contextmanager
 def open_fits(
-    path: str, complaint: str = "is no FITS file, or a damaged one"
+    path: str, complaint: str = "is not a FITS file, or is damaged"
 ) -> Iterator[FitsFile]:
-    """Open a FITS file, and raise whatever is found wrong with it while it is open as FileError.
+    """Open a FITS file, and raise all errors while it is open as FileError.
 
     Parameters
     ----------
     path : str
         File to read.
     complaint : str, optional
-        What a file is, or cannot be, where astropy cannot read it.
+        The words after the name of a file that astropy cannot read.
 
     Yields
     ------
     FitsFile
-        To read from; do nothing else meanwhile, lest its errors be taken for the file's.
+        Do nothing but read from it: other errors would be taken for the file's.
 
     Raises
     ------
     FileError
-        A file that is missing, no regular one, no FITS or damaged.
+        A file that is missing, damaged, not a regular one or not FITS.
 
     Warns
     -----
     LnoclWarning
-        What astropy found wrong and could mend.
+        Faults that astropy found and mended.
     """
     try:
         stream = open_regular(path)
@@ -237,7 +237,7 @@ def open_fits(
         except (LnoclError, MemoryError):
             raise
         except Exception as error:
-            # astropy raises whatever a damaged file leads it to; its advice is for programmers.
+            # astropy may raise any error on a damaged file; its advice is for programmers.
             reason = str(error).partition(". ")[0] or "it ends too early"
             raise FileError(f"{path} {complaint}: {reason}") from error
     for warning in caught:

@@ -10,7 +10,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from lnocl.errors import FileError, InputError, warn
+from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.fitsfile import open_fits
 from lnocl.io.headers import make_wcs, number, quiet_log, readable
 from lnocl.process import ignored_warnings
@@ -68,16 +68,15 @@ def read_stack(paths: Sequence[str]) -> Stack:
     Raises
     ------
     FileError
-        A file that is missing, no FITS, damaged, truncated or tile-compressed, or that holds no
-        image or one that is larger than the memory.
+        A file that is missing, damaged, truncated, tile-compressed or not FITS, that has no image,
+        or whose image is larger than the memory.
     InputError
         An image of another dimension or shape than the others.
 
     Warns
     -----
     LnoclWarning
-        What astropy found wrong with a file and could mend; data that do not match their
-        DATASUM.
+        Faults of a file that astropy found and mended; data that do not match their DATASUM.
     """
     images, headers, sha256 = zip(*(_read_file(path) for path in paths), strict=True)
     for path, image in zip(paths, images, strict=True):
@@ -104,7 +103,7 @@ def read_single(path: str) -> Stack:
 
 
 def read_extension(path: str, name: str) -> NDArray[np.float64] | None:
-    """Return the image extension of this name of a file, or None where there is none.
+    """Return the image extension of this name of a file, or None where the file lacks it.
 
     Raises
     ------
@@ -118,10 +117,10 @@ def read_extension(path: str, name: str) -> NDArray[np.float64] | None:
 
 
 def read_keyword(path: str, header: fits.Header, keyword: str) -> str | float | None:
-    """Return what a keyword says of an image that was read from a file; None where it is missing.
+    """Return the value of a keyword for an image that was read from a file; None if missing.
 
-    Of an image in an extension the primary header is asked too, where telescopes leave what holds
-    for the whole file.
+    Where the header of the image lacks it, the primary header is read, in which telescopes leave
+    the keywords that hold for the whole file.
 
     Raises
     ------
@@ -158,7 +157,7 @@ def wcs_cards(header: fits.Header) -> fits.Header:
     cards = fits.Header()
     for key in sorted({match[1] for match in map(_WCS_KEYWORD.fullmatch, header) if match}):
         try:
-            # What astropy mends on reading it writes mended.
+            # Cards that astropy mends on reading are written mended.
             wcs = make_wcs(header, key or " ")
             with ignored_warnings(), quiet_log():
                 if key and not wcs.wcs.ctype[0].endswith("-SIP"):
@@ -166,8 +165,8 @@ def wcs_cards(header: fits.Header) -> fits.Header:
                 cards.update(wcs.to_header(relax=True))
         except Exception as error:
             warn(
-                f"the coordinates (WCS{key and ' ' + key}) of the first image cannot be kept "
-                f"and are left out: {error}"
+                f"the coordinates (WCS{key and ' ' + key}) of the first image cannot be "
+                f"copied and are left out: {error}"
             )
     return cards
 
@@ -184,8 +183,8 @@ class SavedResult(NamedTuple):
     star_fluxes : ndarray of float64, shape (n,)
         Electrons.
     history, curve, held_out : dict of str to ndarray of float64, or None
-        Columns of the tables ``HISTORY``, ``CURVE`` and ``HELDOUT``; None where there is no such
-        table.
+        Columns of the tables ``HISTORY``, ``CURVE`` and ``HELDOUT``; None for a table that is
+        missing.
     header : astropy.io.fits.Header
         Header of the extended source.
     path : str
@@ -207,13 +206,13 @@ class SavedResult(NamedTuple):
         Raises
         ------
         InputError
-            It gives no finite number.
+            Its value is not a finite number.
         """
         return number(self.path, self.header, keyword)
 
 
 def read_result(path: str) -> SavedResult:
-    """Read what `fitswrite.write_result` has written.
+    """Read a result that `fitswrite.write_result` has written.
 
     Parameters
     ----------
@@ -248,8 +247,8 @@ def read_result(path: str) -> SavedResult:
         if (table in tables or table == "STARS") and name not in tables.get(table, ())
     ]
     if lacking or extended.ndim != 2:
-        what = f"there is no column {lacking[0]}" if lacking else "the image is a cube"
-        raise FileError(f"{path} is no result or truth that lnocl has written: {what}")
+        fault = f"there is no column {lacking[0]}" if lacking else "the image is a cube"
+        raise FileError(f"{path} is not a result or truth written by lnocl: {fault}")
     stars = tables["STARS"]
     return SavedResult(
         extended,
@@ -264,7 +263,7 @@ def read_result(path: str) -> SavedResult:
 
 
 class _NoImageError(FileError):
-    """A file holds no image, or none of the name that is sought."""
+    """A file without an image, or without one of the name that is sought."""
 
 
 def _read_file(
@@ -289,15 +288,11 @@ def _check_shape(
     first_shape: tuple[int, ...],
     alone: bool,
 ) -> None:
+    found = f"{path} has an image of {counted(len(shape), 'dimension')}"
     if alone and len(shape) not in (2, 3):
-        raise InputError(
-            f"{path} has an image of {len(shape)} dimensions; two are needed, or three for a cube"
-        )
+        raise InputError(f"{found}; two are needed, or three for a cube")
     if not alone and len(shape) != 2:
-        raise InputError(
-            f"{path} has an image of {len(shape)} dimensions; several files need two each "
-            "(a cube goes alone)"
-        )
+        raise InputError(f"{found}; each of several files needs two (a cube must be the only file)")
     if shape != first_shape:
         raise InputError(
             f"{path} has the shape {shape} and {first_path} {first_shape}; they must be the same"

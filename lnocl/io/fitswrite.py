@@ -1,4 +1,4 @@
-"""FITS out: images, and the result with what is needed to repeat the run."""
+"""FITS out: images and results, with the commands that make them again."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def write_result(
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
-    The primary HDU holds the extended source, the table ``STARS`` the columns x, y, flux and what
-    else is given, the table ``HISTORY`` iteration and objective, the table ``CURVE`` iteration,
+    The primary HDU holds the extended source, the table ``STARS`` the columns x, y, flux and any
+    others given, the table ``HISTORY`` iteration and objective, the table ``CURVE`` iteration,
     rho, rho_star and magnitude, the table ``HELDOUT`` mu, smoothing, iteration and error. All have
     CHECKSUM and DATASUM.
 
@@ -65,7 +65,7 @@ def write_result(
     star_fluxes : array_like, shape (n,)
         Electrons.
     history : ndarray with fields ``iteration`` and ``objective``, optional
-        The objective after each iteration; none for a truth.
+        The objective after each iteration; a truth has no history.
     wcs : astropy.io.fits.Header, optional
         Cards of the coordinate systems, from `fitsread.wcs_cards`.
     cards : iterable of (keyword, value, comment), optional
@@ -94,8 +94,7 @@ def write_result(
     header = coordinates.copy()
     header["BUNIT"] = ("electron/s" if per_second else "electron", "per pixel")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
-    _add_cards(header, cards)
-    _add_commands(header, commands)
+    _add_provenance(header, cards, (), commands)
     hdus = fits.HDUList(
         [
             fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
@@ -131,7 +130,7 @@ def write_image(
     overwrite : bool, optional
         Whether an existing file may be replaced.
     notes : iterable of str, optional
-        Lines of printable ASCII that say what was done; the HISTORY lines hold them as comments
+        Steps of the making, in lines of printable ASCII; the HISTORY lines hold them as comments
         of a shell.
     commands : iterable of sequence of str, optional
         Shell commands that repeat the run, as words; the HISTORY lines spell them out.
@@ -142,11 +141,7 @@ def write_image(
         The file cannot be written, or exists and must not be overwritten.
     """
     hdu = fits.PrimaryHDU(np.asarray(image, dtype=np.float64))
-    _add_cards(hdu.header, cards)
-    for note in notes:
-        for line in textwrap.wrap(note, HISTORY_WIDTH - 2):
-            hdu.header.add_history(f"# {line}")
-    _add_commands(hdu.header, commands)
+    _add_provenance(hdu.header, cards, notes, commands)
     hdu.add_checksum(when="")  # astropy would note the time
     with whole_file(path, overwrite) as stream:
         fits.HDUList([hdu]).writeto(stream)
@@ -171,7 +166,7 @@ def history_lines(words: Sequence[str]) -> list[str]:
 
     Examples
     --------
-    >>> from lnocl.fitswrite import history_lines
+    >>> from lnocl.io.fitswrite import history_lines
     >>> history_lines(["lnocl", "deconvolve", "a star.fits", "-o", "naïve.fits"])
     ["lnocl deconvolve 'a star.fits' -o $'na\\303\\257ve.fits'"]
     """
@@ -186,12 +181,18 @@ def history_lines(words: Sequence[str]) -> list[str]:
     return [*lines, line]
 
 
-def _add_cards(header: fits.Header, cards: Iterable[Card]) -> None:
+def _add_provenance(
+    header: fits.Header,
+    cards: Iterable[Card],
+    notes: Iterable[str],
+    commands: Iterable[Sequence[str]],
+) -> None:
+    """Add the cards, and HISTORY lines with the notes, as comments, and the commands."""
     for keyword, value, comment in cards:
         header[keyword] = (_ascii(value) if isinstance(value, str) else value, comment)
-
-
-def _add_commands(header: fits.Header, commands: Iterable[Sequence[str]]) -> None:
+    for note in notes:
+        for line in textwrap.wrap(note, HISTORY_WIDTH - 2):
+            header.add_history(f"# {line}")
     for words in commands:
         for line in history_lines(words):
             header.add_history(line)
@@ -237,7 +238,7 @@ def _table(name: str, rows: NDArray[np.void]) -> fits.BinTableHDU:
 
 
 def _ascii(text: str) -> str:
-    """Return text with what FITS does not allow written as escapes, as in Python."""
+    """Return text in ASCII, as FITS needs, with escapes as in Python."""
     return text.encode("unicode_escape").decode("ascii")
 
 

@@ -1,4 +1,4 @@
-"""An observation from FITS files: counts, exposures, backgrounds, masks, offsets."""
+"""An observation from FITS files: counts, exposures, backgrounds, masks and offsets."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from astropy.units import dimensionless_unscaled
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, counted
 from lnocl.io import sky
 from lnocl.io.fitsread import Stack, read_extension, read_keyword, read_stack
 from lnocl.io.maps import Maps, Word
@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 
 class Calibration(NamedTuple):
-    """What is known of images in files; words are numbers, names of files, or as said.
+    """The calibration of images in files; a word is a number, the name of a file, or as said.
 
     Attributes
     ----------
@@ -41,8 +41,8 @@ class Calibration(NamedTuple):
     saturation : float, optional
         Pixels of this value and above, in units of the images, are bad.
     gain : float, optional
-        Electrons for each adu or count, or whatever else the images are in. Counts per time are
-        still that.
+        Electrons for each adu or count, or for each of whatever unit the images have. Counts per
+        time stay counts per time.
     align : {"wcs"}, optional
         Offsets from the headers' coordinates.
     """
@@ -69,7 +69,7 @@ class Frames(NamedTuple):
     background : list of Word
         As given, with the numbers that ``"auto"`` found.
     sha256 : dict of str to list of str
-        Checksums of all files, by what they are: images, psfs, background, ...
+        Checksums of all files, by the option they belong to: images, psfs, background, ...
     """
 
     observation: Observation
@@ -78,47 +78,49 @@ class Frames(NamedTuple):
     sha256: dict[str, list[str]]
 
 
-def read_frames(images: Sequence[str], psfs: Sequence[str], known: Calibration) -> Frames:
-    """Read images and PSFs, and what is known of them.
+def read_frames(images: Sequence[str], psfs: Sequence[str], calibration: Calibration) -> Frames:
+    """Read images, their PSFs and their calibration.
 
-    What was done to the images is logged, such as how many pixels are masked and why.
+    Notes such as the number of masked pixels and the reason are logged.
 
     Parameters
     ----------
     images, psfs : sequence of str
         Files, as for `fitsread.read_stack`. The unit of the images is that of their BUNIT; without
         one they are in electrons.
-    known : Calibration
-        What is known of them.
+    calibration : Calibration
+        Their calibration.
 
     Raises
     ------
     FileError, InputError
-        As `fitsread.read_stack` and `Observation`; a unit that is no count; counts per time
-        without exposure; maps that do not fit.
+        As `fitsread.read_stack` and `Observation`; a unit that is not one of counts; counts per
+        time without exposure; maps that do not fit.
     """
-    return _Reader(images, psfs, known).frames()
+    return _Reader(images, psfs, calibration).frames()
 
 
 class _Reader:
-    """The files of an observation on their way to be one."""
+    """Reader of the files of one observation."""
 
-    def __init__(self, images: Sequence[str], psfs: Sequence[str], known: Calibration) -> None:
-        self._paths, self._known = images, known
+    def __init__(
+        self, images: Sequence[str], psfs: Sequence[str], calibration: Calibration
+    ) -> None:
+        self._paths, self._calibration = images, calibration
         self._images = read_stack(images)
         self._psfs = read_stack(psfs)
         self._maps = Maps(self._images.data.shape)
 
     def frames(self) -> Frames:
-        """Return the observation that the files are."""
+        """Return the observation in the files."""
         factor, are_rates = self._electrons()
         exposure = self._exposure()
         if are_rates and exposure is None:
             raise InputError(
-                f"{self._paths[0]} holds counts per time: give --exposure, in seconds: a number, "
-                "a map, or a keyword of the header such as EXPTIME"
+                f"{self._paths[0]} holds counts per time; give exposure, in seconds: a number, a "
+                "map, or a keyword of the header such as EXPTIME"
             )
-        # What a unit of the images is in electrons.
+        # Electrons in each unit of the images.
         each = factor * (_maps(exposure) if are_rates and exposure is not None else 1.0)
         counts = self._images.data * each
         inverse = self._inverse_variance()
@@ -137,10 +139,10 @@ class _Reader:
         return Frames(observation, self._images, background, sha256)
 
     def _electrons(self) -> tuple[float, bool]:
-        """Return how many electrons a unit of the images is, and whether per second."""
-        gain = self._known.gain
+        """Return the electrons in a unit of the images, and whether they are per second."""
+        gain = self._calibration.gain
         if gain is not None and not (np.isfinite(gain) and gain > 0):
-            raise InputError(f"the gain must be a number more than 0; {gain:g} was given")
+            raise InputError(f"gain must be more than 0; {gain:g} was given")
         unit = self._unit()
         if gain is not None:
             factor, are_rates = units.count_of(unit, (*units.COUNTS, "adu")) or (1.0, False)
@@ -148,83 +150,76 @@ class _Reader:
         counts = units.count_of(unit)
         if counts is None:
             raise InputError(
-                f"{self._paths[0]} is in {self._images.header['BUNIT']}, which is no count: give "
-                "--gain, the electrons for each unit of it"
+                f"{self._paths[0]} is in {self._images.header['BUNIT']}, not in counts; give gain, "
+                "the electrons for each of these units"
             )
         return counts
 
     def _unit(self) -> Any:
-        """Return the unit of the images, without dimension where their headers name none."""
+        """Return the unit of the images, without dimension where their headers have no unit."""
         first, *others = (
             units.parse(str(header.get("BUNIT", ""))) for header in self._images.headers
         )
         for path, unit in zip(self._paths[1:], others, strict=True):
             if unit != first:
                 raise InputError(
-                    f"the images come in several units: {self._paths[0]} in {first or 'none'}, "
-                    f"{path} in {unit or 'none'}; give them in one"
+                    f"the images have several units: {self._paths[0]} has {first or 'no unit'}, "
+                    f"{path} has {unit or 'no unit'}; convert them to one"
                 )
         return dimensionless_unscaled if first is None else first
 
     def _exposure(self) -> Array | None:
-        words = self._known.exposure
-        for word in words:
-            if isinstance(word, str):
-                found = [
-                    read_keyword(path, header, word)
-                    for path, header in zip(self._paths, self._images.headers, strict=True)
-                ]
-                if any(value is not None for value in found):
-                    return self._from_headers(word, found)
-        return self._maps.combine("exposure", words) if words else None
+        words = self._calibration.exposure
+        if not words:
+            return None
+        return self._maps.combine(
+            "exposure", self._maps.fill("exposure", words, self._exposure_from_header)
+        )
 
-    def _from_headers(self, keyword: str, found: Sequence[Word | None]) -> Array:
-        if len(self._known.exposure) > 1:
+    def _exposure_from_header(self, j: int, keyword: str) -> float | None:
+        of_file = min(j, len(self._paths) - 1)  # a cube has one header
+        path = self._paths[of_file]
+        value = read_keyword(path, self._images.headers[of_file], keyword)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise InputError(
-                f"the exposure {keyword} is a keyword, of all images' headers: give it alone"
+                f"{keyword} of {path} is {value!r}, not a number; give exposure as numbers"
             )
-        for path, value in zip(self._paths, found, strict=True):
-            if value is None:
-                raise InputError(f"{path} has no {keyword}; give the exposures as numbers")
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise InputError(
-                    f"{keyword} of {path} is {value!r}, no number; give the exposures as numbers"
-                )
-        values = np.array(found, float)
-        log.info("exposure from %s: %s seconds", keyword, ", ".join(f"{v:g}" for v in values))
-        return values
+        log.info("image %d: exposure %g seconds, from %s", j + 1, value, keyword)
+        return float(value)
 
     def _inverse_variance(self) -> Array | None:
-        paths = self._known.inverse_variance
+        paths = self._calibration.inverse_variance
         if not paths:
             return None
-        if any(self._known.read_noise):
-            raise InputError("give read noise or inverse variance, which holds it, not both")
+        if any(self._calibration.read_noise):
+            raise InputError("give read_noise or inverse_variance, which includes it, not both")
         inverse = self._maps.read("inverse_variance", paths)
         if (inverse < 0).any():
             raise InputError(
-                f"the inverse variance {paths[0]} has negative pixels; they must be 0 or more, "
-                "and 0 where a pixel is bad"
+                f"inverse_variance {paths[0]} has negative pixels; they must be 0 or more, and 0 "
+                "where a pixel is bad"
             )
         return inverse
 
     def _mask(self, exposure: Array | None, inverse: Array | None) -> Mask:
-        """Return which pixels are bad; say how many, each once, for its first reason."""
+        """Return which pixels are bad, and log their number, each pixel for its first reason."""
         masked = np.zeros(self._images.data.shape, bool)
         for why, bad in self._bad_pixels(exposure, inverse):
             for j, count in enumerate((bad & ~masked).sum(axis=(1, 2)), 1):
-                log.info("image %d: %d pixels masked %s", j, count, why)
+                log.info("image %d: %s masked %s", j, counted(count, "pixel"), why)
             masked |= bad
         return masked
 
     def _bad_pixels(
         self, exposure: Array | None, inverse: Array | None
     ) -> Iterator[tuple[str, Mask]]:
-        if paths := [word for word in self._known.mask if word != "dq"]:
+        if paths := [word for word in self._calibration.mask if word != "dq"]:
             yield "by the mask", self._maps.read("mask", paths) != 0  # NaN is not 0 either
-        if "dq" in self._known.mask:
+        if "dq" in self._calibration.mask:
             yield "by the extension DQ", self._data_quality()
-        level = self._known.saturation
+        level = self._calibration.saturation
         if level is not None:
             yield f"as saturated, at {level:g} or above", self._images.data >= level
         if exposure is not None and exposure.ndim == 3:
@@ -234,7 +229,7 @@ class _Reader:
 
     def _data_quality(self) -> Mask:
         images = self._images.data
-        # A file holds an image, or a cube of all.
+        # A file holds one image, or a cube of all images.
         shapes = images.shape[1:], images.shape if len(self._paths) == 1 else images.shape[1:]
         flagged = []
         for path in self._paths:
@@ -251,27 +246,20 @@ class _Reader:
 
     def _read_noise(self, each: Array | float, inverse: Array | None, mask: Mask) -> Array:
         if inverse is None:
-            return self._maps.combine("read_noise", self._known.read_noise)
+            return self._maps.combine("read_noise", self._calibration.read_noise)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(mask, 0.0, each / np.sqrt(inverse))
 
     def _background(self, counts: Array, mask: Mask) -> list[Word]:
         """Return the background with numbers in the place of "auto"."""
-        words = list(self._known.background)
-        if words == ["auto"]:
-            words *= len(counts)
-        if "auto" in words and len(words) != len(counts):
-            raise InputError(
-                f"{len(words)} values of background for {len(counts)} images; give one, or one "
-                "for each"
-            )
-        return [
-            _clipped_median(j, counts[j - 1], mask[j - 1]) if word == "auto" else word
-            for j, word in enumerate(words, 1)
-        ]
+        return self._maps.fill(
+            "background",
+            self._calibration.background,
+            lambda j, word: _clipped_median(j + 1, counts[j], mask[j]) if word == "auto" else None,
+        )
 
     def _offsets(self) -> Array | None:
-        if self._known.align is None:
+        if self._calibration.align is None:
             return None
         images, headers = self._images.data, self._images.headers
         if len(headers) != len(images):
@@ -296,8 +284,8 @@ def _clipped_median(j: int, counts: Array, mask: Mask) -> float:
     good = counts[~mask & np.isfinite(counts)]
     if good.size == 0:
         raise InputError(
-            f"image {j} has no good pixel to find its background from; leave the image out, or "
-            "give --background as a number"
+            f"image {j} has no good pixel to measure its background; leave the image out, or give "
+            "background as a number"
         )
     _, median, scatter = sigma_clipped_stats(good)
     log.info(
@@ -309,7 +297,7 @@ def _clipped_median(j: int, counts: Array, mask: Mask) -> float:
     if median < 0:
         raise InputError(
             f"image {j} has a sigma-clipped median of {median:.6g} electrons: its background was "
-            "subtracted already; give --background 0, and its noise as --read-noise or "
-            "--inverse-variance"
+            "subtracted already; give background 0, and its noise as read_noise or "
+            "inverse_variance"
         )
     return float(median)

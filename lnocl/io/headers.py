@@ -1,4 +1,4 @@
-"""What FITS headers say, read with care: values, numbers, coordinate systems."""
+"""Values, numbers and coordinate systems of FITS headers that may be damaged."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from lnocl.process import ignored_warnings
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
-# The most that FITS and the SIP convention know of what astropy makes room for.
+# Counts that astropy allocates memory for, and the largest that FITS and SIP allow: with an A_ORDER
+# of 3000 it takes half a minute.
 _LIMITS = (
     (re.compile("WCSAXES[A-Z]?"), 999),
     (re.compile("[AB]P?_ORDER"), 9),
@@ -32,49 +33,49 @@ def readable(header: fits.Header) -> fits.Header:
     UserWarning
         A card is left out.
     """
-    kept = header.copy()
+    cleaned = header.copy()
     for i, card in reversed(list(enumerate(header.cards))):
         try:
             _ = card.value
-        except Exception as error:  # whatever a damaged card leads astropy to
+        except Exception as error:  # astropy may raise any error on a damaged card
             reason = str(error).partition(", ")[0]
             warn(f"a card of the header is left out: {reason}")
-            del kept[i]
-    return kept
+            del cleaned[i]
+    return cleaned
 
 
 def number(path: str, header: fits.Header, keyword: str) -> float | None:
-    """Return the number that a keyword gives; None where it is missing.
+    """Return the number that a keyword holds; None where it is missing.
 
     Raises
     ------
     InputError
-        The keyword of this file gives no finite number.
+        Its value in this file is not a finite number.
     """
     if keyword not in header:
         return None
     value = header[keyword]
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"{keyword} of {path} is {value!r}, no finite number")
+        raise InputError(f"{keyword} of {path} is {value!r}, not a finite number")
     return value
 
 
 def make_wcs(header: fits.Header, key: str = " ") -> WCS:
-    """Return a coordinate system of the first two axes; what astropy says meanwhile is hidden.
+    """Return a coordinate system of the first two axes, without astropy's warnings and notes.
 
     Raises
     ------
     InputError
-        A header that claims more axes or coefficients than FITS knows.
+        A header that claims more axes or coefficients than FITS allows.
     Exception
-        Whatever else a damaged header leads astropy to.
+        Any error of astropy on a damaged header.
     """
     from astropy.wcs import WCS  # a fifth of a second, for headers that have one
 
     for keyword in header:
-        for pattern, most in _LIMITS:
-            if pattern.fullmatch(keyword) and not 0 <= header[keyword] <= most:
-                raise InputError(f"{keyword} is {header[keyword]}, and {most} at most")
+        for pattern, largest in _LIMITS:
+            if pattern.fullmatch(keyword) and not 0 <= header[keyword] <= largest:
+                raise InputError(f"{keyword} is {header[keyword]}; at most {largest} is allowed")
     with ignored_warnings(), quiet_log():
         return WCS(header, key=key, naxis=2)
 

@@ -1,24 +1,24 @@
-"""What is known of each image, as numbers or as maps from FITS files that fit the images."""
+"""Quantities of each image, as numbers, as words for numbers or as maps from FITS files."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, counted
 from lnocl.io.fitsread import read_stack
 from lnocl.scene.observation import Array
 
 Word = str | float
 
-# What a word may be besides a number and a file.
+# The words that a quantity may be, besides a number and a file.
 OTHER_WORDS = {"background": "auto, ", "exposure": "a keyword of the images' headers, "}
 
 
 class Maps:
-    """Reads maps for images, and keeps the checksums of their files.
+    """Reader of maps for images, with the checksums of their files.
 
     Parameters
     ----------
@@ -28,12 +28,44 @@ class Maps:
     Attributes
     ----------
     sha256 : dict of str to list of str
-        Checksums of the files read, by what they are.
+        Checksums of the files read, by quantity.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._shape = shape
         self.sha256: dict[str, list[str]] = {}
+
+    def fill(
+        self, name: str, words: Sequence[Word], number_of: Callable[[int, str], float | None]
+    ) -> list[Word]:
+        """Return words with numbers in the place of those that mean one in each image.
+
+        Parameters
+        ----------
+        name : str
+            The quantity.
+        words : sequence of Word
+            One for all images, or one for each.
+        number_of : callable
+            ``number_of(j, word)`` returns the number that a word means in image j, counted from
+            0, or None.
+
+        Raises
+        ------
+        InputError
+            Neither one word nor one for each image; a word without a number in some of the images.
+        """
+        self._check_count(name, words)
+        each = list(words) * self._shape[0] if len(words) == 1 else words
+        filled = [_number(j, word, number_of) for j, word in enumerate(each)]
+        if len(words) > 1:
+            return filled
+        are_numbers = [isinstance(word, float) for word in filled]
+        if any(are_numbers) and not all(are_numbers):
+            raise InputError(
+                f"image {are_numbers.index(False) + 1} has no {words[0]}; give {name} as numbers"
+            )
+        return filled if all(are_numbers) else list(words)
 
     def combine(self, name: str, words: Sequence[Word]) -> Array:
         """Return numbers as they are, shape (n,), or maps with numbers spread over theirs.
@@ -41,26 +73,28 @@ class Maps:
         Raises
         ------
         FileError, InputError
-            As `read`; a word that is no file.
+            As `read`; a word that is not the name of a file.
         """
         if all(isinstance(word, float) for word in words):
             return np.array(words, float)
         for word in words:
             if isinstance(word, str) and not os.path.exists(word):
                 raise InputError(
-                    f"{_say(name)} {word!r} is not a number, {OTHER_WORDS.get(name, '')}or a file "
-                    "that exists"
+                    f"{name} {word!r} is not a number, {OTHER_WORDS.get(name, '')}or a file that "
+                    "exists"
                 )
-        if len(words) == 1:
-            return self.read(name, [str(words[0])])
-        if len(words) != self._shape[0]:
-            raise InputError(
-                f"{len(words)} values of {_say(name)} for {self._shape[0]} images; give one, or "
-                "one for each"
-            )
+        self._check_count(name, words)
         if all(isinstance(word, str) for word in words):
             return self.read(name, [str(word) for word in words])
         return np.array([self._spread(name, word) for word in words])
+
+    def _check_count(self, name: str, words: Sequence[Word]) -> None:
+        """Refuse several words, not all of them numbers, that are not one for each image."""
+        if len(words) not in (1, self._shape[0]) and any(isinstance(word, str) for word in words):
+            raise InputError(
+                f"{name} has {len(words)} values for {counted(self._shape[0], 'image')}; give one, "
+                "or one for each"
+            )
 
     def _spread(self, name: str, word: Word) -> Array:
         if isinstance(word, float):
@@ -68,7 +102,7 @@ class Maps:
         return self._read(name, [word], (1,))[0]
 
     def read(self, name: str, paths: Sequence[str]) -> Array:
-        """Return maps of the images' shape, of which files may hold one, or one for each.
+        """Return maps for all images, shape (p, ny, nx), from files with one, or one for each.
 
         Raises
         ------
@@ -83,12 +117,13 @@ class Maps:
         n, *shape = stack.data.shape
         if tuple(shape) != self._shape[1:] or n not in numbers:
             raise InputError(
-                f"{_say(name)} {paths[0]} has the shape {stack.data.shape} and the images "
+                f"{name} {paths[0]} has the shape {stack.data.shape} and the images "
                 f"{self._shape}; give one map that fits all images, or one for each"
             )
         self.sha256.setdefault(name, []).extend(stack.sha256)
         return stack.data
 
 
-def _say(name: str) -> str:
-    return name.replace("_", " ")
+def _number(j: int, word: Word, number_of: Callable[[int, str], float | None]) -> Word:
+    number = number_of(j, word) if isinstance(word, str) else word
+    return word if number is None else number

@@ -19,7 +19,7 @@ from astropy.wcs import WCS
 from astropy.wcs.utils import pixel_to_pixel
 from numpy.typing import NDArray
 
-from lnocl.errors import FileError, InputError, LnoclError
+from lnocl.errors import FileError, InputError, LnoclError, counted
 from lnocl.io.fitsfile import open_fits, open_regular
 from lnocl.io.headers import make_wcs, quiet_log
 from lnocl.process import ignored_warnings
@@ -27,10 +27,10 @@ from lnocl.scene.units import parse
 
 log = logging.getLogger("lnocl")
 
-# What the offset between two images may differ by over them, in pixels: from rotation, scale and
+# Largest variation of the offset between two images over them, in pixels, from rotation, scale and
 # distortion.
-MOST_TURNED = 0.1
-# Points across an image at which the offset is looked at.
+MAX_OFFSET_VARIATION = 0.1
+# Points across an image at which the offset is computed.
 POINTS = 5
 
 Pairs = NDArray[np.float64]
@@ -42,7 +42,7 @@ def celestial_wcs(header: fits.Header, path: str, advice: str = "give positions 
     Raises
     ------
     InputError
-        An image without celestial coordinates, or with some that astropy cannot use.
+        An image without celestial coordinates that astropy can use.
     """
     wcs = _find_wcs(header)
     if wcs is None:
@@ -56,12 +56,12 @@ def has_celestial(header: fits.Header) -> bool:
 
 
 def _find_wcs(header: fits.Header) -> WCS | None:
-    with ignored_warnings(), quiet_log():  # what astropy mends
+    with ignored_warnings(), quiet_log():  # of faults that astropy mends
         try:
             wcs = make_wcs(header)
-            assert wcs.pixel_to_world(0, 0).icrs  # the Sun's, say, are not on the sky
+            assert wcs.pixel_to_world(0, 0).icrs  # those of the Sun are not on the sky
             return wcs
-        except Exception:  # whatever a damaged header leads astropy to
+        except Exception:  # astropy may raise any error on a damaged header
             return None
 
 
@@ -79,11 +79,11 @@ def parse_sky(texts: Sequence[str]) -> SkyCoord:
     Raises
     ------
     InputError
-        No such position.
+        A text that is not a position.
 
     Examples
     --------
-    >>> from lnocl.sky import parse_sky
+    >>> from lnocl.io.sky import parse_sky
     >>> parse_sky(["15.25,-3.5", "1:01:00,-3:30:00"]).to_string()
     ['15.25 -3.5', '15.25 -3.5']
     """
@@ -113,7 +113,7 @@ def to_pixels(coordinates: SkyCoord, wcs: WCS, path: str) -> Pairs:
     Raises
     ------
     InputError
-        A position that the projection of the image does not show.
+        A position outside the projection of the image.
     """
     found = _pixel_to(wcs.world_to_pixel, coordinates).reshape(2, -1).T
     for position, pixels in zip(coordinates.ravel(), found, strict=True):
@@ -159,9 +159,9 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
     else:
         raise InputError(
             f"{path} has neither columns x and y nor ra and dec; it has "
-            f"{', '.join(table.colnames) or 'none'}"
+            f"{', '.join(table.colnames) or 'no columns'}"
         )
-    log.info("%s: %d stars", path, len(found))
+    log.info("%s: %s", path, counted(len(found), "star"))
     return found
 
 
@@ -181,7 +181,7 @@ def _read_table(path: str) -> Table:
             ignored_warnings(),
         ):
             formats = identify_format("read", Table, path, content, [content], {})
-            # A name that says nothing of what is in the file is that of a plain text.
+            # A file whose name and content show no other format is plain text.
             kind = formats[0] if formats else "ascii"
             if kind == "fits":
                 return _read_fits_table(path)
@@ -191,7 +191,7 @@ def _read_table(path: str) -> Table:
             return Table.read(content, format=kind)
     except LnoclError:
         raise
-    except Exception as error:  # astropy raises whatever a file leads its readers to
+    except Exception as error:  # astropy's readers may raise any error
         reason = getattr(error, "strerror", None) or str(error).strip().partition("\n")[0]
         raise FileError(f"{path} cannot be read as a table: {reason}") from error
 
@@ -219,7 +219,7 @@ def _numbers(path: str, column: Any, unit: u.UnitBase) -> Pairs:
         given = parse(str(column.unit or unit))
         values = values * given.to(unit)
     except (TypeError, ValueError) as error:
-        raise InputError(f"column {column.name} of {path} is no position: {error}") from None
+        raise InputError(f"column {column.name} of {path} is not a position: {error}") from None
     if values.ndim != 1:
         raise InputError(f"column {column.name} of {path} has several numbers in a row")
     if not np.isfinite(values).all() or np.any(getattr(column, "mask", False)):
@@ -228,7 +228,7 @@ def _numbers(path: str, column: Any, unit: u.UnitBase) -> Pairs:
 
 
 def offsets(headers: Sequence[fits.Header], paths: Sequence[str], shape: tuple[int, int]) -> Pairs:
-    """Return where each image has what the first one has at (0, 0), shape (p, 2), pixels.
+    """Return the offset of each image from the first, shape (p, 2), in pixels (dx, dy).
 
     The mean over the image of ``pixel_j(sky(pixel_1)) - pixel_1``.
 
@@ -240,7 +240,7 @@ def offsets(headers: Sequence[fits.Header], paths: Sequence[str], shape: tuple[i
         the image within a tenth of a pixel.
     """
     first, *others = (
-        celestial_wcs(header, path, "leave --align out")
+        celestial_wcs(header, path, "leave align out")
         for header, path in zip(headers, paths, strict=True)
     )
     found = [np.zeros(2)]
@@ -261,11 +261,11 @@ def _offset(first: WCS, wcs: WCS, first_path: str, path: str, shape: tuple[int, 
             "leave one of them out"
         )
     spread = abs(change - mean[:, None, None]).max()
-    if spread > MOST_TURNED:
+    if spread > MAX_OFFSET_VARIATION:
         raise InputError(
-            f"{path} is {_describe_turn(moved, nx)} against {first_path}, which moves pixels by "
-            f"up to {spread:.2g} besides the offset: images are never resampled; give those of "
-            "one orientation and scale together, or have them reduced to one grid"
+            f"{path} is {_describe_turn(moved, nx)} relative to {first_path}, which moves pixels "
+            f"by up to {spread:.2g} besides the offset: images are never resampled; give only "
+            "images of one orientation and scale, or reduce them to one grid"
         )
     return mean
 

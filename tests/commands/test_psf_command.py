@@ -49,6 +49,7 @@ def folder(tmp_path, monkeypatch):
         fits.writeto(f"{name}.fits", np.array(array), fits.Header({"BUNIT": "adu"}))
     Path("there.fits").write_bytes(b"old")
     Path("there.png").write_bytes(b"old")
+    Path("link.png").symlink_to("out.fits")
     return tmp_path
 
 
@@ -185,9 +186,8 @@ class TestTheFile:
             assert step in text
         commands = [line for line in header["HISTORY"] if not line.startswith("# ")]
         assert "".join(commands).replace("\\", "") == (
-            f"cd {os.getcwd()}lnocl psf star.fits --star 30.0,29.0 --mask mask.fits "
-            "--saturation 8900.0 --background auto --rotate 0.0 30.0 --size 21 --clip-negative "
-            "-o out.fits"
+            f"cd {os.getcwd()}lnocl psf star.fits --star 30.0,29.0 --size 21 --background auto "
+            "--mask mask.fits --saturation 8900.0 --rotate 0.0 30.0 --clip-negative -o out.fits"
         )
 
     def test_what_was_not_asked_for_is_not_in_the_header(self):
@@ -199,7 +199,7 @@ class TestTheFile:
             "".join(header["HISTORY"])
             .replace("\\", "")
             .endswith(
-                "lnocl psf star.fits --background 40.0 --no-recentre --rotate 0.0 --clip-negative "
+                "lnocl psf star.fits --background 40.0 --rotate 0.0 --no-recentre --clip-negative "
                 "-o out.fits"
             )
         )
@@ -329,19 +329,21 @@ REFUSED = {
     ),
     "masks": ({}, ["--mask", "masks.fits"], 2, "masks.fits holds 2 images; give a file with one"),
     "mask of all": ({}, ["--mask", "none.fits"], 2, "the mask none.fits leaves no good pixel"),
-    "saturation": ({}, ["--saturation", "-1"], 2, "saturation must be positive; -1 was given"),
-    "saturation nan": ({}, ["--saturation", "nan"], 2, "saturation is nan; give one finite"),
-    "background": ({}, ["--background", "sky"], 2, "background is 'sky'; give a number or"),
-    "background inf": ({}, ["--background", "-inf"], 2, "background is -inf; give one finite"),
-    "angle": ({}, ["--rotate", "0", "inf"], 2, "rotate is inf; give one finite number"),
+    "saturation": ({}, ["--saturation", "-1"], 2, "--saturation must be positive; -1 was given"),
+    "saturation nan": ({}, ["--saturation", "nan"], 2, "'nan' is not a finite number"),
+    "background": ({}, ["--background", "sky"], 2, "--background is 'sky'; give a number or"),
+    "background inf": ({}, ["--background", "-inf"], 2, "--background is -inf; give one finite"),
+    "angle": ({}, ["--rotate", "0", "inf"], 2, "--rotate is inf; give one finite number"),
     "angle of words": ({}, ["--rotate", "x"], 2, "argument --rotate: invalid float value: 'x'"),
-    "size": ({}, ["--size", "2"], 2, "size must be a whole number of 3 or more; 2 was given"),
+    "size": ({}, ["--size", "2"], 2, "--size must be a whole number of 3 or more; 2 was given"),
     "size large": ({}, ["--size", "60"], 2, "reaches beyond the frame; give a size of 59 or less"),
     "size rotated": ({}, ["--size", "50", "--rotate", "0", "45"], 2, "rotated by 45 degrees"),
     "picture name": ({}, ["--plot", "a.pdf"], 2, "a name ending in .png, not a.pdf"),
     "picture exists": ({}, ["--plot", "there.png"], 1, "there.png exists; give another name"),
-    "picture is output": (
-        {"output": "x.png"}, ["--plot", "./x.png"], 2, "./x.png is the output too",
+    "picture is output": ({}, ["--plot", "link.png"], 2, "link.png is the output too"),
+    "output is a picture": (
+        {"output": "x.png"}, [], 2,
+        "the output is a FITS file; give it a name ending in .fits, not x.png",
     ),
     "picture is input": (
         {"frame": "there.png"}, ["--plot", "there.png", "--overwrite"], 2, "one of the inputs",
@@ -352,12 +354,16 @@ REFUSED = {
 }  # fmt: skip
 
 
+def contents():
+    return {path: os.path.exists(path) and Path(path).read_bytes() for path in os.listdir()}
+
+
 @pytest.mark.parametrize(("where", "options", "status", "message"), REFUSED.values(), ids=REFUSED)
 def test_what_is_refused(capsys, where, options, status, message):
-    before = {path: Path(path).read_bytes() for path in os.listdir()}
+    before = contents()
     assert run(*options, **where) == status
     assert message in complaint(capsys.readouterr())
-    assert {path: Path(path).read_bytes() for path in os.listdir()} == before
+    assert contents() == before
 
 
 @pytest.mark.parametrize("options", [["--plot", "there.png"], ["--star", "1,2", "--star", "3,4"]])
@@ -375,7 +381,7 @@ def test_wrong_use(capsys):
 
 def test_the_help_loads_nothing_heavy():
     script = (
-        "import sys; from lnocl.cli import main\n"
+        "import sys; from lnocl.commands.cli import main\n"
         "try: main(['psf', '--help'])\n"
         "finally: print(sorted({'astropy', 'pyopencl', 'scipy', 'matplotlib'} & set(sys.modules)))"
     )

@@ -242,9 +242,9 @@ class TestCheckOutput:
             ("there.fits", FileError, "exists; give another name, or --overwrite"),
             ("missing/out.fits", FileError, "does not exist; create it first"),
             ("there.fits/out.fits", FileError, "cannot be written: Not a directory"),
-            ("folder", FileError, "is no regular file"),
+            ("folder", FileError, "is not a regular file"),
             ("n" * 300 + ".fits", FileError, "cannot be written: File name too long"),
-            ("new/", FileError, "names no file"),
+            ("new/", FileError, "is not the name of a file"),
             ("out.fits.gz", InputError, "is not compressed"),
         ],
     )
@@ -259,7 +259,7 @@ class TestCheckOutput:
             atomic.check_output("/proc/out.fits", overwrite=False)
 
     def test_a_device_is_never_replaced(self):
-        with pytest.raises(FileError, match="no regular file"):
+        with pytest.raises(FileError, match="not a regular file"):
             atomic.check_output(os.devnull, overwrite=True)
 
     def test_an_input_is_never_replaced(self, tmp_path):
@@ -404,3 +404,11 @@ def test_a_signal_that_comes_as_a_file_is_made_leaves_none(work, tmp_path, monke
     with pytest.raises(KeyboardInterrupt):
         work(str(tmp_path / "out.txt"))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_in_the_place_of_an_output_folder(tmp_path):
+    path = tmp_path / "out"
+    path.write_text("old")
+    with pytest.raises(FileError) as caught:
+        atomic.check_folder(str(path), overwrite=True)
+    assert str(caught.value) == f"the output folder {path} cannot be used: it is not a folder"

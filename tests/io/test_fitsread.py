@@ -10,47 +10,12 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
+from wcs_headers import LINEAR, PHYSICAL, SIP, TPV
 
 from lnocl.errors import FileError, InputError, LnoclWarning
 from lnocl.io import fitsread, fitswrite
 
 IMAGE = np.arange(1.0, 121.0).reshape(10, 12)
-
-LINEAR = {
-    "CTYPE1": "RA---TAN",
-    "CTYPE2": "DEC--TAN",
-    "CRPIX1": 5.5,
-    "CRPIX2": 4.25,
-    "CRVAL1": 248.62114984968,
-    "CRVAL2": 70.53098794332,
-    "CD1_1": -1.1e-5,
-    "CD1_2": 2.3e-6,
-    "CD2_1": 2.2e-6,
-    "CD2_2": 1.2e-5,
-}
-SIP = LINEAR | {
-    "CTYPE1": "RA---TAN-SIP",
-    "CTYPE2": "DEC--TAN-SIP",
-    "A_ORDER": 2,
-    "A_2_0": 1e-3,
-    "B_ORDER": 2,
-    "B_0_2": -2e-3,
-}
-TPV = LINEAR | {
-    "CTYPE1": "RA---TPV",
-    "CTYPE2": "DEC--TPV",
-    "PV1_1": 1.0,
-    "PV1_4": 40.0,
-    "PV2_1": 1.0,
-}
-PHYSICAL = {f"{name}P": value for name, value in {"CTYPE1": "x", "CTYPE2": "y"}.items()} | {
-    "CRPIX1P": 3.0,
-    "CRPIX2P": -7.5,
-    "CRVAL1P": 4032.5,
-    "CRVAL2P": 3994.5,
-    "CDELT1P": 0.25,
-    "CDELT2P": 0.5,
-}
 
 
 def save(path, *hdus, checksum=False):
@@ -204,11 +169,11 @@ class TestRefusedFiles:
         [
             (lambda path: None, "cannot be opened: No such file"),
             (lambda path: path.mkdir(), "cannot be opened: Is a directory"),
-            (lambda path: path.touch(), "is no FITS file, or a damaged one: it ends too early"),
-            (text, "is no FITS file"),
+            (lambda path: path.touch(), "is not a FITS file, or is damaged: it ends too early"),
+            (text, "is not a FITS file"),
             (truncated, f"is truncated: it should have {2880 + 960} bytes and has {2880 + 959}"),
-            (truncated_header, "is no FITS file, or a damaged one"),
-            (truncated_gzip, "is no FITS file, or a damaged one"),
+            (truncated_header, "is not a FITS file, or is damaged"),
+            (truncated_gzip, "is not a FITS file, or is damaged"),
             (no_image, "holds no image"),
             (random_groups, "holds no image"),
             (tiles, "is tile-compressed; unpack it"),
@@ -243,13 +208,15 @@ class TestRefusedFiles:
     @pytest.mark.parametrize("shape", [(12,), (1, 1, 10, 12)])
     def test_wrong_dimensions(self, tmp_path, shape):
         path = save(tmp_path / "a.fits", fits.PrimaryHDU(np.ones(shape)))
-        with pytest.raises(InputError, match=f"a.fits has an image of {len(shape)} dimensions"):
+        with pytest.raises(InputError, match=f"a.fits has an image of {len(shape)} dimension"):
             fitsread.read_stack([path])
 
     def test_a_cube_among_several_files(self, tmp_path):
         image = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE))
         cube = save(tmp_path / "b.fits", fits.PrimaryHDU(np.array([IMAGE, IMAGE])))
-        with pytest.raises(InputError, match=r"b.fits has an image of 3 dimensions; several"):
+        with pytest.raises(
+            InputError, match=r"b.fits has an image of 3 dimensions; each of several"
+        ):
             fitsread.read_stack([image, cube])
 
     def test_different_shapes(self, tmp_path):
@@ -342,7 +309,7 @@ class TestCoordinates:
         ids=["axes", "singular", "lookup", "tab"],
     )
     def test_coordinates_that_cannot_be_kept_are_announced(self, broken):
-        with pytest.warns(LnoclWarning, match="of the first image cannot be kept"):
+        with pytest.warns(LnoclWarning, match="of the first image cannot be copied"):
             cards = fitsread.wcs_cards(fits.Header(LINEAR | broken))
         assert len(cards) == 0
 

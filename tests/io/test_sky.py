@@ -111,15 +111,15 @@ class TestOffsets:
     @pytest.mark.parametrize(
         ("other", "message"),
         [
-            (header(angle=1.0), "b.fits is rotated by -1.00 degrees and scaled by 1.0000 against "
-             "a.fits, which moves pixels by up to 0.13 besides the offset: images are never "
-             "resampled; give those of one orientation and scale together, or have them reduced "
-             "to one grid"),
-            (header(angle=180.0), "180.00 degrees and scaled by 1.0000 against a.fits"),
+            (header(angle=1.0), "b.fits is rotated by -1.00 degrees and scaled by 1.0000 relative "
+             "to a.fits, which moves pixels by up to 0.13 besides the offset: images are never "
+             "resampled; give only images of one orientation and scale, or reduce them to one "
+             "grid"),
+            (header(angle=180.0), "180.00 degrees and scaled by 1.0000 relative to a.fits"),
             (header(scale=SCALE / 1.1), "b.fits is rotated by 0.00 degrees and scaled by 1.1000"),
-            (header(mirror=True), "b.fits is mirrored against a.fits, which moves pixels by up"),
+            (header(mirror=True), "b.fits is mirrored relative to a.fits, which moves pixels by"),
             (with_sip(A_2_0=1e-2), "b.fits is rotated by 0.00 degrees and scaled by 0.9960"),
-            (fits.Header(), "b.fits has no sky coordinates (WCS) that can be used; leave --align"),
+            (fits.Header(), "b.fits has no sky coordinates (WCS) that can be used; leave align"),
             (header(**SOLAR), "b.fits has no sky coordinates (WCS) that can be used"),
             (header(CRVAL1=152.0), "b.fits shows another part of the sky than a.fits, by its sky "
              "coordinates; leave one of them out"),
@@ -274,9 +274,12 @@ class TestTables:
         ("text", "message"),
         [
             ("x,mag\n1,2\n", "t.csv has neither columns x and y nor ra and dec; it has x, mag"),
-            ("", "t.csv has neither columns x and y nor ra and dec; it has none"),
+            ("", "t.csv has neither columns x and y nor ra and dec; it has no columns"),
             ("no table\nat all\n", "t.csv has neither columns x and y nor ra and dec; it has no"),
-            ("x,y\na,2\n", "column x of t.csv is no position: could not convert string to float"),
+            (
+                "x,y\na,2\n",
+                "column x of t.csv is not a position: could not convert string to float",
+            ),
             ("x,y\nnan,2\n", "column x of t.csv has rows without a number"),
             ("x,y\n2,inf\n", "column y of t.csv has rows without a number"),
             ("ra,dec\n10,95\n", "column dec of t.csv has rows beyond 90 degrees"),
@@ -290,7 +293,7 @@ class TestTables:
 
     def test_units_that_are_no_pixels_or_angles(self):
         Table({"x": [1.0] * u.arcsec, "y": [1.0] * u.arcsec}).write("t.ecsv")
-        with pytest.raises(InputError, match=r"column x of t\.ecsv is no position: 'arcsec'"):
+        with pytest.raises(InputError, match=r"column x of t\.ecsv is not a position: 'arcsec'"):
             stars("t.ecsv")
 
     def test_columns_of_vectors(self):

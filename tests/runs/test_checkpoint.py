@@ -493,8 +493,8 @@ def test_one_signal_ends_it_with_a_result_and_a_checkpoint(number, command, tmp_
     header = fits.getheader(tmp_path / "found.fits")
     assert header["STOPPED"] == "interrupt"
     assert complaint.splitlines()[-1] == (
-        f"lnocl: error: interrupted after {header['NITER']} iterations; what they gave is in "
-        "found.fits; go on with --resume run.fits"
+        f"lnocl: error: interrupted after {header['NITER']} iterations; their result is in "
+        "found.fits; continue with --resume run.fits"
     )
     assert checkpoint.read(str(saved)).arrays["progress"][0] == header["NITER"]
 

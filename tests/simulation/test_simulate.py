@@ -353,7 +353,7 @@ def test_load_target_refuses_files_without_image(tmp_path):
     fits.PrimaryHDU().writeto(empty)
     image = tmp_path / "image.fits"
     fits.PrimaryHDU(np.ones((32, 32))).writeto(image)
-    for path, message in ((text, "is no FITS file"), (empty, "no image")):
+    for path, message in ((text, "is not a FITS file"), (empty, "no image")):
         with pytest.raises(FileError, match=message) as caught:
             load_target(path)
         assert "\n" not in str(caught.value)

@@ -322,7 +322,7 @@ class TestCommand:
             (["--read-noise", "8"], "--read-noise goes with images"),
             (["images.fits"], "images need their PSFs: give --psf"),
             ([*FILES, "--size", "64"], "--size is of the demo's scene"),
-            ([*FILES, "--n-iter", "7"], "n_iter must be a whole number, 8 or more; 7"),
+            ([*FILES, "--n-iter", "7"], "--n-iter must be a whole number, 8 or more; 7"),
             ([*FILES, "--accuracy", "0"], "accuracy must be positive and finite; 0"),
             ([*FILES, "--accuracy", "nan"], "accuracy must be positive and finite; nan"),
             ([*FILES, "--star", "32,3"], "the star at (32, 3) lies outside"),

@@ -1,0 +1,242 @@
+"""The arguments of subcommands, each written once; the parser and the record follow from it."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+# The values for which a switch is on the command line.
+SWITCHES = {"store_true": True, "store_false": False}
+# The keywords of an option that takes several values and may be repeated.
+SEVERAL: dict[str, Any] = {"nargs": "+", "action": "extend"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """An argument of a subcommand, named as the parameter of the function that takes it.
+
+    Attributes
+    ----------
+    flags : tuple of str
+        Spellings on the command line, shortest first; of a positional argument its name.
+    keywords : mapping
+        Further keyword arguments of `argparse.ArgumentParser.add_argument`.
+    card : tuple of two str, optional
+        Keyword and comment of its header card; values of a list are numbered from 1.
+    checksum : str
+        Keyword of the cards with the checksums of its files.
+    is_input : bool
+        Whether a text that it is given may be the name of a file to read.
+    is_repeated : bool
+        Whether the command that repeats a run has it.
+    """
+
+    flags: tuple[str, ...]
+    keywords: Mapping[str, Any]
+    card: tuple[str, str] | None = None
+    checksum: str = ""
+    is_input: bool = False
+    is_repeated: bool = True
+
+    @property
+    def name(self) -> str:
+        """Its name in the namespace of the parsed arguments."""
+        return self.keywords.get("dest") or self.flags[-1].lstrip("-").replace("-", "_")
+
+    @property
+    def is_positional(self) -> bool:
+        """Whether it is given by its place, without a flag."""
+        return not self.flags[0].startswith("-")
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether the usage names it: one of several options is hard to find there."""
+        return self.is_positional or bool(self.keywords.get("required"))
+
+    def usage(self) -> str:
+        """Return the words of the usage for it."""
+        metavar = self.keywords["metavar"]
+        values = {"+": f"{metavar} [{metavar} ...]", "*": f"[{metavar} ...]"}
+        value = values.get(self.keywords.get("nargs", ""), metavar)
+        return value if self.is_positional else f"{self.flags[0]} {value}"
+
+    def but(self, **keywords: Any) -> Option:
+        """Return the same option with other keywords for the parser, such as its help."""
+        return dataclasses.replace(self, keywords={**self.keywords, **keywords})
+
+    def words(self, value: Any) -> list[str]:
+        """Return the words of a command line that give it a value; for None there are none."""
+        flag = [] if self.is_positional else [self.flags[0]]
+        action = self.keywords.get("action")
+        if action in SWITCHES:
+            return flag if value is SWITCHES[action] else []
+        values = _listed(value)
+        if action == "append":
+            return [word for each in values for word in (*flag, _word(each))]
+        return [*flag, *map(_word, values)] if values else []
+
+    def inputs(self, value: Any) -> list[str]:
+        """Return the names in a value that may be those of files to read."""
+        return [word for word in _listed(value) if self.is_input and isinstance(word, str)]
+
+
+# The options of a subcommand, by the headings of its help.
+Options = Mapping[str, Sequence[Option]]
+
+
+def option(
+    *flags: str,
+    card: tuple[str, str] | None = None,
+    checksum: str = "",
+    is_input: bool = False,
+    is_repeated: bool = True,
+    **keywords: Any,
+) -> Option:
+    """Return an `Option`; all further keywords are for the parser."""
+    return Option(flags, keywords, card, checksum, is_input or bool(checksum), is_repeated)
+
+
+def input_paths(options: Sequence[Option], values: Mapping[str, Any]) -> list[str]:
+    """Return the names in the values of arguments that may be those of files to read."""
+    return [path for each in options for path in each.inputs(values[each.name])]
+
+
+def _listed(value: Any) -> list[Any]:
+    if value is None:
+        return []
+    return value if isinstance(value, list) else [value]
+
+
+def _word(value: Any) -> str:
+    """Return a text that is not taken for an option, a number to the last digit, or ``X,Y``."""
+    if isinstance(value, str):
+        return f"./{value}" if value.startswith("-") else value
+    return ",".join(map(repr, value if isinstance(value, tuple) else (value,)))
+
+
+def number_or_word(text: str) -> float | str:
+    """Return a number where a text is one, else the text."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def whole_or_word(text: str) -> int | str:
+    """Return a whole number where a text is one, else the text."""
+    try:
+        return int(text)
+    except ValueError:
+        return text
+
+
+def finite(text: str) -> float:
+    """Return a number that a header can hold.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        A text that is not a finite number.
+    """
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
+    return number
+
+
+def position(text: str) -> tuple[float, float]:
+    """Return the numbers of ``X,Y``.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        A text that is not two numbers.
+    """
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not X,Y") from None
+    return x, y
+
+
+IMAGES = option(
+    "images",
+    nargs="+",
+    metavar="IMAGE",
+    checksum="ISUM",
+    help="FITS file with an image, or one file with a cube of them, in the unit of its BUNIT, or "
+    "else in electrons per pixel",
+)
+PSFS = option(
+    "--psf",
+    **SEVERAL,
+    dest="psfs",
+    metavar="PSF",
+    checksum="PSUM",
+    help="FITS file with a PSF, centred at (ky // 2, kx // 2): one for all images or one for each, "
+    "or one file with a cube of them",
+)
+BACKGROUND = option(
+    "--background",
+    **SEVERAL,
+    type=number_or_word,
+    metavar="B",
+    card=("BKG", "background, electrons"),
+    checksum="BSUM",
+    help="electrons per pixel, a FITS file with a map of them, or auto, the sigma-clipped median "
+    "of the image; one for all images or one for each (default: 0)",
+)
+READ_NOISE = option(
+    "--read-noise",
+    **SEVERAL,
+    type=number_or_word,
+    metavar="S",
+    card=("RON", "read noise, electrons"),
+    checksum="RSUM",
+    help="standard deviation in electrons, or a FITS file with a map of it; one for all images or "
+    "one for each (default: 0)",
+)
+SATURATION = option(
+    "--saturation",
+    type=finite,
+    metavar="V",
+    card=("SATURATE", "saturation level, unit of the input"),
+    help="pixels of this value and above are bad, in the unit of the images",
+)
+STARS = option(
+    "--star",
+    action="append",
+    default=[],
+    type=position,
+    dest="stars",
+    metavar="X,Y",
+    help="position of a star in pixels, 0-based, x along columns; may be repeated",
+)
+DEVICE = option(
+    "--device",
+    metavar="SPEC",
+    card=("DEVICE", "device"),
+    help="OpenCL device as PLATFORM[:DEVICE], each an index or a part of the name, as lnocl "
+    "devices lists them (default: that of PYOPENCL_CTX, else the first GPU, else the first CPU)",
+)
+OVERWRITE = option(
+    "--overwrite", action="store_true", is_repeated=False, help="replace files that exist"
+)
+QUIET = option(
+    "--quiet", action="store_true", is_repeated=False, help="show only warnings and errors"
+)
+
+
+def output_folder(content: str, **keywords: Any) -> list[Option]:
+    """Return the option for the folder of the output, and that to replace files in it."""
+    default = " (default: %(default)s)" if "default" in keywords else ""
+    folder = option(
+        "-o", "--output", metavar="DIR", help=f"folder for {content}{default}", **keywords
+    )
+    return [folder, OVERWRITE.but(help="replace files in DIR")]

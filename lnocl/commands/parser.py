@@ -1,0 +1,95 @@
+"""Subcommands, and the parser of their command lines."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, NoReturn
+
+from lnocl.commands.options import Options
+from lnocl.errors import InputError
+
+
+class Command(NamedTuple):
+    """A subcommand.
+
+    Attributes
+    ----------
+    summary : str
+        Its line in the help.
+    options : Options
+        Its arguments, by the headings of its help; those under no heading have an empty one.
+    run : callable
+        Runs it with the parsed arguments.
+    epilog : str
+        The last paragraph of its help.
+    """
+
+    summary: str
+    options: Options
+    run: Callable[[argparse.Namespace], None]
+    epilog: str = ""
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add its options to its parser."""
+        parser.epilog = self.epilog
+        needed = (each for options in self.options.values() for each in options if each.is_needed)
+        parser.usage = " ".join(["%(prog)s", *(each.usage() for each in needed), "[options]"])
+        for heading, options in self.options.items():
+            group = parser.add_argument_group(heading) if heading else parser
+            for each in options:
+                group.add_argument(*each.flags, **each.keywords)
+
+    def flags(self, words: Sequence[str] = ()) -> dict[str, str]:
+        """Return the flag of each parameter that an option stands for.
+
+        Parameters
+        ----------
+        words : sequence of str, optional
+            The command line; a name in it may be that of a file, and is left out.
+        """
+        options = (each for group in self.options.values() for each in group)
+        return {
+            each.name: each.flags[-1]
+            for each in options
+            if not each.is_positional and each.name not in words
+        }
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are ours, and that takes ``-1,3`` and ``-inf`` for values."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(allow_abbrev=False, **kwargs)
+        self._negative_number_matcher = re.compile(r"-(\d|\.\d|inf|nan)[\d.,eainf+-]*$", re.I)
+        self._words: Sequence[str] = ()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse as `argparse` does, and remember the words for a message."""
+        self._words = args or ()
+        return super().parse_known_args(args, namespace)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise the error with which argparse would end the program."""
+        advice = self._swallowed() if "arguments are required" in message else ""
+        raise InputError(f"{message}{advice}; see {self.prog} --help")
+
+    def _swallowed(self) -> str:
+        """Say which option has taken a file that was meant as a positional argument, if any."""
+        taken: dict[str, list[str]] = {}
+        flag = ""
+        for word in self._words:
+            action = self._option_string_actions.get(word)
+            if action is not None or word == "--":
+                flag = word if action is not None and action.nargs == "+" else ""
+            elif flag:
+                taken.setdefault(flag, []).append(word)
+        for flag, values in reversed(taken.items()):
+            if len(values) > 1 and os.path.exists(values[-1]):
+                return (
+                    f"; {flag} has taken {values[-1]}: put it before the options, or after --, as "
+                    f"in {flag} {values[0]} -- {values[-1]}"
+                )
+        return ""

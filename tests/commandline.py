@@ -1,0 +1,90 @@
+"""Runs of the command line in a folder of files for it."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from scenes import make_psfs
+
+from lnocl.commands import cli
+
+SHAPE = (16, 12)
+NUMPY = ("--engine", "numpy")
+
+
+@pytest.fixture
+def command_folder(tmp_path, monkeypatch):
+    """Work in a folder with two images, their PSFs, and files that are no use."""
+    monkeypatch.chdir(tmp_path)
+    chance = np.random.default_rng(1)
+    images = chance.poisson(20.0, (2, *SHAPE)).astype(float)
+    images[:, 5, 7] += 400.0
+    psfs = make_psfs(2, (7, 7))
+    nan_psf = psfs[0].copy()
+    nan_psf[0, 0] = np.nan
+    arrays = {
+        "a": images[0],
+        "b": images[1],
+        "cube": images,
+        "oblong": images[0].T,
+        "line": images[0, 0],
+        "four": images[None],
+        "nan": np.full(SHAPE, np.nan),
+        "k1": psfs[0],
+        "k2": psfs[1],
+        "psfs": psfs,
+        "three": psfs[[0, 1, 0]],
+        "zero": np.zeros((7, 7)),
+        "nanpsf": nan_psf,
+        "negative": psfs[0] - 1e-3,
+    }
+    header = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 15.25})
+    for name, array in arrays.items():
+        fits.writeto(f"{name}.fits", array, header)
+    Path("text.fits").write_text("no FITS at all\n" * 400)
+    Path("cut.fits").write_bytes(Path("a.fits").read_bytes()[:3000])
+    fits.BinTableHDU.from_columns([fits.Column("a", "D", array=[1.0])]).writeto("table.fits")
+    Path("there.fits").write_bytes(b"old")
+    return tmp_path
+
+
+def run(*arguments, image="a.fits", psf="k1.fits", engine=NUMPY, output="out.fits"):
+    """Deconvolve for one iteration unless the arguments say otherwise."""
+    images = [image] if isinstance(image, str) else image
+    return cli.main(
+        ["deconvolve", *images, "--psf", psf, "--n-iter", "1", "-o", output, *engine, *arguments]
+    )
+
+
+def one_complaint(captured):
+    """Return the message of the one error on stderr; lines before it may only be warnings."""
+    assert captured.out == ""
+    *warned, error = captured.err.splitlines()
+    assert all(line.startswith("lnocl: warning: ") for line in warned)
+    assert error.startswith("lnocl: error: ")
+    return error.removeprefix("lnocl: error: ")
+
+
+def outside(*arguments, stdout=subprocess.PIPE, **environment):
+    """Run the command line in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "lnocl", *arguments],
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONUNBUFFERED": ""} | environment,
+    )
+
+
+def outcome(path):
+    """Return everything in a result that a run computes."""
+    with fits.open(path, checksum=True) as hdus:
+        return {
+            hdu.name: hdu.data if hdu.is_image else {n: hdu.data[n] for n in hdu.columns.names}
+            for hdu in hdus
+        }

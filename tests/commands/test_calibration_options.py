@@ -1,0 +1,265 @@
+"""The command ``lnocl deconvolve`` on frames as a telescope leaves them."""
+
+import hashlib
+import os
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.wcs import WCS
+from commandline import NUMPY, SHAPE, one_complaint, outcome
+
+import lnocl
+from lnocl.commands import cli
+from lnocl.io.frames import Calibration, read_frames
+
+pytestmark = pytest.mark.usefixtures("command_folder")
+
+
+class TestFrames:
+    """Two frames as a telescope leaves them: adu per second, an offset, bad pixels."""
+
+    WCS = fits.Header(
+        {
+            "CTYPE1": "RA---TAN",
+            "CTYPE2": "DEC--TAN",
+            "CRPIX1": 6.0,
+            "CRPIX2": 8.0,
+            "CRVAL1": 150.0,
+            "CRVAL2": 30.0,
+            "CDELT1": -1e-5,
+            "CDELT2": 1e-5,
+            "BUNIT": "ADU/s",
+        }
+    )
+    INPUTS = ("f1.fits", "f2.fits", "--psf", "psfs.fits")
+    OPTIONS = (
+        *("--background", "auto", "level.fits", "--exposure", "EXPTIME", "--gain", "1.7"),
+        *("--inverse-variance", "inverse.fits", "--mask", "mask.fits", "dq", "--align", "wcs"),
+        *("--saturation", "1000", "--star", "3,12.25", "--stars", "stars.csv", "--refine"),
+        *("--mu", "1e-4", "--smoothing", "1e-3", "--solver", "sgp"),
+        *("--n-iter", "9", "--stop", "1e-9", "--pad", "2"),
+        *("--zero-point", "-2.5", "--models", "--residuals"),
+    )
+
+    @pytest.fixture(autouse=True)
+    def frames(self, command_folder):
+        y, x = np.indices((15, 15)) - 7
+        smooth = np.exp(-(x**2 + y**2) / 3.0)  # wide enough to be moved between pixels
+        fits.writeto("psfs.fits", np.array([smooth, smooth.T**1.2]), overwrite=True)
+        for j, (dx, dy, exposure) in enumerate([(0.0, 0.0, 30.0), (1.25, -0.5, 60.0)], 1):
+            header = self.WCS.copy()
+            header["CRPIX1"] += dx
+            header["CRPIX2"] += dy
+            header["EXPTIME"] = exposure
+            y, x = np.indices(SHAPE)
+            counts = fits.getdata(f"{'ab'[j - 1]}.fits")
+            for star in [(3.0, 12.25), (7.0, 5.0), (8.5, 4.0)]:
+                squares = (x - star[0] - dx) ** 2 + (y - star[1] - dy) ** 2
+                counts += 900.0 * np.exp(-0.5 * squares)
+            image = counts / 1.7 / exposure
+            image[1, j] = 2000.0
+            flags = np.zeros(SHAPE, "i2")
+            flags[14, j] = 8
+            fits.HDUList([fits.PrimaryHDU(image, header), fits.ImageHDU(flags, name="DQ")]).writeto(
+                f"f{j}.fits"
+            )
+        fits.writeto("level.fits", np.full(SHAPE, 3.0))
+        fits.writeto("inverse.fits", np.full(SHAPE, 1e3))
+        mask = np.zeros(SHAPE, "u1")
+        mask[0, 0] = 1
+        fits.writeto("mask.fits", mask)
+        self.sky = WCS(self.WCS).pixel_to_world(7.0, 5.0)
+        Path("stars.csv").write_text("ra,dec\n{!r},{!r}\n".format(*self.at(8.5, 4.0)))
+        self.sky_option = ("--star-sky", "{!r},{!r}".format(*self.at(7.0, 5.0)))
+
+    def at(self, x, y):
+        position = WCS(self.WCS).pixel_to_world(x, y)
+        return float(position.ra.deg), float(position.dec.deg)
+
+    def run(self, *options, output="out.fits"):
+        return cli.main(["deconvolve", *self.INPUTS, *NUMPY, *options, "-o", output])
+
+    def test_the_command_in_the_header_makes_the_same_file_bit_by_bit(self, capsys):
+        assert self.run(*self.OPTIONS, *self.sky_option) == 0
+        captured = capsys.readouterr()
+        first, header = outcome("out.fits"), fits.getheader("out.fits")
+        words = shlex.split("\n".join(header["HISTORY"]).replace("\\\n", ""))
+        words = words[words.index("lnocl") :]
+        for option in [*self.OPTIONS, *self.sky_option]:
+            if option.startswith("--") and option not in ("--star-sky", "--stars"):
+                assert option in words
+        assert words.count("--star") == 3
+        given = words[words.index("--background") + 1 :][:2]
+        assert given == [repr(header["BKG1"]), "level.fits"]
+        os.rename("out.fits", "first.fits")
+        os.unlink("stars.csv")  # positions are spelled out
+        assert cli.main(words[1:]) == 0
+        assert capsys.readouterr().out == captured.out
+        again = outcome("out.fits")
+        assert set(again) == {"PRIMARY", "STARS", "HISTORY", "MODELS", "RESIDUALS"}
+        for name, data in first.items():
+            np.testing.assert_equal(again[name], data)
+        assert fits.getheader("out.fits")["HISTORY"] == header["HISTORY"]
+
+    def test_it_is_what_the_library_makes_of_the_files(self):
+        assert self.run(*self.OPTIONS, *self.sky_option, "--quiet") == 0
+        known = Calibration(
+            background=["auto", "level.fits"],
+            inverse_variance=["inverse.fits"],
+            exposure=["EXPTIME"],
+            mask=["mask.fits", "dq"],
+            saturation=1000.0,
+            gain=1.7,
+            align="wcs",
+        )
+        observation = read_frames(self.INPUTS[:2], ["psfs.fits"], known).observation
+        stars = [(3.0, 12.25)]
+        for x, y in [(7.0, 5.0), (8.5, 4.0)]:
+            at = SkyCoord(*self.at(x, y), unit="deg")
+            stars.append([float(each) for each in WCS(self.WCS).world_to_pixel(at)])
+        np.testing.assert_allclose(stars[1:], [(7.0, 5.0), (8.5, 4.0)], atol=1e-6)
+        expected = lnocl.deconvolve(
+            observation,
+            stars=stars,
+            mu=1e-4,
+            smoothing=1e-3,
+            solver="sgp",
+            n_iter=9,
+            stop=1e-9,
+            pad=2,
+            engine="numpy",
+            refine_positions=True,
+        )
+        found = outcome("out.fits")
+        np.testing.assert_array_equal(found["PRIMARY"], expected.extended)
+        table = found["STARS"]
+        assert list(table) == ["x", "y", "flux", "x_error", "y_error", "flux_error", "mag", "ra",
+                               "dec"]  # fmt: skip
+        for names, values in [
+            (["x", "y"], expected.star_positions.T),
+            (["flux"], [expected.star_fluxes]),
+            (["x_error", "y_error"], expected.star_position_errors.T),
+            (["flux_error"], [expected.star_flux_errors]),
+        ]:
+            np.testing.assert_array_equal([table[name] for name in names], values)
+        assert (table["flux_error"] > 0).all()
+        np.testing.assert_allclose(table["mag"], -2.5 - 2.5 * np.log10(table["flux"]), atol=1e-12)
+        sky = SkyCoord(table["ra"], table["dec"], unit="deg")
+        back = WCS(self.WCS).world_to_pixel(sky)
+        np.testing.assert_allclose(back, [table["x"], table["y"]], atol=1e-6)
+        for name, cube in [("MODELS", expected.models()), ("RESIDUALS", expected.residuals())]:
+            np.testing.assert_array_equal(found[name], cube.astype("f4"))
+        unknown = observation.mask | (found["MODELS"] == 0)
+        np.testing.assert_array_equal(np.isnan(found["RESIDUALS"]), unknown)
+
+    def test_units_and_cards_of_the_result(self):
+        assert self.run(*self.OPTIONS, *self.sky_option) == 0
+        with fits.open("out.fits") as hdus:
+            header, table = hdus[0].header, hdus["STARS"].header
+            coordinates = [WCS(hdus[name].header, naxis=2) for name in ("MODELS", "RESIDUALS")]
+            assert hdus["MODELS"].header["BUNIT"] == "electron"
+            assert "BUNIT" not in hdus["RESIDUALS"].header
+        assert header["BUNIT"] == "electron/s"
+        named = {table[f"TTYPE{i}"]: table[f"TUNIT{i}"] for i in range(1, table["TFIELDS"] + 1)}
+        assert named == {
+            **dict.fromkeys(["x", "y", "x_error", "y_error"], "pix"),
+            **dict.fromkeys(["flux", "flux_error"], "ct/s"),
+            "mag": "mag",
+            "ra": "deg",
+            "dec": "deg",
+        }
+        for wcs in coordinates:
+            x, y = wcs.world_to_pixel(self.sky)
+            np.testing.assert_allclose([x, y], [7.0, 5.0], atol=1e-6)
+        expected = {
+            "BKG2": "level.fits",
+            "EXP1": 30.0,
+            "EXP2": 60.0,
+            "GAIN": 1.7,
+            "SATURATE": 1000.0,
+            "ZEROPT": -2.5,
+            "REFINED": True,
+            "OFFX1": 0.0,
+            "OFFY1": 0.0,
+        }
+        assert {keyword: header[keyword] for keyword in expected} == expected
+        np.testing.assert_allclose([header["OFFX2"], header["OFFY2"]], [1.25, -0.5], atol=1e-6)
+        for keyword, path in {
+            "ISUM2": "f2.fits",
+            "PSUM1": "psfs.fits",
+            "BSUM1": "level.fits",
+            "VSUM1": "inverse.fits",
+            "MSUM1": "mask.fits",
+        }.items():
+            assert header[keyword] == hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+    def test_maps_of_exposure_and_read_noise_have_cards_too(self):
+        options = ("--gain", "1", "--exposure", "inverse.fits", "--read-noise", "level.fits", "2")
+        assert self.run(*options, "--n-iter", "1") == 0
+        header = fits.getheader("out.fits")
+        assert (header["EXP1"], header["RON1"], header["RON2"]) == (
+            "inverse.fits",
+            "level.fits",
+            2.0,
+        )
+        assert len(header["ESUM1"]) == len(header["RSUM1"]) == 64
+
+    def test_what_was_done_is_said_unless_it_is_quiet(self, capsys):
+        assert self.run(*self.OPTIONS, *self.sky_option) == 0
+        said = capsys.readouterr()
+        level = fits.getheader("out.fits")["BKG1"]
+        assert [line.removeprefix("lnocl: ") for line in said.err.splitlines()] == [
+            "image 1: exposure 30 seconds, from EXPTIME",
+            "image 2: exposure 60 seconds, from EXPTIME",
+            "image 1: 1 pixel masked by the mask",
+            "image 2: 1 pixel masked by the mask",
+            "image 1: 1 pixel masked by the extension DQ",
+            "image 2: 1 pixel masked by the extension DQ",
+            "image 1: 1 pixel masked as saturated, at 1000 or above",
+            "image 2: 1 pixel masked as saturated, at 1000 or above",
+            "image 1: 0 pixels masked without inverse variance",
+            "image 2: 0 pixels masked without inverse variance",
+            next(line for line in said.err.splitlines() if "sigma-clipped" in line)[7:],
+            "image 2: offset 1.250, -0.500 pixels in x, y, from the WCS",
+            "stars.csv: 1 star",
+        ]
+        assert f"image 1: background {level:.6g} electrons per pixel" in said.err
+        assert "electrons per second" in said.out
+        assert self.run(*self.OPTIONS, *self.sky_option, "--quiet", "--overwrite") == 0
+        assert capsys.readouterr() == ("", "")
+
+    @pytest.mark.parametrize(
+        "options",
+        [("--mask", "out.fits"), ("--inverse-variance", "out.fits"), ("--background", "out.fits"),
+         ("--read-noise", "1", "out.fits"), ("--exposure", "out.fits"), ("--stars", "out.fits")],
+    )  # fmt: skip
+    def test_an_output_that_is_an_input_is_refused(self, capsys, options):
+        before = Path("mask.fits").read_bytes()
+        Path("out.fits").write_bytes(before)
+        assert self.run(*options, "--overwrite") == 2
+        message = "the output out.fits is one of the inputs; give it another name"
+        assert one_complaint(capsys.readouterr()) == message
+        assert Path("out.fits").read_bytes() == before
+
+    def test_without_stars_or_coordinates(self):
+        for name in ("f1.fits", "f2.fits"):
+            fits.delval(name, "CTYPE1")
+            fits.delval(name, "CTYPE2")
+        assert self.run("--gain", "1", "--exposure", "1", "--zero-point", "25", "--refine",
+                        "--n-iter", "1", "--models") == 0  # fmt: skip
+        found = outcome("out.fits")
+        assert list(found["STARS"]) == ["x", "y", "flux", "x_error", "y_error", "flux_error", "mag"]
+        assert found["MODELS"].shape == (2, *SHAPE)
+
+    def test_the_result_is_plotted(self, capsys):
+        pytest.importorskip("matplotlib")
+        assert self.run(*self.OPTIONS, *self.sky_option) == 0
+        capsys.readouterr()
+        assert cli.main(["plot", "out.fits", "-o", "figures"]) == 0
+        written = capsys.readouterr().out
+        assert "figures/objects.png" in written
+        assert Path("figures/objects.png").stat().st_size > 1000

@@ -1,0 +1,154 @@
+"""The command ``lnocl deconvolve``: what it runs, writes and says."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from commandline import NUMPY, SHAPE, run
+
+import lnocl
+from lnocl.commands import cli
+from lnocl.opencl import device
+
+pytestmark = pytest.mark.usefixtures("command_folder")
+
+
+class TestDeconvolve:
+    ARGUMENTS = (
+        *(
+            "--background",
+            "2.5",
+            "3.0000000000000004",
+            "--read-noise",
+            "1",
+            "--star",
+            "7,5",
+            "--star",
+            "2,9",
+        ),
+        *("--mu", "1e-3", "--smoothing", "0.02", "--n-iter", "7", "--pad", "3"),
+    )
+
+    @pytest.mark.parametrize(
+        "inputs",
+        [
+            ["a.fits", "b.fits", "--psf", "k1.fits", "k2.fits"],
+            ["a.fits", "b.fits", "--psf", "psfs.fits"],
+            ["cube.fits", "--psf", "k1.fits", "k2.fits"],
+            ["a.fits", "b.fits", "--psf", "k1.fits", "--psf", "k2.fits"],
+        ],
+    )
+    def test_the_file_holds_what_the_function_returns(self, inputs, capsys):
+        status = cli.main(["deconvolve", *inputs, *NUMPY, *self.ARGUMENTS, "-o", "out.fits"])
+        captured = capsys.readouterr()
+        assert (status, captured.err) == (0, "")
+        expected = lnocl.deconvolve(
+            lnocl.Observation(
+                fits.getdata("cube.fits"), fits.getdata("psfs.fits"), [2.5, 3.0000000000000004], 1.0
+            ),
+            stars=[(7, 5), (2, 9)],
+            mu=1e-3,
+            smoothing=0.02,
+            n_iter=7,
+            pad=3,
+            engine="numpy",
+        )
+        with fits.open("out.fits", checksum=True) as hdus:
+            np.testing.assert_array_equal(hdus[0].data, expected.extended)
+            assert hdus[0].header["CRVAL1"] == 15.25
+            np.testing.assert_array_equal(hdus["STARS"].data["x"], [7.0, 2.0])
+            np.testing.assert_array_equal(hdus["STARS"].data["y"], [5.0, 9.0])
+            np.testing.assert_array_equal(hdus["STARS"].data["flux"], expected.star_fluxes)
+            np.testing.assert_array_equal(
+                hdus["HISTORY"].data["objective"], expected.history["objective"]
+            )
+        objective = expected.history["objective"][-1]
+        assert captured.out.splitlines() == [
+            f"7 iterations on numpy, objective {objective:.6g}",
+            f"star at (7, 5): {expected.star_fluxes[0]:.6g} electrons",
+            f"star at (2, 9): {expected.star_fluxes[1]:.6g} electrons",
+            f"extended source: {expected.extended.sum():.6g} electrons",
+            "written to out.fits",
+        ]
+
+    def test_every_parameter_is_in_the_header(self):
+        inputs = ("a.fits", "b.fits", "--psf", "k1.fits")
+        assert cli.main(["deconvolve", *inputs, *NUMPY, *self.ARGUMENTS, "-o", "out.fits"]) == 0
+        header = fits.getheader("out.fits")
+        expected = {
+            "CREATOR": f"lnocl {lnocl.__version__}",
+            "SOLVER": "sgm",
+            "NITER": 7,
+            "STOPPED": "n_iter",
+            "MU": 1e-3,
+            "SMOOTHIN": 0.02,
+            "PAD": 3,
+            "PRECISIO": "double",
+            "ENGINE": "numpy",
+            "DEVICE": "numpy",
+            "BKG1": 2.5,
+            "BKG2": 3.0000000000000004,
+            "RON1": 1.0,
+        }
+        assert {keyword: header[keyword] for keyword in expected} == expected
+        assert {len(header[name]) for name in ("ISUM1", "ISUM2", "PSUM1")} == {64}
+        assert "".join(header["HISTORY"]).replace("\\", "") == (
+            f"cd {os.getcwd()}lnocl deconvolve a.fits b.fits --psf k1.fits "
+            "--background 2.5 3.0000000000000004 --read-noise 1.0 --star 7.0,5.0 --star 2.0,9.0 "
+            "--n-iter 7 --solver sgm --mu 0.001 --smoothing 0.02 --pad 3 --precision double "
+            "--engine numpy -o out.fits"
+        )
+
+    def test_negative_psf_pixels_are_kept_and_announced(self, capsys):
+        assert run(psf="negative.fits") == 0
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1
+        assert lines[0].startswith("lnocl: warning: ")
+        assert lines[0].endswith("psf pixels are negative and were kept")
+
+    def test_what_the_device_must_hold_is_said_first(self, capsys):
+        assert run("--n-iter", "1", engine=()) == 0
+        name = re.escape(device.describe(device.choose().device))
+        assert re.match(rf"lnocl: {name}: the scene takes [\d.]+ MiB\n", capsys.readouterr().err)
+
+    def test_quiet_says_nothing_but_warnings(self, capsys):
+        assert run("--quiet", psf="negative.fits") == 0
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.startswith("lnocl: warning: ")
+        assert captured.err.count("\n") == 1
+
+    def test_overwrite(self):
+        assert run("--overwrite", output="there.fits") == 0
+        assert fits.getdata("there.fits").shape == SHAPE
+
+    @pytest.mark.parametrize(
+        "name", ["a 'b' \"c\" &\nd.fits", "naïve☃.fits", "\udcff.fits", "-x.fits"]
+    )
+    def test_names_of_any_kind_are_read_written_and_repeated(self, name, capsys):
+        Path(name).write_bytes(Path("a.fits").read_bytes())
+        options = ("--psf", "k1.fits", "--n-iter", "1", *NUMPY, f"-oout-{name}")
+        assert cli.main(["deconvolve", *options, "--", name]) == 0
+        assert capsys.readouterr().out.count("\n") == 3
+        first = fits.getdata(f"out-{name}")
+        script = "\n".join(fits.getheader(f"out-{name}")["HISTORY"])
+        os.unlink(f"out-{name}")
+        python = f'lnocl() {{ {shlex.quote(sys.executable)} -m lnocl "$@"; }}'
+        subprocess.run(["bash", "-ec", f"{python}\n{script}"], capture_output=True, check=True)
+        np.testing.assert_array_equal(fits.getdata(f"out-{name}"), first)
+
+    def test_on_the_device_that_is_recorded(self, capsys):
+        assert run(engine=("--precision", "double"), output="cl.fits") == 0
+        assert run(output="np.fits") == 0
+        chosen = device.choose(None).device
+        header = fits.getheader("cl.fits")
+        assert header["DEVICE"] == device.describe(chosen)
+        assert f"--device {device.spec_of(chosen)} " in "".join(header["HISTORY"])
+        np.testing.assert_allclose(fits.getdata("cl.fits"), fits.getdata("np.fits"), rtol=1e-10)
+        assert device.describe(chosen) in capsys.readouterr().out

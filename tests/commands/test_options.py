@@ -1,0 +1,204 @@
+"""The tables of options: parser, messages, cards and the repeated command follow from them."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from commandline import NUMPY, one_complaint, run
+
+from lnocl.commands import cli, deconvolve, messages, psf, record
+from lnocl.commands.options import option, position
+from lnocl.io.frames import Calibration
+
+pytestmark = pytest.mark.usefixtures("command_folder")
+
+# Options of lnocl deconvolve that no function takes as they are.
+OF_THE_SHELL = {"images", "output", "overwrite", "quiet", "models", "residuals", "star_sky",
+                "star_table", "zero_point"}  # fmt: skip
+# Parameters of lnocl.deconvolve that the shell gives itself, or that no option gives.
+NOT_OPTIONS = {"observation", "callback", "progress", "initial_extended", "initial_star_fluxes"}
+
+
+def test_every_option_is_a_parameter_and_every_parameter_an_option():
+    names = {each.name for each in deconvolve.ALL_OPTIONS}
+    taken = {*deconvolve.PARAMETERS, *Calibration._fields, "psfs"}
+    assert names - taken == OF_THE_SHELL
+    assert taken - names == NOT_OPTIONS
+
+
+@pytest.mark.parametrize("table", [deconvolve.ALL_OPTIONS, psf.OPTIONS])
+def test_no_two_options_share_a_keyword_or_a_checksum(table):
+    keywords = [each.card[0] for each in table if each.card]
+    checksums = [each.checksum for each in table if each.checksum]
+    assert len({*keywords, *checksums}) == len(keywords) + len(checksums)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (option("--gain", type=float), ["--gain", "1.7000000000000002"]),
+        (option("--size", type=int), ["--size", "21"]),
+        (option("--mask", nargs="+", action="extend"), ["--mask", "a.fits", "./-b.fits"]),
+        (option("--star", action="append", type=position),
+         ["--star", "1.5,-2.0", "--star", "3.0,4.0"]),
+        (option("--models", action="store_true"), ["--models"]),
+        (option("--models", action="store_true"), []),
+        (option("--no-recentre", action="store_false", dest="recentre"), ["--no-recentre"]),
+        (option("--no-recentre", action="store_false", dest="recentre"), []),
+        (option("--gain", type=float), []),
+        (option("images", nargs="+"), ["a.fits", "./-b.fits"]),
+        (option("-o", "--output"), ["-o", "./-out.fits"]),
+    ],
+)  # fmt: skip
+def test_the_words_of_a_value_are_parsed_to_that_value(given, words):
+    parser = argparse.ArgumentParser()
+    parser.add_argument(*given.flags, **given.keywords)
+    assert given.words(getattr(parser.parse_args(words), given.name)) == words
+
+
+def test_cards_follow_from_the_values():
+    table = [
+        option("--gain", card=("GAIN", "a gain")),
+        option("--level", card=("BKG", "a level"), checksum="BSUM"),
+        option("--device", card=("DEVICE", "a device")),
+        option("--stop"),
+    ]
+    used = {"gain": None, "level": [2.5, "maps/b.fits"], "device": "CPU/GPU", "stop": 0.1}
+    assert record.make_cards(table, used, {"level": ["12ab"]}, [("NBAD", 3, "")])[1:] == [
+        ("BKG1", 2.5, "a level"),
+        ("BKG2", "b.fits", "a level"),
+        ("DEVICE", "CPU/GPU", "a device"),
+        ("NBAD", 3, ""),
+        ("BSUM1", "12ab", ""),
+    ]
+
+
+# A message of the library for each option that it may complain of, in a run of the command.
+COMPLAINTS = {
+    "--mu": (["--mu", "-1"], "--mu must be a number, finite and not negative; -1.0 was given"),
+    "--smoothing": (["--smoothing", "nan"], "--smoothing must be a number, finite"),
+    "--n-iter": (["--n-iter", "0"], "--n-iter must be a whole number, 1 or more; 0 was given"),
+    "--n-iter at most": (["--n-iter", "3000000000"], "--n-iter must be 2147483646 at most; 3000"),
+    "--stop": (["--stop", "2"], "--stop 2.0 is not known; give discrepancy, held-out, or a"),
+    "--pad": (["--pad", "-1"], "--pad must be a whole number, 0 or more, or auto; -1 was given"),
+    "--pad grid": (["--pad", "5000"], "with --pad 5000 need a grid of (16384, 16384)"),
+    "--engine": (["--device", "0"], "--engine numpy uses no device; leave --device '0' out"),
+    "both": (["--mu", "auto", "--smoothing", "auto"], "--mu and --smoothing cannot both be auto"),
+    "--checkpoint-every": (
+        ["--checkpoint", "c.fits", "--checkpoint-every", "-1"],
+        "--checkpoint-every must be seconds, 0 or more; -1.0 was given",
+    ),
+    "--background": (["--background", "-1"], "--background must be finite and not negative"),
+    "--background auto": (["--background", "Auto"], "--background 'Auto' is not a number, auto"),
+    "--read-noise": (["--read-noise", "-1"], "--read-noise must be finite and not negative"),
+    "--read-noise word": (["--read-noise", "low"], "--read-noise 'low' is not a number, or a"),
+    "--read-noise large": (["--read-noise", "1e200"], "the square of --read-noise must be finite"),
+    "--read-noise map": (["--read-noise", "oblong.fits"], "--read-noise oblong.fits has the shape"),
+    "--exposure": (["--exposure", "0"], "--exposure must be finite and more than zero; 0 was"),
+    "--gain": (["--gain", "-1"], "--gain must be more than 0; -1 was given"),
+    "--mask": (["--mask", "oblong.fits"], "--mask oblong.fits has the shape (1, 12, 16)"),
+    "--inverse-variance": (
+        ["--inverse-variance", "negative.fits"],
+        "--inverse-variance negative.fits has",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("given", "message"), COMPLAINTS.values(), ids=COMPLAINTS)
+def test_messages_name_the_option_that_was_typed(capsys, given, message):
+    half = np.zeros((16, 12))
+    half[5, 7] = 1.0
+    fits.writeto("half.fits", half)
+    assert run(*given) == 2
+    assert message in one_complaint(capsys.readouterr())
+
+
+def test_warnings_name_the_option_that_was_typed(capsys):
+    fits.writeto("wide.fits", np.ones((70, 70)))
+    assert run("--quiet", psf="wide.fits") == 0
+    assert "crop it, or give --pad to enlarge the grid" in capsys.readouterr().err
+
+
+FLAGS = {"n_iter": "--n-iter", "mu": "--mu", "pad": "--pad", "psfs": "--psf", "sky": "--sky",
+         "sky_brightness": "--sky", "mask": "--mask"}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("message", "named"),
+    [
+        ("n_iter, mu and pad", "--n-iter, --mu and --pad"),
+        ("give pad 5 or more, or pad less", "give --pad 5 or more, or pad less"),
+        ("with pad=3 it fits", "with --pad 3 it fits"),
+        ("psfs hold values", "psfs hold values"),
+        ("sky_brightness must be", "--sky must be"),
+        ("the sky and the mask are empty", "the sky and the mask are empty"),
+        ("give a mask file", "give a mask file"),
+        ("mask.fits has no pixels", "mask.fits has no pixels"),
+        ("n_iter.fits, ./n_iter and 'n_iter' hold images", None),
+        ("mu-1.fits and mu/1.fits are missing", None),
+    ],
+)
+def test_only_names_of_parameters_become_options(message, named):
+    assert messages.name_options(message, FLAGS) == (message if named is None else named)
+
+
+def test_a_file_that_is_called_as_a_parameter_keeps_its_name(capsys):
+    Path("oblong.fits").rename("mask")
+    assert run(image=("a.fits", "mask")) == 2
+    message = "mask has the shape (12, 16) and a.fits (16, 12); they must be the same"
+    assert one_complaint(capsys.readouterr()) == message
+
+
+class TestTakenImages:
+    """An option of several values takes every word that follows it."""
+
+    @pytest.mark.parametrize(
+        ("words", "advice"),
+        [
+            (["--psf", "k1.fits", "a.fits"], "--psf has taken a.fits: put it before the options, "
+             "or after --, as in --psf k1.fits -- a.fits"),
+            (["--psf", "k1.fits", "k2.fits", "--background", "5", "a.fits"],
+             "--background has taken a.fits: put it before the options, or after --, as in "
+             "--background 5 -- a.fits"),
+            (["--psf", "k1.fits", "a.fits", "--background", "5", "6"], "--psf has taken a.fits"),
+        ],
+    )  # fmt: skip
+    def test_the_option_that_has_them_is_named(self, capsys, words, advice):
+        assert cli.main(["deconvolve", *words, "-o", "out.fits", *NUMPY]) == 2
+        message = one_complaint(capsys.readouterr())
+        assert message.startswith("the following arguments are required: IMAGE; ")
+        assert advice in message
+        assert not Path("out.fits").exists()
+
+    @pytest.mark.parametrize("words", [["--psf", "k1.fits"], ["--psf", "k1.fits", "--gain", "2"]])
+    def test_no_option_is_blamed_for_images_that_were_not_given(self, capsys, words):
+        assert cli.main(["deconvolve", *words, "-o", "out.fits"]) == 2
+        assert one_complaint(capsys.readouterr()) == (
+            "the following arguments are required: IMAGE; see lnocl deconvolve --help"
+        )
+
+    def test_as_advised_it_works(self):
+        words = ["--n-iter", "1", *NUMPY, "-o", "out.fits", "--psf", "k1.fits", "--", "a.fits"]
+        assert cli.main(["deconvolve", *words]) == 0
+
+
+class TestNamesOfOutputs:
+    @pytest.mark.parametrize("name", ["w.png", "out", "out.fits.txt", "fits", "no/w.png"])
+    def test_others_than_those_of_fits_files_are_refused(self, capsys, name):
+        assert run(output=name, image="no.fits") == 2
+        assert one_complaint(capsys.readouterr()) == (
+            f"the output is a FITS file; give it a name ending in .fits, not {name}"
+        )
+
+    def test_nor_is_it_compressed(self, capsys):
+        assert run(output="out.fits.gz", image="no.fits") == 2
+        assert one_complaint(capsys.readouterr()) == (
+            "the output out.fits.gz is not compressed; give it a name ending in .fits"
+        )
+
+    @pytest.mark.parametrize("name", ["out.fits", "OUT.FIT", "out.fts"])
+    def test_those_of_fits_files_are_taken(self, name):
+        assert run(output=name) == 0
+        assert fits.getdata(name).shape == (16, 12)

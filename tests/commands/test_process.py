@@ -1,0 +1,155 @@
+"""The command line as a process: streams, signals, imports, devices."""
+
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from astropy.io import fits
+from commandline import NUMPY, SHAPE, outside, run
+
+import lnocl
+from lnocl.commands import cli
+from lnocl.opencl import device
+from lnocl.runs.progress import Bar
+
+pytestmark = pytest.mark.usefixtures("command_folder")
+
+
+class TestProcess:
+    ARGUMENTS = ("deconvolve", "a.fits", "--psf", "k1.fits", "--n-iter", "1", *NUMPY)
+
+    def test_an_error_is_one_line_and_no_traceback(self):
+        done = outside(*self.ARGUMENTS, "--mu", "-1", "-o", "out.fits")
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        assert done.stderr.startswith("lnocl: error: --mu must be")
+
+    def test_version_and_help_load_nothing_heavy(self):
+        for option in ("--version", "--help"):
+            script = (
+                "import sys; from lnocl.commands.cli import main\n"
+                f"try: main(['{option}'])\n"
+                "finally: print(sorted({'astropy', 'pyopencl', 'scipy'} & set(sys.modules)))"
+            )
+            done = subprocess.run(
+                [sys.executable, "-c", script], capture_output=True, text=True, check=True
+            )
+            *_, loaded = done.stdout.splitlines()
+            assert loaded == "[]"
+        assert outside("--version").stdout == f"lnocl {lnocl.__version__}\n"
+
+    def test_a_reader_that_left_is_no_error(self):
+        reading, writing = os.pipe()
+        os.close(reading)
+        done = outside(*self.ARGUMENTS, "-o", "out.fits", stdout=writing)
+        os.close(writing)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert fits.getdata("out.fits").shape == SHAPE
+
+    def test_a_signal_while_an_error_is_told_ends_it_at_once(self):
+        script = (
+            "import os, signal, sys\n"
+            "from lnocl.commands import cli\n"
+            "from lnocl.commands import messages\n"
+            "messages.fail = lambda *_: os.kill(os.getpid(), signal.SIGTERM)\n"
+            "sys.exit(cli.main(['deconvolve', 'no.fits', '--psf', 'k1.fits', '-o', 'out.fits']))\n"
+        )
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
+
+    @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
+    def test_a_full_stdout_is_one_line(self):
+        with open("/dev/full", "w") as full:
+            done = outside(*self.ARGUMENTS, "-o", "out.fits", stdout=full)
+        assert done.returncode == 1
+        assert done.stderr == "lnocl: error: [Errno 28] No space left on device\n"
+
+    @pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&- >&- 2>&-"])
+    @pytest.mark.parametrize(("mu", "status"), [("0", 0), ("-1", 2)])
+    def test_nothing_is_said_where_a_stream_is_closed(self, closed, mu, status):
+        words = ["lnocl", *self.ARGUMENTS, "--mu", mu, "-o", "out.fits"]
+        done = self.with_closed(closed, "-m", *words)
+        assert done.returncode == status
+        assert ("Traceback" in done.stderr, os.path.exists("out.fits")) == (False, status == 0)
+
+    def with_closed(self, closed, *words):
+        command = shlex.join([sys.executable, *words])
+        return subprocess.run(["bash", "-c", f"{command} {closed}"], capture_output=True, text=True)
+
+    @pytest.mark.parametrize("command", [["--help"], ["--version"], ["devices"]])
+    def test_nor_by_what_says_nothing_else(self, command):
+        assert self.with_closed(">&-", "-m", "lnocl", *command).returncode == 0
+
+    def test_no_file_gets_the_number_of_a_closed_stream(self):
+        script = (
+            "import os; from lnocl.commands.cli import main\n"
+            "main(['devices']); print(os.open(os.devnull, os.O_RDONLY) > 2)"
+        )
+        done = self.with_closed("<&- 2>&-", "-c", script)
+        assert done.stdout.splitlines()[-1] == "True"
+
+    def test_a_library_s_bar_where_stderr_is_closed(self, monkeypatch):
+        monkeypatch.setattr(sys, "stderr", None)
+        with Bar(1, progress=True) as bar:
+            bar.show(1, lambda: "done", last=True)
+
+    @pytest.mark.parametrize(
+        "command",
+        [["selftest"], ["deconvolve", "a.fits", "--psf", "k1.fits", "--stop", "held-out",
+                        "--n-iter", "100000", "--precision", "double", "-o", "out.fits"]],
+    )  # fmt: skip
+    def test_sigterm_ends_any_command_in_one_line_and_cleans_up(self, tmp_path, command):
+        kernels = tmp_path / "kernels"
+        kernels.mkdir()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "lnocl", *command],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"TMPDIR": str(kernels)},
+        )
+        # What each says first, before the first iteration.
+        (process.stdout if command == ["selftest"] else process.stderr).readline()
+        assert len(list(kernels.glob("lnocl-kernels-*"))) == 1
+        process.send_signal(signal.SIGTERM)
+        _, complaint = process.communicate()
+        assert (process.returncode, complaint) == (143, "lnocl: error: terminated\n")
+        assert list(kernels.iterdir()) == []
+        assert not Path("out.fits").exists()
+
+    def test_signals_do_again_what_they_did(self):
+        before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+        assert run() == 0
+        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+    def test_it_runs_in_a_thread_which_hears_no_signals(self):
+        statuses = []
+        thread = threading.Thread(target=lambda: statuses.append(run("--quiet")))
+        thread.start()
+        thread.join()
+        assert statuses == [0]
+
+    def test_a_stdout_of_ascii_shows_what_it_can(self):
+        done = outside(*self.ARGUMENTS, "-o", "naïve.fits", PYTHONIOENCODING="ascii")
+        assert done.stderr == ""
+        assert done.stdout.endswith("written to na\\xefve.fits\n")
+
+    def test_a_progress_bar_stays_off_a_stderr_that_is_no_terminal(self):
+        assert outside(*self.ARGUMENTS, "-o", "out.fits").stderr == ""
+
+
+class TestDevices:
+    def test_it_lists_what_was_found_and_what_is_used_and_why(self, capsys):
+        assert cli.main(["devices"]) == 0
+        *listed, used = capsys.readouterr().out.splitlines()
+        found = device.find_devices()
+        assert listed == [f"{device.spec_of(each)} {device.describe(each)}" for each in found]
+        choice = device.choose(None)
+        assert used == (
+            f"lnocl uses {device.spec_of(choice.device)} unless told otherwise: {choice.reason}"
+        )

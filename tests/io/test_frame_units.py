@@ -1,0 +1,112 @@
+"""Observations from FITS files: the units of the images, gain and exposure."""
+
+import numpy as np
+import pytest
+from astropy import units as u
+from frame_files import IMAGES, observe, save, save_images
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lnocl.errors import InputError
+from lnocl.scene import units
+
+pytestmark = pytest.mark.usefixtures("frame_folder")
+
+ELECTRONS = ["ELECTRONS", "electron", "Electrons", "COUNTS", "count", "ct", "cts", "e-", "E-", "e",
+             "photon", "electron/pix", "e-/pixel", "", "  "]  # fmt: skip
+RATES = ["ELECTRONS/S", "electron/s/pix", "electron/s", "counts/s", "Counts/sec", "COUNTS/SECOND",
+         "e-/s", "e- s-1", "e/s", "electron s^-1", "electrons per second", "cps"]  # fmt: skip
+DIGITAL = ["DN", "adu", "ADU", "dn", "DN/pixel"]
+DIGITAL_RATES = ["ADU/s", "adu s-1", "DN/s", "DN/sec", "DN/s/pix"]
+OTHERS = ["MJy/sr", "mJy", "10**-20 erg/s/cm2", "mag", "UNKNOWN", "total nonsense", "(", "[e-]"]
+
+
+class TestUnits:
+    @pytest.mark.parametrize("unit", ELECTRONS)
+    def test_counts_are_taken_as_they_are_and_times_the_gain(self, unit):
+        save_images(BUNIT=unit)
+        np.testing.assert_array_equal(observe().images, IMAGES)
+        np.testing.assert_array_equal(observe(exposure=[20.0]).images, IMAGES)
+        np.testing.assert_array_equal(observe(gain=2.5).images, 2.5 * IMAGES)
+
+    @pytest.mark.parametrize("unit", RATES)
+    def test_counts_per_second_are_times_the_exposure(self, unit):
+        save_images(BUNIT=unit)
+        observation = observe(exposure=[20.0, 30.0])
+        expected = IMAGES * np.array([20.0, 30.0])[:, None, None]
+        np.testing.assert_array_equal(observation.images, expected)
+        np.testing.assert_array_equal(observation.exposure, [20.0, 30.0])
+        both = observe(exposure=[20.0, 30.0], gain=2.0)
+        np.testing.assert_array_equal(both.images, 2.0 * expected)
+        with pytest.raises(InputError, match=r"1\.fits holds counts per time; give exposure"):
+            observe()
+        with pytest.raises(InputError, match="holds counts per time"):
+            observe(gain=2.0)
+
+    @pytest.mark.parametrize("unit", [*DIGITAL, *DIGITAL_RATES, *OTHERS])
+    def test_other_units_need_the_gain(self, unit):
+        save_images(BUNIT=unit)
+        with pytest.raises(InputError) as caught:
+            observe(exposure=[20.0])
+        assert str(caught.value) == (
+            f"1.fits is in {unit}, not in counts; give gain, the electrons for each of these units"
+        )
+        expected = IMAGES * (2.0 if unit not in DIGITAL_RATES else 40.0)
+        np.testing.assert_array_equal(observe(exposure=[20.0], gain=2.0).images, expected)
+
+    @pytest.mark.parametrize("unit", DIGITAL_RATES)
+    def test_adu_per_second_need_the_exposure_too(self, unit):
+        save_images(BUNIT=unit)
+        with pytest.raises(InputError, match="holds counts per time"):
+            observe(gain=2.0)
+
+    @pytest.mark.parametrize("unit", ["electron/min", "ADU/min"])
+    def test_a_minute_is_sixty_seconds(self, unit):
+        save_images(BUNIT=unit)
+        found = observe(exposure=[120.0], gain=1.5).images
+        np.testing.assert_allclose(found, 3.0 * IMAGES, rtol=1e-14)
+
+    def test_images_in_several_units_are_refused(self):
+        save("1.fits", IMAGES[0], BUNIT="electron")
+        save("2.fits", IMAGES[1], BUNIT="ADU")
+        with pytest.raises(InputError) as caught:
+            observe(gain=2.0)
+        assert str(caught.value) == (
+            "the images have several units: 1.fits has electron, 2.fits has adu; convert them to "
+            "one"
+        )
+        save("1.fits", IMAGES[0])
+        with pytest.raises(InputError, match=r"1\.fits has no unit, 2\.fits has adu"):
+            observe(gain=2.0)
+        save("2.fits", IMAGES[1], BUNIT="E-")
+        save("1.fits", IMAGES[1], BUNIT="ELECTRONS")
+        observe()
+
+    @pytest.mark.parametrize("gain", [0.0, -1.0, np.nan, np.inf])
+    def test_a_gain_out_of_range(self, gain):
+        save_images()
+        with pytest.raises(InputError, match=f"gain must be more than 0; {gain:g} "):
+            observe(gain=gain)
+
+    @pytest.mark.parametrize("unit", ["-1", "1e400 ct", "4t448", "2u14", "1,", "mag(ct)"])
+    def test_text_that_is_not_a_unit(self, unit):
+        assert isinstance(units.parse(unit), u.UnrecognizedUnit)
+        assert units.count_of(units.parse(unit)) is None
+
+    @settings(max_examples=60, deadline=None)
+    @given(text=st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=12))
+    def test_no_text_of_a_header_breaks_it(self, text):
+        unit = units.parse(text)
+        assert (unit is None) == (not text.strip())
+        if unit is not None:
+            assert isinstance(unit, u.UnitBase)
+            counts = units.count_of(unit)
+            assert counts is None or counts[0] > 0
+
+    @settings(max_examples=30, deadline=None)
+    @given(
+        unit=st.sampled_from(["electron", "ct", "adu", "electron / s", "ct / s", "adu / s"]),
+        change=st.sampled_from([str.upper, str.lower, str.title]),
+    )
+    def test_case_does_not_matter(self, unit, change):
+        assert units.parse(change(unit)) == u.Unit(unit)
