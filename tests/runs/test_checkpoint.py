@@ -437,6 +437,7 @@ def wait_for_change(path, process, before=None):
         time.sleep(0.001)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("solver", "kills", "more"),
     [
@@ -481,6 +482,7 @@ def progress_of(read):
     return 0, read.arrays["kept_at"][-1]
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_one_signal_ends_it_with_a_result_and_a_checkpoint(number, command, tmp_path):
     command = [*command, "--n-iter", "100000"]
@@ -499,6 +501,7 @@ def test_one_signal_ends_it_with_a_result_and_a_checkpoint(number, command, tmp_
     assert checkpoint.read(str(saved)).arrays["progress"][0] == header["NITER"]
 
 
+@pytest.mark.system
 def test_more_than_one_signal_ends_it_at_once(command, tmp_path):
     fits.writeto(tmp_path / "large.fits", np.full((2, 2048, 2048), 50.0, np.float32))
     command = ["large.fits" if word == "images.fits" else word for word in command]
@@ -603,6 +606,7 @@ def test_signals_do_again_what_they_did_once_the_run_is_over():
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", ["found.fits", "images.fits"])
 def test_a_checkpoint_in_the_place_of_other_files_is_refused(name, command, tmp_path):
     process = start(command, tmp_path, "-o", "found.fits", "--checkpoint", name)
@@ -611,6 +615,7 @@ def test_a_checkpoint_in_the_place_of_other_files_is_refused(name, command, tmp_
     assert f"the checkpoint {name} is the output or an input" in complaint
 
 
+@pytest.mark.system
 def test_the_output_does_not_replace_the_checkpoint_gone_on_from(command, saved, tmp_path):
     process = start(command, tmp_path, "-o", saved, "--resume", saved)
     _, complaint = process.communicate()
