@@ -660,6 +660,7 @@ class TestFrames:
         assert Path("figures/objects.png").stat().st_size > 1000
 
 
+@pytest.mark.system
 class TestProcess:
     ARGUMENTS = ("deconvolve", "a.fits", "--psf", "k1.fits", "--n-iter", "1", *NUMPY)
 
