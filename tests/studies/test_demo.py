@@ -288,8 +288,9 @@ class TestPlot:
     def _matplotlib(self):
         pytest.importorskip("matplotlib")
 
-    def test_everything_the_data_allow(self, run, capsys):
+    def test_everything_the_data_allow(self, run, capsys, monkeypatch):
         files, _ = run
+        monkeypatch.setattr("lnocl.plotting.plots.save", lambda _, path, __: Path(path).touch())
         results = [str(files / f"{name}.fits") for name in ("rlm", "mc-rl")]
         truth = str(files / "truth.fits")
         assert cli.main(["plot", *results, "--truth", truth, "-o", "out"]) == 0
