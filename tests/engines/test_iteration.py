@@ -253,12 +253,10 @@ def test_objectives_are_those_of_scipy(engine, recipe):
     assert errors.max() <= OBJECTIVE_TOLERANCES[engine["precision"]]
 
 
+@pytest.mark.exhaustive  # such programs take a minute to build; tests/kernels has groups as well
 @pytest.mark.parametrize(
     ("precision", "recipe"),
-    [
-        pytest.param("single", "64x256 two stars, map", marks=pytest.mark.exhaustive),
-        ("double", "20x50 star, mu, mask, noise"),
-    ],
+    [("single", "64x256 two stars, map"), ("double", "20x50 star, mu, mask, noise")],
 )
 def test_the_tuning_of_a_gpu_gives_the_same(monkeypatch, precision, recipe):
     """Several work-items share a block, whatever device there is."""

@@ -240,7 +240,9 @@ def poison(engine, what):
     """Put NaN into a pixel of what an engine holds."""
     if isinstance(engine, opencl.OpenCLEngine):
         nan = np.full(1, np.nan, engine.program.dtype)
-        cl.enqueue_copy(engine._queue, engine._memory.buffers[what], nan, dst_offset=16 * nan.nbytes)
+        cl.enqueue_copy(
+            engine._queue, engine._memory.buffers[what], nan, dst_offset=16 * nan.nbytes
+        )
     elif what == "extended":
         engine._extended = engine._extended.copy()
         engine._extended[3, 3] = np.nan
