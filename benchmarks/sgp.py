@@ -41,7 +41,7 @@ from lnocl.runs import held_out
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.simulation.simulate import Experiment, Star, Target, hh34, load_target, simulate
-from lnocl.studies import demo, experiment
+from lnocl.studies import experiment, files
 
 SGM_ITERATIONS = {"hh34": 8000, "hh211": 2000}
 STARTS = (0.01, 0.1, 0.5, 0.9)
@@ -336,7 +336,7 @@ def answer(data, device):
     best = sgm[np.argmin(sgm[:, 2])]
     n_sgp = int(follow(simulation, "sgp", 250, within=best[2], device=device)[-1, 0])
     with tempfile.TemporaryDirectory() as folder:
-        demo.write_simulation(folder, "hh34", simulation)
+        files.write_simulation(folder, "hh34", simulation)
         images, psfs = (
             sorted(map(str, Path(folder).glob(f"{kind}_*.fits"))) for kind in ("image", "psf")
         )

@@ -21,7 +21,7 @@ from lnocl import metrics
 from lnocl.errors import InputError, LnoclError
 from lnocl.io import atomic, fitsread, fitswrite
 from lnocl.simulation import simulate
-from lnocl.studies import demo, experiment
+from lnocl.studies import experiment, files
 
 # La Camera et al. (2012), Table 1: rho' and rho'' in percent, with their iterations.
 PAPER = {
@@ -70,7 +70,7 @@ def compute(path, simulation, observation, method, mu, n_iter, every, patience, 
         simulation, observation, method, mu, n_iter, every, patience, progress=True
     )
     minutes = ("MINUTES", (time.monotonic() - start) / 60, "that it took")
-    demo.write_reconstruction(str(path), simulation, found, [*cards, minutes])
+    files.write_reconstruction(str(path), simulation, found, [*cards, minutes])
 
 
 def read_row(path, method, mu, cards):

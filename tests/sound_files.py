@@ -17,7 +17,7 @@ from lnocl.io.frames import Calibration, read_frames
 from lnocl.plotting import plots
 from lnocl.runs import checkpoint
 from lnocl.simulation import simulate
-from lnocl.studies import demo
+from lnocl.studies import figures
 
 SHAPE = (32, 34)
 # Seconds that one file may take.
@@ -140,7 +140,7 @@ def draw(sound, damaged, name):
     files[name.partition(".")[0]] = damaged
     # What matplotlib says of damaged numbers; that they are damaged is said by their DATASUM.
     warnings.filterwarnings("ignore", "Data has no positive values")
-    list(demo.draw(f"{damaged}.figures", [files["result"]], files["truth"], overwrite=True))
+    list(figures.draw(f"{damaged}.figures", [files["result"]], files["truth"], overwrite=True))
 
 
 def read_checkpoint(sound, damaged, name):

@@ -21,9 +21,9 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.studies import demo
+    from lnocl.studies import figures
 
-    for line in demo.draw(
+    for line in figures.draw(
         arguments.output, arguments.results, arguments.truth, arguments.overwrite
     ):
         messages.say([line])

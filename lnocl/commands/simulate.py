@@ -85,7 +85,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     from lnocl.io import atomic
     from lnocl.simulation import simulate
-    from lnocl.studies import demo
+    from lnocl.studies import files
 
     stars = arguments.stars and [simulate.Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
     target = simulate.load_target(arguments.scene, arguments.size, stars)
@@ -103,7 +103,7 @@ def _run(arguments: argparse.Namespace) -> None:
     atomic.check_folder(arguments.output, arguments.overwrite, make=False)
     simulation = simulate.simulate(target, experiment)
     atomic.check_folder(arguments.output, arguments.overwrite)
-    command = demo.write_simulation(
+    command = files.write_simulation(
         arguments.output, arguments.scene, simulation, arguments.overwrite
     )
     messages.say(

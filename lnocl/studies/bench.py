@@ -1,4 +1,4 @@
-"""The command ``lnocl bench``: from a scene or files to a table, its file and its picture."""
+"""The work of ``lnocl bench``: from a scene or files to a table, its file and its figure."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from lnocl.scene.observation import Observation
 from lnocl.simulation.simulate import Simulation, load_target, simulate
 from lnocl.studies import demo, experiment, trade
 
-# Columns that the terminal explains.
-EXPLAINED = ("ms", "to_goal", "deviation", "near_star", "flux", "rho", "front")
+# Columns whose descriptions are printed below the table.
+DESCRIBED = ("ms", "to_goal", "deviation", "near_star", "flux", "rho", "front")
 
 
-class Problem(NamedTuple):
-    """What is reconstructed.
+class BenchmarkInput(NamedTuple):
+    """An observation, and the arguments of its deconvolution.
 
     Attributes
     ----------
     observation : Observation
-        The images.
+        The images and their PSFs.
     stars : sequence of (x, y)
         Positions in pixels, 0-based.
     mu : float
         Weight of the Tikhonov term, per electron.
     inputs : dict
-        Where it came from, for the record.
+        Scene and seed, or files and their checksums, for the record.
     simulation : Simulation or None
-        The truth, where it is known.
+        The simulation, where `observation` is one.
     """
 
     observation: Observation
@@ -47,19 +47,19 @@ class Problem(NamedTuple):
     simulation: Simulation | None = None
 
 
-class Source(Protocol):
-    """Where a problem comes from."""
+class InputSource(Protocol):
+    """A source of benchmark input: the demo's scene, or files."""
 
     @property
     def paths(self) -> list[str]:
-        """Files that it is read from."""
+        """Paths of its files."""
 
-    def load(self) -> Problem:
-        """Return it."""
+    def load(self) -> BenchmarkInput:
+        """Return the input."""
 
 
-class Demo(NamedTuple):
-    """The demo's scene.
+class DemoScene(NamedTuple):
+    """The demo's scene as a source.
 
     Attributes
     ----------
@@ -74,19 +74,19 @@ class Demo(NamedTuple):
 
     @property
     def paths(self) -> list[str]:
-        """Files that it is read from: none."""
+        """An empty list: the scene is simulated."""
         return []
 
-    def load(self) -> Problem:
-        """Simulate it."""
+    def load(self) -> BenchmarkInput:
+        """Simulate the scene."""
         simulation = simulate(load_target(demo.SCENE, self.size))
         inputs = {"scene": demo.SCENE, "size": self.size, "seed": simulation.experiment.seed}
         observation = experiment.observe(simulation)
-        return Problem(observation, simulation.stars, self.mu, inputs, simulation)
+        return BenchmarkInput(observation, simulation.stars, self.mu, inputs, simulation)
 
 
-class Files(NamedTuple):
-    """FITS files, and what `lnocl.Observation` and `lnocl.deconvolve` are told of them."""
+class FitsFiles(NamedTuple):
+    """FITS files as a source, with arguments of `lnocl.Observation` and `lnocl.deconvolve`."""
 
     images: Sequence[str]
     psfs: Sequence[str]
@@ -97,20 +97,20 @@ class Files(NamedTuple):
 
     @property
     def paths(self) -> list[str]:
-        """Files that it is read from."""
+        """Paths of the images and PSFs."""
         return [*self.images, *self.psfs]
 
-    def load(self) -> Problem:
-        """Read them."""
-        known = Calibration(self.background, self.read_noise)
-        read = frames.read_frames(self.images, self.psfs, known)
+    def load(self) -> BenchmarkInput:
+        """Read the files."""
+        calibration = Calibration(self.background, self.read_noise)
+        read = frames.read_frames(self.images, self.psfs, calibration)
         inputs = {
             "images": dict(zip(self.images, read.sha256["images"], strict=True)),
             "psfs": dict(zip(self.psfs, read.sha256["psfs"], strict=True)),
             "background": read.background,
             "read_noise": list(self.read_noise),
         }
-        return Problem(read.observation, self.stars, self.mu, inputs)
+        return BenchmarkInput(read.observation, self.stars, self.mu, inputs)
 
 
 def choose_source(
@@ -121,8 +121,8 @@ def choose_source(
     stars: Sequence[tuple[float, float]],
     mu: float | None,
     size: int | None,
-) -> Source:
-    """Return the files, or the demo's scene where none are given.
+) -> InputSource:
+    """Return the files as a source, or the demo's scene if no image is given.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def choose_source(
     Raises
     ------
     InputError
-        Arguments of files without files, or a size with them.
+        Arguments of images are given without images, a size with them, or images without PSFs.
     """
     if not images:
         given = {"psf": psfs, "background": background, "read-noise": read_noise, "star": stars}
@@ -148,16 +148,16 @@ def choose_source(
             raise InputError(
                 f"{strays[0]} goes with images, and none are given; the demo's scene has its own"
             )
-        return Demo(256 if size is None else size, demo.MU if mu is None else mu)
+        return DemoScene(256 if size is None else size, demo.MU if mu is None else mu)
     if not psfs:
         raise InputError("images need their PSFs: give --psf")
     if size is not None:
         raise InputError("--size is of the demo's scene, and images are given; leave one out")
-    return Files(images, psfs, background or [0.0], read_noise or [0.0], stars, mu or 0.0)
+    return FitsFiles(images, psfs, background or [0.0], read_noise or [0.0], stars, mu or 0.0)
 
 
 def run(
-    source: Source,
+    source: InputSource,
     n_iter: int = 400,
     accuracy: float = 1e-3,
     device: str | None = None,
@@ -165,14 +165,14 @@ def run(
     overwrite: bool = False,
     progress: bool = False,
 ) -> Iterator[str]:
-    """Compare settings on a source; print, write and draw what they cost and how close they come.
+    """Compare the cost and accuracy of settings, and write a table and a figure.
 
-    Interrupted, it reports the runs that are complete, and then raises KeyboardInterrupt.
+    An interrupted comparison reports the runs that are complete, then raises KeyboardInterrupt.
 
     Parameters
     ----------
-    source : Source
-        Of `choose_source`.
+    source : InputSource
+        Source of `choose_source`.
     n_iter, accuracy, device, progress
         As for `lnocl.studies.trade.compare`.
     stem : str, optional
@@ -188,26 +188,26 @@ def run(
     Raises
     ------
     InputError
-        A parameter or an image that cannot be used.
+        A parameter or an image cannot be used.
     DeviceError
-        No OpenCL device, or one that cannot do what was asked of it.
+        No OpenCL device was found, or the device failed.
     FileError
-        A file that cannot be read or written, or that exists and must not be overwritten.
+        A file cannot be read or written, or exists and must not be overwritten.
     """
     trade.check(n_iter, accuracy)
     if stem is not None:
         _check_files(stem, overwrite, source.paths)
-    problem = source.load()
+    given = source.load()
     table = None
     interrupt = None
     try:
         for so_far in trade.compare(
-            problem.observation,
-            problem.stars,
-            problem.mu,
+            given.observation,
+            given.stars,
+            given.mu,
             n_iter,
             accuracy,
-            problem.simulation,
+            given.simulation,
             device,
             progress,
         ):
@@ -215,24 +215,24 @@ def run(
     except KeyboardInterrupt as error:
         interrupt = error
     if table is not None:
-        yield from _report(table, problem, accuracy, stem, overwrite)
+        yield from _report(table, given, accuracy, stem, overwrite)
     if interrupt is not None:
         raise interrupt
 
 
 def _report(
-    table: Table, problem: Problem, accuracy: float, stem: str | None, overwrite: bool
+    table: Table, given: BenchmarkInput, accuracy: float, stem: str | None, overwrite: bool
 ) -> Iterator[str]:
     table.meta |= {
         "version": __version__,
-        "inputs": problem.inputs,
-        "stars": [list(star) for star in problem.stars],
-        "mu": problem.mu,
+        "inputs": given.inputs,
+        "stars": [list(star) for star in given.stars],
+        "mu": given.mu,
     }
     yield f"deviations from {_reference(table)}, on {table.meta['device']}"
     yield from _lines(table)
     yield from (
-        f"{name}: {table[name].description}" for name in EXPLAINED if name in table.colnames
+        f"{name}: {table[name].description}" for name in DESCRIBED if name in table.colnames
     )
     if stem is not None:
         yield from _write(table, stem, overwrite)
@@ -264,16 +264,16 @@ def _write(table: Table, stem: str, overwrite: bool) -> Iterator[str]:
 
 
 def _figure(table: Table) -> plots.Figure:
-    judged = trade.judged(table)
+    column = trade.deviation_column(table)
     settings = {}
     for precision, pad in dict.fromkeys(zip(table["precision"], table["pad"], strict=True)):
         rows = table[(table["precision"] == precision) & (table["pad"] == pad)]
         settings[f"{precision}, {f'pad {pad}' if pad else 'no padding'}"] = {
             "seconds": np.array(rows["seconds"]),
-            "deviation": np.array(rows[judged]),
+            "deviation": np.array(rows[column]),
             "front": np.array(rows["front"]),
         }
-    return plots.costs(settings, "all rows" if judged == "deviation" else "rows around the star")
+    return plots.costs(settings, "all rows" if column == "deviation" else "rows around the star")
 
 
 def _check_files(stem: str, overwrite: bool, inputs: Sequence[str]) -> None:

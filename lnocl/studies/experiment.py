@@ -1,4 +1,4 @@
-"""The paper's experiment: reconstruct a simulation whose truth is known, and measure the result."""
+"""The paper's experiment: a simulation is reconstructed, and measured against its truth."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WIDTH_SHARE = 0.1
 
 @dataclass
 class Reconstruction:
-    """A reconstruction at its best, and how it came there.
+    """The estimate of the smallest error near the star, and the errors of all iterations.
 
     Attributes
     ----------
@@ -46,11 +46,11 @@ class Reconstruction:
         Fields ``iteration``, ``rho`` (rho', restoration error of all rows), ``rho_star``
         (rho'', of the 24 rows around the star) and ``magnitude`` (of the star).
     extended : ndarray of float64, shape (ny, nx)
-        At the smallest rho''; with the star in it for RLM.
+        Estimate at the smallest rho'', electrons per pixel; for RLM the star is in it.
     star_flux : float
-        Electrons, at the smallest rho''; in a 3 x 3 box for RLM.
+        Flux of the star at the smallest rho'', electrons; for RLM in a box of 3 x 3 pixels.
     history : ndarray
-        Fields ``iteration`` and ``objective``, of every iteration done.
+        Fields ``iteration`` and ``objective``, for every iteration.
     device : str
         Name of the device.
     """
@@ -70,30 +70,30 @@ class Reconstruction:
 
     @property
     def name(self) -> str:
-        """Method and mu, for tables and legends."""
+        """Method and mu, as tables and legends show them."""
         return self.method if self.method == "RLM" else f"MC-RL mu={self.mu:g}"
 
 
 class Tracker:
-    """A callback that follows restoration errors and the star's magnitude, and keeps the best.
+    """A callback that measures the errors of estimates, and stores the best estimate.
 
     Parameters
     ----------
     simulation : Simulation
-        With one star.
+        Simulation with one star.
     method : {"RLM", "MC-RL"}
-        Decides how errors and magnitude are measured (La Camera et al. 2012, section 3.2).
+        Method, by which errors and magnitude are measured (La Camera et al. 2012, section 3.2).
     every : int
-        Iterations from one look to the next, 1 or more.
+        Iterations from one measurement to the next, 1 or more.
     n_iter : int
-        The last iteration, which is looked at in any case.
+        The last iteration, which is always measured.
     patience : float, optional
-        Stop when the iterations exceed this many times those of the smallest rho' and rho''.
+        The run stops after this many times the iterations of the smallest rho' and rho''.
 
     Raises
     ------
     InputError
-        Where the simulation has not exactly one star, or `every` is less than 1.
+        The simulation has not exactly one star, or `every` is less than 1.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class Tracker:
         self._smallest = {"rho": (0, np.inf), "rho_star": (0, np.inf)}
 
     def __call__(self, iteration: int, estimate: Estimate) -> bool:
-        """Measure this iteration, if its turn has come; return whether to stop."""
+        """Measure the estimate if this iteration is due, and return whether to stop."""
         if iteration % self._every and iteration != self._n_iter:
             return False
         extended = estimate.extended
@@ -143,7 +143,7 @@ class Tracker:
 
 
 def observe(simulation: Simulation) -> Observation:
-    """Return the observation that a simulation stands for, read noise included."""
+    """Return the images of a simulation as an observation, with background and read noise."""
     return Observation(
         simulation.images,
         simulation.psfs,
@@ -162,27 +162,34 @@ def reconstruct(
     patience: float | None = None,
     **keywords: Any,
 ) -> Reconstruction:
-    """Reconstruct a simulation by one method and follow its errors.
+    """Reconstruct a simulation by one method, and measure its errors on the way.
 
     Parameters
     ----------
     simulation : Simulation
-        With one star.
+        Simulation with one star.
     observation : Observation
-        That of `observe`.
+        The simulation as `observe` returns it.
     method : {"RLM", "MC-RL"}
         Without or with the star as a component of its own.
     mu : float
-        Weight of the Tikhonov term, for MC-RL.
-    n_iter, every, patience
-        Most iterations; iterations between two looks; see `Tracker`.
+        Weight of the Tikhonov term, per electron.
+    n_iter : int
+        Largest number of iterations.
+    every, patience
+        As for `Tracker`.
     **keywords
-        For `lnocl.deconvolve`.
+        Further arguments of `lnocl.deconvolve`.
+
+    Returns
+    -------
+    Reconstruction
+        The estimate of the smallest rho'', and the curve of errors.
 
     Raises
     ------
     InputError
-        Where the simulation has not exactly one star, `every` is less than 1, or
+        The simulation has not exactly one star, `every` is less than 1, or
         `lnocl.deconvolve` refuses a value.
     """
     tracker = Tracker(simulation, method, every, n_iter, patience)
@@ -205,12 +212,11 @@ def width_threshold(truth: Array) -> float:
 
 
 def profile_errors(simulation: Simulation, found: Reconstruction) -> dict[str, float]:
-    """Return the mean absolute relative errors of flux and width profile near the star.
+    """Return the mean absolute relative errors of the flux and width profiles near the star.
 
-    Over the 40 rows around the star, 20 before it and 19 after it, in which the true jet has at
-    least a twentieth of its brightest row (flux), or any pixel above the threshold (width); for
-    RLM without the 3 rows around the star (La Camera et al. 2012, section 4). NaN where there is
-    no such row.
+    The means are over the rows of `near_star` that have a value in `profile_deviations`; for RLM
+    without the 3 rows around the star (La Camera et al. 2012, section 4). They are NaN where no
+    row has a value.
     """
     truth, star = simulation.extended, _only_star(simulation)
     masked = star if found.method == "RLM" else None
@@ -220,19 +226,19 @@ def profile_errors(simulation: Simulation, found: Reconstruction) -> dict[str, f
 
 
 def near_star(star: tuple[int, int]) -> slice:
-    """Return the 40 rows around the star, 20 before it and 19 after it, those that are there."""
+    """Return the 40 rows around the star, 20 before it and 19 after it, cut at the edges."""
     return slice(max(star[1] - NEAR_STAR, 0), star[1] + NEAR_STAR)
 
 
 def profile_deviations(
     extended: Array, truth: Array, masked: tuple[int, int] | None = None
 ) -> dict[str, Array]:
-    """Return the signed relative errors of flux and width profile, row by row.
+    """Return the signed relative errors of the flux and width profiles, row by row.
 
     Parameters
     ----------
     extended, truth : ndarray of float64, shape (ny, nx)
-        The source to measure and the one to measure it by, electrons per pixel.
+        The estimate and the true source, electrons per pixel.
     masked : (x, y), optional
         Position of the star around which 3 rows are left out, where it is in `extended` (RLM).
 

@@ -1,4 +1,4 @@
-"""What accuracy costs: settings timed, and measured against the answer in double precision."""
+"""Cost against accuracy: settings are timed, and measured against double precision."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.simulation.simulate import Simulation
 from lnocl.studies import experiment
 
-# Estimates are kept after these shares of the iterations: an eighth, a quarter, half, all.
+# Estimates are measured after an eighth, a quarter, half and all of the iterations.
 PARTS = (8, 4, 2, 1)
 
 # Columns of the table: unit, format on the terminal, and description.
 COLUMNS = {
-    "precision": (None, "s", "of the arithmetic"),
+    "precision": (None, "s", "precision of the arithmetic"),
     "pad": ("pix", "d", "least unobserved pixels round the images"),
-    "iterations": (None, "d", "done"),
-    "ms": ("ms", ".3g", "an iteration, mean of the run from its second one on"),
-    "seconds": ("s", ".3g", "of the iterations"),
-    "to_goal": ("s", ".3g", "to the reference's last objective times 1 + accuracy; NaN: never"),
-    "deviation": (None, ".1e", "of the extended source from the reference, all rows"),
+    "iterations": (None, "d", "iterations done"),
+    "ms": ("ms", ".3g", "time of an iteration, mean over the run from its second one on"),
+    "seconds": ("s", ".3g", "time of all iterations"),
+    "to_goal": ("s", ".3g", "time to the reference's last objective times 1 + accuracy, or NaN"),
+    "deviation": (None, ".1e", "deviation of the extended source from the reference, all rows"),
     "near_star": (None, ".1e", "the same, 24 rows around the first star"),
     "star_flux": (None, ".1e", "largest deviation of a star's flux"),
     "flux": (None, ".1e", "largest deviation of the flux profile"),
@@ -40,24 +40,24 @@ COLUMNS = {
     "rho": (None, ".2%", "rho', error of the extended source, all rows"),
     "rho_star": (None, ".2%", "rho'', the same, 24 rows around the star"),
     "mag_error": ("mag", ".4f", "magnitude of the star less the true one"),
-    "front": (None, "", "nothing is both faster and closer to the reference"),
+    "front": (None, "", "whether no other setting is faster and closer to the reference"),
 }
 
 
 def check(n_iter: int, accuracy: float) -> None:
-    """Check the parameters of `compare`, before any work is done.
+    """Check the parameters of `compare` before any work is done.
 
     Parameters
     ----------
     n_iter : int
-        Most iterations.
+        Iterations of the longest run, 8 or more.
     accuracy : float
-        Deviation that is good enough.
+        Deviation that is close enough, positive.
 
     Raises
     ------
     InputError
-        Where `n_iter` is less than 8, or `accuracy` is not positive and finite.
+        `n_iter` is less than 8, or `accuracy` is not positive and finite.
     """
     if not (isinstance(n_iter, (int, np.integer)) and n_iter >= PARTS[0]):
         raise InputError(f"n_iter must be a whole number, {PARTS[0]} or more; {n_iter} was given")
@@ -75,7 +75,7 @@ def compare(
     device: str | None = None,
     progress: bool = False,
 ) -> Iterator[Table]:
-    r"""Time and measure the settings of `lnocl.deconvolve`, against double precision.
+    r"""Time settings of `lnocl.deconvolve`, and measure each against double precision.
 
     The reference :math:`(f_0, c_0)` is the estimate in double precision, without padding, after
     `n_iter` iterations. For both precisions, without padding and with half the PSF's larger axis,
@@ -88,9 +88,9 @@ def compare(
     Parameters
     ----------
     observation : Observation
-        The images, p of shape (ny, nx), and what is known of them.
+        The images, p of shape (ny, nx).
     stars : sequence of (x, y), optional
-        As for `lnocl.deconvolve`. The first one is that of the rows around the star.
+        As for `lnocl.deconvolve`. "Near the star" is near the first.
     mu : float, optional
         As for `lnocl.deconvolve`, per electron.
     n_iter : int, optional
@@ -98,27 +98,27 @@ def compare(
     accuracy : float, optional
         Relative excess over the reference's objective that `to_goal` times, positive.
     simulation : Simulation, optional
-        What `observation` was made from, with one star, where the truth is known.
+        The simulation that `observation` was made from, with one star, where there is one.
     device : str, optional
         As for `lnocl.deconvolve`.
     progress : bool, optional
-        Show a progress bar on stderr, where that is a terminal.
+        Whether a progress bar is shown on stderr, where that is a terminal.
 
     Yields
     ------
     Table
-        After each run, of all runs so far: a row for each setting, with the columns of `COLUMNS`
-        (``rho``, ``rho_star`` and ``mag_error`` where the truth is known). Times in seconds and
-        milliseconds, of the iterations alone; deviations relative, 1 is all of the reference.
-        NaN in ``near_star`` and ``rho_star`` where there is no star, or where its 24 rows do not
-        fit in the image. ``flux`` and ``width`` are over the rows that count in
-        `lnocl.studies.experiment.profile_errors`; without a star, over those of the whole image.
-        The meta of the table holds device, iterations and accuracy.
+        After each run, a table of all runs so far: a row for each setting, with the columns of
+        `COLUMNS`, of which ``rho``, ``rho_star`` and ``mag_error`` need the truth. Times are of
+        the iterations alone. Deviations are shares of the reference. ``near_star`` and
+        ``rho_star`` are NaN where there is no star, or where its 24 rows do not fit in the image.
+        ``flux`` and ``width`` are over the rows of `lnocl.studies.experiment.profile_errors`;
+        without a star, over those of the whole image. The meta of the table holds device,
+        iterations and accuracy.
 
     Raises
     ------
     InputError
-        `check` or `lnocl.deconvolve` refuses a value, or the images hold no light.
+        `check` or `lnocl.deconvolve` refuses a value, or the reference is 0 everywhere.
     DeviceError
         As for `lnocl.deconvolve`: no double precision, or too little memory for the padding.
 
@@ -141,31 +141,31 @@ def compare(
             device=device, pad=setting.pad, callback=callback,
         )  # fmt: skip
 
-    reconstruct(settings[0], 1)  # what it refuses is refused before the bar shows
+    reconstruct(settings[0], 1)  # raises errors and gives warnings before the bar is shown
     checkpoints = sorted({n_iter // part for part in PARTS})
     rows: list[dict[str, Any]] = []
-    yardstick = None
+    reference = None
     with make_bar(len(settings) * len(checkpoints), "row", progress) as bar:
         _compile(settings[1:], reconstruct)
         for setting in settings:
-            watch = Watch(checkpoints, bar.update)
+            timer = IterationTimer(checkpoints, bar.update)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", LnoclWarning)  # the first run has said it
-                result = reconstruct(setting, n_iter, watch)
-            yardstick = yardstick or ReferenceSolution.of(result, stars, accuracy, simulation)
-            rows += _rows(setting, watch, result, yardstick)
+                warnings.simplefilter("ignore", LnoclWarning)  # the first run has given it
+                result = reconstruct(setting, n_iter, timer)
+            reference = reference or ReferenceSolution.of(result, stars, accuracy, simulation)
+            rows += _rows(setting, timer, result, reference)
             yield _tabulate(rows, device=result.device, n_iter=n_iter, accuracy=accuracy)
 
 
-def front(seconds: ArrayLike, deviations: ArrayLike) -> NDArray[np.bool_]:
-    """Return which settings nothing beats on both sides, their Pareto front.
+def pareto_front(seconds: ArrayLike, deviations: ArrayLike) -> NDArray[np.bool_]:
+    """Return which settings are on the Pareto front of time and deviation.
 
-    A setting is beaten by one that is as fast and as close at least, and faster or closer.
+    A setting is off the front if another is at least as fast and as close, and faster or closer.
 
     Parameters
     ----------
     seconds, deviations : array_like, shape (n,)
-        Small is good.
+        The two costs of each setting.
 
     Returns
     -------
@@ -175,12 +175,12 @@ def front(seconds: ArrayLike, deviations: ArrayLike) -> NDArray[np.bool_]:
     Raises
     ------
     InputError
-        Where they are no real numbers, or some are masked.
+        They are not real numbers, or some are masked.
 
     Examples
     --------
-    >>> from lnocl.trade import front
-    >>> front([1.0, 2.0, 3.0], [0.1, 0.2, 0.0])
+    >>> from lnocl.studies.trade import pareto_front
+    >>> pareto_front([1.0, 2.0, 3.0], [0.1, 0.2, 0.0])
     array([ True, False,  True])
     """
     s, d = numbers("seconds", seconds), numbers("deviations", deviations)
@@ -189,30 +189,30 @@ def front(seconds: ArrayLike, deviations: ArrayLike) -> NDArray[np.bool_]:
     return ~(no_worse & better).any(axis=0) & ~np.isnan(s) & ~np.isnan(d)
 
 
-def judged(table: Table) -> str:
-    """Return the column that `front` and `advice` go by: near the star, where it is known."""
+def deviation_column(table: Table) -> str:
+    """Return the name of the deviation that counts: near the star, or of all rows without one."""
     return "deviation" if np.isnan(table["near_star"]).any() else "near_star"
 
 
 def advice(table: Table, accuracy: float) -> str:
-    """Return a sentence: the fastest setting whose deviation is within the accuracy.
+    """Return a sentence that names the fastest setting within an accuracy.
 
     Parameters
     ----------
     table : Table
-        Of `compare`.
+        Table of `compare`.
     accuracy : float
-        Deviation that is good enough, around the first star, or of all rows without one.
+        Largest deviation in the column of `deviation_column`.
 
     Returns
     -------
     str
-        The setting with its time and deviation, or that there is none.
+        The setting with its time and deviation; or the sentence says that no setting is so close.
     """
-    column = judged(table)
+    column = deviation_column(table)
     good = table[table[column] <= accuracy]
     if not len(good):
-        return f"for an accuracy of {accuracy:g}: no setting comes so close to the reference"
+        return f"for an accuracy of {accuracy:g}: no setting is so close to the reference"
     best = good[int(np.argmin(good["seconds"]))]
     padding = f"{best['pad']} pixels of padding" if best["pad"] else "no padding"
     return (
@@ -223,12 +223,12 @@ def advice(table: Table, accuracy: float) -> str:
 
 @dataclass(frozen=True)
 class Setting:
-    """What is varied between runs.
+    """The precision and padding of a run.
 
     Attributes
     ----------
     precision : {"single", "double"}
-        Of the arithmetic.
+        Precision of the arithmetic.
     pad : int
         Least unobserved pixels round the images.
     """
@@ -237,39 +237,39 @@ class Setting:
     pad: int
 
 
-class Watch:
-    """A callback that keeps estimates and times the iterations between them.
+class IterationTimer:
+    """A callback that times iterations, and stores the estimates at some of them.
 
-    The clock starts when the first iteration is done, so it holds no compilation, no upload and
-    no start-up; it stands while the callback works on an estimate.
+    The clock starts after the first iteration, and so holds neither compilation nor start-up. It
+    stands while the callback reads an estimate.
 
     Parameters
     ----------
     checkpoints : collection of int
-        Iterations whose estimate is kept.
-    tell : callable
-        Called, without arguments, at each checkpoint, with the clock stopped.
+        Iterations whose estimate is stored.
+    on_checkpoint : callable
+        Called without arguments at each checkpoint, with the clock stopped.
 
     Attributes
     ----------
-    kept : dict of int to (ndarray, ndarray)
+    estimates : dict of int to (ndarray, ndarray)
         Extended source, shape (ny, nx), and star fluxes, shape (n,), electrons, by iteration.
     """
 
-    def __init__(self, checkpoints: Collection[int], tell: Callable[[], Any]) -> None:
-        self.kept: dict[int, tuple[Array, Array]] = {}
-        self._checkpoints, self._tell = checkpoints, tell
+    def __init__(self, checkpoints: Collection[int], on_checkpoint: Callable[[], Any]) -> None:
+        self.estimates: dict[int, tuple[Array, Array]] = {}
+        self._checkpoints, self._on_checkpoint = checkpoints, on_checkpoint
         self._spans: list[float] = []
         self._fetches: list[float] = []
         self._resumed = math.nan
         self._last = 0
 
     def __call__(self, iteration: int, estimate: Estimate) -> None:
-        """Keep the estimate, where this iteration is a checkpoint."""
+        """Store the estimate if this iteration is a checkpoint."""
         if iteration != 1 and iteration not in self._checkpoints:
             return
-        # The device runs behind the host: reading waits for it, so that this span holds the
-        # iterations and one fetch; a second read, which need not wait, tells what a fetch takes.
+        # Reading waits for the device, which runs behind the host. So this span holds the
+        # iterations and one fetch; a second read does not wait, and times the fetch alone.
         extended = estimate.extended
         arrived = time.perf_counter()
         del estimate.extended
@@ -278,37 +278,37 @@ class Watch:
         if iteration > 1:
             self._spans.append(arrived - self._resumed)
         if iteration in self._checkpoints:
-            self.kept[iteration] = extended, estimate.star_fluxes
-            self._tell()
+            self.estimates[iteration] = extended, estimate.star_fluxes
+            self._on_checkpoint()
         self._last = iteration
         self._resumed = time.perf_counter()
 
     @property
     def seconds_each(self) -> float:
-        """Mean time of an iteration, seconds, of those after the first."""
-        # The shortest fetch: a machine that does something else only makes them longer.
+        """Mean time of the iterations after the first, in seconds."""
+        # The shortest fetch is the best measure: other work on the machine only adds to it.
         fetching = len(self._spans) * min(self._fetches)
         return (sum(self._spans) - fetching) / (self._last - 1)
 
 
 @dataclass(frozen=True)
 class ReferenceSolution:
-    """What estimates are measured by: the reference and, where it is known, the truth.
+    """The solution in double precision, and the truth where it is known, to measure estimates by.
 
     Attributes
     ----------
     extended : ndarray of float64, shape (ny, nx)
-        The reference's, electrons per pixel.
+        Extended source of the reference, electrons per pixel.
     star_fluxes : ndarray of float64, shape (n,)
-        The reference's, electrons.
+        Star fluxes of the reference, electrons.
     goal : float
-        Objective to be reached.
+        Objective of the column ``to_goal``.
     star : (x, y) or None
-        The first star.
+        Pixel of the first star.
     rows : slice or None
-        The rows around it, where they fit.
+        The 24 rows around it, where they fit in the image.
     simulation : Simulation or None
-        The truth.
+        The simulation, which holds the truth.
     """
 
     extended: Array
@@ -326,7 +326,7 @@ class ReferenceSolution:
         accuracy: float,
         simulation: Simulation | None,
     ) -> ReferenceSolution:
-        """Return the yardstick that a reference makes."""
+        """Return the reference that a result makes."""
         extended = reference.extended
         if not extended.any():
             raise InputError("the images hold no light above their background to measure")
@@ -335,13 +335,13 @@ class ReferenceSolution:
         rows = star and _rows_around(star, extended.shape)
         return cls(extended, reference.star_fluxes, goal, star, rows, simulation)
 
-    def reached(self, objectives: Array) -> float:
-        """Return the iterations to the goal; NaN where it is not reached."""
+    def iterations_to_goal(self, objectives: Array) -> float:
+        """Return the number of iterations to the goal; NaN where it is not reached."""
         within = np.flatnonzero(objectives <= self.goal)
         return float(within[0]) if within.size else math.nan
 
     def measure(self, extended: Array, star_fluxes: Array) -> dict[str, float]:
-        """Return the columns of an estimate, deviations first, errors where there is a truth."""
+        """Return the deviations of an estimate, and its errors from the truth, by column."""
         profiles = experiment.profile_deviations(extended, self.extended)
         near = slice(None) if self.star is None else experiment.near_star(self.star)
         columns = {
@@ -372,34 +372,34 @@ class ReferenceSolution:
 
 
 def _compile(settings: Sequence[Setting], reconstruct: Callable[[Setting, int], Result]) -> None:
-    """Do one iteration of each: kernels are compiled, and what cannot run is refused at once."""
+    """Do one iteration of each setting, which compiles its kernels and raises its errors early."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LnoclWarning)  # the first run has said it
+        warnings.simplefilter("ignore", LnoclWarning)  # the first run has given it
         for setting in settings:
             reconstruct(setting, 1)
 
 
 def _rows(
-    setting: Setting, watch: Watch, result: Result, yardstick: ReferenceSolution
+    setting: Setting, timer: IterationTimer, result: Result, reference: ReferenceSolution
 ) -> Iterator[dict[str, Any]]:
-    each = watch.seconds_each
-    for iterations, (extended, star_fluxes) in watch.kept.items():
+    each = timer.seconds_each
+    for iterations, (extended, star_fluxes) in timer.estimates.items():
         yield {
             "precision": setting.precision,
             "pad": setting.pad,
             "iterations": iterations,
             "ms": 1e3 * each,
             "seconds": each * iterations,
-            "to_goal": each * yardstick.reached(result.history["objective"]),
-            **yardstick.measure(extended, star_fluxes),
+            "to_goal": each * reference.iterations_to_goal(result.history["objective"]),
+            **reference.measure(extended, star_fluxes),
         }
 
 
 def _tabulate(rows: Sequence[dict[str, Any]], **meta: Any) -> Table:
     table = Table(rows=list(rows), names=list(rows[0]), meta=meta)
-    # To the digits shown: rounding alone does not make a setting closer than another.
-    shown = [float(f"{deviation:.1e}") for deviation in table[judged(table)]]
-    table["front"] = front(table["seconds"], shown)
+    # Only the digits that are shown count: rounding alone makes no setting closer than another.
+    shown = [float(f"{deviation:.1e}") for deviation in table[deviation_column(table)]]
+    table["front"] = pareto_front(table["seconds"], shown)
     for name in table.colnames:
         unit, form, description = COLUMNS[name]
         column = table[name]

@@ -20,6 +20,7 @@ from lnocl.runs.progress import Bar
 pytestmark = pytest.mark.usefixtures("command_folder")
 
 
+@pytest.mark.system
 class TestProcess:
     ARGUMENTS = ("deconvolve", "a.fits", "--psf", "k1.fits", "--n-iter", "1", *NUMPY)
 

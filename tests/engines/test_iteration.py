@@ -157,16 +157,23 @@ def scipy_iteration(made):
         extended = extended * (correction + pull) / divisor
 
 
-# One precision of these is left to CI: the other shows that the path is right.
+# These are left to CI: another precision or scene shows that the path is right.
 EXHAUSTIVE = {
     "opencl-single": (
         "1x60 star",
         "64x2 mu, smoothing",
         "16x32 star, mu, mask, noise",
         "512x16 three stars",
+        "64x64 four images, no background",
+        "20x50 star, mu, mask, noise",
         "8x128 exposure map, star between pixels",
     ),
     "opencl-double": (
+        "2x2",
+        "1x60 star",
+        "64x2 mu, smoothing",
+        "512x16 three stars",
+        "20x32 exposure map, star between pixels, mu, mask, noise",
         "64x256 two stars, map",
         "64x64 four images, no background",
         "16x16 three stars, pad, mask",
@@ -246,6 +253,7 @@ def test_objectives_are_those_of_scipy(engine, recipe):
     assert errors.max() <= OBJECTIVE_TOLERANCES[engine["precision"]]
 
 
+@pytest.mark.exhaustive  # such programs take a minute to build; tests/kernels has groups as well
 @pytest.mark.parametrize(
     ("precision", "recipe"),
     [("single", "64x256 two stars, map"), ("double", "20x50 star, mu, mask, noise")],

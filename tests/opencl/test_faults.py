@@ -149,7 +149,7 @@ def test_a_log_that_cannot_be_saved_is_no_other_error(monkeypatch):
     assert "could not be saved" in refused()
 
 
-@pytest.mark.exhaustive
+@pytest.mark.system
 def test_memory_that_is_really_short():
     code = """
 import resource
@@ -171,6 +171,7 @@ for room in (170, 200, 230):
     assert "too little memory free: the scene takes 1" in done.stdout
 
 
+@pytest.mark.system
 def test_a_fork_after_opencl_is_refused():
     """Both a new run and one that was begun before the fork."""
     code = """
@@ -202,6 +203,7 @@ print(deconvolve())
     assert float(parent) > 0
 
 
+@pytest.mark.system
 def test_a_fork_before_opencl_works():
     code = """
 process = os.fork()
@@ -217,6 +219,7 @@ print(deconvolve())
     assert one == other
 
 
+@pytest.mark.system
 def test_a_fork_after_opencl_may_use_the_reference():
     code = """
 deconvolve()

@@ -30,6 +30,9 @@ GRIDS = SQUARES + OBLONGS
 # Columns are the transform in one dimension; these grids have every length from 2 to 8192.
 LENGTHS = sorted({ny: (ny, nx) for ny, nx in SQUARES + OBLONGS[:2]}.values())
 DTYPES = (np.float32, np.float64)
+# One grid of every kind of pass, one more precision of the smallest and of a square; CI runs all.
+FEW = [(2, 2), (16, 2), (64, 8), (8, 1024), (128, 128)]
+FEW_DOUBLE = [(2, 2), (128, 128)]
 ACCURATE_L2 = {np.float32: 5e-7, np.float64: 1e-15}
 
 
@@ -42,6 +45,21 @@ def accurate_worst(dtype, n):
 @functools.cache
 def transform(grid, dtype):
     return Transform(cl.Context([choose().device]), grid, np.dtype(dtype))
+
+
+def runs(grids):
+    """Return each grid in each precision, most of them for CI alone."""
+    return [
+        pytest.param(
+            grid,
+            dtype,
+            marks=[]
+            if grid in (FEW if dtype is np.float32 else FEW_DOUBLE)
+            else [pytest.mark.exhaustive],
+        )
+        for grid in grids
+        for dtype in DTYPES
+    ]
 
 
 def rounded(values, dtype):
@@ -67,8 +85,7 @@ def columns_of(grid, dtype):
     return rounded(rng.normal(size=shape) + 1j * rng.normal(size=shape), dtype)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("grid", LENGTHS)
+@pytest.mark.parametrize(("grid", "dtype"), runs(LENGTHS))
 def test_one_dimension(grid, dtype):
     t, columns, n = transform(grid, dtype), columns_of(grid, dtype), grid[0]
     before = columns.copy()
@@ -78,18 +95,7 @@ def test_one_dimension(grid, dtype):
     assert np.array_equal(columns, before)
 
 
-@pytest.mark.parametrize(
-    ("grid", "dtype"),
-    [
-        pytest.param(
-            grid,
-            dtype,
-            marks=[pytest.mark.exhaustive] if dtype is np.float64 and grid not in LENGTHS else [],
-        )
-        for grid in GRIDS
-        for dtype in DTYPES
-    ],
-)
+@pytest.mark.parametrize(("grid", "dtype"), runs(GRIDS))
 def test_two_dimensions(grid, dtype):
     t, n = transform(grid, dtype), grid[0] * grid[1]
     pixels = rounded(np.random.default_rng(n).normal(size=grid), dtype)
@@ -99,8 +105,7 @@ def test_two_dimensions(grid, dtype):
     assert_accurate(t.irfft2(t.rfft2(pixels)), pixels, dtype, n)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("grid", [(2, 2), (16, 2), (64, 8), (8, 1024), (128, 128)])
+@pytest.mark.parametrize(("grid", "dtype"), runs(FEW))
 class TestIdentities:
     def test_impulse_is_flat_and_exact(self, grid, dtype):
         pixels = np.zeros(grid)
@@ -137,6 +142,7 @@ class TestIdentities:
         assert power.sum() == pytest.approx(energy, rel=2 * ACCURATE_L2[dtype])
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_error_grows_as_the_root_of_the_logarithm(dtype, record_property):
     """RMS error = c (log2 N)^power against long double; the power is reported, about 1/2."""

@@ -40,6 +40,8 @@ SCENES = {
 PERIODIC = [name for name, recipe in SCENES.items() if not recipe.pad]
 WITH_MU = [name for name, recipe in SCENES.items() if recipe.mu]
 WITH_STARS = [name for name, recipe in SCENES.items() if recipe.n_stars]
+# In double precision CI tests the others.
+DOUBLE = ("bare", "three stars, mask, map, mu")
 every_scene = pytest.mark.parametrize("name", SCENES)
 
 
@@ -189,6 +191,13 @@ MINIMA = {
 }
 # Those that OpenCL programs are built for; test_iteration.py has exposures on both engines.
 SMALL = [name for name in MINIMA if "large" not in name and "exposures" not in name]
+
+
+def rarely(name):
+    """Return a scene as a parameter, for CI alone unless it is a small one."""
+    return pytest.param(name, marks=[] if name in SMALL else [pytest.mark.exhaustive])
+
+
 # Of J, of the extended source and of the star fluxes. Measured: in double 1.1e-15, 4.1e-8 and
 # 1.5e-9, which is where L-BFGS-B ends; in single 6.2e-7, 9.5e-4 and 7.9e-6; after 5000 iterations
 # of the split-gradient method 2.5e-9, 6.4e-5 and 3.9e-6.
@@ -220,7 +229,14 @@ def errors_at_the_minimum(name, result):
     [
         pytest.param(*engine.values, name, id=f"{engine.id}-{name}", marks=engine.marks)
         for engine in FEWER_ENGINES
-        for name in (MINIMA if engine.id == "numpy" else SMALL)
+        for name in SMALL
+    ]
+    + [
+        pytest.param(
+            *FEWER_ENGINES[0].values, name, id=f"numpy-{name}", marks=pytest.mark.exhaustive
+        )
+        for name in MINIMA
+        if name not in SMALL
     ],
 )
 def test_minimum_is_that_of_l_bfgs_b(engine, name):
@@ -231,7 +247,7 @@ def test_minimum_is_that_of_l_bfgs_b(engine, name):
     assert problem.off_the_minimum(unknowns(result)) <= OFF_THE_MINIMUM[engine["precision"]]
 
 
-@pytest.mark.parametrize("name", MINIMA)
+@pytest.mark.parametrize("name", [rarely(name) for name in MINIMA])
 def test_split_gradient_method_has_the_same_minimum(name):
     result = MINIMA[name].make().deconvolve(solver="sgm", n_iter=5000, engine="numpy")
     errors = errors_at_the_minimum(name, result)
@@ -411,8 +427,18 @@ TWIN_TOLERANCES = {
 }
 
 
-@every_scene
-@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize(
+    ("precision", "name"),
+    [
+        pytest.param(
+            precision,
+            name,
+            marks=[pytest.mark.exhaustive] if precision == "double" and name not in DOUBLE else [],
+        )
+        for precision in ("double", "single")
+        for name in SCENES
+    ],
+)
 def test_engines_agree(precision, name):
     tolerances = TWIN_TOLERANCES[precision]
 
@@ -432,7 +458,13 @@ def test_engines_agree(precision, name):
         assert (np.array(errors) <= tolerances[iteration]).all(), (iteration, errors)
 
 
-@pytest.mark.parametrize("name", WITH_MU)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in DOUBLE else [pytest.mark.exhaustive])
+        for name in WITH_MU
+    ],
+)
 def test_engines_agree_after_a_hundred_iterations(name):
     """In double and with mu: else rounding has become a share of the answer by then."""
     result = run(name, n_iter=100, engine="opencl", precision="double")
@@ -696,7 +728,9 @@ def test_a_shortened_step_has_the_scaling_of_its_base():
     assert worst(*found) <= 8e-16  # measured 2.8e-16
 
 
-@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize(
+    "precision", ["single", pytest.param("double", marks=pytest.mark.exhaustive)]
+)
 def test_steps_take_three_images_more_and_at_most_one_for_each_star(precision):
     name = "four images, three stars"
     without = engine_of(name, precision, takes_steps=False)

@@ -15,7 +15,7 @@ import lnocl
 from lnocl.commands import cli, messages
 from lnocl.io import fitsread, fitswrite
 from lnocl.simulation import simulate
-from lnocl.studies import demo, experiment
+from lnocl.studies import demo, experiment, figures, files
 
 SMALL = ("--size", "64")
 
@@ -176,7 +176,7 @@ class TestSimulate:
         Path("out").mkdir()
         Path("out/record.json").write_text("kept")
         with pytest.raises(lnocl.FileError, match=r"record.json exists"):
-            demo.write_simulation("out", "hh34", simulation)
+            files.write_simulation("out", "hh34", simulation)
         assert Path("out/record.json").read_text() == "kept"
 
         def fail(*names):
@@ -187,7 +187,7 @@ class TestSimulate:
         replace = os.replace
         monkeypatch.setattr(os, "replace", fail)
         with pytest.raises(lnocl.FileError, match=r"record.json cannot be written: No space"):
-            demo.write_simulation("out", "hh34", simulation, overwrite=True)
+            files.write_simulation("out", "hh34", simulation, overwrite=True)
         assert Path("out/record.json").read_text() == "kept"
         assert not list(Path("out").glob(".lnocl*"))
 
@@ -288,8 +288,9 @@ class TestPlot:
     def _matplotlib(self):
         pytest.importorskip("matplotlib")
 
-    def test_everything_the_data_allow(self, run, capsys):
+    def test_everything_the_data_allow(self, run, capsys, monkeypatch):
         files, _ = run
+        monkeypatch.setattr("lnocl.plotting.plots.save", lambda _, path, __: Path(path).touch())
         results = [str(files / f"{name}.fits") for name in ("rlm", "mc-rl")]
         truth = str(files / "truth.fits")
         assert cli.main(["plot", *results, "--truth", truth, "-o", "out"]) == 0
@@ -317,7 +318,7 @@ class TestPlot:
             )
         paths = [f"{name}.fits" for name in "abcd"]
         saved = [fitsread.read_result(path) for path in paths]
-        assert demo._names(paths, saved) == [
+        assert figures._names(paths, saved) == [
             "RLM",
             "MC-RL mu=0 (b.fits)",
             "MC-RL mu=0 (c.fits)",

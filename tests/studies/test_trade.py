@@ -121,9 +121,9 @@ class TestNumbers:
         assert np.isnan(table["near_star"]).all()
         assert np.isnan(table["star_flux"]).all() == (not stars)
         assert np.isfinite(table["flux"]).all()
-        assert trade.judged(table) == "deviation"
+        assert trade.deviation_column(table) == "deviation"
         shown = [float(f"{deviation:.1e}") for deviation in table["deviation"]]
-        expected = trade.front(table["seconds"], shown)
+        expected = trade.pareto_front(table["seconds"], shown)
         np.testing.assert_array_equal(table["front"], expected)
 
     @pytest.mark.usefixtures("numpy_only")
@@ -170,13 +170,13 @@ class Clock:
 def test_the_clock_holds_the_iterations_after_the_first_and_nothing_else(checkpoints, monkeypatch):
     clock = Clock()
     monkeypatch.setattr(trade.time, "perf_counter", lambda: clock.now)
-    watch = trade.Watch(checkpoints, clock.tell)
+    timer = trade.IterationTimer(checkpoints, clock.tell)
     for iteration in range(1, 9):
         clock.pending += 100.0 if iteration == 1 else 2.0
-        watch(iteration, clock)
+        timer(iteration, clock)
         clock.__dict__.pop("extended", None)  # lnocl makes a new estimate for each call
-    assert watch.seconds_each == 2.0
-    assert list(watch.kept) == checkpoints
+    assert timer.seconds_each == 2.0
+    assert list(timer.estimates) == checkpoints
 
 
 COSTS = st.one_of(st.integers(0, 4).map(float), st.just(float("nan")))
@@ -193,7 +193,7 @@ def test_front_is_what_brute_force_finds(settings):
 
     expected = [not np.isnan([s, d]).any() and not beaten(s, d) for s, d in settings]
     seconds, deviations = zip(*settings, strict=True)
-    assert trade.front(seconds, deviations).tolist() == expected
+    assert trade.pareto_front(seconds, deviations).tolist() == expected
 
 
 class TestAdvice:
@@ -212,7 +212,7 @@ class TestAdvice:
 
     def test_where_there_is_none_it_says_so(self, tables):
         assert trade.advice(tables[0][:3], 1e-9) == (
-            "for an accuracy of 1e-09: no setting comes so close to the reference"
+            "for an accuracy of 1e-09: no setting is so close to the reference"
         )
 
 
@@ -299,7 +299,7 @@ class TestCommand:
 
     @pytest.mark.parametrize("ending", ["ecsv", "png"])
     def test_existing_files_are_refused_before_the_work(self, ending, capsys, monkeypatch):
-        monkeypatch.setattr(bench.Files, "load", lambda source: pytest.fail("work was begun"))
+        monkeypatch.setattr(bench.FitsFiles, "load", lambda source: pytest.fail("work was begun"))
         Path(f"out.{ending}").write_text("kept")
         assert run(*FILES, "-o", "out") == 1
         captured = capsys.readouterr()
@@ -346,7 +346,7 @@ class TestCommand:
 def test_the_front_has_no_masked_settings():
     seconds = np.ma.array([1.0, 2.0, 3.0], mask=[False, True, True])
     with pytest.raises(lnocl.InputError, match="seconds has 2 masked values; fill them or leave"):
-        trade.front(seconds, [1.0, 2.0, 3.0])
+        trade.pareto_front(seconds, [1.0, 2.0, 3.0])
 
 
 def test_the_figure_joins_the_front_and_marks_the_reference():

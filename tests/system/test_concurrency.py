@@ -17,6 +17,8 @@ import lnocl
 from lnocl.io.fitsread import read_stack
 from lnocl.runs.held_out import split_counts
 
+pytestmark = pytest.mark.system
+
 
 def arguments(seed, n):
     rng = np.random.default_rng(seed)

@@ -9,6 +9,8 @@ import pytest
 from lnocl.engines import opencl
 
 BENCHMARKS = str(Path(__file__).parents[2] / "benchmarks")
+pytestmark = pytest.mark.system
+
 COUNTS = {"iterate": 2000, "deconvolve": 50}
 
 
@@ -21,7 +23,6 @@ def leaks(monkeypatch):
     return leaks
 
 
-@pytest.mark.exhaustive
 @pytest.mark.parametrize("work", COUNTS)
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
 def test_memory_and_files_stay_as_they_are(leaks, solver, work):
@@ -29,7 +30,6 @@ def test_memory_and_files_stay_as_they_are(leaks, solver, work):
     assert leaks.is_flat(row), row
 
 
-@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", ["memory", "files"])
 def test_planted_leaks_are_found(leaks, monkeypatch, kind):
     """An engine that keeps a MiB, which is touched, or a file open."""

@@ -35,9 +35,12 @@ EXCUSED = "Uninitialized value written to global memory address in put_part, inp
 BUILD_OPTIONS = "-O0 -disable-llvm-passes -D__builtin_prefetch(p)=((void)(p))"
 OPTIONS = ["--data-races", "--uniform-writes", "--uninitialized", "--max-errors", "100000"]
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("oclgrind") is None, reason="oclgrind is not there: apt-get install oclgrind"
-)
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(
+        shutil.which("oclgrind") is None, reason="oclgrind is not there: apt-get install oclgrind"
+    ),
+]
 
 RUNS = [
     pytest.param(

@@ -26,7 +26,10 @@ from lnocl.psf.make import make_psf
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the real data are not at ../shared/data")
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(not DATA.is_dir(), reason="the real data are not at ../shared/data"),
+]
 
 engines = pytest.mark.parametrize("engine", ["opencl", "numpy"])
 
@@ -236,7 +239,6 @@ class TestAltair:
             atol=1e-3 * stars[0].psf.max(),
         )  # fmt: skip
 
-    @pytest.mark.exhaustive
     def test_the_example_makes_four_psfs(self, tmp_path):
         """The shell script, with this lnocl in its path."""
         pytest.importorskip("matplotlib")
@@ -327,7 +329,6 @@ def example():
     return module
 
 
-@pytest.mark.exhaustive  # .ci/run runs the scripts anyway
 class TestExamples:
     """What docs/real.md says of examples/*.sh."""
 

@@ -5,6 +5,8 @@ from scenes import Recipe, worst
 
 from lnocl.opencl.device import find_devices, spec_of
 
+pytestmark = pytest.mark.system
+
 RECIPE = Recipe((20, 50), 3, 1, mu=1e-3, masked=0.03, background="map", read_noise=(0.5, 1.0, 1.5))
 # Of extended source and star fluxes after 1000 iterations. PoCL 3.0, PoCL 3.1 and Intel's CPU
 # runtime agreed bit for bit; compilers may fuse multiply and add otherwise and still be right.
