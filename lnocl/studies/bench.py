@@ -16,7 +16,7 @@ from lnocl.io import atomic, frames
 from lnocl.io.frames import Calibration, Word
 from lnocl.plotting import plots
 from lnocl.scene.observation import Observation
-from lnocl.simulation.simulate import Simulation, load_target, simulate
+from lnocl.simulation import Simulation, load_target, simulate
 from lnocl.studies import demo, experiment, trade
 
 # Columns that the terminal explains.

@@ -13,7 +13,7 @@ from lnocl import __version__, metrics
 from lnocl.errors import InputError, LnoclError
 from lnocl.io import atomic, fitsread, fitswrite
 from lnocl.plotting import plots
-from lnocl.simulation.simulate import Experiment, Simulation, load_target, simulate
+from lnocl.simulation import Experiment, Simulation, load_target, simulate
 from lnocl.studies import experiment
 from lnocl.studies.experiment import Reconstruction
 

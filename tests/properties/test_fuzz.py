@@ -23,7 +23,7 @@ from lnocl.io import fitsread, fitswrite, sky
 from lnocl.io.frames import Calibration, read_frames
 from lnocl.plotting import plots
 from lnocl.runs import checkpoint
-from lnocl.simulation import simulate
+from lnocl.simulation import load_target
 from lnocl.studies import demo
 
 SHAPE = (32, 34)
@@ -150,7 +150,7 @@ def read_stars(sound, damaged, name):
 
 
 def read_scene(sound, damaged, name):
-    simulate.load_target(damaged)
+    load_target(damaged)
 
 
 def read_saved(sound, damaged, name):

@@ -18,7 +18,7 @@ from scipy.ndimage import fourier_shift
 from lnocl.errors import InputError, LnoclError, LnoclWarning
 from lnocl.psf.make import MARGIN, N_SHARED_STEPS, make_psf, make_psfs
 from lnocl.psf.repair import MIN_GOOD, WINDOW
-from lnocl.simulation.simulate import fizeau_psf
+from lnocl.simulation import fizeau_psf
 
 
 def fizeau(angle=0.0, n=256, scale=9.0, strehl=1.0):

@@ -16,7 +16,7 @@ from scipy.signal import resample
 from scipy.special import j1
 
 from lnocl.errors import FileError, InputError
-from lnocl.simulation.simulate import (
+from lnocl.simulation import (
     Experiment,
     Star,
     Target,

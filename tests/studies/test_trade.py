@@ -17,7 +17,7 @@ import lnocl
 from lnocl import metrics
 from lnocl.commands import cli
 from lnocl.plotting import plots
-from lnocl.simulation import simulate
+from lnocl.simulation import hh34, simulate
 from lnocl.studies import bench, demo, experiment, trade
 
 MADE = Recipe((32, 32), n_images=2, n_stars=1, mu=1e-4).make()
@@ -238,7 +238,7 @@ class TestCommand:
     def test_the_demo_has_a_truth(self, capsys):
         assert run("--size", "64", "-o", "out") == 0
         table = Table.read("out.ecsv")
-        simulation = simulate.simulate(simulate.hh34(64))
+        simulation = simulate(hh34(64))
         result = lnocl.deconvolve(
             experiment.observe(simulation),
             simulation.stars,
