@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,17 @@ from numpy.typing import NDArray
 from lnocl import __version__, metrics
 from lnocl.errors import InputError, LnoclError
 from lnocl.io import atomic, fitsread, fitswrite
-from lnocl.plotting import plots
+from lnocl.plotting.curves import errors, held_out_errors, magnitudes, objectives
+from lnocl.plotting.figure import check, save
+from lnocl.plotting.overview import overview
+from lnocl.plotting.profiles import profiles
+from lnocl.plotting.sources import Frame, Source, objects
 from lnocl.simulation import Experiment, Simulation, load_target, simulate
 from lnocl.studies import experiment
 from lnocl.studies.experiment import Reconstruction
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SCENE = "hh34"
 # Weight and iterations of the demo. At 256 x 256 and seed 0, rho'' of MC-RL is 6.6 % at mu 0,
@@ -243,7 +251,7 @@ def draw(
     InputError
         Where the shapes of the files differ, or one holds no flux or values that are not finite.
     """
-    plots.check()
+    check()
     atomic.check_folder(folder, overwrite, FIGURE_FILES, make=False)
     results = list(dict.fromkeys(results))
     saved = [fitsread.read_result(path) for path in results]
@@ -251,31 +259,31 @@ def draw(
     _check_saved([*([] if true is None else [true]), *saved])
     names = _names(results, saved)
     sources = [
-        plots.Source(name, each.extended, holds_star=not each.stars)
+        Source(name, each.extended, holds_star=not each.stars)
         for name, each in zip(names, saved, strict=True)
     ]
     frame = _frame([*([] if true is None else [true]), *saved])
-    original = None if true is None else plots.Source("truth", true.extended)
+    original = None if true is None else Source("truth", true.extended)
     curves = _tables(names, [each.curve for each in saved])
     histories = _tables(names, [each.history for each in saved])
     atomic.check_folder(folder, overwrite, FIGURE_FILES)
-    yield _draw(folder, "objects", plots.objects(original, sources, frame), overwrite)
+    yield _draw(folder, "objects", objects(original, sources, frame), overwrite)
     if curves:
-        yield _draw(folder, "errors", plots.errors(curves), overwrite)
-        yield _draw(folder, "magnitude", plots.magnitudes(curves, _true_magnitude(true)), overwrite)
+        yield _draw(folder, "errors", errors(curves), overwrite)
+        yield _draw(folder, "magnitude", magnitudes(curves, _true_magnitude(true)), overwrite)
     else:
         yield "errors and magnitude skipped: no file has a table CURVE (lnocl demo writes it)"
         if histories:
-            yield _draw(folder, "objective", plots.objectives(histories), overwrite)
+            yield _draw(folder, "objective", objectives(histories), overwrite)
     held_out = _tables(names, [each.held_out for each in saved])
     if held_out:
-        yield _draw(folder, "held-out", plots.held_out_errors(held_out), overwrite)
+        yield _draw(folder, "held-out", held_out_errors(held_out), overwrite)
     if original is None or frame.star is None:
         yield "flux and width skipped: they need --truth with a star"
         return
     threshold = experiment.width_threshold(original.extended)
     for kind in ("flux", "width"):
-        figure = plots.profiles(kind, original, sources, frame, experiment.NEAR_STAR, threshold)
+        figure = profiles(kind, original, sources, frame, experiment.NEAR_STAR, threshold)
         yield _draw(folder, kind, figure, overwrite)
 
 
@@ -347,20 +355,20 @@ def _pictures(
     folder: str, simulation: Simulation, found: Sequence[Reconstruction], overwrite: bool
 ) -> Iterator[str]:
     try:
-        plots.check()
+        check()
     except LnoclError as error:
         yield f"no pictures: {error}"
         return
     scale = float(simulation.experiment.pixel_scale.value)
-    figure = plots.overview(
-        plots.Source("truth", simulation.extended, note="the jet without its star"),
-        plots.Source(
+    figure = overview(
+        Source("truth", simulation.extended, note="the jet without its star"),
+        Source(
             "one of the images",
             simulation.images[0] - simulation.background[0],
             note="sky subtracted",
         ),
         [
-            plots.Source(
+            Source(
                 each.name,
                 each.extended,
                 each.method == "RLM",
@@ -369,7 +377,7 @@ def _pictures(
             )
             for each in found
         ],
-        plots.Frame(simulation.stars[0], scale),
+        Frame(simulation.stars[0], scale),
         experiment.NEAR_STAR,
     )
     yield _draw(folder, "demo", figure, overwrite)
@@ -377,9 +385,9 @@ def _pictures(
     yield from draw(folder, results, _in(folder, "truth"), overwrite)
 
 
-def _draw(folder: str, name: str, figure: plots.Figure, overwrite: bool) -> str:
+def _draw(folder: str, name: str, figure: Figure, overwrite: bool) -> str:
     path = os.path.join(folder, f"{name}.png")
-    plots.save(figure, path, overwrite)
+    save(figure, path, overwrite)
     return f"drew {path}"
 
 
@@ -407,10 +415,10 @@ def _tables(
     }
 
 
-def _frame(saved: Sequence[fitsread.SavedResult]) -> plots.Frame:
+def _frame(saved: Sequence[fitsread.SavedResult]) -> Frame:
     star = next((each.stars[0] for each in saved if each.stars), None)
     scale = next((each.number("PIXSCALE") for each in saved if "PIXSCALE" in each.header), None)
-    return plots.Frame(star, scale)
+    return Frame(star, scale)
 
 
 def _true_magnitude(true: fitsread.SavedResult | None) -> float | None:

@@ -266,16 +266,15 @@ class TestPicture:
         pytest.importorskip("matplotlib")
 
     def test_it_is_drawn(self, capsys, monkeypatch):
-        from lnocl.plotting import plots
+        from lnocl.plotting.psf import star_psf
 
         drawn = []
 
         def draw(*arguments):
             drawn.append(arguments)
-            return original(*arguments)
+            return star_psf(*arguments)
 
-        original = plots.star_psf
-        monkeypatch.setattr(plots, "star_psf", draw)
+        monkeypatch.setattr("lnocl.plotting.psf.star_psf", draw)
         assert run("--plot", "a.PNG", "--rotate", "0", "45", "--mask", "mask.fits") == 0
         assert capsys.readouterr().out.splitlines()[-1] == "drew a.PNG"
         assert Path("a.PNG").read_bytes().startswith(b"\x89PNG")

@@ -21,7 +21,6 @@ from test_fitsread import PHYSICAL, SIP
 from lnocl.errors import FileError, InputError, LnoclError, LnoclWarning
 from lnocl.io import fitsread, fitswrite, sky
 from lnocl.io.frames import Calibration, read_frames
-from lnocl.plotting import plots
 from lnocl.runs import checkpoint
 from lnocl.simulation import load_target
 from lnocl.studies import demo
@@ -289,7 +288,8 @@ def fuzz(seeds, sound, folder):
 @pytest.fixture
 def quick_figures(monkeypatch):
     """Draw, but do not render, which is what takes the time and knows nothing of the files."""
-    monkeypatch.setattr(plots, "save", lambda figure, path, overwrite: None)
+    for module in ("lnocl.plotting.figure", "lnocl.studies.demo"):
+        monkeypatch.setattr(f"{module}.save", lambda figure, path, overwrite: None)
 
 
 CASES = 300

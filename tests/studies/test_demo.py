@@ -166,7 +166,9 @@ class TestSimulate:
         assert os.listdir() == []
 
     def test_a_folder_that_cannot_be_made_is_refused_before_the_work(self, capsys, monkeypatch):
-        monkeypatch.setattr(simulate, "simulate", lambda *arguments: pytest.fail("work was begun"))
+        monkeypatch.setattr(
+            "lnocl.simulation.simulate", lambda *arguments: pytest.fail("work was begun")
+        )
         Path("text").write_text("kept")
         assert cli.main(["simulate", "hh34", *SMALL, "-o", "text/out"]) == 1
         assert "text/out cannot be used" in one_complaint(capsys.readouterr())
@@ -250,7 +252,7 @@ class TestSimulate:
             asked.append(experiment)
             raise lnocl.InputError("enough")
 
-        monkeypatch.setattr(simulate, "simulate", refuse)
+        monkeypatch.setattr("lnocl.simulation.simulate", refuse)
         assert cli.main(["simulate", "hh34", *SMALL, "-o", "out", *stated]) == 2
         assert str(asked[0]) == str(Experiment())
 
@@ -272,7 +274,9 @@ class TestSimulate:
         ("arguments", "status", "message"), BAD_SIMULATE.values(), ids=BAD_SIMULATE
     )
     def test_refusals(self, arguments, status, message, capsys, monkeypatch):
-        monkeypatch.setattr(simulate, "simulate", lambda *arguments: pytest.fail("work was begun"))
+        monkeypatch.setattr(
+            "lnocl.simulation.simulate", lambda *arguments: pytest.fail("work was begun")
+        )
         fits.writeto("dark.fits", np.zeros((64, 64)))
         Path("text.fits").write_text("no FITS")
         Path("full").mkdir()
