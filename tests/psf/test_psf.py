@@ -16,8 +16,9 @@ from scipy import special
 from scipy.ndimage import fourier_shift
 
 from lnocl.errors import InputError, LnoclError, LnoclWarning
-from lnocl.psf.make import MARGIN, N_SHARED_STEPS, make_psf, make_psfs
+from lnocl.psf.make import N_SHARED_STEPS, make_psf, make_psfs
 from lnocl.psf.repair import MIN_GOOD, WINDOW
+from lnocl.psf.steps import MARGIN
 from lnocl.simulation import fizeau_psf
 
 
