@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,8 +18,8 @@ MIN_SIZE = 3
 LARGEST = 1e150
 
 
-def _read(frame: ArrayLike, mask: ArrayLike | None) -> tuple[Array, Mask]:
-    """Return a float64 copy with NaN where it is bad, and where that is."""
+def read_frame(frame: ArrayLike, mask: ArrayLike | None) -> tuple[Array, Mask]:
+    """Return a float64 copy with NaN in bad pixels, and a mask, True where a pixel is bad."""
     given, masked = values_and_mask("frame", frame)
     pixels = numbers("frame", given)
     if pixels.ndim != 2 or pixels.size == 0:
@@ -39,23 +40,26 @@ def _read(frame: ArrayLike, mask: ArrayLike | None) -> tuple[Array, Mask]:
     return pixels, bad
 
 
-def _one_number(name: str, value: object) -> float:
+def one_number(name: str, value: object) -> float:
+    """Return one finite number."""
     array = numbers(name, value)  # type: ignore[arg-type]
     if array.ndim or not np.isfinite(array):
         raise InputError(f"{name} is {value!r}; give one finite number")
     return float(array)
 
 
-def _saturation(saturation: float | None) -> float:
+def saturation_level(saturation: float | None) -> float:
+    """Return the level from which on a pixel is saturated; infinite by default."""
     if saturation is None:
         return math.inf
-    level = _one_number("saturation", saturation)
+    level = one_number("saturation", saturation)
     if level <= 0:
         raise InputError(f"saturation must be positive; {level:g} was given")
     return level
 
 
-def _size(size: int | None) -> int | None:
+def whole_size(size: int | None) -> int | None:
+    """Return the side of the PSF, pixels; None where the largest is to be taken."""
     if size is None:
         return None
     try:
@@ -67,6 +71,16 @@ def _size(size: int | None) -> int | None:
     return side
 
 
-def _angle(rotate: float) -> float:
-    """Return the angle in [-180, 180], degrees."""
-    return math.remainder(_one_number("rotate", rotate), 360)
+def wrapped_angles(rotate: Sequence[float]) -> list[float]:
+    """Return the angles in [-180, 180], degrees."""
+    angles = [math.remainder(one_number("rotate", angle), 360) for angle in rotate]
+    if not angles:
+        raise InputError("rotate holds no angle; give one or more")
+    return angles
+
+
+def refuse_unless_bool(**flags: object) -> None:
+    """Refuse flags that are neither True nor False."""
+    for name, flag in flags.items():
+        if not isinstance(flag, bool | np.bool_):
+            raise InputError(f"{name} is {flag!r}; give True or False")

@@ -7,34 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError
-from lnocl.psf import resampling
+from lnocl.psf import checks, resampling, steps
 from lnocl.psf.centring import Mask, Pixel, Point
-from lnocl.psf.checks import _angle, _read, _saturation, _size
-from lnocl.psf.repair import WINDOW
-from lnocl.psf.steps import (
-    MARGIN,
-    _at,
-    _background,
-    _centre,
-    _crop,
-    _cut,
-    _find,
-    _fit,
-    _middle,
-    _nearest,
-    _negative,
-    _region,
-    _repair,
-    _rotate,
-    _stay,
-    _warn_of_guess,
-    _warn_of_ringing,
-)
 
 Array = NDArray[np.float64]
 # The first steps, which do not depend on the angle: star, background, bad pixels, centre.
@@ -43,21 +23,21 @@ N_SHARED_STEPS = 4
 
 @dataclass(frozen=True)
 class StarPsf:
-    """A PSF made from a frame of a star, and how it was made.
+    """A PSF made from a frame of a star, and the record of its making.
 
     Attributes
     ----------
     psf : ndarray of float64, shape (k, k)
         Point spread function of unit sum, the star's centre at ``(k // 2, k // 2)``.
     steps : tuple of str
-        What was done, one line for each step, in order, with its numbers. The flux left out of
-        the crop is measured with the noise of all pixels of that square.
+        One line for each step, in order, with its numbers. The flux left out of the crop is
+        measured with the noise of all pixels of that square.
     flux : float
         Flux of the PSF before it was normalised, in the unit of the frame.
     centre : tuple of float
-        Where ``(k // 2, k // 2)`` lies in the frame: (x, y), 0-based pixels.
+        Position of ``(k // 2, k // 2)`` in the frame: (x, y), 0-based pixels.
     background : float
-        What was subtracted, in the unit of the frame.
+        The level that was subtracted, in the unit of the frame.
     frame : ndarray of float64, shape (ny, nx)
         The frame as it was given; NaN where it was masked.
     bad : ndarray of bool, shape (ny, nx)
@@ -99,20 +79,23 @@ def make_psf(
     its neighbours or twice that. Bad pixels with fewer than `MIN_GOOD` good ones in the square of
     side `WINDOW` around them, where all beyond the frame counts as bad, are set to the background.
 
-    **The centre** is that of the circular Gaussian that fits the star best by least squares
-    (adaptive moments). It is not the brightest pixel: it is the centre of the light in the core,
-    and of a disc crossed by fringes it is the centre of the disc, wherever the fringes lie, so
-    PSFs at several angles turn about the same point of the sky. Rms error in a coordinate, on
-    Fizeau, Airy and Gaussian stars of 2 pixels (FWHM) and wider: 0.004 pixels and less without
-    noise, 0.007 to 0.015 with noise of 1/100 of the peak in each pixel, 0.03 to 0.08 with 1/20.
-    Without noise it is 0.02 where the FWHM is 1.5, and 0.05 where it is 1.
+    **The centre** is that of the circular Gaussian that fits the star best by least squares,
+    together with a constant and without the bad pixels. It is not the brightest pixel: it is the
+    centre of the light in the core, and of a disc crossed by fringes it is the centre of the disc,
+    wherever the fringes lie, so PSFs at several angles turn about the same point of the sky. Rms
+    error in a coordinate, on Fizeau, Airy and Gaussian stars of 2 pixels (FWHM) and wider: 0.004
+    pixels and less without noise, 0.005 to 0.012 with noise of 1/100 of the peak in each pixel,
+    0.025 to 0.06 with 1/20. Without noise it is 0.002 where the FWHM is 1.5, and 0.012 where it
+    is 1. Stars that are brighter within 12 pixels pull it away.
 
-    **The shift** to the middle of a pixel is by the phase of the Fourier transform: exact where
-    the pixels sample the PSF, two to its FWHM and more. Where they do not it rings: the darkest
-    pixel of a Gaussian of FWHM 1, 1.5, 2, 2.5, 3 pixels has -8, -1.6, -0.4, -0.05, -0.004 % of
-    its peak after the worst of shifts, and all negative ones of 65 x 65 have -50, -14, -2.4, -0.3,
-    -0.02 % of its flux. Where negative pixels grow by more than `RINGING` a warning says so.
-    ``recentre=False`` leaves the pixels as they are.
+    **The shift** to the middle of a pixel takes the star for a sum of Gaussians on its pixels
+    (`lnocl.scene.shifting.place`). It is exact where the pixels sample the PSF, two to its FWHM
+    and more. Below that it blurs, by 7 to 10 % of the peak at a FWHM of 1.5, and it rings where
+    the star lies near the edge of a pixel: the darkest pixel of a Gaussian of FWHM 1, 1.5, 2, 2.5,
+    3 pixels has -8, -1.8, -0.38, -0.04, -0.003 % of its peak after the worst of shifts, and all
+    negative ones of 65 x 65 have -26, -7.6, -1.6, -0.18, -0.016 % of its flux. A quarter of a
+    pixel from the middle these are -8, -1.2, -0.45, -0.05, -0.004 %. Where negative pixels grow by
+    more than `RINGING` a warning says so. ``recentre=False`` leaves the pixels as they are.
 
     **The rotation** is by three shears in Fourier space (Unser et al.), which on a simulated
     Fizeau PSF at Nyquist's sampling is right to 3e-5 of the peak, where cubic splines are to 4e-2
@@ -127,13 +110,13 @@ def make_psf(
         Image of a star, in any linear unit. A pixel that is not finite, or that is masked in a
         `numpy.ma` array or a CCDData, is bad. Nothing else may be masked.
     position : tuple of float, optional
-        Where the star is: (x, y), 0-based pixels, to `SEARCH` pixels. By default at the brightest
+        Position of the star: (x, y), 0-based pixels, to `NEAR` pixels. By default the brightest
         pixel of the frame after a median filter of 3 x 3 good pixels.
     size : int, optional
         Side k of the PSF, pixels, 3 or more. By default the largest that the frame has around
         the star, at this rotation.
     background : float or "auto", optional
-        What to subtract, in the unit of the frame. "auto" is the median of the good pixels, after
+        Level to subtract, in the unit of the frame. "auto" is the median of the good pixels, after
         clipping at 3 sigma, in a square ring around the crop, half as wide as it; in the frame's
         border where fewer than `MIN_SKY` are there, or where no size is given.
     mask : array_like of bool, shape (ny, nx), optional
@@ -144,7 +127,7 @@ def make_psf(
         Whether to find the star's centre and to shift it to the middle of a pixel. Otherwise the
         pixel at `position` is moved as it is.
     clip_negative : bool, optional
-        Whether to set negative pixels to 0; the flux of the PSF grows by what they held.
+        Whether to set negative pixels to 0; the flux of the PSF grows by their flux.
     rotate : float, optional
         Angle, degrees, from the x axis towards the y axis: counter-clockwise with y up. The PSF
         of a baseline at angle a becomes that of one at a + rotate. Multiples of 90 degrees are
@@ -159,21 +142,20 @@ def make_psf(
     ------
     InputError
         Where an argument has the wrong type, shape or range, or, but for the frame, holds masked
-        values; where the star is outside the frame
-        or not found; where the crop does not fit in the frame; where no good pixel is left;
-        where the star is a hole too wide to be repaired; where nothing is above the
-        background.
+        values; where the star is outside the frame or not found; where the crop does not fit in
+        the frame; where no good pixel is left; where too few pixels of the star are good to repair
+        the others; where nothing is above the background.
 
     Warns
     -----
     LnoclWarning
-        Saturated pixels in the PSF, whose repair is a guess; bad pixels too far from good ones
-        that were set to the background; ringing where the star is undersampled.
+        Saturated pixels in the PSF, whose repair is a guess; bad pixels with too few good ones
+        around them, which were set to the background; ringing of an undersampled star.
 
     References
     ----------
-    G. M. Bernstein, M. Jarvis, AJ 123, 583 (2002), for adaptive moments; M. Unser, P. Thévenaz,
-    L. Yaroslavsky, IEEE Trans. Image Process. 4, 1371 (1995), for rotation by shears.
+    M. Unser, P. Thévenaz, L. Yaroslavsky, IEEE Trans. Image Process. 4, 1371 (1995), for rotation
+    by shears.
 
     Examples
     --------
@@ -185,10 +167,10 @@ def make_psf(
     >>> print(*star.steps, sep="\n")
     star: brightest pixel of the median-filtered frame, x = 23, y = 19
     background: 100, as given, subtracted
-    bad pixels: none
+    bad pixels: 0 in the frame
     centre: x = 23.300, y = 18.800, FWHM 4.71 pixels; shifted by x -0.300, y 0.200
     crop: 21 x 21 pixels; 0.00 % of the flux in the largest square there is, 39 x 39, left out
-    negative pixels: 0, 0.00 % of the flux; kept
+    negative pixels: 0, 0.00 % of the flux; left as they are
     normalised: flux 125664 set to 1
     """
     (star,) = _make(
@@ -261,72 +243,76 @@ def _make(
     clip_negative: bool,
     rotate: Sequence[float],
 ) -> list[StarPsf]:
-    given, bad = _read(frame, mask)
-    saturated = ~bad & (given >= _saturation(saturation))
-    # A repaired pixel takes nothing from its value, however far beyond the level that is.
-    pixels = np.where(bad, 0.0, np.minimum(given, _saturation(saturation)))
-    side, angles = _size(size), [_angle(angle) for angle in rotate]
-    for name, flag in (("recentre", recentre), ("clip_negative", clip_negative)):
-        if not isinstance(flag, bool | np.bool_):
-            raise InputError(f"{name} is {flag!r}; give True or False")
-    if not angles:
-        raise InputError("rotate holds no angle; give one or more")
+    """Return the PSFs at all angles; the arguments are those of `make_psfs`."""
+    given, bad = checks.read_frame(frame, mask)
+    saturated = ~bad & (given >= checks.saturation_level(saturation))
     unusable = bad | saturated
+    side, angles = checks.whole_size(size), checks.wrapped_angles(rotate)
+    checks.refuse_unless_bool(recentre=recentre, clip_negative=clip_negative)
     if unusable.all():
-        raise InputError("all pixels of the frame are bad; there is no star to be seen")
-    steps = []
-
-    start, line = _find(pixels, bad, position)
-    steps.append(line)
+        raise InputError("all pixels of the frame are bad; give a frame that shows a star")
+    # A repaired pixel takes nothing from its value, however far beyond the level that is.
+    pixels = np.where(bad, 0.0, np.minimum(given, checks.saturation_level(saturation)))
     half = None if side is None else max(resampling.reach(side, angle) for angle in angles)
-    level, line = _background(background, pixels, unusable, start, half)
-    steps.append(line)
+
+    start, found = steps.find_star(pixels, bad, position)
+    level, measured = steps.measure_background(background, pixels, unusable, start, half)
     light = np.where(unusable, 0.0, pixels - level)
-    region = _region(pixels.shape, start, half)
-    unrepairable, line = _repair(light, unusable, saturated, region)
-    steps.append(line)
-    centre, line = _centre(light, region, start, level) if recentre else _stay(start)
-    steps.append(line)
-    pixel = _nearest(centre)
-    side = min(_fit(given.shape, pixel, side, angle) for angle in angles)
-    if unrepairable[pixel]:
-        raise InputError(
-            f"the star at {_at(pixel)} is a hole: only few of the {WINDOW} x {WINDOW} pixels "
-            "there are good; take a frame with a shorter exposure"
+    region = steps.reachable(pixels.shape, start, half)
+    unrepairable, repaired = steps.repair_bad(light, unusable, saturated, region)
+    centre, shift, centred = steps.find_centre(light, unusable, start, level, recentre)
+    pixel = steps.nearest_pixel(centre)
+    side = min(steps.fitting_side(given.shape, pixel, side, angle) for angle in angles)
+    steps.refuse_hole(unrepairable, pixel)
+    squares = [
+        _make_square(light, pixel, shift, side, angle, level, clip_negative) for angle in angles
+    ]
+    steps.warn_of_guess(saturated, light, pixel, side)
+    steps.warn_of_ringing([square.negative_shares for square in squares])
+    shared = (found, measured, repaired, centred)
+    return [
+        StarPsf(
+            square.psf / square.flux,
+            (*shared, *square.lines),
+            square.flux,
+            (centre[1], centre[0]),
+            level,
+            given,
+            unusable,
         )
-    by = (pixel[0] - centre[0], pixel[1] - centre[1]) if recentre else None
-    stars, rung = [], []
-    for angle in angles:
-        psf, share, lines = _turn(light, pixel, by, side, angle, level, clip_negative)
-        rung.append(share)
-        flux = float(psf.sum())
-        lines = [*steps, *lines, f"normalised: flux {flux:.6g} set to 1"]
-        at = centre[1], centre[0]
-        stars.append(StarPsf(psf / flux, tuple(lines), flux, at, level, given, unusable))
-    _warn_of_guess(_cut(saturated, pixel, side // 2), _cut(light, pixel, side // 2))
-    _warn_of_ringing(rung)
-    return stars
+        for square in squares
+    ]
 
 
-def _turn(
+class _Square(NamedTuple):
+    """A PSF at one angle, its flux, its negative shares before and after, and its lines."""
+
+    psf: Array
+    flux: float
+    negative_shares: tuple[float, float]
+    lines: tuple[str, ...]
+
+
+def _make_square(
     light: Array,
     pixel: Pixel,
-    by: Point | None,
+    shift: Point | None,
     side: int,
     angle: float,
     level: float,
     clip_negative: bool,
-) -> tuple[Array, tuple[float, float], list[str]]:
-    """Return the PSF at an angle, the negative share of its flux before and after, and lines."""
+) -> _Square:
     lines = []
-    work = before = _cut(light, pixel, resampling.reach(side, angle) + MARGIN)
-    if by is not None:
-        work = resampling.shift(work, by)
+    work = before = steps.cut_square(light, pixel, resampling.reach(side, angle) + steps.MARGIN)
+    if shift is not None:
+        work = resampling.shift(work, shift)
     if angle:
-        work, line = _rotate(work, angle, side // 2)
+        work, line = steps.rotate_square(work, angle, side // 2)
         lines.append(line)
-    psf, line = _crop(work, side, light, pixel, level)
+    psf, line = steps.crop_square(work, side, light, pixel, level)
     lines.append(line)
-    share = [float(-image.clip(max=0).sum() / psf.sum()) for image in (_middle(before, side), psf)]
-    psf, line = _negative(psf, clip_negative)
-    return psf, (share[0], share[1]), [*lines, line]
+    negative_shares = steps.negative_shares(steps.middle_square(before, side), psf)
+    psf, line = steps.count_negative(psf, clip_negative)
+    flux = float(psf.sum())
+    normalised = f"normalised: flux {flux:.6g} set to 1"
+    return _Square(psf, flux, negative_shares, (*lines, line, normalised))

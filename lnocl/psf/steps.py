@@ -12,23 +12,23 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl.errors import InputError, warn
 from lnocl.psf import resampling
 from lnocl.psf.centring import FWHM, SEARCH, Array, Mask, Pixel, Point, brightest, fit_gaussian
-from lnocl.psf.checks import MIN_SIZE, _one_number
-from lnocl.psf.repair import repair
+from lnocl.psf.checks import MIN_SIZE, one_number
+from lnocl.psf.repair import WINDOW, repair
 from lnocl.scene.observation import numbers
 
-# Pixels kept around the crop while it is shifted and rotated, since Fourier shifts wrap.
+# Pixels around the crop while it is shifted and rotated: both wrap round its edges.
 MARGIN = 16
-# Pixels that a background is measured from, at least.
+# Fewest pixels that a background is measured from.
 MIN_SKY = 100
 # Width of the frame's border, as a share of the shorter side.
 BORDER = 1 / 16
-# By how much a shift or a rotation may make negative pixels grow without a warning: a share of the
-# flux, and of what they were, since noise is not what it was after either.
+# Growth of negative pixels by shift and rotation that calls for a warning: a share of the flux on
+# top of a share of the negative flux before, since both change noise too.
 RINGING, OF_NOISE = 0.01, 0.2
 
 
-def _find(pixels: Array, bad: Mask, position: ArrayLike | None) -> tuple[Pixel, str]:
-    """Return the pixel at the star."""
+def find_star(pixels: Array, bad: Mask, position: ArrayLike | None) -> tuple[Pixel, str]:
+    """Return the star's pixel: the one at `position`, or the brightest."""
     ny, nx = pixels.shape
     if position is None:
         start = brightest(pixels, bad)
@@ -36,7 +36,7 @@ def _find(pixels: Array, bad: Mask, position: ArrayLike | None) -> tuple[Pixel, 
     given = numbers("position", position)
     if given.shape != (2,) or not np.isfinite(given).all():
         raise InputError(f"position is {position!r}; give two finite numbers, x and y")
-    start = _nearest((float(given[1]), float(given[0])))
+    start = nearest_pixel((float(given[1]), float(given[0])))
     if not (0 <= start[0] < ny and 0 <= start[1] < nx):
         raise InputError(
             f"position ({given[0]:g}, {given[1]:g}) is outside the frame of {nx} x {ny} pixels; "
@@ -45,22 +45,23 @@ def _find(pixels: Array, bad: Mask, position: ArrayLike | None) -> tuple[Pixel, 
     return start, f"star: given at x = {given[0]:g}, y = {given[1]:g}"
 
 
-def _region(shape: tuple[int, ...], start: Pixel, half: int | None) -> tuple[slice, slice]:
-    """Return all that can reach the PSF, wherever the centre will be found."""
+def reachable(shape: tuple[int, ...], start: Pixel, half: int | None) -> tuple[slice, slice]:
+    """Return the rows and columns that the PSF may be made of, wherever its centre is found."""
     far = max(shape) if half is None else half + MARGIN + SEARCH
     y, x = (slice(max(i - far, 0), i + far + 1) for i in start)
     return y, x
 
 
-def _background(
+def measure_background(
     background: float | str,
     pixels: Array,
     bad: Mask,
     start: Pixel,
     half: int | None,
 ) -> tuple[float, str]:
+    """Return the background: as given, or the median around the crop or in the border."""
     if not isinstance(background, str):
-        level = _one_number("background", background)
+        level = one_number("background", background)
         return level, f"background: {level:g}, as given, subtracted"
     if background != "auto":
         raise InputError(f'background is {background!r}; give a number or "auto"')
@@ -82,12 +83,12 @@ def _background(
     )
 
 
-def _repair(
+def repair_bad(
     light: Array, bad: Mask, saturated: Mask, region: tuple[slice, slice]
 ) -> tuple[Mask, str]:
     """Interpolate the bad pixels of a region in place; return those that are too far inside."""
     if not bad.any():
-        return bad, "bad pixels: none"
+        return bad, "bad pixels: 0 in the frame"
     repaired, unrepairable = repair(light, bad, region)
     if n_unrepairable := int(unrepairable.sum()):
         warn(
@@ -100,24 +101,20 @@ def _repair(
     )
 
 
-def _stay(start: Pixel) -> tuple[Point, str]:
-    y, x = start
-    return (float(y), float(x)), f"centre: pixel {_at(start)}; not shifted"
-
-
-def _centre(
-    light: Array, region: tuple[slice, slice], start: Pixel, level: float
-) -> tuple[Point, str]:
-    """Return the centre of the star, to a part of a pixel."""
-    origin = region[0].start, region[1].start
-    (y, x), sigma = fit_gaussian(light[region], (start[0] - origin[0], start[1] - origin[1]), level)
-    centre = float(y + origin[0]), float(x + origin[1])
-    pixel = _nearest(centre)
+def find_centre(
+    light: Array, unusable: Mask, start: Pixel, level: float, recentre: bool
+) -> tuple[Point, Point | None, str]:
+    """Return the star's centre and the shift to the middle of a pixel; None for no shift."""
+    if not recentre:
+        return (float(start[0]), float(start[1])), None, f"centre: pixel {_at(start)}; not shifted"
+    centre, sigma = fit_gaussian(light, unusable, start, level)
+    pixel = nearest_pixel(centre)
     shift = pixel[0] - centre[0], pixel[1] - centre[1]
-    return centre, (
+    line = (
         f"centre: x = {centre[1]:.3f}, y = {centre[0]:.3f}, FWHM {FWHM * sigma:.2f} pixels; "
         f"shifted by x {_plain(shift[1], 3)}, y {_plain(shift[0], 3)}"
     )
+    return centre, shift, line
 
 
 def _largest(shape: tuple[int, ...], pixel: Pixel, angle: float) -> int:
@@ -132,7 +129,7 @@ def _largest(shape: tuple[int, ...], pixel: Pixel, angle: float) -> int:
     return side
 
 
-def _fit(shape: tuple[int, ...], pixel: Pixel, side: int | None, angle: float) -> int:
+def fitting_side(shape: tuple[int, ...], pixel: Pixel, side: int | None, angle: float) -> int:
     """Return the side of the PSF: as asked for if the frame has it, or the largest there is."""
     largest = _largest(shape, pixel, angle)
     if largest < MIN_SIZE:
@@ -148,7 +145,16 @@ def _fit(shape: tuple[int, ...], pixel: Pixel, side: int | None, angle: float) -
     return side
 
 
-def _cut(array: NDArray, pixel: Pixel, half: int) -> NDArray:
+def refuse_hole(unrepairable: Mask, pixel: Pixel) -> None:
+    """Refuse a star whose middle has too few good pixels around it to be repaired."""
+    if unrepairable[pixel]:
+        raise InputError(
+            f"the star at {_at(pixel)} has too few good pixels among the {WINDOW} x {WINDOW} "
+            "around it; take a frame with a shorter exposure"
+        )
+
+
+def cut_square(array: NDArray, pixel: Pixel, half: int) -> NDArray:
     """Return the square of this half width around a pixel, mirrored where the frame ends."""
     inside = tuple(slice(max(i - half, 0), i + half + 1) for i in pixel)
     missing = [
@@ -158,14 +164,14 @@ def _cut(array: NDArray, pixel: Pixel, half: int) -> NDArray:
     return np.pad(array[inside], missing, mode="symmetric")
 
 
-def _middle(work: NDArray, side: int) -> NDArray:
+def middle_square(work: NDArray, side: int) -> NDArray:
     """Return the square of this side around the middle of one of odd side."""
     first = len(work) // 2 - side // 2
     return work[first : first + side, first : first + side]
 
 
-def _rotate(work: Array, angle: float, radius: int) -> tuple[Array, str]:
-    """Rotate about the middle; what it costs is measured within a radius."""
+def rotate_square(work: Array, angle: float, radius: int) -> tuple[Array, str]:
+    """Rotate about the middle; the change of sharpness is measured within a radius."""
     turned = resampling.rotate(work, angle)
     y, x = (np.arange(len(work)) - len(work) // 2 for _ in range(2))
     disc = np.hypot(y[:, None], x) <= radius
@@ -178,9 +184,11 @@ def _rotate(work: Array, angle: float, radius: int) -> tuple[Array, str]:
     )
 
 
-def _crop(work: Array, side: int, light: Array, pixel: Pixel, level: float) -> tuple[Array, str]:
-    """Return the PSF, and which share of the flux it leaves out."""
-    psf = _middle(work, side).copy()
+def crop_square(
+    work: Array, side: int, light: Array, pixel: Pixel, level: float
+) -> tuple[Array, str]:
+    """Return the PSF; the line says which share of the flux is outside it."""
+    psf = middle_square(work, side).copy()
     largest = _largest(light.shape, pixel, 0.0)
     y, x = (slice(i - largest // 2, i - largest // 2 + largest) for i in pixel)
     kept, whole = float(psf.sum()), float(light[y, x].sum())
@@ -198,35 +206,45 @@ def _crop(work: Array, side: int, light: Array, pixel: Pixel, level: float) -> t
     )
 
 
-def _warn_of_guess(saturated: Mask, light: Array) -> None:
+def warn_of_guess(saturated: Mask, light: Array, pixel: Pixel, side: int) -> None:
+    """Warn where saturated pixels of the PSF were repaired."""
+    saturated, light = (cut_square(image, pixel, side // 2) for image in (saturated, light))
     if n_saturated := int(saturated.sum()):
-        share = light[saturated].sum() / light.sum()
+        share = _percent(light[saturated].sum() / light.sum())
         warn(
-            f"{n_saturated} saturated pixels of the PSF were repaired, and hold "
-            f"{_percent(share)} of its flux: its core is a guess"
+            f"{n_saturated} saturated pixels of the PSF were repaired, and hold {share} of its "
+            "flux: its core is a guess"
         )
 
 
-def _warn_of_ringing(shares: Sequence[tuple[float, float]]) -> None:
-    """Warn of the worst, of shares of the flux in negative pixels before and after."""
+def negative_shares(before: Array, psf: Array) -> tuple[float, float]:
+    """Return the flux in negative pixels before shift and rotation and after, as shares."""
+    negative, after = (float(-image.clip(max=0).sum() / psf.sum()) for image in (before, psf))
+    return negative, after
+
+
+def warn_of_ringing(shares: Sequence[tuple[float, float]]) -> None:
+    """Warn where shift and rotation made negative pixels grow; the worst of all PSFs counts."""
     before, after = max(shares, key=lambda share: share[1] - (1 + OF_NOISE) * share[0])
     if after > RINGING + (1 + OF_NOISE) * before:
         warn(
-            f"shift and rotation ring: negative pixels hold {_percent(after)} of the flux, "
-            f"{_percent(before)} before; the star is undersampled, and without recentring its "
-            "pixels are left as they are"
+            f"the PSF rings: negative pixels hold {_percent(after)} of its flux after shift and "
+            f"rotation, {_percent(before)} before; the star is undersampled, and its pixels stay "
+            "as they are without recentring and rotation"
         )
 
 
-def _negative(psf: Array, clip: bool) -> tuple[Array, str]:
+def count_negative(psf: Array, clip: bool) -> tuple[Array, str]:
+    """Return the PSF with its negative pixels, or with 0 in their place."""
     negative = psf < 0
     share = _percent(psf[negative].sum() / psf.sum())
-    what = "set to 0" if clip else "kept"
-    line = f"negative pixels: {negative.sum()}, {share} of the flux; {what}"
+    done = "set to 0" if clip else "left as they are"
+    line = f"negative pixels: {negative.sum()}, {share} of the flux; {done}"
     return (np.where(negative, 0.0, psf) if clip else psf), line
 
 
-def _nearest(point: Point) -> Pixel:
+def nearest_pixel(point: Point) -> Pixel:
+    """Return the pixel that a point lies in."""
     return math.floor(point[0] + 0.5), math.floor(point[1] + 0.5)
 
 

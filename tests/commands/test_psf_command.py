@@ -250,8 +250,8 @@ class TestMessages:
     def test_several_angles_warn_once(self, capsys):
         assert run("--rotate", "0", "20", "45", "--background", "0", frame="sharp.fits") == 0
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("lnocl: warning: shift and rotation ring: ")
-        assert line.endswith("without recentring its pixels are left as they are")
+        assert line.startswith("lnocl: warning: the PSF rings: ")
+        assert line.endswith("its pixels stay as they are without recentring and rotation")
 
     def test_the_largest_crop_is_called_so(self, capsys):
         assert run() == 0
@@ -374,7 +374,7 @@ def test_wrong_use(capsys):
 
 def test_the_help_loads_nothing_heavy():
     script = (
-        "import sys; from lnocl.cli import main\n"
+        "import sys; from lnocl.commands.cli import main\n"
         "try: main(['psf', '--help'])\n"
         "finally: print(sorted({'astropy', 'pyopencl', 'scipy', 'matplotlib'} & set(sys.modules)))"
     )
