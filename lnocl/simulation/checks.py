@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -14,40 +15,44 @@ Array = NDArray[np.float64]
 
 MIN_SIZE = 32
 
-# Electrons that one image may hold of all sources and of the sky in a pixel; Poisson deviates are
-# 64-bit integers, and float64 counts one by one up to 9e15.
+# Largest number of electrons in one image, of all sources and of the sky in a pixel: Poisson
+# deviates are 64-bit integers, and float64 counts one by one up to 9e15.
 MAX_ELECTRONS = 1e15
 
 
-def _quantity(name: str, value: Any, unit: u.UnitBase) -> float:
-    """Return a finite number in this unit."""
+def numbers(name: str, value: Any, unit: u.UnitBase) -> Array:
+    """Return a quantity, or a text such as "30 min", as finite numbers in a unit."""
     try:
         with np.errstate(over="ignore"):
-            converted = u.Quantity(value).to_value(unit)
+            array = np.asarray(u.Quantity(value).to_value(unit), np.float64)
     except (TypeError, ValueError, u.UnitsError):
         raise InputError(
-            f"{name} must be a quantity in {unit} or the like; {value} was given"
+            f"{name} must be a quantity in {unit} or a unit of its kind; {value} was given"
         ) from None
-    if np.ndim(converted) != 0 or not np.isfinite(converted):
-        raise InputError(f"{name} must be one finite number; {value} was given")
-    return float(converted)
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} must be finite; {value} was given")
+    return array
 
 
-def _positive(name: str, value: Any, unit: u.UnitBase) -> float:
-    number = _quantity(name, value, unit)
-    if number <= 0:
+def number(name: str, value: Any, unit: u.UnitBase, minimum: float = -math.inf) -> float:
+    """Return a quantity as one finite number in a unit, the minimum or more."""
+    array = numbers(name, value, unit)
+    if array.ndim or array < minimum:
+        bound = "" if minimum == -math.inf else f", {minimum:g} or more"
+        raise InputError(f"{name} must be one number{bound}; {value} was given")
+    return float(array)
+
+
+def positive(name: str, value: Any, unit: u.UnitBase) -> float:
+    """Return a quantity as one finite number in a unit, more than 0."""
+    value_in_unit = number(name, value, unit)
+    if value_in_unit <= 0:
         raise InputError(f"{name} must be positive; {value} was given")
-    return number
+    return value_in_unit
 
 
-def _not_negative(name: str, value: Any, unit: u.UnitBase) -> float:
-    number = _quantity(name, value, unit)
-    if number < 0:
-        raise InputError(f"{name} must not be negative; {value} was given")
-    return number
-
-
-def _check_electrons(name: str, number: float) -> None:
+def check_electrons(name: str, number: float) -> None:
+    """Refuse more electrons than can be simulated."""
     if not number <= MAX_ELECTRONS:
         raise InputError(
             f"{name} would leave {number:.3g} electrons in one image; at most "
@@ -55,18 +60,20 @@ def _check_electrons(name: str, number: float) -> None:
         )
 
 
-def _check_share(name: str, value: float) -> None:
+def check_share(name: str, value: float) -> None:
+    """Refuse a number outside (0, 1]."""
     if not (isinstance(value, (int, float, np.floating)) and 0 < value <= 1):
         raise InputError(f"{name} must be in (0, 1]; {value} was given")
 
 
-def _check_shape(shape: Any, least: int = MIN_SIZE) -> tuple[int, int]:
+def check_shape(shape: Any, minimum: int = MIN_SIZE) -> tuple[int, int]:
+    """Return a shape (ny, nx); refuse sides that are odd or below a minimum."""
     if np.shape(shape) != (2,):
         raise InputError(f"shape must be (ny, nx); {shape} was given")
     ny, nx = shape
     for n in (ny, nx):
-        if not isinstance(n, (int, np.integer)) or n % 2 or n < least:
+        if not isinstance(n, (int, np.integer)) or n % 2 or n < minimum:
             raise InputError(
-                f"the image is {nx} x {ny} pixels; each side must be even and {least} or more"
+                f"the image is {nx} x {ny} pixels; each side must be even and {minimum} or more"
             )
     return int(ny), int(nx)

@@ -13,10 +13,10 @@ from scipy.optimize import brentq
 from lnocl.errors import InputError
 from lnocl.simulation.checks import (
     Array,
-    _check_shape,
-    _check_share,
-    _positive,
-    _quantity,
+    check_shape,
+    check_share,
+    number,
+    positive,
 )
 from lnocl.simulation.telescope import (
     APERTURE_DIAMETER,
@@ -112,11 +112,11 @@ def fizeau_psf(
     >>> int(row[4:9].argmax()) + 4
     6
     """
-    ny, nx = _check_shape(shape)
-    theta = _quantity("angle", angle, u.rad)
-    length = _positive("wavelength", wavelength, u.m)
-    scale = _positive("pixel_scale", pixel_scale, u.rad)
-    _check_share("strehl", strehl)
+    ny, nx = check_shape(shape)
+    theta = number("angle", angle, u.rad)
+    length = positive("wavelength", wavelength, u.m)
+    scale = positive("pixel_scale", pixel_scale, u.rad)
+    check_share("strehl", strehl)
     diameter, baseline = APERTURE_DIAMETER.to_value(u.m), BASELINE.to_value(u.m)
     coarsest = length / (2 * (baseline + diameter))
     if scale > coarsest * (1 + 1e-9):

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import json
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from astropy import units as u
+from astropy.utils.misc import JsonCustomEncoder
 from scipy import fft
 
-from lnocl.simulation.checks import Array, _check_electrons
+from lnocl.simulation.checks import Array, check_electrons
 from lnocl.simulation.fizeau import N_SCREENS, fizeau_psf
 from lnocl.simulation.targets import Target
 from lnocl.simulation.telescope import (
@@ -24,7 +26,7 @@ from lnocl.simulation.telescope import (
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """What `simulate` returns.
+    """Simulated images, and the truth that they show.
 
     Attributes
     ----------
@@ -59,31 +61,32 @@ class Simulation:
     experiment: Experiment
 
     def record(self) -> dict[str, Any]:
-        """Return every number the simulation was made from, ready for `json.dump`."""
-        return {
+        """Return every number the simulation was made from, ready for `json.dump`.
+
+        A quantity is its value and its unit.
+        """
+        record = {
             "target": {
-                "shape": list(self.extended.shape),
-                "extended_electrons": float(self.extended.sum()),
+                "shape": self.extended.shape,
+                "extended_electrons": self.extended.sum(),
                 "stars": [
-                    {"x": x, "y": y, "electrons": float(flux)}
+                    {"x": x, "y": y, "electrons": flux}
                     for (x, y), flux in zip(self.stars, self.star_fluxes, strict=True)
                 ],
             },
-            "experiment": {
-                item.name: _plain(getattr(self.experiment, item.name))
-                for item in fields(self.experiment)
-            },
+            "experiment": vars(self.experiment),
             "telescope": {
-                "baseline": _plain(BASELINE),
-                "aperture_diameter": _plain(APERTURE_DIAMETER),
-                "obscuration_diameter": _plain(OBSCURATION_DIAMETER),
-                "collecting_area": _plain(collecting_area()),
+                "baseline": BASELINE,
+                "aperture_diameter": APERTURE_DIAMETER,
+                "obscuration_diameter": OBSCURATION_DIAMETER,
+                "collecting_area": collecting_area(),
                 "n_actuators": N_ACTUATORS,
                 "n_screens": N_SCREENS,
             },
             "zero_magnitude_electrons": self.zero_magnitude_flux,
             "sky_electrons_per_pixel": self.experiment.sky_electrons,
         }
+        return dict(json.loads(json.dumps(record, cls=JsonCustomEncoder)))
 
 
 def simulate(target: Target, experiment: Experiment | None = None) -> Simulation:
@@ -128,10 +131,10 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
     stars = [(star.x, star.y) for star in target.stars]
     star_fluxes = np.array([experiment.source_electrons(star.magnitude) for star in target.stars])
     for star, flux in zip(target.stars, star_fluxes, strict=True):
-        _check_electrons(f"the star at ({star.x}, {star.y})", float(flux))
+        check_electrons(f"the star at ({star.x}, {star.y})", float(flux))
     extended_flux = experiment.source_electrons(experiment.extended_magnitude)
     total = float(star_fluxes.sum()) + extended_flux + experiment.sky_electrons
-    _check_electrons("all light together", total)
+    check_electrons("all light together", total)
     *psf_seeds, noise_seed = np.random.SeedSequence(experiment.seed).spawn(
         len(experiment.angles) + 1
     )
@@ -178,10 +181,3 @@ def _expected_images(
     for (x, y), flux in zip(stars, star_fluxes, strict=True):
         images += flux * np.roll(psfs, (y - ny // 2, x - nx // 2), axis=(1, 2))
     return images
-
-
-def _plain(value: Any) -> Any:
-    """Return a number, or a quantity as its value and unit, in types that JSON knows."""
-    if isinstance(value, u.Quantity):
-        return {"value": value.value.tolist(), "unit": value.unit.to_string()}
-    return int(value) if isinstance(value, (int, np.integer)) else float(value)

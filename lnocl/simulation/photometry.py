@@ -8,7 +8,7 @@ from astropy import constants
 from astropy import units as u
 
 from lnocl.errors import InputError
-from lnocl.simulation.checks import _check_share, _not_negative, _positive, _quantity
+from lnocl.simulation.checks import check_share, number, positive
 
 MAG_PER_ARCSEC2 = u.mag / u.arcsec**2
 PHOTON_RATE = u.photon / u.s / u.m**2
@@ -47,10 +47,10 @@ def photon_rate(
     >>> print(f"{photon_rate(13 * u.mag, 666.7 * u.Jy, 2.12 * u.um, 0.02 * u.um):.1f}")
     598.9 ph / (s m2)
     """
-    flux_density = _positive("zero_point", zero_point, u.Jy) * u.Jy
-    width = _positive("bandwidth", bandwidth, u.m) / _positive("wavelength", wavelength, u.m)
+    flux_density = positive("zero_point", zero_point, u.Jy) * u.Jy
+    width = positive("bandwidth", bandwidth, u.m) / positive("wavelength", wavelength, u.m)
     try:
-        dimming = 10 ** (-0.4 * _quantity("magnitude", magnitude, u.mag))
+        dimming = 10 ** (-0.4 * number("magnitude", magnitude, u.mag))
     except OverflowError:
         raise InputError(f"magnitude {magnitude} is too bright for any number") from None
     return (flux_density / constants.h * width * dimming * u.photon).to(PHOTON_RATE)
@@ -85,8 +85,8 @@ def pixel_magnitude(surface_brightness: u.Quantity, pixel_scale: u.Quantity) -> 
     >>> print(f"{pixel_magnitude(13.5 * u.mag / u.arcsec**2, 5 * u.mas):.3f}")
     25.005 mag
     """
-    side = _positive("pixel_scale", pixel_scale, u.arcsec)
-    brightness = _quantity("surface_brightness", surface_brightness, MAG_PER_ARCSEC2)
+    side = positive("pixel_scale", pixel_scale, u.arcsec)
+    brightness = number("surface_brightness", surface_brightness, MAG_PER_ARCSEC2)
     return (brightness - 5 * math.log10(side)) * u.mag
 
 
@@ -125,7 +125,7 @@ def electrons(
     >>> print(electrons(2 * u.photon / u.s / u.m**2, 100 * u.m**2, 0.5, 1 * u.min))
     6000.0 electron
     """
-    _check_share("throughput", throughput)
-    arriving = _not_negative("rate", rate, PHOTON_RATE)
-    collected = _positive("area", area, u.m**2) * _positive("exposure_time", exposure_time, u.s)
+    check_share("throughput", throughput)
+    arriving = number("rate", rate, PHOTON_RATE, minimum=0.0)
+    collected = positive("area", area, u.m**2) * positive("exposure_time", exposure_time, u.s)
     return arriving * collected * throughput * u.electron

@@ -15,7 +15,7 @@ from scipy.special import expit
 from lnocl.errors import InputError
 from lnocl.io import fitsread
 from lnocl.scene.observation import unmasked
-from lnocl.simulation.checks import _check_shape, _quantity
+from lnocl.simulation.checks import check_shape, number
 
 # Below this the 24 rows around the star of `hh34` do not fit.
 MIN_JET_SIZE = 64
@@ -72,7 +72,7 @@ class Target:
                 f"the extended source has {array.ndim} dimensions of {array.dtype}; "
                 "give two, of real numbers"
             )
-        _check_shape(array.shape)
+        check_shape(array.shape)
         array = array.astype(np.float64)
         if not (np.isfinite(array).all() and (array >= 0).all()):
             raise InputError("the extended source must be finite and not negative everywhere")
@@ -119,7 +119,7 @@ def hh34(size: int = DEFAULT_SIZE) -> Target:
     >>> target.extended.shape, target.stars[0].x, target.stars[0].y
     ((256, 256), 128, 64)
     """
-    ny, nx = _check_shape((size, size), MIN_JET_SIZE)
+    ny, nx = check_shape((size, size), MIN_JET_SIZE)
     star = Star(nx // 2, ny // 4)
     s = np.arange(ny)[:, None] - float(star.y)  # distance from the star along the axis
     length = 0.62 * ny
@@ -194,7 +194,7 @@ def load_target(
 
 def _check_star(star: Star, shape: tuple[int, ...]) -> Star:
     ny, nx = shape
-    _quantity("the magnitude of a star", star.magnitude, u.mag)
+    number("the magnitude of a star", star.magnitude, u.mag)
     for value in (star.x, star.y):
         if not isinstance(value, (int, float, np.integer, np.floating)):
             raise InputError(f"the position of a star must be two numbers; {value!r} was given")

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from astropy import units as u
 
 from lnocl.errors import InputError
 from lnocl.simulation.checks import (
-    _check_electrons,
-    _check_share,
-    _not_negative,
-    _positive,
-    _quantity,
+    check_electrons,
+    check_share,
+    number,
+    numbers,
+    positive,
 )
 from lnocl.simulation.photometry import MAG_PER_ARCSEC2, electrons, photon_rate, pixel_magnitude
 
@@ -110,19 +109,22 @@ class Experiment:
             ("exposure_time", u.min),
             ("zero_point", u.Jy),
         ):
-            object.__setattr__(self, name, _positive(name, getattr(self, name), unit) * unit)
+            object.__setattr__(self, name, positive(name, getattr(self, name), unit) * unit)
         for name, unit in (("extended_magnitude", u.mag), ("sky_brightness", MAG_PER_ARCSEC2)):
-            object.__setattr__(self, name, _quantity(name, getattr(self, name), unit) * unit)
-        noise = _not_negative("read_noise", self.read_noise, u.electron)
+            object.__setattr__(self, name, number(name, getattr(self, name), unit) * unit)
+        noise = number("read_noise", self.read_noise, u.electron, minimum=0.0)
         object.__setattr__(self, "read_noise", noise * u.electron)
-        object.__setattr__(self, "angles", _check_angles(self.angles))
-        _check_share("throughput", self.throughput)
-        _check_share("strehl", self.strehl)
+        angles = np.atleast_1d(numbers("angles", self.angles, u.deg))
+        if angles.ndim != 1 or angles.size == 0:
+            raise InputError(f"angles must be one or several numbers; {self.angles} was given")
+        object.__setattr__(self, "angles", angles * u.deg)
+        check_share("throughput", self.throughput)
+        check_share("strehl", self.strehl)
         if not (isinstance(self.seed, (int, np.integer)) and self.seed >= 0):
             raise InputError(f"seed must be a whole number, 0 or more; {self.seed} was given")
-        _check_electrons("the extended source", self.source_electrons(self.extended_magnitude))
-        _check_electrons("the sky in a pixel", self.sky_electrons)
-        _check_electrons("read_noise", noise)
+        check_electrons("the extended source", self.source_electrons(self.extended_magnitude))
+        check_electrons("the sky in a pixel", self.sky_electrons)
+        check_electrons("read_noise", noise)
         if not math.isfinite(self.source_electrons(0 * u.mag)):
             raise InputError("a star of magnitude 0 would leave infinitely many electrons")
 
@@ -136,13 +138,3 @@ class Experiment:
     def sky_electrons(self) -> float:
         """Electrons of the sky in each pixel of one image."""
         return self.source_electrons(pixel_magnitude(self.sky_brightness, self.pixel_scale))
-
-
-def _check_angles(angles: Any) -> u.Quantity:
-    try:
-        values = np.atleast_1d(u.Quantity(angles).to_value(u.deg)).astype(np.float64)
-    except (TypeError, ValueError, u.UnitsError):
-        raise InputError(f"angles must be quantities in deg; {angles} was given") from None
-    if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all():
-        raise InputError(f"angles must be one or several finite numbers; {angles} was given")
-    return values * u.deg
