@@ -157,7 +157,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     if arguments.plot is None:
         return
 
-    from lnocl.plotting.figure import check
+    from lnocl.plotting.figure import check_matplotlib
 
     if not arguments.plot.lower().endswith(".png"):
         raise InputError(
@@ -170,7 +170,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
             f"--plot draws {MAX_DRAWN} PSFs at most, and {len(arguments.angles)} angles were given"
         )
     atomic.check_output(arguments.plot, arguments.overwrite, inputs)
-    check()
+    check_matplotlib()
 
 
 def _read_image(path: str) -> tuple[NDArray[np.float64], str]:
@@ -260,18 +260,18 @@ def _repeating_command(arguments: argparse.Namespace) -> list[str]:
 
 
 def _draw(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> None:
-    from lnocl.plotting.figure import save
-    from lnocl.plotting.psf import star_psf
+    from lnocl.plotting.figure import save_figure
+    from lnocl.plotting.psf import draw_star_psf
 
     first = stars[0]
-    figure = star_psf(
+    figure = draw_star_psf(
         first.frame - first.background,
         first.bad,
         first.centre,
         [star.psf for star in stars],
         arguments.angles,
     )
-    save(figure, arguments.plot, arguments.overwrite)
+    save_figure(figure, arguments.plot, arguments.overwrite)
 
 
 COMMAND = Command(

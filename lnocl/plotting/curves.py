@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import MARKERS, Array, _figure, _line, _plain_ticks
+from lnocl.plotting.figure import MARKERS, Array, line_style, new_figure, plain_ticks
 
 
-def errors(curves: Mapping[str, Mapping[str, Array]]) -> Figure:
+def draw_errors(curves: Mapping[str, Mapping[str, Array]]) -> Figure:
     """Draw the restoration errors rho' and rho'' against the iterations.
 
     Parameters
@@ -32,7 +32,7 @@ def errors(curves: Mapping[str, Mapping[str, Array]]) -> Figure:
     LnoclError
         Where matplotlib is missing.
     """
-    figure = _figure(9.5, 4.0)
+    figure = new_figure(9.5, 4.0)
     for axis, column, title in zip(
         figure.subplots(1, 2),
         ("rho", "rho_star"),
@@ -44,17 +44,17 @@ def errors(curves: Mapping[str, Mapping[str, Array]]) -> Figure:
     ):
         for i, (name, curve) in enumerate(curves.items()):
             x, y = curve["iteration"], 100 * curve[column]
-            axis.plot(x, y, **_line(i), label=name)
-            axis.plot(x[y.argmin()], y.min(), "o", ms=6, color=_line(i)["color"])
+            axis.plot(x, y, **line_style(i), label=name)
+            axis.plot(x[y.argmin()], y.min(), "o", ms=6, color=line_style(i)["color"])
         axis.set(xscale="log", yscale="log", xlabel="iteration", ylabel="error (%)")
         axis.set_title(title, fontsize=10)
-        _plain_ticks(axis.yaxis)
+        plain_ticks(axis.yaxis)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=9, title="dot: smallest", title_fontsize=8)
     return figure
 
 
-def magnitudes(curves: Mapping[str, Mapping[str, Array]], true: float | None) -> Figure:
+def draw_magnitudes(curves: Mapping[str, Mapping[str, Array]], true: float | None) -> Figure:
     """Draw the magnitude of the star against the iterations.
 
     Parameters
@@ -74,12 +74,12 @@ def magnitudes(curves: Mapping[str, Mapping[str, Array]], true: float | None) ->
     LnoclError
         Where matplotlib is missing.
     """
-    figure = _figure(6.5, 4.0)
+    figure = new_figure(6.5, 4.0)
     axis = figure.subplots()
     if true is not None:
         axis.axhline(true, color="black", lw=1, label="truth")
     for i, (name, curve) in enumerate(curves.items()):
-        axis.plot(curve["iteration"], curve["magnitude"], **_line(i), label=name)
+        axis.plot(curve["iteration"], curve["magnitude"], **line_style(i), label=name)
     axis.set(xscale="log", xlabel="iteration", ylabel="star (mag)")
     axis.ticklabel_format(axis="y", useOffset=False)
     axis.invert_yaxis()
@@ -88,7 +88,7 @@ def magnitudes(curves: Mapping[str, Mapping[str, Array]], true: float | None) ->
     return figure
 
 
-def objectives(histories: Mapping[str, Mapping[str, Array]]) -> Figure:
+def draw_objectives(histories: Mapping[str, Mapping[str, Array]]) -> Figure:
     """Draw the objective against the iterations, above the smallest one of each.
 
     Parameters
@@ -106,18 +106,20 @@ def objectives(histories: Mapping[str, Mapping[str, Array]]) -> Figure:
     LnoclError
         Where matplotlib is missing.
     """
-    figure = _figure(6.5, 4.0)
+    figure = new_figure(6.5, 4.0)
     axis = figure.subplots()
     for i, (name, history) in enumerate(histories.items()):
         later = history["iteration"] > 0
-        axis.plot(history["iteration"][later], history["objective"][later], **_line(i), label=name)
+        axis.plot(
+            history["iteration"][later], history["objective"][later], **line_style(i), label=name
+        )
     axis.set(xscale="log", yscale="log", xlabel="iteration", ylabel="objective J")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=9)
     return figure
 
 
-def held_out_errors(tables: Mapping[str, Mapping[str, Array]]) -> Figure:
+def draw_held_out_errors(tables: Mapping[str, Mapping[str, Array]]) -> Figure:
     """Draw the errors that held-out counts estimate, a line for each penalty.
 
     Parameters
@@ -135,14 +137,17 @@ def held_out_errors(tables: Mapping[str, Mapping[str, Array]]) -> Figure:
     LnoclError
         Where matplotlib is missing.
     """
-    figure = _figure(6.5 * len(tables), 4.0)
+    figure = new_figure(6.5 * len(tables), 4.0)
     panels = figure.subplots(1, len(tables), squeeze=False)[0]
     for axis, (name, table) in zip(panels, tables.items(), strict=True):
         varied = max(("mu", "smoothing"), key=lambda weight: len(np.unique(table[weight])))
         for i, value in enumerate(np.unique(table[varied])):
             rows = table[varied] == value
             axis.plot(
-                table["iteration"][rows], table["error"][rows], **_line(i), label=f"{value:.2g}"
+                table["iteration"][rows],
+                table["error"][rows],
+                **line_style(i),
+                label=f"{value:.2g}",
             )
         axis.set(xscale="log", yscale="log", xlabel="iteration", ylabel="estimated relative error")
         axis.set_title(name, fontsize=10)
@@ -151,8 +156,8 @@ def held_out_errors(tables: Mapping[str, Mapping[str, Array]]) -> Figure:
     return figure
 
 
-def costs(settings: Mapping[str, Mapping[str, NDArray]], measure: str) -> Figure:
-    """Draw what settings deviate from a reference against the time they take.
+def draw_costs(settings: Mapping[str, Mapping[str, NDArray]], measure: str) -> Figure:
+    """Draw the deviation of settings from a reference against their time.
 
     Parameters
     ----------
@@ -160,7 +165,7 @@ def costs(settings: Mapping[str, Mapping[str, NDArray]], measure: str) -> Figure
         For each name the columns ``seconds``, ``deviation`` (relative) and ``front`` (whether
         nothing is both faster and closer).
     measure : str
-        What deviates, for the axis.
+        Name of the deviation, for the axis.
 
     Returns
     -------
@@ -173,7 +178,7 @@ def costs(settings: Mapping[str, Mapping[str, NDArray]], measure: str) -> Figure
     LnoclError
         Where matplotlib is missing.
     """
-    figure = _figure(6.5, 4.5)
+    figure = new_figure(6.5, 4.5)
     axis = figure.subplots()
     seconds, deviation, front = (
         np.concatenate([columns[name] for columns in settings.values()])
@@ -188,7 +193,7 @@ def costs(settings: Mapping[str, Mapping[str, NDArray]], measure: str) -> Figure
             columns["seconds"][shown],
             columns["deviation"][shown],
             MARKERS[i % len(MARKERS)],
-            color=_line(i)["color"],
+            color=line_style(i)["color"],
             label=name,
         )
     for time in seconds[deviation == 0]:

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 DPI = 110
-# The palette of M. Okabe and K. Ito, "Color Universal Design" (2008), for all kinds of sight.
+# The palette of M. Okabe and K. Ito, "Color Universal Design" (2008), for colour-blind readers.
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D")
 COLOUR_MAP = "viridis"
 
 
-def check() -> None:
+def check_matplotlib() -> None:
     """Check that figures can be drawn.
 
     Raises
@@ -40,8 +40,8 @@ def check() -> None:
         ) from None
 
 
-def save(figure: Figure, path: str, overwrite: bool = False) -> None:
-    """Write a figure as PNG: the file is there complete, or not at all.
+def save_figure(figure: Figure, path: str, overwrite: bool = False) -> None:
+    """Write a figure as PNG, complete or not at all.
 
     Parameters
     ----------
@@ -61,8 +61,9 @@ def save(figure: Figure, path: str, overwrite: bool = False) -> None:
         figure.savefig(stream, format="png", dpi=DPI, pil_kwargs={"optimize": True})
 
 
-def _figure(width: float, height: float) -> Figure:
-    check()
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, apart from pyplot's state."""
+    check_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -71,11 +72,12 @@ def _figure(width: float, height: float) -> Figure:
     return figure
 
 
-def _line(i: int) -> dict[str, Any]:
+def line_style(i: int) -> dict[str, Any]:
+    """Return colour and style of the i-th line; they begin again after the last."""
     return {"color": COLOURS[i % len(COLOURS)], "linestyle": STYLES[i % len(STYLES)]}
 
 
-def _plain_ticks(axis: Any) -> None:
+def plain_ticks(axis: Any) -> None:
     """Label a short logarithmic axis with plain numbers."""
     from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 

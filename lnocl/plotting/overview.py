@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import _figure
-from lnocl.plotting.profiles import _draw_profile, _legend_of_profiles, _near
-from lnocl.plotting.sources import Frame, Source, _draw_objects
+from lnocl.plotting.figure import new_figure
+from lnocl.plotting.profiles import add_legend, draw_rows, rows_near_star
+from lnocl.plotting.sources import Frame, Source, draw_panels
 
 
-def overview(
+def draw_overview(
     truth: Source, image: Source, found: Sequence[Source], frame: Frame, near: int
 ) -> Figure:
     """Draw truth, image and reconstructions around the star, and the flux near it below.
@@ -40,14 +40,14 @@ def overview(
         Where matplotlib is missing.
     """
     shown = [truth, image, *found]
-    figure = _figure(2.75 * len(shown), 7.0)
+    figure = new_figure(2.75 * len(shown), 7.0)
     parts: Any = figure.subfigures(2, 1, height_ratios=(1.2, 1))
     above, below = parts
     axes = above.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-    _draw_objects(above, axes, shown, truth.extended.max(), frame, "log")
+    draw_panels(above, axes, shown, truth.extended.max(), frame, "log")
     profile, error = below.subplots(1, 2)
-    _draw_profile(profile, error, "flux", truth, found, frame, _near(truth, frame, near), None)
+    draw_rows(profile, error, "flux", truth, found, frame, rows_near_star(truth, frame, near), None)
     profile.set_title("Flux of each row across the jet", fontsize=11)
     error.set_title("Its relative error", fontsize=11)
-    _legend_of_profiles(below, profile, found)
+    add_legend(below, profile, found)
     return figure

@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import Array, _figure, _line
-from lnocl.plotting.sources import Frame, Source, _whole
+from lnocl.plotting.figure import Array, line_style, new_figure
+from lnocl.plotting.sources import Frame, Source, whole_pixel
 
-# Share of the brightest true row below which a row has no relative error worth showing.
+# Share of the brightest true row below which relative errors are not shown.
 FAINT_ROW = 0.01
-# Largest relative error that an axis makes room for, percent.
+# Largest relative error on an axis, percent.
 MAX_PERCENT = 100.0
 
 
-def profiles(
+def draw_profiles(
     kind: str, truth: Source, found: Sequence[Source], frame: Frame, near: int, threshold: float
 ) -> Figure:
     """Draw the flux or width profile along the jet with relative errors, near the star and beyond.
@@ -53,23 +53,24 @@ def profiles(
     LnoclError
         Where matplotlib is missing.
     """
-    figure = _figure(10.0, 6.0)
+    figure = new_figure(10.0, 6.0)
     axes = figure.subplots(2, 2, sharex="col", height_ratios=(1.3, 1))
-    close = _near(truth, frame, near)
+    close = rows_near_star(truth, frame, near)
     bright = np.flatnonzero(_bright_rows(truth))
-    # The last row at least, also where the star's rows reach the edge.
+    # At least the last row, where the star's rows reach the edge.
     start = min(close.stop, len(truth.extended) - 1)
     rest = slice(start, max(int(bright[-1]), start) + 1)
     for column, rows, title in ((0, close, "Near the star"), (1, rest, "The rest of the jet")):
         profile, error = axes[:, column]
-        _draw_profile(profile, error, kind, truth, found, frame, rows, threshold)
+        draw_rows(profile, error, kind, truth, found, frame, rows, threshold)
         profile.set_title(title, fontsize=10)
         profile.set_xlabel("")
-    _legend_of_profiles(figure, axes[0, 0], found)
+    add_legend(figure, axes[0, 0], found)
     return figure
 
 
-def _legend_of_profiles(part: Any, axis: Axes, found: Sequence[Source]) -> None:
+def add_legend(part: Any, axis: Axes, found: Sequence[Source]) -> None:
+    """Add the legend of an axis below a figure or a part of it."""
     masked = any(source.holds_star for source in found)
     lines, labels = axis.get_legend_handles_labels()
     part.legend(
@@ -78,13 +79,14 @@ def _legend_of_profiles(part: Any, axis: Axes, found: Sequence[Source]) -> None:
         loc="outside lower center",
         ncols=min(len(labels), 4),
         fontsize=9,
-        title="RLM without the 3 rows at the star, which it holds" if masked else None,
+        title="RLM: without the 3 rows at the star, which is part of it" if masked else None,
         title_fontsize=8,
     )
 
 
-def _near(truth: Source, frame: Frame, near: int) -> slice:
-    y = _whole(frame.origin)[1]
+def rows_near_star(truth: Source, frame: Frame, near: int) -> slice:
+    """Return so many rows on either side of the star, inside the image."""
+    y = whole_pixel(frame.origin)[1]
     return slice(max(y - near, 0), min(y + near, len(truth.extended)))
 
 
@@ -93,7 +95,7 @@ def _bright_rows(truth: Source) -> NDArray[np.bool_]:
     return flux >= FAINT_ROW * flux.max()
 
 
-def _draw_profile(
+def draw_rows(
     profile: Axes,
     error: Axes,
     kind: str,
@@ -106,7 +108,7 @@ def _draw_profile(
     """Draw a profile of these rows, and its relative error where the true row is not faint."""
 
     def measure(source: Source) -> Array:
-        star = _whole(frame.origin) if source.holds_star else None
+        star = whole_pixel(frame.origin) if source.holds_star else None
         if threshold is None or kind == "flux":
             return metrics.flux_profile(source.extended, star)
         return metrics.width_profile(source.extended, threshold, star)
@@ -120,8 +122,8 @@ def _draw_profile(
     for i, source in enumerate(found):
         values = measure(source)
         percent = 100 * metrics.relative_error(values, reference)[rows]
-        profile.plot(y, values[rows] * scale, **_line(i), label=source.name)
-        error.plot(y, percent, **_line(i), marker=".", ms=4, label=source.name)
+        profile.plot(y, values[rows] * scale, **line_style(i), label=source.name)
+        error.plot(y, percent, **line_style(i), marker=".", ms=4, label=source.name)
         largest = max([largest, *np.abs(percent[np.isfinite(percent)])])
     error.set_ylim(*(np.array([-1.1, 1.1]) * min(largest, MAX_PERCENT)))
     error.axhline(0, color="black", lw=1)

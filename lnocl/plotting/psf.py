@@ -12,13 +12,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOUR_MAP, COLOURS, Array, _figure, _line
+from lnocl.plotting.figure import COLOUR_MAP, COLOURS, Array, line_style, new_figure
 
 # Share of a PSF's peak at which its stretch ends.
 PSF_FLOOR = 1e-4
 
 
-def star_psf(
+def draw_star_psf(
     frame: Array,
     bad: NDArray[np.bool_],
     centre: tuple[float, float],
@@ -51,34 +51,34 @@ def star_psf(
     LnoclError
         Where matplotlib is missing.
     """
-    figure = _figure(12.5, 4.0 * len(psfs))
-    seen = np.where(bad, np.nan, frame)
+    figure = new_figure(12.5, 4.0 * len(psfs))
+    good = np.where(bad, np.nan, frame)
     rows = figure.subplots(len(psfs), 3, squeeze=False)
     for (left, middle, right), psf, angle in zip(rows, psfs, angles, strict=True):
-        _draw_frame(left, seen, centre, len(psf), angle)
+        _draw_frame(left, good, centre, len(psf), angle)
         _draw_psf(middle, psf, angle)
         _draw_middle(right, psf)
         for axis in (left, middle):
-            axis.set(xlabel="x from the centre (pixels)", ylabel="y (pixels)")
+            axis.set(xlabel="x from the centre (pixels)", ylabel="y from the centre (pixels)")
             axis.plot(0, 0, "+", color="white", ms=9, mew=0.8)
     return figure
 
 
 def _draw_frame(
-    axis: Axes, seen: Array, centre: tuple[float, float], side: int, angle: float
+    axis: Axes, good: Array, centre: tuple[float, float], side: int, angle: float
 ) -> None:
     """Draw a frame, NaN where it is bad, and the crop before it was rotated."""
     low, high = _edges(side)
-    y, x = (np.arange(n) - c for n, c in zip(seen.shape, centre[::-1], strict=True))
-    near = (np.abs(y[:, None]) + np.abs(x) <= side) & np.isfinite(seen)
-    brightest = seen[near].max() if near.any() else 1.0
-    _draw_log(axis, seen, (x[0] - 0.5, x[-1] + 0.5, y[0] - 0.5, y[-1] + 0.5), brightest)
+    y, x = (np.arange(n) - c for n, c in zip(good.shape, centre[::-1], strict=True))
+    near = (np.abs(y[:, None]) + np.abs(x) <= side) & np.isfinite(good)
+    brightest = good[near].max() if near.any() else 1.0
+    _draw_log(axis, good, (x[0] - 0.5, x[-1] + 0.5, y[0] - 0.5, y[-1] + 0.5), brightest)
     corners = np.array([[low, low], [high, low], [high, high], [low, high], [low, low]])
     cosine, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     axis.plot(*(corners @ np.array([[cosine, -sine], [sine, cosine]])).T, color="white", lw=1)
     wide = 0.75 * side
     axis.set(xlim=(max(-wide, x[0]), min(wide, x[-1])), ylim=(max(-wide, y[0]), min(wide, y[-1])))
-    axis.set_title("Frame, bad pixels coloured, and crop", fontsize=11)
+    axis.set_title("Frame with crop (white) and bad pixels (orange)", fontsize=11)
 
 
 def _draw_psf(axis: Axes, psf: Array, angle: float) -> None:
@@ -96,7 +96,7 @@ def _draw_middle(axis: Axes, psf: Array) -> None:
     for i, (values, name) in enumerate(
         ((psf[side // 2], "along x"), (psf[:, side // 2], "along y"))
     ):
-        axis.plot(at, values / psf.max(), **_line(i), label=name)
+        axis.plot(at, values / psf.max(), **line_style(i), label=name)
     axis.set_yscale("symlog", linthresh=PSF_FLOOR)
     axis.axvline(0, color="0.4", lw=1, ls=":")
     axis.set_title("PSF through its centre", fontsize=11)
@@ -114,7 +114,7 @@ def _edges(side: int) -> tuple[float, float]:
 def _draw_log(
     axis: Axes, image: Array, extent: tuple[float, float, float, float], top: float
 ) -> Any:
-    """Draw an image in logarithmic stretch, what is negative as the darkest."""
+    """Draw an image in logarithmic stretch, negative pixels in the darkest colour."""
     from matplotlib import colormaps
     from matplotlib.colors import LogNorm
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOUR_MAP, Array, _figure
+from lnocl.plotting.figure import COLOUR_MAP, Array, new_figure
 
 # Pixels shown around the star: to the left and right, before and beyond it along the jet.
 ACROSS, BEFORE, BEYOND = 24, 16, 32
@@ -46,12 +46,12 @@ class Source:
 
 @dataclass(frozen=True)
 class Frame:
-    """Where the star is and how large the pixels are.
+    """Position of the star and size of the pixels, for the axes.
 
     Attributes
     ----------
     star : (x, y) or None
-        Pixels, 0-based; without it a figure shows all there is.
+        Pixels, 0-based; without it a figure shows the whole image.
     pixel_scale : float or None
         Mas per pixel; without it axes are in pixels.
     """
@@ -66,7 +66,7 @@ class Frame:
 
     @property
     def origin(self) -> tuple[float, float]:
-        """Where the axes are zero, pixels."""
+        """Position of zero on the axes, pixels."""
         return (0.0, 0.0) if self.star is None else self.star
 
     def along(self, n: int, axis: int) -> Array:
@@ -78,7 +78,7 @@ class Frame:
         return f"{axis} ({self.unit})" if self.star is None else f"{axis} from star ({self.unit})"
 
 
-def objects(truth: Source | None, found: Sequence[Source], frame: Frame) -> Figure:
+def draw_objects(truth: Source | None, found: Sequence[Source], frame: Frame) -> Figure:
     """Draw the extended sources side by side around the star, in sqrt and in log scale.
 
     Parameters
@@ -104,31 +104,32 @@ def objects(truth: Source | None, found: Sequence[Source], frame: Frame) -> Figu
     shown = [*([] if truth is None else [truth]), *found]
     measured = [truth] if truth is not None else found
     top = max(_top(source, frame) for source in measured)
-    figure = _figure(max(2.6 * len(shown) + 0.8, 4.5), 6.2)
+    figure = new_figure(max(2.6 * len(shown) + 0.8, 4.5), 6.2)
     rows = figure.subplots(2, len(shown), sharex=True, sharey=True, squeeze=False)
     for axes, stretch in zip(rows, ("sqrt", "log"), strict=True):
-        _draw_objects(figure, axes, shown, top, frame, stretch)
+        draw_panels(figure, axes, shown, top, frame, stretch)
     return figure
 
 
 def _top(source: Source, frame: Frame) -> float:
-    """Return the brightest pixel apart from the star, where one is in the source."""
+    """Return the brightest pixel; a star that is part of the source is left out."""
     if not source.holds_star:
         return float(source.extended.max())
     if frame.star is not None:
-        return float(metrics.mask_star(source.extended, _whole(frame.star)).max())
-    # Nobody knows where it is; a star is few pixels.
+        return float(metrics.mask_star(source.extended, whole_pixel(frame.star)).max())
+    # Its position is unknown, but a star has few pixels.
     return float(np.percentile(source.extended, 99.9) or source.extended.max())
 
 
-def _whole(star: tuple[float, float]) -> tuple[int, int]:
+def whole_pixel(star: tuple[float, float]) -> tuple[int, int]:
+    """Return the pixel (x, y) that a position lies in."""
     return round(star[0]), round(star[1])
 
 
-def _draw_objects(
+def draw_panels(
     part: Figure, axes: Sequence[Axes], shown: Sequence[Source], top: float, frame: Frame, name: str
 ) -> None:
-    """Draw the sources on one stretch, which ends at the brightest true pixel."""
+    """Draw the sources on one stretch, which ends at `top`."""
     from matplotlib.colors import LogNorm, PowerNorm
     from matplotlib.ticker import MaxNLocator
 

@@ -73,7 +73,7 @@ def make_psf(
 
     **Bad pixels** are interpolated from the `NEIGHBOURS` nearest good ones by quintic radial
     functions. In a Fizeau core with fringes 6 pixels apart, one bad pixel is found to 0.02 % of
-    the peak rms, a block of 2 x 2 to 0.4 %, of 3 x 3 to 2 %, and what was clipped at 0.7 (0.5) of
+    the peak rms, a block of 2 x 2 to 0.4 %, of 3 x 3 to 2 %, and a core clipped at 0.7 (0.5) of
     the peak has 1 % (4 %) less flux than it should; with fringes 3.4 pixels apart 16 % (34 %): a
     repaired core is a guess, and a warning says so. In the wings a repaired pixel is as noisy as
     its neighbours or twice that. Bad pixels with fewer than `MIN_GOOD` good ones in the square of
@@ -108,7 +108,7 @@ def make_psf(
     ----------
     frame : array_like, shape (ny, nx)
         Image of a star, in any linear unit. A pixel that is not finite, or that is masked in a
-        `numpy.ma` array or a CCDData, is bad. Nothing else may be masked.
+        `numpy.ma` array or a CCDData, is bad. Other arguments must not be masked.
     position : tuple of float, optional
         Position of the star: (x, y), 0-based pixels, to `NEAR` pixels. By default the brightest
         pixel of the frame after a median filter of 3 x 3 good pixels.
@@ -143,7 +143,7 @@ def make_psf(
     InputError
         Where an argument has the wrong type, shape or range, or, but for the frame, holds masked
         values; where the star is outside the frame or not found; where the crop does not fit in
-        the frame; where no good pixel is left; where too few pixels of the star are good to repair
+        the frame; where all pixels are bad; where too few pixels of the star are good to repair
         the others; where nothing is above the background.
 
     Warns
@@ -210,7 +210,7 @@ def make_psfs(
     Raises
     ------
     InputError
-        As `make_psf`; where there is no angle.
+        As `make_psf`; where `rotate` is empty.
 
     Warns
     -----

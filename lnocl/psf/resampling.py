@@ -40,7 +40,7 @@ def rotate(image: Array, angle: float) -> Array:
     Parameters
     ----------
     image : ndarray of float64, shape (n, n)
-        Of odd side; what leaves it is wrapped round.
+        Of odd side; light that leaves it is wrapped round.
     angle : float
         Degrees from the x axis towards the y axis. Multiples of 90 are exact.
 

@@ -191,15 +191,15 @@ def crop_square(
     psf = middle_square(work, side).copy()
     largest = _largest(light.shape, pixel, 0.0)
     y, x = (slice(i - largest // 2, i - largest // 2 + largest) for i in pixel)
-    kept, whole = float(psf.sum()), float(light[y, x].sum())
-    if not kept > 0:
+    flux, whole = float(psf.sum()), float(light[y, x].sum())
+    if not flux > 0:
         raise InputError(
-            f"the flux of the PSF above the background {level:g} is {kept:g}; give another "
+            f"the flux of the PSF above the background {level:g} is {flux:g}; give another "
             "position or a lower background"
         )
     if side == largest:
         return psf, f"crop: {side} x {side} pixels, the largest square there is"
-    left_out = _percent(1 - kept / whole) + " of the flux" if whole > 0 else "an unknown share"
+    left_out = _percent(1 - flux / whole) + " of the flux" if whole > 0 else "an unknown share"
     return psf, (
         f"crop: {side} x {side} pixels; {left_out} in the largest square there is, "
         f"{largest} x {largest}, left out"

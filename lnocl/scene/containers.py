@@ -66,7 +66,7 @@ def _masked(name: str, values: Any) -> Any:
 
 
 def _split(name: str, values: Any) -> tuple[Any, Any]:
-    """Return plain numbers and their unit; None where they have none."""
+    """Return plain numbers and their unit; the unit is None for plain numbers."""
     values = _gather(name, values)
     if isinstance(values, _Numbers) or getattr(values, "unit", None) is not None:
         return values.value, values.unit

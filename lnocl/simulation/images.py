@@ -176,7 +176,7 @@ def _expected_images(
     """Return the images of extended source and stars without sky or noise, (p, ny, nx)."""
     ny, nx = extended.shape
     otfs = fft.rfft2(fft.ifftshift(psfs, axes=(1, 2)))
-    # The transform leaves rounding errors of either sign where there is no light.
+    # The transform leaves rounding errors of either sign in dark pixels.
     images = fft.irfft2(otfs * fft.rfft2(extended), s=(ny, nx)).clip(min=0)
     for (x, y), flux in zip(stars, star_fluxes, strict=True):
         images += flux * np.roll(psfs, (y - ny // 2, x - nx // 2), axis=(1, 2))

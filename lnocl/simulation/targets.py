@@ -40,7 +40,7 @@ class Star:
 
 
 class Target:
-    """What is observed: an extended source and the stars in it.
+    """An extended source and its stars, as they are on the sky.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def load_target(
         Pixels along each side of a built-in scene, 1024 by default; a file has its own.
     stars : sequence of Star, optional
         Stars instead of those of the scene. Those of a file are one star of magnitude 13 at the
-        header keywords STARX, STARY (0-based), where it has them, else none.
+        header keywords STARX, STARY (0-based), where it has them.
 
     Returns
     -------

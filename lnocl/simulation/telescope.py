@@ -43,7 +43,7 @@ def collecting_area() -> u.Quantity:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """How the images are taken; the defaults are those of La Camera et al. (2012).
+    """Instrument, filter and exposures; the defaults are those of La Camera et al. (2012).
 
     The paper names neither the zero point nor the throughput: see docs/photometry.md.
 

@@ -14,8 +14,8 @@ from lnocl import __version__
 from lnocl.errors import InputError, LnoclError
 from lnocl.io import atomic, frames
 from lnocl.io.frames import Calibration, Word
-from lnocl.plotting.curves import costs
-from lnocl.plotting.figure import check, save
+from lnocl.plotting.curves import draw_costs
+from lnocl.plotting.figure import check_matplotlib, save_figure
 from lnocl.scene.observation import Observation
 from lnocl.simulation import Simulation, load_target, simulate
 from lnocl.studies import demo, experiment, trade
@@ -259,11 +259,11 @@ def _write(table: Table, stem: str, overwrite: bool) -> Iterator[str]:
     atomic.write_text(f"{stem}.ecsv", text.getvalue(), overwrite)
     yield f"written to {stem}.ecsv"
     try:
-        check()
+        check_matplotlib()
     except LnoclError as error:
         yield f"no picture: {error}"
         return
-    save(_figure(table), f"{stem}.png", overwrite)
+    save_figure(_figure(table), f"{stem}.png", overwrite)
     yield f"drew {stem}.png"
 
 
@@ -277,7 +277,7 @@ def _figure(table: Table) -> Figure:
             "deviation": np.array(rows[judged]),
             "front": np.array(rows["front"]),
         }
-    return costs(settings, "all rows" if judged == "deviation" else "rows around the star")
+    return draw_costs(settings, "all rows" if judged == "deviation" else "rows around the star")
 
 
 def _check_files(stem: str, overwrite: bool, inputs: Sequence[str]) -> None:

@@ -13,11 +13,16 @@ from numpy.typing import NDArray
 from lnocl import __version__, metrics
 from lnocl.errors import InputError, LnoclError
 from lnocl.io import atomic, fitsread, fitswrite
-from lnocl.plotting.curves import errors, held_out_errors, magnitudes, objectives
-from lnocl.plotting.figure import check, save
-from lnocl.plotting.overview import overview
-from lnocl.plotting.profiles import profiles
-from lnocl.plotting.sources import Frame, Source, objects
+from lnocl.plotting.curves import (
+    draw_errors,
+    draw_held_out_errors,
+    draw_magnitudes,
+    draw_objectives,
+)
+from lnocl.plotting.figure import check_matplotlib, save_figure
+from lnocl.plotting.overview import draw_overview
+from lnocl.plotting.profiles import draw_profiles
+from lnocl.plotting.sources import Frame, Source, draw_objects
 from lnocl.simulation import Experiment, Simulation, load_target, simulate
 from lnocl.studies import experiment
 from lnocl.studies.experiment import Reconstruction
@@ -251,7 +256,7 @@ def draw(
     InputError
         Where the shapes of the files differ, or one holds no flux or values that are not finite.
     """
-    check()
+    check_matplotlib()
     atomic.check_folder(folder, overwrite, FIGURE_FILES, make=False)
     results = list(dict.fromkeys(results))
     saved = [fitsread.read_result(path) for path in results]
@@ -267,23 +272,23 @@ def draw(
     curves = _tables(names, [each.curve for each in saved])
     histories = _tables(names, [each.history for each in saved])
     atomic.check_folder(folder, overwrite, FIGURE_FILES)
-    yield _draw(folder, "objects", objects(original, sources, frame), overwrite)
+    yield _draw(folder, "objects", draw_objects(original, sources, frame), overwrite)
     if curves:
-        yield _draw(folder, "errors", errors(curves), overwrite)
-        yield _draw(folder, "magnitude", magnitudes(curves, _true_magnitude(true)), overwrite)
+        yield _draw(folder, "errors", draw_errors(curves), overwrite)
+        yield _draw(folder, "magnitude", draw_magnitudes(curves, _true_magnitude(true)), overwrite)
     else:
         yield "errors and magnitude skipped: no file has a table CURVE (lnocl demo writes it)"
         if histories:
-            yield _draw(folder, "objective", objectives(histories), overwrite)
+            yield _draw(folder, "objective", draw_objectives(histories), overwrite)
     held_out = _tables(names, [each.held_out for each in saved])
     if held_out:
-        yield _draw(folder, "held-out", held_out_errors(held_out), overwrite)
+        yield _draw(folder, "held-out", draw_held_out_errors(held_out), overwrite)
     if original is None or frame.star is None:
         yield "flux and width skipped: they need --truth with a star"
         return
     threshold = experiment.width_threshold(original.extended)
     for kind in ("flux", "width"):
-        figure = profiles(kind, original, sources, frame, experiment.NEAR_STAR, threshold)
+        figure = draw_profiles(kind, original, sources, frame, experiment.NEAR_STAR, threshold)
         yield _draw(folder, kind, figure, overwrite)
 
 
@@ -355,12 +360,12 @@ def _pictures(
     folder: str, simulation: Simulation, found: Sequence[Reconstruction], overwrite: bool
 ) -> Iterator[str]:
     try:
-        check()
+        check_matplotlib()
     except LnoclError as error:
         yield f"no pictures: {error}"
         return
     scale = float(simulation.experiment.pixel_scale.value)
-    figure = overview(
+    figure = draw_overview(
         Source("truth", simulation.extended, note="the jet without its star"),
         Source(
             "one of the images",
@@ -387,7 +392,7 @@ def _pictures(
 
 def _draw(folder: str, name: str, figure: Figure, overwrite: bool) -> str:
     path = os.path.join(folder, f"{name}.png")
-    save(figure, path, overwrite)
+    save_figure(figure, path, overwrite)
     return f"drew {path}"
 
 

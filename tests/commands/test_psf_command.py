@@ -266,15 +266,15 @@ class TestPicture:
         pytest.importorskip("matplotlib")
 
     def test_it_is_drawn(self, capsys, monkeypatch):
-        from lnocl.plotting.psf import star_psf
+        from lnocl.plotting.psf import draw_star_psf
 
         drawn = []
 
         def draw(*arguments):
             drawn.append(arguments)
-            return star_psf(*arguments)
+            return draw_star_psf(*arguments)
 
-        monkeypatch.setattr("lnocl.plotting.psf.star_psf", draw)
+        monkeypatch.setattr("lnocl.plotting.psf.draw_star_psf", draw)
         assert run("--plot", "a.PNG", "--rotate", "0", "45", "--mask", "mask.fits") == 0
         assert capsys.readouterr().out.splitlines()[-1] == "drew a.PNG"
         assert Path("a.PNG").read_bytes().startswith(b"\x89PNG")
@@ -294,7 +294,7 @@ class TestPicture:
         assert run("--plot", "there.png", "--overwrite") == 0
         assert Path("there.png").read_bytes().startswith(b"\x89PNG")
 
-    def test_without_matplotlib_nothing_is_begun(self, capsys, monkeypatch):
+    def test_without_matplotlib_it_says_so_before_it_reads(self, capsys, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         assert run("--plot", "a.png", frame="no.fits") == 1
         assert complaint(capsys.readouterr()) == (

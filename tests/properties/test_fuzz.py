@@ -289,7 +289,7 @@ def fuzz(seeds, sound, folder):
 def quick_figures(monkeypatch):
     """Draw, but do not render, which is what takes the time and knows nothing of the files."""
     for module in ("lnocl.plotting.figure", "lnocl.studies.demo"):
-        monkeypatch.setattr(f"{module}.save", lambda figure, path, overwrite: None)
+        monkeypatch.setattr(f"{module}.save_figure", lambda figure, path, overwrite: None)
 
 
 CASES = 300

@@ -623,7 +623,7 @@ def test_no_angle_is_refused():
 # --- What is refused
 
 BROAD = 40 + 90000 * gaussian(12.0, 30, 30, (61, 70))
-HOLLOW = np.where(np.hypot(*(np.mgrid[:61, :70] - 30)) < 6, np.nan, BROAD)
+UNREPAIRABLE = np.where(np.hypot(*(np.mgrid[:61, :70] - 30)) < 6, np.nan, BROAD)
 
 REFUSED = {
     "frame holds <U1; give real numbers": {"frame": [["a"]]},
@@ -674,7 +674,7 @@ REFUSED = {
     "recentre is 'no'; give True or False": {"recentre": "no"},
     "clip_negative is 1; give True or False": {"clip_negative": 1},
     "the star at x = 30, y = 30 has too few good pixels among the 11 x 11 around it; take a frame "
-    "with a shorter exposure": {"frame": HOLLOW},
+    "with a shorter exposure": {"frame": UNREPAIRABLE},
 }  # fmt: skip
 
 

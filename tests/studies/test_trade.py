@@ -16,7 +16,7 @@ from scenes import Recipe
 import lnocl
 from lnocl import metrics
 from lnocl.commands import cli
-from lnocl.plotting.curves import costs
+from lnocl.plotting.curves import draw_costs
 from lnocl.simulation import hh34, simulate
 from lnocl.studies import bench, demo, experiment, trade
 
@@ -363,7 +363,7 @@ def test_the_figure_joins_the_front_and_marks_the_reference():
             "front": np.array([True, True]),
         },
     }
-    (axis,) = costs(settings, "all rows").axes
+    (axis,) = draw_costs(settings, "all rows").axes
     lines = {line.get_label(): line for line in axis.lines}
     np.testing.assert_array_equal(lines["front"].get_data(), [[0.5, 2.0], [0.1, 1e-6]])
     np.testing.assert_array_equal(lines["double"].get_data(), [[1.0], [0.1]])
