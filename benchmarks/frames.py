@@ -33,7 +33,7 @@ from scipy.ndimage import gaussian_filter
 
 import lnocl
 from lnocl.metrics import restoration_error
-from lnocl.simulation.simulate import Experiment, fizeau_psf, hh34, simulate
+from lnocl.simulation import Experiment, fizeau_psf, hh34, simulate
 
 SKY = 768
 FRAMES = ((256, 256), (150, 200))

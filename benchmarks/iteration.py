@@ -33,7 +33,7 @@ import lnocl.opencl.program
 from lnocl.opencl.device import choose, describe
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
-from lnocl.simulation.simulate import Experiment, hh34, simulate
+from lnocl.simulation import Experiment, hh34, simulate
 from lnocl.studies.experiment import observe
 
 SIZES = (64, 128, 256, 512, 1024, 2048, 4096)

@@ -17,7 +17,7 @@ from astropy.table import Table
 import lnocl
 from lnocl.metrics import star_rows
 from lnocl.opencl.device import choose, describe
-from lnocl.simulation.simulate import Experiment, hh34, simulate
+from lnocl.simulation import Experiment, hh34, simulate
 
 SIZE, CONTRAST, ITERATIONS = 256, 1.0, 10_000
 CONTRASTS = 10.0 ** np.arange(9)

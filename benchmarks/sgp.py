@@ -40,7 +40,7 @@ from lnocl.metrics import restoration_error, star_rows
 from lnocl.runs import held_out
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
-from lnocl.simulation.simulate import Experiment, Star, Target, hh34, load_target, simulate
+from lnocl.simulation import Experiment, Star, Target, hh34, load_target, simulate
 from lnocl.studies import experiment, files
 
 SGM_ITERATIONS = {"hh34": 8000, "hh211": 2000}

@@ -20,7 +20,8 @@ from astropy.table import Table
 from lnocl import metrics
 from lnocl.errors import InputError, LnoclError
 from lnocl.io import atomic, fitsread, fitswrite
-from lnocl.simulation import simulate
+from lnocl.simulation import Experiment, load_target, simulate
+from lnocl.simulation.targets import SCENES
 from lnocl.studies import experiment, files
 
 # La Camera et al. (2012), Table 1: rho' and rho'' in percent, with their iterations.
@@ -51,7 +52,7 @@ COLUMNS = (
 def identity(scene, simulation, n_iter, every, patience):
     """Return the cards that bind a row to its experiment."""
     ny, nx = simulation.extended.shape
-    name = scene if scene in simulate.SCENES else Path(scene).name
+    name = scene if scene in SCENES else Path(scene).name
     return [
         ("SCENE", name.encode("unicode_escape").decode("ascii"), "target"),
         ("SIZEX", nx, "pixels along x"),
@@ -160,11 +161,11 @@ def run(given):
     """Compute the rows that are missing and print the table."""
     if given.quick:
         given.rlm_iterations, given.n_iter = 60, 60
-        given.size = 64 if given.scene in simulate.SCENES else given.size
+        given.size = 64 if given.scene in SCENES else given.size
 
     # The jet and the star at magnitude 13: any scene is brought to the paper's photometry.
-    target = simulate.load_target(given.scene, given.size)
-    simulation = simulate.simulate(target, simulate.Experiment(extended_magnitude=13 * u.mag))
+    target = load_target(given.scene, given.size)
+    simulation = simulate(target, Experiment(extended_magnitude=13 * u.mag))
     observation = experiment.observe(simulation)
     atomic.check_folder(str(given.output), overwrite=True)
     keep_truth(given.output / "truth.fits", simulation)

@@ -17,7 +17,8 @@ from astropy.io import fits
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import minimize
 
-from lnocl.simulation.simulate import BASELINE, fizeau_psf
+from lnocl.simulation import fizeau_psf
+from lnocl.simulation.telescope import BASELINE
 
 FRAME = Path(__file__).parents[2] / "shared/data/lbti-fizeau-altair/lm_180507_009030.fits"
 WAVELENGTH = 4.05 * u.um  # Br alpha

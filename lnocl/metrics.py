@@ -1,4 +1,4 @@
-"""What the paper measures of a reconstruction: errors, star magnitude, profiles along the jet.
+"""The paper's measures of a reconstruction: errors, star magnitude, profiles along the jet.
 
 The definitions are those of La Camera et al. (2012), sections 3.2 and 4. The axis of the jet lies
 along y, so a pixel line across it is a row. Positions are whole pixels (x, y), 0-based, x along
@@ -99,8 +99,8 @@ def restoration_error(
 
     The paper's :math:`\rho'` is over all rows, its :math:`\rho''` over `star_rows`. For stars
     apart from the extended source (MC-RL) compare the extended sources, without `star`. For both
-    in one image (RLM) give `star`, and its mask is laid on reconstruction and truth; under it
-    the truth with the star is the truth without.
+    in one image (RLM) give `star`: its pixels are masked in reconstruction and truth, so that the
+    truth with the star may be given as well as the truth without it.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def restoration_error(
     ------
     InputError
         Where the shapes differ, a value is masked, not finite or too large to be squared, the box
-        around the star leaves the image, or the truth is zero on all that is compared.
+        around the star leaves the image, or the truth is zero in all pixels compared.
 
     References
     ----------
@@ -146,7 +146,7 @@ def restoration_error(
     if not (math.isfinite(deviation) and math.isfinite(norm)):
         raise InputError("the values are too large to be squared: divide both by a constant")
     if norm == 0:
-        raise InputError("the truth is zero on all that is compared; there is no relative error")
+        raise InputError("the truth is zero in all pixels compared: no error is relative to it")
     return deviation / norm
 
 
@@ -254,7 +254,7 @@ def width_profile(image: ArrayLike, threshold: float, star: tuple[int, int] | No
     """Return the width profile along the jet.
 
     The width of a row is the number of pixels from the first to the last that are greater than
-    the threshold, both counted: ``last - first + 1``, and 0 where none is.
+    the threshold, both counted: ``last - first + 1``, and 0 where all are below it.
 
     Parameters
     ----------
@@ -310,12 +310,12 @@ def relative_error(profile: ArrayLike, reference: ArrayLike) -> Array:
     -------
     ndarray of float64, shape (ny,)
         Signed: positive where the profile is too high. NaN where either is masked, and where the
-        reference is 0, where there is no relative error.
+        reference is 0, where a relative error is undefined.
 
     Raises
     ------
     InputError
-        Where they are not two profiles of one length, of real numbers, none masked.
+        Where they are not two profiles of one length, of real numbers that are not masked.
 
     Examples
     --------

@@ -14,9 +14,8 @@ from wcs_headers import PHYSICAL, SIP
 
 from lnocl.io import fitsread, fitswrite, sky
 from lnocl.io.frames import Calibration, read_frames
-from lnocl.plotting import plots
 from lnocl.runs import checkpoint
-from lnocl.simulation import simulate
+from lnocl.simulation import load_target
 from lnocl.studies import figures
 
 SHAPE = (32, 34)
@@ -128,7 +127,7 @@ def read_stars(sound, damaged, name):
 
 
 def read_scene(sound, damaged, name):
-    simulate.load_target(damaged)
+    load_target(damaged)
 
 
 def read_saved(sound, damaged, name):
@@ -187,4 +186,4 @@ def limits():
 @pytest.fixture
 def quick_figures(monkeypatch):
     """Draw, but do not render, which is what takes the time and knows nothing of the files."""
-    monkeypatch.setattr(plots, "save", lambda figure, path, overwrite: None)
+    monkeypatch.setattr("lnocl.studies.figures.save_figure", lambda figure, path, overwrite: None)

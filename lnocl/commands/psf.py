@@ -164,7 +164,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     if arguments.plot is None:
         return
 
-    from lnocl.plotting import plots
+    from lnocl.plotting.figure import check_matplotlib
 
     if not arguments.plot.lower().endswith(".png"):
         raise InputError(
@@ -177,7 +177,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
             f"--plot draws {MAX_DRAWN} PSFs at most, and {len(arguments.rotate)} angles were given"
         )
     atomic.check_output(arguments.plot, arguments.overwrite, inputs)
-    plots.check()
+    check_matplotlib()
 
 
 def _read_image(path: str) -> tuple[NDArray[np.float64], list[str]]:
@@ -234,17 +234,18 @@ def _result_cards(stars: Sequence[StarPsf]) -> list[Card]:
 
 
 def _draw(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> None:
-    from lnocl.plotting import plots
+    from lnocl.plotting.figure import save_figure
+    from lnocl.plotting.psf import draw_star_psf
 
     first = stars[0]
-    figure = plots.star_psf(
+    figure = draw_star_psf(
         first.frame - first.background,
         first.bad,
         first.centre,
         [star.psf for star in stars],
         arguments.rotate,
     )
-    plots.save(figure, arguments.plot, arguments.overwrite)
+    save_figure(figure, arguments.plot, arguments.overwrite)
 
 
 COMMAND = Command(

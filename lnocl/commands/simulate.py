@@ -84,24 +84,25 @@ def _run(arguments: argparse.Namespace) -> None:
     from astropy import units as u
 
     from lnocl.io import atomic
-    from lnocl.simulation import simulate
+    from lnocl.simulation import Experiment, Star, load_target, simulate
+    from lnocl.simulation.photometry import MAG_PER_ARCSEC2
     from lnocl.studies import files
 
-    stars = arguments.stars and [simulate.Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
-    target = simulate.load_target(arguments.scene, arguments.size, stars)
+    stars = arguments.stars and [Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
+    target = load_target(arguments.scene, arguments.size, stars)
     units = {
         "angles": u.deg,
         "extended_magnitude": u.mag,
-        "sky_brightness": simulate.MAG_PER_ARCSEC2,
+        "sky_brightness": MAG_PER_ARCSEC2,
         "read_noise": u.electron,
     }
     names = (*units, "exposure_time", "strehl", "throughput", "seed")
     given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
-    experiment = simulate.Experiment(
+    experiment = Experiment(
         **{name: value * units[name] if name in units else value for name, value in given.items()}
     )
     atomic.check_folder(arguments.output, arguments.overwrite, make=False)
-    simulation = simulate.simulate(target, experiment)
+    simulation = simulate(target, experiment)
     atomic.check_folder(arguments.output, arguments.overwrite)
     command = files.write_simulation(
         arguments.output, arguments.scene, simulation, arguments.overwrite

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from astropy.modeling import fitting, models
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, median_filter
 
 from lnocl.errors import InputError
+from lnocl.process import ignored_warnings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -16,11 +18,19 @@ Mask = NDArray[np.bool_]
 Pixel = tuple[int, int]
 Point = tuple[float, float]
 
-# Pixels that the centre may lie away from where the star was said or seen to be.
+# Pixels that the centre may lie away from the star's position.
 SEARCH = 16
-# The narrowest and the widest Gaussian fitted, pixels and share of what it is fitted in.
-MIN_SIGMA, MAX_SIGMA = 0.8, 1 / 3
-MAX_ITERATIONS = 500
+# Pixels around the position among which the fit starts at the brightest one.
+NEAR = 5
+# The narrowest Gaussian that is fitted, pixels.
+MIN_SIGMA = 0.3
+# Pixels, and sigmas of the star, that the fitted square reaches from its middle.
+MARGIN, WIDTHS = 4, 5
+# By how much a star lowers chi squared at least; the best Gaussian in noise lowers it by 10 to 30.
+MIN_IMPROVEMENT = 50
+# Good pixels that a Gaussian of four parameters and a constant are fitted to, at least.
+MIN_PIXELS = 9
+MAX_EVALUATIONS = 500
 FWHM = 2 * math.sqrt(2 * math.log(2))
 
 
@@ -43,25 +53,25 @@ def brightest(pixels: Array, bad: Mask) -> Pixel:
     around = np.pad(np.where(bad, np.nan, pixels), 1, constant_values=np.nan)
     y, x = np.nonzero(maximum_filter(bad, 3))
     windows = np.stack([around[y + i, x + j] for i in range(3) for j in range(3)], axis=1)
-    seen = np.isfinite(windows).any(axis=1)
+    has_good = np.isfinite(windows).any(axis=1)
     smooth[y, x] = -np.inf
-    smooth[y[seen], x[seen]] = np.nanmedian(windows[seen], axis=1) if seen.any() else 0.0
+    if has_good.any():
+        smooth[y[has_good], x[has_good]] = np.nanmedian(windows[has_good], axis=1)
     iy, ix = np.unravel_index(int(smooth.argmax()), smooth.shape)
     return int(iy), int(ix)
 
 
-def fit_gaussian(light: Array, start: Pixel, level: float) -> tuple[Point, float]:
-    """Return centre and sigma of the circular Gaussian that fits best by least squares.
-
-    The moments of the light weighted with the Gaussian are those that the Gaussian itself has
-    under this weight: its centre, and half its variance.
+def fit_gaussian(light: Array, bad: Mask, start: Pixel, level: float) -> tuple[Point, float]:
+    """Return centre and sigma of the circular Gaussian and constant that fit the star best.
 
     Parameters
     ----------
     light : ndarray of float64, shape (ny, nx)
-        The star above its background.
+        The star above its background, interpolated where it is bad.
+    bad : ndarray of bool, shape (ny, nx)
+        True where a pixel is left out of the fit.
     start : tuple of int
-        Row and column of a pixel within `SEARCH` pixels of the centre.
+        Row and column of the star's position, to `NEAR` pixels.
     level : float
         The background that was subtracted, for the messages.
 
@@ -75,43 +85,55 @@ def fit_gaussian(light: Array, start: Pixel, level: float) -> tuple[Point, float
     Raises
     ------
     InputError
-        Where nothing is above the background, or the fit leaves the square searched.
+        Where nothing is above the background, or no star is within `SEARCH` pixels of the start.
     """
-    around = tuple(slice(max(i - SEARCH, 0), i + SEARCH + 1) for i in start)
+    around = _square(start, SEARCH)
     peak = light[around].max()
     if peak <= 0:
         raise InputError(
             f"nothing within {SEARCH} pixels of the star is above the background {level:g}; "
             "give another position or a lower background"
         )
-    widest = max(light.shape) * MAX_SIGMA
-    area = int((light[around] >= peak / 2).sum())
-    sigma = min(max(math.sqrt(area / (2 * math.pi * math.log(2))), MIN_SIGMA), widest)
-    y, x = map(float, start)
-    for _ in range(MAX_ITERATIONS):
-        rows, columns = (_weighted(n, at, sigma) for n, at in zip(light.shape, (y, x), strict=True))
-        moments = rows @ light @ columns.T
-        if moments[0, 0] <= 0:
-            break
-        dy, dx = 2 * moments[1, 0] / moments[0, 0], 2 * moments[0, 1] / moments[0, 0]
-        y, x = y + dy, x + dx
-        if not max(abs(y - start[0]), abs(x - start[1])) <= SEARCH:
-            break
-        variance = (moments[2, 0] + moments[0, 2]) / (2 * moments[0, 0])
-        ratio = variance / sigma**2
-        # The new variance is 1 / (1 / variance - 1 / sigma^2), grown by 4 at most.
-        ratio = ratio / (1 - ratio) if 0 < ratio < 0.8 else 4.0 if ratio > 0 else 0.25
-        new = min(max(sigma * math.sqrt(ratio), MIN_SIGMA), widest)
-        if max(abs(dy), abs(dx), abs(new - sigma)) < 1e-9:
-            return (y, x), new
-        sigma = new
-    raise InputError(
-        f"no star is found within {SEARCH} pixels of where it should be; give its position, or "
-        "another background"
-    )
+    near = _square(start, NEAR)
+    row, column = brightest(light[near], np.zeros_like(bad[near]))
+    first = near[0].start + row, near[1].start + column
+    area = int((light[near] >= light[first] / 2).sum())
+    sigma = math.sqrt(area / (2 * math.pi * math.log(2)))
+    square = _square(first, MARGIN + math.ceil(WIDTHS * sigma))
+    good = np.zeros_like(bad)
+    good[square] = ~bad[square]
+    y, x = np.nonzero(good)
+    found = _fit(y, x, light[good] / peak, first, sigma)
+    if found is None or max(abs(found[0] - start[0]), abs(found[1] - start[1])) > SEARCH:
+        raise InputError(
+            f"no star is found within {SEARCH} pixels of where it should be; give its position, or "
+            "another background"
+        )
+    # Digits beyond these are rounding of the fit: a centred star stays where it is.
+    return (round(found[0], 9), round(found[1], 9)), found[2]
 
 
-def _weighted(n: int, at: float, sigma: float) -> Array:
-    """Return the Gaussian times 1, d and d^2 for the distances d along an axis."""
-    d = np.arange(n) - at
-    return np.exp(-0.5 * (d / sigma) ** 2) * np.array([np.ones(n), d, d * d])
+def _square(pixel: Pixel, half: int) -> tuple[slice, slice]:
+    y, x = (slice(max(i - half, 0), i + half + 1) for i in pixel)
+    return y, x
+
+
+def _fit(
+    y: NDArray[np.int_], x: NDArray[np.int_], light: Array, first: Pixel, sigma: float
+) -> tuple[float, float, float] | None:
+    """Return row, column and sigma of the best Gaussian; None where noise would fit as well."""
+    if len(light) < MIN_PIXELS:
+        return None
+    star = models.Gaussian2D(
+        light.max(), first[1], first[0], sigma, sigma, 0.0,
+        fixed={"theta": True}, bounds={"x_stddev": (MIN_SIGMA, None)},
+    )  # fmt: skip
+    star.y_stddev.tied = lambda model: model.x_stddev_0
+    fitter = fitting.LMLSQFitter()
+    with ignored_warnings(), np.errstate(all="ignore"):
+        fitted = fitter(star + models.Const2D(0.0), x, y, light, maxiter=MAX_EVALUATIONS)
+        left = float(np.var(light - fitted(x, y)))
+    improvement = len(light) * (float(np.var(light)) - left)
+    if not (fitted.amplitude_0 > 0 and improvement > MIN_IMPROVEMENT * left):
+        return None
+    return fitted.y_mean_0.value, fitted.x_mean_0.value, fitted.x_stddev_0.value

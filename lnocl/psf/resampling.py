@@ -1,4 +1,4 @@
-"""Shifts and rotations of an image by the phase of its Fourier transform."""
+"""Shifts and rotations of the image of a star."""
 
 from __future__ import annotations
 
@@ -7,22 +7,31 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.ndimage import fourier_shift
+
+from lnocl.scene.shifting import place
 
 Array = NDArray[np.float64]
 
 
 def shift(image: Array, by: tuple[float, float]) -> Array:
-    """Return an image moved by (rows, columns), wrapped round.
+    """Return an image of a star moved by (rows, columns), wrapped round.
+
+    It is moved as `lnocl.scene.shifting.place` moves a PSF: as a sum of Gaussians on its pixels.
 
     Parameters
     ----------
     image : ndarray of float64, shape (ny, nx)
-        Any image.
+        The star in the middle.
     by : tuple of float
         Pixels.
+
+    Returns
+    -------
+    ndarray of float64, shape (ny, nx)
+        The image moved; its sum stays the same to rounding.
     """
-    return np.asarray(fft.ifft2(fourier_shift(fft.fft2(image), by)).real)
+    ny, nx = image.shape
+    return place(image, (ny, nx), nx // 2 + by[1], ny // 2 + by[0]).on_grid((ny, nx))
 
 
 def rotate(image: Array, angle: float) -> Array:
@@ -31,9 +40,14 @@ def rotate(image: Array, angle: float) -> Array:
     Parameters
     ----------
     image : ndarray of float64, shape (n, n)
-        Of odd side; what leaves it is wrapped round.
+        Of odd side; light that leaves it is wrapped round.
     angle : float
         Degrees from the x axis towards the y axis. Multiples of 90 are exact.
+
+    Returns
+    -------
+    ndarray of float64, shape (n, n)
+        The image rotated, by three shears, each by the phases of a spectrum.
     """
     quarters, rest = _quarters(angle)
     turned = np.rot90(image, -quarters)
@@ -49,6 +63,11 @@ def reach(side: int, angle: float) -> int:
         Pixels.
     angle : float
         Degrees.
+
+    Returns
+    -------
+    int
+        Pixels from the middle, along x or y.
     """
     if angle == 0:
         return side // 2

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, warn
-from lnocl.scene import units
+from lnocl.scene import containers
 
 Array = NDArray[np.float64]
 
@@ -106,11 +106,11 @@ class Observation:
         offsets: ArrayLike | None = None,
     ) -> None:
         has_exposure = exposure is not None
-        counts, are_rates = units.plain("images", images, has_exposure)
+        counts, are_rates = containers.counts("images", images, has_exposure)
         given, masked = values_and_mask("images", counts)
         self.images = _stack("images", given)
         self.mask = masked.copy().reshape(self.images.shape)
-        self.psfs = _check_psfs(units.bare("psfs", psfs), self.n_images)
+        self.psfs = _check_psfs(containers.bare("psfs", psfs), self.n_images)
         self.offsets = self._check_offsets(offsets)
         self._apply_mask(mask)
         self.exposure = self._check_exposure(1.0 if exposure is None else exposure)
@@ -157,7 +157,7 @@ class Observation:
 
     def _check_exposure(self, exposure: ArrayLike) -> Array:
         """Return exposures; what saw nothing is masked."""
-        values = self._one_or_map("exposure", units.seconds(exposure), 1.0)
+        values = self._one_or_map("exposure", containers.seconds(exposure), 1.0)
         if values.ndim == 1:
             _refuse_unless("exposure", values, "finite and more than zero", values > 0)
             return values
@@ -166,7 +166,7 @@ class Observation:
         return values
 
     def _check_background(self, background: ArrayLike, has_exposure: bool) -> Array:
-        given, are_rates = units.plain("background", background, has_exposure)
+        given, are_rates = containers.counts("background", background, has_exposure)
         values = self._one_or_map("background", given, 0.0)
         _refuse_unless("background", values, "finite and not negative", values >= 0)
         if not are_rates:
@@ -176,7 +176,7 @@ class Observation:
         return values * (_each_pixel(self.exposure) if values.ndim == 3 else self.exposure)
 
     def _add_read_noise(self, read_noise: ArrayLike) -> None:
-        sigma = self._one_or_map("read_noise", units.plain("read_noise", read_noise)[0], 0.0)
+        sigma = self._one_or_map("read_noise", containers.counts("read_noise", read_noise)[0], 0.0)
         _refuse_unless("read_noise", sigma, "finite and not negative", sigma >= 0)
         variance = sigma**2
         _refuse_unless("the square of read_noise", variance, "finite", variance >= 0)
@@ -212,7 +212,7 @@ class Observation:
     def _check_offsets(self, offsets: ArrayLike | None) -> Array:
         if offsets is None:
             return np.zeros((self.n_images, 2))
-        values = numbers("offsets", units.pixels("offsets", offsets))
+        values = numbers("offsets", containers.pixels("offsets", offsets))
         if values.shape != (self.n_images, 2):
             raise InputError(
                 f"offsets has shape {values.shape}; give (dx, dy) for each of the "

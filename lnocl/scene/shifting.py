@@ -181,7 +181,8 @@ def _variance(profile: Array) -> float:
     It and its alias -1 / 2 have ``2 sinc(1 / 2) exp(-pi^2 sigma^2 / 2)`` together, of unit light.
     """
     signs = 1 - 2 * (np.arange(len(profile)) % 2)
-    share = abs(float(signs @ profile)) / float(profile.sum())
+    light = float(profile.sum())
+    share = abs(float(signs @ profile)) / light if light else 1.0
     return 2.0 / np.pi**2 * float(np.log(4.0 / np.pi / np.clip(share, MIN_NYQUIST, 1.0)))
 
 

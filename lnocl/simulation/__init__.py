@@ -1,1 +1,26 @@
-"""Simulated telescopes, targets and images."""
+"""Images of a star and its jet through a Fizeau interferometer, as the paper simulated them.
+
+The experiment is that of La Camera et al. (2012), section 3: a target of stars and an extended
+source, one PSF for each hour angle, photon noise of target and sky, and read noise.
+"""
+
+from lnocl.simulation.fizeau import fizeau_psf
+from lnocl.simulation.images import Simulation, simulate
+from lnocl.simulation.photometry import electrons, photon_rate, pixel_magnitude
+from lnocl.simulation.targets import Star, Target, hh34, load_target
+from lnocl.simulation.telescope import Experiment, collecting_area
+
+__all__ = [
+    "Experiment",
+    "Simulation",
+    "Star",
+    "Target",
+    "collecting_area",
+    "electrons",
+    "fizeau_psf",
+    "hh34",
+    "load_target",
+    "photon_rate",
+    "pixel_magnitude",
+    "simulate",
+]

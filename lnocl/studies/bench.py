@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from astropy.table import Table
@@ -14,10 +14,14 @@ from lnocl import __version__
 from lnocl.errors import InputError, LnoclError
 from lnocl.io import atomic, frames
 from lnocl.io.frames import Calibration, Word
-from lnocl.plotting import plots
+from lnocl.plotting.curves import draw_costs
+from lnocl.plotting.figure import check_matplotlib, save_figure
 from lnocl.scene.observation import Observation
-from lnocl.simulation.simulate import Simulation, load_target, simulate
+from lnocl.simulation import Simulation, load_target, simulate
 from lnocl.studies import demo, experiment, trade
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Columns whose descriptions are printed below the table.
 DESCRIBED = ("ms", "to_goal", "deviation", "near_star", "flux", "rho", "front")
@@ -255,15 +259,15 @@ def _write(table: Table, stem: str, overwrite: bool) -> Iterator[str]:
     atomic.write_text(f"{stem}.ecsv", text.getvalue(), overwrite)
     yield f"written to {stem}.ecsv"
     try:
-        plots.check()
+        check_matplotlib()
     except LnoclError as error:
         yield f"no picture: {error}"
         return
-    plots.save(_figure(table), f"{stem}.png", overwrite)
+    save_figure(_figure(table), f"{stem}.png", overwrite)
     yield f"drew {stem}.png"
 
 
-def _figure(table: Table) -> plots.Figure:
+def _figure(table: Table) -> Figure:
     column = trade.deviation_column(table)
     settings = {}
     for precision, pad in dict.fromkeys(zip(table["precision"], table["pad"], strict=True)):
@@ -273,7 +277,7 @@ def _figure(table: Table) -> plots.Figure:
             "deviation": np.array(rows[column]),
             "front": np.array(rows["front"]),
         }
-    return plots.costs(settings, "all rows" if column == "deviation" else "rows around the star")
+    return draw_costs(settings, "all rows" if column == "deviation" else "rows around the star")
 
 
 def _check_files(stem: str, overwrite: bool, inputs: Sequence[str]) -> None:

@@ -8,9 +8,11 @@ from collections.abc import Iterator, Sequence
 from lnocl import metrics
 from lnocl.errors import LnoclError
 from lnocl.io import atomic
-from lnocl.plotting import plots
+from lnocl.plotting.figure import check_matplotlib
+from lnocl.plotting.overview import draw_overview
+from lnocl.plotting.sources import Frame, Source
 from lnocl.scene.observation import Observation
-from lnocl.simulation.simulate import Experiment, Simulation, load_target, simulate
+from lnocl.simulation import Experiment, Simulation, load_target, simulate
 from lnocl.studies import experiment, figures, files
 from lnocl.studies.experiment import Reconstruction
 
@@ -133,20 +135,20 @@ def _pictures(
     folder: str, simulation: Simulation, found: Sequence[Reconstruction], overwrite: bool
 ) -> Iterator[str]:
     try:
-        plots.check()
+        check_matplotlib()
     except LnoclError as error:
         yield f"no pictures: {error}"
         return
     scale = float(simulation.experiment.pixel_scale.value)
-    figure = plots.overview(
-        plots.Source("truth", simulation.extended, note="the jet without its star"),
-        plots.Source(
+    figure = draw_overview(
+        Source("truth", simulation.extended, note="the jet without its star"),
+        Source(
             "one of the images",
             simulation.images[0] - simulation.background[0],
             note="sky subtracted",
         ),
         [
-            plots.Source(
+            Source(
                 each.name,
                 each.extended,
                 each.method == "RLM",
@@ -155,7 +157,7 @@ def _pictures(
             )
             for each in found
         ],
-        plots.Frame(simulation.stars[0], scale),
+        Frame(simulation.stars[0], scale),
         experiment.NEAR_STAR,
     )
     yield figures.save(folder, "demo", figure, overwrite)

@@ -12,7 +12,7 @@ from lnocl import metrics
 from lnocl.deconvolution import HISTORY_DTYPE, Estimate, deconvolve
 from lnocl.errors import InputError
 from lnocl.scene.observation import Array, Observation
-from lnocl.simulation.simulate import Simulation
+from lnocl.simulation import Simulation
 
 CURVE_DTYPE = np.dtype(
     [

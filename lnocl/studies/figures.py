@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,19 @@ from numpy.typing import NDArray
 from lnocl import metrics
 from lnocl.errors import InputError
 from lnocl.io import atomic, fitsread
-from lnocl.plotting import plots
+from lnocl.plotting.curves import (
+    draw_errors,
+    draw_held_out_errors,
+    draw_magnitudes,
+    draw_objectives,
+)
+from lnocl.plotting.figure import check_matplotlib, save_figure
+from lnocl.plotting.profiles import draw_profiles
+from lnocl.plotting.sources import Frame, Source, draw_objects
 from lnocl.studies import experiment
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FIGURES = ("objects", "errors", "magnitude", "objective", "held-out", "flux", "width")
 FIGURE_FILES = tuple(f"{name}.png" for name in FIGURES)
@@ -49,7 +61,7 @@ def draw(
         The shapes of the files differ, one holds no flux or values that are not finite, or has a
         star outside its image.
     """
-    plots.check()
+    check_matplotlib()
     atomic.check_folder(folder, overwrite, FIGURE_FILES, make=False)
     results = list(dict.fromkeys(results))
     saved = [fitsread.read_result(path) for path in results]
@@ -57,38 +69,38 @@ def draw(
     _check_saved([*([] if true is None else [true]), *saved])
     names = _names(results, saved)
     sources = [
-        plots.Source(name, each.extended, holds_star=not each.stars)
+        Source(name, each.extended, holds_star=not each.stars)
         for name, each in zip(names, saved, strict=True)
     ]
     frame = _frame([*([] if true is None else [true]), *saved])
-    original = None if true is None else plots.Source("truth", true.extended)
+    original = None if true is None else Source("truth", true.extended)
     curves = _tables(names, [each.curve for each in saved])
     histories = _tables(names, [each.history for each in saved])
     atomic.check_folder(folder, overwrite, FIGURE_FILES)
-    yield save(folder, "objects", plots.objects(original, sources, frame), overwrite)
+    yield save(folder, "objects", draw_objects(original, sources, frame), overwrite)
     if curves:
-        yield save(folder, "errors", plots.errors(curves), overwrite)
-        yield save(folder, "magnitude", plots.magnitudes(curves, _true_magnitude(true)), overwrite)
+        yield save(folder, "errors", draw_errors(curves), overwrite)
+        yield save(folder, "magnitude", draw_magnitudes(curves, _true_magnitude(true)), overwrite)
     else:
         yield "errors and magnitude skipped: no file has a table CURVE (lnocl demo writes it)"
         if histories:
-            yield save(folder, "objective", plots.objectives(histories), overwrite)
+            yield save(folder, "objective", draw_objectives(histories), overwrite)
     held_out = _tables(names, [each.held_out for each in saved])
     if held_out:
-        yield save(folder, "held-out", plots.held_out_errors(held_out), overwrite)
+        yield save(folder, "held-out", draw_held_out_errors(held_out), overwrite)
     if original is None or frame.star is None:
         yield "flux and width skipped: they need --truth with a star"
         return
     threshold = experiment.width_threshold(original.extended)
     for kind in ("flux", "width"):
-        figure = plots.profiles(kind, original, sources, frame, experiment.NEAR_STAR, threshold)
+        figure = draw_profiles(kind, original, sources, frame, experiment.NEAR_STAR, threshold)
         yield save(folder, kind, figure, overwrite)
 
 
-def save(folder: str, name: str, figure: plots.Figure, overwrite: bool) -> str:
+def save(folder: str, name: str, figure: Figure, overwrite: bool) -> str:
     """Write a figure into a folder as PNG, and return a line that names its file."""
     path = os.path.join(folder, f"{name}.png")
-    plots.save(figure, path, overwrite)
+    save_figure(figure, path, overwrite)
     return f"drew {path}"
 
 
@@ -132,10 +144,10 @@ def _tables(
     }
 
 
-def _frame(saved: Sequence[fitsread.SavedResult]) -> plots.Frame:
+def _frame(saved: Sequence[fitsread.SavedResult]) -> Frame:
     star = next((each.stars[0] for each in saved if each.stars), None)
     scale = next((each.number("PIXSCALE") for each in saved if "PIXSCALE" in each.header), None)
-    return plots.Frame(star, scale)
+    return Frame(star, scale)
 
 
 def _true_magnitude(true: fitsread.SavedResult | None) -> float | None:

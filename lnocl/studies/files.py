@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 from lnocl import __version__
 from lnocl.io import atomic, fitswrite
-from lnocl.simulation.simulate import Simulation
+from lnocl.simulation import Simulation
 from lnocl.studies.experiment import Reconstruction
 
 

@@ -18,7 +18,7 @@ from lnocl.deconvolution import Estimate, Result, deconvolve
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.runs.progress import make_bar
 from lnocl.scene.observation import Array, Observation, numbers
-from lnocl.simulation.simulate import Simulation
+from lnocl.simulation import Simulation
 from lnocl.studies import experiment
 
 # Estimates are measured after an eighth, a quarter, half and all of the iterations.

@@ -17,7 +17,7 @@ from lnocl.deconvolution import Result, deconvolve
 from lnocl.errors import DeviceError, LnoclError
 from lnocl.opencl.device import context_of, describe, has_double, spec_of
 from lnocl.scene.observation import Observation
-from lnocl.simulation.simulate import Experiment, Star, load_target, simulate
+from lnocl.simulation import Experiment, Star, load_target, simulate
 from lnocl.verify.comparison import ALLOWED, KERNELS, deviation, kernels_of, relative
 from lnocl.verify.harness import SCENES, THREE_IMAGES, KernelHarness, inputs
 

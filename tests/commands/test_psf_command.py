@@ -250,8 +250,8 @@ class TestMessages:
     def test_several_angles_warn_once(self, capsys):
         assert run("--rotate", "0", "20", "45", "--background", "0", frame="sharp.fits") == 0
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("lnocl: warning: shift and rotation ring: ")
-        assert line.endswith("without recentring its pixels are left as they are")
+        assert line.startswith("lnocl: warning: the PSF rings: ")
+        assert line.endswith("its pixels stay as they are without recentring and rotation")
 
     def test_the_largest_crop_is_called_so(self, capsys):
         assert run() == 0
@@ -266,16 +266,15 @@ class TestPicture:
         pytest.importorskip("matplotlib")
 
     def test_it_is_drawn(self, capsys, monkeypatch):
-        from lnocl.plotting import plots
+        from lnocl.plotting.psf import draw_star_psf
 
         drawn = []
 
         def draw(*arguments):
             drawn.append(arguments)
-            return original(*arguments)
+            return draw_star_psf(*arguments)
 
-        original = plots.star_psf
-        monkeypatch.setattr(plots, "star_psf", draw)
+        monkeypatch.setattr("lnocl.plotting.psf.draw_star_psf", draw)
         assert run("--plot", "a.PNG", "--rotate", "0", "45", "--mask", "mask.fits") == 0
         assert capsys.readouterr().out.splitlines()[-1] == "drew a.PNG"
         assert Path("a.PNG").read_bytes().startswith(b"\x89PNG")
@@ -295,7 +294,7 @@ class TestPicture:
         assert run("--plot", "there.png", "--overwrite") == 0
         assert Path("there.png").read_bytes().startswith(b"\x89PNG")
 
-    def test_without_matplotlib_nothing_is_begun(self, capsys, monkeypatch):
+    def test_without_matplotlib_it_says_so_before_it_reads(self, capsys, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         assert run("--plot", "a.png", frame="no.fits") == 1
         assert complaint(capsys.readouterr()) == (

@@ -20,7 +20,7 @@ from scenes import make_psfs
 from lnocl.commands import cli
 from lnocl.errors import FileError, InputError
 from lnocl.io import atomic, fitsread, fitswrite
-from lnocl.plotting import plots
+from lnocl.plotting.figure import save_figure
 
 IMAGE = np.arange(1.0, 121.0).reshape(10, 12)
 LARGE = np.random.default_rng(3).normal(size=(400, 500))
@@ -43,7 +43,7 @@ def write_text(path, overwrite=False):
 def write_figure(path, overwrite=False):
     figure = Figure(figsize=(7, 7))
     figure.add_subplot().imshow(LARGE)
-    plots.save(figure, path, overwrite)
+    save_figure(figure, path, overwrite)
 
 
 # All that the package writes with; each writes 1.5 MB and more, the figure 0.3 MB and more.

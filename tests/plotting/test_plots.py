@@ -1,4 +1,4 @@
-"""The figures: what they show, and what they refuse."""
+"""The figures show the right data, and refuse to be drawn without matplotlib."""
 
 import sys
 
@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 
 from lnocl.errors import LnoclError
-from lnocl.plotting import plots
+from lnocl.plotting.curves import draw_errors, draw_magnitudes, draw_objectives
+from lnocl.plotting.figure import save_figure
+from lnocl.plotting.overview import draw_overview
+from lnocl.plotting.profiles import draw_profiles
+from lnocl.plotting.psf import PSF_FLOOR, draw_star_psf
+from lnocl.plotting.sources import Frame, Source, draw_objects
 
 pytest.importorskip("matplotlib")
 
 STAR = (20, 24)
-FRAME = plots.Frame(STAR, 5.0)
+FRAME = Frame(STAR, 5.0)
 
 
 def jet(scale=1.0):
@@ -20,10 +25,10 @@ def jet(scale=1.0):
     return scale * 1e3 * np.exp(-0.5 * ((x - STAR[0]) / 3.0) ** 2) / (1 + np.exp(STAR[1] - y))
 
 
-TRUTH = plots.Source("truth", jet())
+TRUTH = Source("truth", jet())
 WITH_STAR = jet(0.8)
 WITH_STAR[STAR[1], STAR[0]] += 1e7
-FOUND = [plots.Source("RLM", WITH_STAR, holds_star=True), plots.Source("MC-RL", jet(1.1))]
+FOUND = [Source("RLM", WITH_STAR, holds_star=True), Source("MC-RL", jet(1.1))]
 CURVE = {
     "iteration": np.array([10.0, 20.0, 30.0]),
     "rho": np.array([0.5, 0.2, 0.3]),
@@ -42,7 +47,7 @@ def panels(figure):
 
 
 def test_objects_are_shown_on_the_stretch_of_the_truth():
-    shown = panels(plots.objects(TRUTH, FOUND, FRAME))
+    shown = panels(draw_objects(TRUTH, FOUND, FRAME))
     assert len(shown) == 6
     assert {image.norm.vmax for image in shown} == {TRUTH.extended.max()}
     titles = [image.axes.get_title() for image in shown]
@@ -51,24 +56,24 @@ def test_objects_are_shown_on_the_stretch_of_the_truth():
 
 
 def test_the_star_does_not_set_the_stretch_where_there_is_no_truth():
-    shown = panels(plots.objects(None, FOUND, FRAME))
+    shown = panels(draw_objects(None, FOUND, FRAME))
     assert shown[0].norm.vmax == pytest.approx(1.1e3)
 
 
 def test_axes_are_in_mas_from_the_star_or_in_pixels():
-    near = panels(plots.objects(TRUTH, FOUND, FRAME))[-1].axes
+    near = panels(draw_objects(TRUTH, FOUND, FRAME))[-1].axes
     assert near.get_xlabel() == "x from star (mas)"
     assert near.get_ylim() == (-80, 160)
     # The pixel of the star is centred on 0.
     left, right, bottom, top = near.images[0].get_extent()
     assert (left, right, bottom, top) == (-102.5, 137.5, -122.5, 197.5)
-    whole = panels(plots.objects(TRUTH, FOUND[1:], plots.Frame()))[-1].axes
+    whole = panels(draw_objects(TRUTH, FOUND[1:], Frame()))[-1].axes
     assert whole.get_xlabel() == "x (pixels)"
     assert whole.get_xlim() == (-0.5, 47.5)
 
 
 def test_errors_are_in_percent_with_their_minimum_marked():
-    left, right = plots.errors({"MC-RL": CURVE}).axes
+    left, right = draw_errors({"MC-RL": CURVE}).axes
     np.testing.assert_allclose(lines(left)["MC-RL"][1], [50, 20, 30])
     np.testing.assert_allclose(lines(right)["MC-RL"][1], [60, 50, 40])
     (x, y) = left.lines[1].get_data()
@@ -76,23 +81,23 @@ def test_errors_are_in_percent_with_their_minimum_marked():
 
 
 def test_magnitudes_are_bright_upwards():
-    (axis,) = plots.magnitudes({"RLM": CURVE}, 13.0).axes
+    (axis,) = draw_magnitudes({"RLM": CURVE}, 13.0).axes
     assert axis.yaxis_inverted()
     assert set(lines(axis)) == {"RLM", "truth"}
-    (axis,) = plots.magnitudes({"RLM": CURVE}, None).axes
+    (axis,) = draw_magnitudes({"RLM": CURVE}, None).axes
     assert set(lines(axis)) == {"RLM"}
 
 
 def test_objectives_begin_after_the_start():
     history = {"iteration": np.arange(3.0), "objective": np.array([9.0, 5.0, 4.0])}
-    (axis,) = plots.objectives({"a": history}).axes
+    (axis,) = draw_objectives({"a": history}).axes
     assert lines(axis)["a"][1].tolist() == [5.0, 4.0]
 
 
 @pytest.mark.parametrize(("kind", "expected"), [("flux", 10.0), ("width", 0.0)])
 def test_profiles_and_their_errors(kind, expected):
     # So low a threshold that both jets are as wide.
-    figure = plots.profiles(kind, TRUTH, FOUND, FRAME, near=20, threshold=1e-12)
+    figure = draw_profiles(kind, TRUTH, FOUND, FRAME, near=20, threshold=1e-12)
     near, rest, near_error, rest_error = figure.axes
     np.testing.assert_array_equal(lines(near)["MC-RL"][0], 5.0 * np.arange(-20, 20))
     for axis in (near_error, rest_error):
@@ -108,36 +113,36 @@ def test_profiles_and_their_errors(kind, expected):
 def test_profiles_of_a_star_in_the_dark_or_at_the_edge(kind, star):
     light = jet()
     light[:30] = 0.0
-    dark = plots.Source("truth", light)
-    figure = plots.profiles(kind, dark, FOUND, plots.Frame(star), near=20, threshold=1.0)
+    dark = Source("truth", light)
+    figure = draw_profiles(kind, dark, FOUND, Frame(star), near=20, threshold=1.0)
     assert all(len(lines(axis)["MC-RL"][0]) for axis in figure.axes)
 
 
 def test_the_overview_has_a_panel_for_each_and_two_profiles(tmp_path):
-    figure = plots.overview(TRUTH, plots.Source("image", jet()), FOUND, FRAME, 20)
+    figure = draw_overview(TRUTH, Source("image", jet()), FOUND, FRAME, 20)
     assert len(panels(figure)) == 4
-    plots.save(figure, str(tmp_path / "overview.png"))
+    save_figure(figure, str(tmp_path / "overview.png"))
     raw = (tmp_path / "overview.png").read_bytes()
     assert raw.startswith(b"\x89PNG")
     assert len(raw) < 200_000
 
 
 def test_more_results_than_colours_are_drawn(tmp_path):
-    many = [plots.Source(f"MC-RL mu={i}", jet()) for i in range(8)]
-    assert len(plots.profiles("flux", TRUTH, many, FRAME, 20, 100.0).axes) == 4
-    plots.save(plots.objects(TRUTH, many, FRAME), str(tmp_path / "objects.png"))
+    many = [Source(f"MC-RL mu={i}", jet()) for i in range(8)]
+    assert len(draw_profiles("flux", TRUTH, many, FRAME, 20, 100.0).axes) == 4
+    save_figure(draw_objects(TRUTH, many, FRAME), str(tmp_path / "objects.png"))
     assert (tmp_path / "objects.png").stat().st_size < 200_000
 
 
 def test_pyplot_is_left_alone():
-    plots.objects(TRUTH, FOUND, FRAME)
+    draw_objects(TRUTH, FOUND, FRAME)
     assert "matplotlib.pyplot" not in sys.modules
 
 
 def test_without_matplotlib_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(LnoclError, match=r"pip install 'lnocl\[plot\]'"):
-        plots.errors({"RLM": CURVE})
+        draw_errors({"RLM": CURVE})
 
 
 @pytest.mark.parametrize("angle", [0.0, 30.0])
@@ -147,12 +152,12 @@ def test_a_psf_is_shown_beside_the_frame_that_it_was_made_from(angle):
     bad = np.zeros(frame.shape, bool)
     bad[28, 31] = True
     psf = frame[18:39, 20:41]
-    figure = plots.star_psf(frame, bad, (30.0, 28.0), [psf], [angle])
+    figure = draw_star_psf(frame, bad, (30.0, 28.0), [psf], [angle])
     left, right = panels(figure)
     assert left.get_array().mask[28, 31]
     assert left.get_array().mask.sum() == 1
     assert left.get_extent() == [-30.5, 39.5, -28.5, 32.5]
-    np.testing.assert_array_equal(right.get_array(), (psf / psf.max()).clip(plots.PSF_FLOOR))
+    np.testing.assert_array_equal(right.get_array(), (psf / psf.max()).clip(PSF_FLOOR))
     assert right.get_extent() == [-10.5, 10.5, -10.5, 10.5]
     crop = np.array(left.axes.lines[0].get_data())
     # What was at -angle in the frame is along x in the PSF.
@@ -166,7 +171,7 @@ def test_a_psf_is_shown_beside_the_frame_that_it_was_made_from(angle):
 def test_several_psfs_are_shown_in_a_row_each():
     frame = np.arange(900.0).reshape(30, 30)
     psfs = [frame[5:16, 5:16], frame[6:17, 6:17]]
-    figure = plots.star_psf(frame, frame < 0, (12.0, 12.0), psfs, [0.0, 90.0])
+    figure = draw_star_psf(frame, frame < 0, (12.0, 12.0), psfs, [0.0, 90.0])
     images = panels(figure)
     assert len(images) == 4
     for image, psf in zip(images[1::2], psfs, strict=True):

@@ -16,7 +16,7 @@ from scipy.signal import resample
 from scipy.special import j1
 
 from lnocl.errors import FileError, InputError
-from lnocl.simulation.simulate import (
+from lnocl.simulation import (
     Experiment,
     Star,
     Target,
@@ -389,25 +389,35 @@ def flat(**pixels):
         (lambda: Target(flat(), [Star(0.5, 0)]), "between pixels"),
         (lambda: Target(flat(), [Star("a", 0)]), "two numbers"),
         (lambda: Target(flat(), [Star(1, 1, 13)]), "magnitude of a star"),
-        (lambda: Target(flat(), [Star(1, 1, math.nan * u.mag)]), "one finite number"),
+        (
+            lambda: Target(flat(), [Star(1, 1, math.nan * u.mag)]),
+            "magnitude of a star must be finite",
+        ),
         (lambda: Experiment(strehl=0.0), r"strehl must be in \(0, 1\]"),
         (lambda: Experiment(strehl=1.01), "strehl"),
         (lambda: Experiment(strehl=math.nan), "strehl"),
         (lambda: Experiment(angles=[0, math.inf] * u.deg), "angles"),
         (lambda: Experiment(angles=[] * u.deg), "angles"),
-        (lambda: Experiment(angles=[0, 45]), "angles must be quantities in deg"),
+        (lambda: Experiment(angles=[0, 45]), "angles must be a quantity in deg"),
         (lambda: Experiment(exposure_time=-30 * u.min), "exposure_time must be positive"),
         (lambda: Experiment(exposure_time=30), "exposure_time must be a quantity in min"),
         (lambda: Experiment(bandwidth=0 * u.um), "bandwidth"),
         (lambda: Experiment(wavelength="2 parsnips"), "wavelength"),
-        (lambda: Experiment(pixel_scale=[5, 5] * u.mas), "pixel_scale"),
-        (lambda: Experiment(read_noise=-1 * u.electron), "read_noise must not be negative"),
+        (lambda: Experiment(pixel_scale=[5, 5] * u.mas), "pixel_scale must be one number"),
+        (lambda: Experiment(angles=[[0], [45]] * u.deg), "angles must be one or several numbers"),
+        (
+            lambda: Experiment(read_noise=-1 * u.electron),
+            "read_noise must be one number, 0 or more",
+        ),
         (lambda: Experiment(throughput=1.5), "throughput"),
         (lambda: Experiment(zero_point=0 * u.Jy), "zero_point"),
         (lambda: Experiment(sky_brightness=13 * u.mag), "sky_brightness"),
         (lambda: Experiment(seed=-1), "seed"),
         (lambda: Experiment(exposure_time="1e300 min"), "the extended source would leave"),
-        (lambda: Experiment(exposure_time="1e307 min"), "one finite|infinitely|would leave"),
+        (
+            lambda: Experiment(exposure_time="1e307 min"),
+            "exposure_time must be finite|infinitely|would leave",
+        ),
         (lambda: Experiment(sky_brightness=-1000 * u.mag / u.arcsec**2), "too bright"),
         (lambda: Experiment(sky_brightness=-50 * u.mag / u.arcsec**2), "the sky in a pixel"),
         (lambda: Experiment(read_noise=1e300 * u.electron), "read_noise would leave"),

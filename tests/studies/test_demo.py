@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.io import fits
 
 import lnocl
 from lnocl.commands import cli, messages
 from lnocl.io import fitsread, fitswrite
-from lnocl.simulation import simulate
+from lnocl.simulation import Experiment, Star, Target, hh34, load_target, simulate
+from lnocl.simulation.photometry import MAG_PER_ARCSEC2
 from lnocl.studies import demo, experiment, figures, files
 
 SMALL = ("--size", "64")
@@ -132,8 +134,8 @@ BAD_SIMULATE = {
     "strehl 0": (["hh34", "--strehl", "0"], 2, "strehl must be in (0, 1]; 0.0 was given"),
     "strehl 2": (["hh34", "--strehl", "2"], 2, "strehl must be in (0, 1]"),
     "strehl nan": (["hh34", "--strehl", "nan"], 2, "strehl must be in (0, 1]"),
-    "angle": (["hh34", "--angle", "0", "nan"], 2, "angles must be one or several finite"),
-    "angle inf": (["hh34", "--angle", "-inf"], 2, "angles must be one or several finite"),
+    "angle": (["hh34", "--angle", "0", "nan"], 2, "angles must be finite"),
+    "angle inf": (["hh34", "--angle", "-inf"], 2, "angles must be finite"),
     "throughput": (["hh34", "--throughput", "1.5"], 2, "throughput must be in (0, 1]"),
     "time": (["hh34", "--exposure-time", "30"], 2, "--exposure-time must be a quantity in min"),
     "no time": (["hh34", "--exposure-time", "0 s"], 2, "--exposure-time must be positive"),
@@ -164,15 +166,15 @@ class TestSimulate:
         assert os.listdir() == []
 
     def test_a_folder_that_cannot_be_made_is_refused_before_the_work(self, capsys, monkeypatch):
-        monkeypatch.setattr(simulate, "simulate", lambda *arguments: pytest.fail("work was begun"))
+        monkeypatch.setattr(
+            "lnocl.simulation.simulate", lambda *arguments: pytest.fail("work was begun")
+        )
         Path("text").write_text("kept")
         assert cli.main(["simulate", "hh34", *SMALL, "-o", "text/out"]) == 1
         assert "text/out cannot be used" in one_complaint(capsys.readouterr())
 
     def test_the_record_is_whole_or_not_there(self, capsys, monkeypatch):
-        simulation = simulate.simulate(
-            simulate.hh34(64), simulate.Experiment(angles=0 * simulate.u.deg)
-        )
+        simulation = simulate(hh34(64), Experiment(angles=0 * u.deg))
         Path("out").mkdir()
         Path("out/record.json").write_text("kept")
         with pytest.raises(lnocl.FileError, match=r"record.json exists"):
@@ -196,16 +198,16 @@ class TestSimulate:
         more = ("--extended-magnitude", "12", "--sky", "14", "--read-noise", "5", "--seed", "3")
         arguments = ["hh34", *SMALL, "--angle", "0", "-60", "--star", "20,30,11.5"]
         assert cli.main(["simulate", *arguments, *options, *more, "-o", "out"]) == 0
-        expected = simulate.simulate(
-            simulate.load_target("hh34", 64, [simulate.Star(20, 30, 11.5 * simulate.u.mag)]),
-            simulate.Experiment(
-                angles=(0, -60) * simulate.u.deg,
+        expected = simulate(
+            load_target("hh34", 64, [Star(20, 30, 11.5 * u.mag)]),
+            Experiment(
+                angles=(0, -60) * u.deg,
                 exposure_time="10 min",
                 strehl=0.5,
                 throughput=0.2,
-                extended_magnitude=12 * simulate.u.mag,
-                sky_brightness=14 * simulate.MAG_PER_ARCSEC2,
-                read_noise=5 * simulate.u.electron,
+                extended_magnitude=12 * u.mag,
+                sky_brightness=14 * MAG_PER_ARCSEC2,
+                read_noise=5 * u.electron,
                 seed=3,
             ),
         )
@@ -250,9 +252,9 @@ class TestSimulate:
             asked.append(experiment)
             raise lnocl.InputError("enough")
 
-        monkeypatch.setattr(simulate, "simulate", refuse)
+        monkeypatch.setattr("lnocl.simulation.simulate", refuse)
         assert cli.main(["simulate", "hh34", *SMALL, "-o", "out", *stated]) == 2
-        assert str(asked[0]) == str(simulate.Experiment())
+        assert str(asked[0]) == str(Experiment())
 
     def test_overwrite_replaces(self):
         command = ["simulate", "hh34", *SMALL, "-o", "out", "--angle", "0"]
@@ -272,7 +274,9 @@ class TestSimulate:
         ("arguments", "status", "message"), BAD_SIMULATE.values(), ids=BAD_SIMULATE
     )
     def test_refusals(self, arguments, status, message, capsys, monkeypatch):
-        monkeypatch.setattr(simulate, "simulate", lambda *arguments: pytest.fail("work was begun"))
+        monkeypatch.setattr(
+            "lnocl.simulation.simulate", lambda *arguments: pytest.fail("work was begun")
+        )
         fits.writeto("dark.fits", np.zeros((64, 64)))
         Path("text.fits").write_text("no FITS")
         Path("full").mkdir()
@@ -290,7 +294,9 @@ class TestPlot:
 
     def test_everything_the_data_allow(self, run, capsys, monkeypatch):
         files, _ = run
-        monkeypatch.setattr("lnocl.plotting.plots.save", lambda _, path, __: Path(path).touch())
+        monkeypatch.setattr(
+            "lnocl.studies.figures.save_figure", lambda _, path, __: Path(path).touch()
+        )
         results = [str(files / f"{name}.fits") for name in ("rlm", "mc-rl")]
         truth = str(files / "truth.fits")
         assert cli.main(["plot", *results, "--truth", truth, "-o", "out"]) == 0
@@ -364,9 +370,7 @@ class TestPlot:
 
 @pytest.fixture(scope="module")
 def simulation():
-    return simulate.simulate(
-        simulate.hh34(64), simulate.Experiment(angles=[0, 90] * simulate.u.deg)
-    )
+    return simulate(hh34(64), Experiment(angles=[0, 90] * u.deg))
 
 
 class TestExperiment:
@@ -381,10 +385,10 @@ class TestExperiment:
 
     @pytest.mark.parametrize("n", [0, 2])
     def test_exactly_one_star(self, n):
-        stars = [simulate.Star(10 + j, 20) for j in range(n)]
-        several = simulate.simulate(
-            simulate.Target(np.ones((64, 64)), stars),
-            simulate.Experiment(angles=0 * simulate.u.deg),
+        stars = [Star(10 + j, 20) for j in range(n)]
+        several = simulate(
+            Target(np.ones((64, 64)), stars),
+            Experiment(angles=0 * u.deg),
         )
         with pytest.raises(lnocl.InputError, match=f"has {n} stars"):
             experiment.reconstruct(several, experiment.observe(several), "RLM", 0.0, 1)
@@ -398,11 +402,11 @@ class TestExperiment:
         """20 rows before the star and 19 after it; NaN where all the light is beyond."""
         image = np.zeros((96, 64))
         image[70, 20] = 1.0
-        star = simulate.Star(20, 50)
-        how = simulate.Experiment(angles=0 * simulate.u.deg)
+        star = Star(20, 50)
+        how = Experiment(angles=0 * u.deg)
         for row, expected in ((70, np.nan), (69, 0.0), (30, 0.0), (29, np.nan)):
             moved = np.roll(image, row - 70, axis=0)
-            made = simulate.simulate(simulate.Target(moved, [star]), how)
+            made = simulate(Target(moved, [star]), how)
             curve = np.zeros(1, experiment.CURVE_DTYPE)
             found = experiment.Reconstruction("MC-RL", 0.0, curve, made.extended, 1.0)
             errors = experiment.profile_errors(made, found)

@@ -16,8 +16,8 @@ from scenes import Recipe
 import lnocl
 from lnocl import metrics
 from lnocl.commands import cli
-from lnocl.plotting import plots
-from lnocl.simulation import simulate
+from lnocl.plotting.curves import draw_costs
+from lnocl.simulation import hh34, simulate
 from lnocl.studies import bench, demo, experiment, trade
 
 MADE = Recipe((32, 32), n_images=2, n_stars=1, mu=1e-4).make()
@@ -238,7 +238,7 @@ class TestCommand:
     def test_the_demo_has_a_truth(self, capsys):
         assert run("--size", "64", "-o", "out") == 0
         table = Table.read("out.ecsv")
-        simulation = simulate.simulate(simulate.hh34(64))
+        simulation = simulate(hh34(64))
         result = lnocl.deconvolve(
             experiment.observe(simulation),
             simulation.stars,
@@ -363,7 +363,7 @@ def test_the_figure_joins_the_front_and_marks_the_reference():
             "front": np.array([True, True]),
         },
     }
-    (axis,) = plots.costs(settings, "all rows").axes
+    (axis,) = draw_costs(settings, "all rows").axes
     lines = {line.get_label(): line for line in axis.lines}
     np.testing.assert_array_equal(lines["front"].get_data(), [[0.5, 2.0], [0.1, 1e-6]])
     np.testing.assert_array_equal(lines["double"].get_data(), [[1.0], [0.1]])

@@ -1,4 +1,4 @@
-"""Astropy's containers through the door: the same as the numbers in electrons, or a clear word."""
+"""Astropy's containers are taken as their numbers in electrons, or refused in one line."""
 
 import warnings
 
@@ -218,42 +218,54 @@ def test_counts_of_an_exposure_that_no_number_holds_are_refused(name, rate):
 REFUSED = {
     "images in adu": (
         {"images": IMAGES * u.adu},
-        "images in adu are no counts: give electrons; multiply by the gain (electrons per adu)",
+        "images must be counts per pixel, not adu; multiply by the gain (electrons per adu)",
     ),
     "images in adu per second": (
         {"images": IMAGES * u.adu / u.s, "exposure": 1 * u.s},
-        "images in adu / s are no counts: give electrons; multiply by the gain",
+        "images must be counts per pixel, not adu / s; multiply by the gain",
     ),
     "images in DN": ({"images": IMAGES * u.DN}, "multiply by the gain (electrons per adu)"),
-    "a list in adu": ({"images": [image * u.adu for image in IMAGES]}, "images in adu are no"),
-    "CCDData in adu": ({"images": CCDData(IMAGES, unit="adu")}, "images in adu are no counts"),
+    "a list in adu": (
+        {"images": [image * u.adu for image in IMAGES]},
+        "images must be counts per pixel, not adu",
+    ),
+    "CCDData in adu": (
+        {"images": CCDData(IMAGES, unit="adu")},
+        "images must be counts per pixel, not adu",
+    ),
     "images in jansky": (
         {"images": IMAGES * u.Jy},
-        "images in Jy are no counts: give electrons per pixel",
+        "images must be counts per pixel, not Jy; give electrons",
     ),
     "rates without exposure": (
         {"images": IMAGES * u.electron / u.s},
         "images in electron / s are counts per time; give exposure in seconds with them",
     ),
-    "background in jansky": ({"background": 2 * u.Jy}, "background in Jy are no counts"),
+    "background in jansky": (
+        {"background": 2 * u.Jy},
+        "background must be counts per pixel, not Jy",
+    ),
     "background per time without exposure": (
         {"background": 2 * u.electron / u.s},
         "background in electron / s are counts per time; give exposure in seconds with them",
     ),
     "background as NDData in adu": (
         {"background": NDData(IMAGES, unit="adu")},
-        "background in adu are no counts",
+        "background must be counts per pixel, not adu",
     ),
-    "read noise in adu": ({"read_noise": 2 * u.adu}, "read_noise in adu are no counts"),
+    "read noise in adu": (
+        {"read_noise": 2 * u.adu},
+        "read_noise must be counts per pixel, not adu",
+    ),
     "read noise per time": (
         {"read_noise": 2 * u.electron / u.s, "exposure": 2 * u.s},
         "read_noise in electron / s are counts per time; give electrons",
     ),
     "exposure in metres": (
         {"exposure": 2 * u.m},
-        "exposure in m is no time: give seconds, or numbers without unit",
+        "exposure must be in seconds or numbers without unit, not in m",
     ),
-    "exposures in metres": ({"exposure": [2 * u.m] * 3}, "exposure in m is no time"),
+    "exposures in metres": ({"exposure": [2 * u.m] * 3}, "exposure must be in seconds"),
     "exposures in two units": (
         {"exposure": [2 * u.s, 2 * u.min, 1 * u.s]},
         "exposure come in several units (s, min); give them in one",
@@ -261,9 +273,12 @@ REFUSED = {
     "negative exposure": ({"exposure": -2 * u.s}, "exposure must be finite and more than zero; -2"),
     "offsets in mm": (
         {"offsets": np.zeros((3, 2)) * u.mm},
-        "offsets in mm are no pixels: give pixels, from the WCS of the images",
+        "offsets must be in pixels, not in mm; convert them with the WCS of the images",
     ),
-    "offsets in arcsec": ({"offsets": [(1 * u.arcsec, 1 * u.arcsec)] * 3}, "offsets in arcsec are"),
+    "offsets in arcsec": (
+        {"offsets": [(1 * u.arcsec, 1 * u.arcsec)] * 3},
+        "offsets must be in pixels, not in arcsec",
+    ),
     "several units": (
         {"images": [CCDData(i, unit=n) for i, n in zip(IMAGES, ("ct", "adu", "ct"), strict=True)]},
         "images come in several units (ct, adu); give them in one",

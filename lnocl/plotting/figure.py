@@ -1,0 +1,86 @@
+"""A figure: its colours and lines, and the file that it is written to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.errors import LnoclError
+from lnocl.io.atomic import whole_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Array = NDArray[np.float64]
+
+DPI = 110
+# The palette of M. Okabe and K. Ito, "Color Universal Design" (2008), for colour-blind readers.
+COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+STYLES = ("-", "--", "-.", ":")
+MARKERS = ("o", "s", "^", "D")
+COLOUR_MAP = "viridis"
+
+
+def check_matplotlib() -> None:
+    """Check that figures can be drawn.
+
+    Raises
+    ------
+    LnoclError
+        Where matplotlib is missing.
+    """
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
+        raise LnoclError(
+            "pictures need matplotlib, which is not installed: pip install 'lnocl[plot]'"
+        ) from None
+
+
+def save_figure(figure: Figure, path: str, overwrite: bool = False) -> None:
+    """Write a figure as PNG, complete or not at all.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        One of those that the functions here return.
+    path : str
+        File to write.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written, or exists and must not be overwritten.
+    """
+    with whole_file(path, overwrite) as stream:
+        figure.savefig(stream, format="png", dpi=DPI, pil_kwargs={"optimize": True})
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, apart from pyplot's state."""
+    check_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def line_style(i: int) -> dict[str, Any]:
+    """Return colour and style of the i-th line; they begin again after the last."""
+    return {"color": COLOURS[i % len(COLOURS)], "linestyle": STYLES[i % len(STYLES)]}
+
+
+def plain_ticks(axis: Any) -> None:
+    """Label a short logarithmic axis with plain numbers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(ScalarFormatter())
+    axis.set_minor_formatter(NullFormatter())

@@ -1,0 +1,261 @@
+"""The steps from a frame of a star to a PSF; each says in one line what it did."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from astropy.stats import sigma_clipped_stats
+from numpy.typing import ArrayLike, NDArray
+
+from lnocl.errors import InputError, warn
+from lnocl.psf import resampling
+from lnocl.psf.centring import FWHM, SEARCH, Array, Mask, Pixel, Point, brightest, fit_gaussian
+from lnocl.psf.checks import MIN_SIZE, one_number
+from lnocl.psf.repair import WINDOW, repair
+from lnocl.scene.observation import numbers
+
+# Pixels around the crop while it is shifted and rotated: both wrap round its edges.
+MARGIN = 16
+# Fewest pixels that a background is measured from.
+MIN_SKY = 100
+# Width of the frame's border, as a share of the shorter side.
+BORDER = 1 / 16
+# Growth of negative pixels by shift and rotation that calls for a warning: a share of the flux on
+# top of a share of the negative flux before, since both change noise too.
+RINGING, OF_NOISE = 0.01, 0.2
+
+
+def find_star(pixels: Array, bad: Mask, position: ArrayLike | None) -> tuple[Pixel, str]:
+    """Return the star's pixel: the one at `position`, or the brightest."""
+    ny, nx = pixels.shape
+    if position is None:
+        start = brightest(pixels, bad)
+        return start, f"star: brightest pixel of the median-filtered frame, {_at(start)}"
+    given = numbers("position", position)
+    if given.shape != (2,) or not np.isfinite(given).all():
+        raise InputError(f"position is {position!r}; give two finite numbers, x and y")
+    start = nearest_pixel((float(given[1]), float(given[0])))
+    if not (0 <= start[0] < ny and 0 <= start[1] < nx):
+        raise InputError(
+            f"position ({given[0]:g}, {given[1]:g}) is outside the frame of {nx} x {ny} pixels; "
+            "give x and y, 0-based"
+        )
+    return start, f"star: given at x = {given[0]:g}, y = {given[1]:g}"
+
+
+def reachable(shape: tuple[int, ...], start: Pixel, half: int | None) -> tuple[slice, slice]:
+    """Return the rows and columns that the PSF may be made of, wherever its centre is found."""
+    far = max(shape) if half is None else half + MARGIN + SEARCH
+    y, x = (slice(max(i - far, 0), i + far + 1) for i in start)
+    return y, x
+
+
+def measure_background(
+    background: float | str,
+    pixels: Array,
+    bad: Mask,
+    start: Pixel,
+    half: int | None,
+) -> tuple[float, str]:
+    """Return the background: as given, or the median around the crop or in the border."""
+    if not isinstance(background, str):
+        level = one_number("background", background)
+        return level, f"background: {level:g}, as given, subtracted"
+    if background != "auto":
+        raise InputError(f'background is {background!r}; give a number or "auto"')
+    y, x = (np.abs(np.arange(n) - i) for n, i in zip(pixels.shape, start, strict=True))
+    distance = np.maximum(y[:, None], x)
+    sky, where = np.zeros_like(bad), "around the crop"
+    if half is not None:
+        sky = ~bad & (distance > half) & (distance <= 2 * half)
+    if sky.sum() < MIN_SKY:
+        width = max(1, int(min(pixels.shape) * BORDER))
+        sky, where = ~bad, "in the frame's border"
+        sky[width:-width, width:-width] = False
+    if not sky.any():
+        raise InputError("no good pixel is left for the background; give it as a number")
+    _, level, scatter = map(float, sigma_clipped_stats(pixels[sky], sigma=3.0))
+    return level, (
+        f"background: {level:g} subtracted, scatter {scatter:.3g}, "
+        f"median of {sky.sum()} pixels {where}"
+    )
+
+
+def repair_bad(
+    light: Array, bad: Mask, saturated: Mask, region: tuple[slice, slice]
+) -> tuple[Mask, str]:
+    """Interpolate the bad pixels of a region in place; return those that are too far inside."""
+    if not bad.any():
+        return bad, "bad pixels: 0 in the frame"
+    repaired, unrepairable = repair(light, bad, region)
+    if n_unrepairable := int(unrepairable.sum()):
+        warn(
+            f"{n_unrepairable} bad pixels around the star have too few good ones beside them and "
+            "were set to the background"
+        )
+    return unrepairable, (
+        f"bad pixels: {bad.sum()} in the frame, {saturated.sum()} of them saturated; "
+        f"{repaired.sum()} around the star repaired, {n_unrepairable} set to the background"
+    )
+
+
+def find_centre(
+    light: Array, unusable: Mask, start: Pixel, level: float, recentre: bool
+) -> tuple[Point, Point | None, str]:
+    """Return the star's centre and the shift to the middle of a pixel; None for no shift."""
+    if not recentre:
+        return (float(start[0]), float(start[1])), None, f"centre: pixel {_at(start)}; not shifted"
+    centre, sigma = fit_gaussian(light, unusable, start, level)
+    pixel = nearest_pixel(centre)
+    shift = pixel[0] - centre[0], pixel[1] - centre[1]
+    line = (
+        f"centre: x = {centre[1]:.3f}, y = {centre[0]:.3f}, FWHM {FWHM * sigma:.2f} pixels; "
+        f"shifted by x {_plain(shift[1], 3)}, y {_plain(shift[0], 3)}"
+    )
+    return centre, shift, line
+
+
+def _largest(shape: tuple[int, ...], pixel: Pixel, angle: float) -> int:
+    """Return the side of the largest PSF that the frame has around a pixel."""
+    before = min(pixel)
+    after = min(n - 1 - i for n, i in zip(shape, pixel, strict=True))
+    if angle == 0:
+        return min(2 * before + 1, 2 * after + 2)
+    side = 2 * min(before, after) + 1
+    while side > 1 and resampling.reach(side, angle) > min(before, after):
+        side -= 2
+    return side
+
+
+def fitting_side(shape: tuple[int, ...], pixel: Pixel, side: int | None, angle: float) -> int:
+    """Return the side of the PSF: as asked for if the frame has it, or the largest there is."""
+    largest = _largest(shape, pixel, angle)
+    if largest < MIN_SIZE:
+        raise InputError(f"the star at {_at(pixel)} is at the edge of the frame; give another")
+    if side is None:
+        return largest
+    if side > largest:
+        turned = f", rotated by {angle:g} degrees," if angle else ""
+        raise InputError(
+            f"a PSF of {side} x {side} pixels{turned} around the star at {_at(pixel)} reaches "
+            f"beyond the frame; give a size of {largest} or less"
+        )
+    return side
+
+
+def refuse_hole(unrepairable: Mask, pixel: Pixel) -> None:
+    """Refuse a star whose middle has too few good pixels around it to be repaired."""
+    if unrepairable[pixel]:
+        raise InputError(
+            f"the star at {_at(pixel)} has too few good pixels among the {WINDOW} x {WINDOW} "
+            "around it; take a frame with a shorter exposure"
+        )
+
+
+def cut_square(array: NDArray, pixel: Pixel, half: int) -> NDArray:
+    """Return the square of this half width around a pixel, mirrored where the frame ends."""
+    inside = tuple(slice(max(i - half, 0), i + half + 1) for i in pixel)
+    missing = [
+        (max(half - i, 0), max(i + half + 1 - n, 0))
+        for i, n in zip(pixel, array.shape, strict=True)
+    ]
+    return np.pad(array[inside], missing, mode="symmetric")
+
+
+def middle_square(work: NDArray, side: int) -> NDArray:
+    """Return the square of this side around the middle of one of odd side."""
+    first = len(work) // 2 - side // 2
+    return work[first : first + side, first : first + side]
+
+
+def rotate_square(work: Array, angle: float, radius: int) -> tuple[Array, str]:
+    """Rotate about the middle; the change of sharpness is measured within a radius."""
+    turned = resampling.rotate(work, angle)
+    y, x = (np.arange(len(work)) - len(work) // 2 for _ in range(2))
+    disc = np.hypot(y[:, None], x) <= radius
+    sharpness = [
+        float((image[disc] ** 2).sum() / image[disc].sum() ** 2) for image in (work, turned)
+    ]
+    return turned, (
+        f"rotation: {angle:g} degrees; its sharpness, the sum of the squares over the square of "
+        f"the sum, changed by {_percent(sharpness[1] / sharpness[0] - 1, 4)}"
+    )
+
+
+def crop_square(
+    work: Array, side: int, light: Array, pixel: Pixel, level: float
+) -> tuple[Array, str]:
+    """Return the PSF; the line says which share of the flux is outside it."""
+    psf = middle_square(work, side).copy()
+    largest = _largest(light.shape, pixel, 0.0)
+    y, x = (slice(i - largest // 2, i - largest // 2 + largest) for i in pixel)
+    flux, whole = float(psf.sum()), float(light[y, x].sum())
+    if not flux > 0:
+        raise InputError(
+            f"the flux of the PSF above the background {level:g} is {flux:g}; give another "
+            "position or a lower background"
+        )
+    if side == largest:
+        return psf, f"crop: {side} x {side} pixels, the largest square there is"
+    left_out = _percent(1 - flux / whole) + " of the flux" if whole > 0 else "an unknown share"
+    return psf, (
+        f"crop: {side} x {side} pixels; {left_out} in the largest square there is, "
+        f"{largest} x {largest}, left out"
+    )
+
+
+def warn_of_guess(saturated: Mask, light: Array, pixel: Pixel, side: int) -> None:
+    """Warn where saturated pixels of the PSF were repaired."""
+    saturated, light = (cut_square(image, pixel, side // 2) for image in (saturated, light))
+    if n_saturated := int(saturated.sum()):
+        share = _percent(light[saturated].sum() / light.sum())
+        warn(
+            f"{n_saturated} saturated pixels of the PSF were repaired, and hold {share} of its "
+            "flux: its core is a guess"
+        )
+
+
+def negative_shares(before: Array, psf: Array) -> tuple[float, float]:
+    """Return the flux in negative pixels before shift and rotation and after, as shares."""
+    negative, after = (float(-image.clip(max=0).sum() / psf.sum()) for image in (before, psf))
+    return negative, after
+
+
+def warn_of_ringing(shares: Sequence[tuple[float, float]]) -> None:
+    """Warn where shift and rotation made negative pixels grow; the worst of all PSFs counts."""
+    before, after = max(shares, key=lambda share: share[1] - (1 + OF_NOISE) * share[0])
+    if after > RINGING + (1 + OF_NOISE) * before:
+        warn(
+            f"the PSF rings: negative pixels hold {_percent(after)} of its flux after shift and "
+            f"rotation, {_percent(before)} before; the star is undersampled, and its pixels stay "
+            "as they are without recentring and rotation"
+        )
+
+
+def count_negative(psf: Array, clip: bool) -> tuple[Array, str]:
+    """Return the PSF with its negative pixels, or with 0 in their place."""
+    negative = psf < 0
+    share = _percent(psf[negative].sum() / psf.sum())
+    done = "set to 0" if clip else "left as they are"
+    line = f"negative pixels: {negative.sum()}, {share} of the flux; {done}"
+    return (np.where(negative, 0.0, psf) if clip else psf), line
+
+
+def nearest_pixel(point: Point) -> Pixel:
+    """Return the pixel that a point lies in."""
+    return math.floor(point[0] + 0.5), math.floor(point[1] + 0.5)
+
+
+def _at(pixel: Pixel) -> str:
+    return f"x = {pixel[1]}, y = {pixel[0]}"
+
+
+def _plain(value: float, digits: int) -> str:
+    """Return a number without a minus sign before zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
+
+
+def _percent(share: float, digits: int = 2) -> str:
+    return _plain(100 * float(share), digits) + " %"

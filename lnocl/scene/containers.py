@@ -1,0 +1,154 @@
+"""Quantities, NDData and sequences of them as plain numbers, in the units of an observation."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lnocl.errors import InputError
+from lnocl.scene.units import count_of
+
+
+class _Numbers:
+    """Numbers with their unit, which may be None."""
+
+    def __init__(self, value: Any, unit: Any) -> None:
+        self.value, self.unit = value, unit
+
+
+def _gather(name: str, values: Any, depth: int = 0) -> Any:
+    """Return NDData as numbers with a unit, masked where it is, and a sequence with units as one.
+
+    Uncertainties are not used: the noise is Poisson's. Anything else is returned as it is.
+    """
+    if "astropy.units" not in sys.modules:  # then it cannot have any
+        return values
+    if _is_nddata(values):
+        return _Numbers(_masked(name, values), values.unit)
+    if not _may_hold_units(values) or depth > 1:  # pairs of lengths are the deepest
+        return values
+    parts = [_gather(name, part, depth + 1) if _may_hold_units(part) else part for part in values]
+    if not any(hasattr(part, "unit") for part in parts):
+        return values
+    units = {str(getattr(part, "unit", None)): getattr(part, "unit", None) for part in parts}
+    if len(units) > 1:
+        raise InputError(f"{name} come in several units ({', '.join(units)}); give them in one")
+    stack = [np.ma.asanyarray(getattr(part, "value", part)) for part in parts]
+    if len({part.shape for part in stack}) > 1:
+        raise InputError(f"{name} cannot be read as an array: their shapes differ")
+    return _Numbers(np.ma.stack(stack), *units.values())
+
+
+def _may_hold_units(values: Any) -> bool:
+    return _is_nddata(values) or (isinstance(values, Sequence) and not isinstance(values, str))
+
+
+def _is_nddata(values: Any) -> bool:
+    if "astropy.nddata" not in sys.modules:
+        return False
+    from astropy.nddata import NDData
+
+    return isinstance(values, NDData)
+
+
+def _masked(name: str, values: Any) -> Any:
+    data = np.ma.asanyarray(values.data)
+    if values.mask is None:
+        return data
+    if np.shape(values.mask) not in ((), data.shape):
+        raise InputError(
+            f"{name} have a mask of shape {np.shape(values.mask)}; their data have {data.shape}"
+        )
+    return np.ma.array(data, mask=np.asarray(values.mask, bool))
+
+
+def _split(name: str, values: Any) -> tuple[Any, Any]:
+    """Return plain numbers and their unit; the unit is None for plain numbers."""
+    values = _gather(name, values)
+    if isinstance(values, _Numbers) or getattr(values, "unit", None) is not None:
+        return values.value, values.unit
+    return values, None
+
+
+def counts(name: str, values: Any, has_exposure: bool | None = None) -> tuple[Any, bool]:
+    """Return counts without their unit, and whether they are per unit of exposure time.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for messages.
+    values : array_like, Quantity, NDData or a sequence of these
+        Without a unit they are taken as electrons. All parts of a sequence have the same unit.
+    has_exposure : bool, optional
+        Whether there are exposures to multiply counts per time by; None where counts per time make
+        no sense.
+
+    Returns
+    -------
+    numbers : array_like
+        Counts, or counts per unit of exposure time.
+    are_rates : bool
+        Whether they are per unit of exposure time.
+
+    Raises
+    ------
+    InputError
+        A unit that is not a count; counts per time without exposures.
+    """
+    numbers, unit = _split(name, values)
+    if unit is None:
+        return numbers, False
+    known = count_of(unit)
+    if known is None:
+        from astropy import units as u
+
+        digital = {u.adu, u.DN} & set(unit.decompose().bases)
+        advice = "multiply by the gain (electrons per adu)" if digital else "give electrons"
+        raise InputError(f"{name} must be counts per pixel, not {unit}; {advice}")
+    factor, is_rate = known
+    if is_rate and not has_exposure:
+        advice = "electrons" if has_exposure is None else "exposure in seconds with them"
+        raise InputError(f"{name} in {unit} are counts per time; give {advice}")
+    return numbers * factor, is_rate
+
+
+def seconds(values: Any) -> Any:
+    """Return exposures as plain numbers, times in seconds.
+
+    Raises
+    ------
+    InputError
+        A unit that is not a time.
+    """
+    numbers, unit = _split("exposure", values)
+    if unit is None or unit.physical_type == "dimensionless":
+        return numbers if unit is None else numbers * unit.to("")
+    if unit.physical_type != "time":
+        raise InputError(f"exposure must be in seconds or numbers without unit, not in {unit}")
+    return numbers * unit.to("s")
+
+
+def pixels(name: str, values: Any) -> Any:
+    """Return lengths in pixels as plain numbers.
+
+    Raises
+    ------
+    InputError
+        A unit other than pixels.
+    """
+    numbers, unit = _split(name, values)
+    if unit is None:
+        return numbers
+    if not unit.is_equivalent("pix"):
+        raise InputError(
+            f"{name} must be in pixels, not in {unit}; convert them with the WCS of the images"
+        )
+    return numbers * unit.to("pix")
+
+
+def bare(name: str, values: Any) -> Any:
+    """Return values without their unit: of PSFs only the shape counts."""
+    return _split(name, values)[0]

@@ -1,0 +1,79 @@
+"""Checks of numbers, quantities and shapes that the simulation shares."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from numpy.typing import NDArray
+
+from lnocl.errors import InputError
+
+Array = NDArray[np.float64]
+
+MIN_SIZE = 32
+
+# Largest number of electrons in one image, of all sources and of the sky in a pixel: Poisson
+# deviates are 64-bit integers, and float64 counts one by one up to 9e15.
+MAX_ELECTRONS = 1e15
+
+
+def numbers(name: str, value: Any, unit: u.UnitBase) -> Array:
+    """Return a quantity, or a text such as "30 min", as finite numbers in a unit."""
+    try:
+        with np.errstate(over="ignore"):
+            array = np.asarray(u.Quantity(value).to_value(unit), np.float64)
+    except (TypeError, ValueError, u.UnitsError):
+        raise InputError(
+            f"{name} must be a quantity in {unit} or a unit of its kind; {value} was given"
+        ) from None
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} must be finite; {value} was given")
+    return array
+
+
+def number(name: str, value: Any, unit: u.UnitBase, minimum: float = -math.inf) -> float:
+    """Return a quantity as one finite number in a unit, the minimum or more."""
+    array = numbers(name, value, unit)
+    if array.ndim or array < minimum:
+        bound = "" if minimum == -math.inf else f", {minimum:g} or more"
+        raise InputError(f"{name} must be one number{bound}; {value} was given")
+    return float(array)
+
+
+def positive(name: str, value: Any, unit: u.UnitBase) -> float:
+    """Return a quantity as one finite number in a unit, more than 0."""
+    value_in_unit = number(name, value, unit)
+    if value_in_unit <= 0:
+        raise InputError(f"{name} must be positive; {value} was given")
+    return value_in_unit
+
+
+def check_electrons(name: str, number: float) -> None:
+    """Refuse more electrons than can be simulated."""
+    if not number <= MAX_ELECTRONS:
+        raise InputError(
+            f"{name} would leave {number:.3g} electrons in one image; at most "
+            f"{MAX_ELECTRONS:.0e} can be simulated"
+        )
+
+
+def check_share(name: str, value: float) -> None:
+    """Refuse a number outside (0, 1]."""
+    if not (isinstance(value, (int, float, np.floating)) and 0 < value <= 1):
+        raise InputError(f"{name} must be in (0, 1]; {value} was given")
+
+
+def check_shape(shape: Any, minimum: int = MIN_SIZE) -> tuple[int, int]:
+    """Return a shape (ny, nx); refuse sides that are odd or below a minimum."""
+    if np.shape(shape) != (2,):
+        raise InputError(f"shape must be (ny, nx); {shape} was given")
+    ny, nx = shape
+    for n in (ny, nx):
+        if not isinstance(n, (int, np.integer)) or n % 2 or n < minimum:
+            raise InputError(
+                f"the image is {nx} x {ny} pixels; each side must be even and {minimum} or more"
+            )
+    return int(ny), int(nx)

@@ -1,0 +1,183 @@
+"""Simulated images of a target, with photon noise and read noise."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.utils.misc import JsonCustomEncoder
+from scipy import fft
+
+from lnocl.simulation.checks import Array, check_electrons
+from lnocl.simulation.fizeau import N_SCREENS, fizeau_psf
+from lnocl.simulation.targets import Target
+from lnocl.simulation.telescope import (
+    APERTURE_DIAMETER,
+    BASELINE,
+    N_ACTUATORS,
+    OBSCURATION_DIAMETER,
+    Experiment,
+    collecting_area,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """Simulated images, and the truth that they show.
+
+    Attributes
+    ----------
+    images : ndarray of float64, shape (p, ny, nx)
+        Electrons per pixel, with noise; read noise makes some negative where the sky is dark.
+    psfs : ndarray of float64, shape (p, ny, nx)
+        Of unit sum, peak at ``(ny // 2, nx // 2)``.
+    background : ndarray of float64, shape (p,)
+        Electrons of the sky per pixel.
+    read_noise : float
+        Standard deviation, electrons.
+    extended : ndarray of float64, shape (ny, nx)
+        The true extended source, electrons per pixel.
+    stars : list of (x, y)
+        Positions in pixels, 0-based, x along columns.
+    star_fluxes : ndarray of float64, shape (n,)
+        The true fluxes, electrons.
+    zero_magnitude_flux : float
+        Electrons of a star of magnitude 0.
+    experiment : Experiment
+        How the images were taken.
+    """
+
+    images: Array
+    psfs: Array
+    background: Array
+    read_noise: float
+    extended: Array
+    stars: list[tuple[int, int]]
+    star_fluxes: Array
+    zero_magnitude_flux: float
+    experiment: Experiment
+
+    def record(self) -> dict[str, Any]:
+        """Return every number the simulation was made from, ready for `json.dump`.
+
+        A quantity is its value and its unit.
+        """
+        record = {
+            "target": {
+                "shape": self.extended.shape,
+                "extended_electrons": self.extended.sum(),
+                "stars": [
+                    {"x": x, "y": y, "electrons": flux}
+                    for (x, y), flux in zip(self.stars, self.star_fluxes, strict=True)
+                ],
+            },
+            "experiment": vars(self.experiment),
+            "telescope": {
+                "baseline": BASELINE,
+                "aperture_diameter": APERTURE_DIAMETER,
+                "obscuration_diameter": OBSCURATION_DIAMETER,
+                "collecting_area": collecting_area(),
+                "n_actuators": N_ACTUATORS,
+                "n_screens": N_SCREENS,
+            },
+            "zero_magnitude_electrons": self.zero_magnitude_flux,
+            "sky_electrons_per_pixel": self.experiment.sky_electrons,
+        }
+        return dict(json.loads(json.dumps(record, cls=JsonCustomEncoder)))
+
+
+def simulate(target: Target, experiment: Experiment | None = None) -> Simulation:
+    """Return images of the target, one for each angle of the experiment.
+
+    ``images[j] ~ Poisson(K_j * extended + sum_s c_s P_js + b) + Normal(0, read_noise)``
+
+    The convolution is periodic and the PSFs are those handed back (the paper's inverse crime).
+
+    Parameters
+    ----------
+    target : Target
+        Extended source and stars.
+    experiment : Experiment, optional
+        By default the paper's.
+
+    Returns
+    -------
+    Simulation
+        Images, PSFs and the truth.
+
+    Raises
+    ------
+    InputError
+        Where the pixels are too coarse for the wavelength; where the light of all sources, and of
+        the sky in a pixel, adds up to more than `MAX_ELECTRONS`.
+
+    References
+    ----------
+    A. La Camera, S. Antoniucci, M. Bertero et al., "Image reconstruction for observations with
+    a high dynamic range: LINC-NIRVANA simulations of a stellar jet", Proc. SPIE 8445 (2012),
+    section 3.
+
+    Examples
+    --------
+    >>> from lnocl.simulation import hh34, simulate
+    >>> simulation = simulate(hh34(64))
+    >>> simulation.images.shape, simulation.stars
+    ((4, 64, 64), [(32, 16)])
+    """
+    experiment = Experiment() if experiment is None else experiment
+    stars = [(star.x, star.y) for star in target.stars]
+    star_fluxes = np.array([experiment.source_electrons(star.magnitude) for star in target.stars])
+    for star, flux in zip(target.stars, star_fluxes, strict=True):
+        check_electrons(f"the star at ({star.x}, {star.y})", float(flux))
+    extended_flux = experiment.source_electrons(experiment.extended_magnitude)
+    total = float(star_fluxes.sum()) + extended_flux + experiment.sky_electrons
+    check_electrons("all light together", total)
+    *psf_seeds, noise_seed = np.random.SeedSequence(experiment.seed).spawn(
+        len(experiment.angles) + 1
+    )
+    psfs = np.stack(
+        [
+            fizeau_psf(
+                target.extended.shape,
+                angle,
+                experiment.wavelength,
+                experiment.pixel_scale,
+                experiment.strehl,
+                seed,
+            )
+            for angle, seed in zip(experiment.angles, psf_seeds, strict=True)
+        ]
+    )
+    extended = target.extended * extended_flux
+    background = np.full(len(psfs), experiment.sky_electrons)
+    read_noise = float(experiment.read_noise.value)
+    expected = _expected_images(psfs, extended, stars, star_fluxes) + background[:, None, None]
+    rng = np.random.default_rng(noise_seed)
+    images = rng.poisson(expected) + rng.normal(0.0, read_noise, expected.shape)
+    return Simulation(
+        images=images,
+        psfs=psfs,
+        background=background,
+        read_noise=read_noise,
+        extended=extended,
+        stars=stars,
+        star_fluxes=star_fluxes,
+        zero_magnitude_flux=experiment.source_electrons(0 * u.mag),
+        experiment=experiment,
+    )
+
+
+def _expected_images(
+    psfs: Array, extended: Array, stars: list[tuple[int, int]], star_fluxes: Array
+) -> Array:
+    """Return the images of extended source and stars without sky or noise, (p, ny, nx)."""
+    ny, nx = extended.shape
+    otfs = fft.rfft2(fft.ifftshift(psfs, axes=(1, 2)))
+    # The transform leaves rounding errors of either sign in dark pixels.
+    images = fft.irfft2(otfs * fft.rfft2(extended), s=(ny, nx)).clip(min=0)
+    for (x, y), flux in zip(stars, star_fluxes, strict=True):
+        images += flux * np.roll(psfs, (y - ny // 2, x - nx // 2), axis=(1, 2))
+    return images

@@ -1,0 +1,140 @@
+"""The Large Binocular Telescope, and the paper's experiment with it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from astropy import units as u
+
+from lnocl.errors import InputError
+from lnocl.simulation.checks import (
+    check_electrons,
+    check_share,
+    number,
+    numbers,
+    positive,
+)
+from lnocl.simulation.photometry import MAG_PER_ARCSEC2, electrons, photon_rate, pixel_magnitude
+
+# The Large Binocular Telescope: two primary mirrors of 8.4 m, 14.4 m apart (J. M. Hill,
+# R. F. Green, J. H. Slagle, Proc. SPIE 6267, 62670Y, 2006), each behind an adaptive secondary of
+# 911 mm with 672 actuators (A. Riccardi et al., Proc. SPIE 4839, 721, 2003).
+BASELINE = 14.4 * u.m
+APERTURE_DIAMETER = 8.4 * u.m
+OBSCURATION_DIAMETER = 0.911 * u.m
+N_ACTUATORS = 672
+
+
+def collecting_area() -> u.Quantity:
+    """Return the area of the two apertures without their obscurations, 109.5 m2.
+
+    ``2 pi / 4 (D^2 - d^2)`` with D = 8.4 m and d = 0.911 m.
+
+    Examples
+    --------
+    >>> from lnocl.simulation import collecting_area
+    >>> print(f"{collecting_area():.2f}")
+    109.53 m2
+    """
+    return (np.pi / 2 * (APERTURE_DIAMETER**2 - OBSCURATION_DIAMETER**2)).to(u.m**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """Instrument, filter and exposures; the defaults are those of La Camera et al. (2012).
+
+    The paper names neither the zero point nor the throughput: see docs/photometry.md.
+
+    Attributes
+    ----------
+    wavelength, bandwidth : Quantity
+        Of the narrow-band filter, H2 at 2.12 um; lengths, positive.
+    pixel_scale : Quantity
+        Angle per pixel, positive, at most ``wavelength / (2 (B + D))``.
+    angles : Quantity
+        One or several angles of the baseline, one for each image, from the x axis towards the y
+        axis.
+    exposure_time : Quantity
+        Of each image, positive.
+    throughput : float
+        Electrons per photon that reaches the telescope, in (0, 1].
+    strehl : float
+        Strehl ratio of each PSF, in (0, 1].
+    zero_point : Quantity
+        Flux density of magnitude 0, positive: Ks of M. Cohen, W. A. Wheaton, S. T. Megeath, AJ
+        126, 1090 (2003).
+    extended_magnitude : Quantity
+        Integrated magnitude of the extended source.
+    sky_brightness : Quantity
+        In mag / arcsec2.
+    read_noise : Quantity
+        Standard deviation, electrons per pixel, zero or more.
+    seed : int
+        Of residual phases and noise, zero or more.
+
+    Raises
+    ------
+    InputError
+        Where a value has the wrong unit or is out of its range; where an image would hold more
+        than `MAX_ELECTRONS` of the extended source, of the sky in a pixel, or of read noise.
+
+    Examples
+    --------
+    >>> from lnocl.simulation import Experiment
+    >>> experiment = Experiment(exposure_time="10 min", read_noise="5 electron")
+    >>> print(experiment.exposure_time)
+    10.0 min
+    """
+
+    wavelength: u.Quantity = 2.12 * u.um
+    bandwidth: u.Quantity = 0.02 * u.um
+    pixel_scale: u.Quantity = 5.0 * u.mas
+    angles: u.Quantity = (0.0, 45.0, 90.0, 135.0) * u.deg
+    exposure_time: u.Quantity = 30.0 * u.min
+    throughput: float = 0.3
+    strehl: float = 0.7
+    zero_point: u.Quantity = 666.7 * u.Jy
+    extended_magnitude: u.Quantity = 13.0 * u.mag
+    sky_brightness: u.Quantity = 13.5 * MAG_PER_ARCSEC2
+    read_noise: u.Quantity = 10.0 * u.electron
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, unit in (
+            ("wavelength", u.um),
+            ("bandwidth", u.um),
+            ("pixel_scale", u.mas),
+            ("exposure_time", u.min),
+            ("zero_point", u.Jy),
+        ):
+            object.__setattr__(self, name, positive(name, getattr(self, name), unit) * unit)
+        for name, unit in (("extended_magnitude", u.mag), ("sky_brightness", MAG_PER_ARCSEC2)):
+            object.__setattr__(self, name, number(name, getattr(self, name), unit) * unit)
+        noise = number("read_noise", self.read_noise, u.electron, minimum=0.0)
+        object.__setattr__(self, "read_noise", noise * u.electron)
+        angles = np.atleast_1d(numbers("angles", self.angles, u.deg))
+        if angles.ndim != 1 or angles.size == 0:
+            raise InputError(f"angles must be one or several numbers; {self.angles} was given")
+        object.__setattr__(self, "angles", angles * u.deg)
+        check_share("throughput", self.throughput)
+        check_share("strehl", self.strehl)
+        if not (isinstance(self.seed, (int, np.integer)) and self.seed >= 0):
+            raise InputError(f"seed must be a whole number, 0 or more; {self.seed} was given")
+        check_electrons("the extended source", self.source_electrons(self.extended_magnitude))
+        check_electrons("the sky in a pixel", self.sky_electrons)
+        check_electrons("read_noise", noise)
+        if not math.isfinite(self.source_electrons(0 * u.mag)):
+            raise InputError("a star of magnitude 0 would leave infinitely many electrons")
+
+    def source_electrons(self, magnitude: u.Quantity) -> float:
+        """Return the electrons that one image holds of a source of this magnitude."""
+        rate = photon_rate(magnitude, self.zero_point, self.wavelength, self.bandwidth)
+        area = collecting_area()
+        return float(electrons(rate, area, self.throughput, self.exposure_time).value)
+
+    @property
+    def sky_electrons(self) -> float:
+        """Electrons of the sky in each pixel of one image."""
+        return self.source_electrons(pixel_magnitude(self.sky_brightness, self.pixel_scale))
