@@ -219,7 +219,13 @@ def stops(data, device):
         truth, (star,) = simulation.extended, simulation.stars
         rows = star_rows(star, truth.shape)
         auto = lnocl.deconvolve(
-            experiment.observe(simulation), [star], "auto", "sgp", 1500, "held-out", device=device
+            experiment.observe(simulation),
+            [star],
+            mu="auto",
+            solver="sgp",
+            n_iter=1500,
+            stop="held-out",
+            device=device,
         )
         curves = {
             mu: follow(simulation, "sgp", 800, mu=mu, device=device)
@@ -228,10 +234,10 @@ def stops(data, device):
         smooth = lnocl.deconvolve(
             experiment.observe(simulation),
             [star],
-            0.0,
-            "sgp",
-            1500,
-            "held-out",
+            mu=0.0,
+            solver="sgp",
+            n_iter=1500,
+            stop="held-out",
             smoothing="auto",
             device=device,
         )
@@ -248,7 +254,13 @@ def stops(data, device):
         row |= {"smoothed best rho''": best["smoothed"][1], "smoothing": smooth.smoothing}
         held_out, discrepancy = (
             lnocl.deconvolve(
-                experiment.observe(simulation), [star], 0.0, "sgp", 1500, stop, device=device
+                experiment.observe(simulation),
+                [star],
+                mu=0.0,
+                solver="sgp",
+                n_iter=1500,
+                stop=stop,
+                device=device,
             )
             for stop in ("held-out", "discrepancy")
         )

@@ -163,6 +163,7 @@ class Result:
 def deconvolve(
     observation: Observation,
     stars: Sequence[tuple[float, float]] = (),
+    *,
     mu: float | str = 0.0,
     solver: str = "sgm",
     n_iter: int = 1000,

@@ -99,6 +99,7 @@ class Observation:
         self,
         images: ArrayLike,
         psfs: ArrayLike,
+        *,
         background: ArrayLike = 0.0,
         read_noise: ArrayLike = 0.0,
         mask: ArrayLike | None = None,

@@ -187,7 +187,7 @@ def reconstruct(
     """
     tracker = Tracker(simulation, method, every, n_iter, patience)
     stars = [] if method == "RLM" else simulation.stars
-    result = deconvolve(observation, stars, mu, n_iter=n_iter, callback=tracker, **keywords)
+    result = deconvolve(observation, stars, mu=mu, n_iter=n_iter, callback=tracker, **keywords)
     return Reconstruction(
         method,
         mu,

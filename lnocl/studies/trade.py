@@ -137,7 +137,7 @@ def compare(
 
     def reconstruct(setting: Setting, n_iter: int, callback: Any = None) -> Result:
         return deconvolve(
-            observation, stars, mu, n_iter=n_iter, precision=setting.precision,
+            observation, stars, mu=mu, n_iter=n_iter, precision=setting.precision,
             device=device, pad=setting.pad, callback=callback,
         )  # fmt: skip
 

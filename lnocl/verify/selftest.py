@@ -208,7 +208,9 @@ def _observe() -> tuple[Observation, list[tuple[int, int]]]:
     shape = seen.images.shape
     mask = np.random.default_rng(0).random(shape) < MASKED
     background = np.broadcast_to(seen.background[:, None, None], shape)
-    observation = Observation(seen.images, seen.psfs, background, seen.read_noise, mask=mask)
+    observation = Observation(
+        seen.images, seen.psfs, background=background, read_noise=seen.read_noise, mask=mask
+    )
     return observation, seen.stars
 
 

@@ -412,6 +412,11 @@ def test_refused(case):
     assert caught.value.exit_status == 2
 
 
+def test_all_but_images_and_psfs_go_by_name():
+    with pytest.raises(TypeError, match="3 positional arguments but 4 were given"):
+        lnocl.Observation(IMAGES, PSF, 5.0)
+
+
 def test_nothing_but_non_finite_pixels_is_refused():
     with (
         pytest.warns(lnocl.LnoclWarning, match="^48 image pixels are not finite"),

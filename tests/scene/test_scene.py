@@ -41,7 +41,7 @@ def test_images_lie_at_the_origin():
     mask = np.zeros((2, 5, 11), bool)
     mask[1, 2, 3] = True
     images = np.arange(110.0).reshape(2, 5, 11)
-    scene = Scene(lnocl.Observation(images, np.ones((1, 1)), images, mask=mask))
+    scene = Scene(lnocl.Observation(images, np.ones((1, 1)), background=images, mask=mask))
     laid, weights, background = scene.images(), scene.weights, scene.background()
     np.testing.assert_array_equal(laid[:, :5, :11] * scene.scale, np.where(mask, 0, images))
     np.testing.assert_array_equal(weights[:, :5, :11], ~mask)
