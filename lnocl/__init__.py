@@ -2,8 +2,9 @@
 
 from importlib.metadata import version
 
-from lnocl.deconvolution import Result, deconvolve
+from lnocl.deconvolution import deconvolve
 from lnocl.errors import DeviceError, FileError, InputError, LnoclError, LnoclWarning
+from lnocl.result import Result
 from lnocl.scene.observation import Observation
 
 __all__ = [

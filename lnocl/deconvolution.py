@@ -3,161 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
-from numbers import Real
+from functools import partial
 from os import PathLike
-from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lnocl.errors import InputError, NotFiniteError, warn
+from lnocl.errors import NotFiniteError
+from lnocl.result import Callback, Estimate, Result, make_result
 from lnocl.runs.checkpoint import Checkpointer, describe
-from lnocl.runs.held_out import (
-    NO_CURVE,
-    Choice,
-    Grid,
-    HeldOutSelection,
-    several_mu,
-    several_smoothings,
+from lnocl.runs.held_out import NO_CURVE, Choice, Grid, HeldOutSelection
+from lnocl.runs.options import (
+    check_choices,
+    check_length,
+    check_observation,
+    check_types,
+    read_penalties,
+    warn_of_rounding,
 )
 from lnocl.runs.progress import Bar
 from lnocl.runs.run import Run, Setup
 from lnocl.runs.stopping import Rule, make_rule
-from lnocl.scene.observation import Array, Observation, numbers
+from lnocl.scene.observation import Observation, numbers
 from lnocl.scene.penalty import Penalty
-from lnocl.solvers import SOLVERS
-
-PRECISIONS = ("single", "double")
-ENGINES = ("opencl", "numpy")
-STOPS = ("discrepancy", "held-out")
-
-# Kernels count iterations in 32 bits.
-MOST_ITERATIONS = 2**31 - 2
-
-# What single precision strays from double, as a share of the extended source, for each iteration of
-# a long run, and the share that is worth a warning (benchmarks/precision.py, docs/precision.md).
-STRAY_PER_ITERATION = 8e-9
-STRAY_WORTH_A_WARNING = 1e-3
-
-HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
-
-
-class Estimate:
-    """What a callback is shown: the estimate of this iteration, fetched when it is asked for.
-
-    Attributes
-    ----------
-    extended : ndarray of float64, shape (ny, nx)
-        Extended source, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n,)
-        Electrons.
-    star_positions : ndarray of float64, shape (n, 2)
-        (x, y) in pixels, as refined last.
-    """
-
-    def __init__(self, run: Run) -> None:
-        self._run: Run | None = run
-
-    @cached_property
-    def extended(self) -> Array:
-        """Extended source, electrons per pixel."""
-        return self._live().extended()
-
-    @cached_property
-    def star_fluxes(self) -> Array:
-        """Star fluxes, electrons."""
-        return self._live().star_fluxes()
-
-    @cached_property
-    def star_positions(self) -> Array:
-        """Star positions, pixels."""
-        return self._live().star_positions().copy()
-
-    def _live(self) -> Run:
-        if self._run is None:
-            raise RuntimeError("read what you need of the estimate before the callback returns")
-        return self._run
-
-    def _close(self) -> None:
-        self._run = None
-
-
-Callback = Callable[[int, Estimate], Any]
-
-
-@dataclass(frozen=True)
-class Result:
-    """What `deconvolve` returns.
-
-    Attributes
-    ----------
-    extended : ndarray of float64, shape (ny, nx)
-        Extended source, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n,)
-        Electrons, in the order of the stars given.
-    star_positions : ndarray of float64, shape (n, 2)
-        (x, y) in pixels, as given or refined.
-    star_flux_errors : ndarray of float64, shape (n,)
-        Standard errors, electrons, by the Fisher information of fluxes and positions where the
-        extended source is known; 0 where positions were not refined.
-    star_position_errors : ndarray of float64, shape (n, 2)
-        Likewise, pixels.
-    n_iter : int
-        Iterations done.
-    stop_reason : str
-        ``"n_iter"``, ``"callback"``, the rule that was met (``"change"``, ``"discrepancy"``,
-        ``"held-out"``), ``"converged"``: no step of ``"sgp"`` lets the objective fall any more,
-        in the precision used; or ``"not finite"``: the objective became infinite or NaN, and the
-        estimate is the last with a finite one.
-    device : str
-        Name of the device, its platform and driver; ``"numpy"`` for the reference.
-    history : ndarray, fields ``iteration`` (int64) and ``objective`` (float64)
-        The objective J after each iteration, from iteration 0, the start.
-    mu : float
-        Weight of the Tikhonov term, as given or as chosen.
-    smoothing : float
-        Weight of the edge-preserving term, as given or as chosen.
-    held_out : ndarray, fields ``mu``, ``smoothing``, ``iteration`` (int64) and ``error``
-        Where held-out counts were asked: the relative error of the extended source that they
-        estimate, for each penalty and iteration looked at; else empty.
-    """
-
-    extended: Array
-    star_fluxes: Array
-    star_positions: Array
-    star_flux_errors: Array
-    star_position_errors: Array
-    n_iter: int
-    stop_reason: str
-    device: str
-    history: NDArray[np.void]
-    mu: float
-    smoothing: float
-    held_out: NDArray[np.void]
-    _models: Callable[[], Array] = field(repr=False, compare=False)
-    _observation: Observation = field(repr=False, compare=False)
-
-    def models(self) -> Array:
-        """Return the m_j, shape (p, ny, nx), electrons per pixel.
-
-        ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j``, in double precision. As in the observation,
-        the square of the read noise is included.
-        """
-        return self._models()
-
-    def residuals(self) -> Array:
-        """Return ``(g_j - m_j) / sqrt(m_j)``, shape (p, ny, nx): about 1 where only noise is left.
-
-        NaN where a pixel is bad, or the model is 0.
-        """
-        observation, models = self._observation, self.models()
-        usable = ~observation.mask & (models > 0)
-        excess = observation.images - models
-        return np.divide(
-            excess, np.sqrt(np.maximum(models, 0.0)), out=np.full_like(excess, np.nan), where=usable
-        )
 
 
 def deconvolve(
@@ -315,12 +183,13 @@ def deconvolve(
     >>> (result.extended.sum() + result.star_fluxes.sum()).round(6)
     np.float64(612.0)
     """
-    _check_observation(observation)
-    _check_choices(solver, n_iter, stop, precision, engine, device)
-    _check_kinds(callback, progress=progress, refine_positions=refine_positions)
-    penalty, grid = _penalties(mu, smoothing)
+    check_observation(observation)
+    check_choices(solver, precision, engine, device)
+    check_length(n_iter, stop)
+    check_types(callback, progress=progress, refine_positions=refine_positions)
+    penalty, grid = read_penalties(mu, smoothing)
     if engine == "opencl" and precision == "single":
-        _warn_of_straying(int(n_iter))
+        warn_of_rounding(int(n_iter))
     setup = Setup(stars, pad, solver, precision, engine, device, refine_positions)
     checkpointer = Checkpointer(
         checkpoint,
@@ -375,77 +244,7 @@ def deconvolve(
             checkpointer.redo(run)
         if stop == "held-out" and stop_reason == "n_iter":
             stop_reason = "held-out"
-        return _wrap_up(run, stop_reason, choice)
-
-
-def _penalties(mu: Any, smoothing: Any) -> tuple[Penalty, Grid | None]:
-    """Return the penalty, the least one where there are several, and what makes the others."""
-    for name, weight in (("mu", mu), ("smoothing", smoothing)):
-        if isinstance(weight, str) and weight != "auto":
-            raise InputError(f"{name} {weight!r} is not known; give a number or auto")
-    if isinstance(mu, str) and isinstance(smoothing, str):
-        raise InputError("mu and smoothing cannot both be auto; give one of them as a number")
-    if isinstance(mu, str):
-        return Penalty(0.0, smoothing), several_mu(smoothing)
-    if isinstance(smoothing, str):
-        return Penalty(mu, 0.0), several_smoothings(mu)
-    return Penalty(mu, smoothing), None
-
-
-def _check_observation(observation: object) -> None:
-    if not isinstance(observation, Observation):
-        raise InputError(
-            f"observation is of type {type(observation).__name__}; give an lnocl.Observation, as "
-            "lnocl.Observation(images, psfs) makes"
-        )
-
-
-def _check_choices(
-    solver: str,
-    n_iter: object,
-    stop: object,
-    precision: str,
-    engine: str,
-    device: object,
-) -> None:
-    choices = {
-        "solver": (solver, tuple(SOLVERS)),
-        "precision": (precision, PRECISIONS),
-        "engine": (engine, ENGINES),
-    }
-    for name, (value, known) in choices.items():
-        if not (isinstance(value, str) and value in known):
-            raise InputError(f"{name} {value!r} is not known; choose from {', '.join(known)}")
-    if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
-        raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")
-    if n_iter > MOST_ITERATIONS:
-        raise InputError(f"n_iter must be {MOST_ITERATIONS} at most; {n_iter} was given")
-    is_change = isinstance(stop, Real) and 0 < cast(float, stop) < 1
-    if not (stop is None or is_change or (isinstance(stop, str) and stop in STOPS)):
-        raise InputError(
-            f"stop {stop!r} is not known; give {', '.join(STOPS)}, or a number between 0 and 1"
-        )
-    if not (device is None or isinstance(device, str)):
-        raise InputError(f"device must be text, PLATFORM[:DEVICE]; {device!r} was given")
-    if engine == "numpy" and device is not None:
-        raise InputError(f"engine numpy uses no device; leave device {device!r} out")
-
-
-def _check_kinds(callback: object, **flags: object) -> None:
-    if not (callback is None or callable(callback)):
-        raise InputError(f"callback must be a function or None; {callback!r} was given")
-    for name, flag in flags.items():
-        if not isinstance(flag, (bool, np.bool_)):
-            raise InputError(f"{name} must be True or False; {flag!r} was given")
-
-
-def _warn_of_straying(n_iter: int) -> None:
-    stray = STRAY_PER_ITERATION * n_iter
-    if stray > STRAY_WORTH_A_WARNING:
-        warn(
-            f"single precision is expected to stray from double by {stray:.1g} of the extended "
-            f"source after {n_iter} iterations; take precision double, or fewer iterations"
-        )
+        return make_result(run, stop_reason, choice)
 
 
 def _choose(
@@ -505,27 +304,3 @@ def _iterate(
     run.finish()
     keep(stop_reason)
     return stop_reason
-
-
-def _wrap_up(run: Run, stop_reason: str, choice: Choice) -> Result:
-    run.finish()
-    history = np.zeros(run.done + 1, HISTORY_DTYPE)
-    history["iteration"] = np.arange(run.done + 1)
-    history["objective"] = run.objectives()
-    flux_errors, position_errors = run.star_errors()
-    return Result(
-        extended=run.extended(),
-        star_fluxes=run.star_fluxes(),
-        star_positions=run.star_positions(),
-        star_flux_errors=flux_errors,
-        star_position_errors=position_errors,
-        n_iter=run.done,
-        stop_reason=stop_reason,
-        device=run.engine.name,
-        history=history,
-        mu=choice.penalty.mu,
-        smoothing=choice.penalty.smoothing,
-        held_out=choice.curve,
-        _models=run.models(),
-        _observation=run.scene.observation,
-    )

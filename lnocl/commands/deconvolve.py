@@ -22,7 +22,10 @@ from lnocl.commands.arguments import (
     finite,
     number_or_word,
 )
-from lnocl.deconvolution import ENGINES, PRECISIONS, SOLVERS, Result, deconvolve
+from lnocl.deconvolution import deconvolve
+from lnocl.result import Result
+from lnocl.runs.options import ENGINES, PRECISIONS
+from lnocl.solvers import SOLVERS
 
 if TYPE_CHECKING:
     from astropy.io import fits

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl import metrics
-from lnocl.deconvolution import HISTORY_DTYPE, Estimate, deconvolve
+from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
+from lnocl.result import HISTORY_DTYPE, Estimate
 from lnocl.scene.observation import Array, Observation
 from lnocl.simulation.simulate import Simulation
 

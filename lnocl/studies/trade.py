@@ -14,8 +14,9 @@ from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl import metrics
-from lnocl.deconvolution import Estimate, Result, deconvolve
+from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, LnoclWarning
+from lnocl.result import Estimate, Result
 from lnocl.runs.progress import make_bar
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.simulation.simulate import Simulation

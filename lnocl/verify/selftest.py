@@ -13,9 +13,10 @@ import numpy as np
 import pyopencl as cl
 from astropy import units as u
 
-from lnocl.deconvolution import Result, deconvolve
+from lnocl.deconvolution import deconvolve
 from lnocl.errors import DeviceError, LnoclError
 from lnocl.opencl.device import context_of, describe, has_double, spec_of
+from lnocl.result import Result
 from lnocl.scene.observation import Observation
 from lnocl.simulation.simulate import Experiment, Star, load_target, simulate
 from lnocl.verify.comparison import ALLOWED, KERNELS, deviation, kernels_of, relative

@@ -546,9 +546,9 @@ def assert_whole(path):
 
 
 IN_THE_END = [
-    "lnocl.deconvolution._wrap_up",
-    "lnocl.deconvolution.Result.models",
-    "lnocl.deconvolution.Result.residuals",
+    "lnocl.deconvolution.make_result",
+    "lnocl.result.Result.models",
+    "lnocl.result.Result.residuals",
     "lnocl.io.fitswrite.write_result",
     "lnocl.io.atomic.os.fsync",
 ]
