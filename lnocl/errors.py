@@ -38,6 +38,10 @@ class DeviceError(LnoclError, RuntimeError):
     """No usable OpenCL device, or the device cannot do what was asked of it."""
 
 
+class DivergedError(LnoclError):
+    """The objective rises where each iteration must lower it."""
+
+
 class NotFiniteError(DeviceError):
     """A sum that steers an iteration is infinite or not a number."""
 
@@ -49,6 +53,11 @@ def refuse_not_finite(*sums: float) -> None:
             "the objective is infinite or not a number: scale the scene where its values are large "
             "beyond measure; else see what lnocl selftest says of the device"
         )
+
+
+def counted(n: int, noun: str) -> str:
+    """Return a number with a noun that agrees with it: ``1 image``, ``2 images``."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 class LnoclWarning(UserWarning):

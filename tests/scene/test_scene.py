@@ -195,7 +195,7 @@ REFUSED = {
     ),
     "masked row of stars": (
         {"stars": [(3, 4), np.ma.array((5, 6), mask=(0, 1))]},
-        "stars has 1 masked values",
+        "stars has 1 masked value;",
     ),
     "text for stars": ({"stars": "3,4"}, "star"),
     "complex star": ({"stars": [(1j, 2)]}, "star"),
@@ -288,7 +288,7 @@ REFUSED = {
     ),
     "masked flux": (
         {"initial_star_fluxes": np.ma.array([1.0], mask=True), "stars": [(3, 4)]},
-        "initial_star_fluxes has 1 masked values",
+        "initial_star_fluxes has 1 masked value;",
     ),
     "text for a flux": ({"initial_star_fluxes": ["a"], "stars": [(3, 4)]}, "initial_star_fluxes"),
 }
