@@ -292,7 +292,7 @@ def choices(data, device):
         for shift, kept in settings:
             with (
                 patch("lnocl.solvers.scaling.SHIFT", shift),
-                patch("lnocl.solvers.sgp.STEPS_KEPT", kept),
+                patch("lnocl.solvers.sgp.N_LENGTHS", kept),
             ):
                 curve = follow(simulation, "sgp", n_iter, device=device)
             best = curve[np.argmin(curve[:, 2])]
