@@ -1,4 +1,4 @@
-"""The one public verb: validate, choose, run, wrap up."""
+"""The public function: check the options, have held-out counts choose, run, return the result."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from os import PathLike
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lnocl.errors import NotFiniteError
+from lnocl.errors import DivergedError, NotFiniteError, warn
 from lnocl.result import Callback, Estimate, Result, make_result
 from lnocl.runs.checkpoint import Checkpointer, describe
-from lnocl.runs.held_out import NO_CURVE, Choice, Grid, HeldOutSelection
+from lnocl.runs.held_out import EMPTY_CURVE, Choice, HeldOutSelection
 from lnocl.runs.options import (
     check_choices,
     check_length,
     check_observation,
+    check_start,
     check_types,
     read_penalties,
     warn_of_rounding,
@@ -24,8 +25,7 @@ from lnocl.runs.options import (
 from lnocl.runs.progress import Bar
 from lnocl.runs.run import Run, Setup
 from lnocl.runs.stopping import Rule, make_rule
-from lnocl.scene.observation import Observation, numbers
-from lnocl.scene.penalty import Penalty
+from lnocl.scene.observation import Array, Observation, numbers
 
 
 def deconvolve(
@@ -62,7 +62,7 @@ def deconvolve(
     Parameters
     ----------
     observation : Observation
-        The images, p of shape (ny, nx), and what is known of them.
+        The p images of shape (ny, nx), with their PSFs, backgrounds, noise and masks.
     stars : sequence of (x, y), optional
         Positions of the point sources in pixels of an image without offset, 0-based, x along
         columns. Between pixels a star's image is the PSF moved in its spectrum
@@ -77,14 +77,14 @@ def deconvolve(
     n_iter : int, optional
         Iterations to do, at most where they may end sooner; 1 or more.
     stop : float, "discrepancy" or "held-out", optional
-        When to stop before `n_iter`. A number in (0, 1): when the objective changes relatively by
-        less an iteration, in the mean over ten. "discrepancy": when the data term has fallen to its
-        expectation for Poisson counts of the model's means. "held-out": at the iteration that
-        held-out counts choose (see Notes).
+        Rule by which to stop before `n_iter`. A number in (0, 1): when the relative change of the
+        objective an iteration, averaged over ten, is below it. "discrepancy": when the data term
+        has fallen to its expectation for Poisson counts of the model's means. "held-out": at the
+        iteration that held-out counts choose (see Notes).
     precision : {"single", "double"}, optional
         Arithmetic of the OpenCL engine. The reference always computes in double.
     engine : {"opencl", "numpy"}, optional
-        OpenCL, or the plain NumPy reference.
+        Where the iterations are computed: OpenCL, or the plain NumPy reference.
     device : str, optional
         OpenCL device as ``PLATFORM[:DEVICE]``, each an index or a part of the name (see
         `lnocl.opencl.device.choose`). By default that of the environment variable PYOPENCL_CTX,
@@ -95,9 +95,11 @@ def deconvolve(
         for sources that run over the edge: the radius with nine tenths of the PSFs' light, at most
         half the shorter side (docs/frames.md).
     initial_extended : array_like, shape (ny, nx), optional
-        Extended source to start from; by default flat.
+        Extended source to start from, not 0 everywhere; by default flat. Pixels that start at 0
+        stay 0 with "sgm".
     initial_star_fluxes : array_like, shape (n,), optional
-        Star fluxes to start from; by default read off the data.
+        Star fluxes to start from, more than 0 with "sgm" unless positions are refined; by default
+        read off the data.
     callback : callable, optional
         ``callback(iteration, estimate)``, called after every iteration; it stops the run by
         returning True. The estimate has ``extended`` and ``star_fluxes``, which are fetched
@@ -122,8 +124,8 @@ def deconvolve(
     checkpoint_every : float, optional
         Seconds between checkpoints, zero or more.
     resume : str or path, optional
-        Checkpoint to go on from. Everything else must be as it was when it was written; the result
-        is then bit for bit that of a run that was never interrupted.
+        Checkpoint to resume from. Everything else must be as it was when it was written. The
+        result is then bit for bit that of a run that was never interrupted.
 
     Returns
     -------
@@ -133,35 +135,44 @@ def deconvolve(
     Raises
     ------
     InputError
-        An observation that is none; a parameter out of its range, masked or too large for the
-        precision, mu and smoothing both "auto", a star outside the images, no such device, or a
-        device for the reference; images or exposures too large to be summed, or a sky that no
-        number holds; held-out counts of images that hold none.
+        `observation` is not an Observation; a parameter is out of its range, masked or too large
+        for the precision; mu and smoothing are both "auto"; a star lies outside the images; the
+        start is 0 where iterations cannot leave it; there is no such device, or one was given for
+        the reference; images or exposures are too large to be summed, or the sky for a number;
+        held-out counts were asked of images that hold no counts.
     FileError
-        A checkpoint that cannot be written or read, is damaged, or would replace that of another
-        run.
+        A checkpoint cannot be written or read, is damaged, or would replace that of another run.
+    DivergedError
+        The objective of the halves of held-out counts rises from the start.
     DeviceError
-        No OpenCL device at all, too little memory on it, no double precision, a compiler or a
-        device that fails; a process that was forked from one that uses OpenCL.
+        There is no OpenCL device; it has too little memory or no double precision; it or its
+        compiler fails; the process was forked from one that uses OpenCL.
 
     Warns
     -----
     LnoclWarning
-        A PSF that is larger than the grid, whose wings wrap round; offsets without `pad`; a PSF
-        that rings where it is moved between pixels; so many iterations that single
-        precision is expected to stray from double by a thousandth of the extended source; held-out
-        counts of images that are not whole counts, or that chose an iteration too near `n_iter`; an
-        objective that is not finite; compiled kernels that cannot be kept, or are damaged.
+        A PSF is larger than the grid, so that its wings wrap round, or rings where it is moved
+        between pixels; there are offsets without `pad`; single precision is expected to stray from
+        double by a thousandth of the extended source; held-out counts are asked of images that are
+        not whole counts, or choose an iteration too near `n_iter`; the objective rises or is not
+        finite; a later checkpoint cannot be written; compiled kernels cannot be kept or are
+        damaged.
 
     Notes
     -----
-    Held-out counts: the counts are dealt out at random to two halves, independent observations of
-    the same sky. Both are reconstructed side by side, and the error of their sum is estimated from
-    the products of one's estimates with the other's (`lnocl.runs.held_out` has the equation), the
-    mean of three ways to deal. Chosen is the last iteration with an error within a tenth of the
-    least; the halves go on for as long again. The reconstruction itself is then made from all
-    counts. So it takes thirteen times as long as if the iteration had been known, and the memory
-    of six runs and of about twenty estimates of each.
+    Held-out counts are cross-validation by data thinning. The counts are split at random into two
+    halves, independent observations of the same sky. Both are reconstructed side by side, and the
+    error of their sum is estimated from the products of one's estimates with the other's, averaged
+    over three splits (`lnocl.runs.held_out` has the equation). The last iteration with an error
+    within a tenth of the least is chosen, and the halves run to twice that iteration. The
+    reconstruction itself is then made from all counts. All this takes thirteen times as long as if
+    the iteration had been known, and the memory of six runs and of about twenty estimates of each.
+
+    The split-gradient method lowers the objective at every iteration where PSFs are not negative.
+    With many negative pixels, as in a raw frame of a star, the objective may rise again, and all
+    the light may end in one pixel. Where it stays a tenth above its least for ten iterations, the
+    run ends with the estimate of the least objective and a warning that names what is wrong with
+    the PSFs. The scaled gradient projection method never accepts a rise.
 
     References
     ----------
@@ -187,94 +198,93 @@ def deconvolve(
     check_choices(solver, precision, engine, device)
     check_length(n_iter, stop)
     check_types(callback, progress=progress, refine_positions=refine_positions)
+    fits_stars = solver == "sgp" or bool(refine_positions)
+    check_start(fits_stars, initial_extended, initial_star_fluxes)
     penalty, grid = read_penalties(mu, smoothing)
     if engine == "opencl" and precision == "single":
         warn_of_rounding(int(n_iter))
     setup = Setup(stars, pad, solver, precision, engine, device, refine_positions)
-    checkpointer = Checkpointer(
-        checkpoint,
-        checkpoint_every,
-        resume,
-        lambda: describe(
-            observation,
-            setup,
-            mu=mu,
-            smoothing=smoothing,
-            n_iter=int(n_iter),
-            stop=stop,
-            initial_extended=initial_extended,
-            initial_star_fluxes=initial_star_fluxes,
-        ),
+    inputs = partial(
+        describe,
+        observation,
+        setup,
+        mu=mu,
+        smoothing=smoothing,
+        n_iter=int(n_iter),
+        stop=stop,
+        initial_extended=initial_extended,
+        initial_star_fluxes=initial_star_fluxes,
     )
+    checkpointer = Checkpointer(checkpoint, checkpoint_every, resume, inputs)
     bar = Bar(int(n_iter), bool(progress))
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
     # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
     with bar, np.errstate(over="ignore", invalid="ignore"):
-        choice = checkpointer.saved.choice() if checkpointer.saved is not None else None
+        choice = checkpointer.choice()
+        if choice is None and grid is None and stop != "held-out":
+            choice = Choice(penalty, int(n_iter), EMPTY_CURVE)
         if choice is None:
-            choice = Choice(penalty, int(n_iter), NO_CURVE)
-            if grid is not None or stop == "held-out":
-                choice = _choose(
-                    setup,
-                    observation,
-                    penalty,
-                    grid,
-                    stop,
-                    int(n_iter),
-                    initial_extended,
-                    bar,
-                    checkpointer,
-                )
+            start = partial(
+                Run, setup, n_iter=int(n_iter), initial_extended=_half(initial_extended)
+            )
+            at_end = stop != "held-out"
+            selection = HeldOutSelection(start, observation, penalty, grid, int(n_iter), at_end)
+            choice = _choose(selection, bar, checkpointer)
         run = Run(
             setup, observation, choice.penalty, choice.n_iter, initial_extended, initial_star_fluxes
         )
-        rule = make_rule(stop)
-        stop_reason = checkpointer.restore(run, rule)
         bar.expect(choice.n_iter)
-        keep = partial(checkpointer.keep, run, rule, choice)
-        if stop_reason:
-            keep(stop_reason)  # perhaps in another file
-        else:
-            try:
-                stop_reason = _iterate(run, choice.n_iter, rule, callback, bar, keep)
-            except NotFiniteError:
-                stop_reason = "not finite"
-        if stop_reason == "not finite":
-            checkpointer.redo(run)
+        stop_reason = _complete(run, choice, make_rule(stop), callback, bar, checkpointer)
         if stop == "held-out" and stop_reason == "n_iter":
             stop_reason = "held-out"
         return make_result(run, stop_reason, choice)
 
 
-def _choose(
-    setup: Setup,
-    observation: Observation,
-    penalty: Penalty,
-    grid: Grid | None,
-    stop: object,
-    n_iter: int,
-    initial_extended: ArrayLike | None,
-    bar: Bar,
-    checkpointer: Checkpointer,
-) -> Choice:
-    """Have held-out counts choose the penalty and the number of iterations, or one of them."""
-    half = None
-    if initial_extended is not None:
-        half = numbers("initial_extended", initial_extended) / 2.0
-    selection = HeldOutSelection(
-        partial(Run, setup, n_iter=n_iter, initial_extended=half),
-        observation,
-        penalty,
-        grid,
-        n_iter,
-        stop != "held-out",
-    )
+def _half(initial_extended: ArrayLike | None) -> Array | None:
+    """Return where the halves of held-out counts start."""
+    if initial_extended is None:
+        return None
+    return numbers("initial_extended", initial_extended) / 2.0
+
+
+def _choose(selection: HeldOutSelection, bar: Bar, checkpointer: Checkpointer) -> Choice:
+    """Have held-out counts choose, from their checkpoint where there is one."""
     if checkpointer.saved is not None:
         selection.restore(checkpointer.saved.arrays)
     return selection.choose(
-        lambda words: bar.show(0, lambda: words), lambda: checkpointer.keep_choosing(selection)
+        lambda words: bar.show(0, lambda: words), lambda: checkpointer.save_selection(selection)
     )
+
+
+def _complete(
+    run: Run,
+    choice: Choice,
+    rule: Rule,
+    callback: Callback | None,
+    bar: Bar,
+    checkpointer: Checkpointer,
+) -> str:
+    """Take a run from its checkpoint, if any, to its end; return why it ended."""
+    stop_reason = checkpointer.restore(run, rule)
+    save = partial(checkpointer.save, run, rule, choice)
+    if stop_reason:
+        save(stop_reason)  # perhaps in another file
+        return stop_reason
+    try:
+        return _iterate(run, choice.n_iter, rule, callback, bar, save)
+    except NotFiniteError:
+        checkpointer.return_to_best(run)
+        warn(
+            f"the objective became infinite or not a number: the result is that of iteration "
+            f"{run.done}, where it was least; scale the scene where its values are large beyond "
+            "measure, else see what lnocl selftest says of the device"
+        )
+        return "not finite"
+    except DivergedError as error:
+        checkpointer.return_to_best(run)
+        warn(f"{error}; the result is that of iteration {run.done}, where it was least")
+        return "diverged"
 
 
 def _iterate(
@@ -283,9 +293,9 @@ def _iterate(
     rule: Rule,
     callback: Callback | None,
     bar: Bar,
-    keep: Callable[[str], None],
+    save: Callable[[str], None],
 ) -> str:
-    """Iterate to the end, keeping checkpoints; return why it ended."""
+    """Iterate to the end, saving checkpoints; return why it ended."""
     quantity = partial(rule.quantity, run)
     stop_reason = None
     for iteration in run:
@@ -299,8 +309,9 @@ def _iterate(
         bar.show(iteration, quantity, last=stop_reason is not None or iteration == n_iter)
         if stop_reason is not None:
             break
-        keep("")
+        save("")
     stop_reason = stop_reason or ("n_iter" if run.done == n_iter else "converged")
     run.finish()
-    keep(stop_reason)
+    run.check_descent()
+    save(stop_reason)
     return stop_reason

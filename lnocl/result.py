@@ -1,4 +1,4 @@
-"""What callers of `deconvolve` are given: the result, and the estimate of each iteration."""
+"""The result of `deconvolve`, and the estimate that a callback is given."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
 
 class Estimate:
-    """What a callback is shown: the estimate of this iteration, fetched when it is asked for.
+    """The estimate of an iteration, as a callback gets it: fetched from the device when read.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class Estimate:
     star_fluxes : ndarray of float64, shape (n,)
         Electrons.
     star_positions : ndarray of float64, shape (n, 2)
-        (x, y) in pixels, as refined last.
+        (x, y) in pixels, as last refined.
     """
 
     def __init__(self, run: Run) -> None:
@@ -60,9 +60,9 @@ class Estimate:
 Callback = Callable[[int, Estimate], Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Result:
-    """What `deconvolve` returns.
+    """The result of `deconvolve`. Results are compared by identity.
 
     Attributes
     ----------
@@ -73,17 +73,20 @@ class Result:
     star_positions : ndarray of float64, shape (n, 2)
         (x, y) in pixels, as given or refined.
     star_flux_errors : ndarray of float64, shape (n,)
-        Standard errors, electrons, by the Fisher information of fluxes and positions where the
-        extended source is known; 0 where positions were not refined.
+        Standard errors of the fluxes, electrons. They are those of the Fisher information of fluxes
+        and positions, with the extended source taken as known. NaN where positions were not
+        refined.
     star_position_errors : ndarray of float64, shape (n, 2)
-        Likewise, pixels.
+        Standard errors of the positions, pixels, likewise.
     n_iter : int
-        Iterations done.
+        The iteration of the estimate.
     stop_reason : str
-        ``"n_iter"``, ``"callback"``, the rule that was met (``"change"``, ``"discrepancy"``,
-        ``"held-out"``), ``"converged"``: no step of ``"sgp"`` lets the objective fall any more,
-        in the precision used; or ``"not finite"``: the objective became infinite or NaN, and the
-        estimate is the last with a finite one.
+        Why the run ended. ``"n_iter"``: all iterations were done. ``"callback"``: the callback
+        returned True. ``"change"``, ``"discrepancy"``, ``"held-out"``: the stopping rule was met.
+        ``"converged"``: no step of ``"sgp"`` lowers the objective any more, in the precision used.
+        ``"diverged"``: the objective rose, as with PSFs that have many negative pixels.
+        ``"not finite"``: the objective became infinite or NaN. In the last two cases the estimate
+        is that of the least objective, and the history ends there.
     device : str
         Name of the device, its platform and driver; ``"numpy"`` for the reference.
     history : ndarray, fields ``iteration`` (int64) and ``objective`` (float64)
@@ -93,8 +96,8 @@ class Result:
     smoothing : float
         Weight of the edge-preserving term, as given or as chosen.
     held_out : ndarray, fields ``mu``, ``smoothing``, ``iteration`` (int64) and ``error``
-        Where held-out counts were asked: the relative error of the extended source that they
-        estimate, for each penalty and iteration looked at; else empty.
+        The relative error of the extended source that held-out counts estimate, for each penalty
+        and iteration that they compared. Empty where nothing was to be chosen.
     """
 
     extended: Array

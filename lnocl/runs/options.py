@@ -6,10 +6,11 @@ from numbers import Real
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError, warn
-from lnocl.runs.held_out import Grid, several_mu, several_smoothings
-from lnocl.scene.observation import Observation
+from lnocl.runs.held_out import PenaltyGrid, mu_grid, smoothing_grid
+from lnocl.scene.observation import Observation, numbers
 from lnocl.scene.penalty import Penalty
 from lnocl.solvers import SOLVERS
 
@@ -99,7 +100,31 @@ def check_types(callback: object, **flags: object) -> None:
             raise InputError(f"{name} must be True or False; {flag!r} was given")
 
 
-def read_penalties(mu: Any, smoothing: Any) -> tuple[Penalty, Grid | None]:
+def check_start(
+    fits_stars: bool, initial_extended: ArrayLike | None, initial_star_fluxes: ArrayLike | None
+) -> None:
+    """Refuse an extended source of 0, and stars of 0 unless their fluxes are fitted at the start.
+
+    Raises
+    ------
+    InputError
+        The start is 0 where iterations that multiply cannot leave it.
+    """
+    if initial_extended is not None and not numbers("initial_extended", initial_extended).any():
+        raise InputError(
+            "initial_extended is 0 everywhere, which no iteration may leave; give it values above "
+            "0, or leave it out"
+        )
+    if initial_star_fluxes is not None and not fits_stars:
+        fluxes = numbers("initial_star_fluxes", initial_star_fluxes)
+        if n_dark := int((fluxes == 0).sum()):
+            raise InputError(
+                f"initial_star_fluxes holds {n_dark} of 0, which solver sgm multiplies and never "
+                "leaves; give values above 0, leave those stars out, or take solver sgp"
+            )
+
+
+def read_penalties(mu: Any, smoothing: Any) -> tuple[Penalty, PenaltyGrid | None]:
     """Return the penalty, the smallest one where one is chosen, and the grid to choose from.
 
     Raises
@@ -113,9 +138,9 @@ def read_penalties(mu: Any, smoothing: Any) -> tuple[Penalty, Grid | None]:
     if isinstance(mu, str) and isinstance(smoothing, str):
         raise InputError("mu and smoothing cannot both be auto; give one of them as a number")
     if isinstance(mu, str):
-        return Penalty(0.0, smoothing), several_mu(smoothing)
+        return Penalty(0.0, smoothing), mu_grid(smoothing)
     if isinstance(smoothing, str):
-        return Penalty(mu, 0.0), several_smoothings(mu)
+        return Penalty(mu, 0.0), smoothing_grid(mu)
     return Penalty(mu, smoothing), None
 
 

@@ -365,8 +365,8 @@ def test_positions_are_found_in_a_run(solver):
     assert abs(off / result.star_position_errors).max() <= 4.0
     _, without = run(solver=solver, n_iter=50, refine_positions=False)
     np.testing.assert_array_equal(without.star_positions, made.stars + OFF)
-    np.testing.assert_array_equal(without.star_flux_errors, [0.0])
-    np.testing.assert_array_equal(without.star_position_errors, np.zeros((1, 2)))
+    assert np.isnan(without.star_flux_errors).all()
+    assert np.isnan(without.star_position_errors).all()
     assert result.history["objective"][-1] < without.history["objective"][-1]
     away = without.star_positions - made.stars
     assert (np.hypot(*off.T) < 0.2 * np.hypot(*away.T)).all()
