@@ -37,7 +37,7 @@ from astropy.io import fits
 
 import lnocl
 from lnocl.metrics import restoration_error, star_rows
-from lnocl.runs import held_out
+from lnocl.runs.thinning import split_counts
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.simulation.simulate import Experiment, Star, Target, hh34, load_target, simulate
@@ -194,7 +194,7 @@ def random_scene(seed, data):
 
 def likelihood_choice(simulation, device, n_iter=400, every=2):
     """Return the iteration at which the likelihood of a held-out half is best."""
-    ((first, second),) = held_out.split_counts(experiment.observe(simulation))
+    ((first, second),) = split_counts(experiment.observe(simulation))
     scene = Scene(first, simulation.stars)
     model = Model(scene)
     curve = []

@@ -105,8 +105,8 @@ def deconvolve(
         returning True. The estimate has ``extended`` and ``star_fluxes``, which are fetched
         from the device when they are read. The halves of held-out counts do not call it.
     progress : bool, optional
-        Show a progress bar on stderr, where that is a terminal, with the objective or what the
-        stopping rule watches.
+        Show a progress bar on stderr, where that is a terminal, with the objective or the quantity
+        of the stopping rule.
     refine_positions : bool, optional
         Move the stars to where they are most likely, at most 3 pixels away, by Fisher scoring of
         all fluxes and positions with the extended source held fixed: at the start and after 3, 6,
@@ -130,7 +130,7 @@ def deconvolve(
     Returns
     -------
     Result
-        Extended source, star fluxes, and how they came about.
+        The extended source, the stars, and the history of the run.
 
     Raises
     ------

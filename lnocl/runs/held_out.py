@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from lnocl.errors import DivergedError, InputError, LnoclWarning, refuse_not_finite, warn
 from lnocl.process import ignored_warnings
 from lnocl.runs.run import Run
+from lnocl.runs.thinning import split_counts
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.solvers.engine import State
@@ -53,14 +54,11 @@ N_SPLITS = 3
 SPACING = 1.1
 # Snapshots before this share of the chosen iteration are dropped.
 OLDEST_SNAPSHOT = 1.0 / 3.0
-# A count in single precision is whole to this share of it.
-COUNT_ROUNDING = 1e-6
 # mu in units of p over the largest value of the extended source, at which the Tikhonov term takes
 # half of the brightest pixel.
 MU_GRID = 10.0 ** np.arange(-3.0, 0.1, 0.5)
 # The weight of the edge-preserving term in units of the noise of the gradient of the data term.
 SMOOTHING_GRID = 10.0 ** np.arange(-1.5, 0.6, 0.5)
-MAX_COUNTS = 2.0**62
 
 # The prefix of the names under which the states of all halves are saved, stacked.
 HALVES = "halves_"
@@ -101,68 +99,6 @@ def curve_of(rows: Array) -> NDArray[np.void]:
     for name, row in zip(CURVE_DTYPE.names or (), rows, strict=True):
         curve[name] = row
     return curve
-
-
-def split_counts(
-    observation: Observation, n_splits: int = 1
-) -> list[tuple[Observation, Observation]]:
-    """Return pairs of halves of an observation, its counts split at random.
-
-    A Poisson count is split binomially, so that its halves are independent Poisson counts of half
-    its mean. The fraction of a number that is not whole goes to one of the halves, which keeps
-    their variances those of counts to 1/16. The seeds are fixed.
-
-    Raises
-    ------
-    InputError
-        The images hold no counts, or too many in a pixel.
-
-    Warns
-    -----
-    LnoclWarning
-        Images that are not whole counts.
-    """
-    images = np.where(observation.mask, 0.0, observation.images)
-    if not images.any():
-        raise InputError(
-            "the images hold no counts to hold out; give n_iter, mu and smoothing as numbers"
-        )
-    if images.max() > MAX_COUNTS:
-        raise InputError(
-            f"a pixel of {images.max():.3g} electrons is too bright to be split; give n_iter, mu "
-            "and smoothing as numbers"
-        )
-    if not _are_whole(observation):
-        warn("the images are not whole counts: they are split as if they were Poisson counts")
-    whole = np.floor(images)
-    known = {
-        "background": observation.background / 2.0,
-        "mask": observation.mask,
-        "exposure": observation.exposure,
-        "offsets": observation.offsets,
-    }
-    pairs = []
-    for seed in range(n_splits):
-        rng = np.random.default_rng(seed)
-        first = rng.binomial(whole.astype(np.int64), 0.5).astype(np.float64)
-        first += (images - whole) * rng.integers(0, 2, images.shape)
-        with ignored_warnings(LnoclWarning):  # the whole observation has warned already
-            pairs.append(
-                (
-                    Observation(first, observation.psfs, **known),
-                    Observation(images - first, observation.psfs, **known),
-                )
-            )
-    return pairs
-
-
-def _are_whole(observation: Observation) -> bool:
-    """Return whether all counts are whole, as they were before the read noise was added."""
-    variance = observation.read_noise**2
-    counts = observation.images - (variance if variance.ndim == 3 else variance[:, None, None])
-    counts = counts[~observation.mask & (observation.images > 0)]  # negative ones were set to 0
-    rounding = COUNT_ROUNDING * np.maximum(abs(counts), 1.0)
-    return bool((abs(counts - np.round(counts)) <= rounding).all())
 
 
 def mu_grid(smoothing: float) -> PenaltyGrid:
@@ -315,8 +251,8 @@ class HeldOutSelection:
     n_iter : int
         Iterations at most.
     at_end : bool
-        Whether the reconstruction will go on to `n_iter`, and the penalty is to be the best there;
-        else each penalty has its own number of iterations.
+        Whether the reconstruction runs to `n_iter`, and the penalty is to be the best there; else
+        each penalty has its own number of iterations.
 
     Raises
     ------

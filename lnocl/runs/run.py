@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.errors import refuse_not_finite
-from lnocl.runs.divergence import Descent
+from lnocl.runs.descent import Descent
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene

@@ -8,7 +8,7 @@ from scenes import same
 
 import lnocl
 from lnocl.errors import DivergedError, NotFiniteError
-from lnocl.runs.divergence import MAX_RISE, N_ABOVE, Descent, explain_rise
+from lnocl.runs.descent import MAX_RISE, N_ABOVE, Descent, explain_rise
 from lnocl.scene.scene import Scene
 
 SIZE = 32
@@ -65,7 +65,7 @@ def test_the_result_is_the_estimate_of_the_least_objective(engine, seed):
 
 def test_without_it_all_the_light_is_in_one_pixel(monkeypatch):
     """The trap is there."""
-    monkeypatch.setattr("lnocl.runs.divergence.N_ABOVE", 10**9)
+    monkeypatch.setattr("lnocl.runs.descent.N_ABOVE", 10**9)
     result = lnocl.deconvolve(observe(4), engine="numpy")
     assert result.stop_reason == "n_iter"
     assert result.extended.max() > 0.9 * result.extended.sum()
