@@ -124,12 +124,12 @@ class Sky:
 
     def observation(self):
         """Return what is known of the frame."""
-        return lnocl.Observation(self.cut(self.counts), psfs(self.kind), BACKGROUND)
+        return lnocl.Observation(self.cut(self.counts), psfs(self.kind), background=BACKGROUND)
 
     def reconstruct(self, solver, pad, device, whole=False):
         """Return iteration, errors and the extended source at the middle's smallest error."""
         if whole:
-            observation = lnocl.Observation(self.counts, psfs(self.kind), BACKGROUND)
+            observation = lnocl.Observation(self.counts, psfs(self.kind), background=BACKGROUND)
             stars = [(x + self.x, y + self.y) for x, y in self.stars]
         else:
             observation, stars = self.observation(), self.stars

@@ -37,7 +37,7 @@ from astropy.io import fits
 
 import lnocl
 from lnocl.metrics import restoration_error, star_rows
-from lnocl.runs import held_out
+from lnocl.runs.thinning import split_counts
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.simulation import Experiment, Star, Target, hh34, load_target, simulate
@@ -194,7 +194,7 @@ def random_scene(seed, data):
 
 def likelihood_choice(simulation, device, n_iter=400, every=2):
     """Return the iteration at which the likelihood of a held-out half is best."""
-    ((first, second),) = held_out.split_counts(experiment.observe(simulation))
+    ((first, second),) = split_counts(experiment.observe(simulation))
     scene = Scene(first, simulation.stars)
     model = Model(scene)
     curve = []
@@ -219,7 +219,13 @@ def stops(data, device):
         truth, (star,) = simulation.extended, simulation.stars
         rows = star_rows(star, truth.shape)
         auto = lnocl.deconvolve(
-            experiment.observe(simulation), [star], "auto", "sgp", 1500, "held-out", device=device
+            experiment.observe(simulation),
+            [star],
+            mu="auto",
+            solver="sgp",
+            n_iter=1500,
+            stop="held-out",
+            device=device,
         )
         curves = {
             mu: follow(simulation, "sgp", 800, mu=mu, device=device)
@@ -228,10 +234,10 @@ def stops(data, device):
         smooth = lnocl.deconvolve(
             experiment.observe(simulation),
             [star],
-            0.0,
-            "sgp",
-            1500,
-            "held-out",
+            mu=0.0,
+            solver="sgp",
+            n_iter=1500,
+            stop="held-out",
             smoothing="auto",
             device=device,
         )
@@ -248,7 +254,13 @@ def stops(data, device):
         row |= {"smoothed best rho''": best["smoothed"][1], "smoothing": smooth.smoothing}
         held_out, discrepancy = (
             lnocl.deconvolve(
-                experiment.observe(simulation), [star], 0.0, "sgp", 1500, stop, device=device
+                experiment.observe(simulation),
+                [star],
+                mu=0.0,
+                solver="sgp",
+                n_iter=1500,
+                stop=stop,
+                device=device,
             )
             for stop in ("held-out", "discrepancy")
         )
@@ -280,7 +292,7 @@ def choices(data, device):
         for shift, kept in settings:
             with (
                 patch("lnocl.solvers.scaling.SHIFT", shift),
-                patch("lnocl.solvers.sgp.STEPS_KEPT", kept),
+                patch("lnocl.solvers.sgp.N_LENGTHS", kept),
             ):
                 curve = follow(simulation, "sgp", n_iter, device=device)
             best = curve[np.argmin(curve[:, 2])]

@@ -1,19 +1,23 @@
-"""Multi-component Richardson-Lucy deconvolution of astronomical images on OpenCL."""
+"""Multi-component Richardson-Lucy deconvolution of astronomical images on OpenCL.
+
+Describe the images with `Observation`, reconstruct the sky with `deconvolve`, and read its
+`Result`; errors are `LnoclError`, warnings `LnoclWarning`:
+
+    observation = lnocl.Observation(images, psfs, background=559.0, read_noise=10.0)
+    result = lnocl.deconvolve(observation, stars=[(512, 256)])
+
+The command ``lnocl --help`` does the same for FITS files, and more.
+"""
 
 from importlib.metadata import version
 
-from lnocl.deconvolution import Result, deconvolve
-from lnocl.errors import DeviceError, FileError, InputError, LnoclError, LnoclWarning
+from lnocl.deconvolution import deconvolve
+from lnocl.errors import DeviceError as DeviceError
+from lnocl.errors import FileError as FileError
+from lnocl.errors import InputError as InputError
+from lnocl.errors import LnoclError, LnoclWarning
+from lnocl.result import Result
 from lnocl.scene.observation import Observation
 
-__all__ = [
-    "DeviceError",
-    "FileError",
-    "InputError",
-    "LnoclError",
-    "LnoclWarning",
-    "Observation",
-    "Result",
-    "deconvolve",
-]
+__all__ = ["LnoclError", "LnoclWarning", "Observation", "Result", "deconvolve"]
 __version__ = version("lnocl")

@@ -38,6 +38,10 @@ class DeviceError(LnoclError, RuntimeError):
     """No usable OpenCL device, or the device cannot do what was asked of it."""
 
 
+class DivergedError(LnoclError):
+    """The objective rises where each iteration must lower it."""
+
+
 class NotFiniteError(DeviceError):
     """A sum that steers an iteration is infinite or not a number."""
 

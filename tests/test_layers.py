@@ -15,6 +15,7 @@ FLOORS = [
     {"simulation", "plotting"},
     {"engines"},
     {"runs"},
+    {"result"},
     {"deconvolution"},
     {"__init__"},
     {"verify", "studies"},

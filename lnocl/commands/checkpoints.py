@@ -14,7 +14,7 @@ from lnocl.commands.signals import first_handled
 from lnocl.errors import InputError, LnoclError, counted
 
 if TYPE_CHECKING:
-    from lnocl.deconvolution import Result
+    from lnocl.result import Result
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

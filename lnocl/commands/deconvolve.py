@@ -13,8 +13,11 @@ from typing import TYPE_CHECKING, Any
 from lnocl.commands import checkpoints, messages, options, record
 from lnocl.commands.options import SEVERAL, finite, number_or_word, option, whole_or_word
 from lnocl.commands.parser import Command
-from lnocl.deconvolution import ENGINES, PRECISIONS, SOLVERS, Result, deconvolve
+from lnocl.deconvolution import deconvolve
 from lnocl.errors import counted
+from lnocl.result import Result
+from lnocl.runs.options import ENGINES, PRECISIONS
+from lnocl.solvers import SOLVERS
 
 if TYPE_CHECKING:
     from astropy.io import fits

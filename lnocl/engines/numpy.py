@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from lnocl.errors import refuse_not_finite
 from lnocl.reference.convolve import convolve_columns, correlate_columns, otf_columns
 from lnocl.reference.ratio import ratio_rows
 from lnocl.reference.rows import irfft_rows, rfft_rows
@@ -14,6 +13,7 @@ from lnocl.reference.step import gradient_rows, step_rows
 from lnocl.reference.sums import collect_sums
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
+from lnocl.solvers.engine import State
 from lnocl.solvers.scaling import Scaling
 
 
@@ -42,6 +42,7 @@ class ReferenceEngine:
         self._inverse_weight = self._invert_weight()
         self._slope = self._curvature = np.zeros(scene.grid)
         self._objectives: list[float] = []
+        self._n_fetched = 0
 
     def set_scaling(self, scaling: Scaling) -> None:
         """Measure steps with this from now on."""
@@ -104,7 +105,6 @@ class ReferenceEngine:
 
     def scale(self) -> None:
         """Scale the estimate by its correction."""
-        refuse_not_finite(self._objectives[-1])
         self._extended, self._row_spectrum, self._squares, self._star_fluxes = scale_rows(
             self._row_spectrum,
             self._extended,
@@ -164,6 +164,7 @@ class ReferenceEngine:
     def forget_objective(self) -> None:
         """Take the objective recorded last off the record."""
         self._objectives.pop()
+        self._n_fetched = min(self._n_fetched, len(self._objectives))
 
     def extended(self) -> Array:
         """Return the extended source, on the grid and scaled."""
@@ -181,7 +182,12 @@ class ReferenceEngine:
         """Return the objectives recorded so far, scaled."""
         return np.array(self._objectives)
 
-    def state(self) -> dict[str, Array]:
+    def fetched_objectives(self) -> Array:
+        """Return the objectives recorded since the last call, scaled."""
+        fetched, self._n_fetched = self._objectives[self._n_fetched :], len(self._objectives)
+        return np.array(fetched)
+
+    def state(self) -> State:
         """Return what `restore` needs, as it is between iterations."""
         return {
             "extended": self._extended,
@@ -192,7 +198,7 @@ class ReferenceEngine:
             "gradient": self._gradient,
         }
 
-    def restore(self, state: dict[str, Array]) -> None:
+    def restore(self, state: State) -> None:
         """Go on from this state."""
         self._extended, self._previous = state["extended"], state["previous"]
         self._gradient = state["gradient"]
@@ -200,3 +206,4 @@ class ReferenceEngine:
         self._row_spectrum = rfft_rows(self._extended)
         self._squares = float(state["square_sums"][0])
         self._objectives = state.get("objectives", np.zeros(0)).tolist()
+        self._n_fetched = len(self._objectives)

@@ -8,7 +8,6 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from lnocl.errors import refuse_not_finite
 from lnocl.opencl.device import choose, context_of, describe
 from lnocl.opencl.faults import guarded
 from lnocl.opencl.launch import Launch, Launcher
@@ -18,6 +17,7 @@ from lnocl.opencl.program import Program, Tuning
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import LEAST_MODEL, Scene
 from lnocl.scene.shifting import Stamp
+from lnocl.solvers.engine import State
 from lnocl.solvers.scaling import Scaling
 
 # The host waits once in so many iterations, for those before them: often enough that an interrupt
@@ -99,6 +99,7 @@ class OpenCLEngine:
         self._n_scaled = 0
         self._last_mark: cl.Event | None = None
         self._unseen: Transfer | None = None
+        self._fetched = np.zeros(0)
         self._observed: NDArray[np.bool_] | None = None
         self._memory.allocate(**sizes)
         self._upload_scene()
@@ -304,7 +305,7 @@ class OpenCLEngine:
         self._correlate()
 
     def scale(self) -> None:
-        """Scale the estimate by its correction; look at the objectives of some iterations ago."""
+        """Scale the estimate by its correction; fetch the objectives of some iterations ago."""
         event = self._scale()
         self._convolve()
         self._n_scaled += 1
@@ -314,7 +315,7 @@ class OpenCLEngine:
             self._last_mark = event
         if self._n_scaled % ITERATIONS_UNSEEN == 0:
             if self._unseen is not None:
-                refuse_not_finite(*self._unseen.wait()[0])
+                self._fetched = self._unseen.wait()[0].reshape(-1, 2).sum(axis=1)
             first = 2 * (self._n_objectives - ITERATIONS_UNSEEN)
             self._unseen = self._memory.fetch_ranges(("objectives", first, 2 * ITERATIONS_UNSEEN))
 
@@ -396,7 +397,12 @@ class OpenCLEngine:
         pairs = self._memory.download("objectives", 2 * self._n_objectives)
         return pairs.reshape(-1, 2).sum(axis=1)
 
-    def state(self) -> dict[str, NDArray]:
+    def fetched_objectives(self) -> Array:
+        """Return the objectives that `scale` has fetched since the last call, scaled."""
+        fetched, self._fetched = self._fetched, np.zeros(0)
+        return fetched
+
+    def state(self) -> State:
         """Return the arrays that `restore` needs, between iterations, as they lie on the device."""
         state = {name: self._memory.download_raw(name) for name in self._stateful}
         state["objectives"] = state["objectives"][: 2 * self._n_objectives]
@@ -408,7 +414,7 @@ class OpenCLEngine:
         estimate = "extended", "star_fluxes", "square_sums", "objectives"
         return estimate if self.scaling is None else (*estimate, "previous", "gradient")
 
-    def restore(self, state: dict[str, NDArray]) -> None:
+    def restore(self, state: State) -> None:
         """Continue from this state."""
         for name in self._stateful:
             if name in state:  # there may be no objective yet, and no star

@@ -129,11 +129,11 @@ class _Reader:
         observation = Observation(
             counts,
             self._psfs.data,
-            self._maps.combine("background", background),
-            self._read_noise(each, inverse, mask),
-            mask if mask.any() else None,
-            1.0 if exposure is None else exposure,
-            self._offsets(),
+            background=self._maps.combine("background", background),
+            read_noise=self._read_noise(each, inverse, mask),
+            mask=mask if mask.any() else None,
+            exposure=1.0 if exposure is None else exposure,
+            offsets=self._offsets(),
         )
         sha256 = {"images": self._images.sha256, "psfs": self._psfs.sha256, **self._maps.sha256}
         return Frames(observation, self._images, background, sha256)

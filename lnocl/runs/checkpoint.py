@@ -1,4 +1,4 @@
-"""Checkpoints: what a run has come to, in a file that it can go on from, bit for bit."""
+"""Checkpoints: the state of a run in a file, from which it resumes bit for bit."""
 
 from __future__ import annotations
 
@@ -13,72 +13,70 @@ from numbers import Real
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError, warn
 from lnocl.io.atomic import check_output, whole_file
-from lnocl.runs.held_out import NO_CURVE, Choice, HeldOutSelection, curve_of, plain
+from lnocl.runs.held_out import EMPTY_CURVE, Choice, HeldOutSelection, curve_of, rows_of
 from lnocl.runs.run import Run, Setup, engine_name
 from lnocl.runs.stopping import Rule
 from lnocl.scene.observation import Observation, numbers
 from lnocl.scene.penalty import Penalty
-
-Arrays = dict[str, NDArray[Any]]
+from lnocl.solvers.engine import State
 
 OBSERVED = ("images", "psfs", "background", "mask", "exposure", "offsets")
 # The widest value: a SHA-256 in hexadecimal, or the repr of a parameter or name of a device.
 WIDTH = 256
-# More than there are parameters; a hostile file may have any number, compressed to nothing.
-MOST_ROWS = 100
+# More than there are parameters: a hostile file may have any number, compressed to nothing.
+MAX_ROWS = 100
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a checkpoint holds.
+    """The content of a checkpoint.
 
     Attributes
     ----------
     path : str
-        The file it was read from.
+        The file that it was read from.
     described : dict of str to str
-        What the run was bound to, as from `describe`.
+        The inputs and parameters of the run, as from `describe`.
     ended : str
         Why the run had ended; empty where it had not.
     arrays : dict of str to ndarray
-        Its state.
+        The state of the run.
     """
 
     path: str
     described: dict[str, str]
     ended: str
-    arrays: Arrays
+    arrays: State
 
     def choice(self) -> Choice | None:
-        """Return what held-out counts had chosen, or what had been given; None if not yet."""
+        """Return the choice of held-out counts, or of the caller; None if it was not made yet."""
         if "choice" not in self.arrays:
             return None
         mu, smoothing, n_iter = self.arrays["choice"].tolist()
-        curve = curve_of(self.arrays.get("curve", plain(NO_CURVE)))
+        curve = curve_of(self.arrays.get("curve", rows_of(EMPTY_CURVE)))
         return Choice(Penalty(mu, smoothing), int(n_iter), curve)
 
     def refuse_unless(self, described: Mapping[str, str]) -> None:
-        """Refuse to go on where anything differs from what the run was bound to.
+        """Refuse to resume a run of other inputs or parameters.
 
         Raises
         ------
         InputError
-            Something differs; the message names it.
+            An input or a parameter differs; the message names it.
         """
         differing = [name for name in described if self.described.get(name) != described[name]]
         if differing:
             raise InputError(
                 f"the checkpoint {self.path} is of another run: {', '.join(differing)} "
-                f"differ{'s' * (len(differing) == 1)}; repeat its command as it was, or begin anew"
+                f"differ{'s' * (len(differing) == 1)}; repeat its command as it was, or start anew"
             )
 
 
 def describe(observation: Observation, setup: Setup, **parameters: Any) -> dict[str, str]:
-    """Return what a run is bound to: checksums of arrays, and the other parameters in words."""
+    """Return the inputs and parameters of a run: checksums of arrays, other values in words."""
     bound = {
         "version": version("lnocl"),
         **{name: getattr(observation, name) for name in OBSERVED},
@@ -91,7 +89,7 @@ def describe(observation: Observation, setup: Setup, **parameters: Any) -> dict[
 
 def _describe(name: str, value: Any) -> str:
     if isinstance(value, (Real, np.bool_)):
-        value = float(value)  # of whatever kind it is
+        value = float(value)  # so that 1, True and np.float32(1) are the same
     if value is None or isinstance(value, (str, float)):
         return ascii(value)[:WIDTH]
     array = numbers(name, value).astype("<f8")
@@ -106,19 +104,19 @@ def read(path: str) -> Checkpoint:
     Raises
     ------
     FileError
-        A file that is missing, no checkpoint, truncated or altered.
+        The file is missing, not a checkpoint, truncated or altered.
     """
-    from astropy.io import fits  # which runs without checkpoints need not load
+    from astropy.io import fits  # runs without checkpoints need not load it
 
     from lnocl.io.fitsfile import open_fits
 
-    arrays: Arrays = {}
-    with open_fits(path, "is no checkpoint, or a damaged one") as file:
+    arrays: State = {}
+    with open_fits(path, "is not a checkpoint, or a damaged one") as file:
         for hdu in file.hdus():
             if isinstance(hdu, fits.PrimaryHDU):
                 ended, digest = str(hdu.header["ENDED"]), hdu.header["DIGEST"]
             elif hdu.name == "RUN":
-                described = {str(row["name"]): str(row["value"]) for row in hdu.data[:MOST_ROWS]}
+                described = {str(row["name"]): str(row["value"]) for row in hdu.data[:MAX_ROWS]}
             else:
                 arrays[hdu.name.lower()] = np.array(hdu.data, hdu.data.dtype.newbyteorder("="))
         if digest != _digest(described, ended, arrays):
@@ -126,8 +124,8 @@ def read(path: str) -> Checkpoint:
     return Checkpoint(path, described, ended, arrays)
 
 
-def _digest(described: Mapping[str, str], ended: str, arrays: Arrays) -> str:
-    """Return the SHA-256 of all that a checkpoint holds."""
+def _digest(described: Mapping[str, str], ended: str, arrays: State) -> str:
+    """Return the SHA-256 of the content of a checkpoint."""
     digest = hashlib.sha256(repr((sorted(described.items()), ended)).encode())
     for name, array in sorted(arrays.items()):
         digest.update(repr((name, array.shape, array.dtype.str)).encode())
@@ -139,7 +137,7 @@ def write(
     path: str,
     described: Mapping[str, str],
     ended: str,
-    arrays: Arrays,
+    arrays: State,
     overwrite: bool = True,
 ) -> None:
     """Write a checkpoint; a file of that name is replaced once this one is complete.
@@ -147,23 +145,23 @@ def write(
     Raises
     ------
     FileError
-        The file cannot be written, or is there and must not be overwritten.
+        The file cannot be written, or exists and must not be overwritten.
     """
     from astropy.io import fits
 
-    kept = {name: array for name, array in arrays.items() if array.size}  # FITS has none of 0
+    filled = {name: array for name, array in arrays.items() if array.size}  # FITS has no empty ones
     primary = fits.PrimaryHDU()
-    primary.header["ENDED"] = ended, "why the run ended; empty where it goes on"
-    primary.header["DIGEST"] = _digest(described, ended, kept)
+    primary.header["ENDED"] = ended, "why the run ended; empty where it had not"
+    primary.header["DIGEST"] = _digest(described, ended, filled)
     table = np.array(list(described.items()), [("name", "U32"), ("value", f"U{WIDTH}")])
-    images = [fits.ImageHDU(array, name=name.upper()) for name, array in kept.items()]
+    images = [fits.ImageHDU(array, name=name.upper()) for name, array in filled.items()]
     hdus = fits.HDUList([primary, fits.BinTableHDU(table, name="RUN"), *images])
     with whole_file(path, overwrite) as stream:
         hdus.writeto(stream)
 
 
 class Checkpointer:
-    """Keeps the checkpoints of a run, and finds the one that it goes on from.
+    """Writes the checkpoints of a run, and holds the one that it resumes from.
 
     Parameters
     ----------
@@ -172,21 +170,21 @@ class Checkpointer:
     every : float
         Seconds between them, zero or more.
     resume : str or None
-        The checkpoint that the run goes on from, which may be replaced.
+        The checkpoint to resume from, which may be replaced.
     describe : callable
-        Returns what the run is bound to; called where there is a path or a checkpoint.
+        Returns the inputs and parameters of the run; called where there is a path or a checkpoint.
 
     Attributes
     ----------
     saved : Checkpoint or None
-        What the run goes on from.
+        The checkpoint to resume from.
 
     Raises
     ------
     InputError
-        `every` is no such number, or the checkpoint is of another run.
+        `every` is not a number of seconds, or the checkpoint is of another run.
     FileError
-        The file cannot be written, or exists and is not the one gone on from; the checkpoint
+        The file cannot be written, or exists and is not the one to resume from; the checkpoint
         cannot be read.
     """
 
@@ -199,7 +197,7 @@ class Checkpointer:
     ) -> None:
         self._path, source = _file_name("checkpoint", path), _file_name("resume", resume)
         self._saved_at = time.monotonic() if path is None else -math.inf
-        self._finite: Arrays = {}
+        self._best: State = {}
         if not (isinstance(every, Real) and cast(float, every) >= 0):
             raise InputError(f"checkpoint_every must be seconds, 0 or more; {every!r} was given")
         self._every = cast(float, every)
@@ -214,6 +212,10 @@ class Checkpointer:
         if self.saved is not None:
             self.saved.refuse_unless(self._described)
 
+    def choice(self) -> Choice | None:
+        """Return the choice of held-out counts, or of the caller, that was saved, if any."""
+        return None if self.saved is None else self.saved.choice()
+
     def _refuse_to_replace(self) -> None:
         assert self._path is not None
         if os.path.lexists(self._path) and not self._may_replace:
@@ -222,78 +224,74 @@ class Checkpointer:
     def restore(self, run: Run, rule: Rule) -> str:
         """Put a run where its checkpoint was, if any; return why it had ended, if it had.
 
-        A run that a callback has ended, or an interrupt, goes on.
+        A run that a callback or an interrupt has ended continues.
 
         Raises
         ------
         NotFiniteError
             The start is infinite or not a number.
         """
-        ended = ""
-        if self.saved is not None and self.saved.choice() is not None:
-            run.restore(self.saved.arrays)
-            rule.restore(self.saved.arrays.get("rule", np.zeros(0)).tolist())
-            ended = "" if self.saved.ended == "callback" else self.saved.ended
-        self._finite = run.state()
-        return ended
+        self._best = run.state()
+        if self.saved is None or self.choice() is None:
+            return ""
+        run.restore(self.saved.arrays)
+        rule.restore(self.saved.arrays.get("rule", np.zeros(0)).tolist())
+        self._remember(*run.proven_state())
+        return "" if self.saved.ended == "callback" else self.saved.ended
 
-    def redo(self, run: Run) -> None:
-        """Put a run whose objective is not finite where it was the last time, from what was kept.
+    def _remember(self, state: State, is_best: bool) -> None:
+        """Hold the state of the least objective, for `return_to_best` to iterate from."""
+        if is_best:
+            self._best = state
 
-        The checkpoint stays as it is: a run goes on from it as if nothing had happened.
+    def return_to_best(self, run: Run) -> None:
+        """Put a run back where its objective was least, by iterating again from a state before.
+
+        The file stays as it is.
 
         Raises
         ------
         NotFiniteError
-            There is no such estimate.
-
-        Warns
-        -----
-        LnoclWarning
-            Always.
+            The run has no finite objective.
         """
-        run.redo(self._finite)
-        warn(
-            f"the objective became infinite or not a number: the result is that of iteration "
-            f"{run.done}, the last before; scale the scene where its values are large beyond "
-            "measure, else see what lnocl selftest says of the device"
-        )
+        run.return_to_best(self._best)
 
-    def keep(self, run: Run, rule: Rule, choice: Choice, ended: str) -> None:
-        """Keep what the run has come to, where it is time to or the run has ended; in the file too.
+    def save(self, run: Run, rule: Rule, choice: Choice, ended: str) -> None:
+        """Save the state of a run where that is due or the run has ended, in the file too.
 
         Raises
         ------
         FileError
             The first checkpoint cannot be written.
         NotFiniteError
-            It has come to what is infinite or not a number; the file stays as it is.
+            The state is infinite or not a number; the file stays as it is.
 
         Warns
         -----
         LnoclWarning
-            A later one cannot be written.
+            A later checkpoint cannot be written.
         """
-        if ended or self._is_time():
-            self._finite = run.proven_state()
+        if ended or self._is_due():
+            state, is_best = run.proven_state()
+            self._remember(state, is_best)
             chosen = [choice.penalty.mu, choice.penalty.smoothing, choice.n_iter]
-            besides = {"rule": rule.state(), "choice": chosen, "curve": plain(choice.curve)}
+            besides = {"rule": rule.state(), "choice": chosen, "curve": rows_of(choice.curve)}
             arrays = {name: np.array(values, np.float64) for name, values in besides.items()}
-            self._write(ended, self._finite | arrays)
+            self._write(ended, state | arrays)
 
-    def keep_choosing(self, selection: HeldOutSelection) -> None:
-        """Keep what held-out counts have come to, where there is a file and it is time to.
+    def save_selection(self, selection: HeldOutSelection) -> None:
+        """Save the state of held-out counts where there is a file and that is due.
 
-        Raises and warns as `keep`.
+        Raises and warns as `save`.
         """
-        if self._path is not None and self._is_time():
+        if self._path is not None and self._is_due():
             self._write("", selection.state())
 
-    def _is_time(self) -> bool:
+    def _is_due(self) -> bool:
         return time.monotonic() - self._saved_at >= self._every
 
-    def _write(self, ended: str, arrays: Arrays) -> None:
-        """Write a checkpoint; what cannot be written later on costs no run that has come so far."""
+    def _write(self, ended: str, arrays: State) -> None:
+        """Write a checkpoint; a failure to write ends the run only where it is the first one."""
         try:
             if self._path is not None:
                 self._refuse_to_replace()
@@ -302,7 +300,7 @@ class Checkpointer:
         except FileError as error:
             if self._saved_at == -math.inf:
                 raise
-            warn(f"{error}; the run goes on, and what was there before is as it was")
+            warn(f"{error}; the run continues, and the last checkpoint is as it was")
         self._saved_at = time.monotonic()
 
 

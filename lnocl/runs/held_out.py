@@ -1,16 +1,16 @@
-"""Iterations and penalty chosen by held-out counts: two reconstructions, each judged by the other.
+"""Iterations and penalty chosen by held-out counts: cross-validation by data thinning.
 
-Each count goes to one of two halves of the observation, by the toss of a coin, which makes them
-two independent Poisson observations of the same sky. Both are reconstructed side by side. With A_k
-and B_k the extended sources after k iterations, in the end A_L and B_L, the sum A_k + B_k is a
-reconstruction f_k from all counts, and but for a constant its squared error is
+Data thinning gives each count to one of two halves of the observation, with probability 1/2. The
+halves are independent Poisson observations of the same sky, and are reconstructed side by side.
+With A_k and B_k their extended sources after k iterations, A_L and B_L after the last, the sum
+A_k + B_k is a reconstruction f_k from all counts. But for a constant its squared error is
 
     ||f_k - f||^2 - ||f||^2 = ||f_k||^2 - 2 <f_k, f>,   <f_k, f> = 2 (<A_k, B_L> + <B_k, A_L>),
 
-as noise of independent halves averages out of these products, and what L iterations have not yet
-resolved is small where L is large. The noise alone is ||A_k - B_k||^2. All is averaged over a few
-ways to deal the counts out. The likelihood of the held-out half itself, the usual measure, is flat
-over most of the run and ends it two to four times too early: docs/sgp.md.
+as noise of independent halves averages out of these products, and structure that L iterations have
+not resolved is small where L is large. The noise alone is ||A_k - B_k||^2. The errors are averaged
+over several splits of the counts. The likelihood of the held-out half itself, the usual measure, is
+flat over most of the run and ends it two to four times too early: docs/sgp.md.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError, LnoclWarning, refuse_not_finite, warn
+from lnocl.errors import DivergedError, InputError, LnoclWarning, refuse_not_finite, warn
 from lnocl.process import ignored_warnings
 from lnocl.runs.run import Run
+from lnocl.runs.thinning import split_counts
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
+from lnocl.solvers.engine import State
 
 CURVE_DTYPE = np.dtype(
     [
@@ -38,40 +39,39 @@ CURVE_DTYPE = np.dtype(
     ]
 )
 
-NO_CURVE = np.zeros(0, CURVE_DTYPE)
+EMPTY_CURVE = np.zeros(0, CURVE_DTYPE)
 
-# The last iteration is taken whose error is within a tenth of the least: near a star the estimate
-# goes on improving long after the rest. The least squared error is taken to be the noise alone;
-# what is not resolved adds as much again and more, so that a tenth is cautious.
-WITHIN = 0.1
-# The halves go on for as long again, so that what each is judged by is resolved.
-AS_LONG_AGAIN = 2
-FEWEST = 10
-# Ways to deal the counts out.
-SPLITS = 3
-# Iterations at which the halves are compared are so far apart, relatively.
+# The chosen iteration is the last with an error within a tenth of the least: near a star the
+# estimate improves long after the rest. The least squared error is taken to be the noise alone;
+# unresolved structure adds as much again and more, so that a tenth is cautious.
+ERROR_TOLERANCE = 0.1
+# The halves run to this multiple of the chosen iteration, so that the references are resolved.
+LENGTH_RATIO = 2
+MIN_ITERATIONS = 10
+# Splits of the counts that are averaged over.
+N_SPLITS = 3
+# The ratio of one iteration at which the halves are compared to that before.
 SPACING = 1.1
-# Estimates before this share of the chosen iteration are let go.
-FORGOTTEN = 1.0 / 3.0
+# Snapshots before this share of the chosen iteration are dropped.
+OLDEST_SNAPSHOT = 1.0 / 3.0
 # mu in units of p over the largest value of the extended source, at which the Tikhonov term takes
 # half of the brightest pixel.
 MU_GRID = 10.0 ** np.arange(-3.0, 0.1, 0.5)
 # The weight of the edge-preserving term in units of the noise of the gradient of the data term.
 SMOOTHING_GRID = 10.0 ** np.arange(-1.5, 0.6, 0.5)
-MOST_COUNTS = 2.0**62
 
-# Before the names of what all runs on halves have come to, one behind the other.
+# The prefix of the names under which the states of all halves are saved, stacked.
 HALVES = "halves_"
 
-Arrays = dict[str, NDArray[Any]]
-Estimate = NDArray[np.float32]
-BeginHalf = Callable[[Observation, Penalty], Run]
-Grid = Callable[[Observation, float], list[Penalty]]
+Snapshot = NDArray[np.float32]
+Pair = tuple[Snapshot, Snapshot]
+StartRun = Callable[[Observation, Penalty], Run]
+PenaltyGrid = Callable[[Observation, float], list[Penalty]]
 
 
 @dataclass
 class Choice:
-    """What held-out counts have chosen.
+    """The penalty and the number of iterations, chosen by held-out counts or by the caller.
 
     Attributes
     ----------
@@ -88,75 +88,21 @@ class Choice:
     curve: NDArray[np.void]
 
 
-def plain(curve: NDArray[np.void]) -> Array:
-    """Return a curve as numbers, a row for each field."""
+def rows_of(curve: NDArray[np.void]) -> Array:
+    """Return a curve as plain numbers, a row for each field."""
     return np.array([curve[name] for name in CURVE_DTYPE.names or ()], np.float64)
 
 
 def curve_of(rows: Array) -> NDArray[np.void]:
-    """Return a curve from its numbers."""
+    """Return a curve from the rows that `rows_of` makes of it."""
     curve = np.zeros(rows.shape[1], CURVE_DTYPE)
     for name, row in zip(CURVE_DTYPE.names or (), rows, strict=True):
         curve[name] = row
     return curve
 
 
-def split_counts(observation: Observation, ways: int = 1) -> list[tuple[Observation, Observation]]:
-    """Return two halves of an observation, the counts dealt out at random, in so many ways.
-
-    Whole counts are dealt out one by one, so that the halves of a Poisson count are independent
-    Poisson counts of half its mean. Of what is no whole count the fraction goes to one of the
-    halves, which keeps their variances those of counts to 1/16. The seeds are fixed.
-
-    Raises
-    ------
-    InputError
-        No counts to deal out, or too many.
-
-    Warns
-    -----
-    LnoclWarning
-        Images that are not whole counts.
-    """
-    images = np.where(observation.mask, 0.0, observation.images)
-    if not images.any():
-        raise InputError(
-            "the images hold no counts to hold out; give n_iter, mu and smoothing as numbers"
-        )
-    if images.max() > MOST_COUNTS:
-        raise InputError(
-            f"a pixel of {images.max():.3g} electrons cannot be dealt out; give n_iter, mu and "
-            "smoothing as numbers"
-        )
-    whole = np.floor(images)
-    if (whole != images).any():
-        warn("the images are not whole counts: they are split as if they were Poisson counts")
-    known = {
-        "background": observation.background / 2.0,
-        "mask": observation.mask,
-        "exposure": observation.exposure,
-        "offsets": observation.offsets,
-    }
-    pairs = []
-    for seed in range(ways):
-        rng = np.random.default_rng(seed)
-        first = rng.binomial(whole.astype(np.int64), 0.5).astype(np.float64)
-        first += (images - whole) * rng.integers(0, 2, images.shape)
-        with ignored_warnings(LnoclWarning):  # they are said of the whole observation too
-            pairs.append(
-                (
-                    Observation(first, observation.psfs, **known),
-                    Observation(images - first, observation.psfs, **known),
-                )
-            )
-    return pairs
-
-
-Pair = tuple[Estimate, Estimate]
-
-
-def several_mu(smoothing: float) -> Grid:
-    """Return what makes the penalties to choose mu from, once the brightest pixel is known."""
+def mu_grid(smoothing: float) -> PenaltyGrid:
+    """Return a function that makes the penalties to choose mu from, given the brightest pixel."""
 
     def grid(observation: Observation, brightest: float) -> list[Penalty]:
         total = observation.exposure.sum(axis=0).max()
@@ -165,11 +111,11 @@ def several_mu(smoothing: float) -> Grid:
     return grid
 
 
-def several_smoothings(mu: float) -> Grid:
-    """Return what makes the penalties to choose the smoothing from.
+def smoothing_grid(mu: float) -> PenaltyGrid:
+    """Return a function that makes the penalties to choose the smoothing from.
 
-    They are measured by the standard deviation of the gradient of the data term where only counts
-    vary, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, < > the mean over the pixels observed.
+    Their unit is the standard deviation of the gradient of the data term by the noise of the
+    counts, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, < > the mean over the observed pixels.
     """
 
     def grid(observation: Observation, brightest: float) -> list[Penalty]:
@@ -187,58 +133,84 @@ def several_smoothings(mu: float) -> Grid:
 
 
 class _Trial:
-    """The runs of all pairs of halves at one penalty, and their estimates at some iterations."""
+    """The runs on all pairs of halves at one penalty, with snapshots of their extended sources."""
 
     def __init__(self, runs: Sequence[tuple[Run, Run]]) -> None:
         self._runs = runs
-        self.kept: list[tuple[int, list[Pair]]] = []
+        self.snapshots: list[tuple[int, list[Pair]]] = []
 
     def advance(self) -> Iterator[int]:
-        """Go on to the next iteration that is kept, and yield it, until a run ends."""
-        last = self.iterations[-1] if self.kept else 0
-        due = max(last + 1, math.floor(SPACING * last))
-        for iteration, *_ in zip(*(run for pair in self._runs for run in pair), strict=False):
-            if iteration == due:
-                self.kept.append((iteration, [(_flat(a), _flat(b)) for a, b in self._runs]))
-                due = max(due + 1, math.floor(SPACING * due))
-                yield iteration
+        """Iterate to the next snapshot and yield its iteration, until a run ends.
 
-    def state(self) -> Arrays:
-        """Return what `restore` needs, at an iteration that was kept last."""
+        Where an objective rises, the trial ends at the last snapshot before that.
+
+        Raises
+        ------
+        DivergedError
+            An objective rises, and no snapshot before that is left.
+
+        Warns
+        -----
+        LnoclWarning
+            An objective rises.
+        """
+        last = self.iterations[-1] if self.snapshots else 0
+        due = max(last + 1, math.floor(SPACING * last))
+        try:
+            for iteration, *_ in zip(*(run for pair in self._runs for run in pair), strict=False):
+                if iteration == due:
+                    pairs = [(_flat(a), _flat(b)) for a, b in self._runs]
+                    self.snapshots.append((iteration, pairs))
+                    due = max(due + 1, math.floor(SPACING * due))
+                    yield iteration
+        except DivergedError:
+            best = min(run.best_iteration() for pair in self._runs for run in pair)
+            self.snapshots = [each for each in self.snapshots if each[0] <= best]
+            if not self.snapshots:
+                raise
+            warn(
+                f"the objective of a half of the counts rises after iteration {best}: held-out "
+                f"counts choose among the iterations up to {self.iterations[-1]}"
+            )
+
+    def state(self) -> State:
+        """Return the arrays that `restore` needs, right after a snapshot."""
         runs = enumerate(run for pair in self._runs for run in pair)
         state = {f"{HALVES}{k}_{name}": a for k, run in runs for name, a in run.state().items()}
-        state["kept_at"] = np.array(self.iterations)
-        state["kept"] = np.array([pairs for _, pairs in self.kept])
+        state["snapshot_iterations"] = np.array(self.iterations)
+        state["snapshots"] = np.array([pairs for _, pairs in self.snapshots])
         return state
 
-    def restore(self, state: Arrays) -> None:
-        """Go on from this state."""
+    def restore(self, state: State) -> None:
+        """Continue from this state."""
         for k, run in enumerate(run for pair in self._runs for run in pair):
             prefix = f"{HALVES}{k}_"
             run.restore(
                 {n.removeprefix(prefix): a for n, a in state.items() if n.startswith(prefix)}
             )
-        self.kept = [
-            (int(at), [(a, b) for a, b in pairs])
-            for at, pairs in zip(state["kept_at"], state["kept"], strict=True)
+        self.snapshots = [
+            (int(iteration), [(a, b) for a, b in pairs])
+            for iteration, pairs in zip(
+                state["snapshot_iterations"], state["snapshots"], strict=True
+            )
         ]
 
-    def forget(self, first: float) -> None:
-        """Let the estimates before an iteration go."""
-        self.kept = [kept for kept in self.kept if kept[0] >= first]
+    def drop_before(self, first: float) -> None:
+        """Drop the snapshots before an iteration."""
+        self.snapshots = [each for each in self.snapshots if each[0] >= first]
 
     @property
     def iterations(self) -> list[int]:
-        """The iterations kept."""
-        return [iteration for iteration, _ in self.kept]
+        """The iterations of the snapshots."""
+        return [iteration for iteration, _ in self.snapshots]
 
     @property
-    def end(self) -> list[Pair]:
-        """The last estimates."""
-        return self.kept[-1][1]
+    def last(self) -> list[Pair]:
+        """The last snapshot."""
+        return self.snapshots[-1][1]
 
     def excess(self, reference: Sequence[Pair]) -> Array:
-        """Return ``||f_k||^2 - 2 <f_k, f>`` at each iteration kept, judged by a reference."""
+        """Return ``||f_k||^2 - 2 <f_k, f>`` of each snapshot, with the reference for A_L, B_L."""
         return np.array(
             [
                 np.mean(
@@ -247,203 +219,232 @@ class _Trial:
                         for (a, b), (a_end, b_end) in zip(pairs, reference, strict=True)
                     ]
                 )
-                for _, pairs in self.kept
+                for _, pairs in self.snapshots
             ]
         )
 
     def noise(self, at: int) -> float:
-        """Return ``||A_k - B_k||^2`` at one of the iterations kept."""
-        return float(np.mean([_dot(a - b, a - b) for a, b in self.kept[at][1]]))
+        """Return ``||A_k - B_k||^2`` of one of the snapshots."""
+        return float(np.mean([_dot(a - b, a - b) for a, b in self.snapshots[at][1]]))
 
 
-def _dot(a: Estimate, b: Estimate) -> float:
+def _dot(a: Snapshot, b: Snapshot) -> float:
     return float(a @ b)
 
 
-def _flat(run: Run) -> Estimate:
+def _flat(run: Run) -> Snapshot:
     return run.extended().astype(np.float32).ravel()
 
 
 class HeldOutSelection:
-    """Held-out counts at work on the choice of the penalty and the number of iterations.
+    """The selection of the penalty and the number of iterations by held-out counts.
 
     Parameters
     ----------
-    begin : callable
-        ``begin(observation, penalty)`` begins a run of at most `n_iter` iterations.
+    start : callable
+        ``start(observation, penalty)`` starts a run of at most `n_iter` iterations.
     observation : Observation
-        What is to be reconstructed.
+        The observation to reconstruct.
     penalty : Penalty
-        The least, or the only one.
+        The smallest penalty, or the only one.
     grid : callable, optional
-        ``grid(observation, brightest)`` makes the others to choose from, growing; `several_mu` or
-        `several_smoothings`.
+        ``grid(observation, brightest)`` makes the other penalties to choose from, in increasing
+        order; `mu_grid` or `smoothing_grid`.
     n_iter : int
         Iterations at most.
     at_end : bool
-        Whether the reconstruction will go on to `n_iter`, and the penalty is to be the best there;
-        else each penalty has its own number of iterations.
+        Whether the reconstruction runs to `n_iter`, and the penalty is to be the best there; else
+        each penalty has its own number of iterations.
 
     Raises
     ------
     InputError
-        No counts to deal out, or too many.
+        The images hold no counts, or too many in a pixel.
 
     Warns
     -----
     LnoclWarning
-        Images that are not whole counts.
+        The images are not whole counts.
     """
 
     def __init__(
         self,
-        begin: BeginHalf,
+        start: StartRun,
         observation: Observation,
         penalty: Penalty,
-        grid: Grid | None,
+        grid: PenaltyGrid | None,
         n_iter: int,
         at_end: bool,
     ) -> None:
-        self._begin, self._observation = begin, observation
+        self._start, self._observation = start, observation
         self._penalty, self._grid = penalty, grid
         self._n_iter, self._at_end = n_iter, at_end
-        self._halves = split_counts(observation, SPLITS)
-        self._judged: list[_Candidate] = []
+        self._halves = split_counts(observation, N_SPLITS)
+        self._candidates: list[_Candidate] = []
         self._trial = _Trial([])
-        self._saved: Arrays = {}
+        self._saved: State = {}
 
-    def choose(self, report: Callable[[str], None], keep: Callable[[], None]) -> Choice:
+    def choose(self, report: Callable[[str], None], save: Callable[[], None]) -> Choice:
         """Return the penalty and the number of iterations that held-out counts choose.
 
         Parameters
         ----------
         report : callable
-            Told in a few words how far it is.
-        keep : callable
-            Called where `state` may be taken.
+            Is given a few words on the progress.
+        save : callable
+            Is called where `state` may be saved.
 
         Raises
         ------
         InputError
-            Halves of which no iteration betters the start.
+            No iteration of the halves is better than their start.
         NotFiniteError
-            Estimates of halves that are infinite or not a number.
+            Estimates of halves are infinite or not a number.
+        DivergedError
+            The objective of a half rises from the start.
 
         Warns
         -----
         LnoclWarning
-            An iteration chosen too near `n_iter`.
+            The chosen iteration is too near `n_iter`; the objective of a half rises.
         """
-        while (penalty := self._next()) is not None:
-            with ignored_warnings(LnoclWarning):  # likewise
-                halved = penalty.of_half()
-                self._trial = _Trial(
-                    [(self._begin(a, halved), self._begin(b, halved)) for a, b in self._halves]
-                )
-                if self._saved:
-                    self._trial.restore(self._saved)
-                    self._saved = {}
-            first = self._judged[0] if self._judged else None
-            self._judged.append(_follow(self._trial, penalty, self._at_end, first, report, keep))
-        best = min(self._judged, key=lambda judged: judged.error)
-        if not self._at_end and AS_LONG_AGAIN * best.n_iter > self._n_iter:
+        while (penalty := self._next_penalty()) is not None:
+            self._trial = self._start_trial(penalty)
+            first = self._candidates[0] if self._candidates else None
+            self._candidates.append(
+                _run_trial(self._trial, penalty, self._at_end, first, report, save)
+            )
+        best = min(self._candidates, key=lambda candidate: candidate.error)
+        if not self._at_end and LENGTH_RATIO * best.n_iter > self._n_iter:
             warn(
                 f"held-out counts have chosen iteration {best.n_iter} of {self._n_iter}, too near "
-                f"the end to be sure; give n_iter {AS_LONG_AGAIN * best.n_iter} or more"
+                f"the end to be sure; give n_iter {LENGTH_RATIO * best.n_iter} or more"
             )
-        curve = np.concatenate([judged.curve for judged in self._judged])
+        curve = np.concatenate([candidate.curve for candidate in self._candidates])
         return Choice(best.penalty, self._n_iter if self._at_end else best.n_iter, curve)
 
-    def _next(self) -> Penalty | None:
-        """Return the penalty to be tried next, if any."""
-        if not self._judged:
-            return self._penalty
-        least = min(judged.error for judged in self._judged)
-        if self._grid is None or self._judged[-1].error > (1.0 + WITHIN) * least:
-            return None  # the penalty grows, and is too large already
-        brightest = 2.0 * max(float(half.max()) for half in self._judged[0].reference[0])
-        others = self._grid(self._observation, brightest) if brightest > 0 else []
-        return dict(enumerate(others, 1)).get(len(self._judged))
+    def _start_trial(self, penalty: Penalty) -> _Trial:
+        with ignored_warnings(LnoclWarning):  # the run on all counts warns of the same
+            halved = penalty.of_half()
+            trial = _Trial(
+                [(self._start(a, halved), self._start(b, halved)) for a, b in self._halves]
+            )
+            if self._saved:
+                trial.restore(self._saved)
+                self._saved = {}
+        return trial
 
-    def state(self) -> Arrays:
-        """Return what `restore` needs."""
+    def _next_penalty(self) -> Penalty | None:
+        """Return the penalty to try next, if any."""
+        if not self._candidates:
+            return self._penalty
+        least = min(candidate.error for candidate in self._candidates)
+        if self._grid is None or self._candidates[-1].error > (1.0 + ERROR_TOLERANCE) * least:
+            return None  # the penalties increase, and the last is too large already
+        brightest = 2.0 * max(float(half.max()) for half in self._candidates[0].reference[0])
+        others = self._grid(self._observation, brightest) if brightest > 0 else []
+        return dict(enumerate(others, 1)).get(len(self._candidates))
+
+    def state(self) -> State:
+        """Return the arrays that `restore` needs."""
         state = self._trial.state()
-        if self._judged:
-            state["judged"] = np.array([judged.row() for judged in self._judged])
-            state["reference"] = np.array(self._judged[0].reference)
-            state["curves"] = plain(np.concatenate([judged.curve for judged in self._judged]))
+        if self._candidates:
+            state["candidates"] = np.array([candidate.row() for candidate in self._candidates])
+            state["reference"] = np.array(self._candidates[0].reference)
+            state["curves"] = rows_of(
+                np.concatenate([candidate.curve for candidate in self._candidates])
+            )
         return state
 
-    def restore(self, state: Arrays) -> None:
-        """Go on from this state."""
+    def restore(self, state: State) -> None:
+        """Continue from this state."""
         self._saved = state
-        curves = curve_of(state.get("curves", plain(NO_CURVE)))
-        for mu, smoothing, n_iter, error, zero, truth in state.get("judged", np.zeros((0, 6))):
+        curves = curve_of(state.get("curves", rows_of(EMPTY_CURVE)))
+        for mu, smoothing, n_iter, error, *scale in state.get("candidates", np.zeros((0, 6))):
             curve = curves[(curves["mu"] == mu) & (curves["smoothing"] == smoothing)]
             reference = [(a, b) for a, b in state["reference"]]
             penalty = Penalty(float(mu), float(smoothing))
-            self._judged.append(
-                _Candidate(penalty, int(n_iter), error, curve, reference, float(zero), float(truth))
+            self._candidates.append(
+                _Candidate(penalty, int(n_iter), error, curve, reference, *map(float, scale))
             )
 
 
 @dataclass
 class _Candidate:
-    """What a trial has come to: the error where the reconstruction would end, and who judged."""
+    """A penalty that was tried.
+
+    Attributes
+    ----------
+    penalty : Penalty
+        The penalty.
+    n_iter : int
+        The iteration to choose.
+    error : float
+        The relative error there, or at the last iteration where the reconstruction ends there.
+    curve : ndarray
+        The relative error of each snapshot.
+    reference : list of pairs
+        The estimates A_L and B_L, of the first candidate.
+    offset, squared_norm : float
+        The constant that the excess lacks, and the square of the norm of f, by the same.
+    """
 
     penalty: Penalty
     n_iter: int
     error: float
     curve: NDArray[np.void]
     reference: list[Pair]
-    zero: float
-    truth: float
+    offset: float
+    squared_norm: float
 
     def row(self) -> list[float]:
         """Return the numbers."""
-        penalty = self.penalty
-        return [penalty.mu, penalty.smoothing, self.n_iter, self.error, self.zero, self.truth]
+        mu, smoothing = self.penalty.mu, self.penalty.smoothing
+        return [mu, smoothing, self.n_iter, self.error, self.offset, self.squared_norm]
 
 
-def _follow(
+def _run_trial(
     trial: _Trial,
     penalty: Penalty,
     at_end: bool,
     first: _Candidate | None,
     report: Callable[[str], None],
-    keep: Callable[[], None],
+    save: Callable[[], None],
 ) -> _Candidate:
-    """Take a trial as far as is needed, and judge it as the first one was."""
+    """Run a trial as long as is needed; its errors are relative to the first's reference."""
     for iteration in trial.advance():
-        _, least, chosen = _judge(trial, first)
+        _, least, chosen = _select(trial, first)
         weights = f"mu {penalty.mu:.2g}, smoothing {penalty.smoothing:.2g}"
         report(f"held-out counts, {weights}: iteration {chosen} of {iteration}")
-        if not at_end and iteration >= max(FEWEST, AS_LONG_AGAIN * chosen):
+        if not at_end and iteration >= max(MIN_ITERATIONS, LENGTH_RATIO * chosen):
             break
-        trial.forget(min(FORGOTTEN * chosen, trial.iterations[least]))
-        keep()
-    if not trial.kept:
+        trial.drop_before(min(OLDEST_SNAPSHOT * chosen, trial.iterations[least]))
+        save()
+    if not trial.snapshots:
         raise InputError(
             "half of the counts is too little: no iteration betters the start; give n_iter, mu and "
             "smoothing as numbers"
         )
-    excess, least, chosen = _judge(trial, first)
-    reference = first.reference if first else trial.end
-    # The constant that the excess lacks, and the scale of relative errors.
-    zero = first.zero if first else trial.noise(least) - float(excess.min())
-    truth = first.truth if first else float(np.mean([4.0 * _dot(a, b) for a, b in reference]))
-    errors = np.sqrt(np.maximum(excess + zero, 0.0) / max(truth, zero, np.finfo(float).tiny))
+    excess, least, chosen = _select(trial, first)
+    if first:
+        reference, offset, squared_norm = first.reference, first.offset, first.squared_norm
+    else:
+        reference = trial.last
+        offset = trial.noise(least) - float(excess.min())
+        squared_norm = float(np.mean([4.0 * _dot(a, b) for a, b in reference]))
+    squared_errors = np.maximum(excess + offset, 0.0)
+    errors = np.sqrt(squared_errors / max(squared_norm, offset, np.finfo(float).tiny))
     error = float(errors[-1] if at_end else errors.min())
     curve = np.zeros(len(errors), CURVE_DTYPE)
     curve["mu"], curve["smoothing"] = penalty.mu, penalty.smoothing
     curve["iteration"], curve["error"] = trial.iterations, errors
-    return _Candidate(penalty, chosen, error, curve, reference, zero, truth)
+    return _Candidate(penalty, chosen, error, curve, reference, offset, squared_norm)
 
 
-def _judge(trial: _Trial, first: _Candidate | None) -> tuple[Array, int, int]:
-    """Return the excess of what is kept, the place of the least, and the iteration to choose."""
-    excess = trial.excess(first.reference if first else trial.end)
+def _select(trial: _Trial, first: _Candidate | None) -> tuple[Array, int, int]:
+    """Return the excess of each snapshot, the index of the least, and the iteration to choose."""
+    excess = trial.excess(first.reference if first else trial.last)
     refuse_not_finite(*excess)
     least = int(np.argmin(excess))
-    allowed = ((1.0 + WITHIN) ** 2 - 1.0) * trial.noise(least)
+    allowed = ((1.0 + ERROR_TOLERANCE) ** 2 - 1.0) * trial.noise(least)
     return excess, least, trial.iterations[np.flatnonzero(excess <= excess[least] + allowed)[-1]]

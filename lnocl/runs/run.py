@@ -1,22 +1,23 @@
-"""A solver at work on an observation: what `deconvolve` drives, one or several at a time."""
+"""A run: a solver and its engine on one observation, with what it takes to continue it."""
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lnocl.errors import refuse_not_finite
+from lnocl.runs.descent import Descent
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.solvers import SOLVERS
+from lnocl.solvers.engine import Engine, State
 from lnocl.solvers.sgp import Steps
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Setup:
-    """What runs on several observations of one sky have in common; as for `deconvolve`."""
+    """The parameters that all runs of one call of `deconvolve` share."""
 
     stars: Sequence[tuple[float, float]]
     pad: int | str
@@ -37,32 +38,32 @@ class Setup:
     refine_positions: bool = False
 
 
-# Iterations after which star positions are refined: this, and twice as many each time.
+# Star positions are refined after this many iterations, then after twice as many each time.
 FIRST_REFINED = 3
 
 
 class Run:
-    """A solver and its engine, at work on one observation.
+    """A solver and its engine on one observation; iterating over it runs it.
 
     Parameters
     ----------
     setup : Setup
-        What is done.
+        The parameters that the runs share.
     observation : Observation
-        On what.
+        The observation to reconstruct.
     penalty : Penalty
-        On the extended source.
+        The penalty on the extended source.
     n_iter : int
         Iterations at most.
     initial_extended, initial_star_fluxes : array_like, optional
-        Where it starts, as for `deconvolve`.
+        The estimate to start from, as for `deconvolve`.
 
     Attributes
     ----------
     scene : Scene
-        What is modelled.
+        The model of the observation.
     engine : Engine
-        Where it is computed.
+        The engine that computes it.
     done : int
         Iterations done.
 
@@ -91,25 +92,28 @@ class Run:
         self._given_stars = self.scene.stars
         self._refines = setup.refine_positions and self.scene.n_stars > 0
         extended, star_fluxes = self.scene.start(initial_extended, initial_star_fluxes)
-        needs_model = self._refines or setup.solver == "sgp"
-        model = _make_model(self.scene) if needs_model else None
+        self._model_of_stars: Model | None = None
         if self._refines:
-            self._model: Any = model  # else it is let go
+            self._model_of_stars = _make_model(self.scene)
             star_fluxes = self._move_stars(extended, star_fluxes, look_round=True)
         scaling = None
         if setup.solver == "sgp":
+            model = self._model_of_stars or _make_model(self.scene)
             star_fluxes, scaling = _prepare(self.scene, model, extended, star_fluxes)
-        self.engine: Any = _make_engine(setup, self.scene, n_iter, scaling)
+        self.engine = _make_engine(setup, self.scene, n_iter, scaling)
         self.engine.start(extended, star_fluxes)
         self.done = 0
         self._begin_stage()
 
     def __iter__(self) -> Iterator[int]:
         solve = SOLVERS[self._setup.solver]
+        descent = Descent(self.scene)
+        descent.check(self.engine.objectives())  # those from before a checkpoint
         while self.done < self._n_iter:
             begin, is_stage_new = self.done, not self._steps.has_iterated
             for iteration in solve(self.engine, self._due - begin, self._steps):
                 self.done = begin + iteration
+                descent.check(self.engine.fetched_objectives())
                 yield self.done
             was_stuck = is_stage_new and begin == self.done < self._due
             if was_stuck or not self._refines:
@@ -119,21 +123,21 @@ class Run:
                 self._begin_stage()
 
     def _begin_stage(self) -> None:
-        """Begin the iterations until positions are refined, or the last one."""
+        """Set the iteration until which positions stay: the next to refine at, or the last."""
         self._steps = Steps()
         due = max(FIRST_REFINED, 2 * self.done) if self._refines else self._n_iter
         self._due = min(due, self._n_iter)
 
-    def state(self) -> dict[str, NDArray]:
-        """Return what `restore` needs, as it is between iterations.
+    def state(self) -> State:
+        """Return the arrays that `restore` needs, as they are between iterations.
 
         Raises
         ------
         NotFiniteError
-            There are values in it that are infinite or not a number.
+            A value is infinite or not a number.
         """
         steps, scaling = self._steps, self.engine.scaling
-        state = {
+        state: State = {
             **self.engine.state(),
             "progress": np.array([self.done, self._due, steps.has_iterated]),
             "steps": np.array([steps.alpha, *steps.lengths]),
@@ -145,8 +149,8 @@ class Run:
             refuse_not_finite(values.sum(initial=0.0, dtype=np.float64))
         return state
 
-    def proven_state(self) -> dict[str, NDArray]:
-        """Return the state, of an estimate whose objective is finite.
+    def proven_state(self) -> tuple[State, bool]:
+        """Return the state, of a finite objective, and whether that is the least so far.
 
         Raises
         ------
@@ -156,13 +160,14 @@ class Run:
         state = self.state()
         is_recorded = len(self.engine.objectives()) > self.done
         self.finish()
-        refuse_not_finite(self.engine.objective())
+        objectives = self.engine.objectives()
+        refuse_not_finite(objectives[-1])
         if not is_recorded:  # the solver is about to make the same ratios
             self.engine.restore(state)
-        return state
+        return state, int(np.argmin(objectives)) == self.done
 
-    def restore(self, state: dict[str, NDArray]) -> None:
-        """Go on from the state of such a run, made of the same observation and parameters."""
+    def restore(self, state: State) -> None:
+        """Continue from the state of a run of the same observation and parameters."""
         self.done, self._due = (int(number) for number in state["progress"][:2])
         alpha, *lengths = state["steps"].tolist()
         self._steps = Steps(alpha, lengths, bool(state["progress"][2]))
@@ -174,33 +179,39 @@ class Run:
         self.engine.restore(state)
         self._forget_end()
 
-    def redo(self, state: dict[str, NDArray]) -> None:
-        """Go from a state to the last estimate whose objective, and those before, were finite.
+    def return_to_best(self, state: State) -> None:
+        """Iterate from a state to the estimate of the least objective before the first not finite.
 
-        On a new engine, as nothing that the old one holds can be trusted.
+        This takes a new engine, as nothing that the old one holds can be trusted.
 
         Raises
         ------
         NotFiniteError
-            There is none.
+            There is no such estimate.
         """
-        finite = np.isfinite(self.engine.objectives())
-        last = (len(finite) if finite.all() else int(np.argmin(finite))) - 1
-        scaling, self.engine = self.engine.scaling, None  # the device need not hold both
+        best = self.best_iteration()
+        scaling = self.engine.scaling
+        del self.engine  # the device need not hold both
         self.engine = _make_engine(self._setup, self.scene, self._n_iter, scaling)
         self.restore(state)
-        for _ in islice(self, max(last - self.done, 0)):
+        for _ in islice(self, max(best - self.done, 0)):
             pass
         self.finish()
-        self.state()  # which is finite
+        self.state()  # refuses values that are not finite
 
-    def _restored_scaling(self, state: dict[str, NDArray]) -> Scaling:
+    @property
+    def _model(self) -> Model:
+        """The model that follows the stars where they are refined."""
+        assert self._model_of_stars is not None
+        return self._model_of_stars
+
+    def _restored_scaling(self, state: State) -> Scaling:
         from lnocl.solvers.scaling import Scaling
 
         return Scaling.from_state(state)
 
     def _refine(self) -> None:
-        """Move the stars to where the extended source of now makes them most likely."""
+        """Move the stars to where they are most likely, given the current extended source."""
         self._forget_end()
         extended = self.engine.extended()
         refuse_not_finite(extended.sum())
@@ -227,9 +238,10 @@ class Run:
         return self.scene.stars
 
     def star_errors(self) -> tuple[Array, Array]:
-        """Return the standard errors of star fluxes and positions, 0 where none were refined."""
+        """Return the standard errors of star fluxes and positions; NaN where not refined."""
         if not self._refines:
-            return np.zeros(self.scene.n_stars), np.zeros((self.scene.n_stars, 2))
+            n = self.scene.n_stars
+            return np.full(n, np.nan), np.full((n, 2), np.nan)
         from lnocl.solvers.positions import StarFit, Stars
 
         fit = StarFit(self.scene, self._model, self.engine.extended(), self._given_stars)
@@ -249,25 +261,42 @@ class Run:
         return self.engine.star_fluxes() * self.scene.unit
 
     def models(self) -> Callable[[], Array]:
-        """Return what makes the m_j of the estimate of now, electrons per pixel."""
+        """Return a function that makes the m_j of the current estimate, electrons per pixel."""
         extended, star_fluxes = self.engine.extended(), self.engine.star_fluxes()
         return partial(_model_images, self.scene, extended, star_fluxes)
 
     def objective(self) -> float:
-        """Return the objective recorded last."""
+        """Return the last objective."""
         return self.engine.objective() * self.scene.scale
 
     def objectives(self) -> Array:
-        """Return the objectives recorded so far: of the start, and after each iteration."""
+        """Return the objectives so far: of the start, and after each iteration."""
         return self.engine.objectives() * self.scene.scale
 
+    def best_iteration(self) -> int:
+        """Return the iteration of the least objective before the first that is not finite."""
+        objectives = self.engine.objectives()
+        is_infinite = ~np.isfinite(objectives)
+        end = int(np.argmax(is_infinite)) if is_infinite.any() else len(objectives)
+        return int(np.argmin(objectives[:end])) if end else 0
+
+    def check_descent(self) -> None:
+        """Refuse objectives, of the last iterations too, that are not finite or rise.
+
+        Raises
+        ------
+        NotFiniteError, DivergedError
+            As `Descent.check`.
+        """
+        Descent(self.scene).check(self.engine.objectives())
+
     def finish(self) -> None:
-        """Record the objective of the last estimate, where the solver has not done so."""
+        """Record the objective of the current estimate, where the solver has not done so."""
         if len(self.engine.objectives()) == self.done:
             self.engine.ratio()
 
     def _forget_end(self) -> None:
-        """Take the objective of the last estimate off the record, where the solver has put it."""
+        """Take the objective of the current estimate off the record, where it is there."""
         if len(self.engine.objectives()) > self.done:
             self.engine.forget_objective()
 
@@ -282,7 +311,7 @@ def _make_model(scene: Scene) -> Model:
 
 
 def _prepare(
-    scene: Scene, model: Any, extended: Array, star_fluxes: Array
+    scene: Scene, model: Model, extended: Array, star_fluxes: Array
 ) -> tuple[Array, Scaling]:
     from lnocl.solvers.scaling import prepare
 
@@ -299,24 +328,30 @@ def _model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Array:
 
 
 def engine_name(setup: Setup) -> str:
-    """Return the name of the engine that runs have: the device, its platform and driver.
+    """Return the name of the engine of a run: the device, its platform and driver.
 
     Raises
     ------
     InputError
-        No such device.
+        There is no such device.
     DeviceError
-        No device at all.
+        There is no device at all.
     """
     if setup.engine == "numpy":
-        return str(importlib.import_module("lnocl.engines.numpy").ReferenceEngine.name)
-    device = importlib.import_module("lnocl.opencl.device")
-    return str(device.describe(device.choose(setup.device).device))
+        from lnocl.engines.numpy import ReferenceEngine
+
+        return ReferenceEngine.name
+    from lnocl.opencl import device
+
+    return device.describe(device.choose(setup.device).device)
 
 
-def _make_engine(setup: Setup, scene: Scene, n_iter: int, scaling: Any) -> Any:
+def _make_engine(setup: Setup, scene: Scene, n_iter: int, scaling: Scaling | None) -> Engine:
     # Imported where it is chosen: the reference runs where no OpenCL is installed.
     if setup.engine == "numpy":
-        return importlib.import_module("lnocl.engines.numpy").ReferenceEngine(scene, scaling)
-    opencl = importlib.import_module("lnocl.engines.opencl")
-    return opencl.OpenCLEngine(scene, setup.precision, setup.device, n_iter, scaling=scaling)
+        from lnocl.engines.numpy import ReferenceEngine
+
+        return ReferenceEngine(scene, scaling)
+    from lnocl.engines.opencl import OpenCLEngine
+
+    return OpenCLEngine(scene, setup.precision, setup.device, n_iter, scaling=scaling)

@@ -1,4 +1,4 @@
-"""When to stop, without knowing the truth: rules that look at a run after each iteration."""
+"""Stopping rules: each looks at a run after every iteration."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ class Rule(Protocol):
         """Return whether the run should end; asked once after each iteration."""
 
     def quantity(self, run: Run) -> str:
-        """Return what the rule watches, for the progress bar."""
+        """Return the quantity that decides, for the progress bar."""
 
     def state(self) -> list[float]:
-        """Return what `restore` needs."""
+        """Return the numbers that `restore` needs."""
 
     def restore(self, state: list[float]) -> None:
-        """Go on from this state."""
+        """Continue from this state."""
 
 
-class Never:
-    """No rule: the run goes to its last iteration."""
+class NoRule:
+    """The run ends at its last iteration."""
 
     reason = "n_iter"
 
@@ -51,7 +51,7 @@ class Never:
         return f"objective {run.objective():.6g}"
 
     def state(self) -> list[float]:
-        """Return nothing."""
+        """Return an empty list."""
         return []
 
     def restore(self, state: list[float]) -> None:
@@ -63,25 +63,25 @@ class Change:
 
     reason = "change"
 
-    def __init__(self, least: float) -> None:
-        self._least = least
+    def __init__(self, threshold: float) -> None:
+        self._threshold = threshold
         self._recent: deque[float] = deque(maxlen=CHANGE_WINDOW + 1)
 
     def met(self, run: Run) -> bool:
         """Return whether the objective has settled."""
         self._recent.append(run.objective())
-        return len(self._recent) > CHANGE_WINDOW and self._change() < self._least
+        return len(self._recent) > CHANGE_WINDOW and self._change() < self._threshold
 
     def quantity(self, run: Run) -> str:
         """Return the relative change an iteration."""
         return f"change {self._change():.2g}"
 
     def state(self) -> list[float]:
-        """Return the objectives looked at."""
+        """Return the last objectives."""
         return list(self._recent)
 
     def restore(self, state: list[float]) -> None:
-        """Go on from the objectives looked at."""
+        """Continue with these last objectives."""
         self._recent.extend(state)
 
     def _change(self) -> float:
@@ -92,12 +92,12 @@ class Change:
 
 
 class Discrepancy:
-    """The data term falls to what Poisson noise alone would leave.
+    """The data term falls to its expectation for Poisson noise alone.
 
     ``2 J_0 = sum_j sum_n e(m_j)`` over the observed pixels, with ``e(m)`` the expectation of
     ``2 (g ln(g / m) + m - g)`` for Poisson counts g of mean m: 1 for many counts (Bertero et al.
-    2010, Inverse Problems 26, 105004), up to 1.15 for about one, and down to 0 for less. The
-    expectation is taken anew at each power of two of iterations, and before the run ends.
+    2010, Inverse Problems 26, 105004), up to 1.15 for about one, and down to 0 for fewer. The
+    expectation is updated at iterations 1, 2, 4, 8 ..., and before the run ends.
     """
 
     reason = "discrepancy"
@@ -125,7 +125,7 @@ class Discrepancy:
         return [self._expected]
 
     def restore(self, state: list[float]) -> None:
-        """Go on with this expectation."""
+        """Continue with this expectation."""
         (self._expected,) = state
 
     def _discrepancy(self, run: Run) -> float:
@@ -142,7 +142,7 @@ class Discrepancy:
 
 
 # Above this mean the expectation is 1 + 1 / (6 m), to a part in ten million.
-MANY = 1e3
+TABLE_END = 1e3
 
 
 def expected_deviance(mean: ArrayLike) -> Array:
@@ -155,24 +155,24 @@ def expected_deviance(mean: ArrayLike) -> Array:
 
     Examples
     --------
-    >>> from lnocl.stopping import expected_deviance
+    >>> from lnocl.runs.stopping import expected_deviance
     >>> expected_deviance([1e-3, 1.0, 1e6]).round(3)
     array([0.014, 1.147, 1.   ])
     """
     mean = np.asarray(mean, np.float64)
     least, spline = _deviances()
-    few = spline(np.log(np.clip(mean, least, MANY)))
-    return np.where(mean > MANY, 1.0 + 1.0 / (6.0 * np.maximum(mean, 1.0)), few)
+    few = spline(np.log(np.clip(mean, least, TABLE_END)))
+    return np.where(mean > TABLE_END, 1.0 + 1.0 / (6.0 * np.maximum(mean, 1.0)), few)
 
 
 @cache
 def _deviances() -> tuple[float, Any]:
-    """Return the least mean tabled, and the expectation as a spline over the means' logarithms."""
+    """Return the least mean of the table, and its spline over the logarithms of the means."""
     import scipy.interpolate
     import scipy.special
     import scipy.stats
 
-    means = np.geomspace(1e-6, MANY, 400)
+    means = np.geomspace(1e-6, TABLE_END, 400)
     counts = np.arange(2000)[:, None]
     terms = scipy.special.xlogy(counts, counts / means) + means - counts
     deviances = 2.0 * (scipy.stats.poisson.pmf(counts, means) * terms).sum(axis=0)
@@ -184,5 +184,5 @@ def make_rule(stop: str | float | None) -> Rule:
     if stop == "discrepancy":
         return Discrepancy()
     if stop is None or stop == "held-out":
-        return Never()
+        return NoRule()
     return Change(float(stop))

@@ -1,28 +1,33 @@
-"""Several images of one sky with what is known of each: the door where input is checked."""
+"""Several images of one sky, with PSFs, noise and masks; all input is checked here."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.errors import InputError, warn
+from lnocl.errors import InputError, counted, warn
 from lnocl.scene import containers
 
 Array = NDArray[np.float64]
 
-# What to do about masked values of these, which only images and frames of stars may have.
+# The advice where these have masked values, which only images and frames of stars may have.
 UNMASK = {
-    "psfs": "repair them first, as lnocl.psf.make_psf does",
-    "background": "fill them and add their mask to mask",
-    "read_noise": "fill them and add their mask to mask",
-    "exposure": "fill them and add their mask to mask",
+    "psfs": "repair {them} first, as lnocl.psf.make_psf does",
+    "background": "fill {them} and add {their} mask to mask",
+    "read_noise": "fill {them} and add {their} mask to mask",
+    "exposure": "fill {them} and add {their} mask to mask",
 }
+
+
+# An array whose last axis is so short, and the others so long, has its channels last.
+MAX_CHANNELS = 4
+MIN_SIDE = 8
 
 
 class Observation:
     """Images of one sky, each with its point spread function, background and bad pixels.
 
-    Everything is checked and copied here, once, and held in float64. The data follow
+    All input is checked and copied once, and held in float64. The data follow
     ``images[j] ~ Poisson(exposure[j] (psfs[j] * sky) + background[j]) + Normal(0, read_noise[j])``,
     the sky moved by ``offsets[j]``.
 
@@ -30,20 +35,20 @@ class Observation:
     ----------
     images : array_like, shape (p, ny, nx) or (ny, nx)
         Counts in electrons per pixel. A pixel that is not finite, or that is masked in a
-        `numpy.ma` array, counts as bad. Counts that are negative after the read noise was
-        added are set to zero, and their number is announced. An `astropy.units.Quantity`, an
+        `numpy.ma` array, counts as bad. Counts that are negative after the square of the read noise
+        was added are set to zero, with a warning. An `astropy.units.Quantity`, an
         `astropy.nddata.NDData` such as a CCDData, or a sequence of these, is taken with its unit
         and mask; counts per time are multiplied by the exposure. Uncertainties are not used.
         Maps may be masked where the images are; nothing else may hold masked values.
     psfs : array_like, shape (p, ky, kx) or (ky, kx)
         Point spread functions, centre at ``(ky // 2, kx // 2)``, of any positive sum: they are
-        normalised here. One serves all images. Negative pixels are kept and announced.
+        normalised here. One serves all images. Negative pixels are kept, with a warning.
     background : float or array_like, shape (p,) or (p, ny, nx), optional
         Calibration background, electrons per pixel, zero or more. A Quantity may be per time.
     read_noise : float or array_like, shape (p,) or (p, ny, nx), optional
         Standard deviation of the read noise, electrons, zero or more. Its square is added to
-        images and background (Snyder's approximation of Gaussian noise by Poisson noise). Of a
-        survey's inverse variance of sky and read noise together it is the root of one over it.
+        images and background (Snyder's approximation of Gaussian noise by Poisson noise). For a
+        survey's inverse variance of sky and read noise together, give one over its square root.
     mask : array_like of bool, shape (p, ny, nx) or (ny, nx), optional
         True where a pixel is bad, as in `numpy.ma`. One serves all images.
     exposure : float or array_like, shape (p,), (p, ny, nx) or (ny, nx), optional
@@ -51,7 +56,7 @@ class Observation:
         sky is in electrons per pixel and this unit; by default 1. More than zero; a map is zero
         where a pixel saw nothing, which counts as bad.
     offsets : array_like, shape (p, 2), optional
-        ``(dx, dy)`` of each image, pixels: what lies at (x, y) in the sky lies at
+        ``(dx, dy)`` of each image, pixels: a source at (x, y) in the sky is at
         ``(x + dx, y + dy)`` in the image. They are taken into the PSFs; no counts are resampled.
 
     Attributes
@@ -59,7 +64,7 @@ class Observation:
     images, background : ndarray of float64
         Shapes (p, ny, nx), and (p,) or (p, ny, nx); `read_noise` squared is included in both.
         Bad pixels of the images hold 0.
-    exposure : ndarray of float64, shape (p,) or (p, ny, nx)
+    read_noise, exposure : ndarray of float64, shape (p,) or (p, ny, nx)
         As given.
     offsets : ndarray of float64, shape (p, 2)
         As given.
@@ -71,15 +76,16 @@ class Observation:
     Raises
     ------
     InputError
-        Where an array has the wrong shape, type or unit, is empty, or holds values out of range;
-        where anything but `images` holds masked values; where a PSF has no positive sum, or it or
-        its sum is not finite; where images or background become infinite by exposure or read
-        noise; where no good pixel is left; where an offset leaves nothing of an image.
+        An array has the wrong shape, type or unit, is empty, or holds values out of range; an array
+        other than `images` holds masked values; a PSF has no positive sum, or it or its sum is not
+        finite; images or background become infinite by exposure or read noise; no good pixel is
+        left; an offset leaves nothing of an image.
 
     Warns
     -----
     LnoclWarning
-        Non-finite pixels that were masked, negative counts set to zero, negative PSF pixels.
+        Pixels are not finite and were masked; counts are negative and were set to zero; pixels of
+        PSFs are negative.
 
     References
     ----------
@@ -99,6 +105,7 @@ class Observation:
         self,
         images: ArrayLike,
         psfs: ArrayLike,
+        *,
         background: ArrayLike = 0.0,
         read_noise: ArrayLike = 0.0,
         mask: ArrayLike | None = None,
@@ -119,7 +126,8 @@ class Observation:
             if are_rates:
                 self.images *= _each_pixel(self.exposure)
             self.background = self._check_background(background, has_exposure)
-            self._add_read_noise(read_noise)
+            self.read_noise = self._check_read_noise(read_noise)
+            self._add_read_noise()
         self._refuse_overflow()
         self._clip_negative()
 
@@ -148,7 +156,7 @@ class Observation:
         non_finite = ~np.isfinite(self.images) & ~self.mask
         if n_non_finite := int(non_finite.sum()):
             self.mask |= non_finite
-            warn(f"{n_non_finite} image pixels are not finite and were masked")
+            warn(_pixels(n_non_finite, "image", "not finite", "masked"))
 
     def _refuse_all_masked(self) -> None:
         if self.mask.all():
@@ -156,7 +164,7 @@ class Observation:
         self.images[self.mask] = 0.0
 
     def _check_exposure(self, exposure: ArrayLike) -> Array:
-        """Return exposures; what saw nothing is masked."""
+        """Return the exposures, and mask pixels of no exposure."""
         values = self._one_or_map("exposure", containers.seconds(exposure), 1.0)
         if values.ndim == 1:
             _refuse_unless("exposure", values, "finite and more than zero", values > 0)
@@ -175,10 +183,13 @@ class Observation:
             values = _each_pixel(values)
         return values * (_each_pixel(self.exposure) if values.ndim == 3 else self.exposure)
 
-    def _add_read_noise(self, read_noise: ArrayLike) -> None:
+    def _check_read_noise(self, read_noise: ArrayLike) -> Array:
         sigma = self._one_or_map("read_noise", containers.counts("read_noise", read_noise)[0], 0.0)
         _refuse_unless("read_noise", sigma, "finite and not negative", sigma >= 0)
-        variance = sigma**2
+        return sigma
+
+    def _add_read_noise(self) -> None:
+        variance = self.read_noise**2
         _refuse_unless("the square of read_noise", variance, "finite", variance >= 0)
         self.images += np.where(self.mask, 0.0, _each_pixel(variance))
         if variance.ndim != self.background.ndim:
@@ -232,7 +243,7 @@ class Observation:
         if n_negative := int(negative.sum()):
             self.images[negative] = 0.0
             warn(
-                f"{n_negative} image pixels are negative and were set to 0; if the images are "
+                f"{_pixels(n_negative, 'image', 'negative', 'set to 0')}; if the images are "
                 "background-subtracted, add the background back and give it as background"
             )
 
@@ -256,8 +267,12 @@ def unmasked(name: str, values: ArrayLike) -> NDArray:
 def refuse_masked(name: str, masked: NDArray[np.bool_]) -> None:
     """Refuse masked values: below a mask there may be anything."""
     if n_masked := int(np.count_nonzero(masked)):
-        advice = UNMASK.get(name, "fill them or leave them out")
-        raise InputError(f"{name} has {n_masked} masked values; {advice}")
+        them, their = ("it", "its") if n_masked == 1 else ("them", "their")
+        advice = UNMASK.get(name, "fill {them} or leave {them} out")
+        raise InputError(
+            f"{name} has {counted(n_masked, 'masked value')}; "
+            f"{advice.format(them=them, their=their)}"
+        )
 
 
 def numbers(name: str, values: ArrayLike) -> Array:
@@ -273,11 +288,22 @@ def _stack(name: str, values: ArrayLike) -> Array:
     array = numbers(name, values)
     if array.ndim not in (2, 3):
         raise InputError(
-            f"{name} has {array.ndim} dimensions; give two, or three for several {name}"
+            f"{name} has {counted(array.ndim, 'dimension')}; give two, or three for several {name}"
         )
     if array.size == 0:
         raise InputError(f"{name} is empty: its shape is {array.shape}")
+    if array.ndim == 3 and array.shape[2] <= MAX_CHANNELS and min(array.shape[:2]) >= MIN_SIDE:
+        raise InputError(
+            f"{name} has shape {array.shape}, but its axes are (p, ny, nx): give "
+            f"np.moveaxis({name}, -1, 0)"
+        )
     return array.reshape((-1, *array.shape[-2:]))
+
+
+def _pixels(n: int, kind: str, state: str, remedy: str) -> str:
+    """Return a sentence on pixels that agrees in number."""
+    noun, are, were = ("pixel", "is", "was") if n == 1 else ("pixels", "are", "were")
+    return f"{n} {kind} {noun} {are} {state} and {were} {remedy}"
 
 
 def _each_pixel(values: Array) -> Array:
@@ -304,7 +330,8 @@ def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
     stack = _stack("psfs", psfs)
     if stack.shape[0] not in (1, n_images):
         raise InputError(
-            f"{stack.shape[0]} psfs for {n_images} images; give one, or one for each image"
+            f"{counted(len(stack), 'psf')} for {counted(n_images, 'image')}; give one, or one for "
+            "each image"
         )
     if not np.isfinite(stack).all():
         raise InputError("psfs hold values that are not finite; repair them first")
@@ -319,6 +346,6 @@ def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
             "rounding of its values"
         )
     if n_negative := int((stack < 0).sum()):
-        warn(f"{n_negative} psf pixels are negative and were kept")
+        warn(_pixels(n_negative, "psf", "negative", "kept"))
     stack /= sums
     return np.repeat(stack, n_images, axis=0) if len(stack) < n_images else stack

@@ -1,35 +1,45 @@
-"""The verbs that the solvers ask of an engine."""
+"""The engine that a solver iterates on, as a protocol: its verbs and its state."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from numpy.typing import NDArray
 
 from lnocl.scene.observation import Array
 
+if TYPE_CHECKING:
+    from lnocl.solvers.scaling import Scaling
 
-class StarSteps(Protocol):
-    """How star fluxes follow the extended source."""
-
-    def star_step(self, fluxes: Array, gradient: Array, coupling: Array) -> Array:
-        """Return the change of the star fluxes for their gradient and what a step reaches."""
+# Arrays by name, as a checkpoint holds them; empty ones may be missing from it.
+State = dict[str, NDArray[Any]]
 
 
 class Engine(Protocol):
     """The verbs of an iteration; estimates are on the grid and scaled, as in `lnocl.scene.scene`.
 
-    The split-gradient method needs those as far as `scale`; the scaled gradient projection method
-    `ratio`, `correct` and those from `gradient` on.
+    Both solvers call `ratio` and `correct`; the split-gradient method `scale`, the scaled gradient
+    projection method the verbs from `gradient` to `forget_objective`. A run calls the others.
+
+    Attributes
+    ----------
+    name : str
+        The device, its platform and driver.
+    scaling : Scaling or None
+        The scaling of steps, for the scaled gradient projection method.
     """
 
-    scaling: StarSteps | None
+    name: str
+    scaling: Scaling | None
 
     def start(self, extended: Array, star_fluxes: Array) -> None:
-        """Begin from this estimate."""
+        """Begin from this estimate; pixels that were not observed are set to 0."""
 
     def move_stars(self) -> None:
         """Put the stars where the scene has them now."""
+
+    def set_scaling(self, scaling: Scaling) -> None:
+        """Replace the scaling of steps."""
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
@@ -38,13 +48,7 @@ class Engine(Protocol):
         """Back-project the ratios to the correction."""
 
     def scale(self) -> None:
-        """Scale the estimate by its correction.
-
-        Raises
-        ------
-        NotFiniteError
-            An objective, perhaps that of some iterations ago, is infinite or not a number.
-        """
+        """Scale the estimate by its correction."""
 
     def gradient(self) -> tuple[float, float]:
         """Take the estimate as the base of the next step and the correction for its gradient.
@@ -59,11 +63,11 @@ class Engine(Protocol):
     def step(self, alpha: float, share: float) -> tuple[float, Array]:
         """Make the estimate the base plus a share of d, its projected step of length alpha.
 
-        Return ``<gradient, d>`` and what d reaches of the stars.
+        Return ``<gradient, d>`` and, for each star, ``<cross_information, d>``.
         """
 
     def set_star_fluxes(self, star_fluxes: Array) -> None:
-        """Make these the star fluxes."""
+        """Replace the star fluxes."""
 
     def objective(self) -> float:
         """Return the objective recorded last."""
@@ -71,20 +75,26 @@ class Engine(Protocol):
     def forget_objective(self) -> None:
         """Take the objective recorded last off the record."""
 
+    def objectives(self) -> Array:
+        """Return the objectives recorded so far; this waits for the device."""
+
+    def fetched_objectives(self) -> Array:
+        """Return the objectives of `ratio` that have arrived since the last call, in order.
+
+        This does not wait for the device, so that the latest may be missing.
+        """
+
+    def data_term(self) -> float:
+        """Return the data term J_0 of the objective recorded last."""
+
     def extended(self) -> Array:
         """Return the extended source."""
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes."""
 
-    def data_term(self) -> float:
-        """Return the data term J_0 of the objective recorded last."""
+    def state(self) -> State:
+        """Return the arrays that `restore` needs, as they are between iterations."""
 
-    def objectives(self) -> Array:
-        """Return the objectives recorded so far."""
-
-    def state(self) -> dict[str, NDArray]:
-        """Return what `restore` needs, as it is between iterations."""
-
-    def restore(self, state: dict[str, NDArray]) -> None:
-        """Go on from this state."""
+    def restore(self, state: State) -> None:
+        """Continue from this state."""

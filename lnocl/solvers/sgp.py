@@ -10,34 +10,34 @@ import numpy as np
 from lnocl.errors import refuse_not_finite
 from lnocl.solvers.engine import Engine
 
-# Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002: the line search shortens a step to
-# this share until the objective falls by so much of what the slope promises; steps keep in these
-# bounds.
+# Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002: the line search shortens a step by
+# the first factor until the objective falls by at least the second of what the slope promises.
+# Steps stay within the bounds.
 SHORTER = 0.4
 SUFFICIENT = 1e-4
 ALPHA_BOUNDS = 1e-5, 1e5
-# Barzilai-Borwein steps among which the smallest is taken: docs/sgp.md.
-STEPS_KEPT = 2
-# A step this often shortened is lost in rounding.
-MOST_SHORTENED = 12
+# The step is the smallest of so many Barzilai-Borwein steps: docs/sgp.md.
+N_LENGTHS = 2
+# A step that was shortened so often is lost in rounding.
+MAX_SHORTENINGS = 12
 
 
 @dataclass
 class Steps:
-    """What the scaled gradient projection method remembers from one iteration to the next.
+    """The step lengths that the scaled gradient projection method keeps between iterations.
 
     Attributes
     ----------
     alpha : float
         The last step.
     lengths : list of float
-        The Barzilai-Borwein steps among which the smallest is taken.
+        The last Barzilai-Borwein steps.
     has_iterated : bool
-        Whether there was an iteration.
+        Whether an iteration was done.
     """
 
     alpha: float = 1.0
-    lengths: list[float] = field(default_factory=lambda: [ALPHA_BOUNDS[1]] * STEPS_KEPT)
+    lengths: list[float] = field(default_factory=lambda: [ALPHA_BOUNDS[1]] * N_LENGTHS)
     has_iterated: bool = False
 
 
@@ -49,7 +49,7 @@ def sgp(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int
     Problems 25, 015002). alpha is the smaller of the last two steps of Barzilai and Borwein (1988,
     IMA J. Numer. Anal. 8, 141), their second, in the metric of D. The star fluxes follow the
     extended source, by `Scaling.star_step`. The share is 1, shortened until the objective falls
-    enough; it never rises. Ends early where no step lets it fall any more.
+    enough; it never rises. The method ends early where no step lowers the objective any more.
     """
     steps = steps or Steps()
     engine.ratio()
@@ -83,17 +83,17 @@ def _descend(engine: Engine, alpha: float) -> bool:
         change = engine.scaling.star_step(fluxes, gradient, np.zeros_like(coupling))
     slope += float(gradient @ change)
     share = 1.0
-    for _ in range(MOST_SHORTENED):
+    for _ in range(MAX_SHORTENINGS):
         engine.set_star_fluxes(fluxes + share * change)
         engine.ratio()
-        engine.correct()  # before it is known whether it will be needed: the device need not wait
-        reached_objective = engine.objective()
-        if reached_objective <= objective + SUFFICIENT * share * slope:
+        engine.correct()  # perhaps in vain, but the device need not wait
+        trial_objective = engine.objective()
+        if trial_objective <= objective + SUFFICIENT * share * slope:
             return True
         engine.forget_objective()
         share *= SHORTER
         engine.step(alpha, share)
-    refuse_not_finite(reached_objective)  # however short the step
+    refuse_not_finite(trial_objective)  # however short the step
     engine.step(alpha, 0.0)
     engine.set_star_fluxes(fluxes)
     return False

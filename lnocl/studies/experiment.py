@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl import metrics
-from lnocl.deconvolution import HISTORY_DTYPE, Estimate, deconvolve
+from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
+from lnocl.result import HISTORY_DTYPE, Estimate
 from lnocl.scene.observation import Array, Observation
 from lnocl.simulation import Simulation
 
@@ -194,7 +195,7 @@ def reconstruct(
     """
     tracker = Tracker(simulation, method, every, n_iter, patience)
     stars = [] if method == "RLM" else simulation.stars
-    result = deconvolve(observation, stars, mu, n_iter=n_iter, callback=tracker, **keywords)
+    result = deconvolve(observation, stars, mu=mu, n_iter=n_iter, callback=tracker, **keywords)
     return Reconstruction(
         method,
         mu,

@@ -14,8 +14,9 @@ from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl import metrics
-from lnocl.deconvolution import Estimate, Result, deconvolve
+from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, LnoclWarning
+from lnocl.result import Estimate, Result
 from lnocl.runs.progress import make_bar
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.simulation import Simulation
@@ -137,7 +138,7 @@ def compare(
 
     def reconstruct(setting: Setting, n_iter: int, callback: Any = None) -> Result:
         return deconvolve(
-            observation, stars, mu, n_iter=n_iter, precision=setting.precision,
+            observation, stars, mu=mu, n_iter=n_iter, precision=setting.precision,
             device=device, pad=setting.pad, callback=callback,
         )  # fmt: skip
 

@@ -13,9 +13,10 @@ import numpy as np
 import pyopencl as cl
 from astropy import units as u
 
-from lnocl.deconvolution import Result, deconvolve
+from lnocl.deconvolution import deconvolve
 from lnocl.errors import DeviceError, LnoclError
 from lnocl.opencl.device import context_of, describe, has_double, spec_of
+from lnocl.result import Result
 from lnocl.scene.observation import Observation
 from lnocl.simulation import Experiment, Star, load_target, simulate
 from lnocl.verify.comparison import ALLOWED, KERNELS, deviation, kernels_of, relative
@@ -208,7 +209,9 @@ def _observe() -> tuple[Observation, list[tuple[int, int]]]:
     shape = seen.images.shape
     mask = np.random.default_rng(0).random(shape) < MASKED
     background = np.broadcast_to(seen.background[:, None, None], shape)
-    observation = Observation(seen.images, seen.psfs, background, seen.read_noise, mask=mask)
+    observation = Observation(
+        seen.images, seen.psfs, background=background, read_noise=seen.read_noise, mask=mask
+    )
     return observation, seen.stars
 
 

@@ -50,7 +50,10 @@ class TestDeconvolve:
         assert (status, captured.err) == (0, "")
         expected = lnocl.deconvolve(
             lnocl.Observation(
-                fits.getdata("cube.fits"), fits.getdata("psfs.fits"), [2.5, 3.0000000000000004], 1.0
+                fits.getdata("cube.fits"),
+                fits.getdata("psfs.fits"),
+                background=[2.5, 3.0000000000000004],
+                read_noise=1.0,
             ),
             stars=[(7, 5), (2, 9)],
             mu=1e-3,

@@ -188,7 +188,7 @@ def test_subnormals_may_be_flushed(monkeypatch):
     monkeypatch.setattr(
         program,
         "_build",
-        lambda context, text, options: build(context, text, [*options, "-cl-denorms-are-zero"]),
+        lambda context, text, options: build(context, text, (*options, "-cl-denorms-are-zero")),
     )
     result = deconvolve(engine, images, mask=MASK, mu=1e-6, n_iter=300)
     assert worst(result.extended, expected.extended) <= 1e-6

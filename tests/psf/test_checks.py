@@ -31,10 +31,10 @@ REFUSED = {
         "mask": np.ma.array(STAR > 1e9, mask=np.eye(*STAR.shape) * np.arange(70) > 57)
     },
     "mask cannot be read as an array: its rows differ": {"mask": [[True], [True, False]]},
-    "position has 1 masked values; fill them or leave them out": {
+    "position has 1 masked value; fill it or leave it out": {
         "position": np.ma.array([30, 29], mask=[0, 1])
     },
-    "background has 1 masked values": {"background": np.ma.masked},
+    "background has 1 masked value": {"background": np.ma.masked},
     "position is (1,); give two finite numbers, x and y": {"position": (1,)},
     "position is (1, nan); give two finite numbers, x and y": {"position": (1, math.nan)},
     "position (70, 3) is outside the frame of 70 x 61 pixels; give x and y, 0-based": {

@@ -271,7 +271,7 @@ def test_nothing_truncated_or_altered_is_gone_on_from(share, saved, tmp_path):
 def test_what_is_no_checkpoint_is_refused(content, tmp_path):
     path = tmp_path / "other.fits"
     path.write_bytes(content)
-    with pytest.raises(lnocl.FileError, match="is no checkpoint, or a damaged one"):
+    with pytest.raises(lnocl.FileError, match="is not a checkpoint, or a damaged one"):
         checkpoint.read(str(path))
     fits.writeto(path, np.ones((4, 4)), overwrite=True)
     with pytest.raises(lnocl.FileError):
@@ -288,7 +288,7 @@ def test_of_rows_without_end_few_are_read(saved, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "_digest", lambda described, *_: seen.append(len(described)))
     with pytest.raises(lnocl.FileError, match="its digest is wrong"):
         checkpoint.read(str(path))
-    assert seen == [checkpoint.MOST_ROWS]
+    assert seen == [checkpoint.MAX_ROWS]
 
 
 def test_the_checkpoint_of_another_run_is_not_replaced(saved):
@@ -388,7 +388,7 @@ def test_a_full_disk_stops_no_run_that_has_come_far(written, tmp_path, monkeypat
         with pytest.raises(lnocl.FileError, match="No space left"):
             STARS.make().deconvolve(**given)
         return
-    with pytest.warns(lnocl.LnoclWarning, match="No space left on device; the run goes on"):
+    with pytest.warns(lnocl.LnoclWarning, match="No space left on device; the run continues"):
         found = STARS.make().deconvolve(**given)
     assert found.n_iter == 5
     assert checkpoint.read(path).arrays["progress"][0] == written
@@ -481,7 +481,7 @@ def progress_of(read):
     """Return how far a run has come, first in what held-out counts choose."""
     if "choice" in read.arrays:
         return 1, read.arrays["progress"][0]
-    return 0, read.arrays["kept_at"][-1]
+    return 0, read.arrays["snapshot_iterations"][-1]
 
 
 @pytest.mark.system
@@ -551,9 +551,9 @@ def assert_whole(path):
 
 
 IN_THE_END = [
-    "lnocl.deconvolution._wrap_up",
-    "lnocl.deconvolution.Result.models",
-    "lnocl.deconvolution.Result.residuals",
+    "lnocl.deconvolution.make_result",
+    "lnocl.result.Result.models",
+    "lnocl.result.Result.residuals",
     "lnocl.io.fitswrite.write_result",
     "lnocl.io.atomic.os.fsync",
 ]

@@ -15,6 +15,7 @@ import lnocl
 from lnocl.errors import LnoclWarning
 from lnocl.runs import held_out
 from lnocl.runs.stopping import CHANGE_WINDOW, expected_deviance
+from lnocl.runs.thinning import split_counts
 from lnocl.scene.penalty import Penalty
 
 SIZE, STAR = 64, (40, 24)
@@ -110,7 +111,7 @@ def test_discrepancy_stops_where_noise_is_reached(mask, solver):
 class TestHalves:
     def test_are_whole_counts_that_add_up(self):
         observation, *_ = scene()
-        ((first, second),) = held_out.split_counts(observation)
+        ((first, second),) = split_counts(observation)
         np.testing.assert_array_equal(first.images + second.images, observation.images)
         assert (first.images == np.floor(first.images)).all()
         assert min(first.images.min(), second.images.min()) >= 0
@@ -123,7 +124,7 @@ class TestHalves:
         images = np.random.default_rng(5).poisson(mean, (n, n)) + fraction
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LnoclWarning)
-            ((first, second),) = held_out.split_counts(lnocl.Observation(images, np.ones((1, 1))))
+            ((first, second),) = split_counts(lnocl.Observation(images, np.ones((1, 1))))
         covariance = np.cov(first.images.ravel(), second.images.ravel())
         allowed = 6.0 * mean / 2.0 * np.sqrt(2.0) / n
         # Of a fraction, which is no count, 1/4 of its square goes to each.
@@ -133,7 +134,7 @@ class TestHalves:
 
     def test_leave_masked_pixels_out(self):
         observation, *_ = scene(mask=True)
-        ((first, second),) = held_out.split_counts(observation)
+        ((first, second),) = split_counts(observation)
         np.testing.assert_array_equal(first.mask, observation.mask)
         assert first.images[observation.mask].max() == second.images[observation.mask].max() == 0
 
@@ -142,28 +143,44 @@ class TestHalves:
         observation = lnocl.Observation(
             np.full((2, 4, 4), 9.0), np.ones((1, 1)), exposure=exposure, offsets=[(0, 0), (1, -0.5)]
         )
-        for half in held_out.split_counts(observation)[0]:
+        for half in split_counts(observation)[0]:
             seen = ~observation.mask
             np.testing.assert_array_equal(half.mask, observation.mask)
             np.testing.assert_array_equal(half.offsets, observation.offsets)
             np.testing.assert_array_equal(half.exposure[seen], observation.exposure[seen])
 
     def test_say_that_images_are_no_whole_counts(self):
-        observation = lnocl.Observation(np.full((4, 4), 2.5), np.ones((1, 1)))
-        with pytest.warns(LnoclWarning, match="the images are not whole counts"):
-            held_out.split_counts(observation)
+        for images, read_noise in ((2.5, 0.0), (2.25, 0.5), (3e5 + 0.4, 1.0)):
+            observation = lnocl.Observation(
+                np.full((4, 4), images), np.ones((1, 1)), read_noise=read_noise
+            )
+            with pytest.warns(LnoclWarning, match="the images are not whole counts"):
+                split_counts(observation)
+
+    @pytest.mark.parametrize("read_noise", [0.0, 2.3, np.full((16, 16), 2.3)])
+    @pytest.mark.parametrize("gain", [1.0, 0.7], ids=["counts", "rounded"])
+    def test_whole_counts_with_read_noise_or_rounding_are_whole_counts(self, read_noise, gain):
+        """As a camera's counts are, divided by a gain and multiplied by it in single precision."""
+        counts = np.random.default_rng(2).poisson(3000.0, (16, 16)).astype(np.float32)
+        counts[0, :4] = -9.0, -1.0, 0.0, 1.0
+        images = counts / np.float32(gain) * np.float32(gain)
+        assert (images == np.round(images)).all() == (gain == 1.0)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".* negative and w.* set to 0")
+            observation = lnocl.Observation(images, np.ones((1, 1)), read_noise=read_noise)
+        split_counts(observation)
 
     @pytest.mark.parametrize(
         ("value", "message"),
         [
             (0.0, "the images hold no counts to hold out"),
-            (1e20, "1e\\+20 electrons cannot be dealt"),
+            (1e20, "1e\\+20 electrons is too bright to be split"),
         ],
     )
     def test_refuse_what_cannot_be_dealt_out(self, value, message):
         observation = lnocl.Observation(np.full((4, 4), value), np.ones((1, 1)))
         with pytest.raises(lnocl.InputError, match=message):
-            held_out.split_counts(observation)
+            split_counts(observation)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -174,7 +191,7 @@ def test_estimated_errors_are_unbiased(seed):
     noise = [rng.normal(0.0, 0.1, truth.shape).astype(np.float32) for _ in range(4)]
     a, b, a_end, b_end = (truth / 2 + part for part in noise)
     trial = held_out._Trial([])
-    trial.kept = [(1, [(a, b)])]
+    trial.snapshots = [(1, [(a, b)])]
     (excess,) = trial.excess([(a_end, b_end)])
     error = np.linalg.norm(a + b - truth) ** 2
     # Six standard errors: 4 |truth / 2| 0.1 twice.
@@ -229,7 +246,7 @@ class TestHeldOut:
 
     @pytest.mark.parametrize("n_iter", [7, 10, 20])
     def test_errors_are_measured_from_the_noise_of_the_best_estimate(self, n_iter):
-        """Some before it are let go, the last time after the last estimate."""
+        """Some snapshots before it are dropped, the last time after the last one."""
         rng = np.random.default_rng(1)
 
         class Trial(held_out._Trial):
@@ -238,22 +255,22 @@ class TestHeldOut:
                     # Halves of a truth of 10, first far from it, then noisy; best is iteration 12.
                     wide = np.float32(5.0 + 0.5 * max(12 - k, 0))
                     noise = 0.1 * k * rng.standard_normal((2, 4000), np.float32)
-                    self.kept.append((k, [(wide + noise[0], wide + noise[1])]))
+                    self.snapshots.append((k, [(wide + noise[0], wide + noise[1])]))
                     yield k
 
         trial = Trial([])
-        judged = held_out._follow(trial, Penalty(), True, None, lambda _: None, lambda: None)
+        candidate = held_out._run_trial(trial, Penalty(), True, None, lambda _: None, lambda: None)
         assert trial.iterations[0] > 1
-        excess = trial.excess(trial.end)
+        excess = trial.excess(trial.last)
         least = int(np.argmin(excess))
-        a, b = trial.kept[least][1][0]
+        a, b = trial.snapshots[least][1][0]
         noise = np.linalg.norm(a - b) ** 2
-        expected = np.sqrt(noise / max(judged.truth, noise - excess[least]))
-        assert judged.curve["error"][least] == pytest.approx(expected, rel=1e-6)
+        expected = np.sqrt(noise / max(candidate.squared_norm, noise - excess[least]))
+        assert candidate.curve["error"][least] == pytest.approx(expected, rel=1e-6)
 
     def test_halves_that_end_at_once_are_refused(self):
         with pytest.raises(lnocl.InputError, match="no iteration betters the start"):
-            held_out._follow(held_out._Trial([((), ())]), Penalty(), False, None, print, print)
+            held_out._run_trial(held_out._Trial([((), ())]), Penalty(), False, None, print, print)
 
     def test_start_that_is_no_number_is_refused(self):
         with pytest.raises(lnocl.InputError, match="initial_extended"):
@@ -348,6 +365,6 @@ class TestSmoothing:
         for image, psf, e in zip(images, observation.psfs, exposure, strict=True):
             excess = e * (image / (50.0 * e) - 1.0)
             gradient += sum(v * np.roll(excess, 2 - x, 1) for x, v in enumerate(psf.ravel()))
-        grid = held_out.several_smoothings(0.0)(observation, 1.0)
+        grid = held_out.smoothing_grid(0.0)(observation, 1.0)
         found = [penalty.smoothing for penalty in grid] / held_out.SMOOTHING_GRID
         np.testing.assert_allclose(found, gradient.std(), rtol=0.04)

@@ -206,10 +206,10 @@ def test_images_of_equal_sky_may_be_added():
     two = lnocl.Observation(
         np.concatenate([parts, made.images - parts]),
         made.psfs,
-        np.concatenate([0.25 * background, 0.75 * background]),
+        background=np.concatenate([0.25 * background, 0.75 * background]),
         exposure=[1.0, 3.0],
     )
-    one = lnocl.Observation(made.images, made.psfs, background, exposure=4.0)
+    one = lnocl.Observation(made.images, made.psfs, background=background, exposure=4.0)
     # The sum is sufficient where the model of both is the same but for the factor.
     for solver, tolerance in (("sgm", 3e-14), ("sgp", 4e-12)):
         results = [
@@ -278,7 +278,7 @@ def test_a_star_and_images_moved_by_a_fraction_give_the_same_flux(by):
     }
 
     def fluxes_of(images, stars, **known):
-        observation = lnocl.Observation(images, psfs, 10.0, **known)
+        observation = lnocl.Observation(images, psfs, background=10.0, **known)
         return lnocl.deconvolve(observation, stars, n_iter=5, **start, **numpy_alone).star_fluxes
 
     expected = fluxes_of(images, stars)

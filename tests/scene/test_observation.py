@@ -246,10 +246,18 @@ def test_psfs_of_any_sum_that_is_a_number_are_normalised_exactly(scale):
 
 RAGGED = [[1.0, 2.0], [3.0]]
 REFUSED = {
-    "images of one dimension": ({"images": IMAGES[0, 0]}, "images has 1 dimensions"),
+    "images of one dimension": ({"images": IMAGES[0, 0]}, "images has 1 dimension;"),
     "images of four dimensions": ({"images": IMAGES[None]}, "images has 4 dimensions"),
     "no image": ({"images": IMAGES[:0]}, "images is empty: its shape is (0, 4, 4)"),
     "images without pixels": ({"images": IMAGES[:, :, :0]}, "images is empty"),
+    "channels last": (
+        {"images": np.ones((64, 48, 3))},
+        "images has shape (64, 48, 3), but its axes are (p, ny, nx): give np.moveaxis(images, -1,",
+    ),
+    "channels of PSFs last": (
+        {"psfs": np.ones((8, 9, 4))},
+        "psfs has shape (8, 9, 4), but its axes are (p, ny, nx): give np.moveaxis(psfs, -1, 0)",
+    ),
     "complex images": ({"images": IMAGES + 0j}, "images holds complex128"),
     "text for images": ({"images": [["1", "2"]]}, "images holds <U1"),
     "objects for images": ({"images": [[None, 1.0]]}, "images holds object"),
@@ -257,7 +265,7 @@ REFUSED = {
     "one PSF too few": ({"psfs": [PSF, PSF]}, "2 psfs for 3 images"),
     "one PSF too many": ({"psfs": [PSF] * 4}, "4 psfs for 3 images"),
     "several PSFs for one image": ({"images": IMAGES[0], "psfs": [PSF] * 2}, "2 psfs for 1 image"),
-    "PSF of one dimension": ({"psfs": PSF[0]}, "psfs has 1 dimensions"),
+    "PSF of one dimension": ({"psfs": PSF[0]}, "psfs has 1 dimension;"),
     "PSF of four dimensions": ({"psfs": PSF[None, None]}, "psfs has 4 dimensions"),
     "PSF without pixels": ({"psfs": PSF[:0]}, "psfs is empty"),
     "PSF that sums to zero": ({"psfs": [PSF, PSF, 0 * PSF]}, "psf 2 has the sum 0;"),
@@ -329,7 +337,7 @@ REFUSED = {
     ),
     "masked psfs": (
         {"psfs": masked(PSF, 1)},
-        "psfs has 1 masked values; repair them first, as lnocl.psf.make_psf does",
+        "psfs has 1 masked value; repair it first, as lnocl.psf.make_psf does",
     ),
     "masked psfs in a list": ({"psfs": [PSF, masked(PSF, 2), PSF]}, "psfs has 2 masked values"),
     "masked background": (
@@ -340,7 +348,10 @@ REFUSED = {
         {"read_noise": masked(IMAGES, 7)},
         "read_noise has 7 masked values; fill them and add their mask to mask",
     ),
-    "masked number": ({"read_noise": np.ma.masked}, "read_noise has 1 masked values"),
+    "masked number": (
+        {"read_noise": np.ma.masked},
+        "read_noise has 1 masked value; fill it and add its mask to mask",
+    ),
     "masked map of exposures": (
         {"exposure": masked(IMAGES[0], 3)},
         "exposure has 3 masked values; fill them and add their mask to mask",
@@ -349,7 +360,10 @@ REFUSED = {
         {"mask": masked(IMAGES > 40, 2)},
         "mask has 2 masked values; fill them or leave them out",
     ),
-    "masked offsets": ({"offsets": masked(np.zeros((3, 2)), 1)}, "offsets has 1 masked values"),
+    "masked offsets": (
+        {"offsets": masked(np.zeros((3, 2)), 1)},
+        "offsets has 1 masked value; fill it or leave it out",
+    ),
     "ragged mask": ({"mask": [[True, False], [True]]}, "mask"),
     "exposure of 0": ({"exposure": 0}, "exposure must be finite and more than zero; 0 was"),
     "negative exposure": (
@@ -412,6 +426,11 @@ def test_refused(case):
     assert caught.value.exit_status == 2
 
 
+def test_all_but_images_and_psfs_go_by_name():
+    with pytest.raises(TypeError, match="3 positional arguments but 4 were given"):
+        lnocl.Observation(IMAGES, PSF, 5.0)
+
+
 def test_nothing_but_non_finite_pixels_is_refused():
     with (
         pytest.warns(lnocl.LnoclWarning, match="^48 image pixels are not finite"),
@@ -439,6 +458,12 @@ def announced(**changes):
         assert warning.category is lnocl.LnoclWarning
         assert "\n" not in str(warning.message)
     return names["observation"], [str(w.message) for w in caught], {w.filename for w in caught}
+
+
+@pytest.mark.parametrize("shape", [(7, 64, 3), (64, 7, 3), (64, 64, 5), (3, 64, 64)])
+def test_narrow_images_are_images(shape):
+    observation = lnocl.Observation(np.ones(shape), np.ones((1, 1)))
+    assert observation.images.shape == shape
 
 
 def test_good_input_is_taken_in_silence():
@@ -470,7 +495,8 @@ def test_negative_counts_are_set_to_zero_and_counted(read_noise, count):
         images=images, read_noise=read_noise, mask=IMAGES == 48
     )
     assert len(messages) == 1
-    assert messages[0].startswith(f"{count} image pixels are negative and were set to 0")
+    verbs = "pixel is negative and was" if count == 1 else "pixels are negative and were"
+    assert messages[0].startswith(f"{count} image {verbs} set to 0")
     assert files == {"caller.py"}
     variance = np.broadcast_to(np.square(read_noise), (3,))[:, None, None]
     expected = np.where(IMAGES == 48, 0.0, np.maximum(images + variance, 0.0))
@@ -497,7 +523,7 @@ def test_maps_may_be_masked_where_the_images_are():
                 np.testing.assert_array_equal(getattr(found, made), getattr(plain, made))
         with (
             pytest.warns(lnocl.LnoclWarning, match="3 image pixels are not finite"),
-            pytest.raises(lnocl.InputError, match=f"{name} has 1 masked values; fill them"),
+            pytest.raises(lnocl.InputError, match=f"{name} has 1 masked value; fill it"),
         ):
             lnocl.Observation(np.where(bad[0], np.nan, IMAGES), PSF, **{name: maps})
 
@@ -506,6 +532,14 @@ def test_without_more_there_is_no_background_and_an_exposure_of_one():
     observation = lnocl.Observation(IMAGES, PSF)
     assert observation.background.tolist() == [0.0] * 3
     assert observation.exposure.tolist() == [1.0] * 3
+
+
+def test_one_pixel_is_said_to_be_one():
+    images = np.where(IMAGES == 7, np.nan, np.where(IMAGES == 9, -1.0, IMAGES))
+    _, messages, _ = announced(images=images, psfs=np.where(PSF == 2, -0.5, PSF))
+    starts = ("1 psf pixel is negative and was kept", "1 image pixel is not finite and was masked")
+    assert tuple(messages[:2]) == starts
+    assert messages[2].startswith("1 image pixel is negative and was set to 0; if the images are ")
 
 
 def test_negative_psf_pixels_are_kept_and_counted():

@@ -54,7 +54,9 @@ def test_source_that_runs_over_the_edge_is_found_with_it():
     rng = np.random.default_rng(0)
     sky = np.broadcast_to(np.linspace(0.0, 400.0, 64), (64, 64))
     blurred = np.array([np.convolve(np.pad(row, 20, "edge"), GAUSSIAN[20], "valid") for row in sky])
-    observation = lnocl.Observation(rng.poisson(blurred / GAUSSIAN[20].sum() + 20), GAUSSIAN, 20.0)
+    observation = lnocl.Observation(
+        rng.poisson(blurred / GAUSSIAN[20].sum() + 20), GAUSSIAN, background=20.0
+    )
     errors = {}
     for pad in (0, "auto"):
         found = lnocl.deconvolve(observation, pad=pad, n_iter=30, engine="numpy").extended

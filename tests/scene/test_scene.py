@@ -41,7 +41,7 @@ def test_images_lie_at_the_origin():
     mask = np.zeros((2, 5, 11), bool)
     mask[1, 2, 3] = True
     images = np.arange(110.0).reshape(2, 5, 11)
-    scene = Scene(lnocl.Observation(images, np.ones((1, 1)), images, mask=mask))
+    scene = Scene(lnocl.Observation(images, np.ones((1, 1)), background=images, mask=mask))
     laid, weights, background = scene.images(), scene.weights, scene.background()
     np.testing.assert_array_equal(laid[:, :5, :11] * scene.scale, np.where(mask, 0, images))
     np.testing.assert_array_equal(weights[:, :5, :11], ~mask)
@@ -195,7 +195,7 @@ REFUSED = {
     ),
     "masked row of stars": (
         {"stars": [(3, 4), np.ma.array((5, 6), mask=(0, 1))]},
-        "stars has 1 masked values",
+        "stars has 1 masked value;",
     ),
     "text for stars": ({"stars": "3,4"}, "star"),
     "complex star": ({"stars": [(1j, 2)]}, "star"),
@@ -288,7 +288,7 @@ REFUSED = {
     ),
     "masked flux": (
         {"initial_star_fluxes": np.ma.array([1.0], mask=True), "stars": [(3, 4)]},
-        "initial_star_fluxes has 1 masked values",
+        "initial_star_fluxes has 1 masked value;",
     ),
     "text for a flux": ({"initial_star_fluxes": ["a"], "stars": [(3, 4)]}, "initial_star_fluxes"),
 }

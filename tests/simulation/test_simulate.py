@@ -383,7 +383,7 @@ def flat(**pixels):
         (lambda: Target(1e306 * flat()), "too large to be summed: divide it by a constant"),
         (
             lambda: Target(np.ma.array(flat(), mask=flat(first=2) > 1)),
-            "the extended source has 1 masked values; fill them or leave them out",
+            "the extended source has 1 masked value; fill it or leave it out",
         ),
         (lambda: Target(flat(), [Star(32, 0)]), "outside"),
         (lambda: Target(flat(), [Star(0.5, 0)]), "between pixels"),

@@ -202,7 +202,9 @@ def test_fluxes_and_positions_may_be_of_any_size():
 
 def flat_sky(x, y, flux, level, seed, **known):
     mean = flux * gaussian(x, y) + level
-    return lnocl.Observation(np.random.default_rng(seed).poisson(mean), PSF, level, **known)
+    return lnocl.Observation(
+        np.random.default_rng(seed).poisson(mean), PSF, background=level, **known
+    )
 
 
 def fitted(observation, given, level, flux):
@@ -252,7 +254,7 @@ def test_errors_fall_as_the_root_of_the_counts(factor):
 
     def errors(images, **known):
         return lnocl.deconvolve(
-            lnocl.Observation(images, PSF, 2.0 * images.sum() / mean.sum(), **known),
+            lnocl.Observation(images, PSF, background=2.0 * images.sum() / mean.sum(), **known),
             refine_positions=True, initial_extended=np.full(SHAPE, 1e-9), **start, **numpy_alone,
         )  # fmt: skip
 
@@ -286,7 +288,7 @@ def test_a_star_keeps_within_its_radius():
 
 def test_a_star_without_light_is_left_alone():
     """Its flux ends at 0, where its position means nothing and its error is infinite."""
-    observation = lnocl.Observation(np.zeros(SHAPE), PSF, 3.0)
+    observation = lnocl.Observation(np.zeros(SHAPE), PSF, background=3.0)
     result = lnocl.deconvolve(
         observation, [(15, 16)], n_iter=3, refine_positions=True, initial_star_fluxes=[0.0],
         **numpy_alone,
@@ -363,8 +365,8 @@ def test_positions_are_found_in_a_run(solver):
     assert abs(off / result.star_position_errors).max() <= 4.0
     _, without = run(solver=solver, n_iter=50, refine_positions=False)
     np.testing.assert_array_equal(without.star_positions, made.stars + OFF)
-    np.testing.assert_array_equal(without.star_flux_errors, [0.0])
-    np.testing.assert_array_equal(without.star_position_errors, np.zeros((1, 2)))
+    assert np.isnan(without.star_flux_errors).all()
+    assert np.isnan(without.star_position_errors).all()
     assert result.history["objective"][-1] < without.history["objective"][-1]
     away = without.star_positions - made.stars
     assert (np.hypot(*off.T) < 0.2 * np.hypot(*away.T)).all()

@@ -364,8 +364,8 @@ def small_scene(seed, n_images, n_stars, counts, contrast, share, masked):
 
 
 def solve(images, psfs, background, mask, stars, mu, n_iter):
-    observation = lnocl.Observation(images, psfs, background, mask=mask)
-    return lnocl.deconvolve(observation, stars, mu, solver="sgp", n_iter=n_iter, engine="numpy")
+    observation = lnocl.Observation(images, psfs, background=background, mask=mask)
+    return lnocl.deconvolve(observation, stars, mu=mu, solver="sgp", n_iter=n_iter, engine="numpy")
 
 
 def logarithmic(least, most):
@@ -769,8 +769,8 @@ def extreme_images():
 @every_engine
 def test_extremes(engine, images, background):
     made = SCENES["star, mu"].make()
-    observation = lnocl.Observation(images + background, made.psfs, background)
-    result = lnocl.deconvolve(observation, made.stars, 1e-3, solver="sgp", n_iter=30, **engine)
+    observation = lnocl.Observation(images + background, made.psfs, background=background)
+    result = lnocl.deconvolve(observation, made.stars, mu=1e-3, solver="sgp", n_iter=30, **engine)
     for values in (result.extended, result.star_fluxes, result.history["objective"]):
         assert np.isfinite(values).all()
         assert (values >= 0).all()

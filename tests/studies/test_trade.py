@@ -61,7 +61,7 @@ def direct(row, n_iter=None):
     return lnocl.deconvolve(
         MADE.observation(),
         MADE.stars,
-        1e-4,
+        mu=1e-4,
         n_iter=n_iter or int(row["iterations"]),
         precision=str(row["precision"]),
         pad=int(row["pad"]),
@@ -242,7 +242,7 @@ class TestCommand:
         result = lnocl.deconvolve(
             experiment.observe(simulation),
             simulation.stars,
-            demo.MU,
+            mu=demo.MU,
             n_iter=N_ITER,
             engine="numpy",
         )

@@ -1,0 +1,160 @@
+"""The options of `deconvolve`: the values that each may have."""
+
+from __future__ import annotations
+
+from numbers import Real
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lnocl.errors import InputError, warn
+from lnocl.runs.held_out import PenaltyGrid, mu_grid, smoothing_grid
+from lnocl.scene.observation import Observation, numbers
+from lnocl.scene.penalty import Penalty
+from lnocl.solvers import SOLVERS
+
+PRECISIONS = ("single", "double")
+ENGINES = ("opencl", "numpy")
+STOPS = ("discrepancy", "held-out")
+
+# Kernels count iterations in 32 bits.
+MAX_ITERATIONS = 2**31 - 2
+
+# The difference between single and double precision, as a share of the extended source, for each
+# iteration of a long run, and the share that is worth a warning (benchmarks/precision.py,
+# docs/precision.md).
+ROUNDING_PER_ITERATION = 8e-9
+ROUNDING_WORTH_A_WARNING = 1e-3
+
+
+def check_observation(observation: object) -> None:
+    """Refuse anything but an `Observation`.
+
+    Raises
+    ------
+    InputError
+        `observation` is not an Observation.
+    """
+    if not isinstance(observation, Observation):
+        raise InputError(
+            f"observation is of type {type(observation).__name__}; give an lnocl.Observation, as "
+            "lnocl.Observation(images, psfs) makes"
+        )
+
+
+def check_choices(solver: str, precision: str, engine: str, device: object) -> None:
+    """Refuse names that are not known, and a device for the reference.
+
+    Raises
+    ------
+    InputError
+        A name is unknown; a device is not text, or given for the reference.
+    """
+    choices = {
+        "solver": (solver, tuple(SOLVERS)),
+        "precision": (precision, PRECISIONS),
+        "engine": (engine, ENGINES),
+    }
+    for name, (value, known) in choices.items():
+        if not (isinstance(value, str) and value in known):
+            raise InputError(f"{name} {value!r} is not known; choose from {', '.join(known)}")
+    if not (device is None or isinstance(device, str)):
+        raise InputError(f"device must be text, PLATFORM[:DEVICE]; {device!r} was given")
+    if engine == "numpy" and device is not None:
+        raise InputError(f"engine numpy uses no device; leave device {device!r} out")
+
+
+def check_length(n_iter: object, stop: object) -> None:
+    """Refuse a number of iterations or a stopping rule out of range.
+
+    Raises
+    ------
+    InputError
+        `n_iter` is not a whole number from 1 to `MAX_ITERATIONS`; `stop` is not a known rule or a
+        number between 0 and 1.
+    """
+    if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
+        raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")
+    if n_iter > MAX_ITERATIONS:
+        raise InputError(f"n_iter must be {MAX_ITERATIONS} at most; {n_iter} was given")
+    is_change = isinstance(stop, Real) and 0 < cast(float, stop) < 1
+    if not (stop is None or is_change or (isinstance(stop, str) and stop in STOPS)):
+        raise InputError(
+            f"stop {stop!r} is not known; give {', '.join(STOPS)}, or a number between 0 and 1"
+        )
+
+
+def check_types(callback: object, **flags: object) -> None:
+    """Refuse a callback that cannot be called, and flags that are not True or False.
+
+    Raises
+    ------
+    InputError
+        One of them is of another type.
+    """
+    if not (callback is None or callable(callback)):
+        raise InputError(f"callback must be a function or None; {callback!r} was given")
+    for name, flag in flags.items():
+        if not isinstance(flag, (bool, np.bool_)):
+            raise InputError(f"{name} must be True or False; {flag!r} was given")
+
+
+def check_start(
+    fits_stars: bool, initial_extended: ArrayLike | None, initial_star_fluxes: ArrayLike | None
+) -> None:
+    """Refuse an extended source of 0, and stars of 0 unless their fluxes are fitted at the start.
+
+    Raises
+    ------
+    InputError
+        The start is 0 where iterations that multiply cannot leave it.
+    """
+    if initial_extended is not None and not numbers("initial_extended", initial_extended).any():
+        raise InputError(
+            "initial_extended is 0 everywhere, which no iteration may leave; give it values above "
+            "0, or leave it out"
+        )
+    if initial_star_fluxes is not None and not fits_stars:
+        fluxes = numbers("initial_star_fluxes", initial_star_fluxes)
+        if n_dark := int((fluxes == 0).sum()):
+            raise InputError(
+                f"initial_star_fluxes holds {n_dark} of 0, which solver sgm multiplies and never "
+                "leaves; give values above 0, leave those stars out, or take solver sgp"
+            )
+
+
+def read_penalties(mu: Any, smoothing: Any) -> tuple[Penalty, PenaltyGrid | None]:
+    """Return the penalty, the smallest one where one is chosen, and the grid to choose from.
+
+    Raises
+    ------
+    InputError
+        A weight is not a number, finite and not negative, or "auto"; both are "auto".
+    """
+    for name, weight in (("mu", mu), ("smoothing", smoothing)):
+        if isinstance(weight, str) and weight != "auto":
+            raise InputError(f"{name} {weight!r} is not known; give a number or auto")
+    if isinstance(mu, str) and isinstance(smoothing, str):
+        raise InputError("mu and smoothing cannot both be auto; give one of them as a number")
+    if isinstance(mu, str):
+        return Penalty(0.0, smoothing), mu_grid(smoothing)
+    if isinstance(smoothing, str):
+        return Penalty(mu, 0.0), smoothing_grid(mu)
+    return Penalty(mu, smoothing), None
+
+
+def warn_of_rounding(n_iter: int) -> None:
+    """Warn of more iterations than single precision is good for.
+
+    Warns
+    -----
+    LnoclWarning
+        The answer is expected to differ from that in double precision by a thousandth or more.
+    """
+    difference = ROUNDING_PER_ITERATION * n_iter
+    if difference > ROUNDING_WORTH_A_WARNING:
+        warn(
+            f"single precision is expected to stray from double by {difference:.1g} of the "
+            f"extended source after {n_iter} iterations; take precision double, or fewer iterations"
+        )

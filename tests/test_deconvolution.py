@@ -1,0 +1,61 @@
+"""The public function: how it is called, and what it returns."""
+
+import numpy as np
+import pytest
+
+import lnocl
+
+OBSERVATION = lnocl.Observation(np.full((8, 8), 5.0), np.ones((1, 1)), background=1.0)
+
+
+def deconvolve(**given):
+    return lnocl.deconvolve(OBSERVATION, **({"n_iter": 3, "engine": "numpy"} | given))
+
+
+def test_all_but_the_observation_and_the_stars_go_by_name():
+    with pytest.raises(TypeError, match="from 1 to 2 positional arguments but 3 were given"):
+        lnocl.deconvolve(OBSERVATION, [(3, 3)], 0.1)
+
+
+def test_results_are_compared_by_identity():
+    first, second = deconvolve(), deconvolve()
+    assert first == first
+    assert first != second
+    assert len({first, second}) == 2
+
+
+@pytest.mark.parametrize("refine_positions", [False, True])
+def test_errors_of_stars_that_were_not_refined_are_nan(refine_positions):
+    result = deconvolve(stars=[(3, 4)], refine_positions=refine_positions)
+    for errors, shape in ((result.star_flux_errors, (1,)), (result.star_position_errors, (1, 2))):
+        assert errors.shape == shape
+        assert np.isnan(errors).all() != refine_positions
+
+
+DARK_STARTS = {
+    "extended source": (
+        {"initial_extended": np.zeros((8, 8))},
+        ("sgm", "sgp"),
+        "initial_extended is 0 everywhere",
+    ),
+    "star": ({"initial_star_fluxes": [2.0, 0.0]}, ("sgm",), "initial_star_fluxes holds 1 of 0"),
+}
+
+
+@pytest.mark.parametrize("start", DARK_STARTS)
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_starts_that_no_iteration_leaves_are_refused(start, solver):
+    given, refused_by, message = DARK_STARTS[start]
+    given = {"stars": [(2, 2), (5, 5)], "solver": solver, **given}
+    if solver in refused_by:
+        with pytest.raises(lnocl.InputError, match=message):
+            deconvolve(**given)
+    else:
+        assert (deconvolve(**given).star_fluxes > 0).all()
+
+
+def test_an_extended_source_may_start_at_0_in_places():
+    start = np.ones((8, 8))
+    start[2, 3] = 0.0
+    extended = deconvolve(initial_extended=start).extended
+    np.testing.assert_array_equal(extended == 0, start == 0)
