@@ -182,10 +182,10 @@ class ReferenceEngine:
         """Return the objectives recorded so far, scaled."""
         return np.array(self._objectives)
 
-    def fetched_objectives(self) -> Array:
+    def fetched_objectives(self) -> list[float]:
         """Return the objectives recorded since the last call, scaled."""
         fetched, self._n_fetched = self._objectives[self._n_fetched :], len(self._objectives)
-        return np.array(fetched)
+        return fetched
 
     def state(self) -> State:
         """Return what `restore` needs, as it is between iterations."""

@@ -99,7 +99,7 @@ class OpenCLEngine:
         self._n_scaled = 0
         self._last_mark: cl.Event | None = None
         self._unseen: Transfer | None = None
-        self._fetched = np.zeros(0)
+        self._fetched: list[float] = []
         self._observed: NDArray[np.bool_] | None = None
         self._memory.allocate(**sizes)
         self._upload_scene()
@@ -315,7 +315,7 @@ class OpenCLEngine:
             self._last_mark = event
         if self._n_scaled % ITERATIONS_UNSEEN == 0:
             if self._unseen is not None:
-                self._fetched = self._unseen.wait()[0].reshape(-1, 2).sum(axis=1)
+                self._fetched = self._unseen.wait()[0].reshape(-1, 2).sum(axis=1).tolist()
             first = 2 * (self._n_objectives - ITERATIONS_UNSEEN)
             self._unseen = self._memory.fetch_ranges(("objectives", first, 2 * ITERATIONS_UNSEEN))
 
@@ -397,9 +397,9 @@ class OpenCLEngine:
         pairs = self._memory.download("objectives", 2 * self._n_objectives)
         return pairs.reshape(-1, 2).sum(axis=1)
 
-    def fetched_objectives(self) -> Array:
+    def fetched_objectives(self) -> list[float]:
         """Return the objectives that `scale` has fetched since the last call, scaled."""
-        fetched, self._fetched = self._fetched, np.zeros(0)
+        fetched, self._fetched = self._fetched, []
         return fetched
 
     def state(self) -> State:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -44,7 +44,7 @@ class Descent:
         self._least = math.inf
         self._n_above = 0
 
-    def check(self, objectives: Iterable[float]) -> None:
+    def check(self, objectives: Sequence[float]) -> None:
         """Refuse the next objectives, scaled, where they are not finite or stay above the least.
 
         Raises
@@ -54,8 +54,8 @@ class Descent:
         DivergedError
             `N_ABOVE` in turn are above the least so far by more than `MAX_RISE` of it.
         """
+        refuse_not_finite(*objectives)
         for objective in objectives:
-            refuse_not_finite(objective)
             allowed = self._least + MAX_RISE * max(self._least, self._floor)
             self._n_above = self._n_above + 1 if objective > allowed else 0
             self._least = min(self._least, objective)

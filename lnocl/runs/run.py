@@ -108,12 +108,13 @@ class Run:
     def __iter__(self) -> Iterator[int]:
         solve = SOLVERS[self._setup.solver]
         descent = Descent(self.scene)
-        descent.check(self.engine.objectives())  # those from before a checkpoint
+        descent.check(self.engine.objectives().tolist())  # those from before a checkpoint
         while self.done < self._n_iter:
             begin, is_stage_new = self.done, not self._steps.has_iterated
             for iteration in solve(self.engine, self._due - begin, self._steps):
                 self.done = begin + iteration
-                descent.check(self.engine.fetched_objectives())
+                if fetched := self.engine.fetched_objectives():
+                    descent.check(fetched)
                 yield self.done
             was_stuck = is_stage_new and begin == self.done < self._due
             if was_stuck or not self._refines:
@@ -288,7 +289,7 @@ class Run:
         NotFiniteError, DivergedError
             As `Descent.check`.
         """
-        Descent(self.scene).check(self.engine.objectives())
+        Descent(self.scene).check(self.engine.objectives().tolist())
 
     def finish(self) -> None:
         """Record the objective of the current estimate, where the solver has not done so."""

@@ -78,7 +78,7 @@ class Engine(Protocol):
     def objectives(self) -> Array:
         """Return the objectives recorded so far; this waits for the device."""
 
-    def fetched_objectives(self) -> Array:
+    def fetched_objectives(self) -> list[float]:
         """Return the objectives of `ratio` that have arrived since the last call, in order.
 
         This does not wait for the device, so that the latest may be missing.
