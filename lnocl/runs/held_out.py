@@ -60,7 +60,7 @@ MU_GRID = 10.0 ** np.arange(-3.0, 0.1, 0.5)
 # The weight of the edge-preserving term in units of the noise of the gradient of the data term.
 SMOOTHING_GRID = 10.0 ** np.arange(-1.5, 0.6, 0.5)
 
-# The prefix of the names under which the states of all halves are saved, stacked.
+# The prefix, before a number, of the names under which the state of each half is saved.
 HALVES = "halves_"
 
 Snapshot = NDArray[np.float32]

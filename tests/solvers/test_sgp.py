@@ -628,7 +628,9 @@ def test_cross_information_lies_in_a_window(psf_shape, offsets):
     images = rng.poisson(9.0, (2, 128, 128)).astype(float)
     mask = rng.random(images.shape) < 0.1
     psfs = make_psfs(2, psf_shape)
-    scene = Scene(lnocl.Observation(images, psfs, 2.0, mask=mask, offsets=offsets), stars)
+    scene = Scene(
+        lnocl.Observation(images, psfs, background=2.0, mask=mask, offsets=offsets), stars
+    )
     model = Model(scene)
     extended, fluxes = scene.start(None, None)
     fluxes, steps = scaling.prepare(scene, model, extended, fluxes)

@@ -15,7 +15,7 @@ from runtimes import on_pocl
 
 import lnocl
 from lnocl.io.fitsread import read_stack
-from lnocl.runs.held_out import split_counts
+from lnocl.runs.thinning import split_counts
 
 pytestmark = pytest.mark.system
 
