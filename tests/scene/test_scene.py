@@ -370,7 +370,7 @@ def test_negative_pixels_leave_the_weight_of_a_star_positive():
     psf[0, 0] = -0.05 * psf.sum()
     mask = np.zeros((2, 32, 32), bool)
     mask[0, 4:, 4:] = True
-    with pytest.warns(lnocl.LnoclWarning, match="1 psf pixels are negative"):
+    with pytest.warns(lnocl.LnoclWarning, match="1 psf pixel is negative"):
         observation = lnocl.Observation(
             np.ones((2, 32, 32)), psf, mask=mask, exposure=[1000.0, 1.0]
         )
