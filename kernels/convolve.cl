@@ -10,8 +10,7 @@
 #define MIRROR(t) ((t) < 2 ? (t) : (t) ^ (HIGH_BIT(t) - 1))
 
 /* a plus what column 0 gets from its opposite point: (re + i im) conj(p(MIRROR(t))). */
-INLINE cvec add_edge(
-    const cvec a, const real re, const real im, SCRATCH const vec *p, const int t)
+INLINE cvec add_edge(const cvec a, const real re, const real im, SCRATCH const vec *p, const int t)
 {
     SCRATCH const real *opposite = (SCRATCH const real *)p + 2 * MIRROR(t) * BLOCK;
     const real x = opposite[0], y = opposite[BLOCK];

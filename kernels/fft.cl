@@ -99,8 +99,7 @@ INLINE void twiddle_inverse(cvec *a, const int radix, __global const real *roots
 }
 
 /* The roots of the pass over subtransforms of `length` points; `roots` is the table for n. */
-INLINE __global const real *roots_of(
-    __global const real *roots, const int n, const int length)
+INLINE __global const real *roots_of(__global const real *roots, const int n, const int length)
 {
     if (length < n)
         roots += 2 * INNER(n) * (OUTER(n) - 1);
@@ -111,8 +110,7 @@ INLINE __global const real *roots_of(
 }
 
 /* A pass of radix 8 over `total` points in subtransforms of `length`. */
-INLINE void dif_pass(
-    SCRATCH vec *x, const int total, const int length, __global const real *roots)
+INLINE void dif_pass(SCRATCH vec *x, const int total, const int length, __global const real *roots)
 {
     const int eighth = length / 8;
     FOR_EACH(piece, total / 8 * SIDE) {
@@ -131,8 +129,7 @@ INLINE void dif_pass(
     BARRIER;
 }
 
-INLINE void dit_pass(
-    SCRATCH vec *x, const int total, const int length, __global const real *roots)
+INLINE void dit_pass(SCRATCH vec *x, const int total, const int length, __global const real *roots)
 {
     const int eighth = length / 8;
     FOR_EACH(piece, total / 8 * SIDE) {

@@ -50,8 +50,8 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define SIDE (BLOCK / LANES)
 #define ROW_BLOCKS (NY / 2 / BLOCK)
 #define COLUMN_BLOCKS (NX / 2 / BLOCK)
-#define PIXELS_SIZE (NX * NY / LANES)                       /* vectors */
-#define SPECTRA_SIZE (COLUMN_BLOCKS * ROWS * 2 * SIDE)      /* vectors */
+#define PIXELS_SIZE (NX * NY / LANES)                  /* vectors */
+#define SPECTRA_SIZE (COLUMN_BLOCKS * ROWS * 2 * SIDE) /* vectors */
 
 /* Without it PoCL leaves calls behind, and registers go through memory. */
 #define INLINE static inline __attribute__((always_inline))
@@ -91,9 +91,9 @@ typedef PASTE(BITS, WIDTH) ivec;
  * PoCL 3 miscompiles loops round barriers whose bounds differ between the items.
  */
 #if GROUP > 1
-#define FOR_EACH(piece, n)                                                    \
-    for (int round_ = 0, piece = ITEM; round_ < ((n) + GROUP - 1) / GROUP;    \
-         ++round_, piece += GROUP)                                            \
+#define FOR_EACH(piece, n)                                                 \
+    for (int round_ = 0, piece = ITEM; round_ < ((n) + GROUP - 1) / GROUP; \
+        ++round_, piece += GROUP)                                          \
         if (piece < (n))
 #else
 #define FOR_EACH(piece, n) for (int piece = 0; piece < (n); ++piece)

@@ -97,8 +97,7 @@ KERNEL void ratio_rows(
     __global const real *restrict background, __global const vec *restrict exposure,
     __global const vec *restrict star_images, __global const int *restrict first_blocks,
     __global const real *restrict star_fluxes, const int n_images, const int n_stars,
-    const int star_blocks,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const int star_blocks, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);

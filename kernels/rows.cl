@@ -142,9 +142,10 @@ INLINE void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int b
             vec a[LANES];
             UNROLL
             for (int i = 0; i < LANES; ++i) {
-                const int k = 2 * position(h, i, bit) * SIDE, minus_k = 2 * opposite(h, i, bit) * SIDE;
+                const int k = 2 * position(h, i, bit) * SIDE;
+                const int minus_k = 2 * opposite(h, i, bit) * SIDE;
                 a[i] = from_first[first < 2 ? k : minus_k]
-                     + WRITE_SIGN[part] * from_second[second < 2 ? k : minus_k];
+                    + WRITE_SIGN[part] * from_second[second < 2 ? k : minus_k];
             }
             transpose(a);
             UNROLL

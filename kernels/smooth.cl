@@ -44,7 +44,10 @@ INLINE __global const real *row_of(
 INLINE vec lanes_above(
     __global const real *pixels, const int block, const int x, const int odd, const int first)
 {
-    union { vec v; real lanes[LANES]; } above;
+    union {
+        vec v;
+        real lanes[LANES];
+    } above;
     above.v = LOAD_UNALIGNED(row_of(pixels, block, x, odd) + first - 1);
     if (first == 0)
         above.lanes[0] = row_of(pixels, (block + ROW_BLOCKS - 1) % ROW_BLOCKS, x, odd)[BLOCK - 1];
@@ -55,7 +58,10 @@ INLINE vec lanes_above(
 INLINE vec lanes_below(
     __global const real *pixels, const int block, const int x, const int odd, const int first)
 {
-    union { vec v; real lanes[LANES]; } below;
+    union {
+        vec v;
+        real lanes[LANES];
+    } below;
     below.v = LOAD_UNALIGNED(row_of(pixels, block, x, odd) + first + 1);
     if (first == BLOCK - LANES)
         below.lanes[LANES - 1] = row_of(pixels, (block + 1) % ROW_BLOCKS, x, odd)[0];
@@ -112,9 +118,9 @@ KERNEL void smooth(
             const cvec scaled_curvature = {smoothing * c.re, smoothing * c.im};
             STORE(slope + at + lane, x, scaled_slope);
             STORE(curvature + at + lane, x, scaled_curvature);
-            ACCUMULATE(
-                total, smoothing * (psi(f.re - right.re, edge) + psi(f.im - right.im, edge)
-                               + psi(f.re - f.im, edge) + psi(f.im - below, edge)));
+            const vec across = psi(f.re - right.re, edge) + psi(f.im - right.im, edge);
+            const vec down = psi(f.re - f.im, edge) + psi(f.im - below, edge);
+            ACCUMULATE(total, smoothing * (across + down));
         }
         store_pair(smooth_sums + 2 * block, sum_group(sum_lanes(total), shared));
     }

@@ -52,9 +52,9 @@ KERNEL void gradient_rows(
     __global const vec *restrict spectra, __global real *restrict change_sums,
     __global vec *restrict gradient, __global const vec *restrict extended,
     __global const vec *restrict previous, __global const vec *restrict shift,
-    __global const real *restrict inverse_weight,
-    __global const vec *restrict slope, __global const vec *restrict curvature, const real mu,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global const real *restrict inverse_weight, __global const vec *restrict slope,
+    __global const vec *restrict curvature, const real mu, __global const real *restrict row_roots,
+    SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
@@ -108,12 +108,11 @@ KERNEL void gradient_rows(
 KERNEL void step_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
     __global real *restrict step_sums, __global real *restrict coupling_sums,
-    __global real *restrict square_sums,
-    __global const vec *restrict previous, __global const vec *restrict gradient,
-    __global const vec *restrict shift, __global const real *restrict inverse_weight,
-    __global const vec *restrict curvature, __global const vec *restrict cross_information,
-    __global const int *restrict cross_first_blocks, const real mu, const real alpha,
-    const real share, const int n_stars, const int cross_blocks,
+    __global real *restrict square_sums, __global const vec *restrict previous,
+    __global const vec *restrict gradient, __global const vec *restrict shift,
+    __global const real *restrict inverse_weight, __global const vec *restrict curvature,
+    __global const vec *restrict cross_information, __global const int *restrict cross_first_blocks,
+    const real mu, const real alpha, const real share, const int n_stars, const int cross_blocks,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
@@ -142,8 +141,7 @@ KERNEL void step_rows(
             STORE(extended + at + lane, pixel, trial);
             ACCUMULATE(slope_total, g.re * d.re + g.im * d.im);
             for (int s = 0; s < near.count; ++s) {
-                const cvec r =
-                    LOAD(WINDOW_BLOCK(cross_information, near.block[s]) + lane, pixel);
+                const cvec r = LOAD(WINDOW_BLOCK(cross_information, near.block[s]) + lane, pixel);
                 ACCUMULATE(couplings[s], r.re * d.re + r.im * d.im);
             }
 #if HAS_MU

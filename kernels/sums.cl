@@ -19,15 +19,18 @@ typedef struct {
         (total).lost += (old_ - ((total).sum - part_)) + (value_ - part_);  \
     } while (0)
 
-#define MERGE(total, other)                 \
-    do {                                    \
-        ACCUMULATE((total), (other).sum);   \
-        (total).lost += (other).lost;       \
+#define MERGE(total, other)               \
+    do {                                  \
+        ACCUMULATE((total), (other).sum); \
+        (total).lost += (other).lost;     \
     } while (0)
 
 INLINE real_sum sum_lanes(const vec_sum total)
 {
-    union { vec v; real lanes[LANES]; } sum = {total.sum}, lost = {total.lost};
+    union {
+        vec v;
+        real lanes[LANES];
+    } sum = {total.sum}, lost = {total.lost};
     real_sum all = {0, 0};
     UNROLL
     for (int l = 0; l < LANES; ++l) {

@@ -1,18 +1,21 @@
 """Compiled programs in files, one checked file a program, so that a later process need not compile.
 
 PoCL has a folder of its own for that, which processes share without a lock, and a file there that
-was cut short kills the process that loads it. So PoCL is given a private folder, and the binary of
-a program is written to one file, in place at once, behind its checksum.
+was cut short kills the process that loads it. So PoCL is given a private folder. Its files of a
+program, or the binary of another runtime, are written to one file, in place at once, behind their
+checksum.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import os
 import shutil
 import tempfile
 import weakref
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -74,17 +77,55 @@ def _environment(name: str, path: Path) -> Iterator[None]:
             os.environ[name] = given
 
 
+def folders() -> set[str]:
+    """Return the folders that PoCL has made for programs in its private folder, one for each."""
+    own = _own[0].path
+    return {str(path.relative_to(own)) for path in own.glob("*/*") if path.is_dir()}
+
+
+def pack(names: set[str]) -> bytes:
+    """Return the files in some of these folders as the content of an archive."""
+    own, content = _own[0].path, io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for file in sorted(file for name in names for file in (own / name).rglob("*")):
+            if file.is_file():
+                archive.writestr(zipfile.ZipInfo(str(file.relative_to(own))), file.read_bytes())
+    return content.getvalue()
+
+
+def unpack(content: bytes | None) -> set[str]:
+    """Put the files of an archive where PoCL looks for them; return their folders.
+
+    A folder that is there already is left alone, as its files may be loaded. Where the disk is
+    full no part of any folder stays.
+    """
+    if not content:
+        return set()
+    own = _own[0].path
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        names = {str(Path(*Path(name).parts[:2])) for name in archive.namelist()}
+        new = {name for name in names if not (own / name).exists()}
+        try:
+            for name in archive.namelist():
+                if str(Path(*Path(name).parts[:2])) in new:
+                    archive.extract(name, own)
+        except OSError:
+            for name in new:
+                shutil.rmtree(own / name, ignore_errors=True)
+    return names
+
+
 def file_of(name: str) -> Path:
-    """Return the file of the program with this name, all that its binary depends on."""
+    """Return the file of the program with this name, all that its kernels depend on."""
     folder = os.environ.get(VARIABLE)
     if not folder:
         folder = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
         folder = os.path.join(folder, "lnocl")
-    return Path(folder) / f"{DIGEST(name.encode()).hexdigest()}.bin"
+    return Path(folder) / f"{DIGEST(name.encode()).hexdigest()}.kernels"
 
 
 def read(file: Path) -> bytes | None:
-    """Return the binary in a file, or None where there is no file that can be read.
+    """Return the content of a file, or None where there is no file that can be read.
 
     Warns
     -----
@@ -95,27 +136,27 @@ def read(file: Path) -> bytes | None:
         content = file.read_bytes()
     except OSError:
         return None
-    digest, binary = content[:DIGEST_SIZE], content[DIGEST_SIZE:]
-    if DIGEST(binary).digest() == digest:
-        return binary
+    digest, content = content[:DIGEST_SIZE], content[DIGEST_SIZE:]
+    if DIGEST(content).digest() == digest:
+        return content
     discard(file)
     return None
 
 
 def discard(file: Path) -> None:
-    """Remove a file whose binary cannot be used, and say so."""
+    """Remove a file whose content cannot be used, and say so."""
     warn(f"the compiled kernels in {file} are damaged, and are compiled anew")
     with contextlib.suppress(OSError):
         file.unlink()
 
 
-def write(file: Path, binary: bytes) -> None:
-    """Write a binary to its file, whole or not at all; a full disk leaves the file as it was."""
+def write(file: Path, content: bytes) -> None:
+    """Write content to its file, whole or not at all; a full disk leaves the file as it was."""
     with contextlib.suppress(OSError):
         handle, part = tempfile.mkstemp(dir=file.parent, prefix=file.stem, suffix=".part")
         try:
             with os.fdopen(handle, "wb") as out:
-                out.write(DIGEST(binary).digest() + binary)
+                out.write(DIGEST(content).digest() + content)
             os.replace(part, file)
         except BaseException:
             os.unlink(part)

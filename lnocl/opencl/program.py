@@ -40,6 +40,8 @@ SOURCES = (
 # Rooms for stars that programs are built with: another star builds another program seldom.
 STAR_ROOMS = (8, 64, 512, 4096)
 
+POCL = "Portable Computing Language"
+
 # Built programs that a process holds, the last used; each takes some 3 MiB.
 MAX_PROGRAMS = 16
 
@@ -260,26 +262,53 @@ def _arguments(text: str, kernel_names: list[str]) -> Mapping[str, tuple[str, ..
 
 
 class _Built:
-    """A built program, and the file of its binary."""
+    """A built program, and the file that later processes have it from."""
 
-    def __init__(self, program: cl.Program, file: Path, binary: bytes) -> None:
-        self.program, self._file, self._binary = program, file, binary
-        self._process = os.getpid()
+    def __init__(
+        self, context: cl.Context, text: str, options: tuple[str, ...], file: Path
+    ) -> None:
+        self._file, self._process = file, os.getpid()
+        self._content = kernel_cache.read(file)
+        self._is_pocl = context.devices[0].platform.name == POCL
+        if self._is_pocl:
+            self._folders = kernel_cache.unpack(self._content)
+            before = kernel_cache.folders()
+            self.program = _compile(context, text, options)
+            self._folders |= kernel_cache.folders() - before
+        else:
+            self.program = self._load(context, options) or _compile(context, text, options)
         # Not by all_kernels: its kernels are retained once too often, and stay with their program.
-        self.kernel_names = str(program.get_info(cl.program_info.KERNEL_NAMES)).split(";")
+        self.kernel_names = str(self.program.get_info(cl.program_info.KERNEL_NAMES)).split(";")
         self.used: set[str] = set()
         self._looked_at: set[str] = set()
 
+    def _load(self, context: cl.Context, options: tuple[str, ...]) -> cl.Program | None:
+        if not self._content:
+            return None
+        try:
+            program = cl.Program(context, context.devices, [self._content])
+            return _quietly_built(program, options)
+        except cl.Error:
+            kernel_cache.discard(self._file)
+            return None
+
     def store(self) -> None:
-        """Store the binary, if it has more: PoCL compiles each kernel as it is first launched."""
+        """Store the program, if there is more of it than before.
+
+        PoCL compiles each kernel as it is first launched. Its binaries are not asked for: it would
+        compile all kernels once more, for groups of any size.
+        """
         if self.used <= self._looked_at or os.getpid() != self._process:
             return
         with LOCK:
             self._looked_at |= self.used
-            (binary,) = cast(list[bytes], self.program.get_info(cl.program_info.BINARIES))
-            if binary != self._binary and kernel_cache.can_write(self._file.parent):
-                kernel_cache.write(self._file, binary)
-                self._binary = binary
+            if self._is_pocl:
+                content = kernel_cache.pack(self._folders)
+            else:
+                (content,) = cast(list[bytes], self.program.get_info(cl.program_info.BINARIES))
+            if content != self._content and kernel_cache.can_write(self._file.parent):
+                kernel_cache.write(self._file, content)
+                self._content = content
 
 
 _programs: OrderedDict[tuple[cl.Context, str, tuple[str, ...]], _Built] = OrderedDict()
@@ -291,8 +320,7 @@ def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
     with LOCK:
         if key not in _programs:
             name = "\n".join([describe(context.devices[0]), *options, text])
-            file = kernel_cache.file_of(name)
-            _programs[key] = _load(context, options, file) or _compile(context, text, options, file)
+            _programs[key] = _Built(context, text, options, kernel_cache.file_of(name))
             while len(_programs) > MAX_PROGRAMS:
                 _programs.popitem(last=False)
         _programs.move_to_end(key)
@@ -305,21 +333,9 @@ def forget_programs() -> None:
         _programs.clear()
 
 
-def _load(context: cl.Context, options: tuple[str, ...], file: Path) -> _Built | None:
-    binary = kernel_cache.read(file)
-    if binary is None:
-        return None
+def _compile(context: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
     try:
-        program = cl.Program(context, context.devices, [binary])
-        return _Built(_quietly_built(program, options), file, binary)
-    except cl.Error:
-        kernel_cache.discard(file)
-        return None
-
-
-def _compile(context: cl.Context, text: str, options: tuple[str, ...], file: Path) -> _Built:
-    try:
-        return _Built(_quietly_built(cl.Program(context, text), options), file, b"")
+        return _quietly_built(cl.Program(context, text), options)
     except cl.RuntimeError as error:
         raise build_failure(describe(context.devices[0]), error) from error
 

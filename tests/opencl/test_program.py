@@ -57,13 +57,14 @@ def compiled(monkeypatch):
     """The options of the programs that are compiled, which takes no time."""
     options = []
 
-    def compile_nothing(context, text, given, file):
-        options.append(given)
-        return SimpleNamespace(kernel_names=["rfft_rows"], used=set(), store=lambda: None)
+    class Nothing(program._Built):
+        kernel_names = ("rfft_rows",)
+
+        def __init__(self, context, text, given, file):
+            options.append(given)
 
     monkeypatch.setattr(program, "_programs", type(program._programs)())
-    monkeypatch.setattr(program, "_load", lambda *_: None)
-    monkeypatch.setattr(program, "_compile", compile_nothing)
+    monkeypatch.setattr(program, "_Built", Nothing)
     monkeypatch.setattr(program.weakref, "finalize", lambda *_: None)
     return options
 
