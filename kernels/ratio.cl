@@ -109,14 +109,14 @@ KERNEL void ratio_rows(
         dit_inner(z, NX, row_roots);
         const near_stars near =
             stars_near(first_blocks, n_stars, n_images, star_blocks, image, block);
-        vec_sum objective = {0, 0}, products[MAX_STARS];
+        vec_sum objective = {0, 0}, products[NEAR_ROOM];
         for (int s = 0; s < near.count; ++s)
             products[s] = (vec_sum){0, 0};
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[8];
             load_inverse(a, z + lane, x, NX, row_roots);
-            vec terms = 0, part[MAX_STARS];
+            vec terms = 0, part[NEAR_ROOM];
             for (int s = 0; s < near.count; ++s)
                 part[s] = 0;
             /* Left rolled: unrolled, the pixelwise work runs out of registers and is slower. */

@@ -5,14 +5,14 @@ INLINE vec not_below_0(const vec x)
     return x < 0 ? (vec)0 : x;
 }
 
-/* a = 1 / sum_j A_j^T w_j of a point: `from` is where its block and lane begin. */
+/* a = 1 / sum_j A_j^T w_j of a point. */
 INLINE cvec inverse_weight_at(
-    __global const real *inverse_weight, const size_t from, const int pixel)
+    __global const vec *inverse_weight, const int pixel, const int n_images)
 {
 #if HAS_WEIGHTS
-    return LOAD((__global const vec *)inverse_weight + from, pixel);
+    return LOAD(inverse_weight, pixel);
 #else
-    return (cvec){inverse_weight[0], inverse_weight[0]};
+    return (cvec){(real)1 / n_images, (real)1 / n_images};
 #endif
 }
 
@@ -21,7 +21,7 @@ INLINE cvec inverse_weight_at(
  * spectra <- row spectrum of the new f; square_sums: sum f^2; c_s <- c_s star_corrections_s.
  * spectra: one array, in: row spectrum of c, out: twice the row spectrum of f.
  * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; else
- * [1]). slope, curvature: one array of pixels each, const, those of f
+ * a = 1 / n_images). slope, curvature: one array of pixels each, const, those of f
  * (HAS_SMOOTHING; else they count as 0). square_sums: [ROW_BLOCKS][2] (HAS_MU).
  * star_fluxes, star_corrections: [n_stars].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.scale_rows.
@@ -29,9 +29,10 @@ INLINE cvec inverse_weight_at(
 KERNEL void scale_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
     __global real *restrict square_sums, __global real *restrict star_fluxes,
-    __global const real *restrict inverse_weight, __global const real *restrict star_corrections,
+    __global const vec *restrict inverse_weight, __global const real *restrict star_corrections,
     __global const vec *restrict slope, __global const vec *restrict curvature, const real mu,
-    const int n_stars, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const int n_images, const int n_stars, __global const real *restrict row_roots,
+    SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
@@ -50,7 +51,7 @@ KERNEL void scale_rows(
             for (int q = 0; q < OUTER(NX); ++q) {
                 const int pixel = q * INNER(NX) + x;
                 const cvec f = LOAD(source + lane, pixel);
-                const cvec weight = inverse_weight_at(inverse_weight, at + lane, pixel);
+                const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel, n_images);
                 const cvec curved = smoothing_at(curvature + at + lane, pixel);
 #if HAS_SMOOTHING
                 const cvec down = smoothing_at(slope + at + lane, pixel);

@@ -8,10 +8,11 @@
 /* The stars whose windows hold a block of row pairs: their numbers, and which block of all windows
  * that is.
  */
+#define NEAR_ROOM (MAX_STARS > 0 ? MAX_STARS : 1)
 typedef struct {
     int count;
-    int star[MAX_STARS];
-    int block[MAX_STARS];
+    int star[NEAR_ROOM];
+    int block[NEAR_ROOM];
 } near_stars;
 
 INLINE near_stars stars_near(
@@ -20,7 +21,8 @@ INLINE near_stars stars_near(
 {
     near_stars near;
     near.count = 0;
-    for (int s = 0; s < n_stars; ++s) {
+    /* The second bound lets compilers know that none or one star is all there is. */
+    for (int s = 0; s < n_stars && s < MAX_STARS; ++s) {
         const int k = (block - first_blocks[s]) & (ROW_BLOCKS - 1);
         if (k < n_blocks) {
             near.star[near.count] = s;

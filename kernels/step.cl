@@ -15,11 +15,12 @@ INLINE vec shifted_scaling(
  * Made twice, from what it is made of: to write it and read it back is slower.
  */
 INLINE cvec scaling_at(
-    const cvec f, __global const vec *shift, __global const real *inverse_weight,
-    __global const vec *curvature, const size_t from, const int pixel, const real mu)
+    const cvec f, __global const vec *shift, __global const vec *inverse_weight,
+    __global const vec *curvature, const size_t from, const int pixel, const real mu,
+    const int n_images)
 {
     const cvec z = LOAD(shift + from, pixel);
-    const cvec weight = inverse_weight_at(inverse_weight, from, pixel);
+    const cvec weight = inverse_weight_at(inverse_weight + from, pixel, n_images);
     const cvec curved = smoothing_at(curvature + from, pixel);
     return (cvec){
         shifted_scaling(f.re, z.re, weight.re, curved.re, mu),
@@ -44,17 +45,17 @@ INLINE vec next_gradient(const vec correction, const vec f, const vec slope, con
  * D = (f + shift) a / (1 + (mu + curvature) (f + shift) a), a = 1 / sum_j A_j^T w_j.
  * spectra: one array, const, row spectrum of c. gradient: one array of pixels, updated. extended
  * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (HAS_WEIGHTS; else
- * [1]). slope, curvature: one array of pixels each, const, those of f (HAS_SMOOTHING; else they
- * count as 0). change_sums: [ROW_BLOCKS][2][2].
+ * a = 1 / n_images). slope, curvature: one array of pixels each, const, those of f (HAS_SMOOTHING;
+ * else they count as 0). change_sums: [ROW_BLOCKS][2][2].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.gradient_rows.
  */
 KERNEL void gradient_rows(
     __global const vec *restrict spectra, __global real *restrict change_sums,
     __global vec *restrict gradient, __global const vec *restrict extended,
     __global const vec *restrict previous, __global const vec *restrict shift,
-    __global const real *restrict inverse_weight, __global const vec *restrict slope,
-    __global const vec *restrict curvature, const real mu, __global const real *restrict row_roots,
-    SCRATCH vec *restrict scratch)
+    __global const vec *restrict inverse_weight, __global const vec *restrict slope,
+    __global const vec *restrict curvature, const real mu, const int n_images,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
@@ -76,7 +77,7 @@ KERNEL void gradient_rows(
                 const cvec g = LOAD(gradient + at + lane, pixel);
                 const cvec down = smoothing_at(slope + at + lane, pixel);
                 const cvec d =
-                    scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu);
+                    scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu, n_images);
                 const cvec next = {
                     next_gradient(a[q].re, f.re, down.re, mu),
                     next_gradient(a[q].im, f.im, down.im, mu)
@@ -110,17 +111,17 @@ KERNEL void step_rows(
     __global real *restrict step_sums, __global real *restrict coupling_sums,
     __global real *restrict square_sums, __global const vec *restrict previous,
     __global const vec *restrict gradient, __global const vec *restrict shift,
-    __global const real *restrict inverse_weight, __global const vec *restrict curvature,
+    __global const vec *restrict inverse_weight, __global const vec *restrict curvature,
     __global const vec *restrict cross_information, __global const int *restrict cross_first_blocks,
-    const real mu, const real alpha, const real share, const int n_stars, const int cross_blocks,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const real mu, const real alpha, const real share, const int n_images, const int n_stars,
+    const int cross_blocks, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
     FOR_EACH_BLOCK(block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         const near_stars near = stars_near(cross_first_blocks, n_stars, 1, cross_blocks, 0, block);
-        vec_sum slope_total = {0, 0}, square_total = {0, 0}, couplings[MAX_STARS];
+        vec_sum slope_total = {0, 0}, square_total = {0, 0}, couplings[NEAR_ROOM];
         for (int s = 0; s < near.count; ++s)
             couplings[s] = (vec_sum){0, 0};
         /* A pass of its own over the pixels in their order, which prefetching follows: inside the
@@ -131,7 +132,7 @@ KERNEL void step_rows(
             const cvec f = LOAD(previous + at + lane, pixel);
             const cvec g = LOAD(gradient + at + lane, pixel);
             const cvec scale =
-                scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu);
+                scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu, n_images);
             const cvec d = {
                 not_below_0(f.re - alpha * scale.re * g.re) - f.re,
                 not_below_0(f.im - alpha * scale.im * g.im) - f.im

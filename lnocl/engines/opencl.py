@@ -212,9 +212,7 @@ class OpenCLEngine:
         self._make_otfs()
         memory.upload_integers("first_blocks", self._stars.first_blocks)
         self.move_stars()
-        if scene.weights is None:
-            memory.upload("inverse_weight", np.array([1.0 / scene.n_images]))
-        else:
+        if scene.weights is not None:
             self._invert_weights(scene.weights)
 
     def set_scaling(self, scaling: Scaling) -> None:

@@ -37,8 +37,9 @@ SOURCES = (
     "step.cl",
 )
 
-# Rooms for stars that programs are built with: another star builds another program seldom.
-STAR_ROOMS = (8, 64, 512, 4096)
+# Rooms for stars that programs are built with. More stars seldom build another program; where there
+# are none, or one, the loops over stars cost nothing.
+STAR_ROOMS = (0, 1, 8, 64, 512, 4096)
 
 POCL = "Portable Computing Language"
 

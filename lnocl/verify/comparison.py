@@ -345,10 +345,9 @@ def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 
 def _put_weights(harness: KernelHarness, given: SimpleNamespace) -> dict[str, cl.Buffer]:
     """Return the inverse weight, and slope and curvature where the scene is smoothed."""
-    if given.weights is None:
-        buffers = {"inverse_weight": harness.put([given.inverse_weight])}
-    else:
-        buffers = {"inverse_weight": harness.put_pixels(given.inverse_weight)}
+    buffers = {}
+    if given.weights is not None:
+        buffers["inverse_weight"] = harness.put_pixels(given.inverse_weight)
     if given.smoothing:
         buffers["slope"] = harness.put_pixels(given.slope)
         buffers["curvature"] = harness.put_pixels(given.curvature)
