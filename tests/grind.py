@@ -166,7 +166,9 @@ def tune_as_on_gpu():
 
     def tuned(device, dtype, grid):
         gpu = SimpleNamespace(
-            type=cl.device_type.GPU, max_work_group_size=device.max_work_group_size
+            type=cl.device_type.GPU,
+            max_work_group_size=device.max_work_group_size,
+            local_mem_size=device.local_mem_size,
         )
         return tune(gpu, dtype, grid)
 

@@ -14,6 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import grind
@@ -59,15 +60,16 @@ def run(case, dtype, *planted):
     command = ["oclgrind", *OPTIONS, *grind.DEVICE_OPTIONS.get(case, [])]
     command += ["--build-options", BUILD_OPTIONS, sys.executable, str(HERE / "grind.py")]
     # Stored programs were built with other options.
-    environment = {**os.environ, "POCL_CACHE_DIR": os.devnull}
-    environment.pop("PYOPENCL_CTX", None)
-    done = subprocess.run(
-        [*command, case, dtype, *planted],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
+    with tempfile.TemporaryDirectory() as store:
+        environment = {**os.environ, "POCL_CACHE_DIR": store}
+        environment.pop("PYOPENCL_CTX", None)
+        done = subprocess.run(
+            [*command, case, dtype, *planted],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=600,
+        )
     trouble = REPORT.sub("", done.stderr).strip()
     if done.returncode:
         trouble += f"\nexit status {done.returncode}"
