@@ -11,7 +11,7 @@ import pyopencl as cl
 
 from lnocl.errors import DeviceError, InputError
 from lnocl.opencl import kernel_cache
-from lnocl.opencl.faults import claim_process
+from lnocl.opencl.faults import after_fault, claim_process
 
 T = TypeVar("T")
 
@@ -78,6 +78,9 @@ def describe(device: cl.Device) -> str:
 def context_of(device: cl.Device) -> cl.Context:
     """Return the context of a device, one for the whole process."""
     return cl.Context([device])
+
+
+after_fault(context_of.cache_clear)  # a context may be lost with its device
 
 
 def spec_of(device: cl.Device) -> str:

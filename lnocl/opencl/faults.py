@@ -75,18 +75,20 @@ def _guard(verb: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return verb(self, *arguments, **keywords)
         except (cl.Error, MemoryError) as error:
-            _forget_contexts()
+            for action in _actions:
+                action()
             raise DeviceError(_explain(error, self)) from error
 
     return guard
 
 
-def _forget_contexts() -> None:
-    """Have later engines begin anew: the context of a device that failed may be lost."""
-    from lnocl.opencl import device, program  # which import this module
+_actions: list[Callable[[], None]] = []
 
-    program.forget_programs()
-    device.context_of.cache_clear()
+
+def after_fault(action: Callable[[], None]) -> Callable[[], None]:
+    """Have an action done after every fault, so that later engines start with a new context."""
+    _actions.append(action)
+    return action
 
 
 def _explain(error: Exception, engine: OnDevice) -> str:

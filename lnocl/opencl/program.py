@@ -18,7 +18,7 @@ import pyopencl as cl
 from lnocl.errors import DeviceError
 from lnocl.opencl import kernel_cache
 from lnocl.opencl.device import describe, has_double
-from lnocl.opencl.faults import build_failure
+from lnocl.opencl.faults import after_fault, build_failure
 from lnocl.process import LOCK, ignored_warnings
 
 # In the order in which they build on each other.
@@ -328,6 +328,7 @@ def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
         return _programs[key]
 
 
+@after_fault
 def forget_programs() -> None:
     """Let all programs go, as after a fault of a device, whose context may be lost."""
     with LOCK:

@@ -115,7 +115,12 @@ def test_a_device_lost_while_the_host_waits(monkeypatch):
         cl.RuntimeError, "EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST", "clWaitForEvents"
     )
     monkeypatch.setattr(cl.Event, "wait", fail_with(error)(cl.Event.wait))
+    lost = device.context_of(device.choose().device)
     assert "clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST" in refused()
+    monkeypatch.undo()
+    assert device.context_of(device.choose().device) is not lost
+    assert not program._programs
+    lnocl.deconvolve(observe(), n_iter=1)
 
 
 def test_every_public_verb_of_the_engine_is_guarded():
