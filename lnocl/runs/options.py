@@ -112,7 +112,7 @@ def check_start(
     """
     if initial_extended is not None and not numbers("initial_extended", initial_extended).any():
         raise InputError(
-            "initial_extended is 0 everywhere, which no iteration may leave; give it values above "
+            "initial_extended is 0 everywhere, which no iteration can leave; give it values above "
             "0, or leave it out"
         )
     if initial_star_fluxes is not None and not fits_stars:
