@@ -68,7 +68,7 @@ class Option:
         return dataclasses.replace(self, keywords={**self.keywords, **keywords})
 
     def words(self, value: Any) -> list[str]:
-        """Return the words of a command line that give it a value; for None there are none."""
+        """Return the words of a command line that give it a value; None gives no words."""
         flag = [] if self.is_positional else [self.flags[0]]
         action = self.keywords.get("action")
         if action in SWITCHES:
