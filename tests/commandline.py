@@ -1,9 +1,9 @@
 """Runs of the command line in a folder of files for it."""
 
 import os
+import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +17,17 @@ NUMPY = ("--engine", "numpy")
 
 
 @pytest.fixture
-def command_folder(tmp_path, monkeypatch):
-    """Work in a folder with two images, their PSFs, and files that are no use."""
+def command_folder(command_files, tmp_path, monkeypatch):
+    """Work in a folder of copies of the files, which a test may change."""
+    shutil.copytree(command_files, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="session")
+def command_files(tmp_path_factory):
+    """Return a folder with two images, their PSFs, and files that are no use."""
+    folder = tmp_path_factory.mktemp("command_files")
     chance = np.random.default_rng(1)
     images = chance.poisson(20.0, (2, *SHAPE)).astype(float)
     images[:, 5, 7] += 400.0
@@ -44,12 +52,13 @@ def command_folder(tmp_path, monkeypatch):
     }
     header = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 15.25})
     for name, array in arrays.items():
-        fits.writeto(f"{name}.fits", array, header)
-    Path("text.fits").write_text("no FITS at all\n" * 400)
-    Path("cut.fits").write_bytes(Path("a.fits").read_bytes()[:3000])
-    fits.BinTableHDU.from_columns([fits.Column("a", "D", array=[1.0])]).writeto("table.fits")
-    Path("there.fits").write_bytes(b"old")
-    return tmp_path
+        fits.writeto(folder / f"{name}.fits", array, header)
+    (folder / "text.fits").write_text("no FITS at all\n" * 400)
+    (folder / "cut.fits").write_bytes((folder / "a.fits").read_bytes()[:3000])
+    table = fits.BinTableHDU.from_columns([fits.Column("a", "D", array=[1.0])])
+    table.writeto(folder / "table.fits")
+    (folder / "there.fits").write_bytes(b"old")
+    return folder
 
 
 def run(*arguments, image="a.fits", psf="k1.fits", engine=NUMPY, output="out.fits"):

@@ -1,4 +1,4 @@
-"""One store of compiled kernels for all test processes and later runs.
+"""One store of compiled kernels for all test processes and later runs, and one thread for BLAS.
 
 LNOCL_TEST_LOCAL_MEMORY, in bytes, overrides the size of local memory that devices report.
 """
@@ -6,14 +6,28 @@ LNOCL_TEST_LOCAL_MEMORY, in bytes, overrides the size of local memory that devic
 import os
 from pathlib import Path
 
+import pytest
+
 os.environ.setdefault(
     "POCL_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "kernels")
 )
+
+# Before NumPy is imported: the test processes are as many as the processors.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 if size := os.environ.get("LNOCL_TEST_LOCAL_MEMORY"):
     import pyopencl as cl
 
     cl.Device.local_mem_size = property(lambda device: int(size))
 
+
+@pytest.fixture(scope="module")
+def few_screens():
+    """Average PSFs over few phase screens, in tests of all else."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lnocl.simulation.fizeau.N_SCREENS", 5)
+        yield
+
+
 # Fixtures that several folders of tests share.
-pytest_plugins = ["commandline", "frame_files", "sound_files"]
+pytest_plugins = ["commandline", "frame_files", "program_count", "sound_files"]

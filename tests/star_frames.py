@@ -1,5 +1,6 @@
 """Frames of stars whose PSFs are known, and PSFs made from them without warnings."""
 
+import functools
 import math
 import warnings
 
@@ -13,9 +14,12 @@ from lnocl.psf.make import make_psf
 from lnocl.simulation import fizeau_psf
 
 
+@functools.cache
 def fizeau(angle=0.0, n=256, scale=9.0, strehl=1.0):
     """Return a Fizeau PSF; fringes are 30.4 / scale pixels apart."""
-    return fizeau_psf((n, n), angle * u.deg, 2.12 * u.um, scale * u.mas, strehl)
+    psf = fizeau_psf((n, n), angle * u.deg, 2.12 * u.um, scale * u.mas, strehl)
+    psf.flags.writeable = False
+    return psf
 
 
 def shifted(image, x, y):

@@ -211,7 +211,7 @@ class Program:
         self._built = _build(context, text, tuple(self.options))
         self.arguments = _arguments(text, self._built.kernel_names)
         self._kernels: dict[str, cl.Kernel] = {}
-        weakref.finalize(self, _Built.store, self._built)
+        weakref.finalize(self, self._built.store)
 
     def kernel(self, name: str) -> cl.Kernel:
         """Return a kernel, always the same one."""

@@ -132,7 +132,12 @@ class TestDeconvolve:
         assert fits.getdata("there.fits").shape == SHAPE
 
     @pytest.mark.parametrize(
-        "name", ["a 'b' \"c\" &\nd.fits", "naïve☃.fits", "\udcff.fits", "-x.fits"]
+        "name",
+        [
+            "-a 'b' \"c\" &\nd.fits",
+            pytest.param("naïve☃.fits", marks=pytest.mark.exhaustive),
+            pytest.param("\udcff.fits", marks=pytest.mark.exhaustive),
+        ],
     )
     def test_names_of_any_kind_are_read_written_and_repeated(self, name, capsys):
         Path(name).write_bytes(Path("a.fits").read_bytes())
@@ -147,11 +152,11 @@ class TestDeconvolve:
         np.testing.assert_array_equal(fits.getdata(f"out-{name}"), first)
 
     def test_on_the_device_that_is_recorded(self, capsys):
-        assert run(engine=("--precision", "double"), output="cl.fits") == 0
+        assert run(engine=(), output="cl.fits") == 0
         assert run(output="np.fits") == 0
         chosen = device.choose(None).device
         header = fits.getheader("cl.fits")
         assert header["DEVICE"] == device.describe(chosen)
         assert f"--device {device.spec_of(chosen)} " in "".join(header["HISTORY"])
-        np.testing.assert_allclose(fits.getdata("cl.fits"), fits.getdata("np.fits"), rtol=1e-10)
+        np.testing.assert_allclose(fits.getdata("cl.fits"), fits.getdata("np.fits"), rtol=1e-5)
         assert device.describe(chosen) in capsys.readouterr().out

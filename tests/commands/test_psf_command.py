@@ -204,7 +204,9 @@ class TestTheFile:
             )
         )
 
-    @pytest.mark.parametrize("name", ["-o ' b.fits", "naïve☃\n.fits"])
+    @pytest.mark.parametrize(
+        "name", ["-o ' b.fits", pytest.param("naïve☃\n.fits", marks=pytest.mark.exhaustive)]
+    )
     def test_the_history_run_by_a_shell_makes_the_same_file(self, name):
         Path("star.fits").rename(name)
         Path("mask.fits").rename("-mask.fits")

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from kernel_cases import DTYPES, agree_with_twins, harness_of
+from kernel_cases import agree_with_twins, harness_of, in_each_precision
 
 test_kernels_agree_with_their_twins = agree_with_twins("convolve.cl")
 
 
-@pytest.mark.parametrize("dtype", DTYPES.values())
+@in_each_precision
 def test_adjoint_dot_product(dtype):
     """<A f, r> = <f, A^T r> for an asymmetric PSF whose peak is far from the origin."""
     harness = harness_of("radices 8, 8 and 4, 8, 4", dtype)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from kernel_cases import DTYPES, agree_with_twins, harness_of
+from kernel_cases import agree_with_twins, harness_of, in_each_precision
 
 from lnocl import reference
 from lnocl.scene.scene import LEAST_MODEL
@@ -34,7 +34,7 @@ def launch_ratio_rows(harness, model, images, star_image):
     return harness.take_spectra(spectra)[0], *pairs
 
 
-@pytest.mark.parametrize("dtype", DTYPES.values())
+@in_each_precision
 def test_division_guard(dtype):
     """Where the model is not positive the ratio is 0, and J's term that of the least model."""
     harness = harness_of("radices 8, 8 and 4, 8, 4", dtype)

@@ -89,14 +89,14 @@ def test_no_platform(monkeypatch):
 
 def test_no_double_precision(monkeypatch):
     monkeypatch.setattr(program, "has_double", lambda device: False)
-    observation = lnocl.Observation(np.ones((8, 8)), np.ones((1, 1)))
+    observation = lnocl.Observation(np.ones((16, 32)), np.ones((1, 1)))
     with pytest.raises(lnocl.DeviceError, match="has no double precision; take precision single"):
         lnocl.deconvolve(observation, precision="double", n_iter=1)
     lnocl.deconvolve(observation, precision="single", n_iter=1)
 
 
-def scene(p, n, stars=0):
-    observation = lnocl.Observation(np.ones((p, n, n)), np.ones((n, n)))
+def scene(p, shape, stars=0, mask=None):
+    observation = lnocl.Observation(np.ones((p, *shape)), np.ones(shape), mask=mask)
     return opencl.Scene(observation, [(i, i) for i in range(stars)])
 
 
@@ -104,17 +104,22 @@ def scene(p, n, stars=0):
 def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, limit):
     found = device.choose().device
     monkeypatch.setattr(opencl.Memory, "allocate", lambda *_, **__: pytest.fail("allocated"))
-    monkeypatch.setattr(cl.Device, limit, 100_000)
+    monkeypatch.setattr(cl.Device, limit, 20_000)
+    mask = np.arange(16 * 32).reshape(16, 32) == 100
+    many = scene(2, (16, 32), 8, mask)
     with pytest.raises(lnocl.DeviceError, match=r"the scene needs \d+ MiB, .* for star_images"):
-        opencl.OpenCLEngine(scene(2, 64, stars=9), "single", device.spec_of(found), 10)
+        opencl.OpenCLEngine(many, "single", device.spec_of(found), 10)
 
 
-@pytest.mark.parametrize("tuning", [None, program.Tuning(4, 16, scratch_is_global=True)])
-def test_memory_estimate_is_what_the_buffers_hold(tuning, caplog):
+@pytest.mark.parametrize(
+    ("shape", "tuning"),
+    [((16, 32), None), ((64, 32), program.Tuning(4, 16, scratch_is_global=True))],
+)
+def test_memory_estimate_is_what_the_buffers_hold(shape, tuning, caplog):
     """With scratch in local memory, of which 32 KiB will do, and with scratch in global memory."""
     caplog.set_level("INFO", "lnocl")
-    observation = lnocl.Observation(np.ones((2, 64, 64)), np.ones((1, 1)))
-    engine = opencl.OpenCLEngine(opencl.Scene(observation, [(1, 1)]), "single", None, 10, tuning)
+    observation = lnocl.Observation(np.ones((2, *shape)), np.ones((1, 1)))
+    engine = opencl.OpenCLEngine(opencl.Scene(observation), "single", None, 10, tuning)
     engine.extended()  # waits for the device
     launcher = engine._launcher
     held = [*engine._memory.buffers.values(), *launcher.own.values()]
@@ -132,7 +137,9 @@ def test_memory_is_little_more_than_what_must_be_held(monkeypatch, p, n, precisi
     monkeypatch.setattr(opencl.Memory, "allocate", lambda *_, **__: None)
     monkeypatch.setattr(opencl.OpenCLEngine, "_bind_iteration", lambda *_: None)
     monkeypatch.setattr(opencl.OpenCLEngine, "_upload_scene", lambda *_: None)
-    engine = opencl.OpenCLEngine(scene(p, n), precision, None, 1000)
+    nothing = SimpleNamespace(kernel_names=(), store=lambda: None)
+    monkeypatch.setattr(program, "_build", lambda *_: nothing)
+    engine = opencl.OpenCLEngine(scene(p, (n, n)), precision, None, 1000)
     must = (3 * p + 1) * n * n * engine.program.dtype.itemsize
     assert must < engine.bytes_needed <= 1.04 * must
 
@@ -140,7 +147,7 @@ def test_memory_is_little_more_than_what_must_be_held(monkeypatch, p, n, precisi
 def test_failing_compiler_is_named(monkeypatch):
     monkeypatch.setattr(program, "source", lambda: "this is no OpenCL")
     with pytest.raises(lnocl.DeviceError, match="the kernels do not build on") as error:
-        opencl.OpenCLEngine(scene(1, 8), "single", None, 1)
+        opencl.OpenCLEngine(scene(1, (8, 8)), "single", None, 1)
     assert "\n" not in str(error.value)
 
 
@@ -156,7 +163,7 @@ def test_the_reference_engine_needs_no_opencl():
 
 
 def test_build_options_are_recorded_and_kernels_fetched_once():
-    engine = opencl.OpenCLEngine(scene(1, 32), "single", None, 1)
+    engine = opencl.OpenCLEngine(scene(1, (16, 32)), "single", None, 1)
     assert "-DREAL=float" in engine.program.options
     assert "-DNX=32" in engine.program.options
     assert engine.program.kernel("scale_rows") is engine.program.kernel("scale_rows")
@@ -165,12 +172,12 @@ def test_build_options_are_recorded_and_kernels_fetched_once():
 @pytest.mark.parametrize(
     ("keywords", "name"),
     [
-        ({"initial_extended": np.full((8, 8), 1e300)}, "extended"),
+        ({"initial_extended": np.full((16, 32), 1e300)}, "extended"),
         ({"stars": [(1, 1)], "initial_star_fluxes": [1e300]}, "star fluxes"),
     ],
 )
 def test_values_too_large_for_single_precision_are_refused(keywords, name):
-    observation = lnocl.Observation(np.ones((8, 8)), np.ones((1, 1)))
+    observation = lnocl.Observation(np.ones((16, 32)), np.ones((1, 1)))
     with pytest.raises(lnocl.InputError, match=f"{name} as large as .* held in float32"):
         lnocl.deconvolve(observation, n_iter=1, **keywords)
 
@@ -179,8 +186,8 @@ def test_values_too_large_for_single_precision_are_refused(keywords, name):
 @pytest.mark.filterwarnings("ignore:.*psf pixels are negative")
 def test_objective_is_finite_where_the_model_is_negative_and_there_are_counts(engine):
     psf = np.array([[-1.0, 3.0, -1.0]])
-    observation = lnocl.Observation(np.full((8, 8), 3.0), psf)
-    start = np.ones((8, 8))
+    observation = lnocl.Observation(np.full((16, 32), 3.0), psf)
+    start = np.ones((16, 32))
     start[2, 5] = 50.0
     result = lnocl.deconvolve(observation, n_iter=3, initial_extended=start, engine=engine)
     model = np.maximum(blur(start, psf), 4.0 * LEAST_MODEL)  # images of mean 3 are scaled by 4
@@ -193,7 +200,7 @@ def test_objective_is_finite_where_the_model_is_negative_and_there_are_counts(en
 @pytest.mark.parametrize("engine", ["numpy", "opencl"])
 @pytest.mark.filterwarnings("ignore:.*psf pixels are negative")
 def test_star_fluxes_stay_at_zero_or_above_under_negative_psf_pixels(engine):
-    images = np.full((8, 8), 0.5)
+    images = np.full((16, 32), 0.5)
     images[4, 3] = 1e4
     observation = lnocl.Observation(images, [[-2.0, 5.0, -2.0]], background=1.0)
     result = lnocl.deconvolve(observation, stars=[(4, 4)], n_iter=3, engine=engine)

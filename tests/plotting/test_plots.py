@@ -127,6 +127,7 @@ def test_the_overview_has_a_panel_for_each_and_two_profiles(tmp_path):
     assert len(raw) < 200_000
 
 
+@pytest.mark.exhaustive
 def test_more_results_than_colours_are_drawn(tmp_path):
     many = [Source(f"MC-RL mu={i}", jet()) for i in range(8)]
     assert len(draw_profiles("flux", TRUTH, many, FRAME, 20, 100.0).axes) == 4

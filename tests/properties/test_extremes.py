@@ -196,7 +196,7 @@ def test_subnormals_may_be_flushed(monkeypatch):
 
 
 def test_single_precision_is_warned_of_in_very_long_runs():
-    observation = lnocl.Observation(np.ones((8, 8)), np.ones((1, 1)))
+    observation = lnocl.Observation(np.ones(SHAPE), np.ones((1, 1)))
     once = {"callback": lambda *_: True}
     with pytest.warns(lnocl.LnoclWarning, match="stray from double by 0.002 of the extended"):
         lnocl.deconvolve(observation, n_iter=200_000, **once)

@@ -111,7 +111,7 @@ def fuzz(seeds, sound, folder):
     return outcomes
 
 
-CASES = 300
+CASES = 150
 
 
 @pytest.mark.usefixtures("limits", "quick_figures")

@@ -214,8 +214,11 @@ class TestHeldOut:
         # Measured over 48 such scenes: within 1.83; the last iteration is at 7 to 12.
         assert error(result, truth) <= 1.9 * min(errors) < errors[-1]
 
-    def test_is_repeated_bit_for_bit(self):
-        first, second = (run(scene()[0], stop="held-out", engine="opencl") for _ in range(2))
+    @pytest.mark.parametrize(
+        "engine", ["numpy", pytest.param("opencl", marks=pytest.mark.exhaustive)]
+    )
+    def test_is_repeated_bit_for_bit(self, engine):
+        first, second = (run(scene()[0], stop="held-out", engine=engine) for _ in range(2))
         np.testing.assert_array_equal(first.extended, second.extended)
         np.testing.assert_array_equal(first.held_out, second.held_out)
 
@@ -315,6 +318,7 @@ class TestMu:
         assert result.mu == min(least, key=least.get)
         assert len(least) > 1
 
+    @pytest.mark.exhaustive
     def test_without_stop_it_is_the_best_at_the_end(self):
         """After far too many iterations a Tikhonov term is better than none."""
         observation, _, truth = scene()
@@ -344,6 +348,7 @@ class TestSmoothing:
         assert len(least) > 1
         assert set(curve["mu"]) == {0.0}
 
+    @pytest.mark.exhaustive
     def test_after_too_many_iterations_it_is_better_than_none(self):
         observation, _, truth = scene()
         result = run(observation, smoothing="auto", n_iter=150)

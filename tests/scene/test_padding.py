@@ -38,7 +38,7 @@ def test_at_most_half_the_shorter_side_and_at_least_one():
     assert recommend_pad(observe(shape=(1, 64))) == 1
 
 
-@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.parametrize("engine", ["numpy", pytest.param("opencl", marks=pytest.mark.exhaustive)])
 def test_auto_is_that_pad_and_is_announced(engine, caplog):
     observation = observe()
     with caplog.at_level(logging.INFO, "lnocl"):

@@ -322,16 +322,16 @@ def test_star_that_no_image_observed_is_refused():
 
 def hidden_star(case):
     """Return an observation in one image of which alone its star is good, and its flux."""
-    flux, sky, (x, y) = 5e4, 3.0, (15, 17)
+    flux, sky, (x, y) = 5e4, 3.0, (15, 8)
     p, exposure = (101, 1.0) if case == "one image of many" else (2, np.array([1000.0, 1.0]))
     psf = gaussian(3.0, 9)
-    mean = np.full((p, 32, 32), sky)
+    mean = np.full((p, 16, 32), sky)
     mean[:, y - 4 : y + 5, x - 4 : x + 5] += flux * psf / psf.sum()
     mask = np.zeros(mean.shape, bool)
     mask[:-1, y - 4 : y + 5, x - 4 : x + 5] = True
     mean *= np.reshape(exposure, (-1, 1, 1))
     if case == "short exposure, map":
-        exposure = exposure[:, None, None] * np.ones((32, 32))
+        exposure = exposure[:, None, None] * np.ones((16, 32))
     images = np.where(mask, 0.0, mean)
     return lnocl.Observation(images, psf, mask=mask, exposure=exposure), (x, y), flux
 

@@ -63,7 +63,7 @@ def minimum_near(line, position):
     return (low + int(fine[low : low + 128].argmin())) / 32
 
 
-@pytest.mark.parametrize("shape", [(64, 64), (100, 100), (64, 96), (1024, 1024)])
+@pytest.mark.parametrize("shape", [(64, 64), (100, 100), (64, 96)])
 def test_psf_has_unit_sum_and_peak_at_centre(shape):
     psf = fizeau_psf(shape, 30 * u.deg, H2, PIXEL, 0.7)
     assert psf.shape == shape
@@ -98,7 +98,7 @@ def test_first_airy_zero(perfect):
     assert dark == pytest.approx(theory, rel=0.01)
 
 
-@pytest.mark.parametrize("strehl", [0.02, 0.3, 0.7, 0.95])
+@pytest.mark.parametrize("strehl", [0.02, 0.7])
 def test_strehl_ratio(strehl):
     ratio = psf_of(256, 45, strehl, seed=1).max() / psf_of(256, 45).max()
     assert ratio == pytest.approx(strehl, abs=0.002)
@@ -214,6 +214,7 @@ def test_photometry_scales(mag, wider, coarser):
     assert difference.value == pytest.approx(5 * math.log10(coarser), abs=1e-9)
 
 
+@pytest.mark.usefixtures("few_screens")
 def test_images_are_a_periodic_convolution_with_noise():
     rng = np.random.default_rng(0)
     target = Target(rng.random((32, 32)), [Star(3, 30), Star(20, 8, 15 * u.mag)])
@@ -234,6 +235,7 @@ def test_images_are_a_periodic_convolution_with_noise():
     assert simulation.zero_magnitude_flux == pytest.approx(fluxes[0] * 10**5.2)
 
 
+@pytest.mark.usefixtures("few_screens")
 def test_read_noise_alone_makes_negative_pixels():
     dark = {"sky_brightness": "30 mag/arcsec2", "extended_magnitude": "40 mag"}
     target = Target(np.ones((64, 64)))
@@ -245,6 +247,7 @@ def test_read_noise_alone_makes_negative_pixels():
     assert photons.min() > 0
 
 
+@pytest.mark.usefixtures("few_screens")
 def test_simulation_follows_its_seed():
     angles = [0, 90] * u.deg
     first, again, other = (simulate(hh34(64), Experiment(angles=angles, seed=s)) for s in (1, 1, 2))
@@ -254,6 +257,7 @@ def test_simulation_follows_its_seed():
     assert not np.allclose(first.psfs[0], first.psfs[1].T, rtol=1e-3)
 
 
+@pytest.mark.usefixtures("few_screens")
 def test_record_is_complete_json():
     experiment = Experiment(angles=[10, 55] * u.deg, seed=np.int64(7))
     simulation = simulate(hh34(64), experiment)

@@ -19,6 +19,8 @@ from lnocl.simulation import Experiment, Star, Target, hh34, load_target, simula
 from lnocl.simulation.photometry import MAG_PER_ARCSEC2
 from lnocl.studies import demo, experiment, figures, files
 
+pytestmark = pytest.mark.usefixtures("few_screens")
+
 SMALL = ("--size", "64")
 
 
@@ -86,6 +88,7 @@ class TestDemo:
         np.testing.assert_array_equal(again.star_fluxes, first.star_fluxes)
         np.testing.assert_array_equal(again.history["objective"], first.history["objective"])
 
+    @pytest.mark.exhaustive
     def test_the_same_numbers_each_time(self, run, capsys, monkeypatch):
         files, said = run
         monkeypatch.setattr(demo, "N_ITER", 100)

@@ -20,6 +20,8 @@ from lnocl.plotting.curves import draw_costs
 from lnocl.simulation import hh34, simulate
 from lnocl.studies import bench, demo, experiment, trade
 
+pytestmark = pytest.mark.usefixtures("few_screens")
+
 MADE = Recipe((32, 32), n_images=2, n_stars=1, mu=1e-4).make()
 N_ITER = 8
 ROWS = 16
