@@ -187,7 +187,14 @@ EXHAUSTIVE = {
         "32x16 exposures, two stars between pixels",
         "8x128 exposure map, star between pixels",
     ),
-    "numpy": ("64x64 four images, no background", "64x256 two stars, map"),
+    "numpy": (
+        "1x60 star",
+        "512x16 three stars",
+        "64x64 four images, no background",
+        "64x256 two stars, map",
+        "20x50 star, mu, mask, noise",
+        "16x16 three stars, pad, mask",
+    ),
 }
 every_run = pytest.mark.parametrize(
     ("engine", "recipe"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scenes import ENGINES, blur, make_psfs, worst
+from scenes import FEWER_ENGINES, blur, make_psfs, worst
 
 import lnocl
 from lnocl.opencl import program
@@ -19,8 +19,8 @@ MASK = np.random.default_rng(8).random((2, *SHAPE)) < 0.05
 # Rounding of the objective in double, as a share of it or of the noise, half a unit a pixel.
 OBJECTIVE_ROUNDING = 1e-12
 
-every_engine = pytest.mark.parametrize("engine", ENGINES)
-double_engines = pytest.mark.parametrize("engine", ENGINES[:2])
+every_engine = pytest.mark.parametrize("engine", FEWER_ENGINES)
+double_engines = pytest.mark.parametrize("engine", FEWER_ENGINES[:2])
 few_examples = settings(max_examples=20, deadline=None)
 
 

@@ -158,7 +158,13 @@ def test_information_is_that_of_the_model(name):
 
 
 @pytest.mark.usefixtures("whole_psfs")
-@every_recipe
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if "offsets" in name else [pytest.mark.exhaustive])
+        for name in RECIPES
+    ],
+)
 def test_minimum_is_that_of_scipy(name):
     """On J itself, summed over all pixels, in standard errors."""
     _, scene, fit, stars, extended = fit_of(name)

@@ -34,7 +34,7 @@ SCENES = {
     "two stars, pad, mask, mu": Recipe(
         (8, 20), 3, 2, mu=1e-3, pad=4, masked=0.05, background="each"
     ),
-    "four images, three stars, mask": Recipe((16, 32), 4, 3, masked=0.02, background="each"),
+    "four images, three stars": Recipe((16, 32), 4, 3, background="each"),
 }
 PERIODIC = [name for name, recipe in SCENES.items() if not recipe.pad]
 WITH_MU = [name for name, recipe in SCENES.items() if recipe.mu]
@@ -279,7 +279,7 @@ def test_objective_never_rises_in_any_scene(scene, mu):
     assert (np.diff(result.history["objective"]) <= 0).all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(scene=small_scenes(logarithmic(-3, 3)), mu=logarithmic(-5, 1))
 def test_convergence_is_claimed_at_the_minimum_alone(scene, mu):
     result = solve(**scene, mu=mu, n_iter=600)  # of which three quarters converge
@@ -488,7 +488,7 @@ def test_a_shortened_step_has_the_scaling_of_its_base():
     "precision", ["single", pytest.param("double", marks=pytest.mark.exhaustive)]
 )
 def test_steps_take_three_images_more_and_at_most_one_for_each_star(precision):
-    name = "four images, three stars, mask"
+    name = "four images, three stars"
     without = engine_of(name, precision, takes_steps=False)
     more = engine_of(name, precision, takes_steps=True).bytes_needed - without.bytes_needed
     images = (3 + 3) * without.layout.pixels_bytes

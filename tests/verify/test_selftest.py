@@ -81,7 +81,8 @@ def is_right(capsys, n_runs):
     assert last == f"all 13 kernels and {n_runs} deconvolutions are right on {NAME}"
 
 
-def test_a_good_device_is_right(capsys, monkeypatch):
+@pytest.mark.exhaustive
+def test_a_device_without_double_precision_is_right(capsys, monkeypatch):
     monkeypatch.setattr(selftest, "CASES", selftest.CASES[:2])
     monkeypatch.setattr(selftest, "has_double", lambda _: False)
     is_right(capsys, n_runs=2)
@@ -89,7 +90,7 @@ def test_a_good_device_is_right(capsys, monkeypatch):
 
 @pytest.mark.exhaustive
 @pytest.mark.skipif(not device.has_double(CHOSEN), reason="no double precision here")
-def test_a_good_device_is_right_at_all_sizes(capsys):
+def test_a_good_device_is_right(capsys):
     is_right(capsys, n_runs=4)
 
 
