@@ -29,6 +29,8 @@ def pytest_testnodedown(node):
 
 
 def pytest_sessionfinish(session):
+    for built in program._programs.values():
+        built.store()  # workers end without what other processes do at their exit
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["programs"] = sorted(names)
     elif session.config.option.markexpr == FAST and len(names) > MAX_PROGRAMS:
