@@ -71,6 +71,7 @@ class Memory:
     def allocate(self, **sizes: int) -> None:
         """Make buffers of so many bytes, in the place of those with the same names."""
         for name, size in sizes.items():
+            self.buffers.pop(name, None)  # first, lest the memory of both is taken
             self.buffers[name] = cl.Buffer(self._queue.context, READ_WRITE, size)
 
     def exchange(self, one: str, other: str) -> None:
