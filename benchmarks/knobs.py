@@ -30,7 +30,7 @@ import lnocl
 from lnocl.errors import DeviceError
 from lnocl.metrics import star_rows
 from lnocl.opencl.device import choose, describe
-from lnocl.scene.scene import LEAST_MODEL, Scene
+from lnocl.scene.scene import MIN_MODEL, Scene
 
 TIMED_SIZE, N_IMAGES = 1024, 4
 ITERATIONS, STAR_ITERATIONS = 1000, 600
@@ -226,7 +226,7 @@ def twin(given, dtype, inside):
         model = side.inverse(side.otfs * side.forward(sky)) + side.background
         if not inside:
             model += flux * p_s
-        ratio = np.where(model > LEAST_MODEL, side.images / np.maximum(model, LEAST_MODEL), 0)
+        ratio = np.where(model > MIN_MODEL, side.images / np.maximum(model, MIN_MODEL), 0)
         excess = ratio - 1
         # In float64, which is as good as lnocl's compensated sums.
         product = (p_s * excess).sum(dtype=np.float64)

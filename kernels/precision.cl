@@ -13,7 +13,7 @@
  *   MAX_STARS       room for stars: the scene has no more than these
  *   HAS_MU, HAS_SMOOTHING, HAS_WEIGHTS, HAS_BACKGROUND_MAP, HAS_EXPOSURE_MAP    0 or 1: what the
  *                   scene has
- *   LEAST_MODEL     the division guard
+ *   MIN_MODEL     the division guard
  *
  * Layouts, in reals, the last index fastest:
  *   pixels    [NY / 2 / BLOCK][NX][2][BLOCK]     lanes are pairs of rows: 2 y and 2 y + 1

@@ -56,7 +56,7 @@ INLINE vec divergence(const vec m, const vec r)
 #define HAS_SENTINEL (HAS_WEIGHTS && !HAS_EXPOSURE_MAP)
 
 /* w (g / m - 1) and the data term of the objective; g < 0: not observed, w = 0. The guard: m counts
- * as LEAST_MODEL where it is less, and g / m as 0 there, as the light that it wants is nowhere.
+ * as MIN_MODEL where it is less, and g / m as 0 there, as the light that it wants is nowhere.
  * A transform's rounding is a share of what it is given: of g / m - 1, the noise, it is less than of
  * g / m, which is about 1 everywhere.
  */
@@ -66,8 +66,8 @@ INLINE vec ratio(vec g, const vec m, vec *term)
     const ivec observed = g >= 0;
     g = observed ? g : (vec)0;
 #endif
-    const ivec dark = m <= (real)LEAST_MODEL; /* which NaN is not: it reaches the objective */
-    const vec modelled = dark ? (vec)(real)LEAST_MODEL : m;
+    const ivec dark = m <= (real)MIN_MODEL; /* which NaN is not: it reaches the objective */
+    const vec modelled = dark ? (vec)(real)MIN_MODEL : m;
     const vec quotient = g / modelled;
     const vec r = dark ? (vec)0 : quotient;
     *term = divergence(modelled, quotient);

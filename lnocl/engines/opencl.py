@@ -15,7 +15,7 @@ from lnocl.opencl.layout import Layout
 from lnocl.opencl.memory import Memory, Transfer, refuse_if_too_large
 from lnocl.opencl.program import Program, Tuning
 from lnocl.scene.observation import Array
-from lnocl.scene.scene import LEAST_MODEL, Scene
+from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Stamp
 from lnocl.solvers.engine import State
 from lnocl.solvers.scaling import Scaling
@@ -25,7 +25,7 @@ from lnocl.solvers.scaling import Scaling
 ITERATIONS_AHEAD = 4
 # And looks at the objectives once in so many, at those of as many before: a transfer costs the host
 # as much as launching an iteration.
-ITERATIONS_UNSEEN = 64
+FETCH_EVERY = 64
 
 
 @guarded
@@ -83,7 +83,7 @@ class OpenCLEngine:
             has_weights=scene.weights is not None,
             has_exposure_map=scene.has_exposure_map,
             has_background_map=self._has_background_map,
-            least_model=LEAST_MODEL,
+            min_model=MIN_MODEL,
         )
         self.layout = Layout(self.program)
         self._stars = _Windows(self.layout, [scene.star_rows(s) for s in range(scene.n_stars)])
@@ -98,7 +98,7 @@ class OpenCLEngine:
         self._pending_objective: Transfer | None = None
         self._n_scaled = 0
         self._last_mark: cl.Event | None = None
-        self._unseen: Transfer | None = None
+        self._unchecked: Transfer | None = None
         self._fetched: list[float] = []
         self._observed: NDArray[np.bool_] | None = None
         self._memory.allocate(**sizes)
@@ -311,11 +311,11 @@ class OpenCLEngine:
             if self._last_mark is not None:
                 self._last_mark.wait()
             self._last_mark = event
-        if self._n_scaled % ITERATIONS_UNSEEN == 0:
-            if self._unseen is not None:
-                self._fetched = self._unseen.wait()[0].reshape(-1, 2).sum(axis=1).tolist()
-            first = 2 * (self._n_objectives - ITERATIONS_UNSEEN)
-            self._unseen = self._memory.fetch_ranges(("objectives", first, 2 * ITERATIONS_UNSEEN))
+        if self._n_scaled % FETCH_EVERY == 0:
+            if self._unchecked is not None:
+                self._fetched = self._unchecked.wait()[0].reshape(-1, 2).sum(axis=1).tolist()
+            first = 2 * (self._n_objectives - FETCH_EVERY)
+            self._unchecked = self._memory.fetch_ranges(("objectives", first, 2 * FETCH_EVERY))
 
     def gradient(self) -> tuple[float, float]:
         """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""

@@ -102,7 +102,7 @@ def _explain(error: Exception, engine: OnDevice) -> str:
             f"fewer stars, precision single, or another device ({cause})"
         )
     return (
-        f"{engine.name} failed ({cause}), and what it held is lost; {needs}: run again, "
+        f"{engine.name} failed ({cause}), and the state of the run is lost; {needs}: run again, "
         "from the checkpoint if there is one, see what lnocl selftest says, or take another device"
     )
 

@@ -132,7 +132,7 @@ class Program:
         Stars of the scene, at most 4096; the program has room for more.
     has_mu, has_smoothing, has_weights, has_background_map, has_exposure_map : bool, optional
         Parts that the scene has.
-    least_model : float, optional
+    min_model : float, optional
         The division guard.
 
     Attributes
@@ -168,7 +168,7 @@ class Program:
         has_weights: bool = False,
         has_background_map: bool = False,
         has_exposure_map: bool = False,
-        least_model: float = 0.0,
+        min_model: float = 0.0,
     ) -> None:
         device = context.devices[0]
         self.context, self.grid, self.dtype = context, grid, dtype
@@ -203,7 +203,7 @@ class Program:
             "HAS_WEIGHTS": int(has_weights),
             "HAS_BACKGROUND_MAP": int(has_background_map),
             "HAS_EXPOSURE_MAP": int(has_exposure_map),
-            "LEAST_MODEL": f"{least_model!r}",
+            "MIN_MODEL": f"{min_model!r}",
         }
         definitions = [f"-D{name}={value}" for name, value in constants.items()]
         self.options = ["-cl-std=CL1.2", "-w", *definitions]

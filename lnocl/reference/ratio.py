@@ -10,7 +10,7 @@ from scipy.special import xlog1py
 
 from lnocl.reference.rows import ComplexArray, irfft_rows, rfft_rows
 from lnocl.scene.observation import Array
-from lnocl.scene.scene import LEAST_MODEL
+from lnocl.scene.scene import MIN_MODEL
 
 
 def ratio_rows(
@@ -25,12 +25,12 @@ def ratio_rows(
 
     ``m_j = A_j f + sum_s c_s P_js + b_j``, ``r_j = w_j g_j / m_j``, ``sum_j <P_js, r_j - w_j>`` and
     ``J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j)``; La Camera et al. (2012), Eq. 7 and 9.
-    Where ``m_j`` is not above `LEAST_MODEL`, ``r_j = 0`` and ``m_j = LEAST_MODEL`` in J_0.
+    Where ``m_j`` is not above `MIN_MODEL`, ``r_j = 0`` and ``m_j = MIN_MODEL`` in J_0.
     """
     model = irfft_rows(row_spectra) + background
     model += np.einsum("s,sjyx->jyx", star_fluxes, star_images)
-    dark = model <= LEAST_MODEL  # which NaN is not: it reaches the objective
-    model = np.where(dark, LEAST_MODEL, model)
+    dark = model <= MIN_MODEL  # which NaN is not: it reaches the objective
+    model = np.where(dark, MIN_MODEL, model)
     ratio = images / model
     # Its terms of first order cancel, those of scipy.special.kl_div only the terms themselves.
     divergence = model * (xlog1py(ratio, ratio - 1.0) - (ratio - 1.0))

@@ -31,7 +31,7 @@ MAX_RINGING = 0.01
 
 # The one division guard: where the model is not above this (images have unit mean) the ratio is
 # taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
-LEAST_MODEL = 2.0**-64
+MIN_MODEL = 2.0**-64
 
 NO_PENALTY = Penalty()
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
-from lnocl.scene.scene import LEAST_MODEL, Scene
+from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.stars import Pixels, StarImages
 
 # A star's flux falls to this share at most in one step, so that it never reaches 0 by a step that
@@ -78,7 +78,7 @@ class StarLikelihood:
     def models(self, lights: Iterable[Array]) -> list[Array]:
         """Return the m_j for the light of the stars, not below the guard of divisions."""
         return [
-            np.maximum(light + diffuse, LEAST_MODEL)
+            np.maximum(light + diffuse, MIN_MODEL)
             for (_, diffuse, _), light in zip(self._images, lights, strict=True)
         ]
 
@@ -109,7 +109,7 @@ class StarLikelihood:
         """Return the flux of one star of these images by least squares, weighted by the counts."""
         moment = norm = 0.0
         for (image, diffuse, weights), light in zip(self._images, lights, strict=True):
-            weighted = weights * light / np.maximum(np.maximum(image, diffuse), LEAST_MODEL)
+            weighted = weights * light / np.maximum(np.maximum(image, diffuse), MIN_MODEL)
             norm += float(weighted @ light)
             moment += float(weighted @ (image - diffuse))
         return moment / norm if norm > 0 else 0.0
@@ -120,7 +120,7 @@ def movable_weights(weights: Array, model: Array) -> Array:
 
     PSFs with negative pixels make it so; one such pixel would have all of the information.
     """
-    return np.where(model > LEAST_MODEL, weights, 0.0)
+    return np.where(model > MIN_MODEL, weights, 0.0)
 
 
 def fit_fluxes(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
-from lnocl.scene.scene import LEAST_MODEL, Scene
+from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Stamp
 from lnocl.solvers.fluxes import bounded_step, fit_fluxes, invert, movable_weights
 
@@ -132,7 +132,7 @@ def _make_scaling(
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     ratios, information = [], np.zeros((scene.n_stars, scene.n_stars))
     for j, light in enumerate(model.starlight(fluxes)):
-        total = np.maximum(light + diffuse[j], LEAST_MODEL)
+        total = np.maximum(light + diffuse[j], MIN_MODEL)
         ratios.append(movable_weights(model.weights[j], total) / total)
         lit = scene.star_field.lit(j)
         information += scene.star_field.images(j, lit).information(ratios[j][lit])

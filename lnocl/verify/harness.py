@@ -15,7 +15,7 @@ from lnocl.errors import DeviceError
 from lnocl.opencl.launch import READ_WRITE, Launcher
 from lnocl.opencl.layout import Layout, bit_reversed
 from lnocl.opencl.program import Program, Tuning
-from lnocl.scene.scene import LEAST_MODEL
+from lnocl.scene.scene import MIN_MODEL
 
 # Scenes with all parts, together, that a program can have.
 THREE_IMAGES = "three images, two stars, mask, background map, smoothing"
@@ -73,9 +73,7 @@ class KernelHarness:
     ) -> None:
         self.n_images, self.n_stars = scene.get("n_images", 1), scene.get("n_stars", 0)
         parts = {name: has for name, has in scene.items() if name != "n_images"}
-        self.program = Program(
-            context, grid, np.dtype(dtype), tuning, least_model=LEAST_MODEL, **parts
-        )
+        self.program = Program(context, grid, np.dtype(dtype), tuning, min_model=MIN_MODEL, **parts)
         self.layout, self.launcher = Layout(self.program), Launcher(self.program)
         self.dtype, self.grid, self.scene = self.program.dtype, grid, scene
         self._buffers: list[cl.Buffer] = []

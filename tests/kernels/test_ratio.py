@@ -5,7 +5,7 @@ import pytest
 from kernel_cases import agree_with_twins, harness_of, in_each_precision
 
 from lnocl import reference
-from lnocl.scene.scene import LEAST_MODEL
+from lnocl.scene.scene import MIN_MODEL
 from lnocl.verify.harness import rounded
 
 test_kernels_agree_with_their_twins = agree_with_twins("ratio.cl")
@@ -45,12 +45,12 @@ def test_division_guard(dtype):
     expected = np.zeros(harness.grid)
     expected[3, 7] = -1.0
     assert np.abs(dark - reference.rfft_rows(expected)).max() < 1e3 * np.finfo(dtype).eps
-    term = -np.log(LEAST_MODEL) - 1.0 + LEAST_MODEL
+    term = -np.log(MIN_MODEL) - 1.0 + MIN_MODEL
     eps = float(np.finfo(dtype).eps)
     assert sums.sum() == pytest.approx(term, rel=4 * eps)
     images[3, 7] = 0.0
     _, sums, _ = launch_ratio_rows(harness, model, images, np.zeros(harness.grid))
-    assert abs(sums.sum()) < LEAST_MODEL + 1e3 * eps**2 * images.size
+    assert abs(sums.sum()) < MIN_MODEL + 1e3 * eps**2 * images.size
 
 
 def test_sums_over_pixels_are_compensated():

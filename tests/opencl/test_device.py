@@ -13,7 +13,7 @@ from scipy.special import kl_div
 import lnocl
 from lnocl.engines import opencl
 from lnocl.opencl import device, program
-from lnocl.scene.scene import LEAST_MODEL
+from lnocl.scene.scene import MIN_MODEL
 
 GPU = SimpleNamespace(name="Fast GPU", type=cl.device_type.GPU)
 CPU = SimpleNamespace(name="Slow CPU", type=cl.device_type.CPU)
@@ -190,7 +190,7 @@ def test_objective_is_finite_where_the_model_is_negative_and_there_are_counts(en
     start = np.ones((16, 32))
     start[2, 5] = 50.0
     result = lnocl.deconvolve(observation, n_iter=3, initial_extended=start, engine=engine)
-    model = np.maximum(blur(start, psf), 4.0 * LEAST_MODEL)  # images of mean 3 are scaled by 4
+    model = np.maximum(blur(start, psf), 4.0 * MIN_MODEL)  # images of mean 3 are scaled by 4
     expected = kl_div(3.0, model).sum()
     assert result.history["objective"][0] == pytest.approx(expected, rel=1e-6)
     assert np.isfinite(result.history["objective"]).all()
