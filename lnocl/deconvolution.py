@@ -54,10 +54,11 @@ def deconvolve(
 
     Minimises ``J = sum_j sum_n [g_j ln(g_j / m_j) + m_j - g_j] + mu / 2 sum f^2`` and, for
     `smoothing`, ``+ smoothing sum [sqrt((f - f')^2 + delta^2) - delta]`` over pairs of neighbours,
-    over the star fluxes c and the extended source f, with ``m_j = K_j * f + sum_s c_s P_js + b_j``,
-    stopped after `n_iter` iterations. The split-gradient method without stars and penalties is
-    Richardson-Lucy for several images; the scaled gradient projection method needs a tenth of its
-    iterations and less.
+    over the star fluxes c and the extended source f. The model of image g_j is
+    ``m_j = A_j f + sum_s c_s P_js + b_j``: A_j convolves with PSF j, P_js is the image of star s
+    for flux 1, and b_j the background. The run ends after `n_iter` iterations. The split-gradient
+    method without stars and penalties is Richardson-Lucy for several images; the scaled gradient
+    projection method needs a tenth of its iterations and less.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ class Scene:
     """What is modelled, on a grid of powers of two, scaled to images of about unit mean.
 
     The scale of images and background is a power of two, so that it changes no digit. Exposures
-    are taken relative to their mean: as ``m_j = e_j (K_j * f + sum_s c_s P_js) + b_j`` is linear,
+    are taken relative to their mean: as ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j`` is linear,
     one of a whole image goes into its PSF, and a map e_j(n) into the weights, with images and
     background divided by it, which leaves the objective as it is but for the weights.
 
