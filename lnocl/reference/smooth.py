@@ -11,8 +11,8 @@ def smooth(extended: Array, smoothing: float, edge: float) -> tuple[Array, Array
     """Return slope, curvature and value of the edge-preserving term.
 
     ``smoothing * sum psi(f - f')`` over the pairs of neighbouring pixels, also across the borders
-    of the grid, ``psi(t) = sqrt(t^2 + edge^2) - edge``. The slope is its gradient, and the curvature
-    is the sum of ``smoothing * psi'(f - f') / (f - f')`` over the four neighbours of a pixel.
+    of the grid, ``psi(t) = sqrt(t^2 + edge^2) - edge``. The slope is its gradient. The curvature is
+    the sum of ``smoothing * psi'(f - f') / (f - f')`` over the four neighbours of a pixel.
     """
     slope, curvature, value = np.zeros_like(extended), np.zeros_like(extended), 0.0
     for axis in (-1, -2):

@@ -180,6 +180,7 @@ def test_kernels_that_write_where_they_must_not_or_do_not_start_are_named(capsys
     assert "INVALID_WORK_GROUP_SIZE" in of_step
 
 
+@pytest.mark.exhaustive
 def test_a_wrong_kernel_spoils_deconvolutions(monkeypatch, plant):
     plant("correlate_columns", runs=("sgm",))
     monkeypatch.setattr(selftest, "CASES", ())
