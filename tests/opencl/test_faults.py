@@ -160,6 +160,7 @@ def test_memory_that_is_really_short():
 import resource
 deconvolve()
 large = lnocl.Observation(np.full((2048, 2048), 5.0), np.ones((3, 3)))
+lnocl.deconvolve(large, n_iter=1, precision="double")  # which builds the kernels
 pages = int(open("/proc/self/statm").read().split()[0])
 for room in (170, 200, 230):
     limit = pages * resource.getpagesize() + room * 2**20
