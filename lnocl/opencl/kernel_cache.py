@@ -13,6 +13,8 @@ import hashlib
 import io
 import os
 import shutil
+import stat
+import struct
 import tempfile
 import weakref
 import zipfile
@@ -25,20 +27,47 @@ from lnocl.process import LOCK
 VARIABLE = "POCL_CACHE_DIR"
 DIGEST = hashlib.sha256
 DIGEST_SIZE = DIGEST().digest_size
+PREFIX = "lnocl-kernels-"
+# Bytes that kernels may take while they are compiled, and those that the store may hold.
+MIN_FREE, MAX_STORED = 16 * 2**20, 512 * 2**20
 
 
 class _Folder:
-    """A folder of this process alone, removed when the process ends."""
+    """A folder of this process alone, removed when the process ends.
+
+    PoCL runs code from it: it lies in the folder for temporary files, or, where no code may be run
+    from there or little space is left, beside the store of compiled kernels.
+    """
 
     def __init__(self) -> None:
-        try:
-            self.path = Path(tempfile.mkdtemp(prefix="lnocl-kernels-"))
-        except OSError as error:
+        reasons = []
+        for parent in (Path(tempfile.gettempdir()), store()):
+            try:
+                parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                if reason := _unfit(parent):
+                    raise OSError(0, reason)
+                self.path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
+                break
+            except OSError as error:
+                reasons.append(f"{parent} ({error.strerror})")
+        else:
             raise DeviceError(
-                f"no folder for kernels can be made: {error}; set TMPDIR to one that can be "
-                "written to"
-            ) from error
+                f"no folder for kernels can be made in {' or in '.join(reasons)}; set TMPDIR to "
+                f"one with {MIN_FREE >> 20} MiB from which programs may be run"
+            )
         weakref.finalize(self, _remove, self.path, os.getpid())
+
+
+def _unfit(folder: Path) -> str:
+    """Return why code cannot be stored and run in a folder, or ""."""
+    if not hasattr(os, "statvfs"):
+        return ""
+    state = os.statvfs(folder)
+    if state.f_flag & os.ST_NOEXEC:
+        return "no programs may be run from there"
+    if state.f_bavail * state.f_frsize < MIN_FREE:
+        return "it is nearly full"
+    return ""
 
 
 def _remove(path: Path, process: int) -> None:
@@ -77,6 +106,11 @@ def _environment(name: str, path: Path) -> Iterator[None]:
             os.environ[name] = given
 
 
+def new_folder() -> str:
+    """Return a new folder in the private one."""
+    return tempfile.mkdtemp(prefix="folder-", dir=_own[0].path)
+
+
 def folders() -> set[str]:
     """Return the folders that PoCL has made for programs in its private folder, one for each."""
     own = _own[0].path
@@ -88,9 +122,21 @@ def pack(names: set[str]) -> bytes:
     own, content = _own[0].path, io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for file in sorted(file for name in names for file in (own / name).rglob("*")):
-            if file.is_file():
-                archive.writestr(zipfile.ZipInfo(str(file.relative_to(own))), file.read_bytes())
+            if file.is_file() and _is_whole(data := file.read_bytes()):
+                archive.writestr(zipfile.ZipInfo(str(file.relative_to(own))), data)
     return content.getvalue()
+
+
+def _is_whole(data: bytes) -> bool:
+    """Return whether a file is not a library that was cut short, as by a full disk.
+
+    The table of an ELF file's sections is its end; a process that loads less than that is killed.
+    """
+    if not data.startswith(b"\x7fELF\x02\x01"):  # 64 bits, little end first
+        return not data.startswith(b"\x7fELF")
+    (offset,) = struct.unpack_from("<Q", data, 40)
+    size, count = struct.unpack_from("<HH", data, 58)
+    return offset + size * count <= len(data)
 
 
 def unpack(content: bytes | None) -> set[str]:
@@ -99,7 +145,7 @@ def unpack(content: bytes | None) -> set[str]:
     A folder that is there already is left alone, as its files may be loaded. Where the disk is
     full no part of any folder stays.
     """
-    if not content:
+    if not content or not zipfile.is_zipfile(io.BytesIO(content)):
         return set()
     own = _own[0].path
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -115,32 +161,53 @@ def unpack(content: bytes | None) -> set[str]:
     return names
 
 
-def file_of(name: str) -> Path:
-    """Return the file of the program with this name, all that its kernels depend on."""
+def store() -> Path:
+    """Return the folder that compiled kernels are stored in."""
     folder = os.environ.get(VARIABLE)
     if not folder:
-        folder = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
+        folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
         folder = os.path.join(folder, "lnocl")
-    return Path(folder) / f"{DIGEST(name.encode()).hexdigest()}.kernels"
+    return Path(folder)
+
+
+def file_of(name: str) -> Path:
+    """Return the file of the program with this name, all that its kernels depend on."""
+    return store() / f"{DIGEST(name.encode()).hexdigest()}.kernels"
 
 
 def read(file: Path) -> bytes | None:
     """Return the content of a file, or None where there is no file that can be read.
 
+    Kernels are code: a file that is another user's, or that others may write to, is not read.
+
     Warns
     -----
     LnoclWarning
-        The file is damaged; it is removed.
+        The file is damaged, and is removed; or it is not this user's alone.
     """
     try:
-        content = file.read_bytes()
+        with open(file, "rb", opener=_without_waiting) as stream:
+            state = os.fstat(stream.fileno())
+            if not stat.S_ISREG(state.st_mode):
+                return None
+            if hasattr(os, "getuid") and (state.st_uid != os.getuid() or state.st_mode & 0o022):
+                warn(f"the compiled kernels in {file} can be written by others, and are not used")
+                return None
+            content = stream.read()
     except OSError:
         return None
     digest, content = content[:DIGEST_SIZE], content[DIGEST_SIZE:]
     if DIGEST(content).digest() == digest:
+        with contextlib.suppress(OSError):
+            os.utime(file)  # the least used are the first to go
         return content
     discard(file)
     return None
+
+
+def _without_waiting(name: str, flags: int) -> int:
+    """Open a file, and a pipe without waiting for its other end."""
+    return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def discard(file: Path) -> None:
@@ -161,6 +228,18 @@ def write(file: Path, content: bytes) -> None:
         except BaseException:
             os.unlink(part)
             raise
+        _trim(file.parent)
+
+
+def _trim(folder: Path) -> None:
+    """Remove the least used files of a store that has grown too large."""
+    files = [(file.stat(), file) for file in folder.glob("*.kernels")]
+    total = sum(state.st_size for state, _ in files)
+    for state, file in sorted(files, key=lambda each: each[0].st_mtime):
+        if total <= MAX_STORED:
+            break
+        file.unlink()
+        total -= state.st_size
 
 
 _refused: set[Path] = set()
@@ -169,7 +248,7 @@ _refused: set[Path] = set()
 def can_write(folder: Path) -> bool:
     """Return whether files can be written to a folder, which is made; warn once where not."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if os.access(folder, os.W_OK | os.X_OK):
             return True
         reason = "it cannot be written to"

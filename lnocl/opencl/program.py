@@ -16,7 +16,7 @@ import numpy as np
 import pyopencl as cl
 
 from lnocl.errors import DeviceError
-from lnocl.opencl import kernel_cache
+from lnocl.opencl import kernel_cache, linking
 from lnocl.opencl.device import describe, has_double
 from lnocl.opencl.faults import after_fault, build_failure
 from lnocl.process import LOCK, ignored_warnings
@@ -40,8 +40,6 @@ SOURCES = (
 # Rooms for stars that programs are built with. More stars seldom build another program; where there
 # are none, or one, the loops over stars cost nothing.
 STAR_ROOMS = (0, 1, 8, 64, 512, 4096)
-
-POCL = "Portable Computing Language"
 
 # Built programs that a process holds, the last used; each takes some 3 MiB.
 MAX_PROGRAMS = 16
@@ -270,7 +268,7 @@ class _Built:
     ) -> None:
         self._file, self._process = file, os.getpid()
         self._content = kernel_cache.read(file)
-        self._is_pocl = context.devices[0].platform.name == POCL
+        self._is_pocl = context.devices[0].platform.name == linking.POCL
         if self._is_pocl:
             self._folders = kernel_cache.unpack(self._content)
             before = kernel_cache.folders()
@@ -319,6 +317,7 @@ def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
     """Return a program that the process has, that a file holds, or that is compiled now."""
     key = context, text, options
     with LOCK:
+        linking.check(context.devices[0])
         if key not in _programs:
             name = "\n".join([describe(context.devices[0]), *options, text])
             _programs[key] = _Built(context, text, options, kernel_cache.file_of(name))

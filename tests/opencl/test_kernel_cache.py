@@ -1,8 +1,10 @@
 """Compiled programs in files: used again, damaged, cut short, in folders that cannot hold them."""
 
 import errno
+import io
 import os
 import shutil
+import zipfile
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,7 +23,7 @@ def warm(tmp_path_factory):
     """The file of one program: its name, its content, and the result of the run that made it."""
     folder = tmp_path_factory.mktemp("store")
     done = run_python(SAID, POCL_CACHE_DIR=str(folder))
-    (file,) = folder.iterdir()
+    (file,) = folder.glob("*.kernels")
     return file.name, file.read_bytes(), done.stdout
 
 
@@ -36,7 +38,7 @@ def test_programs_are_stored_and_used_again(warm, tmp_path):
     done = run_python(code, POCL_CACHE_DIR=str(tmp_path))
     assert done.stdout == f"{said}{tmp_path}\n"
     assert not done.stderr
-    (file,) = tmp_path.iterdir()
+    (file,) = tmp_path.glob("*.kernels")
     assert file.read_bytes() == content
 
 
@@ -130,7 +132,8 @@ def test_a_folder_that_cannot_hold_programs_is_said_once(tmp_path):
 
 def test_no_folder_for_kernels_at_all(monkeypatch):
     monkeypatch.setattr(kernel_cache, "_own", [])
-    monkeypatch.setattr("tempfile.tempdir", "/nonexistent")
+    monkeypatch.setattr("tempfile.tempdir", "/dev/null/a")
+    monkeypatch.setenv("POCL_CACHE_DIR", "/dev/null/b")
     with pytest.raises(lnocl.DeviceError, match=r"no folder for kernels .* set TMPDIR"):
         device.find_devices()
 
@@ -145,3 +148,67 @@ def test_caches_of_pyopencl_are_left_alone(tmp_path, warm):
     cache.touch()
     done = run_python(SAID, POCL_CACHE_DIR=str(tmp_path), XDG_CACHE_HOME=str(cache))
     assert (done.returncode, done.stdout, done.stderr) == (0, said, "")
+
+
+class TestStrangers:
+    """Kernels are code: those that others may have written are not loaded."""
+
+    @pytest.fixture
+    def file(self, tmp_path):
+        kernel_cache.write(tmp_path / "a.kernels", b"content")
+        return tmp_path / "a.kernels"
+
+    def test_a_file_of_ones_own_is_read(self, file):
+        assert kernel_cache.read(file) == b"content"
+
+    @pytest.mark.parametrize("mode", [0o620, 0o602, 0o666])
+    def test_a_file_that_others_may_write_to_is_not(self, file, mode):
+        file.chmod(mode)
+        with pytest.warns(lnocl.LnoclWarning, match="can be written by others, and are not used"):
+            assert kernel_cache.read(file) is None
+
+    def test_a_file_of_another_user_is_not(self, file, monkeypatch):
+        monkeypatch.setattr(os, "getuid", lambda: 12345)
+        with pytest.warns(lnocl.LnoclWarning, match="can be written by others"):
+            assert kernel_cache.read(file) is None
+
+    def test_a_pipe_is_not_waited_for(self, tmp_path):
+        os.mkfifo(tmp_path / "a.kernels")
+        assert kernel_cache.read(tmp_path / "a.kernels") is None
+        assert kernel_cache.read(tmp_path) is None
+
+    def test_folders_and_files_are_their_owners_alone(self, tmp_path):
+        before = os.umask(0)
+        try:
+            assert kernel_cache.can_write(tmp_path / "store")
+            kernel_cache.write(tmp_path / "store" / "a.kernels", b"content")
+        finally:
+            os.umask(before)
+        assert (tmp_path / "store").stat().st_mode & 0o777 == 0o700
+        assert (tmp_path / "store" / "a.kernels").stat().st_mode & 0o777 == 0o600
+
+    def test_what_is_no_archive_is_as_if_it_were_not_there(self):
+        assert kernel_cache.unpack(b"PK\x03\x04 and nothing else") == set()
+
+
+def test_the_store_does_not_grow_without_bound(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel_cache, "MAX_STORED", 3000)
+    for age, name in enumerate("abcde"):
+        kernel_cache.write(tmp_path / f"{name}.kernels", bytes(900))
+        os.utime(tmp_path / f"{name}.kernels", (age, age))
+        if name == "c":
+            kernel_cache.read(tmp_path / "a.kernels")  # is used again
+    assert {file.stem for file in tmp_path.iterdir()} == {"a", "d", "e"}
+
+
+@on_pocl
+def test_a_library_that_was_cut_short_is_not_stored(warm):
+    content = warm[1][kernel_cache.DIGEST_SIZE :]
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        libraries = [archive.read(name) for name in archive.namelist() if name.endswith(".so")]
+    assert libraries
+    for library in libraries:
+        assert kernel_cache._is_whole(library)
+        assert not kernel_cache._is_whole(library[:-1])
+        assert not kernel_cache._is_whole(library[: len(library) // 2])
+    assert kernel_cache._is_whole(b"no library")

@@ -1,0 +1,164 @@
+"""The linker that PoCL needs: it links each kernel, and aborts the process where that fails.
+
+So a process of its own links a kernel first, once in an environment. Where the system has no
+linker, that of the package ziglang is taken if it is installed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+
+import pyopencl as cl
+
+from lnocl.errors import DeviceError
+from lnocl.opencl import kernel_cache
+
+POCL = "Portable Computing Language"
+
+# What the outcome may hang on, besides the device.
+VARIABLES = ("PATH", "COMPILER_PATH", "LIBRARY_PATH", "TMPDIR")
+TRIAL = """
+import sys
+import numpy
+import pyopencl as cl
+platform, device = map(int, sys.argv[1:])
+context = cl.Context([cl.get_platforms()[platform].get_devices()[device]])
+queue, found = cl.CommandQueue(context), numpy.zeros(1, numpy.float32)
+buffer = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, 4)
+cl.Program(context, "__kernel void f(__global float *x) { *x = 1; }").build().f(
+    queue, (1,), None, buffer)
+cl.enqueue_copy(queue, found, buffer)
+"""
+# PoCL's command names start files and libraries that its kernels do not need.
+ZIGLANG = """#!/bin/sh
+output= objects=
+while [ $# -gt 0 ]; do
+    case $1 in
+        -o) output=$2; shift ;;
+        *crt*.o) ;;
+        *.o) objects="$objects $1" ;;
+    esac
+    shift
+done
+exec {python} -m ziglang ld.lld -shared -o "$output" $objects
+"""
+CURE = "run apt-get install gcc libc6-dev, or pip install ziglang, or take engine numpy"
+# Files that PoCL and the linker may have open.
+N_FILES = 24
+# Words of the trial, and their meaning.
+TOO_FEW_FILES = "too few files may be open: raise the limit (ulimit -n)"
+CAUSES = {
+    "Too many open files": TOO_FEW_FILES,
+    "doesn't exist": f"there is no linker: {CURE}",
+    "cannot find": f"the linker lacks files of libgcc or libc: {CURE}",
+    "Resource temporarily unavailable": "too few processes may run: raise the limit (ulimit -u)",
+    "No space left": "the folder for temporary files is full: set TMPDIR to another",
+}
+
+
+@functools.cache
+def check(device: cl.Device) -> None:
+    """Refuse a device of PoCL where its kernels cannot be linked.
+
+    The store of compiled kernels holds the outcome for later processes. Other runtimes are left
+    alone.
+
+    Raises
+    ------
+    DeviceError
+        They cannot; the message says what to install or to set.
+    """
+    if device.platform.name != POCL:
+        return
+    _need_files()
+    note = kernel_cache.file_of(_environment(device)).with_suffix(".linker")
+    linker = kernel_cache.read(note)
+    if linker is None:
+        linker = _find(device)
+        if kernel_cache.can_write(note.parent):
+            kernel_cache.write(note, linker)
+    elif linker == b"ziglang":
+        _take_ziglang()
+
+
+def _need_files() -> None:
+    """Refuse to go where PoCL and its linker cannot open their files."""
+    opened: list[int] = []
+    try:
+        for _ in range(N_FILES):
+            opened.append(os.open(os.devnull, os.O_RDONLY))
+    except OSError as error:
+        raise DeviceError(f"PoCL cannot link kernels: {TOO_FEW_FILES}") from error
+    finally:
+        for each in opened:
+            os.close(each)
+
+
+def _environment(device: cl.Device) -> str:
+    words = [sys.executable, cl.VERSION_TEXT, device.name, device.driver_version]
+    words += [_foreign(os.environ.get(name, "")) for name in VARIABLES]
+    with contextlib.suppress(ImportError):  # there is none on Windows
+        import resource
+
+        limits = resource.RLIMIT_NOFILE, resource.RLIMIT_NPROC, resource.RLIMIT_AS
+        words += [str(resource.getrlimit(limit)) for limit in limits]
+    return "\n".join(words)
+
+
+def _foreign(folders: str) -> str:
+    """Return a list of folders without those that this package has put there."""
+    parts = folders.split(os.pathsep)
+    return os.pathsep.join(part for part in parts if kernel_cache.PREFIX not in part)
+
+
+def _find(device: cl.Device) -> bytes:
+    """Return the linker that works: b"system" or b"ziglang"."""
+    failure = _try(device)
+    if not failure:
+        return b"system"
+    if importlib.util.find_spec("ziglang"):
+        _take_ziglang()
+        if not _try(device):
+            return b"ziglang"
+    cause = next((CAUSES[words] for words in CAUSES if words in failure), failure)
+    raise DeviceError(f"PoCL cannot link kernels: {cause}")
+
+
+def _try(device: cl.Device) -> str:
+    """Link a kernel in another process; return its last words where it was aborted, else ""."""
+    platform = cl.get_platforms().index(device.platform)
+    place = [str(platform), str(device.platform.get_devices().index(device))]
+    folder = kernel_cache.new_folder()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", TRIAL, *place],
+            env={**os.environ, kernel_cache.VARIABLE: folder, "XDG_CACHE_HOME": folder},
+            capture_output=True,
+            text=True,
+            errors="replace",
+        )
+    except OSError as error:
+        return str(error.strerror)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    if done.returncode >= 0:  # whatever it was, it was not an abort
+        return ""
+    return " ".join(done.stderr.split())[-400:] or f"signal {-done.returncode}"
+
+
+def _take_ziglang() -> None:
+    """Give clang, with which PoCL links, a linker that runs that of ziglang."""
+    folder = kernel_cache.new_folder()
+    script = os.path.join(folder, "ld")
+    with open(script, "w", encoding="utf-8") as out:
+        out.write(ZIGLANG.replace("{python}", shlex.quote(sys.executable)))
+    os.chmod(script, 0o700)
+    before = os.environ.get("COMPILER_PATH")
+    os.environ["COMPILER_PATH"] = os.pathsep.join(filter(None, (folder, before)))

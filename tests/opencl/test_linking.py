@@ -1,0 +1,121 @@
+"""PoCL on machines where it cannot link kernels, and would abort the process."""
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from processes import run_python
+from runtimes import on_pocl
+
+import lnocl
+from lnocl.opencl import device, kernel_cache, linking
+
+pytestmark = [on_pocl, pytest.mark.system]
+
+TOLD = """
+try:
+    deconvolve()
+except lnocl.DeviceError as error:
+    print(error)
+"""
+
+
+@pytest.fixture
+def without_linker(tmp_path, monkeypatch):
+    """Return a function that gives PoCL a linker which says something and fails."""
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "store"))
+    monkeypatch.setenv("COMPILER_PATH", str(tmp_path))
+
+    def give(words):
+        (tmp_path / "ld").write_text(f'#!/bin/sh\necho "{words}" >&2\nexit 1\n')
+        (tmp_path / "ld").chmod(0o700)
+
+    return give
+
+
+@pytest.mark.parametrize(
+    ("words", "cause"),
+    [
+        (
+            "ld: cannot find -lgcc: No such file",
+            "the linker lacks files of libgcc or libc",
+        ),
+        ("ld: crti.o: Too many open files", "too few files may be open: raise the limit (ulimit"),
+        ("ld: x.so: No space left on device", "temporary files is full: set TMPDIR"),
+        ("ld: weather", "ld: weather"),
+    ],
+)
+def test_it_is_said_in_one_line(without_linker, words, cause):
+    without_linker(words)
+    done = run_python(TOLD)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("PoCL cannot link kernels: ")
+    assert cause in done.stdout
+    assert done.stdout.count("\n") == 1
+
+
+def test_the_linker_of_ziglang_is_taken(without_linker, tmp_path):
+    """Here a package of that name, which runs the system's."""
+    without_linker("there is none")
+    (tmp_path / "site" / "ziglang").mkdir(parents=True)
+    (tmp_path / "site" / "ziglang" / "__init__.py").touch()
+    (tmp_path / "site" / "ziglang" / "__main__.py").write_text(
+        "import subprocess, sys\n"
+        "assert sys.argv[1:3] == ['ld.lld', '-shared']\n"
+        "open('linked', 'a').write('*')\n"
+        "sys.exit(subprocess.call(['/usr/bin/ld', *sys.argv[2:]]))\n"
+    )
+    path = os.pathsep.join([str(Path(lnocl.__file__).parents[1]), str(tmp_path / "site")])
+    for _ in range(2):
+        done = run_python("print(deconvolve())", cwd=tmp_path, PYTHONPATH=path)
+        assert (done.returncode, done.stderr) == (0, "")
+    assert float(done.stdout) > 0
+    assert len((tmp_path / "linked").read_text()) > 5
+
+
+def test_it_is_tried_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+    chosen = device.choose().device
+    linking.check.__wrapped__(chosen)
+    monkeypatch.setattr(linking, "_try", lambda _: pytest.fail("tried again"))
+    linking.check.__wrapped__(chosen)
+    monkeypatch.setenv("PATH", "/elsewhere")
+    with pytest.raises(pytest.fail.Exception, match="tried again"):
+        linking.check.__wrapped__(chosen)
+
+
+def test_too_few_files_are_refused(tmp_path):
+    done = run_python(
+        "import resource\nresource.setrlimit(resource.RLIMIT_NOFILE, (20, 20))\n" + TOLD,
+        POCL_CACHE_DIR=str(tmp_path),
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "too few files may be open: raise the limit (ulimit -n)" in done.stdout
+
+
+def test_other_runtimes_are_left_alone(monkeypatch):
+    monkeypatch.setattr(linking, "_try", lambda _: pytest.fail("tried"))
+    linking.check.__wrapped__(SimpleNamespace(platform=SimpleNamespace(name="Another")))
+
+
+@pytest.mark.parametrize("lack", ["noexec", "space"])
+def test_kernels_go_where_they_can_be_run(lack, tmp_path, monkeypatch):
+    """Else beside the store; else one line says what to set."""
+    genuine, bad = os.statvfs, {tmp_path / "temporary"}
+
+    def statvfs(folder):
+        found = genuine(folder)
+        exec_flag = os.ST_NOEXEC if Path(folder) in bad and lack == "noexec" else 0
+        free = 100 if Path(folder) in bad and lack == "space" else found.f_bavail
+        return SimpleNamespace(f_flag=exec_flag, f_bavail=free, f_frsize=found.f_frsize)
+
+    monkeypatch.setattr(os, "statvfs", statvfs)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "store"))
+    assert kernel_cache._Folder().path.parent == tmp_path / "store"
+    bad.add(tmp_path / "store")
+    with pytest.raises(lnocl.DeviceError, match="set TMPDIR to one with 16 MiB from which progr"):
+        kernel_cache._Folder()
+    bad.clear()
+    assert kernel_cache._Folder().path.parent == tmp_path / "temporary"
