@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import inspect
 import os
@@ -214,8 +213,7 @@ def _run(arguments: argparse.Namespace) -> None:
     checkpoints.check(arguments, inputs)
     folder = os.getcwd()
     given = {**vars(arguments), "device": _device_spec(arguments)}
-    log = contextlib.nullcontext() if arguments.quiet else messages.shown_log()
-    with log, checkpoints.Interrupts() as interrupts:
+    with messages.shown_log(arguments.quiet), checkpoints.Interrupts() as interrupts:
         calibration = Calibration(**_given(given, Calibration._fields))
         frames = read_frames(arguments.images, arguments.psfs, calibration)
         given["stars"] = _stars(arguments, frames.images)
