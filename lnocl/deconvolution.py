@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import partial
 from os import PathLike
 
@@ -199,6 +200,7 @@ def deconvolve(
     np.float64(612.0)
     """
     check_observation(observation)
+    observation = copy(observation)  # its arrays are read-only, but its attributes may be replaced
     check_choices(solver, precision, engine, device)
     check_length(n_iter, stop)
     check_types(callback, progress=progress, refine_positions=refine_positions)

@@ -88,3 +88,30 @@ def test_stars_on_the_sky_are_refused_and_stars_in_pixels_taken():
         deconvolve(stars=[(3, 4)] * u.arcsec)
     found, expected = (deconvolve(stars=[(3, 4)] * unit) for unit in (u.pix, 1))
     np.testing.assert_array_equal(found.star_fluxes, expected.star_fluxes)
+
+
+ARRAYS = {
+    "extended", "star_fluxes", "star_positions", "star_flux_errors", "star_position_errors",
+    "history", "held_out",
+}  # fmt: skip
+
+
+def test_arrays_of_a_result_are_read_only():
+    result = deconvolve(stars=[(3, 4)])
+    arrays = {name: each for name, each in vars(result).items() if isinstance(each, np.ndarray)}
+    assert set(arrays) == ARRAYS
+    for array in arrays.values():
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = array
+
+
+def test_models_are_those_of_the_images_that_were_given():
+    images, stars = np.random.default_rng(2).poisson(9.0, (8, 8)).astype(float), [[3.0, 4.0]]
+    observation = lnocl.Observation(images, np.ones((1, 1)), background=1.0)
+    result = lnocl.deconvolve(observation, stars, n_iter=3, engine="numpy")
+    models, residuals = result.models(), result.residuals()
+    images += 100.0
+    stars[0][0] = 6.0
+    observation.images, observation.background = images, np.array([50.0])
+    np.testing.assert_array_equal(result.models(), models)
+    np.testing.assert_array_equal(result.residuals(), residuals)
