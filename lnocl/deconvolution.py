@@ -159,9 +159,9 @@ def deconvolve(
         A PSF is larger than the grid, so that its wings wrap round, or rings where it is moved
         between pixels; there are offsets without `pad`; single precision is expected to stray from
         double by a thousandth of the extended source; held-out counts are asked of images that are
-        not whole counts, or choose an iteration too near `n_iter`; the objective rises or is not
-        finite; a later checkpoint cannot be written; compiled kernels cannot be kept or are
-        damaged.
+        not whole counts, or choose an iteration too near `n_iter`; the images do not determine
+        stars that were refined; the objective rises or is not finite; a later checkpoint cannot be
+        written; compiled kernels cannot be kept or are damaged.
 
     Notes
     -----
