@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import partial
 from os import PathLike
 
@@ -17,15 +18,16 @@ from lnocl.runs.options import (
     check_choices,
     check_length,
     check_observation,
-    check_start,
     check_types,
     read_penalties,
+    read_start,
     warn_of_rounding,
 )
 from lnocl.runs.progress import Bar
 from lnocl.runs.run import Run, Setup
 from lnocl.runs.stopping import Rule, make_rule
-from lnocl.scene.observation import Array, Observation, numbers
+from lnocl.scene.observation import Observation
+from lnocl.scene.stars import check_positions
 
 
 def deconvolve(
@@ -66,7 +68,8 @@ def deconvolve(
         The p images of shape (ny, nx), with their PSFs, backgrounds, noise and masks.
     stars : sequence of (x, y), optional
         Positions of the point sources in pixels of an image without offset, 0-based, x along
-        columns. Between pixels a star's image is the PSF moved in its spectrum
+        columns; they may be a Quantity in pixels. Two are at least a thousandth of a pixel apart.
+        Between pixels a star's image is the PSF moved in its spectrum
         (`lnocl.scene.shifting.place`).
     mu : float or "auto", optional
         Weight of the Tikhonov term on the extended source, per electron; zero or more. "auto":
@@ -137,8 +140,9 @@ def deconvolve(
     ------
     InputError
         `observation` is not an Observation; a parameter is out of its range, masked or too large
-        for the precision; mu and smoothing are both "auto"; a star lies outside the images; the
-        start is 0 where iterations cannot leave it; there is no such device, or one was given for
+        for the precision; mu and smoothing are both "auto"; a star lies outside the images; two
+        are at one position; stars are not in pixels, or the start not in counts; the start is 0
+        where iterations cannot leave it; there is no such device, or one was given for
         the reference; images or exposures are too large to be summed, or the sky for a number;
         held-out counts were asked of images that hold no counts.
     FileError
@@ -155,9 +159,9 @@ def deconvolve(
         A PSF is larger than the grid, so that its wings wrap round, or rings where it is moved
         between pixels; there are offsets without `pad`; single precision is expected to stray from
         double by a thousandth of the extended source; held-out counts are asked of images that are
-        not whole counts, or choose an iteration too near `n_iter`; the objective rises or is not
-        finite; a later checkpoint cannot be written; compiled kernels cannot be kept or are
-        damaged.
+        not whole counts, or choose an iteration too near `n_iter`; the images do not determine
+        stars that were refined; the objective rises or is not finite; a later checkpoint cannot be
+        written; compiled kernels cannot be kept or are damaged.
 
     Notes
     -----
@@ -196,15 +200,19 @@ def deconvolve(
     np.float64(612.0)
     """
     check_observation(observation)
+    observation = copy(observation)  # its arrays are read-only, but its attributes may be replaced
     check_choices(solver, precision, engine, device)
     check_length(n_iter, stop)
     check_types(callback, progress=progress, refine_positions=refine_positions)
     fits_stars = solver == "sgp" or bool(refine_positions)
-    check_start(fits_stars, initial_extended, initial_star_fluxes)
+    positions = check_positions(stars, observation)
+    initial_extended, initial_star_fluxes = read_start(
+        observation, fits_stars, initial_extended, initial_star_fluxes
+    )
     penalty, grid = read_penalties(mu, smoothing)
     if engine == "opencl" and precision == "single":
         warn_of_rounding(int(n_iter))
-    setup = Setup(stars, pad, solver, precision, engine, device, refine_positions)
+    setup = Setup(positions, pad, solver, precision, engine, device, refine_positions)
     inputs = partial(
         describe,
         observation,
@@ -226,9 +234,8 @@ def deconvolve(
         if choice is None and grid is None and stop != "held-out":
             choice = Choice(penalty, int(n_iter), EMPTY_CURVE)
         if choice is None:
-            start = partial(
-                Run, setup, n_iter=int(n_iter), initial_extended=_half(initial_extended)
-            )
+            half = None if initial_extended is None else initial_extended / 2.0
+            start = partial(Run, setup, n_iter=int(n_iter), initial_extended=half)
             at_end = stop != "held-out"
             selection = HeldOutSelection(start, observation, penalty, grid, int(n_iter), at_end)
             choice = _choose(selection, bar, checkpointer)
@@ -240,13 +247,6 @@ def deconvolve(
         if stop == "held-out" and stop_reason == "n_iter":
             stop_reason = "held-out"
         return make_result(run, stop_reason, choice)
-
-
-def _half(initial_extended: ArrayLike | None) -> Array | None:
-    """Return where the halves of held-out counts start."""
-    if initial_extended is None:
-        return None
-    return numbers("initial_extended", initial_extended) / 2.0
 
 
 def _choose(selection: HeldOutSelection, bar: Bar, checkpointer: Checkpointer) -> Choice:

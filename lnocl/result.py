@@ -62,7 +62,7 @@ Callback = Callable[[int, Estimate], Any]
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The result of `deconvolve`. Results are compared by identity.
+    """The result of `deconvolve`. Its arrays are read-only; results are compared by identity.
 
     Attributes
     ----------
@@ -74,8 +74,8 @@ class Result:
         (x, y) in pixels, as given or refined.
     star_flux_errors : ndarray of float64, shape (n,)
         Standard errors of the fluxes, electrons. They are those of the Fisher information of fluxes
-        and positions, with the extended source taken as known. NaN where positions were not
-        refined.
+        and positions, with the extended source taken as known. NaN where positions were not refined
+        or the images do not determine them, such as those of stars that have moved to one place.
     star_position_errors : ndarray of float64, shape (n, 2)
         Standard errors of the positions, pixels, likewise.
     n_iter : int
@@ -114,6 +114,11 @@ class Result:
     held_out: NDArray[np.void]
     _models: Callable[[], Array] = field(repr=False, compare=False)
     _observation: Observation = field(repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for values in vars(self).values():
+            if isinstance(values, np.ndarray):
+                values.flags.writeable = False
 
     def models(self) -> Array:
         """Return the m_j, shape (p, ny, nx), electrons per pixel.

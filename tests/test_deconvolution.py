@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from astropy import units as u
 
 import lnocl
 
@@ -59,3 +60,58 @@ def test_an_extended_source_may_start_at_0_in_places():
     start[2, 3] = 0.0
     extended = deconvolve(initial_extended=start).extended
     np.testing.assert_array_equal(extended == 0, start == 0)
+
+
+@pytest.mark.parametrize("name", ["initial_extended", "initial_star_fluxes"])
+def test_units_of_a_start(name):
+    numbers = {"initial_extended": np.eye(8), "initial_star_fluxes": np.array([2.0])}[name]
+    exposed = lnocl.Observation(np.full((8, 8), 5.0), np.ones((1, 1)), exposure=4.0)
+
+    def begin(start, observation=OBSERVATION):
+        options = {"stars": [(3, 4)], "n_iter": 1, "engine": "numpy", name: start}
+        return lnocl.deconvolve(observation, **options).extended
+
+    for unit, electrons in ((u.electron, 1), (u.ct, 1), (u.Unit(2 * u.photon), 2)):
+        np.testing.assert_array_equal(begin(numbers * unit), begin(numbers * electrons))
+    np.testing.assert_array_equal(begin(numbers * u.ct / u.s, exposed), begin(numbers, exposed))
+    for unit, message in {
+        u.km: f"^{name} must be counts.*, not km; give electrons",
+        u.adu: f"^{name} must be counts.*, not adu; multiply by the gain",
+        u.ct / u.s: f"^{name} in ct / s are counts per time; give electrons",
+    }.items():
+        with pytest.raises(lnocl.InputError, match=message):
+            begin(numbers * unit)
+
+
+def test_stars_on_the_sky_are_refused_and_stars_in_pixels_taken():
+    with pytest.raises(lnocl.InputError, match=r"^stars must be in pixels, not in arcsec; convert"):
+        deconvolve(stars=[(3, 4)] * u.arcsec)
+    found, expected = (deconvolve(stars=[(3, 4)] * unit) for unit in (u.pix, 1))
+    np.testing.assert_array_equal(found.star_fluxes, expected.star_fluxes)
+
+
+ARRAYS = {
+    "extended", "star_fluxes", "star_positions", "star_flux_errors", "star_position_errors",
+    "history", "held_out",
+}  # fmt: skip
+
+
+def test_arrays_of_a_result_are_read_only():
+    result = deconvolve(stars=[(3, 4)])
+    arrays = {name: each for name, each in vars(result).items() if isinstance(each, np.ndarray)}
+    assert set(arrays) == ARRAYS
+    for array in arrays.values():
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = array
+
+
+def test_models_are_those_of_the_images_that_were_given():
+    images, stars = np.random.default_rng(2).poisson(9.0, (8, 8)).astype(float), [[3.0, 4.0]]
+    observation = lnocl.Observation(images, np.ones((1, 1)), background=1.0)
+    result = lnocl.deconvolve(observation, stars, n_iter=3, engine="numpy")
+    models, residuals = result.models(), result.residuals()
+    images += 100.0
+    stars[0][0] = 6.0
+    observation.images, observation.background = images, np.array([50.0])
+    np.testing.assert_array_equal(result.models(), models)
+    np.testing.assert_array_equal(result.residuals(), residuals)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import inspect
 import os
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from astropy.io import fits
 
     from lnocl.io.fitsread import Stack
-    from lnocl.io.fitswrite import Card, StarColumn
+    from lnocl.io.fitswrite import StarColumn
     from lnocl.io.frames import Calibration, Frames
 
 PARAMETERS = {
@@ -51,12 +50,14 @@ OPTIONS = {
         option(
             "--models",
             action="store_true",
-            help="add a cube with the model of each image, in electrons",
+            help="add a cube with the model of each image, in electrons; its header has the "
+            "coordinates of the image where all images share them, else their offsets",
         ),
         option(
             "--residuals",
             action="store_true",
-            help="add a cube with the residuals of each image, (image - model) / sqrt(model)",
+            help="add a cube with the residuals of each image, (image - model) / sqrt(model), with "
+            "the same header",
         ),
         options.QUIET,
     ],
@@ -214,8 +215,7 @@ def _run(arguments: argparse.Namespace) -> None:
     checkpoints.check(arguments, inputs)
     folder = os.getcwd()
     given = {**vars(arguments), "device": _device_spec(arguments)}
-    log = contextlib.nullcontext() if arguments.quiet else messages.shown_log()
-    with log, checkpoints.Interrupts() as interrupts:
+    with messages.shown_log(arguments.quiet), checkpoints.Interrupts() as interrupts:
         calibration = Calibration(**_given(given, Calibration._fields))
         frames = read_frames(arguments.images, arguments.psfs, calibration)
         given["stars"] = _stars(arguments, frames.images)
@@ -229,6 +229,7 @@ def _run(arguments: argparse.Namespace) -> None:
         interrupts.listen()  # a run that was resumed at its end has no iteration to start from
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
+        offsets = frames.observation.offsets
         repeated = given | _repeated(given, calibration, frames)
         fitswrite.write_result(
             arguments.output,
@@ -241,7 +242,7 @@ def _run(arguments: argparse.Namespace) -> None:
                 ALL_OPTIONS,
                 repeated | _used(repeated, frames, result),
                 frames.sha256,
-                _offset_cards(frames) if arguments.align else [],
+                fitswrite.offset_cards(offsets) if arguments.align else [],
             ),
             commands=record.make_commands("deconvolve", ALL_OPTIONS, repeated, folder),
             overwrite=arguments.overwrite,
@@ -249,6 +250,7 @@ def _run(arguments: argparse.Namespace) -> None:
             per_second=bool(arguments.exposure),
             star_columns=_star_columns(arguments, result, frames.images.header),
             cubes=_cubes(arguments, result),
+            offsets=offsets,
         )
         if not arguments.quiet:
             messages.say(_summary(arguments, result))
@@ -285,14 +287,6 @@ def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[s
         "pad": recommend_pad(frames.observation) if repeated["pad"] == "auto" else repeated["pad"],
         **({"exposure": exposure.tolist()} if repeated["exposure"] and exposure.ndim == 1 else {}),
     }
-
-
-def _offset_cards(frames: Frames) -> list[Card]:
-    return [
-        (f"OFF{axis}{j}", float(offset), "offset of the image, pixels")
-        for j, offsets in enumerate(frames.observation.offsets, 1)
-        for axis, offset in zip("XY", offsets, strict=True)
-    ]
 
 
 def _stars(arguments: argparse.Namespace, images: Stack) -> list[tuple[float, float]]:

@@ -83,8 +83,11 @@ def show_warning(
 
 
 @contextlib.contextmanager
-def shown_log() -> Iterator[None]:
-    """Show the notes that the library logs on stderr."""
+def shown_log(quiet: bool = False) -> Iterator[None]:
+    """Show the notes that the library logs on stderr, unless it is quiet."""
+    if quiet:
+        yield
+        return
     log, handler = logging.getLogger("lnocl"), _Notes()
     level = log.level
     log.addHandler(handler)

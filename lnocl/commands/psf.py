@@ -107,10 +107,11 @@ def _run(arguments: argparse.Namespace) -> None:
     from lnocl.io import fitswrite
 
     sha256: dict[str, list[str]] = {}
-    frame, sha256["frame"] = _read_image(arguments.frame)
     mask = None
-    if arguments.mask is not None:
-        mask, sha256["mask"] = _read_mask(arguments.mask, arguments.frame, frame.shape)
+    with messages.shown_log(arguments.quiet):
+        frame, sha256["frame"] = _read_image(arguments.frame)
+        if arguments.mask is not None:
+            mask, sha256["mask"] = _read_mask(arguments.mask, arguments.frame, frame.shape)
     stars = psf.make_psfs(
         frame,
         arguments.rotate,

@@ -89,7 +89,8 @@ def _run(arguments: argparse.Namespace) -> None:
     from lnocl.studies import files
 
     stars = arguments.stars and [Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
-    target = load_target(arguments.scene, arguments.size, stars)
+    with messages.shown_log():
+        target = load_target(arguments.scene, arguments.size, stars)
     units = {
         "angles": u.deg,
         "extended_magnitude": u.mag,

@@ -22,6 +22,8 @@ from lnocl.process import recorded_warnings
 # Keywords whose value astropy counts to when it reads a header, and the largest that FITS allows.
 COUNTS = ("NAXIS", "TFIELDS")
 MAX_COUNT = 999
+# Bytes of a block of a FITS file.
+BLOCK = 2880
 
 
 class FitsFile:
@@ -77,7 +79,7 @@ class FitsFile:
                 )
             yield hdu
             end = where["datLoc"] + where["datSpan"]
-            if end >= self._length:
+            if end >= self._length or self._is_empty(end):
                 return
             try:
                 check_header(self.path, self._content, self._length, end)
@@ -86,6 +88,11 @@ class FitsFile:
             except Exception as error:
                 warn(f"everything after byte {end} is left out: {error}")
                 return
+
+    def _is_empty(self, start: int) -> bool:
+        """Return whether the block that starts at this byte is one of zeros, as tapes end in."""
+        self._content.seek(start)
+        return not self._content.read(BLOCK).strip(b"\0")
 
     def pixels(self, hdu: Any) -> NDArray[np.float64]:
         """Return the pixels of an image.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from astropy.io import fits
@@ -13,7 +14,10 @@ from numpy.typing import NDArray
 from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.fitsfile import open_fits
 from lnocl.io.headers import make_wcs, number, quiet_log, readable
+from lnocl.io.selection import choose, describe, has_pixels, only
 from lnocl.process import ignored_warnings
+
+log = logging.getLogger("lnocl")
 
 RESULT_TABLES = {
     "STARS": ("x", "y", "flux"),
@@ -51,9 +55,10 @@ class Stack(NamedTuple):
 def read_stack(paths: Sequence[str]) -> Stack:
     """Read images: one FITS file each, or one file with a cube.
 
-    The image of a file is the first HDU that is an image and has pixels: the primary HDU or an
-    image extension. BSCALE, BZERO and BLANK are applied (a blank pixel is NaN). A file may be
-    compressed as a whole (gzip, bzip2, xz), but not in tiles.
+    The image of a file is the extension SCI, else the primary HDU, else an image extension that
+    is not auxiliary (`lnocl.io.selection.choose`); an extension is named in the log. BSCALE, BZERO
+    and BLANK are applied (a blank pixel is NaN). A file may be compressed as a whole (gzip, bzip2,
+    xz), but not in tiles.
 
     Parameters
     ----------
@@ -71,7 +76,8 @@ def read_stack(paths: Sequence[str]) -> Stack:
         A file that is missing, damaged, truncated, tile-compressed or not FITS, that has no image,
         or whose image is larger than the memory.
     InputError
-        An image of another dimension or shape than the others.
+        An image of another dimension or shape than the others; several images in a file that have
+        an equal claim.
 
     Warns
     -----
@@ -109,6 +115,8 @@ def read_extension(path: str, name: str) -> NDArray[np.float64] | None:
     ------
     FileError
         As `read_stack`.
+    InputError
+        Several extensions have the name.
     """
     try:
         return _read_file(path, name)[0]
@@ -233,7 +241,7 @@ def read_result(path: str) -> SavedResult:
     tables = {}
     with open_fits(path) as file:
         for hdu in file.hdus():
-            if image is None and _has_pixels(hdu):
+            if image is None and has_pixels(hdu):
                 image = file.pixels(hdu), readable(hdu.header)
             elif isinstance(hdu, fits.BinTableHDU) and hdu.name in RESULT_TABLES:
                 tables[hdu.name] = file.columns(hdu)
@@ -271,14 +279,14 @@ def _read_file(
 ) -> tuple[NDArray[np.float64], fits.Header, str]:
     """Return an image in a file, its header and the checksum of the file."""
     with open_fits(path) as file:
-        for hdu in file.hdus():
-            if extension in (None, hdu.name) and _has_pixels(hdu):
-                return file.pixels(hdu), readable(hdu.header), file.sha256()
-    raise _NoImageError(f"{path} holds no image")
-
-
-def _has_pixels(hdu: Any) -> bool:
-    return hdu.is_image and len(getattr(hdu, "shape", ())) > 0 and 0 not in hdu.shape
+        hdus = list(file.hdus())
+        index = choose(path, hdus) if extension is None else only(path, hdus, extension)
+        if index is None:
+            raise _NoImageError(f"{path} holds no image")
+        if index and extension is None:
+            log.info("%s: the image is %s", path, describe(index, hdus[index]))
+        hdu = hdus[index]
+        return file.pixels(hdu), readable(hdu.header), file.sha256()
 
 
 def _check_shape(

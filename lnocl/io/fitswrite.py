@@ -46,6 +46,7 @@ def write_result(
     per_second: bool = False,
     star_columns: Sequence[StarColumn] = (),
     cubes: Mapping[str, tuple[ArrayLike, str]] = MappingProxyType({}),
+    offsets: ArrayLike = (),
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
@@ -84,6 +85,9 @@ def write_result(
         Further columns of the table of stars.
     cubes : mapping of str to (array_like, str), optional
         Further images (p, ny, nx), by the name of their extension, with their unit.
+    offsets : array_like, shape (p, 2), optional
+        Offsets of these images, pixels. Where one is not 0, no coordinate system holds for all of a
+        cube: it has the cards of `offset_cards` instead.
 
     Raises
     ------
@@ -91,6 +95,7 @@ def write_result(
         The file cannot be written, or exists and must not be overwritten.
     """
     coordinates = fits.Header() if wcs is None else wcs
+    shared = coordinates if not np.any(offsets) else fits.Header(offset_cards(offsets))
     header = coordinates.copy()
     header["BUNIT"] = ("electron/s" if per_second else "electron", "per pixel")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
@@ -102,7 +107,7 @@ def write_result(
             *([] if history is None else [_table("HISTORY", history)]),
             *([] if curve is None else [_table("CURVE", curve)]),
             *([] if held_out is None else [_table("HELDOUT", held_out)]),
-            *(_cube(name, *cube, coordinates) for name, cube in cubes.items()),
+            *(_cube(name, *cube, shared) for name, cube in cubes.items()),
         ]
     )
     with whole_file(path, overwrite) as stream:
@@ -145,6 +150,15 @@ def write_image(
     hdu.add_checksum(when="")  # astropy would note the time
     with whole_file(path, overwrite) as stream:
         fits.HDUList([hdu]).writeto(stream)
+
+
+def offset_cards(offsets: ArrayLike) -> list[Card]:
+    """Return the cards OFFX1, OFFY1, OFFX2 ... of the offsets of images, shape (p, 2), pixels."""
+    return [
+        (f"OFF{axis}{j}", float(offset), "offset of the image, pixels")
+        for j, pair in enumerate(np.asarray(offsets), 1)
+        for axis, offset in zip("XY", pair, strict=True)
+    ]
 
 
 def history_lines(words: Sequence[str]) -> list[str]:
@@ -222,8 +236,8 @@ def _star_table(
     return table
 
 
-def _cube(name: str, images: ArrayLike, unit: str, coordinates: fits.Header) -> fits.ImageHDU:
-    hdu = fits.ImageHDU(np.asarray(images, dtype=np.float32), coordinates, name=name)
+def _cube(name: str, images: ArrayLike, unit: str, header: fits.Header) -> fits.ImageHDU:
+    hdu = fits.ImageHDU(np.asarray(images, dtype=np.float32), header, name=name)
     if unit:
         hdu.header["BUNIT"] = unit
     return hdu

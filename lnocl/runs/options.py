@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError, warn
 from lnocl.runs.held_out import PenaltyGrid, mu_grid, smoothing_grid
-from lnocl.scene.observation import Observation, numbers
+from lnocl.scene.containers import counts
+from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.penalty import Penalty
 from lnocl.solvers import SOLVERS
 
@@ -100,28 +101,40 @@ def check_types(callback: object, **flags: object) -> None:
             raise InputError(f"{name} must be True or False; {flag!r} was given")
 
 
-def check_start(
-    fits_stars: bool, initial_extended: ArrayLike | None, initial_star_fluxes: ArrayLike | None
-) -> None:
-    """Refuse an extended source of 0, and stars of 0 unless their fluxes are fitted at the start.
+def read_start(
+    observation: Observation,
+    fits_stars: bool,
+    initial_extended: ArrayLike | None,
+    initial_star_fluxes: ArrayLike | None,
+) -> tuple[Array | None, Array | None]:
+    """Return the start without its units, which are those of the result.
 
     Raises
     ------
     InputError
-        The start is 0 where iterations that multiply cannot leave it.
+        Units that are not of counts, or of counts per time without exposures; an extended source
+        of 0, and stars of 0 unless their fluxes are fitted at the start: iterations that multiply
+        cannot leave it.
     """
-    if initial_extended is not None and not numbers("initial_extended", initial_extended).any():
+    has_exposure = bool((observation.exposure != 1).any()) or None
+    extended = fluxes = None
+    if initial_extended is not None:
+        given, _ = counts("initial_extended", initial_extended, has_exposure)
+        extended = numbers("initial_extended", given)
+    if initial_star_fluxes is not None:
+        given, _ = counts("initial_star_fluxes", initial_star_fluxes, has_exposure, "counts")
+        fluxes = numbers("initial_star_fluxes", given)
+    if extended is not None and not extended.any():
         raise InputError(
             "initial_extended is 0 everywhere, which no iteration can leave; give it values above "
             "0, or leave it out"
         )
-    if initial_star_fluxes is not None and not fits_stars:
-        fluxes = numbers("initial_star_fluxes", initial_star_fluxes)
-        if n_dark := int((fluxes == 0).sum()):
-            raise InputError(
-                f"initial_star_fluxes holds {n_dark} of 0, which solver sgm multiplies and never "
-                "leaves; give values above 0, leave those stars out, or take solver sgp"
-            )
+    if fluxes is not None and not fits_stars and (n_dark := int((fluxes == 0).sum())):
+        raise InputError(
+            f"initial_star_fluxes holds {n_dark} of 0, which solver sgm multiplies and never "
+            "leaves; give values above 0, leave those stars out, or take solver sgp"
+        )
+    return extended, fluxes
 
 
 def read_penalties(mu: Any, smoothing: Any) -> tuple[Penalty, PenaltyGrid | None]:

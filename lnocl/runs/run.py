@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lnocl.errors import refuse_not_finite
+from lnocl.errors import refuse_not_finite, warn
 from lnocl.runs.descent import Descent
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
@@ -22,6 +22,7 @@ from lnocl.solvers.sgp import Steps
 
 if TYPE_CHECKING:
     from lnocl.scene.forward_model import Model
+    from lnocl.solvers.positions import Stars
     from lnocl.solvers.scaling import Scaling
 
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 class Setup:
     """The parameters that all runs of one call of `deconvolve` share."""
 
-    stars: Sequence[tuple[float, float]]
+    stars: ArrayLike
     pad: int | str
     solver: str
     precision: str
@@ -247,6 +248,7 @@ class Run:
 
         fit = StarFit(self.scene, self._model, self.engine.extended(), self._given_stars)
         errors = fit.errors(Stars(self.engine.star_fluxes(), self.scene.stars))
+        _warn_of_undetermined(errors, self.scene.stars)
         # J is divided by the scale too, so that its information is that of as many fewer counts.
         fluxes, positions = errors.fluxes * self.scene.unit, errors.positions
         root = 1.0 / np.sqrt(self.scene.scale)
@@ -326,6 +328,16 @@ def _model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Array:
     if scene.has_exposure_map:
         images *= model.weights
     return images[:, :ny, :nx] * scene.scale
+
+
+def _warn_of_undetermined(errors: Stars, positions: Array) -> None:
+    is_blended = np.isnan(errors.fluxes) | np.isnan(errors.positions).any(axis=1)
+    if is_blended.any():
+        named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in positions[is_blended])
+        warn(
+            f"the images do not determine flux and position of each star at {named}, so that these "
+            "errors are NaN; leave out stars that lie on others"
+        )
 
 
 def engine_name(setup: Setup) -> str:

@@ -68,12 +68,26 @@ def _masked(name: str, values: Any) -> Any:
 def _split(name: str, values: Any) -> tuple[Any, Any]:
     """Return plain numbers and their unit; the unit is None for plain numbers."""
     values = _gather(name, values)
-    if isinstance(values, _Numbers) or getattr(values, "unit", None) is not None:
-        return values.value, values.unit
-    return values, None
+    unit = getattr(values, "unit", None)
+    if unit is None and not isinstance(values, _Numbers):
+        return values, None
+    _refuse_logarithms(name, unit)
+    return values.value, unit
 
 
-def counts(name: str, values: Any, has_exposure: bool | None = None) -> tuple[Any, bool]:
+def _refuse_logarithms(name: str, unit: Any) -> None:
+    from astropy import units as u
+
+    if not (unit is None or isinstance(unit, u.UnitBase)):
+        raise InputError(
+            f"{name} in {unit} are not linear; give them in linear units, as physical does of a "
+            "Magnitude"
+        )
+
+
+def counts(
+    name: str, values: Any, has_exposure: bool | None = None, kind: str = "counts per pixel"
+) -> tuple[Any, bool]:
     """Return counts without their unit, and whether they are per unit of exposure time.
 
     Parameters
@@ -85,6 +99,8 @@ def counts(name: str, values: Any, has_exposure: bool | None = None) -> tuple[An
     has_exposure : bool, optional
         Whether there are exposures to multiply counts per time by; None where counts per time make
         no sense.
+    kind : str, optional
+        How messages name them.
 
     Returns
     -------
@@ -107,7 +123,7 @@ def counts(name: str, values: Any, has_exposure: bool | None = None) -> tuple[An
 
         digital = {u.adu, u.DN} & set(unit.decompose().bases)
         advice = "multiply by the gain (electrons per adu)" if digital else "give electrons"
-        raise InputError(f"{name} must be counts per pixel, not {unit}; {advice}")
+        raise InputError(f"{name} must be {kind}, not {unit}; {advice}")
     factor, is_rate = known
     if is_rate and not has_exposure:
         advice = "electrons" if has_exposure is None else "exposure in seconds with them"
@@ -140,8 +156,8 @@ def pixels(name: str, values: Any) -> Any:
         A unit other than pixels.
     """
     numbers, unit = _split(name, values)
-    if unit is None:
-        return numbers
+    if unit is None or unit.physical_type == "dimensionless":
+        return numbers if unit is None else numbers * unit.to("")
     if not unit.is_equivalent("pix"):
         raise InputError(
             f"{name} must be in pixels, not in {unit}; convert them with the WCS of the images"

@@ -27,7 +27,7 @@ MIN_SIDE = 8
 class Observation:
     """Images of one sky, each with its point spread function, background and bad pixels.
 
-    All input is checked and copied once, and held in float64. The data follow
+    All input is checked and copied once, and held in read-only arrays. The data follow
     ``images[j] ~ Poisson(exposure[j] (psfs[j] * sky) + background[j]) + Normal(0, read_noise[j])``,
     the sky moved by ``offsets[j]``.
 
@@ -130,6 +130,8 @@ class Observation:
             self._add_read_noise()
         self._refuse_overflow()
         self._clip_negative()
+        for values in vars(self).values():
+            values.flags.writeable = False
 
     @property
     def n_images(self) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError
+from lnocl.scene import containers
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
 
@@ -179,15 +180,20 @@ def rows_within(stamps: Sequence[Stamp], grid: tuple[int, int], leeway: float) -
     return rows
 
 
+# Stars that are nearer to each other, in pixels, are one: nothing tells their fluxes apart.
+CLOSEST = 1e-3
+
+
 def check_positions(stars: ArrayLike, observation: Observation) -> Array:
     """Return the positions of stars, shape (n, 2).
 
     Raises
     ------
     InputError
-        They are not pairs of numbers, or one lies outside all images.
+        They are not pairs of numbers, or not in pixels; one lies outside all images; two are at one
+        position.
     """
-    positions = numbers("stars", stars)
+    positions = numbers("stars", containers.pixels("stars", stars))
     if positions.size == 0:
         return np.zeros((0, 2))
     if positions.ndim != 2 or positions.shape[1] != 2:
@@ -201,4 +207,22 @@ def check_positions(stars: ArrayLike, observation: Observation) -> Array:
                 f"be in [0, {nx - 1}] and y in [0, {ny - 1}]"
                 + (" of one of them, its offset added" if observation.offsets.any() else "")
             )
+    _refuse_twins(positions)
     return positions
+
+
+def _refuse_twins(positions: Array) -> None:
+    order = np.argsort(positions[:, 0], kind="stable")
+    x, y = positions[order].T
+    for lag in range(1, len(order)):
+        is_near = x[lag:] - x[:-lag] < CLOSEST
+        if not is_near.any():
+            return
+        twins = np.flatnonzero(is_near & (abs(y[lag:] - y[:-lag]) < CLOSEST))
+        if twins.size:
+            first, second = sorted((order[twins[0]], order[twins[0] + lag]))
+            raise InputError(
+                f"stars {first + 1} and {second + 1} are at one position, ({positions[first, 0]:g},"
+                f" {positions[first, 1]:g}), where their fluxes cannot be told apart; leave one of "
+                "them out"
+            )

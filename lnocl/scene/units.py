@@ -27,12 +27,16 @@ ALIASES = {
     "degree": "deg",
     "degrees": "deg",
 }
-# Words that cannot be aliases: names of other units, or no names in astropy's grammar.
-WORDS = {r"\bper\b": "/", r"\be-": "electron", r"\bdn\b": "adu"}
+# Words that cannot be aliases: names of other units, such as siemens, or no names in astropy's
+# grammar.
+WORDS = {r"\bS\b": "s", r"(?i)\bper\b": "/", r"(?i)\be-": "electron", r"(?i)\bdn\b": "adu"}
 
 
 def parse(text: str) -> Any:
     """Return the unit that a header or a table names, in upper or lower case.
+
+    Each word is taken as it is written where it is a unit, such as Mct and mct, else in lower case,
+    such as ELECTRONS.
 
     Parameters
     ----------
@@ -42,42 +46,53 @@ def parse(text: str) -> Any:
     Returns
     -------
     astropy.units.UnitBase or None
-        None for an empty text; an `astropy.units.UnrecognizedUnit` where the text is not a unit.
+        None for an empty text; an `astropy.units.UnrecognizedUnit` where the text is not a unit, or
+        may be two, such as MCT.
     """
     from astropy import units as u
 
     if not text.strip():
         return None
-    words = text.strip().lower()
+    words = text.strip()
     for pattern, replacement in WORDS.items():
         words = re.sub(pattern, replacement, words)
-    unit = _parse_as_written(words)
-    # Of others, such as MJy, the case matters.
-    return _parse_as_written(text.strip()) if isinstance(unit, u.UnrecognizedUnit) else unit
-
-
-def _parse_as_written(text: str) -> Any:
-    from astropy import units as u
-
     aliases = {name: u.Unit(unit) for name, unit in ALIASES.items()}
     with ignored_warnings(), u.add_enabled_aliases(aliases):  # of spellings that FITS discourages
-        try:
-            unit = u.Unit(text, parse_strict="silent")
-            # "1," is a structure; -1 and 1e400 are not sizes.
-            if isinstance(unit, u.UnitBase) and 0 < unit.decompose().scale < np.inf:
-                return unit
-        except Exception:  # of any kind: the text is anybody's
-            pass
-    return u.UnrecognizedUnit(text)
+        unit = _parse(re.sub("[A-Za-z]+", lambda match: _in_its_case(match[0]), words))
+    return u.UnrecognizedUnit(text.strip()) if unit is None else unit
+
+
+def _in_its_case(word: str) -> str:
+    """Return a word as it is where it is a unit, else in lower case if that is the only reading."""
+    if _parse(word) is not None or _parse(word.lower()) is None:
+        return word
+    return word if _parse(word.capitalize()) is not None else word.lower()
+
+
+def _parse(text: str) -> Any:
+    """Return the unit of a text; None where it is not one."""
+    from astropy import units as u
+
+    try:
+        unit = u.Unit(text, parse_strict="silent")
+        # "1," is a structure; -1 and 1e400 are not sizes.
+        if isinstance(unit, u.UnitBase) and 0 < unit.decompose().scale < np.inf:
+            return None if isinstance(unit, u.UnrecognizedUnit) else unit
+    except Exception:  # of any kind: the text is anybody's
+        pass
+    return None
 
 
 def count_of(unit: Any, counts: Sequence[str] = COUNTS) -> tuple[float, bool] | None:
     """Return the number of counts in a unit, and whether it is per second.
 
-    Electrons, photons and counts are all taken as counts, per pixel or not; None for other units.
+    Electrons, photons and counts are all taken as counts, per pixel or not; None for other units,
+    those of logarithms such as magnitudes among them.
     """
     from astropy import units as u
 
+    if not isinstance(unit, u.UnitBase):
+        return None
     pixels = (u.dimensionless_unscaled, u.pix)
     times = ((u.dimensionless_unscaled, False), (u.s, True))
     for count in (*(getattr(u, name) for name in counts), u.dimensionless_unscaled):

@@ -21,6 +21,10 @@ FIT_ROUNDS = 50
 # Share of its information that each unknown must have left beside the others, rooted, for the
 # matrix to count as regular.
 MIN_DETERMINED = 1e-4
+# Rounding of the information, relative to its diagonal: a combination of unknowns with less is not
+# determined, and the unknowns that have more than this share in it are not either.
+UNDETERMINED = 1e-12
+UNDETERMINED_SHARE = 1e-4
 # A larger relative change of a flux has the information computed anew.
 INFORMATION_CHANGE = 0.01
 
@@ -163,6 +167,22 @@ def invert(information: Array) -> Array:
         root = np.linalg.inv(factor)
         inverse = root.T @ root
     return inverse * units
+
+
+def variances(information: Array) -> Array:
+    """Return the diagonal of the inverse of the information.
+
+    It is infinite for unknowns without information, and NaN for those that the others can stand in
+    for to within rounding, such as the fluxes of two stars at one place.
+    """
+    diagonal = np.diag(information)
+    is_known = diagonal > 0
+    roots = np.sqrt(np.where(is_known, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(information / roots / roots[:, None])
+    is_lost = values < UNDETERMINED
+    is_blended = (vectors[:, is_lost] ** 2).sum(axis=1) > UNDETERMINED_SHARE**2
+    sums = (vectors[:, ~is_lost] ** 2 / values[~is_lost]).sum(axis=1)
+    return np.where(is_known, np.where(is_blended, np.nan, sums / roots**2), np.inf)
 
 
 def bounded_step(information: Array, inverse: Array, gradient: Array, fluxes: Array) -> Array:

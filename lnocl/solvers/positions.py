@@ -14,7 +14,7 @@ from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
 from lnocl.scene.stars import Piece, StarImages, light_up, overlap, places
-from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood, invert
+from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood, invert, variances
 
 # How far from where it was given a star may go, in pixels.
 RADIUS = 3.0
@@ -173,11 +173,10 @@ class StarFit:
         return Stars(fluxes, self._given + _shorten(stars.positions + moves - self._given, RADIUS))
 
     def errors(self, stars: Stars) -> Stars:
-        """Return standard errors, the roots of the diagonal of ``F^-1``; infinite where F is 0."""
+        """Return standard errors, the roots of the `fluxes.variances`."""
         n = len(stars.fluxes)
         _, information = self.derivatives(stars)
-        roots = np.sqrt(np.maximum(np.diag(invert(information)), 0.0))
-        errors: Array = np.where(np.diag(information) > 0, roots, np.inf)
+        errors = np.sqrt(variances(information))
         return Stars(errors[:n], errors[n:].reshape(2, n).T)
 
 

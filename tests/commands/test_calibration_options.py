@@ -160,7 +160,7 @@ class TestFrames:
         assert self.run(*self.OPTIONS, *self.sky_option) == 0
         with fits.open("out.fits") as hdus:
             header, table = hdus[0].header, hdus["STARS"].header
-            coordinates = [WCS(hdus[name].header, naxis=2) for name in ("MODELS", "RESIDUALS")]
+            cubes = [hdus[name].header for name in ("MODELS", "RESIDUALS")]
             assert hdus["MODELS"].header["BUNIT"] == "electron"
             assert "BUNIT" not in hdus["RESIDUALS"].header
         assert header["BUNIT"] == "electron/s"
@@ -172,9 +172,10 @@ class TestFrames:
             "ra": "deg",
             "dec": "deg",
         }
-        for wcs in coordinates:
-            x, y = wcs.world_to_pixel(self.sky)
-            np.testing.assert_allclose([x, y], [7.0, 5.0], atol=1e-6)
+        np.testing.assert_allclose(WCS(header).world_to_pixel(self.sky), [7.0, 5.0], atol=1e-6)
+        for cube in cubes:  # the images are shifted against each other
+            assert not WCS(cube, naxis=2).has_celestial
+            assert [cube["OFFX2"], cube["OFFY2"]] == [header["OFFX2"], header["OFFY2"]]
         expected = {
             "BKG2": "level.fits",
             "EXP1": 30.0,

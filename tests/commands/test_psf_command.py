@@ -248,6 +248,14 @@ class TestMessages:
         assert line.startswith("lnocl: warning: ")
         assert line.endswith("its core is a guess")
 
+    def test_the_extension_with_the_frame_is_named(self, capsys):
+        extension = fits.ImageHDU(FRAME, name="SCI")
+        fits.HDUList([fits.PrimaryHDU(), extension]).writeto("sci.fits")
+        assert run("--size", "21", frame="sci.fits") == 0
+        assert "lnocl: sci.fits: the image is HDU 1 (SCI)\n" in capsys.readouterr().err
+        assert run("--size", "21", "--quiet", "--overwrite", frame="sci.fits") == 0
+        assert capsys.readouterr() == ("", "")
+
     def test_several_angles_warn_once(self, capsys):
         assert run("--rotate", "0", "20", "45", "--background", "0", frame="sharp.fits") == 0
         (line,) = capsys.readouterr().err.splitlines()

@@ -44,7 +44,7 @@ class TestReading:
         assert data[0, 7] == 104.0
         assert np.isnan(data).sum() == 1
 
-    def test_the_first_hdu_with_pixels_is_the_image(self, tmp_path):
+    def test_hdus_without_pixels_are_passed_over(self, tmp_path):
         header = fits.Header(LINEAR)
         path = save(
             tmp_path / "a.fits",

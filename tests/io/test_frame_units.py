@@ -82,6 +82,20 @@ class TestUnits:
         save("1.fits", IMAGES[1], BUNIT="ELECTRONS")
         observe()
 
+    @pytest.mark.parametrize(
+        ("unit", "factor"),
+        [("Mct", 1e6), ("mct", 1e-3), ("Mct/S", 1e6), ("kct", 1e3), ("KCT", 1e3), ("Mphoton", 1e6)],
+    )
+    def test_prefixes_are_those_of_the_case_as_written(self, unit, factor):
+        save_images(BUNIT=unit)
+        np.testing.assert_allclose(observe(exposure=[1.0]).images, factor * IMAGES, rtol=1e-15)
+
+    @pytest.mark.parametrize("unit", ["MCT", "MCt", "mCT", "MElectron/s", "MPHOTON", "electron/MS"])
+    def test_prefixes_that_may_be_two_are_refused(self, unit):
+        save_images(BUNIT=unit)
+        with pytest.raises(InputError, match=f"1.fits is in {unit}, not in counts; give gain"):
+            observe(exposure=[1.0])
+
     @pytest.mark.parametrize("gain", [0.0, -1.0, np.nan, np.inf])
     def test_a_gain_out_of_range(self, gain):
         save_images()

@@ -281,6 +281,8 @@ class TestMask:
         found = read(mask=["mask.fits", "dq"])
         np.testing.assert_array_equal(found.observation.mask, [flags[0] != 0, flags.any(axis=0)])
         assert notes(log) == [
+            "1.fits: the image is HDU 1 (SCI)",
+            "2.fits: the image is HDU 1 (SCI)",
             "image 1: 1 pixel masked by the mask",
             "image 2: 1 pixel masked by the mask",
             "image 1: 0 pixels masked by the extension DQ",

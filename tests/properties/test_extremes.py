@@ -164,7 +164,7 @@ def test_psfs(engine, psfs, background):
         ((0, 0), (31, 15)),
         ((31, 0), (0, 7)),
         ((9, 6), (10, 6)),
-        ((9, 6), (9, 6)),
+        ((9, 6), (9, 6.25)),
     ],
     ids=["corners", "corner and edge", "neighbours", "the same pixel"],
 )

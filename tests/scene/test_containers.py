@@ -303,6 +303,19 @@ REFUSED = {
         {"psfs": [PSF * u.m, PSF * u.s, PSF * u.s]},
         "psfs come in several units (m, s); give them in one",
     ),
+    "images in magnitudes": (
+        {"images": u.Magnitude(IMAGES * u.ct)},
+        "images in mag(ct) are not linear; give them in linear units, as physical does of a Mag",
+    ),
+    "exposures in decibels": (
+        {"exposure": u.Decibel(TIMES * u.s)},
+        "exposure in dB(s) are not linear; give them in linear units",
+    ),
+    "psfs in magnitudes": ({"psfs": u.Magnitude(PSF[1] * u.ct)}, "psfs in mag(ct) are not linear"),
+    "images in plain magnitudes": (
+        {"images": IMAGES * u.mag},
+        "images must be counts per pixel, not mag; give electrons",
+    ),
     "complex counts": ({"images": (IMAGES + 1j) * u.electron}, "images holds complex128"),
     "rates of strings": ({"images": "1 electron"}, "images"),
 }

@@ -555,3 +555,18 @@ def test_negative_psf_pixels_are_kept_and_counted():
 def test_read_noise_whose_square_overflows_is_refused():
     with pytest.raises(lnocl.InputError, match="the square of read_noise must be finite"):
         lnocl.Observation(np.ones((4, 4)), np.ones((1, 1)), read_noise=1e200)
+
+
+@pytest.mark.parametrize("maps", [False, True])
+def test_the_arrays_of_an_observation_are_read_only(maps):
+    shape = (2, 4, 5)
+    given = {"background": 1.0, "read_noise": 2.0, "exposure": 3.0}
+    given = {name: np.full(shape, value) if maps else value for name, value in given.items()}
+    observation = lnocl.Observation(np.ones(shape), np.ones((1, 1)), **given)
+    names = ("images", "psfs", "background", "read_noise", "mask", "exposure", "offsets")
+    assert set(vars(observation)) == set(names)
+    for name in names:
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(observation, name)[...] = 0
+    for name, array in given.items():
+        assert not maps or array.flags.writeable, name

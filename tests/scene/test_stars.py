@@ -4,6 +4,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from astropy import units as u
 from scenes import make_psfs, make_smooth_psfs, worst
 
 import lnocl
@@ -12,7 +13,7 @@ from lnocl.scene import shifting
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import Stamp
-from lnocl.scene.stars import StarImages, overlap
+from lnocl.scene.stars import StarImages, check_positions, overlap
 
 # One is alone, two are neighbours, one wraps round two edges; or all of the grid is lit.
 FIELDS = {
@@ -123,3 +124,43 @@ def test_memory_does_not_grow_as_stars_times_pixels(refines, solver, monkeypatch
     finally:
         tracemalloc.stop()
     assert most < 0.75 * 8 * n * size**2
+
+
+APART = lnocl.Observation(np.ones((32, 32)), make_psfs(1, (3, 3)))
+
+
+@pytest.mark.parametrize(
+    ("stars", "numbers"),
+    [
+        ([(5, 7), (5, 7)], "1 and 2"),
+        ([(5, 7), (9, 3), (5.0004, 6.9996)], "1 and 3"),
+        ([(9, 3), (5, 20), (5, 7), (5, 9), (5, 7.0009)], "3 and 5"),
+    ],
+)
+def test_two_stars_at_one_position_are_refused(stars, numbers):
+    with pytest.raises(lnocl.InputError) as caught:
+        check_positions(stars, APART)
+    assert str(caught.value) == (
+        f"stars {numbers} are at one position, (5, 7), where their fluxes cannot be told apart; "
+        "leave one of them out"
+    )
+
+
+def test_stars_a_little_apart_are_not_refused():
+    stars = [(5, 7), (5.002, 7), (5, 7.002), (4.998, 6.998), (20, 7)]
+    np.testing.assert_array_equal(check_positions(stars, APART), stars)
+
+
+@pytest.mark.parametrize("kind", ["array", "list", "pairs"])
+def test_stars_may_be_in_pixels_and_in_no_other_unit(kind):
+    def give(unit):
+        stars = np.array([(5.5, 7.0), (9.0, 3.0)])
+        if kind == "pairs":
+            return [(x * unit, y * unit) for x, y in stars]
+        return stars * unit if kind == "array" else [star * unit for star in stars]
+
+    for unit in (u.pix, u.dimensionless_unscaled):
+        np.testing.assert_array_equal(check_positions(give(unit), APART), [(5.5, 7), (9, 3)])
+    for unit in (u.arcsec, u.deg, u.km):
+        with pytest.raises(lnocl.InputError, match=f"^stars must be in pixels, not in {unit}; "):
+            check_positions(give(unit), APART)

@@ -1,0 +1,92 @@
+"""The image of a FITS file that may hold several: which HDU it is, and how it is called."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from lnocl.errors import InputError
+
+SCIENCE = "SCI"
+
+# Extensions that belong to an image: errors, flags, weights, exposures, backgrounds, PSFs and
+# tables of distortions, as telescopes, surveys and astropy's CCDData name them.
+AUXILIARY = re.compile(
+    r"ERRS?|ERROR|STAT|SIGMA|STD|RMS|UNC(ERT(AINTY)?)?|VAR(IANCE)?(_\w+)?|IV(AR|M)|INVVAR"
+    r"|\w*DQ|DQ_\w+|QUAL(ITY)?|FLAGS?|FLG|MA?SK|BPM"
+    r"|WHT|WGT|WT|WEIGHTS?|CON|CTX|TIME|EXP(OSURE|TIME|MAP)?|N?SAMP|COVERAGE|COV|AREA"
+    r"|BKG|BACKGROUND|PSF(IMAGE)?|WCSDVARR|D2IMARR|WAVELENGTH"
+)
+DIMENSIONS = (2, 3)
+
+
+def has_pixels(hdu: Any) -> bool:
+    """Return whether an HDU is an image with at least one pixel."""
+    return hdu.is_image and len(getattr(hdu, "shape", ())) > 0 and 0 not in hdu.shape
+
+
+def name_of(hdu: Any) -> str:
+    """Return the EXTNAME of an HDU in upper case, empty where it has none."""
+    return str(hdu.header.get("EXTNAME", "")).strip().upper()
+
+
+def describe(index: int, hdu: Any) -> str:
+    """Return how messages name an HDU, such as ``HDU 1 (SCI)``."""
+    name = name_of(hdu)
+    return f"HDU {index} ({name})" if name else f"HDU {index}"
+
+
+def choose(path: str, hdus: Sequence[Any]) -> int | None:
+    """Return the index of the HDU with the image of a file; None where no HDU has pixels.
+
+    The extension SCI comes first. Without one it is the primary HDU, which may be followed by other
+    images of its height and width; else the only image extension that is not auxiliary, by its
+    name; else the only image of the file.
+
+    Parameters
+    ----------
+    path : str
+        Name of the file, for messages.
+    hdus : sequence of HDU of astropy.io.fits
+        All HDUs of the file, in order.
+
+    Raises
+    ------
+    InputError
+        Several HDUs have an equal claim.
+    """
+    images = [i for i, hdu in enumerate(hdus) if has_pixels(hdu)]
+    images = [i for i in images if len(hdus[i].shape) in DIMENSIONS] or images
+    science = [i for i in images if name_of(hdus[i]) == SCIENCE]
+    others = [i for i in images if not AUXILIARY.fullmatch(name_of(hdus[i]))]
+    claims = science or others or images
+    if claims[:1] == [0] and not science:
+        claims = [i for i in claims if i == 0 or hdus[i].shape[-2:] != hdus[0].shape[-2:]]
+    if len(claims) > 1:
+        raise _ambiguous(path, hdus, claims)
+    return claims[0] if claims else None
+
+
+def only(path: str, hdus: Sequence[Any], name: str) -> int | None:
+    """Return the index of the one image extension of this name; None where the file lacks it.
+
+    Raises
+    ------
+    InputError
+        Several extensions have the name.
+    """
+    claims = [i for i, hdu in enumerate(hdus) if has_pixels(hdu) and name_of(hdu) == name]
+    if len(claims) > 1:
+        raise _ambiguous(path, hdus, claims)
+    return claims[0] if claims else None
+
+
+def _ambiguous(path: str, hdus: Sequence[Any], claims: Sequence[int]) -> InputError:
+    named = [
+        f"{describe(i, hdus[i])} of {' x '.join(map(str, hdus[i].shape))} pixels" for i in claims
+    ]
+    return InputError(
+        f"{path} holds {len(claims)} images that may be meant: {', '.join(named)}; save the one to "
+        "use in a file of its own, such as with getdata and writeto of astropy.io.fits"
+    )

@@ -1,0 +1,99 @@
+"""The image of a file with several HDUs: which it is, how it is named, and what is refused."""
+
+import logging
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from lnocl.errors import InputError
+from lnocl.io import fitsread
+from lnocl.io.selection import AUXILIARY
+
+IMAGE, OTHER, THUMBNAIL = np.full((10, 12), 1.0), np.full((10, 12), 2.0), np.full((3, 4), 3.0)
+CUBE = np.full((2, 10, 12), 4.0)
+
+
+def save(path, *hdus):
+    """Write a file from its primary image, or None, and pairs of name and image."""
+    primary, *extensions = hdus
+    hdus = [fits.PrimaryHDU(primary)]
+    hdus += [fits.ImageHDU(image, name=name) for name, image in extensions]
+    fits.HDUList(hdus).writeto(path)
+    return str(path)
+
+
+CHOSEN = {
+    "SCI after ERR": ([None, ("ERR", OTHER), ("SCI", IMAGE)], "HDU 2 (SCI)"),
+    "SCI beside an image in the primary": ([OTHER, ("SCI", IMAGE)], "HDU 1 (SCI)"),
+    "SCI after a thumbnail": ([THUMBNAIL, ("", OTHER), ("SCI", IMAGE)], "HDU 2 (SCI)"),
+    "SCI in lower case": ([None, ("err", OTHER), ("sci", IMAGE)], "HDU 2 (SCI)"),
+    "another name after ERR": ([None, ("ERR", OTHER), ("DATA", IMAGE)], "HDU 2 (DATA)"),
+    "no name, after variances": ([None, ("VAR_POISSON", OTHER), ("", IMAGE)], "HDU 2"),
+    "the only image, though a mask": ([None, ("MASK", IMAGE)], "HDU 1 (MASK)"),
+    "two dimensions before one": ([None, ("A", np.ones(5)), ("B", IMAGE)], "HDU 2 (B)"),
+    "the primary": ([IMAGE], None),
+    "the primary, its flags and a PSF": ([IMAGE, ("DQ", OTHER), ("PSF", THUMBNAIL)], None),
+    "the primary before images of its size": ([IMAGE, ("", OTHER), ("MODELS", CUBE)], None),
+}
+
+
+@pytest.mark.parametrize("case", CHOSEN)
+def test_the_image_is(tmp_path, caplog, case):
+    hdus, named = CHOSEN[case]
+    path = save(tmp_path / "a.fits", *hdus)
+    caplog.set_level(logging.INFO, "lnocl")
+    np.testing.assert_array_equal(fitsread.read_stack([path]).data, IMAGE[None])
+    said = [f"{path}: the image is {named}"] if named else []
+    assert [record.getMessage() for record in caplog.records] == said
+
+
+AMBIGUOUS = {
+    "two SCI": (
+        [None, ("SCI", IMAGE), ("ERR", OTHER), ("SCI", OTHER)],
+        "HDU 1 (SCI) of 10 x 12 pixels, HDU 3 (SCI) of 10 x 12 pixels",
+    ),
+    "a thumbnail and an image": (
+        [THUMBNAIL, ("", IMAGE)],
+        "HDU 0 of 3 x 4 pixels, HDU 1 of 10 x 12 pixels",
+    ),
+    "two chips": (
+        [None, ("CHIP1", IMAGE), ("WHT", OTHER), ("CHIP2", IMAGE)],
+        "HDU 1 (CHIP1) of 10 x 12 pixels, HDU 3 (CHIP2) of 10 x 12 pixels",
+    ),
+    "errors and flags alone": (
+        [None, ("ERR", IMAGE), ("DQ", OTHER)],
+        "HDU 1 (ERR) of 10 x 12 pixels, HDU 2 (DQ) of 10 x 12 pixels",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", AMBIGUOUS)
+def test_several_that_may_be_meant_are_refused(tmp_path, case):
+    hdus, named = AMBIGUOUS[case]
+    path = save(tmp_path / "a.fits", *hdus)
+    with pytest.raises(InputError) as caught:
+        fitsread.read_stack([path])
+    assert str(caught.value) == (
+        f"{path} holds 2 images that may be meant: {named}; save the one to use in a file of its "
+        "own, such as with getdata and writeto of astropy.io.fits"
+    )
+
+
+def test_two_extensions_of_one_name_are_refused(tmp_path):
+    path = save(tmp_path / "a.fits", None, ("SCI", IMAGE), ("DQ", OTHER), ("DQ", IMAGE))
+    with pytest.raises(InputError, match=r"HDU 2 \(DQ\) of 10 x 12 pixels, HDU 3 \(DQ\)"):
+        fitsread.read_extension(path, "DQ")
+
+
+@pytest.mark.parametrize(
+    ("names", "are_auxiliary"),
+    [
+        ("ERR DQ WHT CON CTX VAR_POISSON VAR_RNOISE VAR_FLAT AREA WAVELENGTH PIXELDQ", True),
+        ("SAMP TIME D2IMARR WCSDVARR MASK UNCERT PSFIMAGE STAT ERRS QUAL VARIANCE IVM", True),
+        ("SCI DATA IMAGE COUNTS B V R CHIP1 STATION VARIABLE CONTINUUM TIMES2", False),
+    ],
+)
+def test_auxiliary_names(names, are_auxiliary):
+    for name in names.split():
+        assert bool(AUXILIARY.fullmatch(name)) == are_auxiliary

@@ -1,0 +1,43 @@
+"""Runs: the errors of stars that the images do not determine."""
+
+import numpy as np
+import pytest
+
+import lnocl
+from lnocl.runs.run import Run, Setup
+from lnocl.scene.penalty import Penalty
+
+GOOD = (12, 9)
+Y, X = np.mgrid[-3:4, -3:4]
+PSF = np.exp(-(X**2 + Y**2) / 3.0)
+
+
+def run_of(observation, stars):
+    setup = Setup(stars, 0, "sgm", "double", "numpy", None, refine_positions=True)
+    return Run(setup, observation, Penalty(), 1)
+
+
+def test_errors_of_stars_that_have_come_to_one_place_are_nan_and_said():
+    observation = lnocl.Observation(np.full((32, 32), 9.0), PSF)
+    run = run_of(observation, [(8.0, 9.0), (8.5, 9.0), (23.0, 22.0)])
+    run.star_errors()
+    alone = run.scene.stars[2]
+    run.scene.move_stars([(8.25, 9.0), (8.25, 9.0), alone])
+    with pytest.warns(
+        lnocl.LnoclWarning,
+        match=r"do not determine .* each star at \(8\.25, 9\), \(8\.25, 9\), so that these errors",
+    ):
+        fluxes, positions = run.star_errors()
+    np.testing.assert_array_equal(np.isnan(fluxes), [True, True, False])
+    np.testing.assert_array_equal(np.isnan(positions[2]), [False, False])
+    assert np.isnan(positions[:2]).any(axis=1).all()
+
+
+def test_errors_of_a_star_with_one_good_pixel_are_nan():
+    """Flux and position are three unknowns."""
+    mask = np.ones((32, 32), bool)
+    mask[GOOD[::-1]] = False
+    run = run_of(lnocl.Observation(np.full((32, 32), 9.0), PSF, mask=mask), [(12.3, 9.2)])
+    with pytest.warns(lnocl.LnoclWarning, match=r"of each star at \(\d+\.?\d*, "):
+        fluxes, _ = run.star_errors()
+    assert np.isnan(fluxes).all()
