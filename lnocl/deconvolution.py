@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Set
 from functools import partial
 from os import PathLike
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,7 +32,7 @@ from lnocl.scene.observation import Array, Observation, numbers
 
 def deconvolve(
     observation: Observation,
-    stars: Sequence[tuple[float, float]] = (),
+    stars: Iterable[tuple[float, float]] = (),
     *,
     mu: float | str = 0.0,
     solver: str = "sgm",
@@ -65,7 +66,7 @@ def deconvolve(
     ----------
     observation : Observation
         The p images of shape (ny, nx), with their PSFs, backgrounds, noise and masks.
-    stars : sequence of (x, y), optional
+    stars : iterable of (x, y), optional
         Positions of the point sources in pixels of an image without offset, 0-based, x along
         columns. Between pixels a star's image is the PSF moved in its spectrum
         (`lnocl.scene.shifting.place`).
@@ -205,7 +206,9 @@ def deconvolve(
     penalty, grid = read_penalties(mu, smoothing)
     if engine == "opencl" and precision == "single":
         warn_of_rounding(int(n_iter))
-    setup = Setup(stars, pad, solver, precision, engine, device, refine_positions)
+    # What can be read once, or has no order that NumPy knows, is no array_like.
+    positions: Any = list(stars) if isinstance(stars, (Iterator, Set)) else stars
+    setup = Setup(positions, pad, solver, precision, engine, device, refine_positions)
     inputs = partial(
         describe,
         observation,

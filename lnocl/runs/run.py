@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import islice
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class Setup:
     """The parameters that all runs of one call of `deconvolve` share."""
 
-    stars: Sequence[tuple[float, float]]
+    stars: ArrayLike
     pad: int | str
     solver: str
     precision: str
