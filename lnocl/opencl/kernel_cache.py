@@ -43,7 +43,8 @@ class _Folder:
         reasons = []
         for parent in (Path(tempfile.gettempdir()), store()):
             try:
-                parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                if parent == store():
+                    parent.mkdir(parents=True, exist_ok=True, mode=0o700)
                 if reason := _unfit(parent):
                     raise OSError(0, reason)
                 self.path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
