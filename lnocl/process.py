@@ -11,7 +11,10 @@ from contextlib import contextmanager
 # One lock for all of it: threads that took one of several could wait for each other.
 LOCK = threading.RLock()
 # A process forked while another thread has it would wait for that thread forever.
-os.register_at_fork(before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=LOCK.release)
+if hasattr(os, "register_at_fork"):  # Windows does not fork
+    os.register_at_fork(
+        before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=LOCK.release
+    )
 
 
 @contextmanager

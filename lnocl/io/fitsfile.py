@@ -108,7 +108,7 @@ class FitsFile:
             Data that do not match their DATASUM.
         """
         needed = 8 * int(np.prod([int(n) for n in hdu.shape], dtype=object))
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        memory = _memory()
         if needed > memory:
             raise FileError(
                 f"{self.path} has an image of shape {hdu.shape}, {needed / 2**30:.3g} GiB; "
@@ -249,6 +249,13 @@ def open_fits(
             raise FileError(f"{path} {complaint}: {reason}") from error
     for warning in caught:
         warn(f"{path}: {warning.message}")
+
+
+def _memory() -> float:
+    """Return the machine's memory, bytes; infinite where it is not known, as on Windows."""
+    if not hasattr(os, "sysconf"):
+        return float("inf")
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _verify(hdu: Any) -> None:

@@ -35,7 +35,8 @@ def find_devices() -> list[cl.Device]:
     devices = [device for platform in _usable_platforms() for device in _devices_of(platform)]
     if not devices:
         raise DeviceError(
-            "no OpenCL device was found; install a runtime, such as pip install 'pyopencl[pocl]'"
+            "no OpenCL device was found; install the driver of your GPU, or PoCL (see README), or "
+            "use the engine numpy"
         )
     return devices
 

@@ -28,7 +28,8 @@ def _note_fork() -> None:
     _was_forked = _uses_opencl
 
 
-os.register_at_fork(after_in_child=_note_fork)
+if hasattr(os, "register_at_fork"):  # Windows does not fork
+    os.register_at_fork(after_in_child=_note_fork)
 
 
 def claim_process() -> None:

@@ -36,7 +36,7 @@ def check_matplotlib() -> None:
         import matplotlib  # noqa: F401
     except ImportError:
         raise LnoclError(
-            "pictures need matplotlib, which is not installed: pip install 'lnocl[plot]'"
+            "pictures need matplotlib, which is not installed: pip install matplotlib"
         ) from None
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from astropy.modeling import fitting, models
 from numpy.typing import NDArray
+from scipy import optimize
 from scipy.ndimage import maximum_filter, median_filter
 
 from lnocl.errors import InputError
-from lnocl.process import ignored_warnings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -124,16 +123,32 @@ def _fit(
     """Return row, column and sigma of the best Gaussian; None where noise would fit as well."""
     if len(light) < MIN_PIXELS:
         return None
-    star = models.Gaussian2D(
-        light.max(), first[1], first[0], sigma, sigma, 0.0,
-        fixed={"theta": True}, bounds={"x_stddev": (MIN_SIGMA, None)},
-    )  # fmt: skip
-    star.y_stddev.tied = lambda model: model.x_stddev_0
-    fitter = fitting.LMLSQFitter()
-    with ignored_warnings(), np.errstate(all="ignore"):
-        fitted = fitter(star + models.Const2D(0.0), x, y, light, maxiter=MAX_EVALUATIONS)
-        left = float(np.var(light - fitted(x, y)))
+
+    def parts(parameters: Array) -> tuple[Array, Array, Array, Array]:
+        """Return distances along y and x in sigmas, their squares' sum, and the Gaussian."""
+        _, row, column, sigma, _ = parameters
+        down, right = (y - row) / max(sigma, MIN_SIGMA), (x - column) / max(sigma, MIN_SIGMA)
+        square = down**2 + right**2
+        return down, right, square, np.exp(-square / 2)
+
+    def residuals(parameters: Array) -> Array:
+        height, *_, constant = parameters
+        return np.asarray(height * parts(parameters)[-1] + constant - light)
+
+    def derivatives(parameters: Array) -> Array:
+        down, right, square, gaussian = parts(parameters)
+        slope = parameters[0] / max(parameters[3], MIN_SIGMA) * gaussian
+        columns = gaussian, slope * down, slope * right, slope * square, np.ones_like(gaussian)
+        return np.stack(columns, axis=1)
+
+    start = np.array([light.max(), *first, sigma, 0.0])
+    with np.errstate(all="ignore"):
+        fitted = optimize.least_squares(
+            residuals, start, derivatives, method="lm", xtol=1e-7, max_nfev=MAX_EVALUATIONS
+        )
+        left = float(np.var(fitted.fun))
+    height, row, column, sigma, _ = map(float, fitted.x)
     improvement = len(light) * (float(np.var(light)) - left)
-    if not (fitted.amplitude_0 > 0 and improvement > MIN_IMPROVEMENT * left):
+    if not (height > 0 and improvement > MIN_IMPROVEMENT * left):
         return None
-    return fitted.y_mean_0.value, fitted.x_mean_0.value, fitted.x_stddev_0.value
+    return row, column, max(sigma, MIN_SIGMA)

@@ -305,7 +305,7 @@ class TestPicture:
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         assert run("--plot", "a.png", frame="no.fits") == 1
         assert complaint(capsys.readouterr()) == (
-            "pictures need matplotlib, which is not installed: pip install 'lnocl[plot]'"
+            "pictures need matplotlib, which is not installed: pip install matplotlib"
         )
         assert run() == 0
         assert not Path("a.png").exists()

@@ -83,7 +83,10 @@ def test_no_platform(monkeypatch):
         raise cl.LogicError("clGetPlatformIDs", -1001, "")
 
     monkeypatch.setattr(cl, "get_platforms", none)
-    with pytest.raises(lnocl.DeviceError, match=r"no OpenCL device was found; install a runtime"):
+    with pytest.raises(
+        lnocl.DeviceError,
+        match=r"no OpenCL device was found; install the driver",
+    ):
         device.choose()
 
 

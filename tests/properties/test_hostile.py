@@ -24,6 +24,7 @@ from wcs_headers import SIP
 
 from lnocl.errors import FileError, InputError, LnoclWarning
 from lnocl.io import fitsread, fitswrite, sky
+from lnocl.process import ignored_warnings
 
 BLOCK = 2880
 BIG = 10**12
@@ -103,7 +104,8 @@ NO_BYTES = {
 def test_rows_that_take_no_room_are_not_read(sound, tmp_path, use, claims, compress):
     columns = [fits.Column(name, "0A") for name in ("x", "y", "flux", "name", "value")]
     name = "RUN" if use is read_checkpoint else "STARS"
-    table = fits.BinTableHDU.from_columns(columns, name=name).header
+    with ignored_warnings():  # older versions of astropy warn of the test's empty columns
+        table = fits.BinTableHDU.from_columns(columns, name=name).header
     table.update({"NAXIS2": 10**8} | claims)
     primary = fits.PrimaryHDU(header=fits.Header({"ENDED": "", "DIGEST": ""})).header
     path = tmp_path / "damaged"

@@ -1,6 +1,6 @@
-"""Install, editable install, sdist and wheel all carry the kernels."""
+"""Install, editable install, sdist and wheel carry the kernels, and the sdist its tests."""
 
-import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -8,7 +8,10 @@ import venv
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+from astropy.io import fits
+from packaging.metadata import Metadata
 
 pytestmark = pytest.mark.system
 
@@ -22,26 +25,76 @@ def run(*command, **keywords):
     return done.stdout
 
 
+def tracked(*folders):
+    """Return the names of the files that git tracks or would track, of all or of some folders."""
+    command = [
+        "git",
+        "ls-files",
+        "-z",
+        "--cached",
+        "--others",
+        "--exclude-standard",
+        "--",
+        *folders,
+    ]
+    return [name for name in run(*command, cwd=ROOT).split("\0") if (ROOT / name).is_file()]
+
+
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     """The sdist and the wheel, built from what git tracks, the wheel from the sdist."""
     folder = tmp_path_factory.mktemp("build")
-    files = run("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=ROOT)
-    for name in filter(None, files.split("\0")):
-        if (ROOT / name).is_file():
-            target = folder / "source" / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes((ROOT / name).read_bytes())
+    for name in tracked():
+        target = folder / "source" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes((ROOT / name).read_bytes())
     run(sys.executable, "-m", "build", "--outdir", folder, folder / "source")
     return folder
 
 
-def test_sdist(built):
+@pytest.fixture(scope="module")
+def unpacked(built, tmp_path_factory):
+    """The files of the sdist."""
+    folder = tmp_path_factory.mktemp("sdist")
     (sdist,) = built.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
-        names = {name.split("/", 1)[-1] for name in archive.getnames()}
-    assert {f"kernels/{name}" for name in KERNELS} <= names
-    assert {"lnocl/py.typed", "LICENSE", "README.md"} <= names
+        archive.extractall(folder, filter="data")
+    (root,) = folder.iterdir()
+    return root
+
+
+def environment(folder, *target):
+    """Make an environment with lnocl that borrows the dependencies of this one."""
+    venv.create(folder, with_pip=False, symlinks=True)
+    python = folder / "bin" / "python"
+    pip = [sys.executable, "-m", "pip", f"--python={python}"]
+    run(*pip, "install", "--quiet", "--no-deps", *target)
+    site = folder / f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
+    borrowed = [path for path in sys.path if "site-packages" in path]
+    (site / "borrowed.pth").write_text("\n".join(borrowed))
+    return python, site
+
+
+def test_the_sdist_has_every_file(unpacked):
+    files = {str(path.relative_to(unpacked)) for path in unpacked.rglob("*") if path.is_file()}
+    assert {*tracked()} - {".gitignore"} <= files
+
+
+def test_links_of_the_sdist_resolve(unpacked):
+    links = [
+        (page, link)
+        for page in unpacked.rglob("*.md")
+        for link in re.findall(r"\]\(([^)#\s]+)", page.read_text())
+        if "://" not in link
+    ]
+    assert len(links) > 10
+    assert [link for page, link in links if not (page.parent / link).exists()] == []
+
+
+def test_the_tests_of_the_sdist_run(unpacked, tmp_path):
+    python, _ = environment(tmp_path, "--editable", unpacked)
+    told = run(python, "-m", "pytest", "-q", "tests/test_metrics.py", "tests/io", cwd=unpacked)
+    assert re.search(r"\d+ passed", told)
 
 
 def test_wheel(built):
@@ -54,23 +107,9 @@ def test_wheel(built):
 @pytest.mark.parametrize("kind", ["wheel", "editable"])
 def test_installed(built, kind, tmp_path):
     """A fresh environment, which borrows the dependencies of this one, finds every kernel."""
-    venv.create(tmp_path, with_pip=False, symlinks=True)
-    python = tmp_path / "bin" / "python"
-    site = tmp_path / f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
     target = [*built.glob("*.whl")] if kind == "wheel" else ["--editable", built / "source"]
-    run(
-        sys.executable,
-        "-m",
-        "pip",
-        f"--python={python}",
-        "install",
-        "--quiet",
-        "--no-deps",
-        *target,
-    )
-    borrowed = os.pathsep.join(path for path in sys.path if "site-packages" in path)
+    python, site = environment(tmp_path, *target)
     code = (
-        f"import sys; sys.path += {borrowed.split(os.pathsep)!r}\n"
         "import lnocl, lnocl.commands.cli\n"
         "from importlib import resources\n"
         "print(lnocl.__file__, *(file.name for file in resources.files('lnocl.kernels').iterdir()))"
@@ -78,3 +117,45 @@ def test_installed(built, kind, tmp_path):
     found, *files = run(python, "-I", "-c", code, cwd=tmp_path).split()
     assert found.startswith(str(site if kind == "wheel" else built / "source"))
     assert set(files) >= KERNELS
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "pocl"),
+    [
+        ("linux", "x86_64", True),
+        ("linux", "aarch64", False),
+        ("darwin", "arm64", False),
+        ("win32", "AMD64", False),
+    ],
+)
+def test_pocl_is_required_where_its_wheel_exists(built, system, machine, pocl):
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        required = Metadata.from_email(archive.read(name), validate=False).requires_dist
+    place = {"sys_platform": system, "platform_machine": machine, "extra": ""}
+    extras = [
+        one.extras
+        for one in required
+        if one.name == "pyopencl" and (one.marker is None or one.marker.evaluate(place))
+    ]
+    assert extras == ([set(), {"pocl"}] if pocl else [set()])
+
+
+def test_it_runs_without_the_functions_that_windows_lacks(tmp_path):
+    fits.writeto(tmp_path / "image.fits", np.ones((8, 8)))
+    code = (
+        "import os, sys\n"
+        "del os.fork, os.register_at_fork, os.sysconf\n"
+        "from lnocl.commands import cli\n"
+        "sys.exit(cli.main(sys.argv[1:]))"
+    )
+    command = "deconvolve image.fits --psf image.fits --engine numpy --n-iter 2 -o out.fits"
+    run(sys.executable, "-c", code, *command.split(), cwd=tmp_path)
+    assert fits.getdata(tmp_path / "out.fits").shape == (8, 8)
+
+
+def test_no_advice_names_a_package_that_no_index_has():
+    texts = {name: (ROOT / name).read_text() for name in tracked("*.py", "*.md", "*.sh", ".ci")}
+    advice = re.compile(r"pip install [^\n&]*\blnocl\b")
+    assert [name for name, text in texts.items() if advice.search(text)] == []
