@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from lnocl.errors import DivergedError, NotFiniteError, warn
 from lnocl.result import Callback, Estimate, Result, make_result
 from lnocl.runs.checkpoint import Checkpointer, describe
-from lnocl.runs.held_out import EMPTY_CURVE, Choice, HeldOutSelection
+from lnocl.runs.held_out import EMPTY_CURVE, Choice, HeldOutSelection, most_bytes
 from lnocl.runs.options import (
     check_choices,
     check_length,
@@ -25,6 +25,7 @@ from lnocl.runs.options import (
 )
 from lnocl.runs.progress import Bar
 from lnocl.runs.run import Run, Setup
+from lnocl.runs.saved import UNBOUNDED
 from lnocl.runs.stopping import Rule, make_rule
 from lnocl.scene.observation import Observation
 from lnocl.scene.stars import check_positions
@@ -224,19 +225,23 @@ def deconvolve(
         initial_extended=initial_extended,
         initial_star_fluxes=initial_star_fluxes,
     )
-    checkpointer = Checkpointer(checkpoint, checkpoint_every, resume, inputs)
+    largest = partial(most_bytes, setup, observation, int(n_iter))
+    checkpointer = Checkpointer(checkpoint, checkpoint_every, resume, inputs, largest)
+    at_end = stop != "held-out"
+    low = np.array([penalty.mu, penalty.smoothing, n_iter if at_end else 1], np.float64)
+    high = np.where([isinstance(mu, str), isinstance(smoothing, str), False], UNBOUNDED, low)
+    high[2] = n_iter
     bar = Bar(int(n_iter), bool(progress))
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
     # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
     with bar, np.errstate(over="ignore", invalid="ignore"):
-        choice = checkpointer.choice()
-        if choice is None and grid is None and stop != "held-out":
+        choice = checkpointer.choice(low, high)
+        if choice is None and grid is None and at_end:
             choice = Choice(penalty, int(n_iter), EMPTY_CURVE)
         if choice is None:
             half = None if initial_extended is None else initial_extended / 2.0
             start = partial(Run, setup, n_iter=int(n_iter), initial_extended=half)
-            at_end = stop != "held-out"
             selection = HeldOutSelection(start, observation, penalty, grid, int(n_iter), at_end)
             choice = _choose(selection, bar, checkpointer)
         run = Run(
@@ -251,8 +256,9 @@ def deconvolve(
 
 def _choose(selection: HeldOutSelection, bar: Bar, checkpointer: Checkpointer) -> Choice:
     """Have held-out counts choose, from their checkpoint where there is one."""
-    if checkpointer.saved is not None:
-        selection.restore(checkpointer.saved.arrays)
+    saved = checkpointer.saved_selection()
+    if saved is not None:
+        selection.restore(saved)
     return selection.choose(
         lambda words: bar.show(0, lambda: words), lambda: checkpointer.save_selection(selection)
     )

@@ -199,11 +199,11 @@ class ReferenceEngine:
         }
 
     def restore(self, state: State) -> None:
-        """Go on from this state."""
+        """Continue from this state."""
         self._extended, self._previous = state["extended"], state["previous"]
         self._gradient = state["gradient"]
-        self._star_fluxes = state.get("star_fluxes", np.zeros(0))
+        self._star_fluxes = state["star_fluxes"]
         self._row_spectrum = rfft_rows(self._extended)
         self._squares = float(state["square_sums"][0])
-        self._objectives = state.get("objectives", np.zeros(0)).tolist()
+        self._objectives = state["objectives"].tolist()
         self._n_fetched = len(self._objectives)

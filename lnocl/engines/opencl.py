@@ -403,7 +403,7 @@ class OpenCLEngine:
     def state(self) -> State:
         """Return the arrays that `restore` needs, between iterations, as they lie on the device."""
         state = {name: self._memory.download_raw(name) for name in self._stateful}
-        state["objectives"] = state["objectives"][: 2 * self._n_objectives]
+        state["objectives"] = state["objectives"].reshape(-1, 2)[: self._n_objectives]
         state["star_fluxes"] = state["star_fluxes"][: self.scene.n_stars]
         return state
 
@@ -415,10 +415,9 @@ class OpenCLEngine:
     def restore(self, state: State) -> None:
         """Continue from this state."""
         for name in self._stateful:
-            if name in state:  # there may be no objective yet, and no star
-                self._memory.upload_raw(name, state[name])
+            self._memory.upload_raw(name, state[name])
         self._transform_estimate()
-        n_objectives = len(state.get("objectives", ())) // 2
+        n_objectives = len(state["objectives"])
         if not self.is_proven:
             self._n_restored = n_objectives
         self._n_objectives = n_objectives

@@ -14,20 +14,23 @@ from typing import Any, cast
 
 import numpy as np
 
-from lnocl.errors import FileError, InputError, warn
+from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.atomic import check_output, whole_file
-from lnocl.runs.held_out import EMPTY_CURVE, Choice, HeldOutSelection, curve_of, rows_of
+from lnocl.runs.held_out import Choice, HeldOutSelection, rows_of
 from lnocl.runs.run import Run, Setup, engine_name
+from lnocl.runs.saved import Saved
 from lnocl.runs.stopping import Rule
-from lnocl.scene.observation import Observation, numbers
-from lnocl.scene.penalty import Penalty
+from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.solvers.engine import State
 
 OBSERVED = ("images", "psfs", "background", "mask", "exposure", "offsets")
 # The widest value: a SHA-256 in hexadecimal, or the repr of a parameter or name of a device.
 WIDTH = 256
-# More than there are parameters: a hostile file may have any number, compressed to nothing.
+# More than there are parameters, and than the state of held-out counts has arrays: a hostile file
+# may have any number, compressed to nothing.
 MAX_ROWS = 100
+MAX_HDUS = 100
+ROW_BYTES = 32 + WIDTH
 
 
 @dataclass(frozen=True)
@@ -50,14 +53,6 @@ class Checkpoint:
     described: dict[str, str]
     ended: str
     arrays: State
-
-    def choice(self) -> Choice | None:
-        """Return the choice of held-out counts, or of the caller; None if it was not made yet."""
-        if "choice" not in self.arrays:
-            return None
-        mu, smoothing, n_iter = self.arrays["choice"].tolist()
-        curve = curve_of(self.arrays.get("curve", rows_of(EMPTY_CURVE)))
-        return Choice(Penalty(mu, smoothing), int(n_iter), curve)
 
     def refuse_unless(self, described: Mapping[str, str]) -> None:
         """Refuse to resume a run of other inputs or parameters.
@@ -98,13 +93,20 @@ def _describe(name: str, value: Any) -> str:
     return digest.hexdigest()
 
 
-def read(path: str) -> Checkpoint:
+def read(path: str, most_bytes: float = math.inf) -> Checkpoint:
     """Read a checkpoint.
+
+    Parameters
+    ----------
+    path : str
+        File to read.
+    most_bytes : float, optional
+        Bytes that its arrays may take together: one that has more is not read.
 
     Raises
     ------
     FileError
-        The file is missing, not a checkpoint, truncated or altered.
+        The file is missing, not a checkpoint, truncated, altered, or too large.
     """
     from astropy.io import fits  # runs without checkpoints need not load it
 
@@ -112,16 +114,28 @@ def read(path: str) -> Checkpoint:
 
     arrays: State = {}
     with open_fits(path, "is not a checkpoint, or a damaged one") as file:
-        for hdu in file.hdus():
+        for k, hdu in enumerate(file.hdus()):
             if isinstance(hdu, fits.PrimaryHDU):
                 ended, digest = str(hdu.header["ENDED"]), hdu.header["DIGEST"]
-            elif hdu.name == "RUN":
+            elif hdu.name == "RUN" and hdu.size <= MAX_ROWS * ROW_BYTES:
                 described = {str(row["name"]): str(row["value"]) for row in hdu.data[:MAX_ROWS]}
-            else:
+            elif _is_plain(hdu) and hdu.size <= most_bytes and k < MAX_HDUS:
+                most_bytes -= hdu.size
                 arrays[hdu.name.lower()] = np.array(hdu.data, hdu.data.dtype.newbyteorder("="))
+                del hdu.data
+            else:
+                raise FileError(
+                    f"the checkpoint {path} is of no such run: with extension {k}, {hdu.name}, it "
+                    "is too large; start anew"
+                )
         if digest != _digest(described, ended, arrays):
             raise FileError(f"the checkpoint {path} is truncated or altered: its digest is wrong")
     return Checkpoint(path, described, ended, arrays)
+
+
+def _is_plain(hdu: Any) -> bool:
+    """Return whether an HDU is an image of as many bytes as its header says, as `write` makes."""
+    return type(hdu).__name__ == "ImageHDU" and not {"BSCALE", "BZERO", "BLANK"} & set(hdu.header)
 
 
 def _digest(described: Mapping[str, str], ended: str, arrays: State) -> str:
@@ -173,11 +187,8 @@ class Checkpointer:
         The checkpoint to resume from, which may be replaced.
     describe : callable
         Returns the inputs and parameters of the run; called where there is a path or a checkpoint.
-
-    Attributes
-    ----------
-    saved : Checkpoint or None
-        The checkpoint to resume from.
+    most_bytes : callable
+        Returns the bytes that the state of such a run may take; called where there is a checkpoint.
 
     Raises
     ------
@@ -194,6 +205,7 @@ class Checkpointer:
         every: object,
         resume: object,
         describe: Callable[[], dict[str, str]],
+        most_bytes: Callable[[], int],
     ) -> None:
         self._path, source = _file_name("checkpoint", path), _file_name("resume", resume)
         self._saved_at = time.monotonic() if path is None else -math.inf
@@ -201,25 +213,54 @@ class Checkpointer:
         if not (isinstance(every, Real) and cast(float, every) >= 0):
             raise InputError(f"checkpoint_every must be seconds, 0 or more; {every!r} was given")
         self._every = cast(float, every)
-        self.saved = None if source is None else read(source)
+        resumed = None if source is None else read(source, most_bytes())
         self._may_replace = False
         if self._path is not None:
             check_output(self._path, overwrite=True)
             self._path = os.path.abspath(self._path)  # wherever the process goes
             self._may_replace = _are_same(self._path, source)
-            self._refuse_to_replace()
-        self._described = describe() if self._path is not None or self.saved is not None else {}
-        if self.saved is not None:
-            self.saved.refuse_unless(self._described)
+            self._refuse_to_replace(self._path)
+        self._described = describe() if self._path is not None or resumed is not None else {}
+        self._ended, self._saved = "", None
+        if resumed is not None:
+            resumed.refuse_unless(self._described)
+            self._ended, self._saved = resumed.ended, Saved(resumed.path, resumed.arrays)
 
-    def choice(self) -> Choice | None:
-        """Return the choice of held-out counts, or of the caller, that was saved, if any."""
-        return None if self.saved is None else self.saved.choice()
+    def choice(self, low: Array, high: Array) -> Choice | None:
+        """Return the choice of held-out counts that was saved, if it was.
 
-    def _refuse_to_replace(self) -> None:
-        assert self._path is not None
-        if os.path.lexists(self._path) and not self._may_replace:
-            raise FileError(f"the checkpoint {self._path} exists; resume from it, or remove it")
+        Parameters
+        ----------
+        low, high : ndarray of float64, shape (3,)
+            Bounds of mu, smoothing and the number of iterations. Where they are equal, nothing was
+            to be chosen, and each checkpoint holds them.
+
+        Raises
+        ------
+        FileError
+            The checkpoint holds another choice.
+        """
+        saved = self._saved
+        if saved is None or not ("choice" in saved or np.array_equal(low, high)):
+            return None
+        return Choice.take(saved, low, high)
+
+    def saved_selection(self) -> Saved | None:
+        """Return the state of held-out counts that was saved, if any, and hold it no longer.
+
+        Raises
+        ------
+        FileError
+            The run is said to have ended.
+        """
+        saved, self._saved = self._saved, None
+        if saved is not None and self._ended:
+            saved.refuse("it ended before held-out counts chose")
+        return saved
+
+    def _refuse_to_replace(self, path: str) -> None:
+        if os.path.lexists(path) and not self._may_replace:
+            raise FileError(f"the checkpoint {path} exists; resume from it, or remove it")
 
     def restore(self, run: Run, rule: Rule) -> str:
         """Put a run where its checkpoint was, if any; return why it had ended, if it had.
@@ -228,16 +269,28 @@ class Checkpointer:
 
         Raises
         ------
+        FileError
+            The run cannot have been there.
         NotFiniteError
             The start is infinite or not a number.
         """
         self._best = run.state()
-        if self.saved is None or self.choice() is None:
+        saved, ended = self._saved, self._ended
+        if saved is None:
             return ""
-        run.restore(self.saved.arrays)
-        rule.restore(self.saved.arrays.get("rule", np.zeros(0)).tolist())
+        self._saved = None  # which the memory need not hold twice
+        state = run.take(saved)
+        done = int(state["progress"][0])
+        rule.restore(saved, done)
+        saved.refuse_others()
+        is_possible = ended in ("", "callback", "n_iter", "converged", rule.reason)
+        saved.refuse_unless(
+            is_possible and (ended != "n_iter" or done == run.n_iter),
+            f"it ended by {ended} after {counted(done, 'iteration')}",
+        )
+        run.restore(state)
         self._remember(*run.proven_state())
-        return "" if self.saved.ended == "callback" else self.saved.ended
+        return "" if ended == "callback" else ended
 
     def _remember(self, state: State, is_best: bool) -> None:
         """Hold the state of the least objective, for `return_to_best` to iterate from."""
@@ -294,7 +347,7 @@ class Checkpointer:
         """Write a checkpoint; a failure to write ends the run only where it is the first one."""
         try:
             if self._path is not None:
-                self._refuse_to_replace()
+                self._refuse_to_replace(self._path)
                 write(self._path, self._described, ended, arrays, self._may_replace)
                 self._may_replace = True
         except FileError as error:

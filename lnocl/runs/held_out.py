@@ -24,7 +24,9 @@ from numpy.typing import NDArray
 
 from lnocl.errors import DivergedError, InputError, LnoclWarning, refuse_not_finite, warn
 from lnocl.process import ignored_warnings
-from lnocl.runs.run import Run
+from lnocl.runs.run import Run, Setup
+from lnocl.runs.run import most_bytes as most_bytes_of_run
+from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved, is_whole
 from lnocl.runs.thinning import split_counts
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
@@ -60,6 +62,8 @@ MU_GRID = 10.0 ** np.arange(-3.0, 0.1, 0.5)
 # The weight of the edge-preserving term in units of the noise of the gradient of the data term.
 SMOOTHING_GRID = 10.0 ** np.arange(-1.5, 0.6, 0.5)
 
+MAX_CANDIDATES = 1 + max(len(MU_GRID), len(SMOOTHING_GRID))
+
 # The prefix, before a number, of the names under which the state of each half is saved.
 HALVES = "halves_"
 
@@ -87,14 +91,38 @@ class Choice:
     n_iter: int
     curve: NDArray[np.void]
 
+    @classmethod
+    def take(cls, saved: Saved, low: Array, high: Array) -> Choice:
+        """Return the choice that a checkpoint holds.
+
+        Parameters
+        ----------
+        saved : Saved
+            The arrays of the checkpoint.
+        low, high : ndarray of float64, shape (3,)
+            Bounds of mu, smoothing and the number of iterations.
+
+        Raises
+        ------
+        FileError
+            It is out of bounds, or its curve is.
+        """
+        mu, smoothing, n_iter = saved.take("choice", FLOAT, (3,), low, high).tolist()
+        saved.refuse_unless(is_whole(n_iter), f"choice holds {n_iter:g} iterations")
+        return cls(Penalty(mu, smoothing), int(n_iter), _take_curve(saved, "curve", int(high[2])))
+
 
 def rows_of(curve: NDArray[np.void]) -> Array:
     """Return a curve as plain numbers, a row for each field."""
     return np.array([curve[name] for name in CURVE_DTYPE.names or ()], np.float64)
 
 
-def curve_of(rows: Array) -> NDArray[np.void]:
-    """Return a curve from the rows that `rows_of` makes of it."""
+def _take_curve(saved: Saved, name: str, n_iter: int) -> NDArray[np.void]:
+    """Return the curve whose `rows_of` a checkpoint holds."""
+    low, high = np.array([[0.0, 0.0, 1.0, 0.0], [UNBOUNDED, UNBOUNDED, n_iter, UNBOUNDED]])
+    shape = len(low), range(MAX_CANDIDATES * n_iter + 1)
+    rows = saved.take(name, FLOAT, shape, low[:, None], high[:, None])
+    saved.refuse_unless(is_whole(rows[2]), f"{name} holds parts of iterations")
     curve = np.zeros(rows.shape[1], CURVE_DTYPE)
     for name, row in zip(CURVE_DTYPE.names or (), rows, strict=True):
         curve[name] = row
@@ -155,13 +183,13 @@ class _Trial:
             An objective rises.
         """
         last = self.iterations[-1] if self.snapshots else 0
-        due = max(last + 1, math.floor(SPACING * last))
+        due = _next_snapshot(last)
         try:
             for iteration, *_ in zip(*(run for pair in self._runs for run in pair), strict=False):
                 if iteration == due:
                     pairs = [(_flat(a), _flat(b)) for a, b in self._runs]
                     self.snapshots.append((iteration, pairs))
-                    due = max(due + 1, math.floor(SPACING * due))
+                    due = _next_snapshot(due)
                     yield iteration
         except DivergedError:
             best = min(run.best_iteration() for pair in self._runs for run in pair)
@@ -181,18 +209,35 @@ class _Trial:
         state["snapshots"] = np.array([pairs for _, pairs in self.snapshots])
         return state
 
-    def restore(self, state: State) -> None:
-        """Continue from this state."""
-        for k, run in enumerate(run for pair in self._runs for run in pair):
-            prefix = f"{HALVES}{k}_"
-            run.restore(
-                {n.removeprefix(prefix): a for n, a in state.items() if n.startswith(prefix)}
-            )
+    def restore(self, saved: Saved) -> None:
+        """Continue from the state in a checkpoint.
+
+        Raises
+        ------
+        FileError
+            The trial cannot have such a state.
+        """
+        runs, states = [run for pair in self._runs for run in pair], []
+        for k, run in enumerate(runs):
+            with saved.part(f"{HALVES}{k}_"):
+                states.append(run.take(saved))
+        n_iter = runs[0].n_iter
+        iterations = saved.take(
+            "snapshot_iterations", np.dtype(np.int64), (range(1, n_iter + 1),), 1, n_iter
+        ).tolist()
+        saved.refuse_unless(
+            {state["progress"][0] for state in states} == {iterations[-1]}
+            and iterations == sorted(set(iterations)),
+            "snapshot_iterations does not end where its runs are",
+        )
+        shape = len(iterations), len(self._runs), 2, runs[0].scene.observation.images[0].size
+        snapshots = saved.take("snapshots", np.dtype(np.float32), shape, 0.0)
+        saved.refuse_others()
+        for run, state in zip(runs, states, strict=True):
+            run.restore(state)
         self.snapshots = [
-            (int(iteration), [(a, b) for a, b in pairs])
-            for iteration, pairs in zip(
-                state["snapshot_iterations"], state["snapshots"], strict=True
-            )
+            (iteration, [(a, b) for a, b in pairs])
+            for iteration, pairs in zip(iterations, snapshots, strict=True)
         ]
 
     def drop_before(self, first: float) -> None:
@@ -226,6 +271,27 @@ class _Trial:
     def noise(self, at: int) -> float:
         """Return ``||A_k - B_k||^2`` of one of the snapshots."""
         return float(np.mean([_dot(a - b, a - b) for a, b in self.snapshots[at][1]]))
+
+
+def most_bytes(setup: Setup, observation: Observation, n_iter: int) -> int:
+    """Return the most bytes that the state of a selection, or of a run, may take.
+
+    Raises
+    ------
+    InputError
+        The stars or the pad of the setup cannot be used.
+    """
+    n_snapshots, due = 1, 1
+    while due <= n_iter:
+        n_snapshots, due = n_snapshots + 1, _next_snapshot(due)
+    snapshot = observation.images[0].size * np.dtype(np.float32).itemsize
+    curve = MAX_CANDIDATES * (CURVE_DTYPE.itemsize + 8)
+    half = most_bytes_of_run(setup, observation, n_iter) + n_snapshots * (snapshot + curve)
+    return 2 * N_SPLITS * half
+
+
+def _next_snapshot(iteration: int) -> int:
+    return max(iteration + 1, math.floor(SPACING * iteration))
 
 
 def _dot(a: Snapshot, b: Snapshot) -> float:
@@ -282,7 +348,7 @@ class HeldOutSelection:
         self._halves = split_counts(observation, N_SPLITS)
         self._candidates: list[_Candidate] = []
         self._trial = _Trial([])
-        self._saved: State = {}
+        self._saved: Saved | None = None
 
     def choose(self, report: Callable[[str], None], save: Callable[[], None]) -> Choice:
         """Return the penalty and the number of iterations that held-out counts choose.
@@ -329,9 +395,9 @@ class HeldOutSelection:
             trial = _Trial(
                 [(self._start(a, halved), self._start(b, halved)) for a, b in self._halves]
             )
-            if self._saved:
+            if self._saved is not None:
                 trial.restore(self._saved)
-                self._saved = {}
+                self._saved = None
         return trial
 
     def _next_penalty(self) -> Penalty | None:
@@ -356,17 +422,37 @@ class HeldOutSelection:
             )
         return state
 
-    def restore(self, state: State) -> None:
-        """Continue from this state."""
-        self._saved = state
-        curves = curve_of(state.get("curves", rows_of(EMPTY_CURVE)))
-        for mu, smoothing, n_iter, error, *scale in state.get("candidates", np.zeros((0, 6))):
-            curve = curves[(curves["mu"] == mu) & (curves["smoothing"] == smoothing)]
-            reference = [(a, b) for a, b in state["reference"]]
-            penalty = Penalty(float(mu), float(smoothing))
-            self._candidates.append(
-                _Candidate(penalty, int(n_iter), error, curve, reference, *map(float, scale))
+    def restore(self, saved: Saved) -> None:
+        """Continue from the state in a checkpoint.
+
+        Raises
+        ------
+        FileError
+            The selection cannot have such a state.
+        """
+        self._saved = saved
+        most = UNBOUNDED
+        rows = saved.take(
+            "candidates",
+            FLOAT,
+            (range(MAX_CANDIDATES), 6),
+            [0, 0, 1, 0, -most, -most],
+            [most, most, self._n_iter, *[most] * 3],
+        )
+        curves = _take_curve(saved, "curves", self._n_iter)
+        shape = N_SPLITS if len(rows) else 0, 2, self._observation.images[0].size
+        reference = [(a, b) for a, b in saved.take("reference", np.dtype(np.float32), shape, 0.0)]
+        for mu, smoothing, n_iter, error, *scale in rows.tolist():
+            penalty = self._next_penalty()
+            saved.refuse_unless(
+                penalty == Penalty(mu, smoothing) and is_whole(n_iter),
+                f"candidates holds mu {mu:g}, smoothing {smoothing:g}, iteration {n_iter:g}",
             )
+            curve = curves[(curves["mu"] == mu) & (curves["smoothing"] == smoothing)]
+            self._candidates.append(
+                _Candidate(Penalty(mu, smoothing), int(n_iter), error, curve, reference, *scale)
+            )
+        saved.refuse_unless(self._next_penalty() is not None, "candidates leaves nothing to try")
 
 
 @dataclass

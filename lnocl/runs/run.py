@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import refuse_not_finite, warn
 from lnocl.runs.descent import Descent
+from lnocl.runs.saved import LARGEST, Saved, Shape
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
+from lnocl.scene.scene import Scene, grid_of
 from lnocl.solvers import SOLVERS
 from lnocl.solvers.engine import Engine, State
-from lnocl.solvers.sgp import Steps
+from lnocl.solvers.sgp import ALPHA_BOUNDS, Steps
 
 if TYPE_CHECKING:
     from lnocl.scene.forward_model import Model
@@ -65,6 +67,8 @@ class Run:
         The model of the observation.
     engine : Engine
         The engine that computes it.
+    n_iter : int
+        Iterations at most.
     done : int
         Iterations done.
 
@@ -88,18 +92,16 @@ class Run:
             from lnocl.solvers.positions import RADIUS
 
             leeway = RADIUS
-        self._setup, self._n_iter = setup, n_iter
+        self._setup, self.n_iter = setup, n_iter
         self.scene = Scene(observation, setup.stars, penalty, setup.pad, leeway)
         self._given_stars = self.scene.stars
         self._refines = setup.refine_positions and self.scene.n_stars > 0
         extended, star_fluxes = self.scene.start(initial_extended, initial_star_fluxes)
-        self._model_of_stars: Model | None = None
         if self._refines:
-            self._model_of_stars = _make_model(self.scene)
             star_fluxes = self._move_stars(extended, star_fluxes, look_round=True)
         scaling = None
         if setup.solver == "sgp":
-            model = self._model_of_stars or _make_model(self.scene)
+            model = self._model if self._refines else _make_model(self.scene)  # which is let go
             star_fluxes, scaling = _prepare(self.scene, model, extended, star_fluxes)
         self.engine = _make_engine(setup, self.scene, n_iter, scaling)
         self.engine.start(extended, star_fluxes)
@@ -110,7 +112,7 @@ class Run:
         solve = SOLVERS[self._setup.solver]
         descent = Descent(self.scene)
         descent.check(self.engine.objectives().tolist())  # those from before a checkpoint
-        while self.done < self._n_iter:
+        while self.done < self.n_iter:
             begin, is_stage_new = self.done, not self._steps.has_iterated
             for iteration in solve(self.engine, self._due - begin, self._steps):
                 self.done = begin + iteration
@@ -120,15 +122,15 @@ class Run:
             was_stuck = is_stage_new and begin == self.done < self._due
             if was_stuck or not self._refines:
                 return
-            if self.done < self._n_iter:
+            if self.done < self.n_iter:
                 self._refine()
                 self._begin_stage()
 
     def _begin_stage(self) -> None:
         """Set the iteration until which positions stay: the next to refine at, or the last."""
         self._steps = Steps()
-        due = max(FIRST_REFINED, 2 * self.done) if self._refines else self._n_iter
-        self._due = min(due, self._n_iter)
+        due = max(FIRST_REFINED, 2 * self.done) if self._refines else self.n_iter
+        self._due = min(due, self.n_iter)
 
     def state(self) -> State:
         """Return the arrays that `restore` needs, as they are between iterations.
@@ -168,6 +170,57 @@ class Run:
             self.engine.restore(state)
         return state, int(np.argmin(objectives)) == self.done
 
+    def take(self, saved: Saved) -> State:
+        """Return the state that a checkpoint holds, where this run could have it.
+
+        Raises
+        ------
+        FileError
+            An array is missing, of another type or shape, or holds numbers that it cannot have.
+        """
+        own = self.state()  # types and shapes of most are those that they have at any time
+        n = self.n_iter
+        progress = saved.take("progress", own["progress"].dtype, (3,), [0, 0, 0], [n, n, 1])
+        done, due = progress[:2].tolist()
+        least_due = done if self._refines else n
+        saved.refuse_unless(due >= least_due, f"progress holds {due}, and must be {least_due}")
+        state: State = {"progress": progress}
+        shapes: dict[str, Shape] = {name: array.shape for name, array in own.items()}
+        shapes["objectives"] = range(done, done + 2), *own["objectives"].shape[1:]
+        if self.engine.scaling is not None:
+            state["cross_windows"] = windows = self._take_windows(saved, own["cross_windows"])
+            shapes["cross_values"] = (int(windows[:, 2:].prod(axis=1).sum()),)
+        bounds: dict[str, tuple[ArrayLike, ArrayLike]] = {
+            "steps": ALPHA_BOUNDS,
+            "positions": self._bounds_of_stars(),
+            **dict.fromkeys(("extended", "previous", "shift", "star_fluxes"), (0.0, LARGEST)),
+        }
+        for name in [name for name in own if name not in state]:
+            state[name] = saved.take(name, own[name].dtype, shapes[name], *bounds.get(name, ()))
+        if self.engine.scaling is not None:
+            is_usable = self._restored_scaling(state).is_usable()
+            saved.refuse_unless(is_usable, "star_information holds no Fisher information")
+        return state
+
+    def _bounds_of_stars(self) -> tuple[ArrayLike, ArrayLike]:
+        if not self._refines:
+            return self.scene.stars, self.scene.stars
+        from lnocl.solvers.positions import RADIUS
+
+        reach = RADIUS * (1.0 + 1e-9)  # which rounding may exceed
+        return self._given_stars - reach, self._given_stars + reach
+
+    def _take_windows(self, saved: Saved, own: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the windows of the cross information: first row, column, height, width."""
+        low: ArrayLike = own
+        high: ArrayLike = own
+        if self._refines:
+            from lnocl.scene.forward_model import largest_window
+
+            size = largest_window(self.scene.observation.psfs.shape[1:], self.scene.grid)
+            low, high = [-LARGEST, -LARGEST, 1, 1], [LARGEST, LARGEST, *size]
+        return saved.take("cross_windows", own.dtype, own.shape, low, high)
+
     def restore(self, state: State) -> None:
         """Continue from the state of a run of the same observation and parameters."""
         self.done, self._due = (int(number) for number in state["progress"][:2])
@@ -194,18 +247,17 @@ class Run:
         best = self.best_iteration()
         scaling = self.engine.scaling
         del self.engine  # the device need not hold both
-        self.engine = _make_engine(self._setup, self.scene, self._n_iter, scaling)
+        self.engine = _make_engine(self._setup, self.scene, self.n_iter, scaling)
         self.restore(state)
         for _ in islice(self, max(best - self.done, 0)):
             pass
         self.finish()
         self.state()  # refuses values that are not finite
 
-    @property
+    @cached_property
     def _model(self) -> Model:
-        """The model that follows the stars where they are refined."""
-        assert self._model_of_stars is not None
-        return self._model_of_stars
+        """The model of the scene; it follows the stars."""
+        return _make_model(self.scene)
 
     def _restored_scaling(self, state: State) -> Scaling:
         from lnocl.solvers.scaling import Scaling
@@ -305,6 +357,22 @@ class Run:
 
 
 # What follows loads scipy, which not every start needs.
+
+
+def most_bytes(setup: Setup, observation: Observation, n_iter: int) -> int:
+    """Return the most bytes that the state of a run may take.
+
+    Raises
+    ------
+    InputError
+        The stars or the pad of the setup cannot be used.
+    """
+    from lnocl.scene.forward_model import largest_window
+
+    grid, n = grid_of(observation, setup.pad), len(setup.stars)
+    window = largest_window(observation.psfs.shape[1:], grid)
+    numbers = 4 * math.prod(grid) + 2 * grid[0] + n * (math.prod(window) + n + 8) + 2 * n_iter + 64
+    return np.dtype(np.float64).itemsize * numbers
 
 
 def _make_model(scene: Scene) -> Model:

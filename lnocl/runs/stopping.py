@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.runs.run import Run
+from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved
 from lnocl.scene.observation import Array
 
 if TYPE_CHECKING:
@@ -33,8 +34,14 @@ class Rule(Protocol):
     def state(self) -> list[float]:
         """Return the numbers that `restore` needs."""
 
-    def restore(self, state: list[float]) -> None:
-        """Continue from this state."""
+    def restore(self, saved: Saved, done: int) -> None:
+        """Continue from the state in a checkpoint of so many iterations.
+
+        Raises
+        ------
+        FileError
+            The rule cannot have such a state.
+        """
 
 
 class NoRule:
@@ -54,7 +61,7 @@ class NoRule:
         """Return an empty list."""
         return []
 
-    def restore(self, state: list[float]) -> None:
+    def restore(self, saved: Saved, done: int) -> None:
         """Do nothing."""
 
 
@@ -80,9 +87,10 @@ class Change:
         """Return the last objectives."""
         return list(self._recent)
 
-    def restore(self, state: list[float]) -> None:
-        """Continue with these last objectives."""
-        self._recent.extend(state)
+    def restore(self, saved: Saved, done: int) -> None:
+        """Continue with the last objectives in a checkpoint."""
+        count = min(done, CHANGE_WINDOW + 1)
+        self._recent.extend(saved.take("rule", FLOAT, (count,), -UNBOUNDED, UNBOUNDED).tolist())
 
     def _change(self) -> float:
         first, last = self._recent[0], self._recent[-1]
@@ -105,7 +113,7 @@ class Discrepancy:
     def __init__(self) -> None:
         self._model: Model | None = None
         self._stars: Array | None = None
-        self._expected = np.nan
+        self._expected = 0.0
 
     def met(self, run: Run) -> bool:
         """Return whether the data are fitted as well as noise allows."""
@@ -124,9 +132,10 @@ class Discrepancy:
         """Return the expectation."""
         return [self._expected]
 
-    def restore(self, state: list[float]) -> None:
-        """Continue with this expectation."""
-        (self._expected,) = state
+    def restore(self, saved: Saved, done: int) -> None:
+        """Continue with the expectation in a checkpoint."""
+        least = np.finfo(FLOAT).tiny if done else 0.0
+        (self._expected,) = saved.take("rule", FLOAT, (1,), least, UNBOUNDED).tolist()
 
     def _discrepancy(self, run: Run) -> float:
         return 2.0 * run.engine.data_term() * run.scene.scale / self._expected

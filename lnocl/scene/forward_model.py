@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
-from lnocl.scene.shifting import Stamp
+from lnocl.scene.shifting import MARGIN, Stamp
 
 # Rounding of an FFT, as a share of the largest value.
 ROUNDING = 1e-16
@@ -116,6 +116,12 @@ def _window_of_correlations(
         last.append(corner + stamp.values.shape)
     start = np.min(first, axis=0)
     return start, np.max(last, axis=0) - start
+
+
+def largest_window(psf_shape: tuple[int, ...], grid: tuple[int, int]) -> tuple[int, int]:
+    """Return the largest shape of `Model.adjoint_of_stamps` of star images, wherever these lie."""
+    height, width = (2 * (k + 2 * MARGIN) for k in psf_shape)
+    return grid if height >= grid[0] or width >= grid[1] else (height, width)
 
 
 def _without_rounding(stamp: Stamp) -> Stamp:

@@ -108,10 +108,7 @@ class Scene:
         self.observation = observation
         positions = check_positions(stars, observation)
         self._leeway = leeway
-        if isinstance(pad, str) and pad == "auto":
-            pad = recommend_pad(observation)
-            log.info("pad: %d pixels, by the PSFs", pad)
-        self.grid = _grid(observation.shape, pad)
+        self.grid = grid_of(observation, pad)
         self._warn_of_large_psf()
         self._warn_of_wrapped_offsets()
         # A power of two just above the mean; 1 where that is 0.
@@ -202,9 +199,8 @@ class Scene:
         return self._per_exposure(self._on_grid(background, fill=1.0), 1.0)
 
     def _per_exposure(self, images: Array, fill: float) -> Array:
-        if not self.has_exposure_map:
+        if self.weights is None or not self.has_exposure_map:
             return images
-        assert self.weights is not None
         observed = self.weights > 0
         return np.divide(images, self.weights, out=np.full_like(images, fill), where=observed)
 
@@ -382,7 +378,18 @@ def _mean(name: str, values: Array) -> float:
     return mean
 
 
-def _grid(shape: tuple[int, int], pad: object) -> tuple[int, int]:
+def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
+    """Return the shape (Ny, Nx) of the grid of a scene.
+
+    Raises
+    ------
+    InputError
+        `pad` is out of range, or the images are too large for the transform.
+    """
+    if isinstance(pad, str) and pad == "auto":
+        pad = recommend_pad(observation)
+        log.info("pad: %d pixels, by the PSFs", pad)
+    shape = observation.shape
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
         raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
     ny, nx = (max(2, 1 << (n + 2 * int(pad) - 1).bit_length()) for n in shape)

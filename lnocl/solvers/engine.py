@@ -11,7 +11,7 @@ from lnocl.scene.observation import Array
 if TYPE_CHECKING:
     from lnocl.solvers.scaling import Scaling
 
-# Arrays by name, as a checkpoint holds them; empty ones may be missing from it.
+# Arrays by name; `objectives` grows along its first axis.
 State = dict[str, NDArray[Any]]
 
 

@@ -55,13 +55,8 @@ class Scaling:
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray]) -> Scaling:
-        """Return the scaling of a state, which without stars may lack all but the shift."""
-        return cls(
-            state["shift"],
-            state.get("star_information", np.zeros((0, 0))),
-            state.get("cross_values", np.zeros(0)),
-            state.get("cross_windows", np.zeros((0, 4), np.int32)),
-        )
+        """Return the scaling of a state."""
+        return cls(**{each.name: state[each.name] for each in fields(cls)})
 
     def state(self) -> dict[str, NDArray]:
         """Return what `from_state` needs."""
@@ -88,6 +83,16 @@ class Scaling:
         tenths.
         """
         return bounded_step(self.star_information, self._inverse, gradient + coupling, fluxes)
+
+    def is_usable(self) -> bool:
+        """Return whether the star information can be inverted, as that of any scene can."""
+        diagonal = np.diag(self.star_information)
+        if not ((diagonal == 0) | (diagonal >= np.finfo(np.float32).tiny)).all():
+            return False
+        try:
+            return bool(np.isfinite(self._inverse).all())
+        except np.linalg.LinAlgError:
+            return False
 
     @cached_property
     def _inverse(self) -> Array:

@@ -281,19 +281,6 @@ def test_what_is_no_checkpoint_is_refused(content, tmp_path):
         checkpoint.read(str(path))
 
 
-def test_of_rows_without_end_few_are_read(saved, tmp_path, monkeypatch):
-    path = tmp_path / "many.fits.gz"
-    rows = np.array([(f"name {k}", "") for k in range(5000)], [("name", "U32"), ("value", "U8")])
-    with fits.open(saved) as hdus:
-        hdus["RUN"] = fits.BinTableHDU(rows, name="RUN")
-        hdus.writeto(path)
-    seen = []
-    monkeypatch.setattr(checkpoint, "_digest", lambda described, *_: seen.append(len(described)))
-    with pytest.raises(lnocl.FileError, match="its digest is wrong"):
-        checkpoint.read(str(path))
-    assert seen == [checkpoint.MAX_ROWS]
-
-
 def test_the_checkpoint_of_another_run_is_not_replaced(saved):
     before = Path(saved).read_bytes()
     with pytest.raises(lnocl.FileError, match="exists; resume from it, or remove it"):

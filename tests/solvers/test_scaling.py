@@ -101,11 +101,9 @@ def test_cross_information_lies_in_a_window(psf_shape, offsets):
 
 @pytest.mark.parametrize("n_stars", [0, 2])
 def test_scaling_is_restored_from_its_state(n_stars):
-    """A checkpoint holds no arrays of size 0."""
     made = TINY.make()
     _, _, steps, _ = prepared(made, made.stars[:n_stars], [1e3, 1e3][:n_stars])
-    state = {name: array for name, array in steps.state().items() if array.size}
-    other = scaling.Scaling.from_state(state)
+    other = scaling.Scaling.from_state(steps.state())
     for name, array in steps.state().items():
         np.testing.assert_array_equal(other.state()[name], array)
     stamps = zip(other.cross_information, steps.cross_information, strict=True)
