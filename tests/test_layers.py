@@ -42,6 +42,13 @@ def imports(module):
             yield node.args[0].value
 
 
+@pytest.mark.parametrize("module", MODULES)
+def test_nothing_is_checked_by_assert(module):
+    """Which python -O leaves out."""
+    tree = ast.parse((PACKAGE / f"{module.replace('.', '/')}.py").read_text())
+    assert not [node.lineno for node in ast.walk(tree) if isinstance(node, ast.Assert)]
+
+
 def room_of(name):
     """Return the room of a dotted name: what the package itself holds is in ``__init__``."""
     room = name.removeprefix("lnocl.").split(".")[0]

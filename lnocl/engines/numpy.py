@@ -46,7 +46,7 @@ class ReferenceEngine:
 
     def set_scaling(self, scaling: Scaling) -> None:
         """Measure steps with this from now on."""
-        self.scaling = scaling
+        self.scaling, self._shift = scaling, scaling.shift
         stamps = [stamp.on_grid(self.scene.grid) for stamp in scaling.cross_information]
         self._cross_information = np.array(stamps).reshape(len(stamps), *self.scene.grid)
 
@@ -118,13 +118,12 @@ class ReferenceEngine:
 
     def gradient(self) -> tuple[float, float]:
         """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""
-        assert self.scaling is not None
         self._gradient, change_step, change_change = gradient_rows(
             self._row_spectrum,
             self._extended,
             self._previous,
             self._gradient,
-            self.scaling.shift,
+            self._shift,
             self._inverse_weight,
             self.scene.mu,
             self._slope,
@@ -139,11 +138,10 @@ class ReferenceEngine:
 
     def step(self, alpha: float, share: float) -> tuple[float, Array]:
         """Step from the base; return ``<gradient, d>`` and ``<reach_s, d>``."""
-        assert self.scaling is not None
         self._extended, self._row_spectrum, self._squares, slope, coupling = step_rows(
             self._previous,
             self._gradient,
-            self.scaling.shift,
+            self._shift,
             self._inverse_weight,
             self._cross_information,
             self.scene.mu,

@@ -59,16 +59,21 @@ def _find_wcs(header: fits.Header) -> WCS | None:
     with ignored_warnings(), quiet_log():  # of faults that astropy mends
         try:
             wcs = make_wcs(header)
-            assert wcs.pixel_to_world(0, 0).icrs  # those of the Sun are not on the sky
+            _ = wcs.pixel_to_world(0, 0).icrs  # those of the Sun are not on the sky
             return wcs
         except Exception:  # astropy may raise any error on a damaged header
             return None
 
 
 def to_sky(positions: Pairs, header: fits.Header) -> Pairs:
-    """Return right ascension and declination (ICRS, degrees) of pixel positions, shape (n, 2)."""
-    wcs = _find_wcs(header)
-    assert wcs is not None
+    """Return right ascension and declination (ICRS, degrees) of pixel positions, shape (n, 2).
+
+    Raises
+    ------
+    InputError
+        An image without celestial coordinates that astropy can use.
+    """
+    wcs = celestial_wcs(header, "the image")
     found = wcs.pixel_to_world(*np.reshape(positions, (-1, 2)).T).icrs
     return np.array([found.ra.deg, found.dec.deg]).T
 

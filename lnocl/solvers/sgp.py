@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from lnocl.errors import refuse_not_finite
 from lnocl.solvers.engine import Engine
+
+if TYPE_CHECKING:
+    from lnocl.solvers.scaling import Scaling
 
 # Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002: the line search shortens a step by
 # the first factor until the objective falls by at least the second of what the slope promises.
@@ -76,11 +80,11 @@ def _descend(engine: Engine, alpha: float) -> bool:
     """Step along the projected gradient as far as the objective falls; return whether it fell."""
     objective, fluxes, gradient = engine.objective(), engine.star_fluxes(), engine.star_gradient()
     slope, coupling = engine.step(alpha, 1.0)
-    assert engine.scaling is not None
     refuse_not_finite(objective, slope, *gradient, *coupling)
-    change = engine.scaling.star_step(fluxes, gradient, coupling)
+    scaling = cast("Scaling", engine.scaling)
+    change = scaling.star_step(fluxes, gradient, coupling)
     if slope + gradient @ change >= 0:  # following the extended source would lead uphill
-        change = engine.scaling.star_step(fluxes, gradient, np.zeros_like(coupling))
+        change = scaling.star_step(fluxes, gradient, np.zeros_like(coupling))
     slope += float(gradient @ change)
     share = 1.0
     for _ in range(MAX_SHORTENINGS):
