@@ -1,4 +1,4 @@
-"""Long runs on the command line: checkpoints, and an orderly end on Ctrl-C or SIGTERM."""
+"""Long runs on the command line: checkpoints, and an orderly end on Ctrl-C, SIGTERM or SIGHUP."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from lnocl.commands.options import finite, option
-from lnocl.commands.signals import first_handled
+from lnocl.commands.signals import ENDING, first_handled
 from lnocl.errors import InputError, LnoclError, counted
 
 if TYPE_CHECKING:
     from lnocl.result import Result
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, *ENDING)
 
 
 OPTIONS = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import warnings
 from collections.abc import Sequence
@@ -11,12 +10,11 @@ from functools import partial
 from lnocl import __version__
 from lnocl.commands import bench, deconvolve, demo, devices, messages, plot, psf, selftest, simulate
 from lnocl.commands.parser import Parser
-from lnocl.commands.signals import Terminated, first_handled, terminate
+from lnocl.commands.signals import ENDING, Terminated, first_handled, terminate
 from lnocl.errors import InputError, LnoclError, LnoclWarning
 
 FAILED = 1
 INTERRUPTED = 130
-TERMINATED = 143
 
 # In the order of the help.
 COMMANDS = {
@@ -42,13 +40,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 terminated.
+        Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 129 (SIGHUP) or 143
+        (SIGTERM) terminated.
     """
     messages.replace_closed_streams()
     words = sys.argv[1:] if arguments is None else arguments
     flags: dict[str, str] = {}
     try:
-        with first_handled([signal.SIGTERM], terminate), warnings.catch_warnings():
+        with first_handled(ENDING, terminate), warnings.catch_warnings():
             warnings.simplefilter("always", LnoclWarning)
             warnings.showwarning = partial(messages.show_warning, flags)
             parsed = _make_parser().parse_args(words)
@@ -60,8 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return messages.fail(str(error), error.exit_status)
     except MemoryError:
         return messages.fail("not enough memory; cut the images, or give fewer at a time", FAILED)
-    except Terminated:
-        return messages.fail("terminated", TERMINATED)
+    except Terminated as error:
+        return messages.fail("terminated", 128 + error.args[0])
     except KeyboardInterrupt:
         return messages.fail("interrupted", INTERRUPTED)
     except OSError as error:
@@ -73,7 +72,7 @@ def _make_parser() -> Parser:
     parser = Parser(
         prog="lnocl",
         description="Multi-component Richardson-Lucy deconvolution of astronomical images.",
-        epilog="Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 143 terminated.",
+        epilog="Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 129 or 143 terminated.",
     )
     parser.add_argument("--version", action="version", version=f"lnocl {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -8,9 +8,12 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
+# Those that end a process; Windows has no SIGHUP, of a terminal that is closed.
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, which ends whatever runs as Ctrl-C does."""
+    """SIGTERM or SIGHUP, its argument, which ends whatever runs as Ctrl-C does."""
 
 
 @contextlib.contextmanager
@@ -58,4 +61,4 @@ def terminate(number: int) -> None:
     Terminated
         Always.
     """
-    raise Terminated
+    raise Terminated(number)

@@ -475,7 +475,7 @@ def progress_of(read):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_one_signal_ends_it_with_a_result_and_a_checkpoint(number, command, tmp_path):
     command = [*command, "--n-iter", "100000"]
     saved = tmp_path / "run.fits"
@@ -550,7 +550,7 @@ IN_THE_END = [
 
 
 @pytest.mark.parametrize("called", IN_THE_END)
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_after_the_last_iteration_costs_nothing(called, number, interrupted, capsys):
     assert interrupted(called, [number], "-o", "found.fits") == 128 + number
     assert capsys.readouterr().err == (
@@ -569,7 +569,12 @@ def test_nor_does_it_where_no_iteration_was_left(interrupted, capsys):
 
 @pytest.mark.parametrize("called", ["lnocl.io.fitswrite.write_result", "lnocl.io.atomic.os.fsync"])
 @pytest.mark.parametrize(
-    ("second", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")]
+    ("second", "word"),
+    [
+        (signal.SIGINT, "interrupted"),
+        (signal.SIGTERM, "terminated"),
+        (signal.SIGHUP, "terminated"),
+    ],
 )
 def test_a_second_one_ends_it_with_no_file(called, second, word, interrupted, capsys):
     before = os.listdir()
