@@ -142,6 +142,7 @@ def whole_file(path: str, overwrite: bool = False) -> Iterator[IO[bytes]]:
     FileError
         The file cannot be written, or exists and must not be overwritten.
     """
+    _refuse_planted_link(path)
     target = os.path.realpath(path)
     temporary = _temporary_beside(target)
     try:
@@ -226,7 +227,20 @@ def _explained(path: str, output: _Output | None = None) -> Iterator[None]:
         raise FileError(f"{path} cannot be written: {failure.strerror or failure}") from error
 
 
+def _refuse_planted_link(path: str) -> None:
+    """Refuse a link of another user in a folder that all may write, as Linux itself may."""
+    if not os.path.islink(path):
+        return
+    owner, folder = os.lstat(path).st_uid, os.stat(os.path.dirname(path) or ".")
+    if folder.st_mode & stat.S_ISVTX and owner not in (os.geteuid(), folder.st_uid):
+        raise FileError(
+            f"the output {path} is a link of another user in a folder that all may write; give "
+            "another name"
+        )
+
+
 def _check_replaceable(path: str, overwrite: bool) -> None:
+    _refuse_planted_link(path)
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:

@@ -412,3 +412,22 @@ def test_a_file_in_the_place_of_an_output_folder(tmp_path):
     with pytest.raises(FileError) as caught:
         atomic.check_folder(str(path), overwrite=True)
     assert str(caught.value) == f"the output folder {path} cannot be used: it is not a folder"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root makes links of other users")
+def test_a_link_of_another_user_where_all_may_write_is_not_followed(tmp_path):
+    shared, victim = tmp_path / "shared", tmp_path / "victim.fits"
+    shared.mkdir()
+    shared.chmod(0o1777)
+    victim.write_bytes(b"precious")
+    link = shared / "out.fits"
+    link.symlink_to(victim)
+    os.lchown(link, 12345, 12345)
+    with pytest.raises(FileError, match=r"is a link of another user in a folder that all may"):
+        atomic.check_output(str(link), overwrite=True)
+    with pytest.raises(FileError, match="is a link of another user"):
+        atomic.write_text(str(link), "new", overwrite=True)
+    assert victim.read_bytes() == b"precious"
+    os.lchown(link, 0, 0)
+    atomic.write_text(str(link), "new", overwrite=True)
+    assert victim.read_bytes() == b"new"
