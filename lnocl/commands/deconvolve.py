@@ -209,6 +209,7 @@ ALL_OPTIONS = [each for group in OPTIONS.values() for each in group]
 def _run(arguments: argparse.Namespace) -> None:
     from lnocl.io import atomic, fitsread, fitswrite
     from lnocl.io.frames import Calibration, read_frames
+    from lnocl.io.headers import observed_cards
 
     inputs = options.input_paths(ALL_OPTIONS, vars(arguments))
     atomic.check_fits_output(arguments.output, arguments.overwrite, inputs)
@@ -238,12 +239,15 @@ def _run(arguments: argparse.Namespace) -> None:
             result.star_fluxes,
             result.history,
             wcs=wcs,
-            cards=record.make_cards(
-                ALL_OPTIONS,
-                repeated | _used(repeated, frames, result),
-                frames.sha256,
-                fitswrite.offset_cards(offsets) if arguments.align else [],
-            ),
+            cards=[
+                *observed_cards(frames.images.header),
+                *record.make_cards(
+                    ALL_OPTIONS,
+                    repeated | _used(repeated, frames, result),
+                    frames.sha256,
+                    fitswrite.offset_cards(offsets) if arguments.align else [],
+                ),
+            ],
             commands=record.make_commands("deconvolve", ALL_OPTIONS, repeated, folder),
             overwrite=arguments.overwrite,
             held_out=result.held_out if result.held_out.size else None,

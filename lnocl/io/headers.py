@@ -24,6 +24,9 @@ _LIMITS = (
     (re.compile("[AB]P?_ORDER"), 9),
 )
 
+# What was observed, when and with what.
+OBSERVED = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS", "EXPTIME")
+
 
 def readable(header: fits.Header) -> fits.Header:
     """Return a header without the cards whose value astropy cannot read.
@@ -42,6 +45,16 @@ def readable(header: fits.Header) -> fits.Header:
             warn(f"a card of the header is left out: {reason}")
             del cleaned[i]
     return cleaned
+
+
+def observed_cards(header: fits.Header) -> list[tuple[str, str | int | float, str]]:
+    """Return the cards that say what was observed, when and with what, without damaged ones."""
+    cards = [(keyword, header.get(keyword)) for keyword in OBSERVED]
+    return [
+        (keyword, value, "of the first image")
+        for keyword, value in cards
+        if isinstance(value, str) or (isinstance(value, (int, float)) and math.isfinite(value))
+    ]
 
 
 def number(path: str, header: fits.Header, keyword: str) -> float | None:

@@ -1,0 +1,17 @@
+"""Values of headers."""
+
+from astropy.io import fits
+
+from lnocl.io.headers import observed_cards
+
+
+def test_what_was_observed_is_kept():
+    header = fits.Header({"OBJECT": "RW Aur", "EXPTIME": 30.0, "FILTER": 7, "OBSERVER": "A"})
+    header["DATE-OBS"] = None
+    header["INSTRUME"] = True
+    assert observed_cards(header) == [
+        ("OBJECT", "RW Aur", "of the first image"),
+        ("INSTRUME", True, "of the first image"),
+        ("FILTER", 7, "of the first image"),
+        ("EXPTIME", 30.0, "of the first image"),
+    ]
