@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Set
 from copy import copy
 from functools import partial
 from os import PathLike
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,7 +34,7 @@ from lnocl.scene.stars import check_positions
 
 def deconvolve(
     observation: Observation,
-    stars: Sequence[tuple[float, float]] = (),
+    stars: Iterable[tuple[float, float]] = (),
     *,
     mu: float | str = 0.0,
     solver: str = "sgm",
@@ -67,7 +68,7 @@ def deconvolve(
     ----------
     observation : Observation
         The p images of shape (ny, nx), with their PSFs, backgrounds, noise and masks.
-    stars : sequence of (x, y), optional
+    stars : iterable of (x, y), optional
         Positions of the point sources in pixels of an image without offset, 0-based, x along
         columns; they may be a Quantity in pixels. Two are at least a thousandth of a pixel apart.
         Between pixels a star's image is the PSF moved in its spectrum
@@ -206,7 +207,9 @@ def deconvolve(
     check_length(n_iter, stop)
     check_types(callback, progress=progress, refine_positions=refine_positions)
     fits_stars = solver == "sgp" or bool(refine_positions)
-    positions = check_positions(stars, observation)
+    # What can be read once, or has no order that NumPy knows, is no array_like.
+    given: Any = list(stars) if isinstance(stars, (Iterator, Set)) else stars
+    positions = check_positions(given, observation)
     initial_extended, initial_star_fluxes = read_start(
         observation, fits_stars, initial_extended, initial_star_fluxes
     )

@@ -115,3 +115,25 @@ def test_models_are_those_of_the_images_that_were_given():
     observation.images, observation.background = images, np.array([50.0])
     np.testing.assert_array_equal(result.models(), models)
     np.testing.assert_array_equal(result.residuals(), residuals)
+
+
+def test_stars_may_be_any_iterable(tmp_path):
+    observation = lnocl.Observation(np.full((8, 8), 5.0), np.ones((3, 3)))
+    given = {"n_iter": 2, "engine": "numpy"}
+    expected = lnocl.deconvolve(observation, [(4, 4), (2, 6)], **given)
+    saved = {"checkpoint": str(tmp_path / "run.fits")}
+    found = lnocl.deconvolve(observation, (star for star in [(4, 4), (2, 6)]), **given, **saved)
+    np.testing.assert_array_equal(found.star_fluxes, expected.star_fluxes)
+    assert len({found, expected}) == 2  # compared by identity
+
+
+def test_an_array_that_cannot_be_made_is_named():
+    class Failing:
+        def __array__(self, *_, **__):
+            raise RuntimeError("the file\nis gone")
+
+    with pytest.raises(lnocl.InputError) as caught:
+        lnocl.Observation(Failing(), np.ones((3, 3)))
+    assert str(caught.value) == (
+        "images cannot be read as an array: RuntimeError: the file is gone"
+    )

@@ -254,8 +254,15 @@ def values_and_mask(name: str, values: ArrayLike) -> tuple[NDArray, NDArray[np.b
     """Return values as an array, and where they are masked, by whatever class or in a list."""
     try:
         array: NDArray = np.ma.asanyarray(values)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError) as error:
+        if "inhomogeneous" not in str(error):
+            raise InputError(f"{name} cannot be read as an array: {error}") from error
         raise InputError(f"{name} cannot be read as an array: its rows differ") from None
+    except MemoryError:
+        raise
+    except Exception as error:  # the caller's own __array__ may raise any
+        words = f"{type(error).__name__}: {error}"
+        raise InputError(f"{name} cannot be read as an array: {words}") from error
     return np.ma.getdata(array, subok=False), np.ma.getmaskarray(array)
 
 
