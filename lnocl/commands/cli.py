@@ -72,7 +72,8 @@ def _make_parser() -> Parser:
     parser = Parser(
         prog="lnocl",
         description="Multi-component Richardson-Lucy deconvolution of astronomical images.",
-        epilog="Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 129 or 143 terminated.",
+        epilog="Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 129 or 143 "
+        "terminated.",
     )
     parser.add_argument("--version", action="version", version=f"lnocl {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
