@@ -8,7 +8,18 @@ from collections.abc import Sequence
 from functools import partial
 
 from lnocl import __version__
-from lnocl.commands import bench, deconvolve, demo, devices, messages, plot, psf, selftest, simulate
+from lnocl.commands import (
+    bench,
+    deconvolve,
+    demo,
+    devices,
+    environment,
+    messages,
+    plot,
+    psf,
+    selftest,
+    simulate,
+)
 from lnocl.commands.parser import Parser
 from lnocl.commands.signals import ENDING, Terminated, first_handled, terminate
 from lnocl.errors import InputError, LnoclError, LnoclWarning
@@ -44,6 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         (SIGTERM) terminated.
     """
     messages.replace_closed_streams()
+    environment.prepare()
     words = sys.argv[1:] if arguments is None else arguments
     flags: dict[str, str] = {}
     try:
