@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 from lnocl.errors import DivergedError, NotFiniteError, warn
 from lnocl.result import Callback, Estimate, Result, make_result
 from lnocl.runs.checkpoint import Checkpointer, describe
-from lnocl.runs.held_out import EMPTY_CURVE, Choice, HeldOutSelection, most_bytes
+from lnocl.runs.choice import EMPTY_CURVE, Choice
+from lnocl.runs.held_out import HeldOutSelection, most_bytes
 from lnocl.runs.options import (
     check_choices,
     check_length,

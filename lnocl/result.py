@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.runs.held_out import Choice
+from lnocl.runs.choice import Choice
 from lnocl.runs.run import Run
 from lnocl.scene.observation import Array, Observation
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.atomic import check_output, whole_file
-from lnocl.runs.held_out import Choice, HeldOutSelection, rows_of
+from lnocl.runs.choice import Choice, rows_of
+from lnocl.runs.held_out import HeldOutSelection
 from lnocl.runs.run import Run, Setup, engine_name
 from lnocl.runs.saved import Saved
 from lnocl.runs.stopping import Rule

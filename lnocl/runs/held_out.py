@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from lnocl.errors import DivergedError, InputError, LnoclWarning, refuse_not_finite, warn
 from lnocl.process import ignored_warnings
+from lnocl.runs.choice import CURVE_DTYPE, Choice, rows_of, take_curve
 from lnocl.runs.run import Run, Setup
 from lnocl.runs.run import most_bytes as most_bytes_of_run
 from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved, is_whole
@@ -31,17 +32,6 @@ from lnocl.runs.thinning import split_counts
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.solvers.engine import State
-
-CURVE_DTYPE = np.dtype(
-    [
-        ("mu", np.float64),
-        ("smoothing", np.float64),
-        ("iteration", np.int64),
-        ("error", np.float64),
-    ]
-)
-
-EMPTY_CURVE = np.zeros(0, CURVE_DTYPE)
 
 # The chosen iteration is the last with an error within a tenth of the least: near a star the
 # estimate improves long after the rest. The least squared error is taken to be the noise alone;
@@ -71,62 +61,6 @@ Snapshot = NDArray[np.float32]
 Pair = tuple[Snapshot, Snapshot]
 StartRun = Callable[[Observation, Penalty], Run]
 PenaltyGrid = Callable[[Observation, float], list[Penalty]]
-
-
-@dataclass
-class Choice:
-    """The penalty and the number of iterations, chosen by held-out counts or by the caller.
-
-    Attributes
-    ----------
-    penalty : Penalty
-        On the extended source.
-    n_iter : int
-        Iterations.
-    curve : ndarray, fields ``mu``, ``smoothing``, ``iteration`` and ``error``
-        Estimated relative error of the extended source, ``||f - truth|| / ||truth||``.
-    """
-
-    penalty: Penalty
-    n_iter: int
-    curve: NDArray[np.void]
-
-    @classmethod
-    def take(cls, saved: Saved, low: Array, high: Array) -> Choice:
-        """Return the choice that a checkpoint holds.
-
-        Parameters
-        ----------
-        saved : Saved
-            The arrays of the checkpoint.
-        low, high : ndarray of float64, shape (3,)
-            Bounds of mu, smoothing and the number of iterations.
-
-        Raises
-        ------
-        FileError
-            It is out of bounds, or its curve is.
-        """
-        mu, smoothing, n_iter = saved.take("choice", FLOAT, (3,), low, high).tolist()
-        saved.refuse_unless(is_whole(n_iter), f"choice holds {n_iter:g} iterations")
-        return cls(Penalty(mu, smoothing), int(n_iter), _take_curve(saved, "curve", int(high[2])))
-
-
-def rows_of(curve: NDArray[np.void]) -> Array:
-    """Return a curve as plain numbers, a row for each field."""
-    return np.array([curve[name] for name in CURVE_DTYPE.names or ()], np.float64)
-
-
-def _take_curve(saved: Saved, name: str, n_iter: int) -> NDArray[np.void]:
-    """Return the curve whose `rows_of` a checkpoint holds."""
-    low, high = np.array([[0.0, 0.0, 1.0, 0.0], [UNBOUNDED, UNBOUNDED, n_iter, UNBOUNDED]])
-    shape = len(low), range(MAX_CANDIDATES * n_iter + 1)
-    rows = saved.take(name, FLOAT, shape, low[:, None], high[:, None])
-    saved.refuse_unless(is_whole(rows[2]), f"{name} holds parts of iterations")
-    curve = np.zeros(rows.shape[1], CURVE_DTYPE)
-    for name, row in zip(CURVE_DTYPE.names or (), rows, strict=True):
-        curve[name] = row
-    return curve
 
 
 def mu_grid(smoothing: float) -> PenaltyGrid:
@@ -439,7 +373,7 @@ class HeldOutSelection:
             [0, 0, 1, 0, -most, -most],
             [most, most, self._n_iter, *[most] * 3],
         )
-        curves = _take_curve(saved, "curves", self._n_iter)
+        curves = take_curve(saved, "curves", self._n_iter)
         shape = N_SPLITS if len(rows) else 0, 2, self._observation.images[0].size
         reference = [(a, b) for a, b in saved.take("reference", np.dtype(np.float32), shape, 0.0)]
         for mu, smoothing, n_iter, error, *scale in rows.tolist():

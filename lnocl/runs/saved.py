@@ -69,7 +69,7 @@ class Saved:
         lengths = [axis if isinstance(axis, range) else range(axis, axis + 1) for axis in shape]
         array = self._arrays.pop(self._prefix + name, None)
         if array is None:
-            array = np.zeros([min(axis) for axis in lengths], dtype)
+            array = np.zeros([axis[0] for axis in lengths], dtype)
             if array.size:
                 self.refuse(f"{name} is missing")
         has_axes = array.ndim == len(lengths)
