@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class Setup:
     """The parameters that all runs of one call of `deconvolve` share."""
 
-    stars: ArrayLike
+    stars: Array
     pad: int | str
     solver: str
     precision: str
