@@ -18,7 +18,6 @@ from lnocl.runs.saved import LARGEST, Saved, Shape
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene, grid_of
-from lnocl.scene.stars import check_positions
 from lnocl.solvers import SOLVERS
 from lnocl.solvers.engine import Engine, State
 from lnocl.solvers.sgp import ALPHA_BOUNDS, Steps
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 class Setup:
     """The parameters that all runs of one call of `deconvolve` share."""
 
-    stars: ArrayLike
+    stars: Array
     pad: int | str
     solver: str
     precision: str
@@ -370,7 +369,7 @@ def most_bytes(setup: Setup, observation: Observation, n_iter: int) -> int:
     """
     from lnocl.scene.forward_model import largest_window
 
-    grid, n = grid_of(observation, setup.pad), len(check_positions(setup.stars, observation))
+    grid, n = grid_of(observation, setup.pad), len(setup.stars)
     window = largest_window(observation.psfs.shape[1:], grid)
     numbers = 4 * math.prod(grid) + 2 * grid[0] + n * (math.prod(window) + n + 8) + 2 * n_iter + 64
     return np.dtype(np.float64).itemsize * numbers
