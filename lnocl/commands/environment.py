@@ -12,8 +12,8 @@ NO_HOME = os.path.join(os.devnull, "home")
 def prepare() -> None:
     """Let users without a home run commands, or with one that cannot be written to.
 
-    astropy fails where there is no home at all, and goes without its settings where it cannot be
-    read. matplotlib then takes a temporary folder, and need not say so.
+    astropy fails to import without a home; with one that cannot be read it uses its defaults.
+    matplotlib then makes a temporary folder, and its message about that is hidden.
     """
     try:
         is_known = os.path.isabs(os.path.expanduser("~"))

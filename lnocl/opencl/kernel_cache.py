@@ -167,6 +167,8 @@ def store() -> Path:
     folder = os.environ.get(VARIABLE)
     if not folder:
         folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        if folder.startswith("~"):  # the user has no home
+            folder = os.devnull
         folder = os.path.join(folder, "lnocl")
     return Path(folder)
 

@@ -212,3 +212,14 @@ def test_a_library_that_was_cut_short_is_not_stored(warm):
         assert not kernel_cache._is_whole(library[:-1])
         assert not kernel_cache._is_whole(library[: len(library) // 2])
     assert kernel_cache._is_whole(b"no library")
+
+
+def test_without_a_home_nothing_is_stored(tmp_path, monkeypatch):
+    """Nor is a folder called ~ made where the process is."""
+    for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)
+    with pytest.warns(lnocl.LnoclWarning, match="cannot be stored in /dev/null/lnocl"):
+        assert not kernel_cache.can_write(kernel_cache.store())
+    assert not list(tmp_path.iterdir())
