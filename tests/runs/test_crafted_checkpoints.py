@@ -8,7 +8,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from astropy.io import fits
-from scenes import Recipe
+from scenes import Recipe, same
 
 import lnocl
 from lnocl.runs import checkpoint
@@ -274,15 +274,21 @@ def test_many_crafted_checkpoints_take_little_memory(kind, all_saved, monkeypatc
 
 @pytest.mark.exhaustive
 @pytest.mark.usefixtures("little_memory")
-def test_files_of_changed_bytes_are_refused_or_gone_on_from(all_saved, tmp_path):
+def test_files_of_changed_bytes_are_refused_or_hold_the_same(all_saved, tmp_path):
+    """Half of the bytes are padding and comments, which the digest leaves out."""
     made, given, saved = all_saved["sgp"]
-    path, chance = tmp_path / "crafted.fits", random.Random(3)
+    path, chance, refused = tmp_path / "crafted.fits", random.Random(3), 0
     checkpoint.write(str(path), saved.described, saved.ended, saved.arrays)
-    sound, outcomes = path.read_bytes(), Counter()
+    sound, expected = path.read_bytes(), made.deconvolve(**given, resume=path)
     for _ in range(1000):
         content = bytearray(sound)
         for _ in range(chance.choice([1, 3, 10])):
             content[chance.randrange(len(content))] ^= 1 << chance.randrange(8)
         path.write_bytes(content)
-        outcomes[go_on(made, given, str(path))] += 1
-    assert outcomes["refused"] > 500
+        try:
+            found = made.deconvolve(**given, resume=path)
+        except lnocl.LnoclError:
+            refused += 1
+        else:
+            same(found, expected)
+    assert 400 < refused < 600  # measured 485
