@@ -103,6 +103,7 @@ def test_other_runtimes_are_left_alone(monkeypatch):
 def test_kernels_go_where_they_can_be_run(lack, tmp_path, monkeypatch):
     """Else beside the store; else one line says what to set."""
     genuine, bad = os.statvfs, {tmp_path / "temporary"}
+    (tmp_path / "temporary").mkdir()
 
     def statvfs(folder):
         found = genuine(folder)
