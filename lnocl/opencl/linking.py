@@ -14,6 +14,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pyopencl as cl
 
@@ -137,13 +138,16 @@ def _try(device: cl.Device) -> str:
     place = [str(platform), str(device.platform.get_devices().index(device))]
     folder = kernel_cache.new_folder()
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", TRIAL, *place],
-            env={**os.environ, kernel_cache.VARIABLE: folder, "XDG_CACHE_HOME": folder},
-            capture_output=True,
-            text=True,
-            errors="replace",
-        )
+        # In a thread, where no signal interrupts it: the process is never left to itself.
+        with ThreadPoolExecutor(1) as thread:
+            done = thread.submit(
+                subprocess.run,
+                [sys.executable, "-c", TRIAL, *place],
+                env={**os.environ, kernel_cache.VARIABLE: folder, "XDG_CACHE_HOME": folder},
+                capture_output=True,
+                text=True,
+                errors="replace",
+            ).result()
     except OSError as error:
         return str(error.strerror)
     finally:

@@ -1,6 +1,8 @@
 """PoCL on machines where it cannot link kernels, and would abort the process."""
 
 import os
+import signal
+import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -83,6 +85,27 @@ def test_it_is_tried_once(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", "/elsewhere")
     with pytest.raises(pytest.fail.Exception, match="tried again"):
         linking.check.__wrapped__(chosen)
+
+
+def test_an_interrupted_trial_leaves_nothing(monkeypatch):
+    started, folders, genuine = [], [], kernel_cache.new_folder
+
+    class Interrupted(subprocess.Popen):
+        def __init__(self, *arguments, **options):
+            started.append(self)
+            super().__init__(*arguments, **options)
+            signal.raise_signal(signal.SIGINT)
+
+    def new_folder():
+        folders.append(genuine())
+        return folders[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", Interrupted)
+    monkeypatch.setattr(kernel_cache, "new_folder", new_folder)
+    with pytest.raises(KeyboardInterrupt):
+        linking._try(device.choose().device)
+    assert [process.returncode for process in started] == [0]
+    assert [os.path.exists(folder) for folder in folders] == [False]
 
 
 def test_too_few_files_are_refused(tmp_path):
