@@ -87,7 +87,7 @@ class Peer:
 
     def __init__(self, scene, dtype):
         self.p = dtype(scene.n_images)
-        self.images = scene.images().astype(dtype)
+        self.images = np.array(list(scene.images()), dtype)
         self.background = scene.background().astype(dtype)[:, None, None]
         psfs = np.array([scene.psf(j) for j in range(scene.n_images)])
         self.otfs = scipy.fft.rfft2(psfs).astype(np.result_type(dtype, np.complex64))

@@ -148,8 +148,10 @@ def make_result(run: Run, stop_reason: str, choice: Choice) -> Result:
     history["iteration"] = np.arange(run.done + 1)
     history["objective"] = run.objectives()
     flux_errors, position_errors = run.star_errors()
+    ny, nx = run.scene.observation.shape
+    sky = run.sky()
     return Result(
-        extended=run.extended(),
+        extended=sky[:ny, :nx],
         star_fluxes=run.star_fluxes(),
         star_positions=run.star_positions(),
         star_flux_errors=flux_errors,
@@ -161,6 +163,6 @@ def make_result(run: Run, stop_reason: str, choice: Choice) -> Result:
         mu=choice.penalty.mu,
         smoothing=choice.penalty.smoothing,
         held_out=choice.curve,
-        _models=run.models(),
+        _models=run.models(sky),
         _observation=run.scene.observation,
     )

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from astropy.io import fits
-from scenes import make_psfs
+from scenes import Recipe, make_psfs
 
 from lnocl.commands import cli
 
@@ -59,6 +59,20 @@ def command_files(tmp_path_factory):
     table.writeto(folder / "table.fits")
     (folder / "there.fits").write_bytes(b"old")
     return folder
+
+
+@pytest.fixture
+def small_command(tmp_path, monkeypatch):
+    """Work in a folder with images and PSFs; return the words that deconvolve them."""
+    made = Recipe((64, 64), 2, 1, smoothing=1e-3, background="scalar").make()
+    for name in ("images", "psfs"):
+        fits.writeto(tmp_path / f"{name}.fits", getattr(made, name))
+    monkeypatch.chdir(tmp_path)
+    (x, y) = made.stars[0]
+    return [
+        *("deconvolve", "images.fits", "--psf", "psfs.fits", "--background", "8"),
+        *("--star", f"{x},{y}", "--quiet", "--overwrite"),
+    ]
 
 
 def run(*arguments, image="a.fits", psf="k1.fits", engine=NUMPY, output="out.fits"):

@@ -117,9 +117,9 @@ def read_observation(sound, damaged, name):
             align="wcs",
         ),
     )
-    fitsread.wcs_cards(frames.images.header)
-    if sky.has_celestial(frames.images.header):
-        sky.to_sky(np.array([(3.0, 4.0)]), frames.images.header)
+    fitsread.wcs_cards(frames.header)
+    if sky.has_celestial(frames.header):
+        sky.to_sky(np.array([(3.0, 4.0)]), frames.header)
 
 
 def read_stars(sound, damaged, name):

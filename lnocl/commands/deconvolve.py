@@ -21,7 +21,6 @@ from lnocl.solvers import SOLVERS
 if TYPE_CHECKING:
     from astropy.io import fits
 
-    from lnocl.io.fitsread import Stack
     from lnocl.io.fitswrite import StarColumn
     from lnocl.io.frames import Calibration, Frames
 
@@ -219,8 +218,8 @@ def _run(arguments: argparse.Namespace) -> None:
     with messages.shown_log(arguments.quiet), checkpoints.Interrupts() as interrupts:
         calibration = Calibration(**_given(given, Calibration._fields))
         frames = read_frames(arguments.images, arguments.psfs, calibration)
-        given["stars"] = _stars(arguments, frames.images)
-        wcs = fitsread.wcs_cards(frames.images.header)
+        given["stars"] = _stars(arguments, frames.header)
+        wcs = fitsread.wcs_cards(frames.header)
         result = deconvolve(
             frames.observation,
             **_given(given, PARAMETERS),
@@ -240,7 +239,7 @@ def _run(arguments: argparse.Namespace) -> None:
             result.history,
             wcs=wcs,
             cards=[
-                *observed_cards(frames.images.header),
+                *observed_cards(frames.header),
                 *record.make_cards(
                     ALL_OPTIONS,
                     repeated | _used(repeated, frames, result),
@@ -252,7 +251,7 @@ def _run(arguments: argparse.Namespace) -> None:
             overwrite=arguments.overwrite,
             held_out=result.held_out if result.held_out.size else None,
             per_second=bool(arguments.exposure),
-            star_columns=_star_columns(arguments, result, frames.images.header),
+            star_columns=_star_columns(arguments, result, frames.header),
             cubes=_cubes(arguments, result),
             offsets=offsets,
         )
@@ -293,20 +292,18 @@ def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[s
     }
 
 
-def _stars(arguments: argparse.Namespace, images: Stack) -> list[tuple[float, float]]:
+def _stars(arguments: argparse.Namespace, header: fits.Header) -> list[tuple[float, float]]:
     """Return the positions of all stars, in pixels: of --star, --star-sky and --stars."""
     positions = list(arguments.stars)
     if arguments.star_sky or arguments.star_table:
         from lnocl.io import sky
 
         if arguments.star_sky:
-            wcs = sky.celestial_wcs(images.header, arguments.images[0])
+            wcs = sky.celestial_wcs(header, arguments.images[0])
             coordinates = sky.parse_sky(arguments.star_sky)
             positions += sky.to_pixels(coordinates, wcs, arguments.images[0]).tolist()
         if arguments.star_table:
-            positions += sky.read_stars(
-                arguments.star_table, images.header, arguments.images[0]
-            ).tolist()
+            positions += sky.read_stars(arguments.star_table, header, arguments.images[0]).tolist()
     return [(x, y) for x, y in positions]
 
 

@@ -34,7 +34,7 @@ class ReferenceEngine:
         self.scene, self.scaling = scene, scaling
         if scaling is not None:
             self.set_scaling(scaling)
-        self._images = scene.images()
+        self._images = np.array(list(scene.images()))
         background = scene.background()
         self._background = background if background.ndim == 3 else background[:, None, None]
         self._otfs = np.array([otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pyopencl as cl
@@ -26,6 +27,8 @@ ITERATIONS_AHEAD = 4
 # And looks at the objectives once in so many, at those of as many before: a transfer costs the host
 # as much as launching an iteration.
 FETCH_EVERY = 64
+# Bytes that Python takes with NumPy, Astropy and PoCL.
+LIBRARIES = 200 * 2**20
 
 
 @guarded
@@ -90,7 +93,9 @@ class OpenCLEngine:
         self._cross = self._cross_windows()
         sizes = self._sizes(n_iter)
         self.bytes_needed = refuse_if_too_large(
-            chosen, {**sizes, "scratch and roots": Launcher.bytes_needed(self.program)}
+            chosen,
+            {**sizes, "scratch and roots": Launcher.bytes_needed(self.program)},
+            self._host_bytes(),
         )
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
@@ -115,6 +120,17 @@ class OpenCLEngine:
     @property
     def _has_background_map(self) -> bool:
         return self.scene.has_exposure_map or self.scene.observation.background.ndim == 3
+
+    def _host_bytes(self) -> int:
+        """Return about how many bytes a run takes on the host, where stars' images are small.
+
+        Besides the observation: one array, the start or the answer; for the scaling OTFs and
+        model images, and eight arrays.
+        """
+        scene = self.scene
+        arrays = 1 if self.scaling is None else 2 * scene.n_images + 8
+        held = scene.observation.nbytes + (0 if scene.weights is None else scene.weights.nbytes)
+        return LIBRARIES + held + arrays * math.prod(scene.grid) * np.dtype(np.float64).itemsize
 
     def _cross_windows(self) -> _Windows:
         stamps = self.scaling.cross_information if self.scaling is not None else []
@@ -198,12 +214,9 @@ class OpenCLEngine:
 
     def _upload_scene(self) -> None:
         scene, memory = self.scene, self._memory
-        images = scene.images()
+        memory.upload_pixels("images", self._marked_images())
         if scene.weights is not None and scene.has_exposure_map:
             memory.upload_pixels("exposure", scene.weights)
-        elif scene.weights is not None:
-            images[~scene.weights] = -1.0  # how the kernels know an unobserved pixel
-        memory.upload_pixels("images", images)
         background = scene.background()
         if background.ndim == 3:
             memory.upload_pixels("background", background)
@@ -214,6 +227,14 @@ class OpenCLEngine:
         self.move_stars()
         if scene.weights is not None:
             self._invert_weights(scene.weights)
+
+    def _marked_images(self) -> Iterator[Array]:
+        """Yield the images, -1 where a pixel was not observed and there is no map of exposures."""
+        weights = None if self.scene.has_exposure_map else self.scene.weights
+        for j, image in enumerate(self.scene.images()):
+            if weights is not None:
+                image[~weights[j]] = -1.0
+            yield image
 
     def set_scaling(self, scaling: Scaling) -> None:
         """Measure steps with this from now on."""
@@ -276,7 +297,7 @@ class OpenCLEngine:
         self._transform_estimate()
         memory.upload("star_fluxes", star_fluxes)
         squares = np.zeros(memory.count("square_sums"))
-        squares[0] = (extended**2).sum()
+        squares[0] = np.einsum("yx,yx->", extended, extended)
         memory.upload("square_sums", squares)
         if self.scaling is not None:
             memory.upload_pixels("previous", [extended])

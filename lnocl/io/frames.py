@@ -7,12 +7,13 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from astropy.io import fits
 from astropy.units import dimensionless_unscaled
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError, counted
 from lnocl.io import sky
-from lnocl.io.fitsread import Stack, read_extension, read_keyword, read_stack
+from lnocl.io.fitsread import read_extension, read_keyword, read_stack
 from lnocl.io.maps import Maps, Word
 from lnocl.scene import units
 from lnocl.scene.observation import Array, Observation
@@ -64,8 +65,8 @@ class Frames(NamedTuple):
     ----------
     observation : Observation
         In electrons; its sky per second where exposures were given.
-    images : Stack
-        The images as they lie in their files.
+    header : astropy.io.fits.Header
+        Header of the first image.
     background : list of Word
         As given, with the numbers that ``"auto"`` found.
     sha256 : dict of str to list of str
@@ -73,7 +74,7 @@ class Frames(NamedTuple):
     """
 
     observation: Observation
-    images: Stack
+    header: fits.Header
     background: list[Word]
     sha256: dict[str, list[str]]
 
@@ -122,9 +123,10 @@ class _Reader:
             )
         # Electrons in each unit of the images.
         each = factor * (_maps(exposure) if are_rates and exposure is not None else 1.0)
-        counts = self._images.data * each
         inverse = self._inverse_variance()
         mask = self._mask(exposure, inverse)
+        counts = self._images.data
+        counts *= each
         background = self._background(counts, mask)
         observation = Observation(
             counts,
@@ -136,7 +138,7 @@ class _Reader:
             offsets=self._offsets(),
         )
         sha256 = {"images": self._images.sha256, "psfs": self._psfs.sha256, **self._maps.sha256}
-        return Frames(observation, self._images, background, sha256)
+        return Frames(observation, self._images.header, background, sha256)
 
     def _electrons(self) -> tuple[float, bool]:
         """Return the electrons in a unit of the images, and whether they are per second."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,9 +79,16 @@ class Layout:
         rows = 2 * self.pixels_shape[-1]
         return np.arange(first * rows, (first + count) * rows) % self.grid[0]
 
+    def row_slices(self, n_rows: int, n_bytes: int) -> Iterator[slice]:
+        """Yield slices of so many rows, each of whole blocks and of about so many bytes."""
+        step = 2 * self.pixels_shape[-1] * max(1, n_bytes // self.block_bytes)
+        return (slice(first, first + step) for first in range(0, n_rows, step))
+
     def unpack_pixels(self, packed: NDArray) -> NDArray[np.float64]:
-        """Return the pixels (Ny, Nx) of an array in the kernels' order."""
-        return np.swapaxes(packed, -3, -1).reshape(self.grid).astype(np.float64)
+        """Return the rows of pixels (..., Nx) that blocks in the kernels' order hold."""
+        _, nx, _, block = self.pixels_shape
+        pairs = np.swapaxes(packed.reshape(-1, nx, 2, block), -3, -1)
+        return pairs.astype(np.float64).reshape(-1, nx)
 
     def pack_spectra(self, row_spectra: NDArray) -> NDArray:
         """Return row spectra (Ny, Nx // 2 + 1) in the kernels' order and precision.

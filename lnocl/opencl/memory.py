@@ -17,6 +17,9 @@ from lnocl.scene.observation import Array
 
 log = logging.getLogger("lnocl")
 
+# Bytes of pixels that are converted and copied at once, lest a second array of all is needed.
+MAX_COPIED = 16 * 2**20
+
 
 class Transfer:
     """Numbers on their way from the device, which works on meanwhile.
@@ -93,9 +96,10 @@ class Memory:
         """Copy arrays of pixels, or of some blocks' rows, to a buffer, one behind the other."""
         offset = 0
         for array in arrays:
-            packed = self._layout.pack_pixels(self._rounded(name, array))
-            cl.enqueue_copy(self._queue, self.buffers[name], packed, dst_offset=offset)
-            offset += packed.nbytes
+            for rows in self._layout.row_slices(len(array), MAX_COPIED):
+                packed = self._layout.pack_pixels(self._rounded(name, array[rows]))
+                cl.enqueue_copy(self._queue, self.buffers[name], packed, dst_offset=offset)
+                offset += packed.nbytes
 
     def download(self, name: str, count: int) -> Array:
         """Return the first numbers in a buffer, as float64."""
@@ -106,9 +110,13 @@ class Memory:
 
     def download_pixels(self, name: str) -> Array:
         """Return the one array of pixels that a buffer holds, as float64."""
-        packed = np.empty(self._layout.pixels_shape, self._layout.dtype)
-        cl.enqueue_copy(self._queue, packed, self.buffers[name])
-        return self._layout.unpack_pixels(packed)
+        pixels, offset = np.empty(self._layout.grid), 0
+        for rows in self._layout.row_slices(len(pixels), MAX_COPIED):
+            packed = np.empty(pixels[rows].size, self._layout.dtype)
+            cl.enqueue_copy(self._queue, packed, self.buffers[name], src_offset=offset)
+            pixels[rows] = self._layout.unpack_pixels(packed)
+            offset += packed.nbytes
+        return pixels
 
     def download_raw(self, name: str) -> NDArray:
         """Return all of a buffer as it lies on the device."""
@@ -151,8 +159,8 @@ class Memory:
         return rounded
 
 
-def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int]) -> int:
-    """Return the bytes of all buffers together, and log them.
+def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int], host_bytes: int) -> int:
+    """Return the bytes of all buffers together, and log them with those on the host.
 
     Raises
     ------
@@ -168,5 +176,10 @@ def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int]) -> int:
             f"gives {device.max_mem_alloc_size / 2**20:.0f} MiB at once: take fewer or "
             "smaller images, fewer stars, precision single, or another device"
         )
-    log.info("%s: the scene takes %.1f MiB", describe(device), total / 2**20)
+    log.info(
+        "%s: the scene takes %.1f MiB there, and up to %.0f MiB of the host's memory",
+        describe(device),
+        total / 2**20,
+        host_bytes / 2**20,
+    )
     return total

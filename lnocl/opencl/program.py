@@ -302,7 +302,10 @@ class _Built:
         with LOCK:
             self._looked_at |= self.used
             if self._is_pocl:
-                content = kernel_cache.pack(self._folders)
+                try:
+                    content = kernel_cache.pack(self._folders)
+                except OSError:  # files there are gone
+                    return
             else:
                 (content,) = cast(list[bytes], self.program.get_info(cl.program_info.BINARIES))
             if content != self._content and kernel_cache.can_write(self._file.parent):

@@ -332,6 +332,8 @@ class Checkpointer:
             besides = {"rule": rule.state(), "choice": chosen, "curve": rows_of(choice.curve)}
             arrays = {name: np.array(values, np.float64) for name, values in besides.items()}
             self._write(ended, state | arrays)
+            if ended:
+                self._best = {}  # it is not returned to any more
 
     def save_selection(self, selection: HeldOutSelection) -> None:
         """Save the state of held-out counts where there is a file and that is due.

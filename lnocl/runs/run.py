@@ -101,8 +101,7 @@ class Run:
             star_fluxes = self._move_stars(extended, star_fluxes, look_round=True)
         scaling = None
         if setup.solver == "sgp":
-            model = self._model if self._refines else _make_model(self.scene)  # which is let go
-            star_fluxes, scaling = _prepare(self.scene, model, extended, star_fluxes)
+            star_fluxes, scaling = self._prepare(extended, star_fluxes)
         self.engine = _make_engine(setup, self.scene, n_iter, scaling)
         self.engine.start(extended, star_fluxes)
         self.done = 0
@@ -254,6 +253,13 @@ class Run:
         self.finish()
         self.state()  # refuses values that are not finite
 
+    def _prepare(self, extended: Array, star_fluxes: Array) -> tuple[Array, Scaling]:
+        from lnocl.solvers.scaling import prepare
+
+        # Where it is not used again the model must not outlive this, as it is large.
+        model = self._model if self._refines else _make_model(self.scene)
+        return prepare(self.scene, model, extended, star_fluxes)
+
     @cached_property
     def _model(self) -> Model:
         """The model of the scene; it follows the stars."""
@@ -271,7 +277,7 @@ class Run:
         refuse_not_finite(extended.sum())
         star_fluxes = self._move_stars(extended, self.engine.star_fluxes())
         if self.engine.scaling is not None:
-            star_fluxes, scaling = _prepare(self.scene, self._model, extended, star_fluxes)
+            star_fluxes, scaling = self._prepare(extended, star_fluxes)
             self.engine.set_scaling(scaling)
         self.engine.move_stars()
         self.engine.start(extended, star_fluxes)
@@ -306,19 +312,24 @@ class Run:
         root = 1.0 / np.sqrt(self.scene.scale)
         return fluxes * root, positions * root
 
+    def sky(self) -> Array:
+        """Return the extended source on the grid, electrons per pixel, shape (Ny, Nx)."""
+        sky = self.engine.extended()
+        sky *= self.scene.unit
+        return sky
+
     def extended(self) -> Array:
         """Return the extended source, electrons per pixel, shape (ny, nx)."""
         ny, nx = self.scene.observation.shape
-        return self.engine.extended()[:ny, :nx] * self.scene.unit
+        return self.sky()[:ny, :nx]
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes, electrons."""
         return self.engine.star_fluxes() * self.scene.unit
 
-    def models(self) -> Callable[[], Array]:
-        """Return a function that makes the m_j of the current estimate, electrons per pixel."""
-        extended, star_fluxes = self.engine.extended(), self.engine.star_fluxes()
-        return partial(_model_images, self.scene, extended, star_fluxes)
+    def models(self, sky: Array) -> Callable[[], Array]:
+        """Return a function that makes the m_j of this sky and the stars, electrons per pixel."""
+        return partial(_model_images, self.scene, sky, self.engine.star_fluxes())
 
     def objective(self) -> float:
         """Return the last objective."""
@@ -381,18 +392,10 @@ def _make_model(scene: Scene) -> Model:
     return Model(scene)
 
 
-def _prepare(
-    scene: Scene, model: Model, extended: Array, star_fluxes: Array
-) -> tuple[Array, Scaling]:
-    from lnocl.solvers.scaling import prepare
-
-    return prepare(scene, model, extended, star_fluxes)
-
-
-def _model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Array:
+def _model_images(scene: Scene, sky: Array, star_fluxes: Array) -> Array:
     ny, nx = scene.observation.shape
     model = _make_model(scene)
-    images = model.images(extended, star_fluxes)
+    images = model.images(sky / scene.unit, star_fluxes)
     if scene.has_exposure_map:
         images *= model.weights
     return images[:, :ny, :nx] * scene.scale

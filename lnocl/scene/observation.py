@@ -143,6 +143,14 @@ class Observation:
         """Shape (ny, nx) of each image."""
         return self.images.shape[1], self.images.shape[2]
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes that its arrays take."""
+        arrays = dict(vars(self))
+        if self.psfs.strides[0] == 0:  # one for all images
+            arrays["psfs"] = self.psfs[:1]
+        return sum(array.nbytes for array in arrays.values())
+
     def _apply_mask(self, mask: ArrayLike | None) -> None:
         if mask is not None:
             given = unmasked("mask", mask)
@@ -193,7 +201,8 @@ class Observation:
     def _add_read_noise(self) -> None:
         variance = self.read_noise**2
         _refuse_unless("the square of read_noise", variance, "finite", variance >= 0)
-        self.images += np.where(self.mask, 0.0, _each_pixel(variance))
+        if variance.any():
+            np.add(self.images, _each_pixel(variance), out=self.images, where=~self.mask)
         if variance.ndim != self.background.ndim:
             variance, self.background = _each_pixel(variance), _each_pixel(self.background)
         self.background = self.background + variance
@@ -345,7 +354,8 @@ def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
     if not np.isfinite(stack).all():
         raise InputError("psfs hold values that are not finite; repair them first")
     with np.errstate(over="ignore", invalid="ignore"):
-        sums, sizes = (values.sum(axis=(1, 2), keepdims=True) for values in (stack, abs(stack)))
+        sums = stack.sum(axis=(1, 2), keepdims=True)
+        sizes = np.array([abs(psf).sum(keepdims=True) for psf in stack])
         # Rounding leaves a sum where values cancel; what overflows is not above itself.
         unusable = ~(sums > np.finfo(np.float64).eps * sizes)
     if unusable.any():
@@ -357,4 +367,4 @@ def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
     if n_negative := int((stack < 0).sum()):
         warn(_pixels(n_negative, "psf", "negative", "kept"))
     stack /= sums
-    return np.repeat(stack, n_images, axis=0) if len(stack) < n_images else stack
+    return np.broadcast_to(stack, (n_images, *stack.shape[1:]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -112,10 +113,13 @@ class Scene:
         self._warn_of_large_psf()
         self._warn_of_wrapped_offsets()
         # A power of two just above the mean; 1 where that is 0.
-        self.scale = 2.0 ** math.frexp(_mean("images", observation.images[~observation.mask]))[1]
+        n_good = int(np.count_nonzero(~observation.mask))
+        # Bad pixels hold 0.
+        self.scale = 2.0 ** math.frexp(_mean("images", observation.images, n_good))[1]
         exposure = observation.exposure
         has_map = exposure.ndim == 3
-        mean_exposure = _mean("exposures", exposure[~observation.mask] if has_map else exposure)
+        seen = exposure[~observation.mask] if has_map else exposure
+        mean_exposure = _mean("exposures", seen, seen.size)
         self.unit = self._sky_unit(mean_exposure)
         self.mu = self._scaled("mu", penalty.mu, self.unit / mean_exposure)
         self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / mean_exposure)
@@ -185,9 +189,10 @@ class Scene:
         """Number of point sources."""
         return len(self.stars)
 
-    def images(self) -> Array:
-        """Return the images on the grid, scaled, shape (p, Ny, Nx); 0 where not observed."""
-        return self._per_exposure(self._on_grid(self.observation.images / self.scale), 0.0)
+    def images(self) -> Iterator[Array]:
+        """Yield each image on the grid, scaled, shape (Ny, Nx); 0 where not observed."""
+        for j, image in enumerate(self.observation.images):
+            yield self._per_exposure(self._on_grid(image / self.scale), 0.0, j)
 
     def background(self) -> Array:
         """Return the background, scaled, shape (p,) or (p, Ny, Nx); 1 where not observed."""
@@ -196,13 +201,13 @@ class Scene:
             background = np.broadcast_to(background[:, None, None], self.observation.images.shape)
         if background.ndim == 1:
             return background
-        return self._per_exposure(self._on_grid(background, fill=1.0), 1.0)
+        return self._per_exposure(self._on_grid(background, fill=1.0), 1.0, slice(None))
 
-    def _per_exposure(self, images: Array, fill: float) -> Array:
+    def _per_exposure(self, values: Array, fill: float, j: int | slice) -> Array:
         if self.weights is None or not self.has_exposure_map:
-            return images
-        observed = self.weights > 0
-        return np.divide(images, self.weights, out=np.full_like(images, fill), where=observed)
+            return values
+        weights = self.weights[j]
+        return np.divide(values, weights, out=np.full_like(values, fill), where=weights > 0)
 
     def psf(self, j: int) -> Array:
         """Return the PSF of image j on the grid, shape (Ny, Nx), its peak at the offset."""
@@ -227,7 +232,8 @@ class Scene:
 
     def scaled_psfs(self) -> list[Array]:
         """Return the PSFs times the relative exposure of their image, where that is a number."""
-        return list(self._gains[:, None, None] * self.observation.psfs)
+        psfs = zip(self._gains, self.observation.psfs, strict=True)
+        return [psf if gain == 1.0 else gain * psf for gain, psf in psfs]
 
     def star_rows(self, s: int) -> NDArray[np.bool_]:
         """Return the rows of the grid, shape (Ny,), that the images of star s may light."""
@@ -269,26 +275,26 @@ class Scene:
     @cached_property
     def _rough_fit(self) -> tuple[Array, float]:
         """Star fluxes and the level of a flat extended source, by linear least squares."""
-        images, background = self.images(), self.background()
-        if background.ndim == 1:
-            background = background[:, None, None]
-        observed = np.ones(images.shape, bool) if self.weights is None else self.weights > 0
-        excess = np.where(observed, images - background, 0.0)
-        n_observed = observed.sum()
-        mean = excess.sum() / n_observed
+        total, n_observed = 0.0, 0
         normal = np.zeros((self.n_stars, self.n_stars))
         moment = np.zeros(self.n_stars)
-        for j in range(self.n_images if self.n_stars else 0):
-            n_there = observed[j].sum()
-            if not n_there:
+        background = self.background()
+        for j, excess in enumerate(self.images()):
+            excess -= background[j]
+            observed = np.ones(self.grid, bool) if self.weights is None else self.weights[j] > 0
+            excess[~observed] = 0.0
+            light, n_there = float(excess.sum()), int(np.count_nonzero(observed))
+            total, n_observed = total + light, n_observed + n_there
+            if not (self.n_stars and n_there):
                 continue
             lit = self._field.lit(j)
-            stars, weights = self._field.images(j, lit), observed[j][lit].astype(np.float64)
+            stars, weights = self._field.images(j, lit), observed[lit].astype(np.float64)
             sums = stars.products(weights)[0]
             normal += stars.information(weights) - np.outer(sums, sums / n_there)
-            moment += stars.products(weights * (excess[j][lit] - excess[j].sum() / n_there))[0]
+            moment += stars.products(weights * (excess[lit] - light / n_there))[0]
+        mean = total / n_observed
         # A star or a sky that starts at zero stays there, so each keeps a small share.
-        least = max(1e-3 * mean, np.finfo(np.float32).eps)
+        least = max(1e-3 * mean, float(np.finfo(np.float32).eps))
         fluxes = np.maximum(
             np.linalg.lstsq(normal, moment, rcond=None)[0], least * math.prod(self.grid) / 100
         )
@@ -370,9 +376,9 @@ class Scene:
             )
 
 
-def _mean(name: str, values: Array) -> float:
+def _mean(name: str, values: Array, n: int) -> float:
     with np.errstate(over="ignore"):
-        mean = float(values.mean())
+        mean = float(values.sum() / n)
     if not math.isfinite(2.0 * mean):  # the power of two above it
         raise InputError(f"the {name} are too large to be summed: divide them by a constant")
     return mean

@@ -135,17 +135,19 @@ def _make_scaling(
 
     inverse = model.adjoint(w / light for w, light in zip(model.weights, bright(), strict=True))
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
-    ratios, information = [], np.zeros((scene.n_stars, scene.n_stars))
-    for j, light in enumerate(model.starlight(fluxes)):
-        total = np.maximum(light + diffuse[j], MIN_MODEL)
-        ratios.append(movable_weights(model.weights[j], total) / total)
+    np.maximum(shift, 0.0, out=shift)
+    shift *= SHIFT
+    information = np.zeros((scene.n_stars, scene.n_stars))
+    stamps: list[list[Stamp]] = [[] for _ in range(scene.n_stars)]  # w_j P_js / m_j of each star
+    for j, light in enumerate(model.starlight(fluxes) if stamps else ()):
+        light += diffuse[j]
+        total = np.maximum(light, MIN_MODEL, out=light)
+        ratio = movable_weights(model.weights[j], total) / total
         lit = scene.star_field.lit(j)
-        information += scene.star_field.images(j, lit).information(ratios[j][lit])
-    cross_information = [
-        model.adjoint_of_stamps([_times(scene.star_stamp(j, s), x) for j, x in enumerate(ratios)])
-        for s in range(scene.n_stars)
-    ]
-    return Scaling.of_stamps(SHIFT * np.maximum(shift, 0.0), information, cross_information)
+        information += scene.star_field.images(j, lit).information(ratio[lit])
+        for s, of_star in enumerate(stamps):
+            of_star.append(_times(scene.star_stamp(j, s), ratio))
+    return Scaling.of_stamps(shift, information, [model.adjoint_of_stamps(x) for x in stamps])
 
 
 def _times(stamp: Stamp, x: Array) -> Stamp:

@@ -202,6 +202,7 @@ def test_the_store_does_not_grow_without_bound(tmp_path, monkeypatch):
 
 
 @on_pocl
+@pytest.mark.system
 def test_a_library_that_was_cut_short_is_not_stored(warm):
     content = warm[1][kernel_cache.DIGEST_SIZE :]
     with zipfile.ZipFile(io.BytesIO(content)) as archive:

@@ -42,7 +42,7 @@ def test_images_lie_at_the_origin():
     mask[1, 2, 3] = True
     images = np.arange(110.0).reshape(2, 5, 11)
     scene = Scene(lnocl.Observation(images, np.ones((1, 1)), background=images, mask=mask))
-    laid, weights, background = scene.images(), scene.weights, scene.background()
+    laid, weights, background = np.array(list(scene.images())), scene.weights, scene.background()
     np.testing.assert_array_equal(laid[:, :5, :11] * scene.scale, np.where(mask, 0, images))
     np.testing.assert_array_equal(weights[:, :5, :11], ~mask)
     np.testing.assert_array_equal(background[:, :5, :11] * scene.scale, np.where(mask, 0, images))
@@ -59,7 +59,7 @@ def test_scale_is_a_power_of_two_that_gives_unit_mean(level):
     images = np.where(mask, 1e30, level)
     scene = Scene(lnocl.Observation(images, np.ones((1, 1)), mask=mask), penalty=Penalty(0.7))
     assert np.frexp(scene.scale)[0] == 0.5
-    assert 0.5 <= scene.images()[0][~mask].mean() < 1
+    assert 0.5 <= next(scene.images())[~mask].mean() < 1
     assert scene.mu == 0.7 * scene.scale
 
 
@@ -342,7 +342,8 @@ HIDDEN = ["one image of many", "short exposure", "short exposure, map"]
 @pytest.mark.parametrize(
     ("engine", "case", "solver"),
     [
-        *(("numpy", case, solver) for case in HIDDEN for solver in ("sgm", "sgp")),
+        *(("numpy", case, "sgm") for case in HIDDEN),
+        ("numpy", "short exposure, map", "sgp"),
         ("opencl", "one image of many", "sgm"),
         ("opencl", "short exposure", "sgp"),
     ],

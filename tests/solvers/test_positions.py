@@ -115,7 +115,7 @@ def models(scene, extended, stars):
     background = other.background()
     background = background if background.ndim == 3 else background[:, None, None]
     weights = np.ones(model.shape) if other.weights is None else other.weights.astype(float)
-    return other.images(), model + background, weights
+    return np.array(list(other.images())), model + background, weights
 
 
 @pytest.mark.usefixtures("whole_psfs")

@@ -188,6 +188,7 @@ def test_a_wrong_kernel_spoils_deconvolutions(monkeypatch, plant):
     assert (found.what, found.precision, found.right, found.fault) == ("sgm", "single", False, "")
 
 
+@pytest.mark.exhaustive
 def test_kernels_that_do_not_build_are_named(capsys, plant):
     plant("not built", runs=("sgp",))
     status, out, err = outcome(capsys)

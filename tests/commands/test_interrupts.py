@@ -1,0 +1,115 @@
+"""Signals that come while a command runs, sent where it calls something."""
+
+import os
+import pkgutil
+import signal
+from pathlib import Path
+
+import pytest
+from astropy.io import fits
+
+from lnocl.commands import cli
+from lnocl.commands.checkpoints import Interrupts
+
+
+@pytest.fixture
+def interrupted(small_command, monkeypatch):
+    """Return what runs the command in this process, and sends signals where it calls something."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which may be ignored here
+    words = [*small_command, "--engine", "numpy", "--n-iter", "3", "--models", "--residuals"]
+
+    def interrupt(called, numbers, *more):
+        genuine, due = pkgutil.resolve_name(called), list(numbers)
+
+        def stand_in(*given, **options):
+            while due:
+                signal.raise_signal(due.pop(0))
+            return genuine(*given, **options)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(called, stand_in)
+            return cli.main([*words, *more])
+
+    yield interrupt
+    signal.signal(signal.SIGINT, before)
+
+
+def assert_whole(path):
+    with fits.open(path, checksum=True) as hdus:
+        assert [hdu.name for hdu in hdus[1:]] == ["STARS", "HISTORY", "MODELS", "RESIDUALS"]
+        assert (hdus[0].header["STOPPED"], hdus[0].header["NITER"]) == ("n_iter", 3)
+
+
+IN_THE_END = [
+    "lnocl.deconvolution.make_result",
+    "lnocl.result.Result.models",
+    "lnocl.result.Result.residuals",
+    "lnocl.io.fitswrite.write_result",
+    "lnocl.io.atomic.os.fsync",
+]
+
+
+@pytest.mark.parametrize("called", IN_THE_END)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_after_the_last_iteration_costs_nothing(called, number, interrupted, capsys):
+    assert interrupted(called, [number], "-o", "found.fits") == 128 + number
+    assert capsys.readouterr().err == (
+        "lnocl: error: interrupted after the last iteration; the result is in found.fits\n"
+    )
+    assert_whole("found.fits")
+
+
+def test_nor_does_it_where_no_iteration_was_left(interrupted, capsys):
+    checkpoints = ("--checkpoint", "run.fits", "-o", "whole.fits")
+    assert interrupted("lnocl.io.fitswrite.write_result", [], *checkpoints) == 0
+    resume = ("--resume", "run.fits", "-o", "found.fits")
+    assert interrupted("lnocl.io.fitswrite.write_result", [signal.SIGINT], *resume) == 130
+    assert_whole("found.fits")
+
+
+@pytest.mark.parametrize("called", ["lnocl.io.fitswrite.write_result", "lnocl.io.atomic.os.fsync"])
+@pytest.mark.parametrize(
+    ("second", "word"),
+    [
+        (signal.SIGINT, "interrupted"),
+        (signal.SIGTERM, "terminated"),
+        (signal.SIGHUP, "terminated"),
+    ],
+)
+def test_a_second_one_ends_it_with_no_file(called, second, word, interrupted, capsys):
+    before = os.listdir()
+    assert interrupted(called, [signal.SIGINT, second], "-o", "found.fits") == 128 + second
+    assert capsys.readouterr().err == f"lnocl: error: {word}\n"
+    assert os.listdir() == before
+
+
+def test_a_signal_that_was_ignored_stays_so():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Interrupts() as interrupts:
+            interrupts.callback(1, None)
+            assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_signals_do_again_what_they_did_once_the_run_is_over():
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with Interrupts() as interrupts:
+        assert not interrupts.callback(1, None)
+        assert signal.getsignal(signal.SIGINT) != before[0]
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.parametrize("name", ["found.fits", "images.fits"])
+def test_a_checkpoint_in_the_place_of_other_files_is_refused(name, small_command, capsys):
+    assert cli.main([*small_command, "-o", "found.fits", "--checkpoint", name]) == 2
+    assert f"the checkpoint {name} is the output or an input" in capsys.readouterr().err
+
+
+def test_the_output_does_not_replace_the_checkpoint_gone_on_from(small_command, capsys):
+    Path("run.fits").touch()
+    assert cli.main([*small_command, "-o", "run.fits", "--resume", "run.fits"]) == 2
+    assert "is one of the inputs" in capsys.readouterr().err
