@@ -119,7 +119,7 @@ class TestDeconvolve:
         assert run("--n-iter", "1", engine=()) == 0
         name = re.escape(device.describe(device.choose().device))
         assert re.match(
-            rf"lnocl: {name}: the scene takes [\d.]+ MiB there, and up to \d+ MiB of the host's mem",
+            rf"lnocl: {name}: the scene takes [\d.]+ MiB there, and up to \d+ MiB of the host",
             capsys.readouterr().err,
         )
 
