@@ -7,8 +7,8 @@ that both announced figures belong to the one process that is measured.
 """
 
 import argparse
+import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -31,9 +31,13 @@ def measure(size: int, n_images: int, solver: str) -> tuple[float, float, float,
             *("--star", f"{size // 2},{size // 2}", "--background", "1", "--solver", solver),
             *("--n-iter", "3", "-o", f"{folder}/out.fits"),
         ]
-        said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / MIB
-    device, host = map(float, re.findall(r"(\d+) MiB", said))
+        with open(f"{folder}/said", "w+") as said:
+            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
+            _, status, usage = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            said.seek(0)
+            device, host = map(float, re.findall(r"([\d.]+) MiB", said.read()))
+    peak = usage.ru_maxrss * 1024 / MIB
     return peak, device, host, (n_images + 1) * size**2 * 8 / MIB
 
 

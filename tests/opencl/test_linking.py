@@ -102,8 +102,12 @@ def test_an_interrupted_trial_leaves_nothing(monkeypatch):
 
     monkeypatch.setattr(subprocess, "Popen", Interrupted)
     monkeypatch.setattr(kernel_cache, "new_folder", new_folder)
-    with pytest.raises(KeyboardInterrupt):
-        linking._try(device.choose().device)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which may be ignored here
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            linking._try(device.choose().device)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert [process.returncode for process in started] == [0]
     assert [os.path.exists(folder) for folder in folders] == [False]
 

@@ -268,7 +268,7 @@ def little_memory():
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.usefixtures("little_memory")
 def test_many_crafted_checkpoints_take_little_memory(kind, all_saved, monkeypatch):
-    outcomes = try_many(all_saved[kind], 250 if kind == "held-out" else 1000, 2, monkeypatch)
+    outcomes = try_many(all_saved[kind], 100 if kind == "held-out" else 400, 2, monkeypatch)
     assert outcomes["refused"] > outcomes["done"]
 
 
@@ -280,7 +280,7 @@ def test_files_of_changed_bytes_are_refused_or_hold_the_same(all_saved, tmp_path
     path, chance, refused = tmp_path / "crafted.fits", random.Random(3), 0
     checkpoint.write(str(path), saved.described, saved.ended, saved.arrays)
     sound, expected = path.read_bytes(), made.deconvolve(**given, resume=path)
-    for _ in range(1000):
+    for _ in range(400):
         content = bytearray(sound)
         for _ in range(chance.choice([1, 3, 10])):
             content[chance.randrange(len(content))] ^= 1 << chance.randrange(8)
@@ -291,4 +291,4 @@ def test_files_of_changed_bytes_are_refused_or_hold_the_same(all_saved, tmp_path
             refused += 1
         else:
             same(found, expected)
-    assert 400 < refused < 600  # measured 485
+    assert 150 < refused < 250  # measured 195

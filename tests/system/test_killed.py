@@ -48,9 +48,9 @@ def wait_for_change(path, process, before=None):
     ("solver", "kills", "more"),
     [
         ("sgm", 1, []),
-        pytest.param("sgm", 15, [], marks=pytest.mark.exhaustive),
-        pytest.param("sgp", 15, [], marks=pytest.mark.exhaustive),
-        pytest.param("sgp", 8, ["--stop", "held-out"], marks=pytest.mark.exhaustive),
+        pytest.param("sgm", 8, [], marks=pytest.mark.exhaustive),
+        pytest.param("sgp", 8, [], marks=pytest.mark.exhaustive),
+        pytest.param("sgp", 4, ["--stop", "held-out"], marks=pytest.mark.exhaustive),
     ],
     ids=["sgm-once", "sgm", "sgp", "sgp-held-out"],
 )
