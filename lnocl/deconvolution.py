@@ -15,7 +15,8 @@ from lnocl.errors import DivergedError, NotFiniteError, warn
 from lnocl.result import Callback, Estimate, Result, make_result
 from lnocl.runs.checkpoint import Checkpointer, describe
 from lnocl.runs.choice import EMPTY_CURVE, Choice
-from lnocl.runs.held_out import HeldOutSelection, most_bytes
+from lnocl.runs.held_out import HeldOutSelection
+from lnocl.runs.held_out import most_bytes as most_bytes_of_selection
 from lnocl.runs.options import (
     check_choices,
     check_length,
@@ -26,7 +27,7 @@ from lnocl.runs.options import (
     warn_of_rounding,
 )
 from lnocl.runs.progress import Bar
-from lnocl.runs.run import Run, Setup
+from lnocl.runs.run import Run, Setup, most_bytes
 from lnocl.runs.saved import UNBOUNDED
 from lnocl.runs.stopping import Rule, make_rule
 from lnocl.scene.observation import Observation
@@ -229,9 +230,11 @@ def deconvolve(
         initial_extended=initial_extended,
         initial_star_fluxes=initial_star_fluxes,
     )
-    largest = partial(most_bytes, setup, observation, int(n_iter))
-    checkpointer = Checkpointer(checkpoint, checkpoint_every, resume, inputs, largest)
     at_end = stop != "held-out"
+    is_chosen = grid is not None or not at_end
+    measure = most_bytes_of_selection if is_chosen else most_bytes
+    largest = partial(measure, setup, observation, int(n_iter))
+    checkpointer = Checkpointer(checkpoint, checkpoint_every, resume, inputs, largest)
     low = np.array([penalty.mu, penalty.smoothing, n_iter if at_end else 1], np.float64)
     high = np.where([isinstance(mu, str), isinstance(smoothing, str), False], UNBOUNDED, low)
     high[2] = n_iter
@@ -241,7 +244,7 @@ def deconvolve(
     # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
     with bar, np.errstate(over="ignore", invalid="ignore"):
         choice = checkpointer.choice(low, high)
-        if choice is None and grid is None and at_end:
+        if choice is None and not is_chosen:
             choice = Choice(penalty, int(n_iter), EMPTY_CURVE)
         if choice is None:
             half = None if initial_extended is None else initial_extended / 2.0

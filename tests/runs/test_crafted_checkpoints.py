@@ -122,7 +122,7 @@ def test_what_a_run_ended_by_is_checked(all_saved, tmp_path):
 
 
 def large_array(hdus):
-    hdus.append(fits.ImageHDU(np.zeros(2**17), name="MORE"))
+    hdus.append(fits.ImageHDU(np.zeros(2**11), name="MORE"))
 
 
 def large_table(hdus):
