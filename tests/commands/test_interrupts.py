@@ -10,12 +10,15 @@ from astropy.io import fits
 
 from lnocl.commands import cli
 from lnocl.commands.checkpoints import Interrupts
+from lnocl.commands.signals import ENDING
 
 
 @pytest.fixture
 def interrupted(small_command, monkeypatch):
     """Return what runs the command in this process, and sends signals where it calls something."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which may be ignored here
+    # Which may be ignored here.
+    before = {signal.SIGINT: signal.signal(signal.SIGINT, signal.default_int_handler)}
+    before |= {number: signal.signal(number, signal.SIG_DFL) for number in ENDING}
     words = [*small_command, "--engine", "numpy", "--n-iter", "3", "--models", "--residuals"]
 
     def interrupt(called, numbers, *more):
@@ -31,7 +34,8 @@ def interrupted(small_command, monkeypatch):
             return cli.main([*words, *more])
 
     yield interrupt
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 def assert_whole(path):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from lnocl.commands.signals import ENDING
 from lnocl.runs import checkpoint
 
 pytestmark = pytest.mark.system
@@ -21,9 +22,14 @@ def start(command, *more):
         [sys.executable, "-m", "lnocl", *command, *more],
         stderr=subprocess.PIPE,
         text=True,
-        # Which whoever runs the tests in the background may ignore.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=heed_signals,
     )
+
+
+def heed_signals():
+    """Ignore no signal, though whoever runs the tests in the background may."""
+    for number in (signal.SIGINT, *ENDING):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def finish(process):
