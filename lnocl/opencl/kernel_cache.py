@@ -18,6 +18,7 @@ import struct
 import tempfile
 import weakref
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,6 +31,8 @@ DIGEST_SIZE = DIGEST().digest_size
 PREFIX = "lnocl-kernels-"
 # Bytes that kernels may take while they are compiled, and those that the store may hold.
 MIN_FREE, MAX_STORED = 16 * 2**20, 512 * 2**20
+# Faults of archives that zipfile finds, and of the disk.
+UNUSABLE = (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
 class _Folder:
@@ -143,23 +146,22 @@ def _is_whole(data: bytes) -> bool:
 def unpack(content: bytes | None) -> set[str]:
     """Put the files of an archive where PoCL looks for them; return their folders.
 
-    A folder that is there already is left alone, as its files may be loaded. Where the disk is
-    full no part of any folder stays.
+    A folder that is there already is left alone, as its files may be loaded. Where the archive is
+    not sound, or the disk full, no part of any folder stays.
     """
-    if not content or not zipfile.is_zipfile(io.BytesIO(content)):
-        return set()
-    own = _own[0].path
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        names = {str(Path(*Path(name).parts[:2])) for name in archive.namelist()}
-        new = {name for name in names if not (own / name).exists()}
-        try:
+    own, new = _own[0].path, set[str]()
+    try:
+        with zipfile.ZipFile(io.BytesIO(content or b"")) as archive:
+            names = {str(Path(*Path(name).parts[:2])) for name in archive.namelist()}
+            new = {name for name in names if not (own / name).exists()}
             for name in archive.namelist():
                 if str(Path(*Path(name).parts[:2])) in new:
                     archive.extract(name, own)
-        except OSError:
-            for name in new:
-                shutil.rmtree(own / name, ignore_errors=True)
-    return names
+        return names
+    except UNUSABLE:
+        for name in new:
+            shutil.rmtree(own / name, ignore_errors=True)
+        return set()
 
 
 def store() -> Path:

@@ -3,6 +3,7 @@
 import errno
 import io
 import os
+import random
 import shutil
 import zipfile
 from types import SimpleNamespace
@@ -224,3 +225,23 @@ def test_without_a_home_nothing_is_stored(tmp_path, monkeypatch):
     with pytest.warns(lnocl.LnoclWarning, match="cannot be stored in /dev/null/lnocl"):
         assert not kernel_cache.can_write(kernel_cache.store())
     assert not list(tmp_path.iterdir())
+
+
+@on_pocl
+def test_archives_that_are_not_sound_leave_nothing():
+    """Though their checksum is right; the first is sound."""
+    device.find_devices()  # which makes the private folder
+    made, chance = io.BytesIO(), random.Random(1)
+    with zipfile.ZipFile(made, "w") as archive:
+        for name in "abc":
+            archive.writestr(f"ZZ/crafted/{name}.so", bytes(50))
+    own, n_unpacked = kernel_cache._own[0].path, 0
+    for turn in range(300):
+        content = bytearray(made.getvalue())
+        for _ in range(min(turn, 3)):
+            content[chance.randrange(len(content))] ^= 1 << chance.randrange(8)
+        unpacked = kernel_cache.unpack(bytes(content))
+        n_unpacked += bool(unpacked)
+        assert unpacked or not list(own.glob("ZZ/*"))
+        shutil.rmtree(own / "ZZ", ignore_errors=True)
+    assert 1 < n_unpacked < 30
