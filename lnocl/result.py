@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.residuals import Fit, StarResiduals, judge, residuals
 from lnocl.runs.choice import Choice
 from lnocl.runs.run import Run
 from lnocl.scene.observation import Array, Observation
@@ -112,7 +113,7 @@ class Result:
     mu: float
     smoothing: float
     held_out: NDArray[np.void]
-    _models: Callable[[], Array] = field(repr=False, compare=False)
+    _models: Callable[[], Iterator[Array]] = field(repr=False, compare=False)
     _observation: Observation = field(repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -126,19 +127,22 @@ class Result:
         ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j``, in double precision. As in the observation,
         the square of the read noise is included.
         """
-        return self._models()
+        return np.array(list(self._models()))
 
     def residuals(self) -> Array:
         """Return ``(g_j - m_j) / sqrt(m_j)``, shape (p, ny, nx): about 1 where only noise is left.
 
         NaN where a pixel is bad, or the model is 0.
         """
-        observation, models = self._observation, self.models()
-        usable = ~observation.mask & (models > 0)
-        excess = observation.images - models
-        return np.divide(
-            excess, np.sqrt(np.maximum(models, 0.0)), out=np.full_like(excess, np.nan), where=usable
-        )
+        images = zip(self._observation.images, self._observation.mask, self._models(), strict=True)
+        return np.array([residuals(*each) for each in images])
+
+    def fits(self) -> tuple[Fit, list[StarResiduals]]:
+        """Return how well the model fits all good pixels, and at each star.
+
+        It takes a convolution of each image in double precision on the host.
+        """
+        return judge(self._observation, self._models(), self.star_positions)
 
 
 def make_result(run: Run, stop_reason: str, choice: Choice) -> Result:

@@ -11,7 +11,7 @@ import lnocl
 FLOORS = [
     {"errors", "process", "kernels"},
     {"scene"},
-    {"metrics", "psf", "io", "reference", "solvers", "opencl"},
+    {"metrics", "residuals", "psf", "io", "reference", "solvers", "opencl"},
     {"simulation", "plotting"},
     {"engines"},
     {"runs"},

@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 import inspect
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lnocl.commands import checkpoints, messages, options, record
@@ -14,6 +14,7 @@ from lnocl.commands.options import SEVERAL, finite, number_or_word, option, whol
 from lnocl.commands.parser import Command
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import counted
+from lnocl.residuals import Fit, StarResiduals
 from lnocl.result import Result
 from lnocl.runs.options import ENGINES, PRECISIONS
 from lnocl.solvers import SOLVERS
@@ -227,6 +228,7 @@ def _run(arguments: argparse.Namespace) -> None:
             callback=interrupts.callback,
         )
         interrupts.listen()  # a run that was resumed at its end has no iteration to start from
+        fit, at_stars = result.fits()
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
         offsets = frames.observation.offsets
@@ -251,12 +253,12 @@ def _run(arguments: argparse.Namespace) -> None:
             overwrite=arguments.overwrite,
             held_out=result.held_out if result.held_out.size else None,
             per_second=bool(arguments.exposure),
-            star_columns=_star_columns(arguments, result, frames.header),
+            star_columns=_star_columns(arguments, result, frames.header, at_stars),
             cubes=_cubes(arguments, result),
             offsets=offsets,
         )
         if not arguments.quiet:
-            messages.say(_summary(arguments, result))
+            messages.say(_summary(arguments, result, fit, at_stars))
     interrupts.explain(arguments, result)
 
 
@@ -308,7 +310,10 @@ def _stars(arguments: argparse.Namespace, header: fits.Header) -> list[tuple[flo
 
 
 def _star_columns(
-    arguments: argparse.Namespace, result: Result, header: fits.Header
+    arguments: argparse.Namespace,
+    result: Result,
+    header: fits.Header,
+    at_stars: Sequence[StarResiduals],
 ) -> list[StarColumn]:
     """Return the columns of the table of stars after positions and fluxes."""
     from lnocl.io import sky
@@ -333,6 +338,14 @@ def _star_columns(
             StarColumn("ra", ra, "deg", "right ascension, ICRS"),
             StarColumn("dec", dec, "deg", "declination, ICRS"),
         ]
+    for name, fits_there in (
+        ("core", [each.core for each in at_stars]),
+        ("wings", [each.wings for each in at_stars]),
+    ):
+        values = [fit.rms for fit in fits_there]
+        columns.append(
+            StarColumn(f"{name}_rms", values, "", f"rms residual in the {name}, 1 by noise")
+        )
     return columns
 
 
@@ -352,12 +365,17 @@ def _device_spec(arguments: argparse.Namespace) -> str | None:
     return device.spec_of(device.choose(arguments.device).device)
 
 
-def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
+def _summary(
+    arguments: argparse.Namespace, result: Result, fit: Fit, at_stars: Sequence[StarResiduals]
+) -> list[str]:
     objective = result.history["objective"][-1]
     electrons = "electrons per second" if arguments.exposure else "electrons"
     stars = (
-        f"star at ({x:.7g}, {y:.7g}): {flux:.6g} {electrons}"
-        for (x, y), flux in zip(result.star_positions, result.star_fluxes, strict=True)
+        f"star at ({x:.7g}, {y:.7g}): {flux:.6g} {electrons}; residuals {_rms(core)} in its core, "
+        f"{_rms(wings)} in its wings"
+        for (x, y), flux, (core, wings) in zip(
+            result.star_positions, result.star_fluxes, at_stars, strict=True
+        )
     )
     reason = f"stopped by {result.stop_reason}"
     return [
@@ -367,8 +385,30 @@ def _summary(arguments: argparse.Namespace, result: Result) -> list[str]:
         *([f"smoothing chosen: {result.smoothing:.3g}"] if arguments.smoothing == "auto" else []),
         *stars,
         f"extended source: {result.extended.sum():.6g} {electrons}",
+        f"residuals {_rms(fit)} in all, where noise gives 1: {_verdict(result, fit, at_stars)}",
         f"written to {arguments.output}",
     ]
+
+
+def _rms(fit: Fit) -> str:
+    return f"{fit.rms:.2f} +- {fit.error:.2f}" if fit.n_pixels else "unknown (no good pixel)"
+
+
+def _verdict(result: Result, fit: Fit, at_stars: Sequence[StarResiduals]) -> str:
+    """Return whether the model fits, and where not what to do."""
+    unfitted = [
+        f"({x:.7g}, {y:.7g})"
+        for (x, y), (core, wings) in zip(result.star_positions, at_stars, strict=True)
+        if core.is_misfit or wings.is_misfit
+    ]
+    if unfitted:
+        return (
+            f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
+            f"{' '.join(unfitted[:3])}: take more iterations, or a PSF that fits"
+        )
+    if fit.is_misfit:
+        return "the model does not fit: take more iterations, or see to background and noise"
+    return "the model fits"
 
 
 COMMAND = Command(

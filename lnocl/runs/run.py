@@ -327,8 +327,8 @@ class Run:
         """Return the star fluxes, electrons."""
         return self.engine.star_fluxes() * self.scene.unit
 
-    def models(self, sky: Array) -> Callable[[], Array]:
-        """Return a function that makes the m_j of this sky and the stars, electrons per pixel."""
+    def models(self, sky: Array) -> Callable[[], Iterator[Array]]:
+        """Return a function that yields the m_j of this sky and the stars, electrons per pixel."""
         return partial(_model_images, self.scene, sky, self.engine.star_fluxes())
 
     def objective(self) -> float:
@@ -392,13 +392,15 @@ def _make_model(scene: Scene) -> Model:
     return Model(scene)
 
 
-def _model_images(scene: Scene, sky: Array, star_fluxes: Array) -> Array:
+def _model_images(scene: Scene, sky: Array, star_fluxes: Array) -> Iterator[Array]:
+    from lnocl.scene.forward_model import model_images
+
     ny, nx = scene.observation.shape
-    model = _make_model(scene)
-    images = model.images(sky / scene.unit, star_fluxes)
-    if scene.has_exposure_map:
-        images *= model.weights
-    return images[:, :ny, :nx] * scene.scale
+    for j, image in enumerate(model_images(scene, sky / scene.unit, star_fluxes)):
+        if scene.weights is not None and scene.has_exposure_map:
+            image *= scene.weights[j]
+        image *= scene.scale
+        yield image[:ny, :nx]
 
 
 def _warn_of_undetermined(errors: Stars, positions: Array) -> None:

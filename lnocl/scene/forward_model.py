@@ -99,10 +99,27 @@ class Model:
         for image, background, light in zip(
             images, self.background, self.starlight(star_fluxes), strict=True
         ):
-            image += background
-            image += light
-            np.maximum(image, 0.0, out=image)
+            _illuminate(image, background, light)
         return images
+
+
+def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[Array]:
+    """Yield the m_j, as `Model.images` returns them; nothing but one of them is held."""
+    background = scene.background()
+    spectrum = scipy.fft.rfft2(extended, workers=-1)
+    for j in range(scene.n_images):
+        otf = scipy.fft.rfft2(scene.psf(j), workers=-1)
+        otf *= spectrum
+        image = scipy.fft.irfft2(otf, scene.grid, workers=-1, overwrite_x=True)
+        _illuminate(image, background[j], scene.star_field.light(j, star_fluxes))
+        yield image
+
+
+def _illuminate(image: Array, background: Array | float, starlight: Array) -> None:
+    """Add background and starlight to the image of an extended source; leave nothing below 0."""
+    image += background
+    image += starlight
+    np.maximum(image, 0.0, out=image)
 
 
 def _window_of_correlations(
