@@ -96,7 +96,7 @@ def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None
     temporary = _temporary_beside(target)
     try:
         try:
-            _Output(temporary).close()
+            _create(temporary).close()
         finally:
             _remove(temporary)
     except OSError as error:
@@ -147,7 +147,7 @@ def whole_file(path: str, overwrite: bool = False) -> Iterator[IO[bytes]]:
     temporary = _temporary_beside(target)
     try:
         with _explained(path):
-            output = _Output(temporary)
+            output = _Output(_create(temporary))
         with _explained(path, output):
             with io.BufferedWriter(output) as stream:
                 yield stream
@@ -181,16 +181,20 @@ def write_text(path: str, text: str, overwrite: bool = False) -> None:
         stream.write(text.encode("utf-8", "backslashreplace"))
 
 
+def _create(path: str) -> io.FileIO:
+    return open(path, "xb", buffering=0)
+
+
 class _Output(io.RawIOBase):
-    """A new file that remembers the error with which a write failed.
+    """A file that remembers the error with which a write failed.
 
     Its writer may raise another one: astropy raises AttributeError on a full disk.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, file: io.FileIO) -> None:
         super().__init__()
         self.failure: OSError | None = None
-        self._file = open(path, "xb", buffering=0)  # noqa: SIM115
+        self._file = file
 
     def writable(self) -> bool:
         return True

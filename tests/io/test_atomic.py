@@ -394,13 +394,13 @@ class TestCommandLine:
     ids=["check", "write"],
 )
 def test_a_signal_that_comes_as_a_file_is_made_leaves_none(work, tmp_path, monkeypatch):
-    class Interrupted(atomic._Output):
-        def __init__(self, path):
-            super().__init__(path)
-            self.close()
-            raise KeyboardInterrupt
+    genuine = atomic._create
 
-    monkeypatch.setattr(atomic, "_Output", Interrupted)
+    def interrupted(path):
+        genuine(path).close()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(atomic, "_create", interrupted)
     with pytest.raises(KeyboardInterrupt):
         work(str(tmp_path / "out.txt"))
     assert not list(tmp_path.iterdir())
