@@ -146,22 +146,22 @@ class _Reader:
         if gain is not None and not (np.isfinite(gain) and gain > 0):
             raise InputError(f"gain must be more than 0; {gain:g} was given")
         unit = self._unit()
+        if unit.is_equivalent(dimensionless_unscaled) and unit != dimensionless_unscaled:
+            unit = None  # a number or a per cent is no count
         if gain is not None:
             factor, are_rates = units.count_of(unit, (*units.COUNTS, "adu")) or (1.0, False)
             return gain * factor, are_rates
         counts = units.count_of(unit)
         if counts is None:
             raise InputError(
-                f"{self._paths[0]} is in {self._images.header['BUNIT']}, not in counts; give gain, "
+                f"{self._paths[0]} is in {self._bunit(0)}, not in counts; give gain, "
                 "the electrons for each of these units"
             )
         return counts
 
     def _unit(self) -> Any:
         """Return the unit of the images, without dimension where their headers have no unit."""
-        first, *others = (
-            units.parse(str(header.get("BUNIT", ""))) for header in self._images.headers
-        )
+        first, *others = (units.parse(self._bunit(j)) for j in range(len(self._paths)))
         for path, unit in zip(self._paths[1:], others, strict=True):
             if unit != first:
                 raise InputError(
@@ -169,6 +169,9 @@ class _Reader:
                     f"{path} has {unit or 'no unit'}; convert them to one"
                 )
         return dimensionless_unscaled if first is None else first
+
+    def _bunit(self, j: int) -> str:
+        return str(read_keyword(self._paths[j], self._images.headers[j], "BUNIT") or "")
 
     def _exposure(self) -> Array | None:
         words = self._calibration.exposure

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 # Counts that astropy allocates memory for, and the largest that FITS and SIP allow: with an A_ORDER
 # of 3000 it takes half a minute.
+_NUMBERS = re.compile("(CRPIX|CRVAL|CDELT|CROTA)[0-9]+[A-Z]?|(CD|PC)[0-9]+_[0-9]+[A-Z]?")
 _LIMITS = (
     (re.compile("WCSAXES[A-Z]?"), 999),
     (re.compile("[AB]P?_ORDER"), 9),
@@ -79,13 +80,17 @@ def make_wcs(header: fits.Header, key: str = " ") -> WCS:
     Raises
     ------
     InputError
-        A header that claims more axes or coefficients than FITS allows.
+        A header that claims more axes or coefficients than FITS allows, or has texts for numbers.
     Exception
         Any error of astropy on a damaged header.
     """
     from astropy.wcs import WCS  # a fifth of a second, for headers that have one
 
     for keyword in header:
+        if _NUMBERS.fullmatch(keyword) and isinstance(header[keyword], str):
+            raise InputError(
+                f"{keyword} is the text {header[keyword]!r}; write it as a number, without quotes"
+            )
         for pattern, largest in _LIMITS:
             if pattern.fullmatch(keyword) and not 0 <= header[keyword] <= largest:
                 raise InputError(f"{keyword} is {header[keyword]}; at most {largest} is allowed")

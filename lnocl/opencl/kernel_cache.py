@@ -31,6 +31,8 @@ DIGEST_SIZE = DIGEST().digest_size
 PREFIX = "lnocl-kernels-"
 # Bytes that kernels may take while they are compiled, and those that the store may hold.
 MIN_FREE, MAX_STORED = 16 * 2**20, 512 * 2**20
+# Files likewise, and bytes of the name of the folder that they lie in.
+MIN_FILES, MAX_PATH = 1000, 250
 # Faults of archives that zipfile finds, and of the disk.
 UNUSABLE = (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
@@ -44,9 +46,11 @@ class _Folder:
 
     def __init__(self) -> None:
         reasons = []
-        for parent in (Path(tempfile.gettempdir()), store()):
+        for find in (_temporary, store):
+            parent = Path("TMPDIR")
             try:
-                if parent == store():
+                parent = find()
+                if find is store:
                     parent.mkdir(parents=True, exist_ok=True, mode=0o700)
                 if reason := _unfit(parent):
                     raise OSError(0, reason)
@@ -62,14 +66,24 @@ class _Folder:
         weakref.finalize(self, _remove, self.path, os.getpid())
 
 
+def _temporary() -> Path:
+    try:
+        return Path(tempfile.gettempdir())
+    except FileNotFoundError:
+        raise OSError(0, "there is no usable folder") from None
+
+
 def _unfit(folder: Path) -> str:
     """Return why code cannot be stored and run in a folder, or ""."""
+    if len(os.fsencode(folder)) > MAX_PATH:
+        return "its path is too long"
     if not hasattr(os, "statvfs"):
         return ""
     state = os.statvfs(folder)
     if state.f_flag & os.ST_NOEXEC:
         return "no programs may be run from there"
-    if state.f_bavail * state.f_frsize < MIN_FREE:
+    is_short_of_files = state.f_files and state.f_favail < MIN_FILES
+    if is_short_of_files or state.f_bavail * state.f_frsize < MIN_FREE:
         return "it is nearly full"
     return ""
 
@@ -177,7 +191,7 @@ def store() -> Path:
 
 def file_of(name: str) -> Path:
     """Return the file of the program with this name, all that its kernels depend on."""
-    return store() / f"{DIGEST(name.encode()).hexdigest()}.kernels"
+    return store() / f"{DIGEST(os.fsencode(name)).hexdigest()}.kernels"
 
 
 def read(file: Path) -> bytes | None:
@@ -198,7 +212,7 @@ def read(file: Path) -> bytes | None:
             if hasattr(os, "getuid") and (state.st_uid != os.getuid() or state.st_mode & 0o022):
                 warn(f"the compiled kernels in {file} can be written by others, and are not used")
                 return None
-            content = stream.read()
+            content = stream.read() if state.st_size <= MAX_STORED else b""
     except OSError:
         return None
     digest, content = content[:DIGEST_SIZE], content[DIGEST_SIZE:]

@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from glob import glob
 
 import pyopencl as cl
 
@@ -24,7 +25,9 @@ from lnocl.opencl import kernel_cache
 POCL = "Portable Computing Language"
 
 # What the outcome may hang on, besides the device.
-VARIABLES = ("PATH", "COMPILER_PATH", "LIBRARY_PATH", "TMPDIR")
+VARIABLES = ("PATH", "COMPILER_PATH", "LIBRARY_PATH", "TMPDIR", "TEMP", "TMP")
+LIMITS = ("RLIMIT_NOFILE", "RLIMIT_NPROC", "RLIMIT_AS", "RLIMIT_FSIZE")
+LIBRARIES = ("/usr/lib*/gcc/*/*", "/usr/lib*/crti.o", "/usr/lib*/*/crti.o")
 TRIAL = """
 import sys
 import numpy
@@ -48,7 +51,7 @@ while [ $# -gt 0 ]; do
     esac
     shift
 done
-exec {python} -m ziglang ld.lld -shared -o "$output" $objects
+exec {python} -P -m ziglang ld.lld -shared -o "$output" $objects
 """
 CURE = "run apt-get install gcc libc6-dev, or pip install ziglang, or take engine numpy"
 # Files that PoCL and the linker may have open.
@@ -60,6 +63,7 @@ CAUSES = {
     "doesn't exist": f"there is no linker on PATH: {CURE}",
     "cannot find": f"the linker lacks files of libgcc or libc: {CURE}",
     "Resource temporarily unavailable": "too few processes may run: raise the limit (ulimit -u)",
+    "File too large": "files must be small here: raise the limit (ulimit -f)",
     "No space left": "the folder for temporary files is full: set TMPDIR to another",
 }
 
@@ -83,7 +87,7 @@ def check(device: cl.Device) -> None:
     linker = kernel_cache.read(note)
     if linker is None:
         linker = _find(device)
-        if kernel_cache.can_write(note.parent):
+        if linker and kernel_cache.can_write(note.parent):
             kernel_cache.write(note, linker)
     elif linker == b"ziglang":
         _take_ziglang()
@@ -105,11 +109,11 @@ def _need_files() -> None:
 def _environment(device: cl.Device) -> str:
     words = [sys.executable, cl.VERSION_TEXT, device.name, device.driver_version]
     words += [_foreign(os.environ.get(name, "")) for name in VARIABLES]
+    words += [str(shutil.which("ld")), *(file for each in LIBRARIES for file in sorted(glob(each)))]
     with contextlib.suppress(ImportError):  # there is none on Windows
         import resource
 
-        limits = resource.RLIMIT_NOFILE, resource.RLIMIT_NPROC, resource.RLIMIT_AS
-        words += [str(resource.getrlimit(limit)) for limit in limits]
+        words += [str(resource.getrlimit(getattr(resource, limit))) for limit in LIMITS]
     return "\n".join(words)
 
 
@@ -120,20 +124,23 @@ def _foreign(folders: str) -> str:
 
 
 def _find(device: cl.Device) -> bytes:
-    """Return the linker that works: b"system" or b"ziglang"."""
+    """Return the linker that works: b"system" or b"ziglang"; b"" where that cannot be tried."""
     failure = _try(device)
     if not failure:
-        return b"system"
+        return b"" if failure is None else b"system"
     if importlib.util.find_spec("ziglang"):
         _take_ziglang()
-        if not _try(device):
+        if _try(device) == "":
             return b"ziglang"
     cause = next((CAUSES[words] for words in CAUSES if words in failure), failure)
     raise DeviceError(f"PoCL cannot link kernels: {cause}")
 
 
-def _try(device: cl.Device) -> str:
-    """Link a kernel in another process; return its last words where it was aborted, else ""."""
+def _try(device: cl.Device) -> str | None:
+    """Link a kernel in another process; return its last words where it was aborted, else "".
+
+    None where it ended by another error, which says nothing of the linker.
+    """
     platform = cl.get_platforms().index(device.platform)
     place = [str(platform), str(device.platform.get_devices().index(device))]
     folder = kernel_cache.new_folder()
@@ -142,7 +149,7 @@ def _try(device: cl.Device) -> str:
         with ThreadPoolExecutor(1) as thread:
             done = thread.submit(
                 subprocess.run,
-                [sys.executable, "-c", TRIAL, *place],
+                [sys.executable, "-P", "-c", TRIAL, *place],  # not from the current folder
                 env={**os.environ, kernel_cache.VARIABLE: folder, "XDG_CACHE_HOME": folder},
                 capture_output=True,
                 text=True,
@@ -152,8 +159,8 @@ def _try(device: cl.Device) -> str:
         return str(error.strerror)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    if done.returncode >= 0:  # whatever it was, it was not an abort
-        return ""
+    if done.returncode >= 0:
+        return None if done.returncode else ""
     return " ".join(done.stderr.split())[-400:] or f"signal {-done.returncode}"
 
 

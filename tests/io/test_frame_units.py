@@ -18,7 +18,8 @@ RATES = ["ELECTRONS/S", "electron/s/pix", "electron/s", "counts/s", "Counts/sec"
          "e-/s", "e- s-1", "e/s", "electron s^-1", "electrons per second", "cps"]  # fmt: skip
 DIGITAL = ["DN", "adu", "ADU", "dn", "DN/pixel"]
 DIGITAL_RATES = ["ADU/s", "adu s-1", "DN/s", "DN/sec", "DN/s/pix"]
-OTHERS = ["MJy/sr", "mJy", "10**-20 erg/s/cm2", "mag", "UNKNOWN", "total nonsense", "(", "[e-]"]
+OTHERS = ["MJy/sr", "mJy", "10**-20 erg/s/cm2", "mag", "UNKNOWN", "total nonsense", "(", "[e-]",
+          "5", "1000", "%"]  # fmt: skip
 
 
 class TestUnits:

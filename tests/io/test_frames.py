@@ -62,6 +62,12 @@ class TestExposure:
             fits.HDUList([primary, fits.ImageHDU(image)]).writeto(path)
         np.testing.assert_array_equal(observe(exposure=["EXPTIME"]).exposure, [30.0, 40.0])
 
+    def test_a_unit_of_the_primary_header_where_the_image_is_an_extension(self):
+        for path, image in zip(("1.fits", "2.fits"), IMAGES, strict=True):
+            primary = fits.PrimaryHDU(header=fits.Header({"BUNIT": "ELECTRONS/S"}))
+            fits.HDUList([primary, fits.ImageHDU(image)]).writeto(path)
+        np.testing.assert_array_equal(observe(exposure=[20.0]).images, 20.0 * IMAGES)
+
     def test_a_keyword_of_a_cube_holds_for_all_its_images(self):
         save("cube.fits", IMAGES, EXPTIME=3.0)
         exposure = observe("cube.fits", exposure=["EXPTIME"]).exposure

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from lnocl.errors import FileError, InputError
 from lnocl.io import sky
+from lnocl.io.headers import make_wcs
 
 SHAPE = (16, 12)
 SCALE = 1e-5
@@ -321,3 +322,13 @@ class TestTables:
             with pytest.raises(FileError) as caught:
                 stars(path)
             assert str(caught.value).startswith(f"{path} cannot be read as a table: {reason}")
+
+
+@pytest.mark.parametrize("keyword", ["CRPIX1", "CRVAL2", "CDELT1", "CD1_2", "PC2_2"])
+def test_texts_for_numbers_are_refused(keyword):
+    """Astropy reads the rest, and puts stars elsewhere."""
+    damaged = header(**{keyword: "3.0"})
+    with pytest.raises(InputError, match=rf"{keyword} is the text '3\.0'; write it as a number"):
+        make_wcs(damaged)
+    with pytest.raises(InputError, match=r"a\.fits has no sky coordinates"):
+        sky.celestial_wcs(damaged, "a.fits")

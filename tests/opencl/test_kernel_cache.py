@@ -202,6 +202,15 @@ def test_the_store_does_not_grow_without_bound(tmp_path, monkeypatch):
     assert {file.stem for file in tmp_path.iterdir()} == {"a", "d", "e"}
 
 
+def test_a_file_that_is_too_large_is_not_read(tmp_path):
+    file = tmp_path / "a.kernels"
+    file.touch(0o600)
+    os.truncate(file, kernel_cache.MAX_STORED + 1)  # a file with a hole takes no room
+    with pytest.warns(lnocl.LnoclWarning, match="are damaged, and are compiled anew"):
+        assert kernel_cache.read(file) is None
+    assert not file.exists()
+
+
 @on_pocl
 @pytest.mark.system
 def test_a_library_that_was_cut_short_is_not_stored(warm):

@@ -112,6 +112,30 @@ def test_an_interrupted_trial_leaves_nothing(monkeypatch):
     assert [os.path.exists(folder) for folder in folders] == [False]
 
 
+def test_it_is_tried_again_where_the_linker_went(tmp_path, monkeypatch):
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+    chosen = device.choose().device
+    linking.check.__wrapped__(chosen)
+    monkeypatch.setattr(linking, "_try", lambda _: pytest.fail("tried again"))
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    with pytest.raises(pytest.fail.Exception, match="tried again"):
+        linking.check.__wrapped__(chosen)
+
+
+def test_the_trial_runs_no_code_of_the_current_folder(tmp_path, monkeypatch):
+    (tmp_path / "numpy.py").write_text("open('planted', 'w'); raise SystemExit(3)")
+    monkeypatch.chdir(tmp_path)
+    assert linking._try(device.choose().device) == ""
+    assert not (tmp_path / "planted").exists()
+
+
+def test_a_trial_that_ends_otherwise_says_nothing_of_the_linker(tmp_path, monkeypatch):
+    monkeypatch.setattr(linking, "TRIAL", "import no_such_module")
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+    linking.check.__wrapped__(device.choose().device)
+    assert not list(tmp_path.iterdir())
+
+
 def test_too_few_files_are_refused(tmp_path):
     done = run_python(
         "import resource\nresource.setrlimit(resource.RLIMIT_NOFILE, (20, 20))\n" + TOLD,
@@ -126,7 +150,7 @@ def test_other_runtimes_are_left_alone(monkeypatch):
     linking.check.__wrapped__(SimpleNamespace(platform=SimpleNamespace(name="Another")))
 
 
-@pytest.mark.parametrize("lack", ["noexec", "space"])
+@pytest.mark.parametrize("lack", ["noexec", "space", "files"])
 def test_kernels_go_where_they_can_be_run(lack, tmp_path, monkeypatch):
     """Else beside the store; else one line says what to set."""
     genuine, bad = os.statvfs, {tmp_path / "temporary"}
@@ -136,7 +160,14 @@ def test_kernels_go_where_they_can_be_run(lack, tmp_path, monkeypatch):
         found = genuine(folder)
         exec_flag = os.ST_NOEXEC if Path(folder) in bad and lack == "noexec" else 0
         free = 100 if Path(folder) in bad and lack == "space" else found.f_bavail
-        return SimpleNamespace(f_flag=exec_flag, f_bavail=free, f_frsize=found.f_frsize)
+        files = 100 if Path(folder) in bad and lack == "files" else 10**6
+        return SimpleNamespace(
+            f_flag=exec_flag,
+            f_bavail=free,
+            f_frsize=found.f_frsize,
+            f_files=10**7,
+            f_favail=files,
+        )
 
     monkeypatch.setattr(os, "statvfs", statvfs)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
@@ -147,3 +178,21 @@ def test_kernels_go_where_they_can_be_run(lack, tmp_path, monkeypatch):
         kernel_cache._Folder()
     bad.clear()
     assert kernel_cache._Folder().path.parent == tmp_path / "temporary"
+
+
+def test_no_usable_folder_for_temporary_files_is_said(tmp_path, monkeypatch):
+    """A path that is too long for SQLite, and no folder at all; the store is taken instead."""
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / ("x" * 200)))
+    assert kernel_cache._Folder().path.parent == tmp_path
+
+    def nowhere():
+        raise FileNotFoundError(2, "No usable temporary directory found")
+
+    monkeypatch.setattr("tempfile.gettempdir", nowhere)
+    assert kernel_cache._Folder().path.parent == tmp_path
+
+
+def test_names_in_other_encodings_are_taken(monkeypatch):
+    monkeypatch.setenv("PATH", "/caf\udce9")
+    assert kernel_cache.file_of(linking._environment(device.choose().device)).name
