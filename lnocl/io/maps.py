@@ -9,9 +9,13 @@ import numpy as np
 
 from lnocl.errors import InputError, counted
 from lnocl.io.fitsread import read_stack
+from lnocl.scene import units
 from lnocl.scene.observation import Array
 
 Word = str | float
+
+# Units that maps are taken in.
+UNITS = {"background": units.COUNTS, "read_noise": units.COUNTS, "exposure": ("second",)}
 
 # The words that a quantity may be, besides a number and a file.
 OTHER_WORDS = {"background": "auto, ", "exposure": "a keyword of the images' headers, "}
@@ -121,7 +125,21 @@ class Maps:
                 f"{self._shape}; give one map that fits all images, or one for each"
             )
         self.sha256.setdefault(name, []).extend(stack.sha256)
+        for path, header in zip(paths, stack.headers, strict=True):
+            _refuse_other_unit(name, path, str(header.get("BUNIT", "")))
         return stack.data
+
+
+def _refuse_other_unit(name: str, path: str, bunit: str) -> None:
+    """Refuse a map whose header has another unit than the one in which it is taken."""
+    unit = units.parse(bunit)
+    if unit is None or name not in UNITS:
+        return
+    if units.count_of(unit, UNITS[name]) != (1.0, False):
+        raise InputError(
+            f"{name} {path} is in {bunit}, and taken in {UNITS[name][0]}s: convert it, or leave "
+            "BUNIT out of its header"
+        )
 
 
 def _number(j: int, word: Word, number_of: Callable[[int, str], float | None]) -> Word:

@@ -62,6 +62,25 @@ class TestExposure:
             fits.HDUList([primary, fits.ImageHDU(image)]).writeto(path)
         np.testing.assert_array_equal(observe(exposure=["EXPTIME"]).exposure, [30.0, 40.0])
 
+    @pytest.mark.parametrize(
+        ("name", "right", "wrong"),
+        [
+            ("exposure", ["s", "sec", ""], ["min", "electron", "ks"]),
+            ("background", ["electron", "counts", ""], ["electron/s", "adu", "MJy/sr"]),
+            ("read_noise", ["electron", "photons", ""], ["adu", "s"]),
+        ],
+    )
+    def test_maps_in_other_units_are_refused(self, name, right, wrong):
+        for path, image in zip(("1.fits", "2.fits"), IMAGES, strict=True):
+            save(path, image)
+        for unit in right:
+            save("map.fits", MAP, BUNIT=unit)
+            observe(**{name: ["map.fits"]})
+        for unit in wrong:
+            save("map.fits", MAP, BUNIT=unit)
+            with pytest.raises(InputError, match=rf"{name} map\.fits is in {unit}, and taken in "):
+                observe(**{name: ["map.fits"]})
+
     def test_a_unit_of_the_primary_header_where_the_image_is_an_extension(self):
         for path, image in zip(("1.fits", "2.fits"), IMAGES, strict=True):
             primary = fits.PrimaryHDU(header=fits.Header({"BUNIT": "ELECTRONS/S"}))
