@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from lnocl.io.fitswrite import StarColumn
     from lnocl.io.frames import Calibration, Frames
 
+Fits = tuple[Fit, list[StarResiduals]]
+
 PARAMETERS = {
     name: parameter.default for name, parameter in inspect.signature(deconvolve).parameters.items()
 }
@@ -57,7 +59,7 @@ OPTIONS = {
             "--residuals",
             action="store_true",
             help="add a cube with the residuals of each image, (image - model) / sqrt(model), with "
-            "the same header",
+            "the same header; say how well the model fits, in all and at each star",
         ),
         options.QUIET,
     ],
@@ -228,7 +230,7 @@ def _run(arguments: argparse.Namespace) -> None:
             callback=interrupts.callback,
         )
         interrupts.listen()  # a run that was resumed at its end has no iteration to start from
-        fit, at_stars = result.fits()
+        fits_found = result.fits() if arguments.residuals else None
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
         offsets = frames.observation.offsets
@@ -253,12 +255,12 @@ def _run(arguments: argparse.Namespace) -> None:
             overwrite=arguments.overwrite,
             held_out=result.held_out if result.held_out.size else None,
             per_second=bool(arguments.exposure),
-            star_columns=_star_columns(arguments, result, frames.header, at_stars),
+            star_columns=_star_columns(arguments, result, frames.header, fits_found),
             cubes=_cubes(arguments, result),
             offsets=offsets,
         )
         if not arguments.quiet:
-            messages.say(_summary(arguments, result, fit, at_stars))
+            messages.say(_summary(arguments, result, fits_found))
     interrupts.explain(arguments, result)
 
 
@@ -313,7 +315,7 @@ def _star_columns(
     arguments: argparse.Namespace,
     result: Result,
     header: fits.Header,
-    at_stars: Sequence[StarResiduals],
+    found: Fits | None,
 ) -> list[StarColumn]:
     """Return the columns of the table of stars after positions and fluxes."""
     from lnocl.io import sky
@@ -338,14 +340,15 @@ def _star_columns(
             StarColumn("ra", ra, "deg", "right ascension, ICRS"),
             StarColumn("dec", dec, "deg", "declination, ICRS"),
         ]
-    for name, fits_there in (
-        ("core", [each.core for each in at_stars]),
-        ("wings", [each.wings for each in at_stars]),
-    ):
-        values = [fit.rms for fit in fits_there]
-        columns.append(
-            StarColumn(f"{name}_rms", values, "", f"rms residual in the {name}, 1 by noise")
-        )
+    if found:
+        for name, fits_there in (
+            ("core", [each.core for each in found[1]]),
+            ("wings", [each.wings for each in found[1]]),
+        ):
+            values = [fit.rms for fit in fits_there]
+            columns.append(
+                StarColumn(f"{name}_rms", values, "", f"rms residual in the {name}, 1 by noise")
+            )
     return columns
 
 
@@ -365,18 +368,22 @@ def _device_spec(arguments: argparse.Namespace) -> str | None:
     return device.spec_of(device.choose(arguments.device).device)
 
 
-def _summary(
-    arguments: argparse.Namespace, result: Result, fit: Fit, at_stars: Sequence[StarResiduals]
-) -> list[str]:
+def _summary(arguments: argparse.Namespace, result: Result, found: Fits | None) -> list[str]:
     objective = result.history["objective"][-1]
     electrons = "electrons per second" if arguments.exposure else "electrons"
-    stars = (
-        f"star at ({x:.7g}, {y:.7g}): {flux:.6g} {electrons}; residuals {_rms(core)} in its core, "
-        f"{_rms(wings)} in its wings"
-        for (x, y), flux, (core, wings) in zip(
-            result.star_positions, result.star_fluxes, at_stars, strict=True
-        )
-    )
+    stars = [
+        f"star at ({x:.7g}, {y:.7g}): {flux:.6g} {electrons}"
+        for (x, y), flux in zip(result.star_positions, result.star_fluxes, strict=True)
+    ]
+    verdict = []
+    if found:
+        fit, at_stars = found
+        stars = [
+            f"{star}; residuals {_rms(core)} in its core, {_rms(wings)} in its wings"
+            for star, (core, wings) in zip(stars, at_stars, strict=True)
+        ]
+        words = _verdict(result, fit, at_stars)
+        verdict = [f"residuals {_rms(fit)} in all, where noise gives 1: {words}"]
     reason = f"stopped by {result.stop_reason}"
     return [
         f"{counted(result.n_iter, 'iteration')} on {result.device}, objective {objective:.6g}",
@@ -385,7 +392,7 @@ def _summary(
         *([f"smoothing chosen: {result.smoothing:.3g}"] if arguments.smoothing == "auto" else []),
         *stars,
         f"extended source: {result.extended.sum():.6g} {electrons}",
-        f"residuals {_rms(fit)} in all, where noise gives 1: {_verdict(result, fit, at_stars)}",
+        *verdict,
         f"written to {arguments.output}",
     ]
 

@@ -147,6 +147,7 @@ def _try(device: cl.Device) -> str | None:
     try:
         # In a thread, where no signal interrupts it: the process is never left to itself.
         with ThreadPoolExecutor(1) as thread:
+            thread.submit(int).result()  # a thread that is there is waited for in any case
             done = thread.submit(
                 subprocess.run,
                 [sys.executable, "-P", "-c", TRIAL, *place],  # not from the current folder
