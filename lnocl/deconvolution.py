@@ -145,8 +145,8 @@ def deconvolve(
     InputError
         `observation` is not an Observation; a parameter is out of its range, masked or too large
         for the precision; mu and smoothing are both "auto"; a star lies outside the images; two
-        are at one position; stars are not in pixels, or the start not in counts; the start is 0
-        where iterations cannot leave it; there is no such device, or one was given for
+        stars are at one position; stars are not in pixels; the start is not in counts, or is 0
+        and stays so; the device does not exist, or was given for
         the reference; images or exposures are too large to be summed, or the sky for a number;
         held-out counts were asked of images that hold no counts.
     FileError

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +15,6 @@ from lnocl.scene.observation import Array, Observation
 CORE, WINGS = 0.5, 1e-3
 # A misfit is this many times the noise, and as many standard errors above it.
 MISFIT, SIGNIFICANCE = 1.5, 5.0
-
-Window = tuple[slice, ...]
 
 
 class Fit(NamedTuple):
@@ -109,23 +107,14 @@ def judge(
 
 def _fit_at(psf: Array, position: Array, values: Array, model: Array) -> tuple[Fit, Fit]:
     """Return the fit in the core and in the wings of a star in one image."""
-    x, y = np.round(position).astype(int).tolist()
-    there, of_psf = _overlap(model.shape, psf.shape, (y, x))
+    from astropy.nddata import NoOverlapError, overlap_slices
+
+    middle = tuple(np.round(position[::-1]).astype(int))
+    try:
+        there, of_psf = overlap_slices(model.shape, psf.shape, middle)
+    except NoOverlapError:  # the star is in other images alone
+        return Fit(), Fit()
     share = psf[of_psf] / psf.max()
     is_core, is_wing = share > CORE, (share > WINGS) & (share <= CORE)
     values, model = values[there], model[there]
     return Fit.of(values[is_core], model[is_core]), Fit.of(values[is_wing], model[is_wing])
-
-
-def _overlap(
-    shape: Sequence[int], psf_shape: Sequence[int], centre: Sequence[int]
-) -> tuple[Window, Window]:
-    """Return what a PSF with its middle at a pixel covers of an image, and what of it that is."""
-    there, of_psf = [], []
-    for n, k, middle in zip(shape, psf_shape, centre, strict=True):
-        first = middle - k // 2
-        begin = min(max(first, 0), n)
-        end = max(min(first + k, n), begin)
-        there.append(slice(begin, end))
-        of_psf.append(slice(begin - first, end - first))
-    return tuple(there), tuple(of_psf)

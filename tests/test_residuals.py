@@ -90,6 +90,15 @@ def test_a_star_without_good_pixels_has_no_rms():
         assert not fit.is_misfit
 
 
+def test_a_star_may_be_beyond_one_of_the_images():
+    images, psf = np.ones((2, 16, 16)), make_smooth_psfs(1, (5, 5))
+    observation = lnocl.Observation(images, psf, offsets=[(0, 0), (15, 15)])
+    _, (both,) = judge(observation, images, np.array([(8, 8)]))
+    _, (first,) = judge(observation, images[:1], np.array([(8, 8)]))
+    assert both == first
+    assert first.core.n_pixels > 0
+
+
 def test_a_result_has_them():
     made = Recipe((8, 16), 2, 1).make()
     result = made.deconvolve(n_iter=3, engine="numpy")

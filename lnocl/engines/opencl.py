@@ -229,7 +229,7 @@ class OpenCLEngine:
             self._invert_weights(scene.weights)
 
     def _marked_images(self) -> Iterator[Array]:
-        """Yield the images, -1 where a pixel was not observed and there is no map of exposures."""
+        """Yield the images; unobserved pixels are -1, unless a map of exposures marks them."""
         weights = None if self.scene.has_exposure_map else self.scene.weights
         for j, image in enumerate(self.scene.images()):
             if weights is not None:

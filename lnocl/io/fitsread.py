@@ -135,8 +135,8 @@ def read_keyword(path: str, header: fits.Header, keyword: str) -> str | float | 
     FileError
         As `read_stack`.
     """
-    if keyword in header:
-        return header[keyword]
+    if keyword in header or "XTENSION" not in header:  # it is the primary header itself
+        return header.get(keyword)
     with ignored_warnings(), open_fits(path) as file:  # shown when the image was read
         primary = readable(next(file.hdus()).header)
     return primary.get(keyword)

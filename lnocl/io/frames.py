@@ -147,7 +147,7 @@ class _Reader:
             raise InputError(f"gain must be more than 0; {gain:g} was given")
         unit = self._unit()
         if unit.is_equivalent(dimensionless_unscaled) and unit != dimensionless_unscaled:
-            unit = None  # a number or a per cent is no count
+            unit = None  # numbers and per cents do not count anything
         if gain is not None:
             factor, are_rates = units.count_of(unit, (*units.COUNTS, "adu")) or (1.0, False)
             return gain * factor, are_rates

@@ -31,8 +31,9 @@ DIGEST_SIZE = DIGEST().digest_size
 PREFIX = "lnocl-kernels-"
 # Bytes that kernels may take while they are compiled, and those that the store may hold.
 MIN_FREE, MAX_STORED = 16 * 2**20, 512 * 2**20
-# Files likewise, and bytes of the name of the folder that they lie in.
-MIN_FILES, MAX_PATH = 1000, 250
+# Files likewise, and bytes of the path of their folder: SQLite, for PyOpenCL's cache, opens no
+# longer path than 512, its own names included.
+MIN_FILES, MAX_PATH = 1000, 350
 # Faults of archives that zipfile finds, and of the disk.
 UNUSABLE = (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
@@ -70,7 +71,7 @@ def _temporary() -> Path:
     try:
         return Path(tempfile.gettempdir())
     except FileNotFoundError:
-        raise OSError(0, "there is no usable folder") from None
+        raise OSError(0, "no folder can be written to") from None
 
 
 def _unfit(folder: Path) -> str:

@@ -60,10 +60,10 @@ N_FILES = 24
 TOO_FEW_FILES = "too few files may be open: raise the limit (ulimit -n)"
 CAUSES = {
     "Too many open files": TOO_FEW_FILES,
-    "doesn't exist": f"there is no linker on PATH: {CURE}",
+    "doesn't exist": f"no linker was found on PATH: {CURE}",
     "cannot find": f"the linker lacks files of libgcc or libc: {CURE}",
     "Resource temporarily unavailable": "too few processes may run: raise the limit (ulimit -u)",
-    "File too large": "files must be small here: raise the limit (ulimit -f)",
+    "File too large": "files may not be as large as kernels: raise the limit (ulimit -f)",
     "No space left": "the folder for temporary files is full: set TMPDIR to another",
 }
 

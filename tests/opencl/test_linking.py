@@ -183,7 +183,7 @@ def test_kernels_go_where_they_can_be_run(lack, tmp_path, monkeypatch):
 def test_no_usable_folder_for_temporary_files_is_said(tmp_path, monkeypatch):
     """A path that is too long for SQLite, and no folder at all; the store is taken instead."""
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / ("x" * 200)))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / ("x" * 400)))
     assert kernel_cache._Folder().path.parent == tmp_path
 
     def nowhere():
