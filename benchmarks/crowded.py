@@ -14,6 +14,7 @@ import resource
 import time
 
 import numpy as np
+from parts import paper
 
 import lnocl
 
@@ -56,7 +57,7 @@ def main():
     given = parser.parse_args()
     observation, stars = field(given.stars, given.size, given.images, given.psf)
     before, begin, first = peak(), time.perf_counter(), []
-    result = lnocl.deconvolve(
+    result = paper(
         observation,
         stars=stars,
         solver=given.solver,

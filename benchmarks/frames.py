@@ -29,6 +29,7 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 import parts
+from parts import paper
 from scipy.ndimage import gaussian_filter
 
 import lnocl
@@ -147,7 +148,7 @@ class Sky:
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", lnocl.LnoclWarning)  # PSFs wrap, and data run over
-            lnocl.deconvolve(
+            paper(
                 observation,
                 stars,
                 solver=solver,
@@ -259,9 +260,7 @@ def smallest(simulation, mask, device):
             best = error, iteration, found
         return iteration > 1.5 * best[1] + 20
 
-    lnocl.deconvolve(
-        observe(simulation, mask), simulation.stars, solver="sgp", callback=look, device=device
-    )
+    paper(observe(simulation, mask), simulation.stars, solver="sgp", callback=look, device=device)
     return best
 
 
@@ -322,7 +321,7 @@ def pixels(given):
                 }
     mask = dead(shape, n_images, False, 0)
     results = [
-        lnocl.deconvolve(observe(simulation, mask, v), simulation.stars, solver="sgp", n_iter=20)
+        paper(observe(simulation, mask, v), simulation.stars, solver="sgp", n_iter=20)
         for v in (0.0, np.nan, 1e30, -1e30, np.inf)
     ]
     assert all(np.array_equal(results[0].extended, r.extended) for r in results)

@@ -24,6 +24,7 @@ import numpy as np
 import sides
 from astropy.table import Table, hstack, vstack
 from iteration import facts, rows, take_turns
+from parts import paper
 from precision import scene
 
 import lnocl
@@ -199,7 +200,7 @@ def deviate(names, device):
 
     def run(precision, knob):
         with knob.turned():
-            result = lnocl.deconvolve(
+            result = paper(
                 observation, [star], n_iter=ITERATIONS, precision=precision, device=device
             )
         return (result.extended, result.star_fluxes[0]), result.history["objective"]

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import parts
 import pyopencl as cl
+from parts import paper
 
 import lnocl
 from lnocl.opencl.device import choose
@@ -59,7 +60,7 @@ def iterate(solver, count, device, look):
         look(done + iteration)
 
     while done < count:
-        result = lnocl.deconvolve(
+        result = paper(
             given,
             stars=[(20, 30)],
             solver=solver,
@@ -76,7 +77,7 @@ def deconvolve(solver, count, device, look):
     """Do so many deconvolutions, looking after each; return their number."""
     given = observation()
     for done in range(1, count + 1):
-        lnocl.deconvolve(
+        paper(
             given, stars=[(20, 30)], solver=solver, n_iter=SHORT, precision="single", device=device
         )
         look(done)

@@ -1,6 +1,6 @@
 """Peak memory of ``lnocl deconvolve``, beside what it announces and what its arrays take.
 
-    python benchmarks/memory.py [--size N] [--images P] [--solver NAME]
+    python benchmarks/memory.py [--size N] [--images P] [--solver NAME] [--stop RULE]
 
 The images are of float32 with a PSF of 101 x 101 for all. PoCL's device memory is the host's, so
 that both announced figures belong to the one process that is measured.
@@ -20,7 +20,7 @@ from astropy.io import fits
 MIB = 2**20
 
 
-def measure(size: int, n_images: int, solver: str) -> tuple[float, float, float, float]:
+def measure(size: int, n_images: int, solver: str, stop: str) -> tuple[float, float, float, float]:
     """Return MiB: the peak, those announced on device and host, those of images and answer."""
     with tempfile.TemporaryDirectory() as folder:
         images = [_write_image(Path(folder) / f"{j}.fits", size, j) for j in range(n_images)]
@@ -28,8 +28,20 @@ def measure(size: int, n_images: int, solver: str) -> tuple[float, float, float,
         fits.writeto(f"{folder}/psf.fits", np.exp(-(x**2 + y**2) / 8.0))
         command = [
             *(sys.executable, "-m", "lnocl", "deconvolve", *images, "--psf", f"{folder}/psf.fits"),
-            *("--star", f"{size // 2},{size // 2}", "--background", "1", "--solver", solver),
-            *("--n-iter", "3", "-o", f"{folder}/out.fits"),
+            *(
+                "--star",
+                f"{size // 2},{size // 2}",
+                "--background",
+                "1",
+                "--solver",
+                solver,
+                "--smoothing",
+                "0",
+                "--pad",
+                "0",
+            ),
+            *("--n-iter", "3" if stop == "none" else "40", "--stop", stop),
+            *("-o", f"{folder}/out.fits"),
         ]
         with open(f"{folder}/said", "w+") as said:
             process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
@@ -55,8 +67,9 @@ if __name__ == "__main__":
     parser.add_argument("--size", type=int, default=4096)
     parser.add_argument("--images", type=int, default=4)
     parser.add_argument("--solver", choices=("sgm", "sgp"), default="sgm")
+    parser.add_argument("--stop", choices=("none", "held-out"), default="none")
     given = parser.parse_args()
-    peak, device, host, arrays = measure(given.size, given.images, given.solver)
+    peak, device, host, arrays = measure(given.size, given.images, given.solver, given.stop)
     print(
         f"peak {peak:.0f} MiB; announced {device:.0f} on the device and {host:.0f} on the host: "
         f"{peak / (device + host):.2f} of both; images and answer take {arrays:.0f}, and the host "

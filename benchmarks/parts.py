@@ -1,9 +1,15 @@
-"""What the benchmarks in parts share: print the rows of a table as they come, and write it."""
+"""What benchmarks share: the paper's iteration, and the tables of those that come in parts."""
+
+from functools import partial
 
 from astropy.table import Table
 
 import lnocl
 from lnocl.opencl.device import choose, describe
+from lnocl.runs.options import PAPER
+
+# The paper's iteration, but for what is given.
+paper = partial(lnocl.deconvolve, **PAPER)
 
 
 def report(rows, part, device, output):

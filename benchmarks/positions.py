@@ -29,13 +29,14 @@ import astropy.units as u
 import numpy as np
 import parts
 from astropy.table import Table
+from parts import paper
 from sgp import make
 
-import lnocl
 from lnocl.metrics import restoration_error, star_rows
 from lnocl.runs.run import Run
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Observation
+from lnocl.scene.penalty import recommend_smoothing
 from lnocl.scene.scene import Scene
 from lnocl.solvers.positions import StarFit, Stars
 from lnocl.studies import experiment
@@ -118,7 +119,7 @@ class Frame:
             if iteration in looks:
                 curve[iteration] = estimate.star_fluxes, estimate.star_positions
 
-        lnocl.deconvolve(
+        paper(
             observation,
             [tuple(star) for star in given],
             n_iter=max(looks),
@@ -163,20 +164,12 @@ def injection(device):
 def smoothed(device):
     """Yield rows of the part "smoothed"."""
     for flux in FLUXES:
-        settings = {"solver": "sgp", "device": device, "smoothing": choose_smoothing(flux, device)}
+        observation = Observation(Frame(0, flux).image, PSF, background=BACKGROUND)
+        smoothing = recommend_smoothing(observation)
+        settings = {"solver": "sgp", "device": device, "smoothing": smoothing}
         for mode in MODES[:2]:
             for row in measure(flux, mode, (12, 24, 48), **settings):
                 yield {"smoothing": settings["smoothing"]} | row
-
-
-def choose_smoothing(flux, device):
-    """Return what held-out counts choose for the first frame, its stars where they are found."""
-    frame = Frame(0, flux)
-    _, found = frame.deconvolve("refined", (12,), solver="sgp", device=device)[12]
-    observation = Observation(frame.image, PSF, background=BACKGROUND)
-    stars = [tuple(star) for star in found]
-    settings = {"solver": "sgp", "device": device, "smoothing": "auto"}
-    return lnocl.deconvolve(observation, stars, n_iter=24, **settings).smoothing
 
 
 def sgm(device):
@@ -194,7 +187,7 @@ def held(device):
             frame = Frame(seed, flux)
             observation = Observation(frame.image, PSF, background=BACKGROUND)
             stars = [tuple(star) for star in frame.stars]
-            result = lnocl.deconvolve(
+            result = paper(
                 observation, stars, solver="sgp", n_iter=150, stop="held-out", device=device
             )
             chosen.append(result.n_iter)
@@ -291,7 +284,7 @@ def follow(observation, truth, star, given, refine, n_iter, solver="sgp", every=
             rho = restoration_error(estimate.extended, truth, rows)
             curve.append((iteration, rho, np.hypot(*(estimate.star_positions[0] - star))))
 
-    result = lnocl.deconvolve(
+    result = paper(
         observation,
         [given],
         solver=solver,

@@ -13,6 +13,7 @@ import argparse
 
 import numpy as np
 from astropy.table import Table
+from parts import paper
 
 import lnocl
 from lnocl.metrics import star_rows
@@ -59,7 +60,7 @@ def deviations(observation, star, checkpoints, device):
             if iteration in checkpoints:
                 kept[iteration] = estimate.extended.copy(), estimate.star_fluxes[0]
 
-        lnocl.deconvolve(
+        paper(
             observation,
             stars=[star],
             n_iter=max(checkpoints),

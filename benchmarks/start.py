@@ -15,9 +15,9 @@ import tempfile
 import time
 
 import numpy as np
+from parts import paper
 from sides import Lnocl, observation
 
-import lnocl
 from lnocl.scene.scene import Scene
 
 ITERATIONS = 200
@@ -27,7 +27,7 @@ def start(size, n_images):
     """Print the seconds from the call to the first iteration."""
     given = observation(size, n_images)
     begin = time.perf_counter()
-    lnocl.deconvolve(given, stars=[(size // 2, size // 2)], callback=lambda *_: True)
+    paper(given, stars=[(size // 2, size // 2)], callback=lambda *_: True)
     print(time.perf_counter() - begin)
 
 

@@ -2,6 +2,8 @@
 # Two Chandra observations of Sgr A*, half a pixel apart: one sky from both.
 # The first argument is the folder of the data, the second one for the output.
 set -eu
+# The iteration with which docs/real.md was made.
+paper="--solver sgm --stop none --smoothing 0 --pad 0"
 here=$(cd "$(dirname "$0")" && pwd)
 data=${1:-"$here/../../shared/data"}/chandra-sgra-pair
 out=${2:-$(mktemp -d)}
@@ -14,8 +16,8 @@ first=$data/chandra-counts-obs-id-4683.fits.gz second=$data/chandra-counts-obs-i
 psfs="$out/psf_4683.fits $out/psf_4684.fits"
 # No background: a constant would be more than the darkest parts of the field, and add counts.
 common="--pad 24 --n-iter 20 --models --residuals --quiet --overwrite"
-lnocl deconvolve "$first" "$second" --psf $psfs $common --align wcs -o "$out/aligned.fits"
-lnocl deconvolve "$first" "$second" --psf $psfs $common -o "$out/not_aligned.fits"
+lnocl deconvolve $paper "$first" "$second" --psf $psfs $common --align wcs -o "$out/aligned.fits"
+lnocl deconvolve $paper "$first" "$second" --psf $psfs $common -o "$out/not_aligned.fits"
 python "$here/real.py" figures "$out/aligned.fits" "$out/not_aligned.fits"
 # These two are not sampled alike; so the same again with half the offset on each image.
 python "$here/real.py" offsets "$out/aligned.fits" "$first" "$second" $psfs 20

@@ -2,6 +2,8 @@
 # A quasar seen by Chandra: one point, and nearly nothing else.
 # The first argument is the folder of the data, the second one for the output.
 set -eu
+# The iteration with which docs/real.md was made.
+paper="--solver sgm --stop none --smoothing 0 --pad 0"
 here=$(cd "$(dirname "$0")" && pwd)
 data=${1:-"$here/../../shared/data"}/chandra-pg1634-point
 out=${2:-$(mktemp -d)}
@@ -15,7 +17,7 @@ known="--background 0.0025 --star 89,76 --n-iter 30 --models --residuals --quiet
 for refine in "" --refine; do
     for psf in "$data/pg1634_psf_0.25pix.fits" "$out/psf.fits"; do
         name=$(basename "$psf" .fits)$refine
-        lnocl deconvolve "$counts" --psf "$psf" $known $refine -o "$out/$name.out.fits"
+        lnocl deconvolve $paper "$counts" --psf "$psf" $known $refine -o "$out/$name.out.fits"
         python "$here/real.py" figures "$out/$name.out.fits"
     done
 done

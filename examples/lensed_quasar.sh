@@ -2,6 +2,8 @@
 # Four images of a quasar between pixels on a faint ring (HST F814W): stars refined, or not.
 # The first argument is the folder of the data, the second one for the output.
 set -eu
+# The iteration with which docs/real.md was made.
+paper="--solver sgm --stop none --smoothing 0 --pad 0"
 here=$(cd "$(dirname "$0")" && pwd)
 data=${1:-"$here/../../shared/data"}/hst-lensed-quasar
 out=${2:-$(mktemp -d)}
@@ -18,15 +20,15 @@ stars="--star 77,73 --star 47,56 --star 55,77 --star 73,48"
 for how in "0 30" "0 300" "30 30" "30 300"; do
     set -- $how
     for refine in "" --refine; do
-        lnocl deconvolve "$sci" --psf "$out/psf.fits" $known $stars $refine \
+        lnocl deconvolve $paper "$sci" --psf "$out/psf.fits" $known $stars $refine \
             --smoothing "$1" --n-iter "$2" -o "$out/smoothing_$1_$2$refine.fits"
         python "$here/real.py" figures "$out/smoothing_$1_$2$refine.fits"
     done
 done
 # Plain Richardson-Lucy: no stars.
-lnocl deconvolve "$sci" --psf "$out/psf.fits" $known --n-iter 100 -o "$out/plain.fits"
+lnocl deconvolve $paper "$sci" --psf "$out/psf.fits" $known --n-iter 100 -o "$out/plain.fits"
 # With the PSF of the file, for comparison: nothing but another PSF helps.
-lnocl deconvolve "$sci" --psf "$data/quasar_F814W_psf.fits" $known $stars --refine --n-iter 30 \
+lnocl deconvolve $paper "$sci" --psf "$data/quasar_F814W_psf.fits" $known $stars --refine --n-iter 30 \
     -o "$out/file_psf.fits"
 python "$here/real.py" figures "$out/file_psf.fits"
 python "$here/real.py" draw "$out/lensed_quasar.png" "image, e-/s=$sci:62,62,32:0:0.5" \

@@ -2,6 +2,8 @@
 # A quasar of redshift 5.85 and its surroundings (HST F125W): the point taken out.
 # The first argument is the folder of the data, the second one for the output.
 set -eu
+# The iteration with which docs/real.md was made.
+paper="--solver sgm --stop none --smoothing 0 --pad 0"
 here=$(cd "$(dirname "$0")" && pwd)
 data=${1:-"$here/../../shared/data"}/hst-quasar-j0005
 out=${2:-$(mktemp -d)}
@@ -12,8 +14,8 @@ sci=$data/sci_J0005-0006.fits
 python "$here/real.py" centred-psf "$data/sci_psf.fits" "$out/psf.fits" 63
 known="--psf $out/psf.fits --inverse-variance $data/ivm_J0005-0006.fits --exposure EXPTIME --pad 16"
 how="--solver sgp --n-iter 10 --models --residuals --quiet --overwrite"
-lnocl deconvolve "$sci" $known --star 64,64 $how -o "$out/whole.fits"
-lnocl deconvolve "$sci" $known --star 64,64 --refine $how -o "$out/refined.fits"
+lnocl deconvolve $paper "$sci" $known --star 64,64 $how -o "$out/whole.fits"
+lnocl deconvolve $paper "$sci" $known --star 64,64 --refine $how -o "$out/refined.fits"
 python "$here/real.py" figures "$out/whole.fits" "$out/refined.fits"
 python "$here/real.py" draw "$out/quasar_host.png" "image, e-/s=$sci:64,64,50:0:0.3" \
     "extended, whole pixel=$out/whole.fits:64,64,50:0:0.3" \

@@ -83,7 +83,7 @@ def stars_psf(sci, exptime, out, which="0,1,2,3"):
         noise = np.sqrt(SKY_VARIANCE)
         observation = lnocl.Observation(rates * seconds, psf, read_noise=noise, exposure=seconds)
         fit = lnocl.deconvolve(
-            observation, IMAGES, solver="sgp", n_iter=10, refine_positions=True, pad=4
+            observation, IMAGES, n_iter=10, stop=None, smoothing=0.0, refine_positions=True, pad=4
         )
         left = np.divide(
             observation.images[0] - fit.models()[0],
@@ -127,7 +127,9 @@ def offsets(aligned, first, second, psf1, psf2, n_iter):
         "offset the wrong way round": (half, -half),
     }.items():
         observation = lnocl.Observation(images, psfs, offsets=np.array(each))
-        result = lnocl.deconvolve(observation, n_iter=int(n_iter), pad=24)
+        result = lnocl.deconvolve(
+            observation, solver="sgm", n_iter=int(n_iter), stop=None, smoothing=0.0, pad=24
+        )
         share = result.models().sum() / np.sum(images)
         print(
             f"{name}: objective {result.history['objective'][-1]:.1f}, rms radius of the "

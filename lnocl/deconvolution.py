@@ -12,23 +12,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.errors import DivergedError, NotFiniteError, warn
-from lnocl.result import Callback, Estimate, Result, make_result
+from lnocl.result import Callback, Estimate, Iterating, Result, make_result
 from lnocl.runs.checkpoint import Checkpointer, describe
-from lnocl.runs.choice import EMPTY_CURVE, Choice
-from lnocl.runs.held_out import HeldOutSelection
-from lnocl.runs.held_out import most_bytes as most_bytes_of_selection
+from lnocl.runs.halves import Halves
+from lnocl.runs.held_out import HeldOutCounts
+from lnocl.runs.held_out import most_bytes as most_bytes_of_halves
 from lnocl.runs.options import (
     check_choices,
     check_length,
     check_observation,
     check_types,
-    read_penalties,
+    read_penalty,
     read_start,
     warn_of_rounding,
 )
+from lnocl.runs.outcome import Outcome
 from lnocl.runs.progress import Bar
-from lnocl.runs.run import Run, Setup, most_bytes
-from lnocl.runs.saved import UNBOUNDED
+from lnocl.runs.run import Run, most_bytes
+from lnocl.runs.start import Setup, make_start
 from lnocl.runs.stopping import Rule, make_rule
 from lnocl.scene.observation import Observation
 from lnocl.scene.stars import check_positions
@@ -38,20 +39,20 @@ def deconvolve(
     observation: Observation,
     stars: Iterable[tuple[float, float]] = (),
     *,
-    mu: float | str = 0.0,
-    solver: str = "sgm",
+    mu: float = 0.0,
+    smoothing: float | str = "auto",
+    solver: str = "sgp",
     n_iter: int = 1000,
-    stop: str | float | None = None,
+    stop: str | float | None = "held-out",
     precision: str = "single",
     engine: str = "opencl",
     device: str | None = None,
-    pad: int | str = 0,
+    pad: int | str = "auto",
     initial_extended: ArrayLike | None = None,
     initial_star_fluxes: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: bool = False,
     refine_positions: bool = False,
-    smoothing: float | str = 0.0,
     checkpoint: str | PathLike[str] | None = None,
     checkpoint_every: float = 60.0,
     resume: str | PathLike[str] | None = None,
@@ -62,9 +63,12 @@ def deconvolve(
     `smoothing`, ``+ smoothing sum [sqrt((f - f')^2 + delta^2) - delta]`` over pairs of neighbours,
     over the star fluxes c and the extended source f. The model of image g_j is
     ``m_j = A_j f + sum_s c_s P_js + b_j``: A_j convolves with PSF j, P_js is the image of star s
-    for flux 1, and b_j the background. The run ends after `n_iter` iterations. The split-gradient
-    method without stars and penalties is Richardson-Lucy for several images; the scaled gradient
-    projection method needs a tenth of its iterations and less.
+    for flux 1, and b_j the background.
+
+    The defaults are for real frames. The paper's iteration is ``solver="sgm", stop=None,
+    smoothing=0, pad=0`` with `mu` and `n_iter` given; without stars and penalties it is
+    Richardson-Lucy for several images. The scaled gradient projection method lowers the same
+    objective in a tenth of its iterations and less.
 
     Parameters
     ----------
@@ -75,20 +79,24 @@ def deconvolve(
         columns; they may be a Quantity in pixels. Two are at least a thousandth of a pixel apart.
         Between pixels a star's image is the PSF moved in its spectrum
         (`lnocl.scene.shifting.place`).
-    mu : float or "auto", optional
-        Weight of the Tikhonov term on the extended source, per electron; zero or more. "auto":
-        0 or one of seven values, three decades up to p over the brightest pixel, whichever held-out
-        counts choose (see Notes).
-    solver : {"sgm", "sgp"}, optional
-        Iteration to use: the split-gradient method, or the scaled gradient projection method, which
-        solves for the star fluxes at the start, so that those given matter little.
+    mu : float, optional
+        Weight of the Tikhonov term on the extended source, per electron; zero or more.
+    smoothing : float or "auto", optional
+        Weight of an edge-preserving term (`lnocl.scene.penalty.Penalty`), zero or more, without
+        unit; delta is three times the mean of the extended source. It keeps the noise down that
+        grows with the iterations, most of all beside bright stars. "auto": a tenth of the noise of
+        the data term's gradient, ``0.1 sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, < > the mean over
+        pixels (docs/sgp.md).
+    solver : {"sgp", "sgm"}, optional
+        Iteration to use: the scaled gradient projection method, which solves for the star fluxes at
+        the start, so that those given matter little; or the split-gradient method, the paper's.
     n_iter : int, optional
         Iterations to do, at most where they may end sooner; 1 or more.
-    stop : float, "discrepancy" or "held-out", optional
-        Rule by which to stop before `n_iter`. A number in (0, 1): when the relative change of the
-        objective an iteration, averaged over ten, is below it. "discrepancy": when the data term
-        has fallen to its expectation for Poisson counts of the model's means. "held-out": at the
-        iteration that held-out counts choose (see Notes).
+    stop : "held-out", "discrepancy", float or None, optional
+        Rule by which to stop before `n_iter`. "held-out": the result is that of the iteration that
+        held-out counts choose (see Notes). "discrepancy": when the data term has fallen to its
+        expectation for Poisson counts of the model's means. A number in (0, 1): when the relative
+        change of the objective an iteration, averaged over ten, is below it. None: at `n_iter`.
     precision : {"single", "double"}, optional
         Arithmetic of the OpenCL engine. The reference always computes in double.
     engine : {"opencl", "numpy"}, optional
@@ -99,9 +107,9 @@ def deconvolve(
         else the first GPU, else the first CPU.
     pad : int or "auto", optional
         Unobserved pixels kept round the images, at least; the grid is then the next power of
-        two on each axis. With ``pad=0`` and a power-of-two image the model is periodic. "auto",
-        for sources that run over the edge: the radius with nine tenths of the PSFs' light, at most
-        half the shorter side (docs/frames.md).
+        two on each axis. With ``pad=0`` and a power-of-two image the model is periodic. "auto":
+        where light runs over the edge of an image, the radius with nine tenths of the PSFs' light,
+        at most half the shorter side (docs/frames.md); else 0.
     initial_extended : array_like, shape (ny, nx), optional
         Extended source to start from, not 0 everywhere; by default flat. Pixels that start at 0
         stay 0 with "sgm".
@@ -111,7 +119,7 @@ def deconvolve(
     callback : callable, optional
         ``callback(iteration, estimate)``, called after every iteration; it stops the run by
         returning True. The estimate has ``extended`` and ``star_fluxes``, which are fetched
-        from the device when they are read. The halves of held-out counts do not call it.
+        from the device when they are read. With held-out counts it is the sum of both halves'.
     progress : bool, optional
         Show a progress bar on stderr, where that is a terminal, with the objective or the quantity
         of the stopping rule.
@@ -119,16 +127,10 @@ def deconvolve(
         Move the stars to where they are most likely, at most 3 pixels away, by Fisher scoring of
         all fluxes and positions with the extended source held fixed: at the start and after 3, 6,
         12, 24 ... iterations (`lnocl.solvers.positions`).
-    smoothing : float or "auto", optional
-        Weight of an edge-preserving term (`lnocl.scene.penalty.Penalty`), zero or more, without
-        unit; delta is three times the mean of the extended source. It keeps the noise down that
-        grows with the iterations, most of all beside bright stars; 1e-4 to 1e-3 for stars a
-        hundred times as bright as what is beside them (docs/sgp.md). "auto": 0 or one of five
-        values, whichever held-out counts choose (see Notes).
     checkpoint : str or path, optional
         File for checkpoints (FITS): written after the first iteration, then every
         `checkpoint_every` seconds, and at the end. Each replaces the one before once it is
-        complete. While held-out counts choose it holds six runs and about twenty estimates of each.
+        complete. With held-out counts it holds both halves and about twenty estimates of each.
     checkpoint_every : float, optional
         Seconds between checkpoints, zero or more.
     resume : str or path, optional
@@ -144,7 +146,7 @@ def deconvolve(
     ------
     InputError
         `observation` is not an Observation; a parameter is out of its range, masked or too large
-        for the precision; mu and smoothing are both "auto"; a star lies outside the images; two
+        for the precision; a star lies outside the images; two
         stars are at one position; stars are not in pixels; the start is not in counts, or is 0
         and stays so; the device does not exist, or was given for
         the reference; images or exposures are too large to be summed, or the sky for a number;
@@ -171,11 +173,12 @@ def deconvolve(
     -----
     Held-out counts are cross-validation by data thinning. The counts are split at random into two
     halves, independent observations of the same sky. Both are reconstructed side by side, and the
-    error of their sum is estimated from the products of one's estimates with the other's, averaged
-    over three splits (`lnocl.runs.held_out` has the equation). The last iteration with an error
-    within a tenth of the least is chosen, and the halves run to twice that iteration. The
-    reconstruction itself is then made from all counts. All this takes thirteen times as long as if
-    the iteration had been known, and the memory of six runs and of about twenty estimates of each.
+    error of their sum is estimated from the products of one's estimates with the other's
+    (`lnocl.runs.held_out` has the equation). The last iteration with an error within a tenth of the
+    least is chosen, the halves run to twice that iteration, and the result is the sum of what they
+    were then: the extended source and the star fluxes; positions are the mean. All this takes about
+    four times as long as if the iteration had been known, and the memory of two runs and of about
+    twenty estimates of each.
 
     The split-gradient method lowers the objective at every iteration where PSFs are not negative.
     With many negative pixels, as in a raw frame of a star, the objective may rise again, and all
@@ -199,9 +202,9 @@ def deconvolve(
     >>> image = np.full((16, 16), 2.0)
     >>> image[5, 8] += 100.0
     >>> obs = lnocl.Observation(np.stack([image] * 4), np.ones((1, 1)))
-    >>> result = lnocl.deconvolve(obs, stars=[(8, 5)], n_iter=50, engine="numpy")
-    >>> (result.extended.sum() + result.star_fluxes.sum()).round(6)
-    np.float64(612.0)
+    >>> result = lnocl.deconvolve(obs, stars=[(8, 5)], engine="numpy")
+    >>> (result.extended.sum() + result.star_fluxes.sum()).round(-1)
+    np.float64(610.0)
     """
     check_observation(observation)
     observation = copy(observation)  # its arrays are read-only, but its attributes may be replaced
@@ -215,7 +218,7 @@ def deconvolve(
     initial_extended, initial_star_fluxes = read_start(
         observation, fits_stars, initial_extended, initial_star_fluxes
     )
-    penalty, grid = read_penalties(mu, smoothing)
+    penalty = read_penalty(mu, smoothing, observation)
     if engine == "opencl" and precision == "single":
         warn_of_rounding(int(n_iter))
     setup = Setup(positions, pad, solver, precision, engine, device, refine_positions)
@@ -230,50 +233,44 @@ def deconvolve(
         initial_extended=initial_extended,
         initial_star_fluxes=initial_star_fluxes,
     )
-    at_end = stop != "held-out"
-    is_chosen = grid is not None or not at_end
-    measure = most_bytes_of_selection if is_chosen else most_bytes
-    largest = partial(measure, setup, observation, int(n_iter))
-    checkpointer = Checkpointer(checkpoint, checkpoint_every, resume, inputs, largest)
-    low = np.array([penalty.mu, penalty.smoothing, n_iter if at_end else 1], np.float64)
-    high = np.where([isinstance(mu, str), isinstance(smoothing, str), False], UNBOUNDED, low)
-    high[2] = n_iter
     bar = Bar(int(n_iter), bool(progress))
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
     # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
     with bar, np.errstate(over="ignore", invalid="ignore"):
-        choice = checkpointer.choice(low, high)
-        if choice is None and not is_chosen:
-            choice = Choice(penalty, int(n_iter), EMPTY_CURVE)
-        if choice is None:
-            half = None if initial_extended is None else initial_extended / 2.0
-            start = partial(Run, setup, n_iter=int(n_iter), initial_extended=half)
-            selection = HeldOutSelection(start, observation, penalty, grid, int(n_iter), at_end)
-            choice = _choose(selection, bar, checkpointer)
-        run = Run(
-            setup, observation, choice.penalty, choice.n_iter, initial_extended, initial_star_fluxes
-        )
-        bar.expect(choice.n_iter)
-        stop_reason = _complete(run, choice, make_rule(stop), callback, bar, checkpointer)
-        if stop == "held-out" and stop_reason == "n_iter":
-            stop_reason = "held-out"
-        return make_result(run, stop_reason, choice)
+        start = make_start(setup, observation, penalty, initial_extended, initial_star_fluxes)
+        measure = most_bytes_of_halves if stop == "held-out" else most_bytes
+        largest = partial(measure, start, int(n_iter))
+        checkpointer = Checkpointer(checkpoint, checkpoint_every, resume, inputs, largest)
+        if stop == "held-out":
+            held_out = HeldOutCounts(start, penalty, int(n_iter))
+            outcome = _choose(held_out, callback, bar, checkpointer)
+        else:
+            run = Run(start, int(n_iter))
+            del start, largest  # which hold arrays of the grid
+            stop_reason = _complete(run, make_rule(stop), callback, bar, checkpointer)
+            outcome = run.outcome(penalty, stop_reason)
+        return make_result(outcome)
 
 
-def _choose(selection: HeldOutSelection, bar: Bar, checkpointer: Checkpointer) -> Choice:
+def _choose(
+    held_out: HeldOutCounts, callback: Callback | None, bar: Bar, checkpointer: Checkpointer
+) -> Outcome:
     """Have held-out counts choose, from their checkpoint where there is one."""
-    saved = checkpointer.saved_selection()
-    if saved is not None:
-        selection.restore(saved)
-    return selection.choose(
-        lambda words: bar.show(0, lambda: words), lambda: checkpointer.save_selection(selection)
-    )
+    checkpointer.restore_held_out(held_out)
+    bar.expect(None)
+
+    def look(iteration: int, halves: Halves) -> bool:
+        bar.show(iteration, lambda: f"objective {halves.objective():.6g}")
+        return _is_ended(callback, iteration, halves)
+
+    outcome = held_out.choose(look, partial(checkpointer.save_held_out, held_out))
+    checkpointer.save_held_out(held_out, outcome.stop_reason)
+    return outcome
 
 
 def _complete(
     run: Run,
-    choice: Choice,
     rule: Rule,
     callback: Callback | None,
     bar: Bar,
@@ -281,12 +278,12 @@ def _complete(
 ) -> str:
     """Take a run from its checkpoint, if any, to its end; return why it ended."""
     stop_reason = checkpointer.restore(run, rule)
-    save = partial(checkpointer.save, run, rule, choice)
+    save = partial(checkpointer.save, run, rule)
     if stop_reason:
         save(stop_reason)  # perhaps in another file
         return stop_reason
     try:
-        return _iterate(run, choice.n_iter, rule, callback, bar, save)
+        return _iterate(run, rule, callback, bar, save)
     except NotFiniteError:
         checkpointer.return_to_best(run)
         warn(
@@ -303,7 +300,6 @@ def _complete(
 
 def _iterate(
     run: Run,
-    n_iter: int,
     rule: Rule,
     callback: Callback | None,
     bar: Bar,
@@ -313,19 +309,26 @@ def _iterate(
     quantity = partial(rule.quantity, run)
     stop_reason = None
     for iteration in run:
-        if callback is not None:
-            estimate = Estimate(run)
-            if callback(iteration, estimate):
-                stop_reason = "callback"
-            estimate._close()
+        if _is_ended(callback, iteration, run):
+            stop_reason = "callback"
         if rule.met(run):
             stop_reason = rule.reason  # it would end here without a callback too
-        bar.show(iteration, quantity, last=stop_reason is not None or iteration == n_iter)
+        bar.show(iteration, quantity, last=stop_reason is not None or iteration == run.n_iter)
         if stop_reason is not None:
             break
         save("")
-    stop_reason = stop_reason or ("n_iter" if run.done == n_iter else "converged")
+    stop_reason = stop_reason or ("n_iter" if run.done == run.n_iter else "converged")
     run.finish()
     run.check_descent()
     save(stop_reason)
     return stop_reason
+
+
+def _is_ended(callback: Callback | None, iteration: int, run: Iterating) -> bool:
+    """Give the callback the estimate of an iteration; return whether it ends the run."""
+    if callback is None:
+        return False
+    estimate = Estimate(run)
+    is_ended = bool(callback(iteration, estimate))
+    estimate._close()
+    return is_ended

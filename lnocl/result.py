@@ -4,18 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.residuals import Fit, StarResiduals, judge, residuals
-from lnocl.runs.choice import Choice
-from lnocl.runs.run import Run
+from lnocl.runs.outcome import Outcome
 from lnocl.scene.observation import Array, Observation
+from lnocl.scene.scene import Scene
 
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
+
+
+class Iterating(Protocol):
+    """What has an estimate: a run, or both halves of held-out counts."""
+
+    def extended(self) -> Array:
+        """Return the extended source, electrons per pixel, shape (ny, nx)."""
+
+    def star_fluxes(self) -> Array:
+        """Return the star fluxes, electrons."""
+
+    def star_positions(self) -> Array:
+        """Return the star positions, pixels, shape (n, 2)."""
 
 
 class Estimate:
@@ -31,8 +44,8 @@ class Estimate:
         (x, y) in pixels, as last refined.
     """
 
-    def __init__(self, run: Run) -> None:
-        self._run: Run | None = run
+    def __init__(self, run: Iterating) -> None:
+        self._run: Iterating | None = run
 
     @cached_property
     def extended(self) -> Array:
@@ -49,7 +62,7 @@ class Estimate:
         """Star positions, pixels."""
         return self._live().star_positions().copy()
 
-    def _live(self) -> Run:
+    def _live(self) -> Iterating:
         if self._run is None:
             raise RuntimeError("read what you need of the estimate before the callback returns")
         return self._run
@@ -91,14 +104,15 @@ class Result:
     device : str
         Name of the device, its platform and driver; ``"numpy"`` for the reference.
     history : ndarray, fields ``iteration`` (int64) and ``objective`` (float64)
-        The objective J after each iteration, from iteration 0, the start.
+        The objective J after each iteration, from iteration 0, the start. With held-out counts the
+        sum of the objectives of both halves.
     mu : float
         Weight of the Tikhonov term, as given or as chosen.
     smoothing : float
         Weight of the edge-preserving term, as given or as chosen.
-    held_out : ndarray, fields ``mu``, ``smoothing``, ``iteration`` (int64) and ``error``
-        The relative error of the extended source that held-out counts estimate, for each penalty
-        and iteration that they compared. Empty where nothing was to be chosen.
+    held_out : ndarray, fields ``iteration`` (int64) and ``error`` (float64)
+        The relative error of the extended source that held-out counts estimate, for each iteration
+        that they compared last. Empty where they did not choose.
     """
 
     extended: Array
@@ -145,28 +159,39 @@ class Result:
         return judge(self._observation, self._models(), self.star_positions)
 
 
-def make_result(run: Run, stop_reason: str, choice: Choice) -> Result:
-    """Return the result of a run that has ended."""
-    run.finish()
-    history = np.zeros(run.done + 1, HISTORY_DTYPE)
-    history["iteration"] = np.arange(run.done + 1)
-    history["objective"] = run.objectives()
-    flux_errors, position_errors = run.star_errors()
-    ny, nx = run.scene.observation.shape
-    sky = run.sky()
+def make_result(outcome: Outcome) -> Result:
+    """Return the result of a reconstruction that has ended."""
+    scene = outcome.scene
+    history = np.zeros(len(outcome.objectives), HISTORY_DTYPE)
+    history["iteration"] = np.arange(len(history))
+    history["objective"] = outcome.objectives
+    flux_errors, position_errors = outcome.star_errors()
+    ny, nx = scene.observation.shape
     return Result(
-        extended=sky[:ny, :nx],
-        star_fluxes=run.star_fluxes(),
-        star_positions=run.star_positions(),
+        extended=outcome.extended[:ny, :nx] * scene.unit,
+        star_fluxes=outcome.star_fluxes * scene.unit,
+        star_positions=scene.stars,
         star_flux_errors=flux_errors,
         star_position_errors=position_errors,
-        n_iter=run.done,
-        stop_reason=stop_reason,
-        device=run.engine.name,
+        n_iter=len(history) - 1,
+        stop_reason=outcome.stop_reason,
+        device=outcome.engine_name,
         history=history,
-        mu=choice.penalty.mu,
-        smoothing=choice.penalty.smoothing,
-        held_out=choice.curve,
-        _models=run.models(sky),
-        _observation=run.scene.observation,
+        mu=outcome.penalty.mu,
+        smoothing=outcome.penalty.smoothing,
+        held_out=outcome.curve,
+        _models=partial(_models, scene, outcome.extended, outcome.star_fluxes),
+        _observation=scene.observation,
     )
+
+
+def _models(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[Array]:
+    """Yield the m_j, electrons per pixel."""
+    from lnocl.scene.forward_model import model_images  # which loads scipy
+
+    ny, nx = scene.observation.shape
+    for j, image in enumerate(model_images(scene, extended, star_fluxes)):
+        if scene.weights is not None and scene.has_exposure_map:
+            image *= scene.weights[j]
+        image *= scene.scale
+        yield image[:ny, :nx]

@@ -14,6 +14,8 @@ from lnocl.commands import cli
 
 SHAPE = (16, 12)
 NUMPY = ("--engine", "numpy")
+# The paper's iteration, whatever the defaults.
+PAPER = ("--solver", "sgm", "--stop", "none", "--smoothing", "0", "--pad", "0")
 
 
 @pytest.fixture
@@ -71,7 +73,7 @@ def small_command(tmp_path, monkeypatch):
     (x, y) = made.stars[0]
     return [
         *("deconvolve", "images.fits", "--psf", "psfs.fits", "--background", "8"),
-        *("--star", f"{x},{y}", "--quiet", "--overwrite"),
+        *("--star", f"{x},{y}", "--quiet", "--overwrite", *PAPER),
     ]
 
 
@@ -79,7 +81,10 @@ def run(*arguments, image="a.fits", psf="k1.fits", engine=NUMPY, output="out.fit
     """Deconvolve for one iteration unless the arguments say otherwise."""
     images = [image] if isinstance(image, str) else image
     return cli.main(
-        ["deconvolve", *images, "--psf", psf, "--n-iter", "1", "-o", output, *engine, *arguments]
+        [
+            *("deconvolve", *images, "--psf", psf, "--n-iter", "1", "-o", output),
+            *(*PAPER, *engine, *arguments),
+        ]
     )
 
 

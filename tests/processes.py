@@ -24,7 +24,9 @@ PRELUDE = """
 import os, sys
 import numpy as np
 import lnocl
+from functools import partial
+paper = partial(lnocl.deconvolve, solver="sgm", stop=None, smoothing=0.0, pad=0)
 observation = lnocl.Observation(np.arange(256.0).reshape(16, 16), np.ones((3, 3)))
 def deconvolve(n_iter=3):
-    return lnocl.deconvolve(observation, n_iter=n_iter).extended.sum()
+    return paper(observation, n_iter=n_iter).extended.sum()
 """

@@ -3,14 +3,17 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from scenes import paper, same
 
 import lnocl
+from lnocl.scene.padding import recommend_pad
+from lnocl.scene.penalty import recommend_smoothing
 
 OBSERVATION = lnocl.Observation(np.full((8, 8), 5.0), np.ones((1, 1)), background=1.0)
 
 
 def deconvolve(**given):
-    return lnocl.deconvolve(OBSERVATION, **({"n_iter": 3, "engine": "numpy"} | given))
+    return paper(OBSERVATION, **({"n_iter": 3, "engine": "numpy"} | given))
 
 
 def test_all_but_the_observation_and_the_stars_go_by_name():
@@ -69,7 +72,7 @@ def test_units_of_a_start(name):
 
     def begin(start, observation=OBSERVATION):
         options = {"stars": [(3, 4)], "n_iter": 1, "engine": "numpy", name: start}
-        return lnocl.deconvolve(observation, **options).extended
+        return paper(observation, **options).extended
 
     for unit, electrons in ((u.electron, 1), (u.ct, 1), (u.Unit(2 * u.photon), 2)):
         np.testing.assert_array_equal(begin(numbers * unit), begin(numbers * electrons))
@@ -108,7 +111,7 @@ def test_arrays_of_a_result_are_read_only():
 def test_models_are_those_of_the_images_that_were_given():
     images, stars = np.random.default_rng(2).poisson(9.0, (8, 8)).astype(float), [[3.0, 4.0]]
     observation = lnocl.Observation(images, np.ones((1, 1)), background=1.0)
-    result = lnocl.deconvolve(observation, stars, n_iter=3, engine="numpy")
+    result = paper(observation, stars, n_iter=3, engine="numpy")
     models, residuals = result.models(), result.residuals()
     images += 100.0
     stars[0][0] = 6.0
@@ -120,9 +123,9 @@ def test_models_are_those_of_the_images_that_were_given():
 def test_stars_may_be_any_iterable(tmp_path):
     observation = lnocl.Observation(np.full((8, 8), 5.0), np.ones((3, 3)))
     given = {"n_iter": 2, "engine": "numpy"}
-    expected = lnocl.deconvolve(observation, [(4, 4), (2, 6)], **given)
+    expected = paper(observation, [(4, 4), (2, 6)], **given)
     saved = {"checkpoint": str(tmp_path / "run.fits")}
-    found = lnocl.deconvolve(observation, (star for star in [(4, 4), (2, 6)]), **given, **saved)
+    found = paper(observation, (star for star in [(4, 4), (2, 6)]), **given, **saved)
     np.testing.assert_array_equal(found.star_fluxes, expected.star_fluxes)
     assert len({found, expected}) == 2  # compared by identity
 
@@ -137,3 +140,26 @@ def test_an_array_that_cannot_be_made_is_named():
     assert str(caught.value) == (
         "images cannot be read as an array: RuntimeError: the file is gone"
     )
+
+
+def test_defaults_are_those_that_are_recommended():
+    """What is not given is chosen: solver, rule, smoothing, pad."""
+    rng = np.random.default_rng(4)
+    y, x = np.indices((32, 32)) - 16
+    psf = np.exp(-(x**2 + y**2) / 6.0)
+    observation = lnocl.Observation(rng.poisson(30.0 + 900.0 * psf), psf, background=20.0)
+    found = lnocl.deconvolve(observation, [(16, 16)], engine="numpy")
+    assert found.stop_reason == "held-out"
+    expected = lnocl.deconvolve(
+        observation,
+        [(16, 16)],
+        mu=0.0,
+        smoothing=recommend_smoothing(observation),
+        solver="sgp",
+        n_iter=1000,
+        stop="held-out",
+        pad=recommend_pad(observation),  # the sky is brighter than the background
+        engine="numpy",
+    )
+    same(found, expected)
+    assert found.smoothing == recommend_smoothing(observation)

@@ -4,6 +4,7 @@ import inspect
 
 import numpy as np
 import pytest
+from scenes import paper
 
 import lnocl
 
@@ -15,7 +16,7 @@ import lnocl
             lambda: lnocl.Observation(np.diag([np.nan] * 8) + 1.0, np.ones((1, 1))), id="shallow"
         ),
         pytest.param(
-            lambda: lnocl.deconvolve(
+            lambda: paper(
                 lnocl.Observation(np.ones((8, 8)), np.ones((31, 31))), n_iter=1, engine="numpy"
             ),
             id="deep",

@@ -155,39 +155,40 @@ OPTIONS = {
             metavar="RULE",
             card=("STOPPED", "why it stopped"),
             help="when to stop before N iterations: held-out, at the iteration that held-out "
-            "counts choose; discrepancy, when the data are fitted as well as noise allows; or a "
-            "number below 1, when the objective changes relatively by less in an iteration",
+            "counts choose; discrepancy, when the data are fitted as well as noise allows; a "
+            "number below 1, when the objective changes relatively by less in an iteration; or "
+            "none (default: %(default)s)",
         ),
         _parameter(
             "--solver",
             choices=tuple(SOLVERS),
             card=("SOLVER", "iteration"),
-            help="split-gradient method, or scaled gradient projection, which needs a tenth of "
-            "the iterations or fewer (default: %(default)s)",
+            help="scaled gradient projection, or the split-gradient method, the paper's, which "
+            "needs ten times the iterations and more (default: %(default)s)",
         ),
         _parameter(
             "--mu",
-            type=number_or_word,
+            type=float,
             metavar="MU",
             card=("MU", "weight of the Tikhonov term, per electron"),
-            help="weight of the Tikhonov term on the extended source, per electron, or auto: "
-            "chosen by held-out counts (default: %(default)s)",
+            help="weight of the Tikhonov term on the extended source, per electron (default: "
+            "%(default)s)",
         ),
         _parameter(
             "--smoothing",
             type=number_or_word,
             metavar="WEIGHT",
             card=("SMOOTHIN", "weight of the edge-preserving term"),
-            help="weight of an edge-preserving term against noise, 1e-4 to 1e-3 beside bright "
-            "stars, or auto: chosen by held-out counts (default: %(default)s)",
+            help="weight of an edge-preserving term against noise, or auto: that which suits the "
+            "noise of the counts (default: %(default)s)",
         ),
         _parameter(
             "--pad",
             type=whole_or_word,
             metavar="N",
             card=("PAD", "least unobserved pixels round the images"),
-            help="smallest number of unobserved pixels round the images; auto, for sources that "
-            "run over the edge: as many as the PSFs need (default: %(default)s)",
+            help="smallest number of unobserved pixels round the images; auto: where light runs "
+            "over the edge as many as the PSFs need, else 0 (default: %(default)s)",
         ),
         _parameter(
             "--precision",
@@ -225,7 +226,7 @@ def _run(arguments: argparse.Namespace) -> None:
         wcs = fitsread.wcs_cards(frames.header)
         result = deconvolve(
             frames.observation,
-            **_given(given, PARAMETERS),
+            **_parameters(given),
             progress=not arguments.quiet,
             callback=interrupts.callback,
         )
@@ -269,6 +270,12 @@ def _given(values: Mapping[str, Any], names: Any) -> dict[str, Any]:
     return {name: values[name] for name in names if values.get(name) is not None}
 
 
+def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters of `lnocl.deconvolve`; in the shell, no rule has a name."""
+    rule = None if given["stop"] == "none" else given["stop"]
+    return _given(given, PARAMETERS) | {"stop": rule}
+
+
 def _repeated(given: Mapping[str, Any], calibration: Calibration, frames: Frames) -> dict[str, Any]:
     """Return the values of the command that repeats the run, where others were given."""
     return {
@@ -282,7 +289,7 @@ def _repeated(given: Mapping[str, Any], calibration: Calibration, frames: Frames
 
 def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[str, Any]:
     """Return the values that were computed with, where rules and keywords were given."""
-    from lnocl.scene.padding import recommend_pad
+    from lnocl.scene.padding import choose_pad
 
     exposure = frames.observation.exposure
     return {
@@ -291,7 +298,7 @@ def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[s
         "mu": result.mu,
         "smoothing": result.smoothing,
         "device": result.device,
-        "pad": recommend_pad(frames.observation) if repeated["pad"] == "auto" else repeated["pad"],
+        "pad": choose_pad(frames.observation) if repeated["pad"] == "auto" else repeated["pad"],
         **({"exposure": exposure.tolist()} if repeated["exposure"] and exposure.ndim == 1 else {}),
     }
 
@@ -388,8 +395,6 @@ def _summary(arguments: argparse.Namespace, result: Result, found: Fits | None) 
     return [
         f"{counted(result.n_iter, 'iteration')} on {result.device}, objective {objective:.6g}",
         *([] if result.stop_reason == "n_iter" else [reason]),
-        *([f"mu chosen: {result.mu:.3g}"] if arguments.mu == "auto" else []),
-        *([f"smoothing chosen: {result.smoothing:.3g}"] if arguments.smoothing == "auto" else []),
         *stars,
         f"extended source: {result.extended.sum():.6g} {electrons}",
         *verdict,

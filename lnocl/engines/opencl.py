@@ -13,7 +13,7 @@ from lnocl.opencl.device import choose, context_of, describe
 from lnocl.opencl.faults import guarded
 from lnocl.opencl.launch import Launch, Launcher
 from lnocl.opencl.layout import Layout
-from lnocl.opencl.memory import Memory, Transfer, refuse_if_too_large
+from lnocl.opencl.memory import Memory, Transfer, announce, refuse_if_too_large
 from lnocl.opencl.program import Program, Tuning
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
@@ -29,6 +29,8 @@ ITERATIONS_AHEAD = 4
 FETCH_EVERY = 64
 # Bytes that Python takes with NumPy, Astropy and PoCL.
 LIBRARIES = 200 * 2**20
+# Estimates of both halves of the counts that are held (`lnocl.runs.halves`).
+SNAPSHOTS = 22
 
 
 @guarded
@@ -51,6 +53,8 @@ class OpenCLEngine:
         By default that of `lnocl.opencl.program.tune`.
     scaling : Scaling, optional
         For the scaled gradient projection method, whose verbs need it.
+    half : {0, 1}, optional
+        Which half of the counts the scene is of, where both are on the device.
 
     Raises
     ------
@@ -69,6 +73,7 @@ class OpenCLEngine:
         n_iter: int,
         tuning: Tuning | None = None,
         scaling: Scaling | None = None,
+        half: int | None = None,
     ) -> None:
         self.name, self.bytes_needed = "the device", 0
         self._n_objectives = self._n_restored = 0
@@ -95,8 +100,12 @@ class OpenCLEngine:
         self.bytes_needed = refuse_if_too_large(
             chosen,
             {**sizes, "scratch and roots": Launcher.bytes_needed(self.program)},
-            self._host_bytes(),
+            1 if half is None else 2,
         )
+        if half is None:
+            announce(chosen, self.bytes_needed, self._host_bytes())
+        elif half == 0:
+            announce(chosen, 2 * self.bytes_needed, self._host_bytes() + self._bytes_of_halves())
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
         self._memory = Memory(self._queue, self.layout, scene.scale)
@@ -131,6 +140,11 @@ class OpenCLEngine:
         arrays = 1 if self.scaling is None else 2 * scene.n_images + 8
         held = scene.observation.nbytes + (0 if scene.weights is None else scene.weights.nbytes)
         return LIBRARIES + held + arrays * math.prod(scene.grid) * np.dtype(np.float64).itemsize
+
+    def _bytes_of_halves(self) -> int:
+        """Return about how many bytes halves take on the host besides: counts and snapshots."""
+        counts = 2 * self.scene.observation.images.nbytes
+        return counts + 2 * SNAPSHOTS * math.prod(self.scene.grid) * self.program.dtype.itemsize
 
     def _cross_windows(self) -> _Windows:
         stamps = self.scaling.cross_information if self.scaling is not None else []

@@ -159,8 +159,17 @@ class Memory:
         return rounded
 
 
-def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int], host_bytes: int) -> int:
-    """Return the bytes of all buffers together, and log them with those on the host.
+def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int], count: int) -> int:
+    """Return the bytes of all buffers together.
+
+    Parameters
+    ----------
+    device : pyopencl.Device
+        The device.
+    sizes : mapping of str to int
+        Bytes of each buffer.
+    count : int
+        How many such sets of buffers it is to hold.
 
     Raises
     ------
@@ -169,17 +178,21 @@ def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int], host_bytes:
     """
     total = sum(sizes.values())
     largest = max(sizes, key=lambda name: sizes[name])
-    if total > device.global_mem_size or sizes[largest] > device.max_mem_alloc_size:
+    if count * total > device.global_mem_size or sizes[largest] > device.max_mem_alloc_size:
         raise DeviceError(
-            f"the scene needs {total / 2**20:.0f} MiB, {sizes[largest] / 2**20:.0f} MiB of it "
-            f"for {largest}; {describe(device)} has {device.global_mem_size / 2**20:.0f} MiB and "
-            f"gives {device.max_mem_alloc_size / 2**20:.0f} MiB at once: take fewer or "
+            f"the scene needs {count * total / 2**20:.0f} MiB, {sizes[largest] / 2**20:.0f} MiB of "
+            f"it for {largest}; {describe(device)} has {device.global_mem_size / 2**20:.0f} MiB "
+            f"and gives {device.max_mem_alloc_size / 2**20:.0f} MiB at once: take fewer or "
             "smaller images, fewer stars, precision single, or another device"
         )
+    return total
+
+
+def announce(device: cl.Device, device_bytes: int, host_bytes: int) -> None:
+    """Log what a scene takes on a device and on the host."""
     log.info(
         "%s: the scene takes %.1f MiB there, and up to %.0f MiB of the host's memory",
         describe(device),
-        total / 2**20,
+        device_bytes / 2**20,
         host_bytes / 2**20,
     )
-    return total

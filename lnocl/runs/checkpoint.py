@@ -16,12 +16,11 @@ import numpy as np
 
 from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.atomic import check_output, whole_file
-from lnocl.runs.choice import Choice, rows_of
-from lnocl.runs.held_out import HeldOutSelection
+from lnocl.runs.held_out import HeldOutCounts
 from lnocl.runs.run import Run, Setup, engine_name
 from lnocl.runs.saved import Saved
 from lnocl.runs.stopping import Rule
-from lnocl.scene.observation import Array, Observation, numbers
+from lnocl.scene.observation import Observation, numbers
 from lnocl.solvers.engine import State
 
 OBSERVED = ("images", "psfs", "background", "mask", "exposure", "offsets")
@@ -227,38 +226,6 @@ class Checkpointer:
             resumed.refuse_unless(self._described)
             self._ended, self._saved = resumed.ended, Saved(resumed.path, resumed.arrays)
 
-    def choice(self, low: Array, high: Array) -> Choice | None:
-        """Return the choice of held-out counts that was saved, if it was.
-
-        Parameters
-        ----------
-        low, high : ndarray of float64, shape (3,)
-            Bounds of mu, smoothing and the number of iterations. Where they are equal, nothing was
-            to be chosen, and each checkpoint holds them.
-
-        Raises
-        ------
-        FileError
-            The checkpoint holds another choice.
-        """
-        saved = self._saved
-        if saved is None or not ("choice" in saved or np.array_equal(low, high)):
-            return None
-        return Choice.take(saved, low, high)
-
-    def saved_selection(self) -> Saved | None:
-        """Return the state of held-out counts that was saved, if any, and hold it no longer.
-
-        Raises
-        ------
-        FileError
-            The run is said to have ended.
-        """
-        saved, self._saved = self._saved, None
-        if saved is not None and self._ended:
-            saved.refuse("it ended before held-out counts chose")
-        return saved
-
     def _refuse_to_replace(self, path: str) -> None:
         if os.path.lexists(path) and not self._may_replace:
             raise FileError(f"the checkpoint {path} exists; resume from it, or remove it")
@@ -310,7 +277,7 @@ class Checkpointer:
         """
         run.return_to_best(self._best)
 
-    def save(self, run: Run, rule: Rule, choice: Choice, ended: str) -> None:
+    def save(self, run: Run, rule: Rule, ended: str) -> None:
         """Save the state of a run where that is due or the run has ended, in the file too.
 
         Raises
@@ -328,20 +295,29 @@ class Checkpointer:
         if ended or self._is_due():
             state, is_best = run.proven_state()
             self._remember(state, is_best)
-            chosen = [choice.penalty.mu, choice.penalty.smoothing, choice.n_iter]
-            besides = {"rule": rule.state(), "choice": chosen, "curve": rows_of(choice.curve)}
-            arrays = {name: np.array(values, np.float64) for name, values in besides.items()}
-            self._write(ended, state | arrays)
+            self._write(ended, state | {"rule": np.array(rule.state(), np.float64)})
             if ended:
                 self._best = {}  # it is not returned to any more
 
-    def save_selection(self, selection: HeldOutSelection) -> None:
-        """Save the state of held-out counts where there is a file and that is due.
+    def restore_held_out(self, held_out: HeldOutCounts) -> None:
+        """Put held-out counts where their checkpoint was, if any.
+
+        Raises
+        ------
+        FileError
+            They cannot have been there.
+        """
+        saved, self._saved = self._saved, None
+        if saved is not None:
+            held_out.restore(saved, self._ended)
+
+    def save_held_out(self, held_out: HeldOutCounts, ended: str = "") -> None:
+        """Save the state of held-out counts where there is a file, and that is due or they ended.
 
         Raises and warns as `save`.
         """
-        if self._path is not None and self._is_due():
-            self._write("", selection.state())
+        if self._path is not None and (ended or self._is_due()):
+            self._write(ended, held_out.state())
 
     def _is_due(self) -> bool:
         return time.monotonic() - self._saved_at >= self._every

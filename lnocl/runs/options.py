@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError, warn
-from lnocl.runs.held_out import PenaltyGrid, mu_grid, smoothing_grid
 from lnocl.scene.containers import counts
 from lnocl.scene.observation import Array, Observation, numbers
-from lnocl.scene.penalty import Penalty
+from lnocl.scene.penalty import Penalty, recommend_smoothing
 from lnocl.solvers import SOLVERS
+
+# The iteration of La Camera et al. (2012), whatever the defaults; mu and n_iter are given too.
+PAPER: dict[str, Any] = {"solver": "sgm", "stop": None, "smoothing": 0.0, "pad": 0}
 
 PRECISIONS = ("single", "double")
 ENGINES = ("opencl", "numpy")
-STOPS = ("discrepancy", "held-out")
+STOPS = ("held-out", "discrepancy")
 
 # Kernels count iterations in 32 bits.
 MAX_ITERATIONS = 2**31 - 2
@@ -82,7 +84,8 @@ def check_length(n_iter: object, stop: object) -> None:
     is_change = isinstance(stop, Real) and 0 < cast(float, stop) < 1
     if not (stop is None or is_change or (isinstance(stop, str) and stop in STOPS)):
         raise InputError(
-            f"stop {stop!r} is not known; give {', '.join(STOPS)}, or a number between 0 and 1"
+            f"stop {stop!r} is not known; give {', '.join(STOPS)}, none, or a number between 0 "
+            "and 1"
         )
 
 
@@ -137,24 +140,19 @@ def read_start(
     return extended, fluxes
 
 
-def read_penalties(mu: Any, smoothing: Any) -> tuple[Penalty, PenaltyGrid | None]:
-    """Return the penalty, the smallest one where one is chosen, and the grid to choose from.
+def read_penalty(mu: Any, smoothing: Any, observation: Observation) -> Penalty:
+    """Return the penalty, the smoothing that which suits the noise where it is "auto".
 
     Raises
     ------
     InputError
-        A weight is not a number, finite and not negative, or "auto"; both are "auto".
+        A weight is not a number, finite and not negative; smoothing is another word than "auto".
     """
-    for name, weight in (("mu", mu), ("smoothing", smoothing)):
-        if isinstance(weight, str) and weight != "auto":
-            raise InputError(f"{name} {weight!r} is not known; give a number or auto")
-    if isinstance(mu, str) and isinstance(smoothing, str):
-        raise InputError("mu and smoothing cannot both be auto; give one of them as a number")
-    if isinstance(mu, str):
-        return Penalty(0.0, smoothing), mu_grid(smoothing)
     if isinstance(smoothing, str):
-        return Penalty(mu, 0.0), smoothing_grid(mu)
-    return Penalty(mu, smoothing), None
+        if smoothing != "auto":
+            raise InputError(f"smoothing {smoothing!r} is not known; give a number or auto")
+        smoothing = recommend_smoothing(observation)
+    return Penalty(mu, smoothing)
 
 
 def warn_of_rounding(n_iter: int) -> None:

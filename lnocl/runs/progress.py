@@ -31,8 +31,8 @@ class Bar:
     def __exit__(self, *exception: object) -> None:
         self._bar.close()
 
-    def expect(self, n_iter: int) -> None:
-        """Change the number of iterations."""
+    def expect(self, n_iter: int | None) -> None:
+        """Change the number of iterations, which may be unknown."""
         self._bar.total = n_iter
 
     def show(self, iteration: int, quantity: Callable[[], str], last: bool = False) -> None:

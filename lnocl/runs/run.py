@@ -3,43 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property, partial
+from collections.abc import Iterator
+from copy import copy
+from functools import cached_property
 from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.errors import refuse_not_finite, warn
+from lnocl.errors import refuse_not_finite
 from lnocl.runs.descent import Descent
+from lnocl.runs.outcome import Outcome
 from lnocl.runs.saved import LARGEST, Saved, Shape
-from lnocl.scene.observation import Array, Observation
+from lnocl.runs.start import Setup, Start, make_model, measure_steps, move_stars
+from lnocl.scene.observation import Array
 from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene, grid_of
+from lnocl.scene.scene import Scene
 from lnocl.solvers import SOLVERS
 from lnocl.solvers.engine import Engine, State
 from lnocl.solvers.sgp import ALPHA_BOUNDS, Steps
 
 if TYPE_CHECKING:
     from lnocl.scene.forward_model import Model
-    from lnocl.solvers.positions import Stars
     from lnocl.solvers.scaling import Scaling
-
-
-@dataclass(frozen=True)
-class Setup:
-    """The parameters that all runs of one call of `deconvolve` share."""
-
-    stars: Array
-    pad: int | str
-    solver: str
-    precision: str
-    engine: str
-    device: str | None
-    refine_positions: bool = False
-
 
 # Star positions are refined after this many iterations, then after twice as many each time.
 FIRST_REFINED = 3
@@ -50,21 +37,17 @@ class Run:
 
     Parameters
     ----------
-    setup : Setup
-        The parameters that the runs share.
-    observation : Observation
-        The observation to reconstruct.
-    penalty : Penalty
-        The penalty on the extended source.
+    start : Start
+        Where it starts.
     n_iter : int
         Iterations at most.
-    initial_extended, initial_star_fluxes : array_like, optional
-        The estimate to start from, as for `deconvolve`.
+    half : {0, 1}, optional
+        Which half of the counts it is of, where both are run side by side.
 
     Attributes
     ----------
     scene : Scene
-        The model of the observation.
+        The model of the observation; the stars are where the run has moved them.
     engine : Engine
         The engine that computes it.
     n_iter : int
@@ -78,32 +61,12 @@ class Run:
         As `deconvolve`.
     """
 
-    def __init__(
-        self,
-        setup: Setup,
-        observation: Observation,
-        penalty: Penalty,
-        n_iter: int,
-        initial_extended: ArrayLike | None = None,
-        initial_star_fluxes: ArrayLike | None = None,
-    ) -> None:
-        leeway = 0.0
-        if setup.refine_positions:
-            from lnocl.solvers.positions import RADIUS
-
-            leeway = RADIUS
-        self._setup, self.n_iter = setup, n_iter
-        self.scene = Scene(observation, setup.stars, penalty, setup.pad, leeway)
-        self._given_stars = self.scene.stars
-        self._refines = setup.refine_positions and self.scene.n_stars > 0
-        extended, star_fluxes = self.scene.start(initial_extended, initial_star_fluxes)
-        if self._refines:
-            star_fluxes = self._move_stars(extended, star_fluxes, look_round=True)
-        scaling = None
-        if setup.solver == "sgp":
-            star_fluxes, scaling = self._prepare(extended, star_fluxes)
-        self.engine = _make_engine(setup, self.scene, n_iter, scaling)
-        self.engine.start(extended, star_fluxes)
+    def __init__(self, start: Start, n_iter: int, half: int | None = None) -> None:
+        self._setup, self.n_iter, self._half = start.setup, n_iter, half
+        self.scene = copy(start.scene)
+        self._given_stars, self._refines = start.given_stars, start.refines
+        self.engine = _make_engine(self._setup, self.scene, n_iter, start.scaling, half)
+        self.engine.start(start.extended, start.star_fluxes)
         self.done = 0
         self._begin_stage()
 
@@ -246,24 +209,17 @@ class Run:
         best = self.best_iteration()
         scaling = self.engine.scaling
         del self.engine  # the device need not hold both
-        self.engine = _make_engine(self._setup, self.scene, self.n_iter, scaling)
+        self.engine = _make_engine(self._setup, self.scene, self.n_iter, scaling, self._half)
         self.restore(state)
         for _ in islice(self, max(best - self.done, 0)):
             pass
         self.finish()
         self.state()  # refuses values that are not finite
 
-    def _prepare(self, extended: Array, star_fluxes: Array) -> tuple[Array, Scaling]:
-        from lnocl.solvers.scaling import prepare
-
-        # Where it is not used again the model must not outlive this, as it is large.
-        model = self._model if self._refines else _make_model(self.scene)
-        return prepare(self.scene, model, extended, star_fluxes)
-
     @cached_property
     def _model(self) -> Model:
         """The model of the scene; it follows the stars."""
-        return _make_model(self.scene)
+        return make_model(self.scene)
 
     def _restored_scaling(self, state: State) -> Scaling:
         from lnocl.solvers.scaling import Scaling
@@ -275,61 +231,29 @@ class Run:
         self._forget_end()
         extended = self.engine.extended()
         refuse_not_finite(extended.sum())
-        star_fluxes = self._move_stars(extended, self.engine.star_fluxes())
-        if self.engine.scaling is not None:
-            star_fluxes, scaling = self._prepare(extended, star_fluxes)
+        star_fluxes = move_stars(
+            self.scene, self._model, extended, self.engine.star_fluxes(), self._given_stars
+        )
+        star_fluxes, scaling = measure_steps(
+            self._setup, self.scene, self._model, extended, star_fluxes
+        )
+        if scaling is not None:
             self.engine.set_scaling(scaling)
         self.engine.move_stars()
         self.engine.start(extended, star_fluxes)
-
-    def _move_stars(self, extended: Array, star_fluxes: Array, look_round: bool = False) -> Array:
-        """Move the stars of the scene; return their fluxes there."""
-        from lnocl.solvers.positions import StarFit, Stars
-
-        fit = StarFit(self.scene, self._model, extended, self._given_stars)
-        given = Stars(star_fluxes, self.scene.stars)
-        starts = [given, fit.look_round(given)] if look_round else [given]
-        stars = min(map(fit.minimise, starts), key=fit.objective)
-        self.scene.move_stars(stars.positions)
-        return stars.fluxes
 
     def star_positions(self) -> Array:
         """Return the star positions, pixels, shape (n, 2)."""
         return self.scene.stars
 
-    def star_errors(self) -> tuple[Array, Array]:
-        """Return the standard errors of star fluxes and positions; NaN where not refined."""
-        if not self._refines:
-            n = self.scene.n_stars
-            return np.full(n, np.nan), np.full((n, 2), np.nan)
-        from lnocl.solvers.positions import StarFit, Stars
-
-        fit = StarFit(self.scene, self._model, self.engine.extended(), self._given_stars)
-        errors = fit.errors(Stars(self.engine.star_fluxes(), self.scene.stars))
-        _warn_of_undetermined(errors, self.scene.stars)
-        # J is divided by the scale too, so that its information is that of as many fewer counts.
-        fluxes, positions = errors.fluxes * self.scene.unit, errors.positions
-        root = 1.0 / np.sqrt(self.scene.scale)
-        return fluxes * root, positions * root
-
-    def sky(self) -> Array:
-        """Return the extended source on the grid, electrons per pixel, shape (Ny, Nx)."""
-        sky = self.engine.extended()
-        sky *= self.scene.unit
-        return sky
-
     def extended(self) -> Array:
         """Return the extended source, electrons per pixel, shape (ny, nx)."""
         ny, nx = self.scene.observation.shape
-        return self.sky()[:ny, :nx]
+        return self.engine.extended()[:ny, :nx] * self.scene.unit
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes, electrons."""
         return self.engine.star_fluxes() * self.scene.unit
-
-    def models(self, sky: Array) -> Callable[[], Iterator[Array]]:
-        """Return a function that yields the m_j of this sky and the stars, electrons per pixel."""
-        return partial(_model_images, self.scene, sky, self.engine.star_fluxes())
 
     def objective(self) -> float:
         """Return the last objective."""
@@ -361,56 +285,24 @@ class Run:
         if len(self.engine.objectives()) == self.done:
             self.engine.ratio()
 
+    def outcome(self, penalty: Penalty, stop_reason: str) -> Outcome:
+        """Return what the run has come to, once it has ended."""
+        self.finish()
+        return Outcome(
+            scene=self.scene,
+            extended=self.engine.extended(),
+            star_fluxes=self.engine.star_fluxes(),
+            given_stars=self._given_stars if self._refines else None,
+            objectives=self.objectives(),
+            engine_name=self.engine.name,
+            penalty=penalty,
+            stop_reason=stop_reason,
+        )
+
     def _forget_end(self) -> None:
         """Take the objective of the current estimate off the record, where it is there."""
         if len(self.engine.objectives()) > self.done:
             self.engine.forget_objective()
-
-
-# What follows loads scipy, which not every start needs.
-
-
-def most_bytes(setup: Setup, observation: Observation, n_iter: int) -> int:
-    """Return the most bytes that the state of a run may take.
-
-    Raises
-    ------
-    InputError
-        The stars or the pad of the setup cannot be used.
-    """
-    from lnocl.scene.forward_model import largest_window
-
-    grid, n = grid_of(observation, setup.pad), len(setup.stars)
-    window = largest_window(observation.psfs.shape[1:], grid)
-    numbers = 4 * math.prod(grid) + 2 * grid[0] + n * (math.prod(window) + n + 8) + 2 * n_iter + 64
-    return np.dtype(np.float64).itemsize * numbers
-
-
-def _make_model(scene: Scene) -> Model:
-    from lnocl.scene.forward_model import Model
-
-    return Model(scene)
-
-
-def _model_images(scene: Scene, sky: Array, star_fluxes: Array) -> Iterator[Array]:
-    from lnocl.scene.forward_model import model_images
-
-    ny, nx = scene.observation.shape
-    for j, image in enumerate(model_images(scene, sky / scene.unit, star_fluxes)):
-        if scene.weights is not None and scene.has_exposure_map:
-            image *= scene.weights[j]
-        image *= scene.scale
-        yield image[:ny, :nx]
-
-
-def _warn_of_undetermined(errors: Stars, positions: Array) -> None:
-    is_blended = np.isnan(errors.fluxes) | np.isnan(errors.positions).any(axis=1)
-    if is_blended.any():
-        named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in positions[is_blended])
-        warn(
-            f"the images do not determine flux and position of each star at {named}, so that these "
-            "errors are NaN; leave out stars that lie on others"
-        )
 
 
 def engine_name(setup: Setup) -> str:
@@ -432,7 +324,9 @@ def engine_name(setup: Setup) -> str:
     return device.describe(device.choose(setup.device).device)
 
 
-def _make_engine(setup: Setup, scene: Scene, n_iter: int, scaling: Scaling | None) -> Engine:
+def _make_engine(
+    setup: Setup, scene: Scene, n_iter: int, scaling: Scaling | None, half: int | None
+) -> Engine:
     # Imported where it is chosen: the reference runs where no OpenCL is installed.
     if setup.engine == "numpy":
         from lnocl.engines.numpy import ReferenceEngine
@@ -440,4 +334,15 @@ def _make_engine(setup: Setup, scene: Scene, n_iter: int, scaling: Scaling | Non
         return ReferenceEngine(scene, scaling)
     from lnocl.engines.opencl import OpenCLEngine
 
-    return OpenCLEngine(scene, setup.precision, setup.device, n_iter, scaling=scaling)
+    return OpenCLEngine(scene, setup.precision, setup.device, n_iter, scaling=scaling, half=half)
+
+
+def most_bytes(start: Start, n_iter: int) -> int:
+    """Return the most bytes that the state of a run may take."""
+    from lnocl.scene.forward_model import largest_window
+
+    scene = start.scene
+    window = largest_window(scene.observation.psfs.shape[1:], scene.grid)
+    n, pixels = scene.n_stars, math.prod(scene.grid)
+    numbers = 4 * pixels + 2 * scene.grid[0] + n * (math.prod(window) + n + 8) + 2 * n_iter + 64
+    return np.dtype(np.float64).itemsize * numbers

@@ -10,6 +10,15 @@ from lnocl.scene.observation import Array, Observation
 # side of the images that the pad is at most (benchmarks/frames.py, docs/frames.md).
 LIGHT = 0.9
 SHARE_OF_SIDE = 0.5
+# Light runs over an edge where so many pixels of it together exceed the background by so many times
+# their noise: of a million such stretches of noise alone fewer than one does.
+STRETCH = 16
+MIN_EXCESS = 5.0
+
+
+def choose_pad(observation: Observation) -> int:
+    """Return the pad "auto": `recommend_pad` where light runs over an edge, else 0."""
+    return recommend_pad(observation) if runs_over_the_edge(observation) else 0
 
 
 def recommend_pad(observation: Observation) -> int:
@@ -40,6 +49,35 @@ def recommend_pad(observation: Observation) -> int:
     """
     most = max(1, int(SHARE_OF_SIDE * min(observation.shape)))
     return min(max(1, *(_radius(psf, LIGHT) for psf in observation.psfs)), most)
+
+
+def runs_over_the_edge(observation: Observation) -> bool:
+    """Return whether light runs over the edge of an image.
+
+    It does where the counts of a stretch of 16 of the outermost pixels exceed the background by
+    five times their noise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> from lnocl.scene.padding import runs_over_the_edge
+    >>> image = np.full((64, 64), 90.0)
+    >>> runs_over_the_edge(lnocl.Observation(image, np.ones((1, 1)), background=90.0))
+    False
+    >>> image[0, 30:34] += 900.0
+    >>> runs_over_the_edge(lnocl.Observation(image, np.ones((1, 1)), background=90.0))
+    True
+    """
+    for j, (image, mask) in enumerate(zip(observation.images, observation.mask, strict=True)):
+        level = np.broadcast_to(observation.background[j], image.shape)
+        for edge in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+            good, starts = ~mask[edge], range(0, len(image[edge]), STRETCH)
+            excess = np.add.reduceat(np.where(good, image[edge] - level[edge], 0.0), starts)
+            variance = np.add.reduceat(np.where(good, image[edge], 0.0), starts)
+            if (excess > MIN_EXCESS * np.sqrt(variance)).any():
+                return True
+    return False
 
 
 def _radius(psf: Array, share: float) -> int:

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any, cast
 
+import numpy as np
+
 from lnocl.errors import InputError
+from lnocl.scene.observation import Observation
+
+log = logging.getLogger("lnocl")
 
 # A larger weight leaves nothing of the data term of images at unit mean.
 MAX_WEIGHT = 2.0**64
+
+# The weight of the edge-preserving term in units of the noise of the gradient of the data term:
+# docs/sgp.md.
+SMOOTHING = 0.1
 
 # To which Python compares an integer of any size without making a float of it.
 MAX_FLOAT = sys.float_info.max
@@ -49,12 +59,23 @@ class Penalty:
                     f"{name} must be a number, finite and not negative; {weight!r} was given"
                 )
 
-    def of_half(self) -> Penalty:
-        """Return the penalty of half the counts of an observation that gives half the estimate.
 
-        A half has half the data term and a quarter of the squares; delta is halved too.
-        """
-        return Penalty(2.0 * self.mu, self.smoothing)
+def recommend_smoothing(observation: Observation) -> float:
+    """Return the weight of the edge-preserving term that suits the noise of an observation.
+
+    It is `SMOOTHING` times the standard deviation of the gradient of the data term by the noise of
+    the counts, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, < > the mean over the observed pixels.
+    """
+    relative = observation.exposure
+    if relative.ndim == 1:
+        relative = relative[:, None, None]
+    variance = np.ma.masked_array(
+        relative**2 / np.maximum(observation.images, 1.0), observation.mask
+    ).mean(axis=(1, 2))
+    squares = (observation.psfs**2).sum(axis=(1, 2))
+    smoothing = SMOOTHING * float(np.sqrt((variance * squares).sum()))
+    log.info("smoothing chosen: %.3g, by the noise of the counts", smoothing)
+    return smoothing
 
 
 def _is_weight(number: float) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, warn
 from lnocl.scene.observation import Array, Observation, numbers
-from lnocl.scene.padding import recommend_pad
+from lnocl.scene.padding import choose_pad
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
 from lnocl.scene.shifting import MovablePsf, Stamp
 from lnocl.scene.stars import StarField, check_positions, rows_within
@@ -59,7 +60,7 @@ class Scene:
         On the extended source.
     pad : int or "auto"
         Unobserved pixels round the images, at least; "auto": those of
-        `lnocl.scene.padding.recommend_pad`.
+        `lnocl.scene.padding.choose_pad`.
     leeway : float
         Pixels that a star may be moved later on, by `move_stars`.
 
@@ -119,11 +120,9 @@ class Scene:
         exposure = observation.exposure
         has_map = exposure.ndim == 3
         seen = exposure[~observation.mask] if has_map else exposure
-        mean_exposure = _mean("exposures", seen, seen.size)
-        self.unit = self._sky_unit(mean_exposure)
-        self.mu = self._scaled("mu", penalty.mu, self.unit / mean_exposure)
-        self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / mean_exposure)
-        relative = exposure / mean_exposure
+        self._mean_exposure = _mean("exposures", seen, seen.size)
+        self.unit = self._sky_unit(self._mean_exposure)
+        relative = exposure / self._mean_exposure
         self._gains = np.ones(self.n_images) if has_map else relative
         self._psfs = [MovablePsf(psf, self.grid) for psf in self.scaled_psfs()]
         self.weights = self._weigh(relative if has_map else None)
@@ -131,7 +130,25 @@ class Scene:
         self.star_weights, is_observed = self._weigh_stars(self._field)
         self._refuse_unobserved_stars(is_observed)
         self._warn_of_ringing()
+        self._penalise(penalty)
+
+    def _penalise(self, penalty: Penalty) -> None:
+        self.mu = self._scaled("mu", penalty.mu, self.unit / self._mean_exposure)
+        self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / self._mean_exposure)
         self.edge = EDGE * self._rough_fit[1] if self.smoothing else 0.0
+
+    def penalised(self, penalty: Penalty) -> Scene:
+        """Return this scene with another penalty."""
+        other = copy(self)
+        other._penalise(penalty)
+        return other
+
+    def of_half(self, observation: Observation) -> Scene:
+        """Return this scene for half of its counts: scaled, all but the images is the same."""
+        half = copy(self)
+        half.observation = observation
+        half.scale, half.unit = self.scale / 2.0, self.unit / 2.0
+        return half
 
     def _scaled(self, name: str, weight: float, factor: float) -> float:
         """Return a weight of the penalty, scaled; refuse one that is too large for float32."""
@@ -393,8 +410,9 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
         `pad` is out of range, or the images are too large for the transform.
     """
     if isinstance(pad, str) and pad == "auto":
-        pad = recommend_pad(observation)
-        log.info("pad: %d pixels, by the PSFs", pad)
+        pad = choose_pad(observation)
+        reason = "light runs" if pad else "no light runs"
+        log.info("pad chosen: %d pixels, as %s over the edge of the images", pad, reason)
     shape = observation.shape
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
         raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")

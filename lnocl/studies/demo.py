@@ -92,7 +92,7 @@ def _reconstruct(
         simulation, observation, method, mu, N_ITER, EVERY, device=device, progress=True
     )
     n_iter, _ = found.best("rho_star")
-    options = ["--mu", repr(mu), "--n-iter", str(n_iter)]
+    options = ["--mu", repr(mu), "--n-iter", str(n_iter), *files.PAPER_WORDS]
     options += [] if device is None else ["--device", device]
     name, stars = method.lower(), [] if method == "RLM" else simulation.stars
     command = files.command(folder, simulation, stars, name, *options)

@@ -12,6 +12,7 @@ from lnocl import metrics
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
 from lnocl.result import HISTORY_DTYPE, Estimate
+from lnocl.runs.options import PAPER
 from lnocl.scene.observation import Array, Observation
 from lnocl.simulation import Simulation
 
@@ -180,7 +181,7 @@ def reconstruct(
     every, patience
         As for `Tracker`.
     **keywords
-        Further arguments of `lnocl.deconvolve`.
+        Further arguments of `lnocl.deconvolve`, whose defaults here are those of the paper.
 
     Returns
     -------
@@ -195,6 +196,7 @@ def reconstruct(
     """
     tracker = Tracker(simulation, method, every, n_iter, patience)
     stars = [] if method == "RLM" else simulation.stars
+    keywords = PAPER | keywords
     result = deconvolve(observation, stars, mu=mu, n_iter=n_iter, callback=tracker, **keywords)
     return Reconstruction(
         method,

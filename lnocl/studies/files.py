@@ -129,6 +129,10 @@ def write_reconstruction(
     )
 
 
+# The words of `lnocl.runs.options.PAPER`.
+PAPER_WORDS = ("--solver", "sgm", "--stop", "none", "--smoothing", "0", "--pad", "0")
+
+
 def command(
     folder: str, simulation: Simulation, stars: Sequence[tuple[int, int]], output: str, *more: str
 ) -> list[str]:

@@ -17,6 +17,7 @@ from lnocl import metrics
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.result import Estimate, Result
+from lnocl.runs.options import PAPER
 from lnocl.runs.progress import make_bar
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.simulation import Simulation
@@ -137,10 +138,11 @@ def compare(
     ]
 
     def reconstruct(setting: Setting, n_iter: int, callback: Any = None) -> Result:
+        given = PAPER | {"mu": mu, "n_iter": n_iter, "pad": setting.pad}
+        precision = setting.precision
         return deconvolve(
-            observation, stars, mu=mu, n_iter=n_iter, precision=setting.precision,
-            device=device, pad=setting.pad, callback=callback,
-        )  # fmt: skip
+            observation, stars, **given, precision=precision, device=device, callback=callback
+        )
 
     reconstruct(settings[0], 1)  # raises errors and gives warnings before the bar is shown
     checkpoints = sorted({n_iter // part for part in PARTS})

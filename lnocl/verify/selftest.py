@@ -17,6 +17,7 @@ from lnocl.deconvolution import deconvolve
 from lnocl.errors import DeviceError, LnoclError
 from lnocl.opencl.device import context_of, describe, has_double, spec_of
 from lnocl.result import Result
+from lnocl.runs.options import PAPER
 from lnocl.scene.observation import Observation
 from lnocl.simulation import Experiment, Star, load_target, simulate
 from lnocl.verify.comparison import ALLOWED, KERNELS, deviation, kernels_of, relative
@@ -179,7 +180,7 @@ def _try_deconvolutions(device: str, precisions: Sequence[str]) -> Iterator[Row]
     observation, stars = _observe()
     for solver, (n_iter, allowed) in RUNS.items():
         reconstruct = functools.partial(
-            deconvolve, observation, stars=stars, solver=solver, n_iter=n_iter
+            deconvolve, observation, stars=stars, **(PAPER | {"solver": solver, "n_iter": n_iter})
         )
         expected = reconstruct(engine="numpy")
         for precision in precisions:

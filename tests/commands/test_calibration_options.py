@@ -11,8 +11,8 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.wcs import WCS
 from commandline import NUMPY, SHAPE, one_complaint, outcome
+from scenes import paper
 
-import lnocl
 from lnocl.commands import cli
 from lnocl.io.frames import Calibration, read_frames
 
@@ -122,7 +122,7 @@ class TestFrames:
             at = SkyCoord(*self.at(x, y), unit="deg")
             stars.append([float(each) for each in WCS(self.WCS).world_to_pixel(at)])
         np.testing.assert_allclose(stars[1:], [(7.0, 5.0), (8.5, 4.0)], atol=1e-6)
-        expected = lnocl.deconvolve(
+        expected = paper(
             observation,
             stars=stars,
             mu=1e-4,

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from commandline import NUMPY, SHAPE, run
+from commandline import NUMPY, PAPER, SHAPE, run
+from scenes import paper
 
 import lnocl
 from lnocl.commands import cli
@@ -32,6 +33,7 @@ class TestDeconvolve:
             "--star",
             "2,9",
         ),
+        *PAPER,
         *("--mu", "1e-3", "--smoothing", "0.02", "--n-iter", "7", "--pad", "3"),
     )
 
@@ -49,7 +51,7 @@ class TestDeconvolve:
         status = cli.main(["deconvolve", *inputs, *options])
         captured = capsys.readouterr()
         assert (status, captured.err) == (0, "")
-        expected = lnocl.deconvolve(
+        expected = paper(
             lnocl.Observation(
                 fits.getdata("cube.fits"),
                 fits.getdata("psfs.fits"),
@@ -112,7 +114,7 @@ class TestDeconvolve:
         assert "".join(header["HISTORY"]).replace("\\", "") == (
             f"cd {os.getcwd()}lnocl deconvolve a.fits b.fits --psf k1.fits "
             "--background 2.5 3.0000000000000004 --read-noise 1.0 --star 7.0,5.0 --star 2.0,9.0 "
-            "--n-iter 7 --solver sgm --mu 0.001 --smoothing 0.02 --pad 3 --precision double "
+            "--n-iter 7 --stop none --solver sgm --mu 0.001 --smoothing 0.02 --pad 3 --precision double "
             "--engine numpy -o out.fits"
         )
 
@@ -152,7 +154,7 @@ class TestDeconvolve:
     )
     def test_names_of_any_kind_are_read_written_and_repeated(self, name, capsys):
         Path(name).write_bytes(Path("a.fits").read_bytes())
-        options = ("--psf", "k1.fits", "--n-iter", "1", *NUMPY, f"-oout-{name}")
+        options = ("--psf", "k1.fits", "--n-iter", "1", *PAPER, *NUMPY, f"-oout-{name}")
         assert cli.main(["deconvolve", *options, "--", name]) == 0
         assert capsys.readouterr().out.count("\n") == 3
         first = fits.getdata(f"out-{name}")

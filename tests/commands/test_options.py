@@ -81,11 +81,11 @@ COMPLAINTS = {
     "--smoothing": (["--smoothing", "nan"], "--smoothing must be a number, finite"),
     "--n-iter": (["--n-iter", "0"], "--n-iter must be a whole number, 1 or more; 0 was given"),
     "--n-iter at most": (["--n-iter", "3000000000"], "--n-iter must be 2147483646 at most; 3000"),
-    "--stop": (["--stop", "2"], "--stop 2.0 is not known; give discrepancy, held-out, or a"),
+    "--stop": (["--stop", "2"], "--stop 2.0 is not known; give held-out, discrepancy, none"),
     "--pad": (["--pad", "-1"], "--pad must be a whole number, 0 or more, or auto; -1 was given"),
     "--pad grid": (["--pad", "5000"], "with --pad 5000 need a grid of (16384, 16384)"),
     "--engine": (["--device", "0"], "--engine numpy uses no device; leave --device '0' out"),
-    "both": (["--mu", "auto", "--smoothing", "auto"], "--mu and --smoothing cannot both be auto"),
+    "--smoothing word": (["--smoothing", "much"], "--smoothing 'much' is not known; give a number"),
     "--checkpoint-every": (
         ["--checkpoint", "c.fits", "--checkpoint-every", "-1"],
         "--checkpoint-every must be seconds, 0 or more; -1.0 was given",

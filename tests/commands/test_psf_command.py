@@ -144,6 +144,7 @@ class TestWhatItMakes:
             "40",
         )
         options = ("--star", "30.3,28.8", "--star", "50,45", "--engine", "numpy", "--n-iter", "30")
+        options += ("--stop", "none", "--quiet")
         assert cli.main([*image, *options, "-o", "sky.fits"]) == 0
         assert capsys.readouterr().err == ""
         flux = fits.getdata("sky.fits", "STARS")["flux"]

@@ -51,7 +51,12 @@ BAD_ARGUMENTS = {
     "mu negative power": (["--mu", "-1e-3"], 2, "--mu must be"),
     "mu nan": (["--mu", "nan"], 2, "--mu must be"),
     "mu minus nan": (["--mu", "-nan"], 2, "--mu must be"),
-    "mu a word": (["--mu", "little"], 2, "--mu 'little' is not known; give a number or auto"),
+    "mu a word": (["--mu", "little"], 2, "argument --mu: invalid float value: 'little'"),
+    "smoothing a word": (
+        ["--smoothing", "little"],
+        2,
+        "--smoothing 'little' is not known; give a number or auto",
+    ),
     "smoothing negative": (["--smoothing", "-1"], 2, "--smoothing must be"),
     "background": (["--background", "-1"], 2, "--background must be finite and not negative; -1"),
     "background nan": (["--background", "nan"], 2, "--background must be finite"),

@@ -277,7 +277,7 @@ class TestCommandLine:
 
     COMMAND = (
         *("deconvolve", "a.fits", "--psf", "k.fits", "--n-iter", "1", "--engine", "numpy"),
-        *("--exposure", "EXPTIME", "--quiet"),
+        *("--stop", "none", "--exposure", "EXPTIME", "--quiet"),
     )
 
     @pytest.fixture(autouse=True)

@@ -7,7 +7,7 @@ import pyopencl as cl
 import pytest
 from processes import run_python
 from runtimes import on_pocl
-from scenes import make_smooth_psfs
+from scenes import make_smooth_psfs, paper
 
 import lnocl
 from lnocl.engines import opencl
@@ -45,7 +45,7 @@ def fail_with(error, after=0):
 def refused(**keywords):
     """Return the one line that a deconvolution is refused with."""
     with pytest.raises(lnocl.DeviceError) as caught:
-        lnocl.deconvolve(observe(), **{"n_iter": 40, **keywords})
+        paper(observe(), **{"n_iter": 40, **keywords})
     assert "\n" not in str(caught.value)
     assert caught.value.__cause__ is not None
     return str(caught.value)
@@ -96,9 +96,7 @@ def test_a_lost_device_is_said_while_it_iterates(monkeypatch, kind, code, solver
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
 def test_too_little_memory_for_a_run_that_goes_on_is_no_lost_device(monkeypatch, tmp_path, solver):
     saved = str(tmp_path / "run.fits")
-    lnocl.deconvolve(
-        observe(), n_iter=40, solver=solver, checkpoint=saved, callback=lambda k, _: k == 20
-    )
+    paper(observe(), n_iter=40, solver=solver, checkpoint=saved, callback=lambda k, _: k == 20)
     error = error_of(cl.RuntimeError, "OUT_OF_RESOURCES", "clEnqueueNDRangeKernel")
     genuine = opencl.OpenCLEngine.restore
 
@@ -120,7 +118,7 @@ def test_a_device_lost_while_the_host_waits(monkeypatch):
     monkeypatch.undo()
     assert device.context_of(device.choose().device) is not lost
     assert not program._programs
-    lnocl.deconvolve(observe(), n_iter=1)
+    paper(observe(), n_iter=1)
 
 
 def test_every_public_verb_of_the_engine_is_guarded():
@@ -160,13 +158,13 @@ def test_memory_that_is_really_short():
 import resource
 deconvolve()
 large = lnocl.Observation(np.full((2048, 2048), 5.0), np.ones((3, 3)))
-lnocl.deconvolve(large, n_iter=1, precision="double")  # which builds the kernels
+paper(large, n_iter=1, precision="double")  # which builds the kernels
 pages = int(open("/proc/self/statm").read().split()[0])
 for room in (170, 200, 230):
     limit = pages * resource.getpagesize() + room * 2**20
     resource.setrlimit(resource.RLIMIT_AS, (limit, resource.getrlimit(resource.RLIMIT_AS)[1]))
     try:
-        lnocl.deconvolve(large, n_iter=1, precision="double")
+        paper(large, n_iter=1, precision="double")
     except lnocl.DeviceError as error:
         print(error)
     except MemoryError:
@@ -185,7 +183,7 @@ import multiprocessing
 runs = []
 def begun(iteration, estimate):
     runs.append(estimate._run)
-lnocl.deconvolve(observation, n_iter=1, callback=begun)
+paper(observation, n_iter=1, callback=begun)
 def child(what):
     try:
         deconvolve() if what == "new" else runs[0].extended()
@@ -231,7 +229,7 @@ def test_a_fork_after_opencl_may_use_the_reference():
 deconvolve()
 process = os.fork()
 if process == 0:
-    lnocl.deconvolve(observation, n_iter=1, engine="numpy")
+    paper(observation, n_iter=1, engine="numpy")
     os._exit(0)
 assert os.waitpid(process, 0)[1] == 0
 """
@@ -276,7 +274,7 @@ def test_an_estimate_is_proven_by_its_objective_before_it_is_kept(
     keywords = {"solver": solver, "engine": "numpy", "n_iter": 20}
     for files in ({"checkpoint": path, "checkpoint_every": every}, {"resume": path}):
         with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
-            result = lnocl.deconvolve(observe(), **keywords, **files)
+            result = paper(observe(), **keywords, **files)
         assert (result.stop_reason, result.n_iter) == ("not finite", 5)
         assert len(result.history) == 6
         assert np.isfinite(result.history["objective"]).all()
@@ -304,14 +302,14 @@ def test_a_run_ends_before_the_objective_is_not_finite(engine, solver, what, at,
 
     keywords = {"solver": solver, "engine": engine, "stars": [(5, 6)]}
     with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
-        result = lnocl.deconvolve(observe(), n_iter=n_iter, callback=callback, **keywords)
+        result = paper(observe(), n_iter=n_iter, callback=callback, **keywords)
     assert result.stop_reason == "not finite"
     assert at - 1 <= result.n_iter <= at
     assert len(seen) <= min(n_iter, at + 2 * opencl.FETCH_EVERY)
     assert len(result.history) == result.n_iter + 1
     assert np.isfinite(result.history["objective"]).all()
     if result.n_iter:
-        expected = lnocl.deconvolve(observe(), n_iter=result.n_iter, **keywords)
+        expected = paper(observe(), n_iter=result.n_iter, **keywords)
         assert np.array_equal(result.extended, expected.extended)
         assert np.array_equal(result.star_fluxes, expected.star_fluxes)
         assert np.array_equal(result.history, expected.history)
@@ -341,7 +339,7 @@ def test_a_run_that_moves_stars_ends_before_the_objective_is_not_finite(engine, 
             poison(estimate._run.engine, "extended")
 
     with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
-        result = lnocl.deconvolve(observation, n_iter=20, callback=callback, **keywords)
+        result = paper(observation, n_iter=20, callback=callback, **keywords)
     assert result.stop_reason == "not finite"
     assert at - 1 <= result.n_iter <= at
     assert len(result.history) == result.n_iter + 1
@@ -361,7 +359,7 @@ def test_a_device_that_always_computes_nan_is_refused(monkeypatch, engine, solve
 
     monkeypatch.setattr(kind, "ratio", poisoned)
     with pytest.raises(lnocl.DeviceError, match=r"the objective .*is infinite or not"):
-        lnocl.deconvolve(observe(), n_iter=20, engine=engine, solver=solver)
+        paper(observe(), n_iter=20, engine=engine, solver=solver)
 
 
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
@@ -377,12 +375,10 @@ def test_a_checkpoint_is_not_replaced_by_what_is_not_finite(tmp_path, solver, wh
     keywords = {"solver": solver, "n_iter": 12, "stars": [(5, 6)], "stop": 1e-9}
     every = {"checkpoint": path, "checkpoint_every": 0}
     with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
-        result = lnocl.deconvolve(observe(), callback=callback, **every, **keywords)
+        result = paper(observe(), callback=callback, **every, **keywords)
     assert result.stop_reason == "not finite"
     assert 6 <= result.n_iter <= 8
-    resumed, expected = (
-        lnocl.deconvolve(observe(), **keywords, **which) for which in ({"resume": path}, {})
-    )
+    resumed, expected = (paper(observe(), **keywords, **which) for which in ({"resume": path}, {}))
     assert resumed.n_iter == expected.n_iter == 12
     assert np.array_equal(resumed.extended, expected.extended)
     assert np.array_equal(resumed.history, expected.history)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scenes import FEWER_ENGINES, blur, make_psfs, worst
+from scenes import FEWER_ENGINES, blur, make_psfs, paper, worst
 
 import lnocl
 from lnocl.opencl import program
@@ -36,7 +36,7 @@ def deconvolve(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lnocl.LnoclWarning)
         observation = lnocl.Observation(images, psfs, background=background, mask=mask)
-        result = lnocl.deconvolve(observation, stars=stars, n_iter=n_iter, **engine, **more)
+        result = paper(observation, stars=stars, n_iter=n_iter, **engine, **more)
     for values in (result.extended, result.star_fluxes, result.history["objective"]):
         assert np.isfinite(values).all()
     assert (result.extended >= 0).all()
@@ -199,9 +199,9 @@ def test_single_precision_is_warned_of_in_very_long_runs():
     observation = lnocl.Observation(np.ones(SHAPE), np.ones((1, 1)))
     once = {"callback": lambda *_: True}
     with pytest.warns(lnocl.LnoclWarning, match="stray from double by 0.002 of the extended"):
-        lnocl.deconvolve(observation, n_iter=200_000, **once)
-    lnocl.deconvolve(observation, n_iter=100_000, **once)
-    lnocl.deconvolve(observation, n_iter=200_000, precision="double", **once)
+        paper(observation, n_iter=200_000, **once)
+    paper(observation, n_iter=100_000, **once)
+    paper(observation, n_iter=200_000, precision="double", **once)
 
 
 @pytest.mark.exhaustive

@@ -7,6 +7,7 @@ import pytest
 from astropy import units as u
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scenes import paper
 
 import lnocl
 
@@ -74,7 +75,7 @@ def deconvolve(observation, **keywords):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", lnocl.LnoclWarning)
-        return lnocl.deconvolve(lnocl.Observation(**observation), **keywords)
+        return paper(lnocl.Observation(**observation), **keywords)
 
 
 def check(result):

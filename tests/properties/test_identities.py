@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import FEWER_ENGINES, Recipe, blur, make_psfs, same, worst
+from scenes import FEWER_ENGINES, Recipe, blur, make_psfs, paper, same, worst
 
 import lnocl
 from lnocl import reference
@@ -154,7 +154,7 @@ def test_truth_is_a_fixed_point(engine):
 def test_one_iteration_through_a_single_pixel_averages_the_images(engine):
     made = BARE.make()
     observation = lnocl.Observation(made.images, np.ones((1, 1)))
-    result = lnocl.deconvolve(observation, n_iter=1, **engine)
+    result = paper(observation, n_iter=1, **engine)
     tolerance = SUM_ROUNDING[engine["precision"]]
     assert worst(result.extended, made.images.mean(axis=0)) <= tolerance
 
@@ -177,7 +177,7 @@ def test_faint_pixels_are_not_lost_in_a_floor(engine):
     faint = image.copy()
     image[5, 9] = 512e9
     observation = lnocl.Observation([image] * 3, np.ones((1, 1)))
-    result = lnocl.deconvolve(observation, n_iter=5, **engine)
+    result = paper(observation, n_iter=5, **engine)
     extended = result.extended.copy()
     extended[5, 9] = faint[5, 9]
     np.testing.assert_allclose(extended, faint, rtol=6e-5)
@@ -189,7 +189,7 @@ def test_rounding_makes_nothing_negative(engine):
     image = np.zeros(SHAPE)
     image[5, 9] = 1000.0
     observation = lnocl.Observation([image] * 3, make_psfs(3, (2, 2)), background=1.0)
-    result = lnocl.deconvolve(observation, n_iter=1, **engine)
+    result = paper(observation, n_iter=1, **engine)
     assert result.extended.min() == 0.0
 
 
@@ -448,10 +448,8 @@ def test_kind_of_array_does_not_matter(shape, dtype, layout, masking, seed):
         other = np.ma.array(other, mask=bad)
     if masking == "numpy.ma and mask":
         other = np.ma.array(images.astype(dtype), mask=bad & (rng.random(shape) < 0.5))
-    result = lnocl.deconvolve(
-        lnocl.Observation(other, psfs, mask=mask), n_iter=3, engine="numpy", **start
-    )
-    same(result, lnocl.deconvolve(plain, n_iter=3, engine="numpy", **start))
+    result = paper(lnocl.Observation(other, psfs, mask=mask), n_iter=3, engine="numpy", **start)
+    same(result, paper(plain, n_iter=3, engine="numpy", **start))
     assert result.extended.shape == shape[1:]
     assert np.isfinite(result.extended).all()
     assert (result.extended >= 0).all()

@@ -18,14 +18,14 @@ pytestmark = pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 STARS = Recipe((8, 16), 2, 2, mu=1e-3, smoothing=0.01, masked=0.05, psf_shape=(3, 3))
 ON_DEVICE = Recipe((16, 32), 2, 2, mu=1e-3, smoothing=0.01, masked=0.05)  # as other tests build
 N_ITER = 8
-# Runs that are cut off at an iteration, or where held-out counts try another penalty.
+# Runs that are cut off at an iteration.
 KINDS = {
     "sgm": {},
     "sgp": {"solver": "sgp"},
     "refined": {"solver": "sgp", "refine_positions": True},
     "change": {"stop": 1e-9},
     "discrepancy": {"stop": "discrepancy"},
-    "held-out": {"solver": "sgp", "mu": "auto", "n_iter": 12},
+    "held-out": {"solver": "sgp", "stop": "held-out", "n_iter": 12},
 }
 NUMBERS = (
     -5, -1, 0, 1, 2, 3, 0.5, 7, 1000, 1e9, 2**31, -(2**31), 1e-300, 1e30, 1e38, 1e300, -1e300,
@@ -41,21 +41,7 @@ def make_saved(folder, kind, engine="numpy"):
     recipe = STARS if engine == "numpy" else ON_DEVICE
     made, path = recipe.make(), str(folder / f"{kind}.fits")
     given = {"n_iter": N_ITER, "engine": engine} | KINDS[kind]
-    cut = {"checkpoint": path, "checkpoint_every": 0.0 if kind == "held-out" else 1e9}
-    if kind != "held-out":
-        made.deconvolve(**given, **cut, callback=lambda k, _: k == 4)
-        return made, given, checkpoint.read(path)
-    genuine = checkpoint.write
-
-    def write(*arguments):
-        if "candidates" in arguments[3]:
-            genuine(*arguments)
-            raise KeyboardInterrupt
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(checkpoint, "write", write)
-        with pytest.raises(KeyboardInterrupt):
-            made.deconvolve(**given, **cut)
+    made.deconvolve(**given, checkpoint=path, checkpoint_every=1e9, callback=lambda k, _: k == 4)
     return made, given, checkpoint.read(path)
 
 
@@ -86,11 +72,29 @@ WRONG = [
     ("star_information", -np.ones((2, 2)), "star_information holds no Fisher information"),
     ("star_fluxes", np.ones(3), "star_fluxes is float64 of shape (3), and must be float64 of "
      "shape (2)"),
-    ("choice", [0.5, 0.01, 8.0], "choice holds 0.5, and must be 0.001"),
-    ("choice", [1e-3, 0.01, 1e9], "choice holds 1e+09, and must be 8"),
-    ("choice", None, "choice is missing"),
     ("more", np.ones(3), "more is not an array of such a run"),
 ]  # fmt: skip
+
+
+WRONG_HALVES = [
+    ("next_look", [10**9], "next_look holds 1e+09, and must be from 1 to 34"),
+    ("halves_1_progress", [3, 12, 1], "halves_1_objectives is float64 of shape (5), "
+     "and must be float64 of shape (3 to 4)"),
+    ("snapshots_iteration", [1, 2, 4, 3], "snapshots_iteration does not lead to iteration 4"),
+    ("snapshots_iteration", [1, 2], "snapshots_extended is float64 of shape (4, 2, 8, 16), and "
+     "must be float64 of shape (2, 2, 8, 16)"),
+    ("snapshots_extended", None, "snapshots_extended is missing"),
+    ("more", np.ones(3), "more is not an array of such a run"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "values", "words"), WRONG_HALVES)
+def test_the_message_says_what_is_wrong_with_halves(name, values, words, all_saved, tmp_path):
+    path = str(tmp_path / "crafted.fits")
+    values = None if values is None else np.array(values)
+    with pytest.raises(lnocl.FileError) as caught:
+        resume(*all_saved["held-out"], path, **{name: values})
+    assert str(caught.value) == f"the checkpoint {path} is of no such run: {words}; start anew"
 
 
 @pytest.mark.parametrize(("name", "values", "words"), WRONG)
@@ -198,7 +202,7 @@ def leave_out(chance, arrays, name):
 
 
 def add(chance, arrays, name):
-    other = chance.choice(["more", "choice", "rule", "curve", "candidates", "shift", "halves_7_x"])
+    other = chance.choice(["more", "rule", "next_look", "shift", "halves_7_x"])
     arrays[other] = arrays[name]
 
 

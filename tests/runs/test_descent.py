@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from scenes import same
+from scenes import paper, same
 
 import lnocl
 from lnocl.errors import DivergedError, NotFiniteError
@@ -45,15 +45,13 @@ rises = pytest.warns(lnocl.LnoclWarning, match="the objective rises: .* is that 
 def test_the_result_is_the_estimate_of_the_least_objective(engine, seed):
     iterations = []
     with rises as caught:
-        result = lnocl.deconvolve(
-            observe(seed), engine=engine, callback=lambda k, _: iterations.append(k)
-        )
+        result = paper(observe(seed), engine=engine, callback=lambda k, _: iterations.append(k))
     assert result.stop_reason == "diverged"
     assert len(iterations) < 200  # of 1000
     objective = result.history["objective"]
     assert len(objective) == result.n_iter + 1 > 2
     assert objective.argmin() == result.n_iter
-    same(result, lnocl.deconvolve(observe(seed), engine=engine, n_iter=result.n_iter))
+    same(result, paper(observe(seed), engine=engine, n_iter=result.n_iter))
     assert result.extended.sum() == pytest.approx(disc().sum(), rel=0.02)
     assert result.extended.max() < 0.2 * result.extended.sum()
     assert [each.filename for each in caught] == [__file__]
@@ -66,13 +64,13 @@ def test_the_result_is_the_estimate_of_the_least_objective(engine, seed):
 def test_without_it_all_the_light_is_in_one_pixel(monkeypatch):
     """The trap is there."""
     monkeypatch.setattr("lnocl.runs.descent.N_ABOVE", 10**9)
-    result = lnocl.deconvolve(observe(4), engine="numpy")
+    result = paper(observe(4), engine="numpy")
     assert result.stop_reason == "n_iter"
     assert result.extended.max() > 0.9 * result.extended.sum()
 
 
 def test_the_scaled_gradient_projection_method_is_not_trapped():
-    result = lnocl.deconvolve(observe(4), engine="numpy", solver="sgp")
+    result = paper(observe(4), engine="numpy", solver="sgp")
     assert (np.diff(result.history["objective"]) <= 0).all()
     assert result.extended.sum() == pytest.approx(disc().sum(), rel=0.02)
     assert result.extended.max() < 0.05 * result.extended.sum()
@@ -84,40 +82,41 @@ def test_a_run_cut_off_ends_where_it_would_have(cut, every, tmp_path):
     """With checkpoints before the least objective, and after it."""
     path, given = tmp_path / "run.fits", {"engine": "numpy", "stop": "discrepancy"}
     with rises:
-        whole = lnocl.deconvolve(observe(1), **given)
+        whole = paper(observe(1), **given)
     assert 1 < whole.n_iter < 6
-    lnocl.deconvolve(
+    paper(
         observe(1), **given, checkpoint=path, checkpoint_every=every, callback=lambda k, _: k == cut
     )
     with rises:
-        resumed = lnocl.deconvolve(observe(1), **given, resume=path)
+        resumed = paper(observe(1), **given, resume=path)
     same(resumed, whole)
     assert (resumed.stop_reason, resumed.n_iter) == ("diverged", whole.n_iter)
     with rises:
-        same(lnocl.deconvolve(observe(1), **given, resume=path, checkpoint=path), whole)
+        same(paper(observe(1), **given, resume=path, checkpoint=path), whole)
 
 
 @pytest.mark.parametrize("engine", ["numpy", "opencl"])
 def test_it_is_noticed_at_the_end_of_a_short_run(engine):
     """Long before the device is asked for objectives."""
     with rises:
-        result = lnocl.deconvolve(observe(1), engine=engine, n_iter=20)
+        result = paper(observe(1), engine=engine, n_iter=20)
     assert (result.stop_reason, result.n_iter) == ("diverged", 4)
 
 
-@pytest.mark.filterwarnings("ignore:the objective rises. .* is that of iteration")
-def test_halves_of_held_out_counts_end_there():
+def test_halves_of_held_out_counts_end_there(monkeypatch):
+    monkeypatch.setattr("lnocl.runs.held_out.MIN_ITERATIONS", 50)
     with pytest.warns(lnocl.LnoclWarning, match="held-out counts choose among") as caught:
-        result = lnocl.deconvolve(observe(1), engine="numpy", mu="auto", n_iter=100)
-    ends = [str(each.message).rsplit(" ", 1)[1] for each in caught if "among" in str(each.message)]
-    without_mu = result.held_out[result.held_out["mu"] == 0]
-    assert without_mu["iteration"][-1] == int(ends[0]) < 20
+        result = paper(observe(1), engine="numpy", stop="held-out", n_iter=100)
+    end = int(str(caught[0].message).rsplit(" ", 1)[1])
+    assert result.held_out["iteration"][-1] == end < 20
     assert result.extended.sum() == pytest.approx(disc().sum(), rel=0.02)
 
 
-def test_halves_that_rise_from_the_start_are_refused():
+def test_halves_that_rise_from_the_start_are_refused(monkeypatch):
+    monkeypatch.setattr("lnocl.runs.held_out.MIN_ITERATIONS", 50)
+    monkeypatch.setattr("lnocl.runs.run.Run.best_iteration", lambda run: 0)
     with pytest.raises(DivergedError, match=r"the objective rises: .*; mend the psfs, or take"):
-        lnocl.deconvolve(observe(0), engine="numpy", mu="auto", n_iter=100)
+        paper(observe(1), engine="numpy", stop="held-out", n_iter=100)
 
 
 class TestDescent:

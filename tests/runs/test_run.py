@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.runs.run import Run, Setup
+from lnocl.runs.run import Run
+from lnocl.runs.start import Setup, make_start
 from lnocl.scene.penalty import Penalty
 
 GOOD = (12, 9)
@@ -14,20 +15,24 @@ PSF = np.exp(-(X**2 + Y**2) / 3.0)
 
 def run_of(observation, stars):
     setup = Setup(stars, 0, "sgm", "double", "numpy", None, refine_positions=True)
-    return Run(setup, observation, Penalty(), 1)
+    return Run(make_start(setup, observation, Penalty()), 1)
+
+
+def errors_of(run):
+    return run.outcome(Penalty(), "n_iter").star_errors()
 
 
 def test_errors_of_stars_that_have_come_to_one_place_are_nan_and_said():
     observation = lnocl.Observation(np.full((32, 32), 9.0), PSF)
     run = run_of(observation, [(8.0, 9.0), (8.5, 9.0), (23.0, 22.0)])
-    run.star_errors()
+    errors_of(run)
     alone = run.scene.stars[2]
     run.scene.move_stars([(8.25, 9.0), (8.25, 9.0), alone])
     with pytest.warns(
         lnocl.LnoclWarning,
         match=r"do not determine .* each star at \(8\.25, 9\), \(8\.25, 9\), so that these errors",
     ):
-        fluxes, positions = run.star_errors()
+        fluxes, positions = errors_of(run)
     np.testing.assert_array_equal(np.isnan(fluxes), [True, True, False])
     np.testing.assert_array_equal(np.isnan(positions[2]), [False, False])
     assert np.isnan(positions[:2]).any(axis=1).all()
@@ -39,5 +44,5 @@ def test_errors_of_a_star_with_one_good_pixel_are_nan():
     mask[GOOD[::-1]] = False
     run = run_of(lnocl.Observation(np.full((32, 32), 9.0), PSF, mask=mask), [(12.3, 9.2)])
     with pytest.warns(lnocl.LnoclWarning, match=r"of each star at \(\d+\.?\d*, "):
-        fluxes, _ = run.star_errors()
+        fluxes, _ = errors_of(run)
     assert np.isnan(fluxes).all()

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scenes import blur, make_psfs
+from scenes import blur, make_psfs, paper
 
 import lnocl
 
@@ -20,7 +20,7 @@ PSFS = make_psfs(2, (5, 6))
 
 def solve(psfs=PSFS, stars=STARS, pad=0, refine=False, images=IMAGES, **known):
     observation = lnocl.Observation(images, psfs, **known)
-    result = lnocl.deconvolve(
+    result = paper(
         observation, stars=stars, n_iter=4, pad=pad, engine="numpy", refine_positions=refine
     )
     return observation, result

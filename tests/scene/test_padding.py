@@ -4,9 +4,10 @@ import logging
 
 import numpy as np
 import pytest
+from scenes import paper
 
 import lnocl
-from lnocl.scene.padding import recommend_pad
+from lnocl.scene.padding import choose_pad, recommend_pad
 from lnocl.scene.scene import Scene
 
 Y, X = np.indices((41, 41)) - 20
@@ -40,13 +41,41 @@ def test_at_most_half_the_shorter_side_and_at_least_one():
 
 @pytest.mark.parametrize("engine", ["numpy", pytest.param("opencl", marks=pytest.mark.exhaustive)])
 def test_auto_is_that_pad_and_is_announced(engine, caplog):
-    observation = observe()
+    observation = lnocl.Observation(np.full((64, 64), 9.0), GAUSSIAN)
     with caplog.at_level(logging.INFO, "lnocl"):
-        found = lnocl.deconvolve(observation, pad="auto", n_iter=2, engine=engine)
-    assert "pad: 7 pixels, by the PSFs" in caplog.messages
-    expected = lnocl.deconvolve(observation, pad=7, n_iter=2, engine=engine)
+        found = paper(observation, pad="auto", n_iter=2, engine=engine)
+    words = "pad chosen: 7 pixels, as light runs over the edge of the images"
+    assert words in caplog.messages
+    expected = paper(observation, pad=7, n_iter=2, engine=engine)
     np.testing.assert_array_equal(found.extended, expected.extended)
     assert Scene(observation, pad="auto").grid == (128, 128)
+
+
+def test_auto_is_no_pad_where_no_light_runs_over_the_edge(caplog):
+    """Of noise alone, and of a star in the middle: fresh images, none over."""
+    for seed in range(100):
+        images = np.random.default_rng(seed).poisson(20.0, (2, 60, 64)).astype(float)
+        images[:, 30:33, 30:33] += 500.0
+        images[:, 0, seed % 60 : seed % 60 + 3] = np.nan if seed % 2 else 20.0
+        mask = np.isnan(images)
+        observation = lnocl.Observation(np.ma.masked_array(images, mask), GAUSSIAN, background=20.0)
+        assert choose_pad(observation) == 0
+    with caplog.at_level(logging.INFO, "lnocl"):
+        assert Scene(observation, pad="auto").grid == (64, 64)
+    words = "pad chosen: 0 pixels, as no light runs over the edge of the images"
+    assert words in caplog.messages
+
+
+@pytest.mark.parametrize("edge", [np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]])
+def test_light_at_any_edge_of_any_image_is_found(edge):
+    images = np.random.default_rng(1).poisson(20.0, (2, 60, 70)).astype(float)
+    images[1][edge][-9:] += 30.0
+    level = np.full((2, 60, 70), 20.0)
+    for background in (20.0, level):
+        observation = lnocl.Observation(images, GAUSSIAN, background=background)
+        assert choose_pad(observation) == recommend_pad(observation) == 7
+    level[1][edge][-9:] += 30.0
+    assert choose_pad(lnocl.Observation(images, GAUSSIAN, background=level)) == 0
 
 
 def test_source_that_runs_over_the_edge_is_found_with_it():
@@ -59,6 +88,6 @@ def test_source_that_runs_over_the_edge_is_found_with_it():
     )
     errors = {}
     for pad in (0, "auto"):
-        found = lnocl.deconvolve(observation, pad=pad, n_iter=30, engine="numpy").extended
+        found = paper(observation, pad=pad, n_iter=30, engine="numpy").extended
         errors[pad] = np.sqrt(np.mean((found - sky)[10:-10, -10:] ** 2))
     assert errors["auto"] < errors[0] / 8  # measured a twentieth

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from astropy.nddata import CCDData
-from scenes import Recipe, make_psfs
+from scenes import Recipe, make_psfs, paper
 
 import lnocl
 from lnocl.scene.penalty import Penalty
@@ -93,9 +93,9 @@ def test_star_weights_are_the_observed_shares():
 def test_psf_larger_than_the_grid_is_announced():
     observation = lnocl.Observation(np.ones(SHAPE), make_psfs(1, (9, 5)))
     with pytest.warns(lnocl.LnoclWarning, match=r"psf \(9, 5\) is larger than the grid") as caught:
-        lnocl.deconvolve(observation, n_iter=1, engine="numpy")
+        paper(observation, n_iter=1, engine="numpy")
     assert [warning.filename for warning in caught] == [__file__]
-    lnocl.deconvolve(observation, n_iter=1, engine="numpy", pad=1)  # fits: nothing announced
+    paper(observation, n_iter=1, engine="numpy", pad=1)  # fits: nothing announced
 
 
 # --- The start
@@ -228,10 +228,13 @@ REFUSED = {
         {"precision": "half"},
         "precision 'half' is not known; choose from single, double",
     ),
-    "unknown mu": ({"mu": "best"}, "mu 'best' is not known; give a number or auto"),
+    "unknown smoothing": (
+        {"smoothing": "best"},
+        "smoothing 'best' is not known; give a number or auto",
+    ),
     "unknown rule": (
         {"stop": "never"},
-        "stop 'never' is not known; give discrepancy, held-out, or a number between 0 and 1",
+        "stop 'never' is not known; give held-out, discrepancy, none, or a number between 0 and 1",
     ),
     "change of 0": ({"stop": 0.0}, "stop 0.0 is not known"),
     "change of 1": ({"stop": 1.0}, "stop 1.0 is not known"),
@@ -298,7 +301,7 @@ REFUSED = {
 def test_refused(case):
     changes, message = REFUSED[case]
     with pytest.raises(lnocl.InputError) as caught:
-        lnocl.deconvolve(**({"observation": OBSERVATION, "n_iter": 1, "engine": "numpy"} | changes))
+        paper(**({"observation": OBSERVATION, "n_iter": 1, "engine": "numpy"} | changes))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -306,7 +309,7 @@ def test_refused(case):
 def test_image_too_large_for_the_grid_is_refused():
     observation = lnocl.Observation(np.ones((1, MAX_AXIS + 1)), np.ones((1, 1)))
     with pytest.raises(lnocl.InputError, match=r"images of \(1, 8193\) .* largest axis is 8192"):
-        lnocl.deconvolve(observation, n_iter=1, engine="numpy")
+        paper(observation, n_iter=1, engine="numpy")
 
 
 def test_star_that_no_image_observed_is_refused():
@@ -314,10 +317,10 @@ def test_star_that_no_image_observed_is_refused():
     mask[:, :5, 8:] = True
     observation = lnocl.Observation(np.ones((2, *SHAPE)), make_psfs(2, (3, 4)), mask=mask)
     with pytest.raises(lnocl.InputError, match=r"the star at \(11, 2\) lies where all .* masked"):
-        lnocl.deconvolve(observation, stars=[(3, 2), (11, 2)], n_iter=1, engine="numpy")
+        paper(observation, stars=[(3, 2), (11, 2)], n_iter=1, engine="numpy")
     mask[1] = False
     observation = lnocl.Observation(np.ones((2, *SHAPE)), make_psfs(2, (3, 4)), mask=mask)
-    lnocl.deconvolve(observation, stars=[(3, 2), (11, 2)], n_iter=1, engine="numpy")
+    paper(observation, stars=[(3, 2), (11, 2)], n_iter=1, engine="numpy")
 
 
 def hidden_star(case):
@@ -353,7 +356,7 @@ def test_star_that_one_image_observed_is_found(engine, case, solver):
     observation, star, flux = hidden_star(case)
     scene = Scene(observation, [star])
     assert 0 < scene.star_weights[0] < 0.01 * scene.n_images
-    result = lnocl.deconvolve(observation, [star], solver=solver, n_iter=30, engine=engine)
+    result = paper(observation, [star], solver=solver, n_iter=30, engine=engine)
     # Measured 7e-4, the sky below the star.
     np.testing.assert_allclose(result.star_fluxes, [flux], rtol=1.5e-3)
 
@@ -384,7 +387,7 @@ def test_negative_pixels_leave_the_weight_of_a_star_positive():
     "stars", [(), [], np.zeros((0, 2)), [(3, 4)], np.array([[3, 4]]), ((3.0, 4),)]
 )
 def test_stars_are_any_sequence_of_pairs(stars):
-    result = lnocl.deconvolve(OBSERVATION, stars=stars, n_iter=np.int64(2), engine="numpy")
+    result = paper(OBSERVATION, stars=stars, n_iter=np.int64(2), engine="numpy")
     assert result.star_fluxes.shape == (len(stars),)
     assert result.device == "numpy"
 
@@ -454,7 +457,6 @@ def test_an_image_that_is_all_masked_says_nothing_of_stars():
     both = lnocl.Observation(images, np.ones((3, 3)), mask=mask)
     one = lnocl.Observation(images[1:], np.ones((3, 3)))
     found, expected = (
-        lnocl.deconvolve(observation, stars=[(3, 3)], n_iter=5, engine="numpy")
-        for observation in (both, one)
+        paper(observation, stars=[(3, 3)], n_iter=5, engine="numpy") for observation in (both, one)
     )
     assert np.allclose(found.star_fluxes, expected.star_fluxes, rtol=1e-10)

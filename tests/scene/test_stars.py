@@ -5,10 +5,11 @@ import tracemalloc
 import numpy as np
 import pytest
 from astropy import units as u
-from scenes import make_psfs, make_smooth_psfs, worst
+from scenes import make_psfs, make_smooth_psfs, paper, worst
 
 import lnocl
-from lnocl.runs.run import Run, Setup
+from lnocl.runs.run import Run
+from lnocl.runs.start import Setup, make_start
 from lnocl.scene import shifting
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
@@ -95,7 +96,7 @@ def test_each_psf_is_transformed_once_and_each_star_placed_once(monkeypatch):
     monkeypatch.setattr(shifting, "_Spectrum", Counted)
     observation = lnocl.Observation(np.full((2, 32, 32), 9.0), make_psfs(2, (32, 32)))
     stars = [(4.3, 5.2), (20.1, 9.0), (6.0, 30.7)]
-    lnocl.deconvolve(observation, stars, solver="sgp", smoothing=1e-3, n_iter=2, engine="numpy")
+    paper(observation, stars, solver="sgp", smoothing=1e-3, n_iter=2, engine="numpy")
     assert len(made) == 2
     assert len(placed) == 2 * 3 + 2  # and each PSF once to see whether it rings
 
@@ -119,7 +120,7 @@ def test_memory_does_not_grow_as_stars_times_pixels(refines, solver, monkeypatch
     setup = Setup(stars, 0, solver, "double", "numpy", None, refine_positions=refines)
     tracemalloc.start()
     try:
-        Run(setup, observation, Penalty(smoothing=1e-3), 3)
+        Run(make_start(setup, observation, Penalty(smoothing=1e-3)), 3)
         _, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

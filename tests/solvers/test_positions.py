@@ -9,12 +9,13 @@ import warnings
 
 import numpy as np
 import pytest
-from scenes import FEWER_ENGINES, Recipe, worst
+from scenes import FEWER_ENGINES, Recipe, paper, worst
 from scipy.optimize import minimize
 from scipy.special import kl_div
 
 import lnocl
-from lnocl.runs.run import Run, Setup
+from lnocl.runs.run import Run
+from lnocl.runs.start import Setup, make_start
 from lnocl.scene.forward_model import Model
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
@@ -259,7 +260,7 @@ def test_errors_fall_as_the_root_of_the_counts(factor):
     start = {"stars": [(15, 16)], "initial_star_fluxes": [500.0], "n_iter": 1}
 
     def errors(images, **known):
-        return lnocl.deconvolve(
+        return paper(
             lnocl.Observation(images, PSF, background=2.0 * images.sum() / mean.sum(), **known),
             refine_positions=True, initial_extended=np.full(SHAPE, 1e-9), **start, **numpy_alone,
         )  # fmt: skip
@@ -286,16 +287,14 @@ def test_a_star_keeps_within_its_radius():
             assert gone == pytest.approx(RADIUS, abs=1e-12)
         else:
             assert np.hypot(*(values[1:] - (15, 16))) <= 0.1
-    result = lnocl.deconvolve(
-        observation, [(20, 16)], n_iter=20, refine_positions=True, **numpy_alone
-    )
+    result = paper(observation, [(20, 16)], n_iter=20, refine_positions=True, **numpy_alone)
     assert np.hypot(*(result.star_positions[0] - (20, 16))) <= RADIUS + 1e-12
 
 
 def test_a_star_without_light_is_left_alone():
     """Its flux ends at 0, where its position means nothing and its error is infinite."""
     observation = lnocl.Observation(np.zeros(SHAPE), PSF, background=3.0)
-    result = lnocl.deconvolve(
+    result = paper(
         observation, [(15, 16)], n_iter=3, refine_positions=True, initial_star_fluxes=[0.0],
         **numpy_alone,
     )  # fmt: skip
@@ -308,9 +307,7 @@ def test_a_star_without_light_is_left_alone():
 def test_a_star_may_leave_the_images_but_not_go_where_all_is_masked():
     """It must not end the run."""
     observation = flat_sky(-1.2, 16.0, 3000.0, 5.0, 0)
-    result = lnocl.deconvolve(
-        observation, [(0, 16)], n_iter=6, pad=8, refine_positions=True, **numpy_alone
-    )
+    result = paper(observation, [(0, 16)], n_iter=6, pad=8, refine_positions=True, **numpy_alone)
     assert result.star_positions[0, 0] < -0.5
     mask = np.zeros(SHAPE, bool)
     mask[:, 16:] = True
@@ -515,7 +512,7 @@ def test_steps_are_measured_anew_where_stars_have_moved(monkeypatch):
 
     monkeypatch.setattr(scaling, "prepare", prepare_and_note)
     setup = Setup(made.stars + OFF, 0, "sgp", "double", "numpy", None, refine_positions=True)
-    run = Run(setup, made.observation(), Penalty(), 7)
+    run = Run(make_start(setup, made.observation(), Penalty()), 7)
     assert list(run) == list(range(1, 8))
     assert len(prepared) == 3  # at the start, after 3 and after 6
     assert run.engine.scaling is prepared[-1][1]

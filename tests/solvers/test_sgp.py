@@ -12,7 +12,7 @@ import pytest
 from explicit_matrix import Problem, problem_of, relative_error, unknowns
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import FEWER_ENGINES, Recipe, blur, make_psfs, same, worst
+from scenes import FEWER_ENGINES, Recipe, blur, make_psfs, paper, same, worst
 from scipy.optimize import minimize
 
 import lnocl
@@ -166,9 +166,9 @@ def test_dark_sky_beside_a_bright_star_is_no_trap(contrast):
     means = np.maximum([blur(sky, psf) for psf in psfs], 0.0)
     observation = lnocl.Observation(np.random.default_rng(0).poisson(means).astype(float), psfs)
     objectives = [
-        lnocl.deconvolve(
-            observation, [(9, 6)], solver=solver, n_iter=n_iter, engine="numpy"
-        ).history["objective"][-1]
+        paper(observation, [(9, 6)], solver=solver, n_iter=n_iter, engine="numpy").history[
+            "objective"
+        ][-1]
         for solver, n_iter in (("sgp", 100), ("sgm", 300))
     ]
     assert objectives[0] < objectives[1]  # by 5 to 6 %
@@ -251,7 +251,7 @@ def small_scene(seed, n_images, n_stars, counts, contrast, share, masked):
 
 def solve(images, psfs, background, mask, stars, mu, n_iter):
     observation = lnocl.Observation(images, psfs, background=background, mask=mask)
-    return lnocl.deconvolve(observation, stars, mu=mu, solver="sgp", n_iter=n_iter, engine="numpy")
+    return paper(observation, stars, mu=mu, solver="sgp", n_iter=n_iter, engine="numpy")
 
 
 def logarithmic(least, most):
@@ -526,7 +526,7 @@ def extreme_images():
 def test_extremes(engine, images, background):
     made = SCENES["star, mask, mu"].make()
     observation = made.observation(images=images + background, background=background)
-    result = lnocl.deconvolve(observation, made.stars, mu=1e-3, solver="sgp", n_iter=30, **engine)
+    result = paper(observation, made.stars, mu=1e-3, solver="sgp", n_iter=30, **engine)
     for values in (result.extended, result.star_fluxes, result.history["objective"]):
         assert np.isfinite(values).all()
         assert (values >= 0).all()

@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.table import Table
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import Recipe
+from scenes import Recipe, paper
 
 import lnocl
 from lnocl import metrics
@@ -44,7 +44,7 @@ def run(*arguments):
 
 
 def by_numpy(*arguments, device, **keywords):
-    return lnocl.deconvolve(*arguments, engine="numpy", **keywords)
+    return paper(*arguments, engine="numpy", **keywords)
 
 
 @pytest.fixture(
@@ -71,7 +71,7 @@ def numpy_only(monkeypatch):
 
 
 def direct(row, engine, n_iter=None):
-    return lnocl.deconvolve(
+    return paper(
         MADE.observation(),
         MADE.stars,
         mu=1e-4,
@@ -255,7 +255,7 @@ class TestCommand:
         assert run("--size", "64", "-o", "out") == 0
         table = Table.read("out.ecsv")
         simulation = simulate(hh34(64))
-        result = lnocl.deconvolve(
+        result = paper(
             experiment.observe(simulation),
             simulation.stars,
             mu=demo.MU,

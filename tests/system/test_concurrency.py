@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from runtimes import on_pocl
+from scenes import paper
 
 import lnocl
 from lnocl.io.fitsread import read_stack
@@ -51,7 +52,7 @@ def test_two_threads_are_right(solver, sizes):
 
     def run(seed, n):
         observation, stars = arguments(seed, n)
-        return lnocl.deconvolve(observation, stars, solver=solver, n_iter=60)
+        return paper(observation, stars, solver=solver, n_iter=60)
 
     with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(together, (4, 7), sizes))
@@ -70,7 +71,7 @@ def test_one_thread_goes_on_where_another_fails():
         failing = pool.submit(lnocl.deconvolve, observation, stars, n_iter=60, callback=fail)
         going = pool.submit(lnocl.deconvolve, observation, stars, n_iter=60)
     assert isinstance(failing.exception(), KeyError)
-    assert_same(going.result(), lnocl.deconvolve(observation, stars, n_iter=60))
+    assert_same(going.result(), paper(observation, stars, n_iter=60))
 
 
 def test_threads_leave_warnings_as_they_were(tmp_path):
@@ -125,7 +126,7 @@ import lnocl
 observation = lnocl.Observation(np.arange(64.0).reshape(8, 8), np.ones((3, 3)), background=1.0)
 print("ready", flush=True)
 sys.stdin.readline()
-result = lnocl.deconvolve(observation, n_iter=20)
+result = lnocl.deconvolve(observation, n_iter=20, stop=None)
 print(hashlib.sha256(result.extended.tobytes()).hexdigest())
 """
 

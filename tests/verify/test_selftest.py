@@ -130,6 +130,8 @@ def test_what_is_tried(monkeypatch):
     assert {row.allowed for row in rows[:-4]} == {1e-6, 3.7e-15}
     spec = device.spec_of(CHOSEN)
     on_the_device = [{"precision": p, "device": spec} for p in ("single", "double")]
+    assert all({"stop": None, "smoothing": 0.0, "pad": 0}.items() <= how.items() for how in runs)
+    runs = [{k: v for k, v in how.items() if k not in ("stop", "smoothing", "pad")} for how in runs]
     assert [(how.pop("solver"), how.pop("n_iter"), len(how.pop("stars")), how) for how in runs] == [
         (solver, n_iter, 2, how)
         for solver, n_iter in (("sgm", 30), ("sgp", 10))

@@ -1,0 +1,80 @@
+"""What a reconstruction comes to: its estimate, and how that was reached."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.errors import warn
+from lnocl.runs.start import make_model
+from lnocl.scene.observation import Array
+from lnocl.scene.penalty import Penalty
+from lnocl.scene.scene import Scene
+
+CURVE_DTYPE = np.dtype([("iteration", np.int64), ("error", np.float64)])
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The estimate that a reconstruction ended with, scaled, and how it came there.
+
+    Attributes
+    ----------
+    scene : Scene
+        The model of the observation, with the stars where they are now.
+    extended : ndarray of float64, shape (Ny, Nx)
+        Extended source.
+    star_fluxes : ndarray of float64, shape (n,)
+        Star fluxes.
+    given_stars : ndarray of float64, shape (n, 2), or None
+        The positions that were given, where the stars were moved from them.
+    objectives : ndarray of float64, shape (n_iter + 1,)
+        Objectives of the start and after each iteration; not scaled.
+    engine_name : str
+        The device, its platform and driver.
+    penalty : Penalty
+        On the extended source.
+    stop_reason : str
+        As `lnocl.Result.stop_reason`.
+    curve : ndarray of `CURVE_DTYPE`
+        As `lnocl.Result.held_out`.
+    """
+
+    scene: Scene
+    extended: Array
+    star_fluxes: Array
+    given_stars: Array | None
+    objectives: Array
+    engine_name: str
+    penalty: Penalty
+    stop_reason: str
+    curve: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
+
+    def star_errors(self) -> tuple[Array, Array]:
+        """Return the standard errors of star fluxes and positions; NaN where they were not moved.
+
+        Warns
+        -----
+        LnoclWarning
+            The images do not determine flux and position of a star.
+        """
+        n = self.scene.n_stars
+        if self.given_stars is None:
+            return np.full(n, np.nan), np.full((n, 2), np.nan)
+        from lnocl.solvers.positions import StarFit, Stars
+
+        scene = self.scene
+        fit = StarFit(scene, make_model(scene), self.extended, self.given_stars)
+        errors = fit.errors(Stars(self.star_fluxes, scene.stars))
+        is_blended = np.isnan(errors.fluxes) | np.isnan(errors.positions).any(axis=1)
+        if is_blended.any():
+            named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in scene.stars[is_blended])
+            warn(
+                f"the images do not determine flux and position of each star at {named}, so that "
+                "these errors are NaN; leave out stars that lie on others"
+            )
+        # J is divided by the scale too, so that its information is that of as many fewer counts.
+        root = 1.0 / np.sqrt(scene.scale)
+        return errors.fluxes * scene.unit * root, errors.positions * root

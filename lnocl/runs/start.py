@@ -1,0 +1,167 @@
+"""Where runs start: a scene, an estimate of it, and what its steps are measured with."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from numpy.typing import ArrayLike
+
+from lnocl.scene.observation import Array, Observation
+from lnocl.scene.penalty import Penalty
+from lnocl.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from lnocl.scene.forward_model import Model
+    from lnocl.solvers.scaling import Scaling
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The parameters that all runs of one call of `deconvolve` share."""
+
+    stars: Array
+    pad: int | str
+    solver: str
+    precision: str
+    engine: str
+    device: str | None
+    refine_positions: bool = False
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a run starts, on the grid and scaled; runs of halves of the counts start alike.
+
+    Attributes
+    ----------
+    setup : Setup
+        The parameters that the runs share.
+    scene : Scene
+        The model of the observation, with the stars where they start.
+    given_stars : ndarray of float64, shape (n, 2)
+        The positions as they were given.
+    extended : ndarray of float64, shape (Ny, Nx)
+        Extended source.
+    star_fluxes : ndarray of float64, shape (n,)
+        Star fluxes.
+    scaling : Scaling or None
+        For the scaled gradient projection method.
+    """
+
+    setup: Setup
+    scene: Scene
+    given_stars: Array
+    extended: Array
+    star_fluxes: Array
+    scaling: Scaling | None
+
+    @property
+    def refines(self) -> bool:
+        """Whether there are stars to be moved."""
+        return self.setup.refine_positions and self.scene.n_stars > 0
+
+    def penalised(self, penalty: Penalty) -> Start:
+        """Return this start with another penalty."""
+        return replace(self, scene=self.scene.penalised(penalty))
+
+    def of_half(self, observation: Observation) -> Start:
+        """Return this start for half of the counts."""
+        return replace(self, scene=self.scene.of_half(observation))
+
+    def at(self, extended: Array, star_fluxes: Array, positions: Array) -> Start:
+        """Return a start from another estimate."""
+        if not self.refines:
+            return replace(self, extended=extended, star_fluxes=star_fluxes)
+        scene = copy(self.scene)
+        scene.move_stars(positions)
+        star_fluxes, scaling = measure_steps(
+            self.setup, scene, make_model(scene), extended, star_fluxes
+        )
+        return replace(
+            self, scene=scene, extended=extended, star_fluxes=star_fluxes, scaling=scaling
+        )
+
+
+def make_start(
+    setup: Setup,
+    observation: Observation,
+    penalty: Penalty,
+    initial_extended: ArrayLike | None = None,
+    initial_star_fluxes: ArrayLike | None = None,
+) -> Start:
+    """Return where a run of an observation starts, its stars moved there where that is asked for.
+
+    Parameters
+    ----------
+    setup : Setup
+        The parameters that the runs share.
+    observation : Observation
+        The observation to reconstruct.
+    penalty : Penalty
+        The penalty on the extended source.
+    initial_extended, initial_star_fluxes : array_like, optional
+        The estimate to start from, as for `deconvolve`.
+
+    Raises
+    ------
+    InputError
+        As `deconvolve`.
+    """
+    leeway = 0.0
+    if setup.refine_positions:
+        from lnocl.solvers.positions import RADIUS
+
+        leeway = RADIUS
+    scene = Scene(observation, setup.stars, penalty, setup.pad, leeway)
+    given = scene.stars
+    extended, star_fluxes = scene.start(initial_extended, initial_star_fluxes)
+    refines = setup.refine_positions and scene.n_stars > 0
+    scaling = None
+    if refines or setup.solver == "sgp":
+        model = make_model(scene)  # which is large, and goes with this block
+        if refines:
+            star_fluxes = move_stars(scene, model, extended, star_fluxes, given, look_round=True)
+        star_fluxes, scaling = measure_steps(setup, scene, model, extended, star_fluxes)
+    return Start(setup, scene, given, extended, star_fluxes, scaling)
+
+
+# What follows loads scipy, which not every start needs.
+
+
+def make_model(scene: Scene) -> Model:
+    """Return the model of a scene on the host; it follows the stars."""
+    from lnocl.scene.forward_model import Model
+
+    return Model(scene)
+
+
+def move_stars(
+    scene: Scene,
+    model: Model,
+    extended: Array,
+    star_fluxes: Array,
+    given: Array,
+    look_round: bool = False,
+) -> Array:
+    """Move the stars of a scene to where they are most likely; return their fluxes there."""
+    from lnocl.solvers.positions import StarFit, Stars
+
+    fit = StarFit(scene, model, extended, given)
+    current = Stars(star_fluxes, scene.stars)
+    starts = [current, fit.look_round(current)] if look_round else [current]
+    stars = min(map(fit.minimise, starts), key=fit.objective)
+    scene.move_stars(stars.positions)
+    return stars.fluxes
+
+
+def measure_steps(
+    setup: Setup, scene: Scene, model: Model, extended: Array, star_fluxes: Array
+) -> tuple[Array, Scaling | None]:
+    """Return the star fluxes to go on from, and the scaling where the solver has one."""
+    if setup.solver != "sgp":
+        return star_fluxes, None
+    from lnocl.solvers.scaling import prepare
+
+    return prepare(scene, model, extended, star_fluxes)
