@@ -9,8 +9,8 @@ scenes   on the paper's experiment (hh34, and HH 211 from DIR, at 512 and 1024):
 starts   the best rho'' of SGP from star fluxes of 0.01 to 0.9 of the truth, at contrast 1 and 30
 bright   rho'' at contrast 30 and 1000: SGP after 500 iterations, without smoothing and with that
          which suits the noise; SGM after 20,000
-stops    twenty seeded scenes of random flux, contrast and number of images: errors where a rule stops
-         SGP, relative to the best that the truth would choose over iterations without smoothing
+stops    twenty seeded scenes of random flux, contrast and number of images: errors where a rule
+         stops SGP, relative to the best that the truth would choose without smoothing
 costs    a run that held-out counts end beside one of as many iterations, by the clock
 choices  what was chosen by measuring: the share of the shift, the number of steps kept
 ngc7027  relative error on the published benchmark, from DIR
