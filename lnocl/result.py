@@ -110,9 +110,9 @@ class Result:
         Weight of the Tikhonov term, as given or as chosen.
     smoothing : float
         Weight of the edge-preserving term, as given or as chosen.
-    held_out : ndarray, fields ``iteration`` (int64) and ``error`` (float64)
-        The relative error of the extended source that held-out counts estimate, for each iteration
-        that they compared last. Empty where they did not choose.
+    held_out : ndarray, fields ``smoothing``, ``iteration`` (int64) and ``error``
+        The relative error of the extended source that held-out counts estimate, for each smoothing
+        and iteration that they compared last. Empty where they did not choose.
     """
 
     extended: Array

@@ -37,7 +37,7 @@ def make_psfs(n_images, shape):
     psfs = []
     for j in range(n_images):
         cos, sin = np.cos(0.4 + 1.1 * j), np.sin(0.4 + 1.1 * j)
-        u, v = cos * x + sin * y - 0.6, cos * y - sin * x + 0.4
+        u, v = cos * x + sin * y - 0.4, cos * y - sin * x + 0.25
         core = np.exp(-0.5 * ((u / 1.9) ** 2 + (v / 0.9) ** 2))
         ghost = np.exp(-0.5 * ((x - 2 * cos) ** 2 + (y + 2 * sin) ** 2))
         psfs.append(core + 0.3 * ghost)
@@ -157,6 +157,7 @@ class Made:
             "mask": self.mask,
             "exposure": self.exposure,
             "offsets": self.offsets,
+            "psf_centre": "given",
         }
         return lnocl.Observation(**(given | changes))
 

@@ -87,7 +87,8 @@ def result(path):
         [(i, 9.0 / (i + 1)) for i in range(9)], dtype=[("iteration", int), ("objective", float)]
     )
     held_out = np.array(
-        [(i, 1.0 / i) for i in (1, 2, 4)], dtype=[("iteration", int), ("error", float)]
+        [(0.1, i, 1.0 / i) for i in (1, 2, 4)],
+        dtype=[("smoothing", float), ("iteration", int), ("error", float)],
     )
     fitswrite.write_result(
         path, COUNTS, [(12.0, 13.0)], [1e5], history, curve=curve, held_out=held_out,

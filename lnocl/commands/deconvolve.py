@@ -39,7 +39,18 @@ def _parameter(flag: str, **keywords: Any) -> options.Option:
 
 
 OPTIONS = {
-    "input": [options.IMAGES, options.PSFS.but(required=True)],
+    "input": [
+        options.IMAGES,
+        options.PSFS.but(required=True),
+        option(
+            "--psf-centre",
+            choices=("check", "fit", "given"),
+            default="check",
+            card=("PSFCENTR", "what became of PSFs off their centre"),
+            help="what becomes of a PSF whose core lies off its centre, (ky // 2, kx // 2): check, "
+            "it is refused; fit, it is moved there; given, nothing (default: %(default)s)",
+        ),
+    ],
     "output": [
         option(
             "-o",

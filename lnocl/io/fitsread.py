@@ -23,7 +23,7 @@ RESULT_TABLES = {
     "STARS": ("x", "y", "flux"),
     "HISTORY": ("iteration", "objective"),
     "CURVE": ("iteration", "rho", "rho_star", "magnitude"),
-    "HELDOUT": ("iteration", "error"),
+    "HELDOUT": ("smoothing", "iteration", "error"),
 }
 
 _WCS_KEYWORD = re.compile(r"(?:CTYPE|CRPIX|CRVAL|CDELT)1([A-Z]?)")

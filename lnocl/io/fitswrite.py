@@ -77,7 +77,7 @@ def write_result(
         Whether an existing file may be replaced.
     curve : ndarray with fields ``iteration``, ``rho``, ``rho_star`` and ``magnitude``, optional
         Restoration errors and magnitude of the star, where the truth is known.
-    held_out : ndarray with fields ``iteration`` and ``error``, optional
+    held_out : ndarray with fields ``smoothing``, ``iteration`` and ``error``, optional
         Relative errors that held-out counts estimate, where they were asked.
     per_second : bool, optional
         Whether extended source and fluxes are electrons per second.

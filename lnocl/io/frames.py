@@ -46,6 +46,8 @@ class Calibration(NamedTuple):
         time stay counts per time.
     align : {"wcs"}, optional
         Offsets from the headers' coordinates.
+    psf_centre : {"check", "fit", "given"}
+        As for `Observation`.
     """
 
     background: Sequence[Word] = (0.0,)
@@ -56,6 +58,7 @@ class Calibration(NamedTuple):
     saturation: float | None = None
     gain: float | None = None
     align: str | None = None
+    psf_centre: str = "check"
 
 
 class Frames(NamedTuple):
@@ -136,6 +139,7 @@ class _Reader:
             mask=mask if mask.any() else None,
             exposure=1.0 if exposure is None else exposure,
             offsets=self._offsets(),
+            psf_centre=self._calibration.psf_centre,
         )
         sha256 = {"images": self._images.sha256, "psfs": self._psfs.sha256, **self._maps.sha256}
         return Frames(observation, self._images.header, background, sha256)

@@ -120,30 +120,34 @@ def draw_objectives(histories: Mapping[str, Mapping[str, Array]]) -> Figure:
 
 
 def draw_held_out_errors(tables: Mapping[str, Mapping[str, Array]]) -> Figure:
-    """Draw the errors that held-out counts estimate.
+    """Draw the errors that held-out counts estimate, a line for each smoothing.
 
     Parameters
     ----------
     tables : mapping of str to mapping of str to ndarray
-        For each name the columns ``iteration`` and ``error``.
+        For each name the columns ``smoothing``, ``iteration`` and ``error``.
 
     Returns
     -------
     matplotlib.figure.Figure
-        One panel, a line for each name.
+        A panel for each name.
 
     Raises
     ------
     LnoclError
         Where matplotlib is missing.
     """
-    figure = new_figure(6.5, 4.0)
-    axis = figure.subplots()
-    for i, (name, table) in enumerate(tables.items()):
-        axis.plot(table["iteration"], table["error"], **line_style(i), label=name)
-    axis.set(xscale="log", yscale="log", xlabel="iteration", ylabel="estimated relative error")
-    axis.grid(alpha=0.3, which="both")
-    axis.legend(fontsize=9)
+    figure = new_figure(6.5 * len(tables), 4.0)
+    panels = figure.subplots(1, len(tables), squeeze=False)[0]
+    for axis, (name, table) in zip(panels, tables.items(), strict=True):
+        for i, value in enumerate(np.unique(table["smoothing"])):
+            rows = table["smoothing"] == value
+            label = f"{value:.2g}"
+            axis.plot(table["iteration"][rows], table["error"][rows], **line_style(i), label=label)
+        axis.set(xscale="log", yscale="log", xlabel="iteration", ylabel="estimated relative error")
+        axis.set_title(name, fontsize=10)
+        axis.grid(alpha=0.3, which="both")
+        axis.legend(fontsize=9, title="smoothing")
     return figure
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lnocl.errors import DivergedError, refuse_not_finite
+from lnocl.scene.cores import off_centre
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.scene import Scene
 
@@ -89,12 +90,9 @@ def _negative_pixels(psfs: Array) -> list[str]:
 
 
 def _off_centre(psfs: Array) -> list[str]:
-    """Say where a PSF's core, all that is brighter than half its peak, is not at its centre."""
-    y, x = np.indices(psfs.shape[1:])
+    """Say where a PSF's core is not at its centre."""
     for j, psf in enumerate(psfs):
-        core = np.where(psf > 0.5 * psf.max(), psf, 0.0)
-        dx, dy = (float((core * axis).sum() / core.sum()) - n // 2
-                  for axis, n in zip((x, y), psf.shape[::-1], strict=True))  # fmt: skip
+        dx, dy = off_centre(psf)
         if math.hypot(dx, dy) > MAX_OFF_CENTRE:
             return [f"the core of psf {j} lies ({dx:z.1f}, {dy:z.1f}) pixels off its centre"]
     return []

@@ -51,23 +51,24 @@ class Halves:
     starts : sequence of two Start
         Where they start.
     n_iter : int
-        Iterations at most.
+        The last iteration, at most.
+    first : int
+        The iteration that they start from.
 
     Attributes
     ----------
+    first : int
+        The iteration that they start from.
     done : int
-        Iterations that both have done.
+        The last iteration that both have done.
     snapshots : list of Snapshot
         At iterations a tenth apart.
     """
 
-    def __init__(self, starts: Sequence[Start], n_iter: int) -> None:
+    def __init__(self, starts: Sequence[Start], n_iter: int, first: int = 0) -> None:
         self._start, self._n_iter = starts[0], n_iter
-        self._runs = [Run(start, n_iter, half) for half, start in enumerate(starts)]
-        setup = self._start.setup
-        is_single = setup.engine == "opencl" and setup.precision == "single"
-        self._dtype = np.dtype(np.float32 if is_single else np.float64)
-        self.done = 0
+        self._runs = [Run(start, n_iter - first, half) for half, start in enumerate(starts)]
+        self.first = self.done = first
         self.snapshots: list[Snapshot] = []
 
     def __iter__(self) -> Iterator[int]:
@@ -86,13 +87,13 @@ class Halves:
         due = self._due()
         try:
             for done, _ in zip(*self._runs, strict=False):
-                self.done = done
-                if done == due:
+                self.done = self.first + done
+                if self.done == due:
                     self.snapshots.append(self.snapshot())
                     due = self._due()
-                yield done
+                yield self.done
         except (DivergedError, NotFiniteError):
-            best = min(run.best_iteration() for run in self._runs)
+            best = self.first + min(run.best_iteration() for run in self._runs)
             self.snapshots = [each for each in self.snapshots if each.iteration <= best]
             if not self.snapshots:
                 raise
@@ -103,11 +104,11 @@ class Halves:
 
     def _due(self) -> int:
         """Return the iteration of the next snapshot."""
-        return next_snapshot(self.snapshots[-1].iteration if self.snapshots else 0)
+        return next_snapshot(self.snapshots[-1].iteration if self.snapshots else self.first)
 
     def snapshot(self) -> Snapshot:
         """Return the estimates as they are."""
-        extended = np.empty((2, *self._runs[0].scene.grid), self._dtype)
+        extended = np.empty((2, *self._runs[0].scene.grid), _dtype(self._start))
         for half, run in zip(extended, self._runs, strict=True):
             half[:] = run.engine.extended()
         return Snapshot(
@@ -136,10 +137,10 @@ class Halves:
         return sum(run.objective() for run in self._runs)
 
     def objectives(self, last: int) -> Array:
-        """Return the sums of the objectives, of the start and all iterations up to the last."""
+        """Return the sums of the objectives, of where they started and all iterations up to one."""
         for run in self._runs:
             run.finish()
-        first, second = (run.objectives()[: last + 1] for run in self._runs)
+        first, second = (run.objectives()[: last - self.first + 1] for run in self._runs)
         return first + second
 
     @property
@@ -155,8 +156,7 @@ class Halves:
         NotFiniteError
             A value is infinite or not a number.
         """
-        columns = zip(Snapshot._fields, zip(*self.snapshots, strict=True), strict=False)
-        state = {f"{SNAPSHOTS}_{field}": np.array(values) for field, values in columns}
+        state = pack(SNAPSHOTS, self.snapshots)
         for k, run in enumerate(self._runs):
             state |= {f"{HALVES}{k}_{name}": array for name, array in run.state().items()}
         return state
@@ -175,7 +175,8 @@ class Halves:
                 states.append(run.take(saved))
         done = {int(state["progress"][0]) for state in states}
         saved.refuse_unless(len(done) == 1, f"{HALVES}0_progress and {HALVES}1_progress differ")
-        self.snapshots, self.done = self._take_snapshots(saved), done.pop()
+        self.snapshots = take(saved, SNAPSHOTS, self._start, self._n_iter)
+        self.done = self.first + done.pop()
         iterations = [each.iteration for each in self.snapshots]
         saved.refuse_unless(
             iterations == sorted(set(iterations)) and iterations[-1] <= self.done < self._due(),
@@ -184,26 +185,42 @@ class Halves:
         for run, state in zip(self._runs, states, strict=True):
             run.restore(state)
 
-    def _take_snapshots(self, saved: Saved) -> list[Snapshot]:
-        grid, stars, reach = self._start.scene.grid, self._start.given_stars, 0.0
-        if self._start.refines:
-            from lnocl.solvers.positions import RADIUS
 
-            reach = RADIUS * (1.0 + 1e-9)  # which rounding may exceed
-        name, whole, double = f"{SNAPSHOTS}_", np.dtype(np.int64), np.dtype(np.float64)
-        count = (range(1, self._n_iter + 1),)
-        iterations = saved.take(f"{name}iteration", whole, count, 1, self._n_iter)
-        k, n = len(iterations), len(stars)
-        return [
-            Snapshot(*each)
-            for each in zip(
-                iterations.tolist(),
-                saved.take(f"{name}extended", self._dtype, (k, 2, *grid), 0.0, LARGEST),
-                saved.take(f"{name}star_fluxes", double, (k, 2, n), 0.0, LARGEST),
-                saved.take(f"{name}positions", double, (k, 2, n, 2), stars - reach, stars + reach),
-                strict=True,
-            )
-        ]
+def pack(name: str, snapshots: Sequence[Snapshot]) -> State:
+    """Return the arrays of snapshots, by the names under which they are saved."""
+    columns = zip(Snapshot._fields, zip(*snapshots, strict=True), strict=False)
+    return {f"{name}_{field}": np.array(values) for field, values in columns}
+
+
+def take(saved: Saved, name: str, start: Start, n_iter: int) -> list[Snapshot]:
+    """Return the snapshots that a checkpoint holds under a name, of halves with such a start.
+
+    Raises
+    ------
+    FileError
+        No such halves have such snapshots within `n_iter` iterations.
+    """
+    reach = 0.0
+    if start.refines:
+        from lnocl.solvers.positions import RADIUS
+
+        reach = RADIUS * (1.0 + 1e-9)  # which rounding may exceed
+    low, high = start.given_stars - reach, start.given_stars + reach
+    whole, double = np.dtype(np.int64), np.dtype(np.float64)
+    iterations = saved.take(f"{name}_iteration", whole, (range(1, n_iter + 1),), 1, n_iter)
+    k, n = len(iterations), len(low)
+    extended = saved.take(
+        f"{name}_extended", _dtype(start), (k, 2, *start.scene.grid), 0.0, LARGEST
+    )
+    star_fluxes = saved.take(f"{name}_star_fluxes", double, (k, 2, n), 0.0, LARGEST)
+    positions = saved.take(f"{name}_positions", double, (k, 2, n, 2), low, high)
+    return list(map(Snapshot, iterations.tolist(), extended, star_fluxes, positions))
+
+
+def _dtype(start: Start) -> np.dtype:
+    """Return the type of the extended sources: that of the device."""
+    is_single = start.setup.engine == "opencl" and start.setup.precision == "single"
+    return np.dtype(np.float32 if is_single else np.float64)
 
 
 def next_snapshot(iteration: int) -> int:

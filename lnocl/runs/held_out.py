@@ -1,4 +1,4 @@
-"""The number of iterations, chosen by held-out counts: cross-validation by data thinning.
+"""Iterations and smoothing chosen by held-out counts: cross-validation by data thinning.
 
 Data thinning gives each count to one of two halves of the observation, with probability 1/2. The
 halves are independent Poisson observations of the same sky, and are reconstructed side by side.
@@ -16,24 +16,29 @@ too early: docs/sgp.md.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError, refuse_not_finite, warn
-from lnocl.runs.halves import Halves, Snapshot, next_snapshot
+from lnocl.runs.halves import Halves, Snapshot, next_snapshot, pack, take
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome
+from lnocl.runs.run import engine_name
 from lnocl.runs.run import most_bytes as most_bytes_of_run
-from lnocl.runs.saved import Saved
+from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved, is_whole
 from lnocl.runs.start import Start
 from lnocl.runs.thinning import split_counts
 from lnocl.scene.observation import Array
 from lnocl.scene.penalty import Penalty
 from lnocl.solvers.engine import State
+
+log = logging.getLogger("lnocl")
 
 # The chosen iteration is the last with an error within a tenth of the least: near a star the
 # estimate improves long after the rest. The least squared error is taken to be the noise alone;
@@ -44,20 +49,26 @@ LENGTH_RATIO = 2
 MIN_ITERATIONS = 10
 # Snapshots before this share of the chosen iteration are dropped.
 OLDEST_SNAPSHOT = 1.0 / 3.0
+# With other penalties than the first the halves run to this multiple of the iteration chosen.
+LATER_LENGTH = 1.5
 
 # look(iteration, halves) returns whether to end there.
 Look = Callable[[int, Halves], bool]
 
 
 class HeldOutCounts:
-    """The choice of the number of iterations by held-out counts.
+    """The choice of the number of iterations, and of the penalty, by held-out counts.
+
+    With the first penalty the halves start where the reconstruction does; all errors are measured
+    with their last estimates. With each other one they start from a third of the iterations chosen
+    with the first.
 
     Parameters
     ----------
     start : Start
         Where the reconstruction starts.
-    penalty : Penalty
-        On the extended source.
+    penalties : sequence of Penalty
+        To choose from: each is tried unless the one before was worse than the one before that.
     n_iter : int
         Iterations at most.
 
@@ -72,12 +83,30 @@ class HeldOutCounts:
         The images are not whole counts.
     """
 
-    def __init__(self, start: Start, penalty: Penalty, n_iter: int) -> None:
-        self._start, self._penalty, self._n_iter = start, penalty, n_iter
-        halves = split_counts(start.scene.observation)
-        self._halves = Halves([start.of_half(each) for each in halves], n_iter)
+    def __init__(self, start: Start, penalties: Sequence[Penalty], n_iter: int) -> None:
+        self._start, self._penalties, self._n_iter = start, penalties, n_iter
+        self._counts = split_counts(start.scene.observation)
+        self._curves: list[NDArray[np.void]] = []
+        self._first: _First | None = None
+        self._best: _Best | None = None
         self._next_look = MIN_ITERATIONS
-        self._is_over = False
+        self._halves: Halves | None = self._begin()
+
+    def _begin(self) -> Halves:
+        """Return halves with the next penalty, where they start."""
+        start = self._start.penalised(self._penalties[len(self._curves)])
+        starts = [start.of_half(each) for each in self._counts]
+        if self._first is None:
+            return Halves(starts, self._n_iter)
+        iteration, *estimates = self._first.origin
+        starts = [
+            half.at(extended.astype(np.float64), star_fluxes, positions)
+            for half, extended, star_fluxes, positions in zip(starts, *estimates, strict=True)
+        ]
+        last = min(self._n_iter, math.ceil(LATER_LENGTH * self._first.n_iter))
+        halves = Halves(starts, last, iteration)
+        halves.snapshots.append(self._first.origin)
+        return halves
 
     def choose(self, look: Look, save: Callable[[], None]) -> Outcome:
         """Return the reconstruction that held-out counts choose, or that at which `look` ends it.
@@ -101,40 +130,95 @@ class HeldOutCounts:
         LnoclWarning
             The chosen iteration is too near `n_iter`; the objective of a half rises.
         """
-        halves = self._halves
-        for iteration in () if self._is_over else halves:
-            is_last = self._judge_when_due()
+        while self._halves is not None:
+            if self._is_ended(self._halves, look, save):
+                halves, penalty = self._halves, self._penalties[len(self._curves)]
+                objectives = self._objectives(halves, halves.done)
+                return self._outcome(halves.snapshot(), penalty, objectives, "callback")
+            is_better = self._judge(self._halves)
+            is_next = is_better and len(self._curves) < len(self._penalties)
+            self._halves = self._begin() if is_next else None
+        best, first = cast(_Best, self._best), cast(_First, self._first)
+        if LENGTH_RATIO * first.n_iter > self._n_iter:
+            warn(
+                f"held-out counts have chosen iteration {first.n_iter} of {self._n_iter}, too near "
+                f"the end to be sure; give n_iter {LENGTH_RATIO * first.n_iter} or more"
+            )
+        penalty = self._penalties[best.trial]
+        if len(self._penalties) > 1:
+            log.info("smoothing chosen: %.3g, by held-out counts", penalty.smoothing)
+        outcome = self._outcome(best.chosen, penalty, best.objectives, "held-out")
+        return replace(outcome, curve=np.concatenate(self._curves))
+
+    def _is_ended(self, halves: Halves, look: Look, save: Callable[[], None]) -> bool:
+        """Run halves as long as is needed; return whether `look` has ended them before."""
+        for iteration in halves:
+            is_last = self._first is None and self._judge_when_due(halves)
             if look(iteration, halves):
-                return self._outcome(halves.snapshot(), "callback")
+                return True
             if is_last:
                 break
             save()
-        if not halves.snapshots:
+        return False
+
+    def _judge_when_due(self, halves: Halves) -> bool:
+        """Drop snapshots that are too old, where that is due; return whether the end is reached."""
+        last = halves.snapshots[-1]
+        if last.iteration != halves.done or last.iteration < self._next_look:
+            return False
+        found = assess(halves.snapshots, last, self._shape)
+        chosen, best = (halves.snapshots[k].iteration for k in (found.chosen, found.best))
+        self._next_look = max(MIN_ITERATIONS, LENGTH_RATIO * chosen)
+        oldest = min(OLDEST_SNAPSHOT * chosen, best)
+        halves.snapshots = [each for each in halves.snapshots if each.iteration >= oldest]
+        return last.iteration >= self._next_look
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return self._start.scene.observation.shape
+
+    def _judge(self, halves: Halves) -> bool:
+        """Add what halves that have ended came to; return whether it is the best so far."""
+        snapshots, trial = halves.snapshots, len(self._curves)
+        if not snapshots:
             raise InputError(
                 "half of the counts is too little: no iteration betters the start; give n_iter "
                 "and stop None"
             )
-        curve, _, chosen = assess(halves.snapshots, self._start.scene.observation.shape)
-        if LENGTH_RATIO * chosen.iteration > self._n_iter:
-            warn(
-                f"held-out counts have chosen iteration {chosen.iteration} of {self._n_iter}, too "
-                f"near the end to be sure; give n_iter {LENGTH_RATIO * chosen.iteration} or more"
-            )
-        return replace(self._outcome(chosen, "held-out"), curve=curve)
-
-    def _judge_when_due(self) -> bool:
-        """Drop snapshots that are too old, where that is due; return whether the end is reached."""
-        snapshots = self._halves.snapshots
-        last = snapshots[-1].iteration
-        if last != self._halves.done or last < self._next_look:
+        reference = snapshots[-1] if self._first is None else self._first.reference
+        found = assess(snapshots, reference, self._shape)
+        chosen = snapshots[found.chosen]
+        if self._first is None:
+            # The least squared error is taken to be the noise alone.
+            offset = found.noise[found.best] - found.excess[found.best]
+            norm = max(found.squared_norm, offset, float(np.finfo(float).tiny))
+            distances = [abs(s.iteration - OLDEST_SNAPSHOT * chosen.iteration) for s in snapshots]
+            origin = snapshots[int(np.argmin(distances))]
+            objectives = halves.objectives(origin.iteration)
+            self._first = _First(chosen.iteration, offset, norm, reference, origin, objectives)
+        first = self._first
+        errors = np.sqrt(np.maximum(found.excess + first.offset, 0.0) / first.squared_norm)
+        curve = np.zeros(len(errors), CURVE_DTYPE)
+        curve["smoothing"] = self._penalties[trial].smoothing
+        curve["iteration"], curve["error"] = [each.iteration for each in snapshots], errors
+        self._curves.append(curve)
+        error = float(errors.min())
+        if self._best is not None and error >= self._best.error:
             return False
-        _, best, chosen = assess(snapshots, self._start.scene.observation.shape)
-        self._next_look = max(MIN_ITERATIONS, LENGTH_RATIO * chosen.iteration)
-        oldest = min(OLDEST_SNAPSHOT * chosen.iteration, best.iteration)
-        self._halves.snapshots = [each for each in snapshots if each.iteration >= oldest]
-        return last >= self._next_look
+        objectives = self._objectives(halves, chosen.iteration)
+        self._best = _Best(trial, error, chosen, objectives)
+        return True
 
-    def _outcome(self, snapshot: Snapshot, stop_reason: str) -> Outcome:
+    def _objectives(self, halves: Halves, last: int) -> Array:
+        """Return the objectives from the start up to an iteration of halves."""
+        objectives = halves.objectives(last)
+        if halves.first == 0:
+            return objectives
+        return np.concatenate([cast(_First, self._first).objectives, objectives[1:]])
+
+    def _outcome(
+        self, snapshot: Snapshot, penalty: Penalty, objectives: Array, stop_reason: str
+    ) -> Outcome:
         """Return the sum of both halves' estimates; scaled, it is their mean."""
         start = self._start
         scene = copy(start.scene)
@@ -145,15 +229,33 @@ class HeldOutCounts:
             extended=snapshot.extended.mean(axis=0, dtype=np.float64),
             star_fluxes=snapshot.star_fluxes.mean(axis=0),
             given_stars=start.given_stars if start.refines else None,
-            objectives=self._halves.objectives(snapshot.iteration),
-            engine_name=self._halves.engine_name,
-            penalty=self._penalty,
+            objectives=objectives,
+            engine_name=engine_name(start.setup),
+            penalty=penalty,
             stop_reason=stop_reason,
         )
 
     def state(self) -> State:
         """Return the arrays that `restore` needs, as they are between iterations."""
-        return self._halves.state() | {"next_look": np.array([self._next_look])}
+        state: State = {}
+        if self._halves is not None:
+            state = self._halves.state() | {"next_look": np.array([self._next_look])}
+        first, best = self._first, self._best
+        if first is None or best is None:
+            return state
+        numbers = first.n_iter, first.offset, first.squared_norm, best.trial, best.error
+        curves = [[*curve[name]] for name in ("iteration", "error") for curve in self._curves]
+        return {
+            **state,
+            "trials": np.array(numbers, np.float64),
+            "curve_lengths": np.array([len(curve) for curve in self._curves]),
+            "curves": np.concatenate(curves),
+            "origin_objectives": first.objectives,
+            "best_objectives": best.objectives,
+            **pack("reference", [first.reference]),
+            **pack("origin", [first.origin]),
+            **pack("best", [best.chosen]),
+        }
 
     def restore(self, saved: Saved, ended: str) -> None:
         """Continue from the state in a checkpoint.
@@ -161,25 +263,120 @@ class HeldOutCounts:
         Raises
         ------
         FileError
-            The halves cannot have such a state.
+            Held-out counts cannot have such a state.
         """
         saved.refuse_unless(ended in ("", "callback", "held-out"), f"it ended by {ended}")
-        most = LENGTH_RATIO * self._n_iter + MIN_ITERATIONS
-        (next_look,) = saved.take("next_look", np.dtype(np.int64), (1,), 1, most)
-        self._halves.restore(saved)
+        if "trials" in saved:
+            self._restore_trials(saved)
+        if ended == "held-out":
+            saved.refuse_unless(self._best is not None, "trials is missing")
+            self._halves = None
+        else:
+            saved.refuse_unless(len(self._curves) < len(self._penalties), "nothing is left to try")
+            most = LENGTH_RATIO * self._n_iter + MIN_ITERATIONS
+            (next_look,) = saved.take("next_look", np.dtype(np.int64), (1,), 1, most)
+            self._next_look, self._halves = int(next_look), self._begin()
+            self._halves.restore(saved)
         saved.refuse_others()
-        self._next_look, self._is_over = int(next_look), ended == "held-out"
+
+    def _restore_trials(self, saved: Saved) -> None:
+        n_iter, n_trials, most = self._n_iter, len(self._penalties), UNBOUNDED
+        low, high = [1, -most, 0, 0, 0], [n_iter, most, most, n_trials - 1, most]
+        numbers = saved.take("trials", FLOAT, (5,), low, high)
+        saved.refuse_unless(is_whole(numbers[[0, 3]]), "trials holds parts of iterations")
+        chosen, offset, squared_norm, trial, error = numbers.tolist()
+        lengths = saved.take(
+            "curve_lengths", np.dtype(np.int64), (range(1, n_trials + 1),), 1, n_iter
+        )
+        rows = saved.take("curves", FLOAT, (2 * int(lengths.sum()),), 0.0, most).reshape(2, -1)
+        saved.refuse_unless(is_whole(rows[0]), "curves holds parts of iterations")
+        saved.refuse_unless(trial < len(lengths), "trials is of a penalty that was not tried")
+        ends = np.cumsum(lengths)
+        for penalty, length, end in zip(self._penalties, lengths, ends, strict=False):
+            curve = np.zeros(length, CURVE_DTYPE)
+            curve["smoothing"] = penalty.smoothing
+            curve["iteration"], curve["error"] = rows[:, end - length : end]
+            self._curves.append(curve)
+        held = {}
+        for name in ("reference", "origin", "best"):
+            held[name], *others = take(saved, name, self._start, n_iter)
+            saved.refuse_unless(not others, f"{name}_iteration holds more than one")
+        counts = {name: (held[name].iteration + 1,) for name in ("origin", "best")}
+        objectives = {
+            name: saved.take(f"{name}_objectives", FLOAT, count, -most, most)
+            for name, count in counts.items()
+        }
+        saved.refuse_unless(held["origin"].iteration <= chosen, "origin_iteration is too late")
+        self._first = _First(
+            int(chosen), offset, squared_norm, held["reference"], held["origin"],
+            objectives["origin"],
+        )  # fmt: skip
+        self._best = _Best(int(trial), error, held["best"], objectives["best"])
+
+
+class _First(NamedTuple):
+    """What the halves with the first penalty came to.
+
+    Attributes
+    ----------
+    n_iter : int
+        The iteration chosen.
+    offset, squared_norm : float
+        The constant that the excess lacks, and the square of the norm of f.
+    reference, origin : Snapshot
+        The last estimates, and those from which the halves of other penalties start.
+    objectives : ndarray of float64
+        Up to those.
+    """
+
+    n_iter: int
+    offset: float
+    squared_norm: float
+    reference: Snapshot
+    origin: Snapshot
+    objectives: Array
+
+
+class _Best(NamedTuple):
+    """The best reconstruction so far: which penalty, least error, chosen estimate, objectives."""
+
+    trial: int
+    error: float
+    chosen: Snapshot
+    objectives: Array
+
+
+class Assessment(NamedTuple):
+    """The errors of snapshots, squared.
+
+    Attributes
+    ----------
+    excess, noise : ndarray of float64
+        ``||f_k||^2 - 2 <f_k, f>`` and ``||A_k - B_k||^2`` of each.
+    squared_norm : float
+        The square of the norm of f.
+    best, chosen : int
+        The snapshots of the least error, and to choose.
+    """
+
+    excess: Array
+    noise: Array
+    squared_norm: float
+    best: int
+    chosen: int
 
 
 def assess(
-    snapshots: Sequence[Snapshot], shape: tuple[int, int]
-) -> tuple[NDArray[np.void], Snapshot, Snapshot]:
-    """Return the relative errors of snapshots, the best of them, and the one to choose.
+    snapshots: Sequence[Snapshot], reference: Snapshot, shape: tuple[int, int]
+) -> Assessment:
+    """Return the errors of snapshots.
 
     Parameters
     ----------
     snapshots : sequence of Snapshot
-        At least one; the last is the reference.
+        At least one.
+    reference : Snapshot
+        A_L and B_L.
     shape : tuple of int
         Shape (ny, nx) of the images, within which errors are measured.
 
@@ -193,7 +390,7 @@ def assess(
     def product(a: Array, b: Array) -> float:
         return float(np.einsum("yx,yx->y", a[inside], b[inside]).sum(dtype=np.float64))
 
-    a_last, b_last = snapshots[-1].extended
+    a_last, b_last = reference.extended
     excess, noise = np.zeros((2, len(snapshots)))
     for k, snapshot in enumerate(snapshots):
         a, b = snapshot.extended
@@ -203,20 +400,15 @@ def assess(
     refuse_not_finite(*excess, *noise)
     best = int(np.argmin(excess))
     allowed = ((1.0 + ERROR_TOLERANCE) ** 2 - 1.0) * noise[best]
-    chosen = np.flatnonzero(excess <= excess[best] + allowed)[-1]
-    offset = noise[best] - excess[best]  # the least squared error is taken to be the noise alone
-    squared_norm = max(4.0 * product(a_last, b_last), offset, np.finfo(float).tiny)
-    curve = np.zeros(len(snapshots), CURVE_DTYPE)
-    curve["iteration"] = [each.iteration for each in snapshots]
-    curve["error"] = np.sqrt(np.maximum(excess + offset, 0.0) / squared_norm)
-    return curve, snapshots[best], snapshots[chosen]
+    chosen = int(np.flatnonzero(excess <= excess[best] + allowed)[-1])
+    return Assessment(excess, noise, 4.0 * product(a_last, b_last), best, chosen)
 
 
 def most_bytes(start: Start, n_iter: int) -> int:
     """Return the most bytes that the state of held-out counts may take."""
-    n_snapshots, due = 1, 1
+    n_snapshots, due = 4, 1
     while due <= n_iter:
         n_snapshots, due = n_snapshots + 1, next_snapshot(due)
     numbers = 2 * math.prod(start.scene.grid) + 6 * start.scene.n_stars + 1
-    snapshots = n_snapshots * numbers * np.dtype(np.float64).itemsize
+    snapshots = (n_snapshots * (numbers + 99) + 2 * n_iter) * np.dtype(np.float64).itemsize
     return 2 * most_bytes_of_run(start, n_iter) + snapshots

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from numbers import Real
 from typing import Any, cast
 
@@ -14,8 +15,13 @@ from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.penalty import Penalty, recommend_smoothing
 from lnocl.solvers import SOLVERS
 
+log = logging.getLogger("lnocl")
+
 # The iteration of La Camera et al. (2012), whatever the defaults; mu and n_iter are given too.
 PAPER: dict[str, Any] = {"solver": "sgm", "stop": None, "smoothing": 0.0, "pad": 0}
+
+# Of the smoothing that is recommended, from which held-out counts choose besides none.
+MULTIPLES = (1.0, 3.0, 10.0)
 
 PRECISIONS = ("single", "double")
 ENGINES = ("opencl", "numpy")
@@ -140,19 +146,25 @@ def read_start(
     return extended, fluxes
 
 
-def read_penalty(mu: Any, smoothing: Any, observation: Observation) -> Penalty:
-    """Return the penalty, the smoothing that which suits the noise where it is "auto".
+def read_penalties(
+    mu: Any, smoothing: Any, stop: object, observation: Observation
+) -> list[Penalty]:
+    """Return the penalty; for smoothing "auto" with held-out counts those to choose from.
 
     Raises
     ------
     InputError
         A weight is not a number, finite and not negative; smoothing is another word than "auto".
     """
-    if isinstance(smoothing, str):
-        if smoothing != "auto":
-            raise InputError(f"smoothing {smoothing!r} is not known; give a number or auto")
-        smoothing = recommend_smoothing(observation)
-    return Penalty(mu, smoothing)
+    if not isinstance(smoothing, str):
+        return [Penalty(mu, smoothing)]
+    if smoothing != "auto":
+        raise InputError(f"smoothing {smoothing!r} is not known; give a number or auto")
+    recommended = recommend_smoothing(observation)
+    if stop == "held-out":
+        return [Penalty(mu, multiple * recommended) for multiple in (0.0, *MULTIPLES)]
+    log.info("smoothing chosen: %.3g, by the noise of the counts", recommended)
+    return [Penalty(mu, recommended)]
 
 
 def warn_of_rounding(n_iter: int) -> None:

@@ -13,7 +13,7 @@ from lnocl.scene.observation import Array
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 
-CURVE_DTYPE = np.dtype([("iteration", np.int64), ("error", np.float64)])
+CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("error", np.float64)])
 
 
 @dataclass(frozen=True)

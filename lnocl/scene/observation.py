@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, counted, warn
 from lnocl.scene import containers
+from lnocl.scene.cores import centre, off_centre, peak
 
 Array = NDArray[np.float64]
 
@@ -22,6 +23,10 @@ UNMASK = {
 # An array whose last axis is so short, and the others so long, has its channels last.
 MAX_CHANNELS = 4
 MIN_SIDE = 8
+
+# Pixels that the core of a PSF may lie off its centre: from the first on a warning is due, from the
+# second on it is refused.
+LITTLE_OFF_CENTRE, FAR_OFF_CENTRE = 0.25, 0.8
 
 
 class Observation:
@@ -58,6 +63,10 @@ class Observation:
     offsets : array_like, shape (p, 2), optional
         ``(dx, dy)`` of each image, pixels: a source at (x, y) in the sky is at
         ``(x + dx, y + dy)`` in the image. They are taken into the PSFs; no counts are resampled.
+    psf_centre : {"check", "fit", "given"}, optional
+        What becomes of a PSF whose core lies off its centre, by which it would move the sky.
+        "check": it is refused where it is off by 0.8 pixels or more, with a warning from 0.25 on.
+        "fit": it is moved to its centre (`lnocl.scene.shifting.place`). "given": nothing.
 
     Attributes
     ----------
@@ -78,14 +87,14 @@ class Observation:
     InputError
         An array has the wrong shape, type or unit, is empty, or holds values out of range; an array
         other than `images` holds masked values; a PSF has no positive sum, or it or its sum is not
-        finite; images or background become infinite by exposure or read noise; no good pixel is
-        left; an offset leaves nothing of an image.
+        finite, or its core is off its centre; images or background become infinite by exposure or
+        read noise; no good pixel is left; an offset leaves nothing of an image.
 
     Warns
     -----
     LnoclWarning
         Pixels are not finite and were masked; counts are negative and were set to zero; pixels of
-        PSFs are negative.
+        PSFs are negative, or their cores a little off their centres.
 
     References
     ----------
@@ -111,13 +120,14 @@ class Observation:
         mask: ArrayLike | None = None,
         exposure: ArrayLike | None = None,
         offsets: ArrayLike | None = None,
+        psf_centre: str = "check",
     ) -> None:
         has_exposure = exposure is not None
         counts, are_rates = containers.counts("images", images, has_exposure)
         given, masked = values_and_mask("images", counts)
         self.images = _stack("images", given)
         self.mask = masked.copy().reshape(self.images.shape)
-        self.psfs = _check_psfs(containers.bare("psfs", psfs), self.n_images)
+        self.psfs = _check_psfs(containers.bare("psfs", psfs), self.n_images, psf_centre)
         self.offsets = self._check_offsets(offsets)
         self._apply_mask(mask)
         self.exposure = self._check_exposure(1.0 if exposure is None else exposure)
@@ -344,7 +354,7 @@ def _refuse_unless(name: str, values: Array, requirement: str, holds: NDArray[np
         raise InputError(f"{name} must be {requirement}; {values[~good].flat[0]:g} was given")
 
 
-def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
+def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:
     stack = _stack("psfs", psfs)
     if stack.shape[0] not in (1, n_images):
         raise InputError(
@@ -367,4 +377,38 @@ def _check_psfs(psfs: ArrayLike, n_images: int) -> Array:
     if n_negative := int((stack < 0).sum()):
         warn(_pixels(n_negative, "psf", "negative", "kept"))
     stack /= sums
+    if psf_centre == "fit":
+        stack = np.array([_centred(psf) for psf in stack])
+    elif psf_centre == "check":
+        _refuse_off_centre(stack)
+    elif psf_centre != "given":
+        raise InputError(f"psf_centre {psf_centre!r} is not known; choose from check, fit, given")
     return np.broadcast_to(stack, (n_images, *stack.shape[1:]))
+
+
+def _refuse_off_centre(psfs: Array) -> None:
+    """Refuse PSFs whose core lies far off their centre, and warn of those a little off."""
+    offsets = np.array([off_centre(psf) for psf in psfs])
+    distances = np.hypot(*offsets.T)
+    j = int(np.argmax(distances))
+    if distances[j] < LITTLE_OFF_CENTRE:
+        return
+    (dx, dy), (y, x) = offsets[j], centre(psfs.shape[1:])
+    words = (
+        f"the core of psf {j} lies ({dx:z.2f}, {dy:z.2f}) pixels off its centre ({x}, {y}), and "
+        "would move the sky by as much: take psf_centre fit to centre it"
+    )
+    if distances[j] >= FAR_OFF_CENTRE:
+        raise InputError(f"{words}, or psf_centre given if it is to be there")
+    warn(words)
+
+
+def _centred(psf: Array) -> Array:
+    """Return a PSF moved so that its core lies at its centre, what leaves one edge at the other."""
+    from lnocl.scene.shifting import place  # which is made of arrays of this module
+
+    y, x = centre(psf.shape)
+    whole = [n - at for n, at in zip((y, x), peak(psf), strict=True)]
+    psf = np.roll(psf, whole, axis=(0, 1))
+    dx, dy = off_centre(psf)
+    return place(psf, psf.shape, x - dx, y - dy).on_grid(psf.shape)

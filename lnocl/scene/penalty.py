@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from dataclasses import dataclass
 from numbers import Real
@@ -12,8 +11,6 @@ import numpy as np
 
 from lnocl.errors import InputError
 from lnocl.scene.observation import Observation
-
-log = logging.getLogger("lnocl")
 
 # A larger weight leaves nothing of the data term of images at unit mean.
 MAX_WEIGHT = 2.0**64
@@ -73,9 +70,7 @@ def recommend_smoothing(observation: Observation) -> float:
         relative**2 / np.maximum(observation.images, 1.0), observation.mask
     ).mean(axis=(1, 2))
     squares = (observation.psfs**2).sum(axis=(1, 2))
-    smoothing = SMOOTHING * float(np.sqrt((variance * squares).sum()))
-    log.info("smoothing chosen: %.3g, by the noise of the counts", smoothing)
-    return smoothing
+    return SMOOTHING * float(np.sqrt((variance * squares).sum()))
 
 
 def _is_weight(number: float) -> bool:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from commandline import NUMPY, PAPER, SHAPE, run
+from commandline import GIVEN, NUMPY, PAPER, SHAPE, run
 from scenes import paper
 
 import lnocl
@@ -34,6 +34,7 @@ class TestDeconvolve:
             "2,9",
         ),
         *PAPER,
+        *GIVEN,
         *("--mu", "1e-3", "--smoothing", "0.02", "--n-iter", "7", "--pad", "3"),
     )
 
@@ -96,6 +97,7 @@ class TestDeconvolve:
         header = fits.getheader("out.fits")
         expected = {
             "CREATOR": f"lnocl {lnocl.__version__}",
+            "PSFCENTR": "given",
             "SOLVER": "sgm",
             "NITER": 7,
             "STOPPED": "n_iter",
@@ -112,7 +114,7 @@ class TestDeconvolve:
         assert {keyword: header[keyword] for keyword in expected} == expected
         assert {len(header[name]) for name in ("ISUM1", "ISUM2", "PSUM1")} == {64}
         assert "".join(header["HISTORY"]).replace("\\", "") == (
-            f"cd {os.getcwd()}lnocl deconvolve a.fits b.fits --psf k1.fits "
+            f"cd {os.getcwd()}lnocl deconvolve a.fits b.fits --psf k1.fits --psf-centre given "
             "--background 2.5 3.0000000000000004 --read-noise 1.0 --star 7.0,5.0 --star 2.0,9.0 "
             "--n-iter 7 --stop none --solver sgm --mu 0.001 --smoothing 0.02 --pad 3 "
             "--precision double --engine numpy -o out.fits"

@@ -75,7 +75,7 @@ def deconvolve(observation, **keywords):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", lnocl.LnoclWarning)
-        return paper(lnocl.Observation(**observation), **keywords)
+        return paper(lnocl.Observation(**observation, psf_centre="given"), **keywords)
 
 
 def check(result):

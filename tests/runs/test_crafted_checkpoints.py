@@ -26,6 +26,7 @@ KINDS = {
     "change": {"stop": 1e-9},
     "discrepancy": {"stop": "discrepancy"},
     "held-out": {"solver": "sgp", "stop": "held-out", "n_iter": 12},
+    "smoothing": {"solver": "sgp", "stop": "held-out", "smoothing": "auto", "mu": 0.0},
 }
 NUMBERS = (
     -5, -1, 0, 1, 2, 3, 0.5, 7, 1000, 1e9, 2**31, -(2**31), 1e-300, 1e30, 1e38, 1e300, -1e300,

@@ -154,7 +154,7 @@ class TestDescent:
 def explain(psf):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lnocl.LnoclWarning)
-        return explain_rise(lnocl.Observation(np.ones((1, SIZE, SIZE)), psf))
+        return explain_rise(lnocl.Observation(np.ones((1, SIZE, SIZE)), psf, psf_centre="given"))
 
 
 NEGATIVE = gaussian() / gaussian().sum()

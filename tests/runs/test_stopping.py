@@ -196,31 +196,31 @@ def test_estimated_errors_are_unbiased(seed):
     """Against the truth, with halves that are it and noise."""
     rng = np.random.default_rng(seed)
     truth = 1.0 + rng.random(10_000)
-    noise = rng.normal(0.0, 0.1, (3, 2, truth.size))
-    noisy, best, last = (truth / 2 + each for each in noise * [[[3.0]], [[1.0]], [[1.0]]])
-    halves = [snapshot(1, *noisy), snapshot(2, *best), snapshot(3, *last)]
-    curve, _, _ = assess(halves, (1, truth.size))
-    squared = (np.linalg.norm(truth) * curve["error"]) ** 2
-    true = [((a + b - truth) ** 2).sum() for a, b in (noisy, best)]
+    noise = rng.normal(0.0, 0.1, (2, 2, truth.size))
+    (a, b), last = (truth / 2 + each for each in noise)
+    found = assess([snapshot(1, a, b)], snapshot(2, *last), (1, truth.size))
+    error = np.linalg.norm(a + b - truth) ** 2
     # Six standard errors: 4 |truth / 2| 0.1 twice.
     allowed = 6.0 * 4.0 * 0.1 * np.linalg.norm(truth)
-    assert abs((squared[0] - squared[1]) - (true[0] - true[1])) < 1.2 * allowed
+    assert abs(found.excess[0] + np.linalg.norm(truth) ** 2 - error) < allowed
+    assert found.noise[0] == pytest.approx(error, rel=0.2)
+    assert found.squared_norm == pytest.approx(np.linalg.norm(truth) ** 2, rel=0.01)
 
 
 @pytest.mark.parametrize("n_last", [12, 20])
-def test_errors_are_measured_from_the_noise_of_the_best_estimate(n_last):
+def test_the_last_iteration_within_a_tenth_of_the_least_error_is_chosen(n_last):
     """Halves of a truth of 10, first far from it, then noisy; best is iteration 12."""
     rng, halves = np.random.default_rng(1), []
     for k in range(1, n_last + 1):
         wide = 5.0 + 0.5 * max(12 - k, 0)
         halves.append(snapshot(k, *(wide + 0.1 * k * rng.standard_normal((2, 4000)))))
-    curve, best, chosen = assess(halves, (1, 4000))
-    a, b = best.extended
-    norm = 2.0 * np.sqrt((halves[-1].extended[0] * halves[-1].extended[1]).sum())
-    at = best.iteration - 1
-    assert curve["error"].argmin() == at
-    assert curve["error"][at] == pytest.approx(np.linalg.norm(a - b) / norm, rel=1e-6)
-    assert (curve["error"][at : chosen.iteration] <= 1.1 * curve["error"][at]).all()
+    found = assess(halves, halves[-1], (1, 4000))
+    assert found.best == 11
+    noise = [((a - b) ** 2).sum() for a, b in (each.extended for each in halves)]
+    np.testing.assert_allclose(found.noise, noise)
+    errors = np.sqrt(found.excess - found.excess.min() + found.noise[found.best])
+    within = np.flatnonzero(errors <= 1.1 * errors.min())
+    assert found.chosen == within[-1] == min(12, n_last - 1)
 
 
 def test_errors_are_measured_within_the_images():
@@ -231,7 +231,9 @@ def test_errors_are_measured_within_the_images():
         each._replace(extended=np.concatenate([each.extended, 1e3 * rng.random((2, 1, 9))], axis=2))
         for each in inside
     ]
-    np.testing.assert_array_equal(assess(wide, (1, 30))[0], assess(inside, (1, 30))[0])
+    found, expected = (assess(each, each[-1], (1, 30)) for each in (wide, inside))
+    np.testing.assert_array_equal(found.excess, expected.excess)
+    np.testing.assert_array_equal(found.noise, expected.noise)
 
 
 class TestHeldOut:
@@ -298,6 +300,7 @@ class TestHeldOut:
 
     def test_keeps_the_curve(self):
         result = run(scene()[0], stop="held-out", mu=1e-6)
+        assert set(result.held_out["smoothing"]) == {0.0}
         errors = result.held_out["error"]
         chosen = result.held_out["iteration"] == result.n_iter
         assert (errors[chosen] <= 1.1 * errors.min()).all()
@@ -378,11 +381,45 @@ def test_half_of_the_counts_with_twice_mu_has_half_the_answer():
 
 
 class TestSmoothing:
-    @pytest.mark.parametrize("stop", [None, "held-out"])
-    def test_auto_is_recommended(self, stop):
+    def test_auto_is_recommended(self):
         observation, *_ = scene()
-        result = run(observation, stop=stop, smoothing="auto", n_iter=40)
+        result = run(observation, smoothing="auto", n_iter=40)
         assert result.smoothing == recommend_smoothing(observation) > 0
+
+    @pytest.mark.parametrize("seed", [0, 3])
+    def test_held_out_counts_choose_the_weight_of_least_error(self, seed):
+        """None and multiples of what is recommended, until the error rises."""
+        observation, *_ = scene(seed=seed)
+        result = run(observation, stop="held-out", smoothing="auto")
+        curve = result.held_out
+        weights = np.unique(curve["smoothing"])
+        np.testing.assert_allclose(
+            weights, recommend_smoothing(observation) * np.array([0, 1, 3, 10])[: len(weights)]
+        )
+        least = [curve["error"][curve["smoothing"] == weight].min() for weight in weights]
+        assert result.smoothing == weights[np.argmin(least)]
+        assert (np.diff(least[:-1]) < 0).all()
+        assert len(weights) == 4 or least[-1] >= least[-2]
+
+    @pytest.mark.parametrize("solver", ["sgm", "sgp"])
+    def test_other_weights_go_on_from_a_third_of_the_iterations(self, solver):
+        observation, *_ = scene()
+        iterations = []
+        result = run(
+            observation,
+            stop="held-out",
+            smoothing="auto",
+            solver=solver,
+            callback=lambda k, _: iterations.append(k),
+        )
+        starts = [k for k, before in zip(iterations[1:], iterations, strict=False) if k <= before]
+        curve = result.held_out
+        first = curve["iteration"][curve["smoothing"] == 0]
+        origins = {curve["iteration"][curve["smoothing"] == w][0] for w in set(curve["smoothing"])}
+        assert {k - 1 for k in starts} == origins - {first[0]} or starts[0] - 1 in first
+        assert len(starts) == len(np.unique(curve["smoothing"])) - 1
+        assert len(result.history) == result.n_iter + 1
+        assert (np.diff(result.history["objective"][: starts[0]]) < 0).all()
 
     def test_after_too_many_iterations_it_is_better_than_none(self):
         observation, _, truth = scene()

@@ -32,7 +32,7 @@ def test_one_image_becomes_a_stack():
 @pytest.mark.parametrize("sum_", [1e-30, 1.0, 3.0, 1e30])
 def test_psfs_are_normalised(sum_):
     psfs = np.array([PSF, PSF[::-1], PSF[:, ::-1]])
-    observation = observe(psfs=sum_ * psfs)
+    observation = observe(psfs=sum_ * psfs, psf_centre="given")
     np.testing.assert_allclose(observation.psfs, psfs / 8, rtol=3e-16, atol=0)
 
 

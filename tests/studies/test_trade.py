@@ -22,7 +22,7 @@ from lnocl.studies import bench, demo, experiment, trade
 
 pytestmark = pytest.mark.usefixtures("few_screens")
 
-MADE = Recipe((32, 32), n_images=2, n_stars=1, mu=1e-4).make()
+MADE = Recipe((32, 32), n_images=2, n_stars=1, mu=1e-4, smooth=True, psf_shape=(9, 9)).make()
 N_ITER = 8
 ROWS = 16
 
