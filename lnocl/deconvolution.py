@@ -31,6 +31,7 @@ from lnocl.runs.progress import Bar
 from lnocl.runs.run import Run, most_bytes
 from lnocl.runs.start import Setup, make_start
 from lnocl.runs.stopping import Rule, make_rule
+from lnocl.scene.noise_check import warn_of_noise
 from lnocl.scene.observation import Observation
 from lnocl.scene.star_check import warn_of_stars
 from lnocl.scene.stars import check_positions
@@ -167,8 +168,9 @@ def deconvolve(
         A PSF is larger than the grid, so that its wings wrap round, or rings where it is moved
         between pixels; it is wider or narrower than a star, or a star is elsewhere than it was
         said to be; there are offsets without `pad`; single precision is expected to stray from
-        double by a thousandth of the extended source; held-out counts are asked of images that are
-        not whole counts, or choose an iteration too near `n_iter`; the images do not determine
+        double by a thousandth of the extended source; the noise of an image is not that of Poisson
+        counts, or that of neighbouring pixels is correlated; held-out counts choose an iteration
+        too near `n_iter`; the images do not determine
         stars that were refined; the objective rises or is not finite; a later checkpoint cannot be
         written; compiled kernels cannot be kept or are damaged.
 
@@ -243,6 +245,7 @@ def deconvolve(
     # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
     with bar, np.errstate(over="ignore", invalid="ignore"):
         start = make_start(setup, observation, penalties[0], initial_extended, initial_star_fluxes)
+        warn_of_noise(observation)
         warn_of_stars(start.scene)
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes
         largest = partial(measure, start, int(n_iter))

@@ -1,4 +1,4 @@
-"""Whether a model fits its images as well as noise allows: in all, and at each star."""
+"""Whether a model fits its images as well as noise allows: in all pixels, and at each star."""
 
 from __future__ import annotations
 
@@ -9,10 +9,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.cores import fwhm
 from lnocl.scene.observation import Array, Observation
+from lnocl.scene.scene import Scene
 
 # The core of a star is where its PSF is above this share of its peak; its wings go on to the other.
 CORE, WINGS = 0.5, 1e-3
+# Light round a star is looked for as far as so many widths of its PSF, in so many sectors, and is
+# worth a word from this share of the star's flux, and of all light there, on (docs/psf.md).
+REACH, SECTORS = 12.0, 8
+MUCH_HALO = 0.1
 # A misfit is this many times the noise, and as many standard errors above it.
 MISFIT, SIGNIFICANCE = 1.5, 5.0
 
@@ -67,10 +73,33 @@ class Fit(NamedTuple):
 
 
 class StarResiduals(NamedTuple):
-    """How well a model fits at a star: in the core of its images, and in their wings."""
+    """How well a model fits at a star.
+
+    Attributes
+    ----------
+    core, wings : Fit
+        In the core of its images, and in their wings.
+    halo : float
+        What lies all round the star in the extended source, falling outwards, as a share of the
+        star's flux: the light that a PSF too narrow or without wings leaves there.
+    halo_share : float
+        The same as a share of all that lies round the star.
+    """
 
     core: Fit
     wings: Fit
+    halo: float
+    halo_share: float
+
+    @property
+    def is_misfit(self) -> bool:
+        """Whether residuals are far above what noise gives."""
+        return self.core.is_misfit or self.wings.is_misfit
+
+    @property
+    def has_halo(self) -> bool:
+        """Whether much lies all round the star."""
+        return min(self.halo, self.halo_share) > MUCH_HALO
 
 
 def residuals(image: Array, mask: NDArray[np.bool_], model: Array) -> Array:
@@ -80,41 +109,103 @@ def residuals(image: Array, mask: NDArray[np.bool_], model: Array) -> Array:
     return np.divide(image - model, noise, out=np.full_like(model, np.nan), where=usable)
 
 
-def judge(
-    observation: Observation, models: Iterable[Array], positions: Array
-) -> tuple[Fit, list[StarResiduals]]:
-    """Return how well a model fits all good pixels, and at each star in all images together.
+def judge(observation: Observation, models: Iterable[Array]) -> Fit:
+    """Return how well the models m_j, each of shape (ny, nx), fit all good pixels."""
+    overall = Fit()
+    for image, mask, model in zip(observation.images, observation.mask, models, strict=True):
+        overall = overall.plus(Fit.of(residuals(image, mask, model), model))
+    return overall
+
+
+def judge_stars(scene: Scene, sky: Array, star_fluxes: Array) -> list[StarResiduals]:
+    """Return how well a model fits at each star, in all images together.
 
     Parameters
     ----------
-    observation : Observation
-        The p images and their PSFs.
-    models : iterable of ndarray of float64, shape (ny, nx)
-        The m_j.
-    positions : ndarray of float64, shape (n, 2)
-        (x, y) of the stars, pixels.
+    scene : Scene
+        What is modelled; the models are made in windows round its stars alone.
+    sky : ndarray of float64, shape (Ny, Nx)
+        Extended source on the grid, electrons per pixel.
+    star_fluxes : ndarray of float64, shape (n,)
+        Electrons.
     """
-    overall, at_stars = Fit(), [StarResiduals(Fit(), Fit()) for _ in positions]
-    for j, model in enumerate(models):
-        values = residuals(observation.images[j], observation.mask[j], model)
-        overall = overall.plus(Fit.of(values, model))
-        psf, offset = observation.psfs[j], observation.offsets[j]
-        for s, position in enumerate(positions):
-            found = _fit_at(psf, position + offset, values, model)
-            at_stars[s] = StarResiduals(*map(Fit.plus, at_stars[s], found))
-    return overall, at_stars
+    found = []
+    ny, nx = scene.observation.shape
+    width = min(fwhm(psf) for psf in scene.observation.psfs) if scene.n_stars else 0.0
+    for position, flux in zip(scene.stars, star_fluxes, strict=True):
+        core, wings = Fit(), Fit()
+        for j in range(scene.n_images):
+            fits = _fits_at(scene, sky, star_fluxes, j, position)
+            core, wings = core.plus(fits[0]), wings.plus(fits[1])
+        halo, light = _halo(sky[:ny, :nx], position, width)
+        shares = (halo / max(each, np.finfo(float).tiny) for each in (float(flux), light))
+        found.append(StarResiduals(core, wings, *shares))
+    return found
 
 
-def _fit_at(psf: Array, position: Array, values: Array, model: Array) -> tuple[Fit, Fit]:
+def _fits_at(
+    scene: Scene, sky: Array, star_fluxes: Array, j: int, position: Array
+) -> tuple[Fit, Fit]:
     """Return the fit in the core and in the wings of a star in one image."""
     from astropy.nddata import NoOverlapError, overlap_slices
 
-    middle = tuple(np.round(position[::-1]).astype(int))
+    from lnocl.scene.forward_model import model_window  # which loads scipy
+
+    observation = scene.observation
+    psf = observation.psfs[j]
+    y, x = np.nonzero(psf > WINGS * psf.max())
+    lit = psf[y.min() : y.max() + 1, x.min() : x.max() + 1]
+    # The middle of what is lit, where the PSF's is at the star.
+    middle = [
+        round(at) - n // 2 + low + size // 2
+        for at, n, low, size in zip(
+            (position + observation.offsets[j])[::-1],
+            psf.shape,
+            (y.min(), x.min()),
+            lit.shape,
+            strict=True,
+        )
+    ]
     try:
-        there, of_psf = overlap_slices(model.shape, psf.shape, middle)
+        there, of_psf = overlap_slices(observation.shape, lit.shape, middle)
     except NoOverlapError:  # the star is in other images alone
         return Fit(), Fit()
-    share = psf[of_psf] / psf.max()
+    rows, columns = (range(axis.start, axis.stop) for axis in there)
+    model = model_window(scene, sky, star_fluxes, j, rows, columns)
+    if scene.weights is not None and scene.has_exposure_map:
+        model *= scene.weights[j][there]
+    model *= scene.scale
+    values = residuals(observation.images[j][there], observation.mask[j][there], model)
+    share = lit[of_psf] / psf.max()
     is_core, is_wing = share > CORE, (share > WINGS) & (share <= CORE)
-    values, model = values[there], model[there]
     return Fit.of(values[is_core], model[is_core]), Fit.of(values[is_wing], model[is_wing])
+
+
+def _halo(extended: Array, position: Array, width: float) -> tuple[float, float]:
+    """Return the light that lies all round a position, and falls outwards; and all light there.
+
+    In each ring round it that is the lower quartile of the means of eight sectors, and never more
+    than in the ring inside it; less what is left in the outermost ring, at twelve PSF widths.
+    """
+    (x, y), (ny, nx) = position, extended.shape
+    reach = min(REACH * width, x, y, nx - 1 - x, ny - 1 - y)
+    edges = [0.0, 1.5]
+    while edges[-1] < reach:
+        edges.append(edges[-1] + max(1.0, 0.15 * edges[-1]))
+    first = np.maximum(np.floor((y - edges[-1], x - edges[-1])).astype(int), 0)
+    window = extended[first[0] : int(y + edges[-1]) + 2, first[1] : int(x + edges[-1]) + 2]
+    rows, columns = np.indices(window.shape)
+    dy, dx = rows + first[0] - y, columns + first[1] - x
+    ring = np.digitize(np.hypot(dy, dx), edges) - 1
+    sector = ((np.arctan2(dy, dx) / (2.0 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
+    sector[ring == 0] = 0
+    n = len(edges) - 1
+    inside = ring < n
+    index = (ring * SECTORS + sector)[inside]
+    counts = np.bincount(index, minlength=n * SECTORS).reshape(n, SECTORS)
+    sums = np.bincount(index, window[inside], minlength=n * SECTORS).reshape(n, SECTORS)
+    means = np.divide(sums, counts, out=np.full(sums.shape, np.inf), where=counts > 0)
+    lower = np.sort(means, axis=1)[np.arange(n), (counts > 0).sum(axis=1) // 4]
+    falling = np.minimum.accumulate(lower)
+    halo = ((falling - falling[-1]) * counts.sum(axis=1)).sum()
+    return float(halo), float(sums.sum())

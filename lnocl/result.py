@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.residuals import Fit, StarResiduals, judge, residuals
+from lnocl.residuals import Fit, StarResiduals, judge, judge_stars, residuals
 from lnocl.runs.outcome import Outcome
-from lnocl.scene.observation import Array, Observation
-from lnocl.scene.scene import Scene
+from lnocl.scene.observation import Array
 
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
@@ -127,8 +126,7 @@ class Result:
     mu: float
     smoothing: float
     held_out: NDArray[np.void]
-    _models: Callable[[], Iterator[Array]] = field(repr=False, compare=False)
-    _observation: Observation = field(repr=False, compare=False)
+    _outcome: Outcome = field(repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for values in vars(self).values():
@@ -141,22 +139,28 @@ class Result:
         ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j``, in double precision. As in the observation,
         the square of the read noise is included.
         """
-        return np.array(list(self._models()))
+        return np.array(list(_models(self._outcome)))
 
     def residuals(self) -> Array:
         """Return ``(g_j - m_j) / sqrt(m_j)``, shape (p, ny, nx): about 1 where only noise is left.
 
         NaN where a pixel is bad, or the model is 0.
         """
-        images = zip(self._observation.images, self._observation.mask, self._models(), strict=True)
+        observation = self._outcome.scene.observation
+        images = zip(observation.images, observation.mask, _models(self._outcome), strict=True)
         return np.array([residuals(*each) for each in images])
 
-    def fits(self) -> tuple[Fit, list[StarResiduals]]:
-        """Return how well the model fits all good pixels, and at each star.
+    def fit(self) -> Fit:
+        """Return how well the model fits all good pixels.
 
         It takes a convolution of each image in double precision on the host.
         """
-        return judge(self._observation, self._models(), self.star_positions)
+        return judge(self._outcome.scene.observation, _models(self._outcome))
+
+    def star_residuals(self) -> list[StarResiduals]:
+        """Return how well the model fits at each star: in its core, its wings and round it."""
+        outcome = self._outcome
+        return judge_stars(outcome.scene, outcome.sky, outcome.star_fluxes)
 
 
 def make_result(outcome: Outcome) -> Result:
@@ -168,8 +172,8 @@ def make_result(outcome: Outcome) -> Result:
     flux_errors, position_errors = outcome.star_errors()
     ny, nx = scene.observation.shape
     return Result(
-        extended=outcome.extended[:ny, :nx] * scene.unit,
-        star_fluxes=outcome.star_fluxes * scene.unit,
+        extended=outcome.sky[:ny, :nx],
+        star_fluxes=outcome.star_fluxes,
         star_positions=scene.stars,
         star_flux_errors=flux_errors,
         star_position_errors=position_errors,
@@ -180,16 +184,17 @@ def make_result(outcome: Outcome) -> Result:
         mu=outcome.penalty.mu,
         smoothing=outcome.penalty.smoothing,
         held_out=outcome.curve,
-        _models=partial(_models, scene, outcome.extended, outcome.star_fluxes),
-        _observation=scene.observation,
+        _outcome=outcome,
     )
 
 
-def _models(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[Array]:
+def _models(outcome: Outcome) -> Iterator[Array]:
     """Yield the m_j, electrons per pixel."""
     from lnocl.scene.forward_model import model_images  # which loads scipy
 
+    scene = outcome.scene
     ny, nx = scene.observation.shape
+    extended, star_fluxes = outcome.sky / scene.unit, outcome.star_fluxes / scene.unit
     for j, image in enumerate(model_images(scene, extended, star_fluxes)):
         if scene.weights is not None and scene.has_exposure_map:
             image *= scene.weights[j]

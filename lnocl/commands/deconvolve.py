@@ -25,10 +25,20 @@ if TYPE_CHECKING:
     from lnocl.io.fitswrite import StarColumn
     from lnocl.io.frames import Calibration, Frames
 
-Fits = tuple[Fit, list[StarResiduals]]
-
 PARAMETERS = {
     name: parameter.default for name, parameter in inspect.signature(deconvolve).parameters.items()
+}
+
+
+REASONS = {
+    "n_iter": "all iterations were done",
+    "held-out": "held-out counts chose this iteration",
+    "discrepancy": "the data are fitted as well as noise allows",
+    "change": "the objective hardly changed any more",
+    "converged": "no step lowers the objective any more",
+    "diverged": "the objective rose after this iteration",
+    "not finite": "the objective was not finite after this iteration",
+    "interrupt": "it was interrupted",
 }
 
 
@@ -70,7 +80,7 @@ OPTIONS = {
             "--residuals",
             action="store_true",
             help="add a cube with the residuals of each image, (image - model) / sqrt(model), with "
-            "the same header; say how well the model fits, in all and at each star",
+            "the same header; say how well the model fits in all pixels",
         ),
         options.QUIET,
     ],
@@ -242,7 +252,8 @@ def _run(arguments: argparse.Namespace) -> None:
             callback=interrupts.callback,
         )
         interrupts.listen()  # a run that was resumed at its end has no iteration to start from
-        fits_found = result.fits() if arguments.residuals else None
+        at_stars = result.star_residuals()
+        overall = result.fit() if arguments.residuals else None
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
         offsets = frames.observation.offsets
@@ -267,12 +278,12 @@ def _run(arguments: argparse.Namespace) -> None:
             overwrite=arguments.overwrite,
             held_out=result.held_out if result.held_out.size else None,
             per_second=bool(arguments.exposure),
-            star_columns=_star_columns(arguments, result, frames.header, fits_found),
+            star_columns=_star_columns(arguments, result, frames.header, at_stars),
             cubes=_cubes(arguments, result),
             offsets=offsets,
         )
         if not arguments.quiet:
-            messages.say(_summary(arguments, result, fits_found))
+            messages.say(_summary(arguments, result, at_stars, overall))
     interrupts.explain(arguments, result)
 
 
@@ -333,7 +344,7 @@ def _star_columns(
     arguments: argparse.Namespace,
     result: Result,
     header: fits.Header,
-    found: Fits | None,
+    at_stars: Sequence[StarResiduals],
 ) -> list[StarColumn]:
     """Return the columns of the table of stars after positions and fluxes."""
     from lnocl.io import sky
@@ -358,15 +369,12 @@ def _star_columns(
             StarColumn("ra", ra, "deg", "right ascension, ICRS"),
             StarColumn("dec", dec, "deg", "declination, ICRS"),
         ]
-    if found:
-        for name, fits_there in (
-            ("core", [each.core for each in found[1]]),
-            ("wings", [each.wings for each in found[1]]),
-        ):
-            values = [fit.rms for fit in fits_there]
-            columns.append(
-                StarColumn(f"{name}_rms", values, "", f"rms residual in the {name}, 1 by noise")
-            )
+    core, wings, halo, _ = map(list, zip(*at_stars, strict=True) if at_stars else [()] * 4)
+    for name, found in (("core", core), ("wings", wings)):
+        values = [fit.rms for fit in found]
+        comment = f"rms residual in the {name}, 1 by noise"
+        columns.append(StarColumn(f"{name}_rms", values, "", comment))
+    columns.append(StarColumn("halo", halo, "", "light all round it over its flux"))
     return columns
 
 
@@ -386,29 +394,28 @@ def _device_spec(arguments: argparse.Namespace) -> str | None:
     return device.spec_of(device.choose(arguments.device).device)
 
 
-def _summary(arguments: argparse.Namespace, result: Result, found: Fits | None) -> list[str]:
+def _summary(
+    arguments: argparse.Namespace,
+    result: Result,
+    at_stars: Sequence[StarResiduals],
+    overall: Fit | None,
+) -> list[str]:
     objective = result.history["objective"][-1]
     electrons = "electrons per second" if arguments.exposure else "electrons"
     stars = [
-        f"star at ({x:.7g}, {y:.7g}): {flux:.6g} {electrons}"
-        for (x, y), flux in zip(result.star_positions, result.star_fluxes, strict=True)
+        f"star at ({x:.7g}, {y:.7g}): {flux:.6g} {electrons}; residuals {_rms(found.core)} in its "
+        f"core, {_rms(found.wings)} in its wings, where noise gives 1"
+        for (x, y), flux, found in zip(
+            result.star_positions, result.star_fluxes, at_stars, strict=True
+        )
     ]
-    verdict = []
-    if found:
-        fit, at_stars = found
-        stars = [
-            f"{star}; residuals {_rms(core)} in its core, {_rms(wings)} in its wings"
-            for star, (core, wings) in zip(stars, at_stars, strict=True)
-        ]
-        words = _verdict(result, fit, at_stars)
-        verdict = [f"residuals {_rms(fit)} in all, where noise gives 1: {words}"]
-    reason = f"stopped by {result.stop_reason}"
     return [
         f"{counted(result.n_iter, 'iteration')} on {result.device}, objective {objective:.6g}",
-        *([] if result.stop_reason == "n_iter" else [reason]),
+        REASONS[result.stop_reason],
         *stars,
         f"extended source: {result.extended.sum():.6g} {electrons}",
-        *verdict,
+        *([] if overall is None else [f"residuals {_rms(overall)} in all, where noise gives 1"]),
+        *_verdict(result.star_positions, at_stars, overall),
         f"written to {arguments.output}",
     ]
 
@@ -417,21 +424,31 @@ def _rms(fit: Fit) -> str:
     return f"{fit.rms:.2f} +- {fit.error:.2f}" if fit.n_pixels else "unknown (no good pixel)"
 
 
-def _verdict(result: Result, fit: Fit, at_stars: Sequence[StarResiduals]) -> str:
+def _verdict(positions: Any, at_stars: Sequence[StarResiduals], overall: Fit | None) -> list[str]:
     """Return whether the model fits, and where not what to do."""
-    unfitted = [
-        f"({x:.7g}, {y:.7g})"
-        for (x, y), (core, wings) in zip(result.star_positions, at_stars, strict=True)
-        if core.is_misfit or wings.is_misfit
-    ]
+    unfitted, lit = [], []
+    for (x, y), found in zip(positions, at_stars, strict=True):
+        if found.is_misfit:
+            unfitted.append(f"({x:.7g}, {y:.7g})")
+        if found.has_halo:
+            lit.append(f"({x:.7g}, {y:.7g}), {100 * found.halo:.0f} %")
+    verdict = []
     if unfitted:
-        return (
+        verdict.append(
             f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
-            f"{' '.join(unfitted[:3])}: take more iterations, or a PSF that fits"
+            f"{' '.join(unfitted[:3])}: its PSF or its position is wrong"
         )
-    if fit.is_misfit:
-        return "the model does not fit: take more iterations, or see to background and noise"
-    return "the model fits"
+    elif overall is not None and overall.is_misfit:
+        verdict.append("the model does not fit: see to background, noise and gain")
+    if lit:
+        verdict.append(
+            f"light lies all round {counted(len(lit), 'star')}, as a share of its flux: "
+            f"{'; '.join(lit[:3])}: the PSF is too narrow or lacks its wings, the background is "
+            "too low, or a source lies there"
+        )
+    if at_stars or overall is not None:
+        verdict = verdict or ["the model fits"]
+    return verdict
 
 
 COMMAND = Command(

@@ -76,11 +76,6 @@ class HeldOutCounts:
     ------
     InputError
         The images hold no counts, or too many in a pixel.
-
-    Warns
-    -----
-    LnoclWarning
-        The images are not whole counts.
     """
 
     def __init__(self, start: Start, penalties: Sequence[Penalty], n_iter: int) -> None:
@@ -224,10 +219,12 @@ class HeldOutCounts:
         scene = copy(start.scene)
         if start.refines:
             scene.move_stars(snapshot.positions.mean(axis=0))
+        sky = snapshot.extended.mean(axis=0, dtype=np.float64)
+        sky *= scene.unit
         return Outcome(
             scene=scene,
-            extended=snapshot.extended.mean(axis=0, dtype=np.float64),
-            star_fluxes=snapshot.star_fluxes.mean(axis=0),
+            sky=sky,
+            star_fluxes=snapshot.star_fluxes.mean(axis=0) * scene.unit,
             given_stars=start.given_stars if start.refines else None,
             objectives=objectives,
             engine_name=engine_name(start.setup),

@@ -18,16 +18,16 @@ CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("er
 
 @dataclass(frozen=True)
 class Outcome:
-    """The estimate that a reconstruction ended with, scaled, and how it came there.
+    """The estimate that a reconstruction ended with, and how it came there.
 
     Attributes
     ----------
     scene : Scene
         The model of the observation, with the stars where they are now.
-    extended : ndarray of float64, shape (Ny, Nx)
-        Extended source.
+    sky : ndarray of float64, shape (Ny, Nx)
+        Extended source on the grid, electrons per pixel.
     star_fluxes : ndarray of float64, shape (n,)
-        Star fluxes.
+        Electrons.
     given_stars : ndarray of float64, shape (n, 2), or None
         The positions that were given, where the stars were moved from them.
     objectives : ndarray of float64, shape (n_iter + 1,)
@@ -43,7 +43,7 @@ class Outcome:
     """
 
     scene: Scene
-    extended: Array
+    sky: Array
     star_fluxes: Array
     given_stars: Array | None
     objectives: Array
@@ -66,8 +66,8 @@ class Outcome:
         from lnocl.solvers.positions import StarFit, Stars
 
         scene = self.scene
-        fit = StarFit(scene, make_model(scene), self.extended, self.given_stars)
-        errors = fit.errors(Stars(self.star_fluxes, scene.stars))
+        fit = StarFit(scene, make_model(scene), self.sky / scene.unit, self.given_stars)
+        errors = fit.errors(Stars(self.star_fluxes / scene.unit, scene.stars))
         is_blended = np.isnan(errors.fluxes) | np.isnan(errors.positions).any(axis=1)
         if is_blended.any():
             named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in scene.stars[is_blended])

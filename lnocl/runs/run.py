@@ -288,10 +288,12 @@ class Run:
     def outcome(self, penalty: Penalty, stop_reason: str) -> Outcome:
         """Return what the run has come to, once it has ended."""
         self.finish()
+        sky = self.engine.extended()
+        sky *= self.scene.unit
         return Outcome(
             scene=self.scene,
-            extended=self.engine.extended(),
-            star_fluxes=self.engine.star_fluxes(),
+            sky=sky,
+            star_fluxes=self.star_fluxes(),
             given_stars=self._given_stars if self._refines else None,
             objectives=self.objectives(),
             engine_name=self.engine.name,

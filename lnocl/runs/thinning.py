@@ -6,14 +6,12 @@ from copy import copy
 
 import numpy as np
 
-from lnocl.errors import InputError, warn
+from lnocl.errors import InputError
 from lnocl.scene.observation import Array, Observation
 
 # Binomial samples are drawn as 64-bit integers.
 MAX_COUNTS = 2.0**62
 SEED = 0
-# A count in single precision is whole to this share of it.
-COUNT_ROUNDING = 1e-6
 
 
 def split_counts(observation: Observation) -> tuple[Observation, Observation]:
@@ -27,11 +25,6 @@ def split_counts(observation: Observation) -> tuple[Observation, Observation]:
     ------
     InputError
         The images hold no counts, or too many in a pixel.
-
-    Warns
-    -----
-    LnoclWarning
-        Images that are not whole counts.
     """
     images = observation.images
     if not images.any():
@@ -41,8 +34,6 @@ def split_counts(observation: Observation) -> tuple[Observation, Observation]:
             f"a pixel of {images.max():.3g} electrons is too bright to be split; give n_iter and "
             "stop None"
         )
-    if not _are_whole(observation):
-        warn("the images are not whole counts: they are split as if they were Poisson counts")
     rng = np.random.default_rng(SEED)
     first = np.empty_like(images)
     for image, half in zip(images, first, strict=True):
@@ -57,12 +48,3 @@ def _half(observation: Observation, images: Array) -> Observation:
     half = copy(observation)
     half.images, half.background = images, observation.background / 2.0
     return half
-
-
-def _are_whole(observation: Observation) -> bool:
-    """Return whether all counts are whole, as they were before the read noise was added."""
-    variance = observation.read_noise**2
-    counts = observation.images - (variance if variance.ndim == 3 else variance[:, None, None])
-    counts = counts[~observation.mask & (observation.images > 0)]  # negative ones were set to 0
-    rounding = COUNT_ROUNDING * np.maximum(abs(counts), 1.0)
-    return bool((abs(counts - np.round(counts)) <= rounding).all())

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import scipy.fft
+import scipy.signal
 from numpy.typing import NDArray
 
 from lnocl.scene.observation import Array
@@ -113,6 +114,29 @@ def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[
         image = scipy.fft.irfft2(otf, scene.grid, workers=-1, overwrite_x=True)
         _illuminate(image, background[j], scene.star_field.light(j, star_fluxes))
         yield image
+
+
+def model_window(
+    scene: Scene, sky: Array, star_fluxes: Array, j: int, rows: range, columns: range
+) -> Array:
+    """Return m_j, scaled, in a window of the grid, of a sky and star fluxes in electrons."""
+    psf = scene.psf_stamp(j)
+    height, width = psf.values.shape
+    around = sky.take(
+        range(rows.start - psf.y - height + 1, rows.stop - psf.y), axis=0, mode="wrap"
+    ).take(range(columns.start - psf.x - width + 1, columns.stop - psf.x), axis=1, mode="wrap")
+    image = scipy.signal.fftconvolve(around / scene.unit, psf.values, mode="valid")
+    background = scene.background()[j]
+    image += (
+        background[rows.start : rows.stop, columns.start : columns.stop]
+        if np.ndim(background)
+        else background
+    )
+    for stamp, flux in zip(scene.star_field.stamps[j], star_fluxes, strict=True):
+        y, x = stamp.rows(scene.grid) - rows.start, stamp.columns(scene.grid) - columns.start
+        y_in, x_in = (y >= 0) & (y < len(rows)), (x >= 0) & (x < len(columns))
+        image[np.ix_(y[y_in], x[x_in])] += flux / scene.unit * stamp.values[np.ix_(y_in, x_in)]
+    return np.maximum(image, 0.0, out=image)
 
 
 def _illuminate(image: Array, background: Array | float, starlight: Array) -> None:

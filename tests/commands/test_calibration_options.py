@@ -137,15 +137,15 @@ class TestFrames:
         found = outcome("out.fits")
         np.testing.assert_array_equal(found["PRIMARY"], expected.extended)
         table = found["STARS"]
-        rms = [(core.rms, wings.rms) for core, wings in expected.fits()[1]]
+        rms = [(s.core.rms, s.wings.rms, s.halo) for s in expected.star_residuals()]
         assert list(table) == ["x", "y", "flux", "x_error", "y_error", "flux_error", "mag", "ra",
-                               "dec", "core_rms", "wings_rms"]  # fmt: skip
+                               "dec", "core_rms", "wings_rms", "halo"]  # fmt: skip
         for names, values in [
             (["x", "y"], expected.star_positions.T),
             (["flux"], [expected.star_fluxes]),
             (["x_error", "y_error"], expected.star_position_errors.T),
             (["flux_error"], [expected.star_flux_errors]),
-            (["core_rms", "wings_rms"], np.transpose(rms)),
+            (["core_rms", "wings_rms", "halo"], np.transpose(rms)),
         ]:
             np.testing.assert_array_equal([table[name] for name in names], values)
         assert (table["flux_error"] > 0).all()
@@ -174,7 +174,7 @@ class TestFrames:
             "mag": "mag",
             "ra": "deg",
             "dec": "deg",
-            **dict.fromkeys(["core_rms", "wings_rms"], ""),
+            **dict.fromkeys(["core_rms", "wings_rms", "halo"], ""),
         }
         np.testing.assert_allclose(WCS(header).world_to_pixel(self.sky), [7.0, 5.0], atol=1e-6)
         for cube in cubes:  # the images are shifted against each other
@@ -257,7 +257,8 @@ class TestFrames:
         assert self.run("--gain", "1", "--exposure", "1", "--zero-point", "25", "--refine",
                         "--n-iter", "1", "--models") == 0  # fmt: skip
         found = outcome("out.fits")
-        assert list(found["STARS"]) == ["x", "y", "flux", "x_error", "y_error", "flux_error", "mag"]
+        columns = ["x", "y", "flux", "x_error", "y_error", "flux_error", "mag"]
+        assert list(found["STARS"]) == [*columns, "core_rms", "wings_rms", "halo"]
         assert found["MODELS"].shape == (2, *SHAPE)
 
     def test_the_result_is_plotted(self, capsys):

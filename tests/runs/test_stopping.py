@@ -2,7 +2,6 @@
 
 import functools
 import io
-import warnings
 
 import numpy as np
 import pytest
@@ -125,9 +124,7 @@ class TestHalves:
         """Variance and covariance of a million pixels, six standard errors wide."""
         n, mean = 1000, 20.0
         images = np.random.default_rng(5).poisson(mean, (n, n)) + fraction
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", LnoclWarning)
-            first, second = split_counts(lnocl.Observation(images, np.ones((1, 1))))
+        first, second = split_counts(lnocl.Observation(images, np.ones((1, 1))))
         covariance = np.cov(first.images.ravel(), second.images.ravel())
         allowed = 6.0 * mean / 2.0 * np.sqrt(2.0) / n
         # Of a fraction, which is no count, 1/4 of its square goes to each.
@@ -151,27 +148,6 @@ class TestHalves:
             np.testing.assert_array_equal(half.mask, observation.mask)
             np.testing.assert_array_equal(half.offsets, observation.offsets)
             np.testing.assert_array_equal(half.exposure[seen], observation.exposure[seen])
-
-    def test_say_that_images_are_no_whole_counts(self):
-        for images, read_noise in ((2.5, 0.0), (2.25, 0.5), (3e5 + 0.4, 1.0)):
-            observation = lnocl.Observation(
-                np.full((4, 4), images), np.ones((1, 1)), read_noise=read_noise
-            )
-            with pytest.warns(LnoclWarning, match="the images are not whole counts"):
-                split_counts(observation)
-
-    @pytest.mark.parametrize("read_noise", [0.0, 2.3, np.full((16, 16), 2.3)])
-    @pytest.mark.parametrize("gain", [1.0, 0.7], ids=["counts", "rounded"])
-    def test_whole_counts_with_read_noise_or_rounding_are_whole_counts(self, read_noise, gain):
-        """As a camera's counts are, divided by a gain and multiplied by it in single precision."""
-        counts = np.random.default_rng(2).poisson(3000.0, (16, 16)).astype(np.float32)
-        counts[0, :4] = -9.0, -1.0, 0.0, 1.0
-        images = counts / np.float32(gain) * np.float32(gain)
-        assert (images == np.round(images)).all() == (gain == 1.0)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".* negative and w.* set to 0")
-            observation = lnocl.Observation(images, np.ones((1, 1)), read_noise=read_noise)
-        split_counts(observation)
 
     @pytest.mark.parametrize(
         ("value", "message"),
@@ -309,15 +285,6 @@ class TestHeldOut:
     def test_without_the_rule_there_is_no_curve(self):
         assert run(scene()[0], n_iter=2).held_out.size == 0
 
-    def test_says_once_that_images_are_no_whole_counts(self):
-        observation, *_ = scene()
-        fractions = lnocl.Observation(observation.images + 0.25, observation.psfs, background=20.25)
-        with pytest.warns(LnoclWarning) as caught:
-            run(fractions, stop="held-out", n_iter=100)
-        assert [str(each.message) for each in caught if "whole" in str(each.message)] == [
-            "the images are not whole counts: they are split as if they were Poisson counts"
-        ]
-
     def test_halves_that_end_at_once_are_refused(self, monkeypatch):
         monkeypatch.setattr("lnocl.runs.run.SOLVERS", {"sgp": lambda *_: iter(())})
         with pytest.raises(lnocl.InputError, match="no iteration betters the start"):
@@ -367,6 +334,7 @@ def test_progress_of_held_out_counts_has_no_end(monkeypatch):
     assert "objective" in last
 
 
+@pytest.mark.filterwarnings("ignore:the noise of image")
 def test_half_of_the_counts_with_twice_mu_has_half_the_answer():
     """Half the data term, a quarter of the squares: what runs of halves rely on."""
     observation, *_ = scene()

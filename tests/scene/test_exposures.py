@@ -261,6 +261,7 @@ def test_a_common_offset_moves_the_sky(recipe):
     assert_close(moved_back, result, 4e-15, 8e-16, 3e-16)  # measured 1.4e-15, 2.9e-16, 9.7e-17
 
 
+@pytest.mark.filterwarnings("ignore:neighbouring pixels of image")
 @pytest.mark.parametrize("by", [(0.5, 0.0), (0.25, -0.4), (2.3, 1.7)])
 def test_a_star_and_images_moved_by_a_fraction_give_the_same_flux(by):
     """Stars alone, through PSFs that pixels hold: the flux is that of where they were."""

@@ -1,7 +1,5 @@
 """The models and residuals of a result, against the equation written out in numpy."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scenes import blur, make_psfs, paper
@@ -100,11 +98,12 @@ def test_residuals_are_in_standard_deviations(known):
     np.testing.assert_allclose(residuals[~bad], expected[~bad], rtol=1e-12, atol=1e-12)
 
 
-def test_there_is_none_where_nothing_is_modelled():
+def test_there_is_none_where_nothing_is_modelled(monkeypatch):
     _, result = solve()
     models = result.models()
     models[0, 2, 3] = 0.0
-    residuals = dataclasses.replace(result, _models=lambda: models).residuals()
+    monkeypatch.setattr("lnocl.result._models", lambda _: iter(models))
+    residuals = result.residuals()
     assert np.isnan(residuals[0, 2, 3])
     assert np.isnan(residuals).sum() == 1
 

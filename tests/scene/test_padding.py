@@ -41,7 +41,7 @@ def test_at_most_half_the_shorter_side_and_at_least_one():
 
 @pytest.mark.parametrize("engine", ["numpy", pytest.param("opencl", marks=pytest.mark.exhaustive)])
 def test_auto_is_that_pad_and_is_announced(engine, caplog):
-    observation = lnocl.Observation(np.full((64, 64), 9.0), GAUSSIAN)
+    observation = lnocl.Observation(np.random.default_rng(0).poisson(9.0, (64, 64)), GAUSSIAN)
     with caplog.at_level(logging.INFO, "lnocl"):
         found = paper(observation, pad="auto", n_iter=2, engine=engine)
     words = "pad chosen: 7 pixels, as light runs over the edge of the images"

@@ -1,0 +1,111 @@
+"""Whether the noise of images is that of Poisson counts, and of each pixel by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from lnocl.errors import warn
+from lnocl.scene.observation import Array, Observation
+
+# Noise is measured in square blocks, of these the darker half, where there are so many.
+BLOCK = 8
+MIN_BLOCKS = 24
+# Second differences of neighbours, and of pixels so far apart.
+FAR = 3
+# What is said of: the variance over the mean beyond this factor of 1, and that of neighbours below
+# this share of that of pixels apart (docs/psf.md).
+MAX_FACTOR = 1.5
+MIN_SHARE = 0.7
+
+
+class Noise(NamedTuple):
+    """The noise of an image where it is darkest.
+
+    Attributes
+    ----------
+    mean : float
+        Electrons per pixel, with the square of the read noise.
+    variance : float
+        By second differences of neighbours: ``<(g(n - 1) - 2 g(n) + g(n + 1))^2> / 6``.
+    variance_apart : float
+        The same of pixels three apart; larger where the noise of neighbours is correlated.
+    """
+
+    mean: float
+    variance: float
+    variance_apart: float
+
+    def log_factor(self) -> float:
+        """Return the logarithm of the variance over the mean, 0 for Poisson counts."""
+        least = float(np.finfo(float).tiny)
+        return float(np.log(max(self.variance, least) / max(self.mean, least)))
+
+    def is_white(self) -> bool:
+        """Return whether neighbours differ as much as pixels apart."""
+        return self.variance >= MIN_SHARE * self.variance_apart
+
+    def is_white_or_below(self) -> bool:
+        """Return whether structure does not explain the variance."""
+        return self.is_white() or self.variance < self.mean
+
+
+def measure_noise(observation: Observation) -> Iterator[Noise | None]:
+    """Yield the noise of each image; None where too few blocks are free of bad pixels."""
+    ny, nx = (n - n % BLOCK for n in observation.shape)
+    for image, mask in zip(observation.images, observation.mask, strict=True):
+        means = _block_means(image[:ny, :nx])
+        good = ~_block_means(mask[:ny, :nx]).astype(bool)
+        if good.sum() < 2 * MIN_BLOCKS:
+            yield None
+            continue
+        dark = good & (means <= np.median(means[good]))
+        near, apart = (_block_means(_squares(image[:ny, :nx], lag))[dark] for lag in (1, FAR))
+        yield Noise(*map(float, (means[dark].mean(), np.median(near), np.median(apart))))
+
+
+def _squares(image: Array, lag: int) -> Array:
+    """Return the squares of second differences along rows over 6, their mean at the ends."""
+    differences = image[:, : -2 * lag] - 2.0 * image[:, lag:-lag] + image[:, 2 * lag :]
+    return np.pad(differences**2 / 6.0, ((0, 0), (lag, lag)), mode="reflect")
+
+
+def _block_means(pixels: Array) -> Array:
+    ny, nx = pixels.shape
+    return pixels.reshape(ny // BLOCK, BLOCK, nx // BLOCK, BLOCK).mean(axis=(1, 3))
+
+
+def warn_of_noise(observation: Observation) -> None:
+    """Warn of the image whose noise is least that of Poisson counts.
+
+    More variance at a distance than between neighbours is structure, such as the rings of a star,
+    unless there is less than Poisson counts have: then the noise of neighbours is correlated.
+
+    Warns
+    -----
+    LnoclWarning
+        The variance is 1.5 times the mean or more, or less than two thirds of it.
+    """
+    found = [
+        (abs(factor), factor, j, noise)
+        for j, noise in enumerate(measure_noise(observation))
+        if noise is not None and (factor := noise.log_factor()) and noise.is_white_or_below()
+    ]
+    size, factor, j, noise = max(found, default=(0.0, 0.0, 0, Noise(1.0, 1.0, 1.0)))
+    if size < np.log(MAX_FACTOR):
+        return
+    if factor < 0 and not noise.is_white():
+        warn(
+            f"neighbouring pixels of image {j} share their noise, as drizzled or resampled ones do "
+            f"(variance {noise.variance:.3g} between neighbours, {noise.variance_apart:.3g} "
+            f"between pixels apart, mean {noise.mean:.3g}): held-out counts choose too many "
+            "iterations; take images that were not resampled, or give n_iter and stop none"
+        )
+    else:
+        warn(
+            f"the noise of image {j} is not that of its counts: where it is darkest the variance "
+            f"is {noise.variance:.3g} and the mean {noise.mean:.3g} electrons; see to gain, "
+            "background (a sky that was subtracted is added again) and read noise"
+        )

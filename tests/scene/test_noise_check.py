@@ -1,0 +1,95 @@
+"""Images whose noise is not that of their counts."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import lnocl
+from lnocl.scene.noise_check import measure_noise, warn_of_noise
+
+SHAPE, LEVEL = (128, 130), 60.0
+Y, X = np.indices(SHAPE) - 64.0
+STAR = 4e4 * np.exp(-(X**2 + Y**2) / 20.0) + 900.0 / (1.0 + (X**2 + Y**2) / 50.0) ** 2
+
+
+def counts(seed=0, level=LEVEL):
+    return np.random.default_rng(seed).poisson(STAR + level).astype(float)
+
+
+def said(images, **given):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        observation = lnocl.Observation(images, np.ones((1, 1)), **given)
+        caught.clear()
+        warn_of_noise(observation)
+    return [str(each.message) for each in caught]
+
+
+def drizzled(image):
+    """Spread each pixel over its neighbours."""
+    return (image + np.roll(image, 1, 0) + np.roll(image, 1, 1) + np.roll(image, 1, (0, 1))) / 4
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("level", [0.5, 60.0, 5e4])
+def test_nothing_is_said_of_counts(seed, level):
+    assert said(counts(seed, level), background=level) == []
+
+
+def test_nothing_is_said_of_counts_with_read_noise():
+    image = counts() + np.random.default_rng(1).normal(0.0, 12.0, SHAPE)
+    assert said(image, read_noise=12.0) == []
+
+
+def test_nothing_is_said_of_bright_structure():
+    """The fringes of a star in all of the image."""
+    image = np.random.default_rng(3).poisson(5e4 * (2.0 + np.sin(X / 2.0) * np.cos(Y / 3.0)))
+    assert said(image.astype(float)) == []
+
+
+WRONG = {
+    "gain of 2": counts() / 2.0,
+    "gain of 1 / 2": 2.0 * counts(),
+    "gain of 1000": counts() / 1000.0,
+    "gain of 1 / 1000": 1000.0 * counts(),
+    "sky subtracted": counts() - LEVEL,
+    "read noise left out": counts() + np.random.default_rng(1).normal(0.0, 12.0, SHAPE),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_other_noise_is_said(case):
+    (message,) = said(np.array([counts(5), WRONG[case]]))
+    assert message.startswith("the noise of image 1 is not that of its counts: where it is darkest")
+    assert "see to gain, background" in message
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_correlated_noise_is_said(times):
+    image = counts()
+    for _ in range(times):
+        image = drizzled(image)
+    (message,) = said(image)
+    assert message.startswith("neighbouring pixels of image 0 share their noise, as drizzled")
+
+
+def test_bad_pixels_are_left_out():
+    image, mask = counts(), np.zeros(SHAPE, bool)
+    mask[::16, ::16] = True
+    image[mask] = 1e9
+    (whole,), (cut,) = (
+        list(measure_noise(lnocl.Observation(each, np.ones((1, 1)), mask=mask)))
+        for each in (counts(), image)
+    )
+    assert whole == cut
+    mask[::8, ::8] = True
+    assert list(measure_noise(lnocl.Observation(image, np.ones((1, 1)), mask=mask))) == [None]
+
+
+def test_the_variance_is_that_of_the_counts():
+    image = np.random.default_rng(2).poisson(40.0, (512, 512)).astype(float)
+    (noise,) = measure_noise(lnocl.Observation(image, np.ones((1, 1))))
+    assert noise.mean == pytest.approx(40.0, rel=0.03)  # of the darker half
+    assert noise.variance == pytest.approx(40.0, rel=0.04)  # a median of blocks
+    assert noise.variance_apart == pytest.approx(40.0, rel=0.06)
