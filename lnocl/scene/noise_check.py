@@ -55,14 +55,16 @@ class Noise(NamedTuple):
 def measure_noise(observation: Observation) -> Iterator[Noise | None]:
     """Yield the noise of each image; None where too few blocks are free of bad pixels."""
     ny, nx = (n - n % BLOCK for n in observation.shape)
-    for image, mask in zip(observation.images, observation.mask, strict=True):
+    counts = zip(observation.images, observation.mask, observation.background, strict=True)
+    for image, mask, background in counts:
         means = _block_means(image[:ny, :nx])
         good = ~_block_means(mask[:ny, :nx]).astype(bool)
         if good.sum() < 2 * MIN_BLOCKS:
             yield None
             continue
         dark = good & (means <= np.median(means[good]))
-        near, apart = (_block_means(_squares(image[:ny, :nx], lag))[dark] for lag in (1, FAR))
+        excess = (image - background)[:ny, :nx]  # the background may have structure that is known
+        near, apart = (_block_means(_squares(excess, lag))[dark] for lag in (1, FAR))
         yield Noise(*map(float, (means[dark].mean(), np.median(near), np.median(apart))))
 
 

@@ -17,8 +17,10 @@ MIN_EXCESS = 5.0
 
 
 def choose_pad(observation: Observation) -> int:
-    """Return the pad "auto": `recommend_pad` where light runs over an edge, else 0."""
-    return recommend_pad(observation) if runs_over_the_edge(observation) else 0
+    """Return the pad "auto": `recommend_pad` where light runs over an edge, else the offsets."""
+    if runs_over_the_edge(observation):
+        return recommend_pad(observation)
+    return int(np.ceil(abs(observation.offsets).max()))
 
 
 def recommend_pad(observation: Observation) -> int:

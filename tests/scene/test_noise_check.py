@@ -74,6 +74,14 @@ def test_correlated_noise_is_said(times):
     assert message.startswith("neighbouring pixels of image 0 share their noise, as drizzled")
 
 
+def test_known_structure_of_the_background_is_no_noise():
+    """As maps of inverse variance of drizzled images have, row by row."""
+    read_noise = np.where(Y % 2 == 0, 70.0, 80.0)
+    noise = np.random.default_rng(4).normal(0.0, read_noise)
+    assert said(counts(level=0.0) + noise, read_noise=read_noise) == []
+    assert said(counts(level=0.0) + noise, read_noise=75.0) == []
+
+
 def test_bad_pixels_are_left_out():
     image, mask = counts(), np.zeros(SHAPE, bool)
     mask[::16, ::16] = True

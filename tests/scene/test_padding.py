@@ -66,6 +66,12 @@ def test_auto_is_no_pad_where_no_light_runs_over_the_edge(caplog):
     assert words in caplog.messages
 
 
+def test_auto_makes_room_for_offsets():
+    images = np.random.default_rng(3).poisson(20.0, (2, 64, 64))
+    given = {"background": 20.0, "offsets": [(0.0, 0.0), (1.3, -2.4)]}
+    assert choose_pad(lnocl.Observation(images, GAUSSIAN, **given)) == 3
+
+
 @pytest.mark.parametrize("edge", [np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]])
 def test_light_at_any_edge_of_any_image_is_found(edge):
     images = np.random.default_rng(1).poisson(20.0, (2, 60, 70)).astype(float)
