@@ -41,7 +41,6 @@ import lnocl
 from lnocl.metrics import restoration_error, star_rows
 from lnocl.runs.thinning import split_counts
 from lnocl.scene.forward_model import Model
-from lnocl.scene.penalty import recommend_smoothing
 from lnocl.scene.scene import Scene
 from lnocl.simulation import Experiment, Star, Target, hh34, load_target, simulate
 from lnocl.studies import experiment, files
@@ -221,13 +220,9 @@ def stops(data, device):
         best = curve[:, 1:].min(axis=0)
         row = {"seed": seed, "p": p, "magnitude": magnitude.value, "contrast": contrast}
         row |= {"best rho'": best[0], "best rho''": best[1]}
-        weight = recommend_smoothing(observation)
-        smoothed = follow(simulation, "sgp", 800, smoothing=weight, device=device)[:, 1:]
-        row |= {"smoothed best rho'": smoothed[:, 0].min() / best[0]}
-        row |= {"smoothed best rho''": smoothed[:, 1].min() / best[1]}
         for name, smoothing, stop in (
             ("held-out", 0.0, "held-out"),
-            ("smoothed", weight, "held-out"),
+            ("default", "auto", "held-out"),
             ("discrepancy", 0.0, "discrepancy"),
         ):
             found, seconds = _timed_run(
@@ -237,14 +232,12 @@ def stops(data, device):
                 restoration_error(found.extended, simulation.extended, *where)
                 for where in ((), (rows,))
             ]
-            row |= {f"{name} at": found.n_iter, f"{name} rho'": errors[0] / best[0]}
-            row |= {f"{name} rho''": errors[1] / best[1]}
+            row |= {f"{name} at": found.n_iter, f"{name} smoothing": found.smoothing}
+            row |= {f"{name} rho'": errors[0] / best[0], f"{name} rho''": errors[1] / best[1]}
             if stop == "held-out":
-                given = {"n_iter": found.n_iter, "smoothing": smoothing}
-                alone = np.median(
-                    [_timed_run(observation, star, device, **given)[1] for _ in range(3)]
-                )
-                row[f"{name} cost"] = seconds / alone
+                given = {"n_iter": found.n_iter, "smoothing": found.smoothing}
+                alone = [_timed_run(observation, star, device, **given)[1] for _ in range(3)]
+                row[f"{name} cost"] = seconds / float(np.median(alone))
         at = likelihood_choice(simulation, device)
         row |= {"likelihood at": at, "likelihood rho'": curve[at - 1, 1] / best[0]}
         row["likelihood rho''"] = curve[at - 1, 2] / best[1]
@@ -263,21 +256,22 @@ def costs(data, device):
     for size in (512, 1024):
         simulation = make("hh34", size, data)
         observation, (star,) = experiment.observe(simulation), simulation.stars
-        for name, smoothing in (("no", 0.0), ("yes", recommend_smoothing(observation))):
-            given = {"smoothing": smoothing, "device": device}
-            _timed_run(observation, star, n_iter=2, **given)  # builds the kernels
-            chosen, _ = _timed_run(observation, star, n_iter=1500, stop="held-out", **given)
+        for smoothing in (0.0, "auto"):
+            held = {"stop": "held-out", "n_iter": 1500, "smoothing": smoothing}
+            chosen, _ = _timed_run(observation, star, device, **held)  # builds the kernels
+            given = {"n_iter": chosen.n_iter, "smoothing": chosen.smoothing}
             turns = [
                 (
-                    _timed_run(observation, star, n_iter=chosen.n_iter, **given)[1],
-                    _timed_run(observation, star, n_iter=1500, stop="held-out", **given)[1],
+                    _timed_run(observation, star, device, **given)[1],
+                    _timed_run(observation, star, device, **held)[1],
                 )
                 for _ in range(5)
             ]
             alone, held_out = np.median(turns, axis=0)
             yield {
                 "size": size,
-                "smoothed": name,
+                "smoothing": str(smoothing),
+                "chosen": chosen.smoothing,
                 "iterations": chosen.n_iter,
                 "run s": alone,
                 "held-out s": held_out,

@@ -16,9 +16,9 @@ from lnocl.scene.scene import Scene
 # The core of a star is where its PSF is above this share of its peak; its wings go on to the other.
 CORE, WINGS = 0.5, 1e-3
 # Light round a star is looked for as far as so many widths of its PSF, in so many sectors, and is
-# worth a word from this share of the star's flux, and of all light there, on (docs/psf.md).
+# worth a word from these shares of the star's flux, and of all light there, on (docs/psf.md).
 REACH, SECTORS = 12.0, 8
-MUCH_HALO = 0.1
+MUCH_HALO, MUCH_SHARE = 0.1, 0.05
 # A misfit is this many times the noise, and as many standard errors above it.
 MISFIT, SIGNIFICANCE = 1.5, 5.0
 
@@ -99,7 +99,7 @@ class StarResiduals(NamedTuple):
     @property
     def has_halo(self) -> bool:
         """Whether much lies all round the star."""
-        return min(self.halo, self.halo_share) > MUCH_HALO
+        return self.halo > MUCH_HALO and self.halo_share > MUCH_SHARE
 
 
 def residuals(image: Array, mask: NDArray[np.bool_], model: Array) -> Array:

@@ -1,0 +1,29 @@
+"""PSFs that are wrong are refused or reported, and those that are right are not."""
+
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = str(Path(__file__).parents[2] / "benchmarks")
+REFUSED = ("1 pixels off", "5 pixels off", "FFT order", "peak at N / 2 - 1")
+
+
+@pytest.fixture
+def wrong(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    import wrong
+
+    return wrong
+
+
+@pytest.mark.exhaustive
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+@pytest.mark.parametrize("contrast", [10.0, 0.3])
+@pytest.mark.parametrize("kind", ["moffat", "halo"])
+def test_fourteen_wrong_psfs_are_reported_and_the_right_one_is_not(kind, contrast, wrong):
+    image, *_ = wrong.make_scene(kind, contrast, seed=7)
+    for name, psf in wrong.wrong_psfs(kind):
+        _, said = wrong.try_it(image, psf, [wrong.STAR], background=wrong.LEVEL)
+        assert bool(said) == (name != "right"), name
+        assert ("refused" in said) == (name in REFUSED)
+        assert not any(word.startswith("?") for word in said)
