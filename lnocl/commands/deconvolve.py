@@ -415,8 +415,18 @@ def _summary(
         *stars,
         f"extended source: {result.extended.sum():.6g} {electrons}",
         *([] if overall is None else [f"residuals {_rms(overall)} in all, where noise gives 1"]),
+        *_shortness(arguments, result),
         *_verdict(result.star_positions, at_stars, overall),
         f"written to {arguments.output}",
+    ]
+
+
+def _shortness(arguments: argparse.Namespace, result: Result) -> list[str]:
+    if result.n_iter > 1 or result.n_iter == arguments.n_iter or result.stop_reason == "interrupt":
+        return []
+    return [
+        f"it ended after {counted(result.n_iter, 'iteration')}: there is little but noise, or PSF, "
+        "background or noise are wrong"
     ]
 
 

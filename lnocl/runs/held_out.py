@@ -137,7 +137,8 @@ class HeldOutCounts:
         if LENGTH_RATIO * first.n_iter > self._n_iter:
             warn(
                 f"held-out counts have chosen iteration {first.n_iter} of {self._n_iter}, too near "
-                f"the end to be sure; give n_iter {LENGTH_RATIO * first.n_iter} or more"
+                "the end to be sure: see to what is said of PSF and noise, which they do not see; "
+                f"where all is well give n_iter {LENGTH_RATIO * first.n_iter} or more"
             )
         penalty = self._penalties[best.trial]
         if len(self._penalties) > 1:

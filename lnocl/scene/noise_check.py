@@ -18,6 +18,8 @@ FAR = 3
 # What is said of: the variance over the mean beyond this factor of 1, and that of neighbours below
 # this share of that of pixels apart (docs/psf.md).
 MAX_FACTOR = 1.5
+# The mean of the darker half of blocks of noise is a tenth of a pixel's noise below that of all.
+DARKNESS = 0.3
 MIN_SHARE = 0.7
 
 
@@ -26,8 +28,8 @@ class Noise(NamedTuple):
 
     Attributes
     ----------
-    mean : float
-        Electrons per pixel, with the square of the read noise.
+    mean, level : float
+        Electrons per pixel of image and background, with the square of the read noise.
     variance : float
         By second differences of neighbours: ``<(g(n - 1) - 2 g(n) + g(n + 1))^2> / 6``.
     variance_apart : float
@@ -35,6 +37,7 @@ class Noise(NamedTuple):
     """
 
     mean: float
+    level: float
     variance: float
     variance_apart: float
 
@@ -65,7 +68,10 @@ def measure_noise(observation: Observation) -> Iterator[Noise | None]:
         dark = good & (means <= np.median(means[good]))
         excess = (image - background)[:ny, :nx]  # the background may have structure that is known
         near, apart = (_block_means(_squares(excess, lag))[dark] for lag in (1, FAR))
-        yield Noise(*map(float, (means[dark].mean(), np.median(near), np.median(apart))))
+        level = means[dark] - _block_means(excess)[dark]
+        yield Noise(
+            *map(float, (means[dark].mean(), level.mean(), np.median(near), np.median(apart)))
+        )
 
 
 def _squares(image: Array, lag: int) -> Array:
@@ -88,14 +94,25 @@ def warn_of_noise(observation: Observation) -> None:
     Warns
     -----
     LnoclWarning
-        The variance is 1.5 times the mean or more, or less than two thirds of it.
+        The variance is 1.5 times the mean or more, or less than two thirds of it; or the
+        background is above the darker half of an image.
     """
+    measured = [
+        (j, noise) for j, noise in enumerate(measure_noise(observation)) if noise is not None
+    ]
+    for j, noise in measured:
+        if noise.level - noise.mean > DARKNESS * np.sqrt(noise.mean):
+            warn(
+                f"the background of image {j} is too high: it is {noise.level:.6g} electrons per "
+                f"pixel where the darker half of the image has {noise.mean:.6g}"
+            )
+            return
     found = [
         (abs(factor), factor, j, noise)
-        for j, noise in enumerate(measure_noise(observation))
-        if noise is not None and (factor := noise.log_factor()) and noise.is_white_or_below()
+        for j, noise in measured
+        if (factor := noise.log_factor()) and noise.is_white_or_below()
     ]
-    size, factor, j, noise = max(found, default=(0.0, 0.0, 0, Noise(1.0, 1.0, 1.0)))
+    size, factor, j, noise = max(found, default=(0.0, 0.0, 0, Noise(1.0, 1.0, 1.0, 1.0)))
     if size < np.log(MAX_FACTOR):
         return
     if factor < 0 and not noise.is_white():

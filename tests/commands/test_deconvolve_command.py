@@ -123,6 +123,15 @@ class TestDeconvolve:
             "--precision double --engine numpy -o out.fits"
         )
 
+    @pytest.mark.parametrize("n_iter", [1, 30])
+    def test_a_run_that_ends_at_once_is_said(self, n_iter, capsys, monkeypatch):
+        """But not where one iteration was asked for."""
+        if n_iter > 1:
+            monkeypatch.setattr("lnocl.solvers.sgp.SUFFICIENT", 1e9)  # no step is enough
+        run("--solver", "sgp", "--n-iter", str(n_iter))
+        said = "it ended after 0 iterations: there is little but noise" in capsys.readouterr().out
+        assert said == (n_iter > 1)
+
     def test_negative_psf_pixels_are_kept_and_announced(self, capsys):
         assert run(psf="negative.fits") == 0
         lines = capsys.readouterr().err.splitlines()

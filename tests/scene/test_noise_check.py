@@ -74,6 +74,14 @@ def test_correlated_noise_is_said(times):
     assert message.startswith("neighbouring pixels of image 0 share their noise, as drizzled")
 
 
+@pytest.mark.parametrize("level", [5.0, 60.0, 5e4])
+def test_a_background_that_is_too_high_is_said(level):
+    high = level + 0.6 * np.sqrt(level)
+    (message,) = said(np.array([counts(3, level)] * 2), background=[level, high])
+    assert message.startswith("the background of image 1 is too high: it is ")
+    assert said(counts(3, level), background=level) == []
+
+
 def test_known_structure_of_the_background_is_no_noise():
     """As maps of inverse variance of drizzled images have, row by row."""
     read_noise = np.where(Y % 2 == 0, 70.0, 80.0)
