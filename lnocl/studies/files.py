@@ -70,7 +70,8 @@ def write_simulation(
     record = {"lnocl": __version__, "scene": scene, **simulation.record()}
     path = os.path.join(folder, "record.json")
     atomic.write_text(path, json.dumps(record, indent=2) + "\n", overwrite)
-    return command(folder, simulation, simulation.stars, "result")
+    # What leaves one edge of a simulation comes in at the opposite one.
+    return command(folder, simulation, simulation.stars, "result", "--pad", "0")
 
 
 def write_reconstruction(
