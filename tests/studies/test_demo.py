@@ -234,7 +234,7 @@ class TestSimulate:
         background = repr(float(expected.background[0]))
         assert told == (
             "lnocl deconvolve out/image_1.fits out/image_2.fits --psf out/psf_1.fits "
-            f"out/psf_2.fits --background {background} --read-noise 5.0 --star 20,30 "
+            f"out/psf_2.fits --background {background} --read-noise 5.0 --star 20,30 --pad 0 "
             "-o out/result.fits"
         )
         assert cli.main([*shlex.split(told)[1:], "--n-iter", "2", "--engine", "numpy"]) == 0
