@@ -2,16 +2,8 @@
 
 Data thinning gives each count to one of two halves of the observation, with probability 1/2. The
 halves are independent Poisson observations of the same sky, and are reconstructed side by side.
-With A_k and B_k their extended sources after k iterations, A_L and B_L after the last, the sum
-f_k = A_k + B_k is a reconstruction from all counts: the result, at the best k. But for a constant
-its squared error is
-
-    ||f_k - f||^2 - ||f||^2 = ||f_k||^2 - 2 <f_k, f>,   <f_k, f> = 2 (<A_k, B_L> + <B_k, A_L>),
-
-as noise of independent halves averages out of these products, and structure that L iterations have
-not resolved is small where L is large. The noise alone is ||A_k - B_k||^2. The likelihood of the
-held-out half itself, the usual measure, is flat over most of the run and ends it two to four times
-too early: docs/sgp.md.
+The sum of their estimates is a reconstruction from all counts: the result, where the errors that
+`lnocl.runs.assessment` estimates are least.
 """
 
 from __future__ import annotations
@@ -26,7 +18,8 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError, refuse_not_finite, warn
+from lnocl.errors import InputError, warn
+from lnocl.runs.assessment import assess
 from lnocl.runs.halves import Halves, Snapshot, next_snapshot, pack, take
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome
 from lnocl.runs.run import engine_name
@@ -40,10 +33,6 @@ from lnocl.solvers.engine import State
 
 log = logging.getLogger("lnocl")
 
-# The chosen iteration is the last with an error within a tenth of the least: near a star the
-# estimate improves long after the rest. The least squared error is taken to be the noise alone;
-# unresolved structure adds as much again and more, so that a tenth is cautious.
-ERROR_TOLERANCE = 0.1
 # The halves run to this multiple of the chosen iteration, so that the references are resolved.
 LENGTH_RATIO = 2
 MIN_ITERATIONS = 10
@@ -131,8 +120,9 @@ class HeldOutCounts:
                 objectives = self._objectives(halves, halves.done)
                 return self._outcome(halves.snapshot(), penalty, objectives, "callback")
             is_better = self._judge(self._halves)
-            is_next = is_better and len(self._curves) < len(self._penalties)
-            self._halves = self._begin() if is_next else None
+            self._halves = None  # the device need not hold those of the next penalty too
+            if is_better and len(self._curves) < len(self._penalties):
+                self._halves = self._begin()
         best, first = cast(_Best, self._best), cast(_First, self._first)
         if LENGTH_RATIO * first.n_iter > self._n_iter:
             warn(
@@ -342,64 +332,6 @@ class _Best(NamedTuple):
     error: float
     chosen: Snapshot
     objectives: Array
-
-
-class Assessment(NamedTuple):
-    """The errors of snapshots, squared.
-
-    Attributes
-    ----------
-    excess, noise : ndarray of float64
-        ``||f_k||^2 - 2 <f_k, f>`` and ``||A_k - B_k||^2`` of each.
-    squared_norm : float
-        The square of the norm of f.
-    best, chosen : int
-        The snapshots of the least error, and to choose.
-    """
-
-    excess: Array
-    noise: Array
-    squared_norm: float
-    best: int
-    chosen: int
-
-
-def assess(
-    snapshots: Sequence[Snapshot], reference: Snapshot, shape: tuple[int, int]
-) -> Assessment:
-    """Return the errors of snapshots.
-
-    Parameters
-    ----------
-    snapshots : sequence of Snapshot
-        At least one.
-    reference : Snapshot
-        A_L and B_L.
-    shape : tuple of int
-        Shape (ny, nx) of the images, within which errors are measured.
-
-    Raises
-    ------
-    NotFiniteError
-        Estimates are infinite or not a number.
-    """
-    inside = tuple(map(slice, shape))
-
-    def product(a: Array, b: Array) -> float:
-        return float(np.einsum("yx,yx->y", a[inside], b[inside]).sum(dtype=np.float64))
-
-    a_last, b_last = reference.extended
-    excess, noise = np.zeros((2, len(snapshots)))
-    for k, snapshot in enumerate(snapshots):
-        a, b = snapshot.extended
-        squares, mixed = product(a, a) + product(b, b), 2.0 * product(a, b)
-        noise[k] = squares - mixed
-        excess[k] = squares + mixed - 4.0 * (product(a, b_last) + product(b, a_last))
-    refuse_not_finite(*excess, *noise)
-    best = int(np.argmin(excess))
-    allowed = ((1.0 + ERROR_TOLERANCE) ** 2 - 1.0) * noise[best]
-    chosen = int(np.flatnonzero(excess <= excess[best] + allowed)[-1])
-    return Assessment(excess, noise, 4.0 * product(a_last, b_last), best, chosen)
 
 
 def most_bytes(start: Start, n_iter: int) -> int:

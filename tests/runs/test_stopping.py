@@ -13,8 +13,8 @@ from scenes import paper
 
 import lnocl
 from lnocl.errors import LnoclWarning
+from lnocl.runs.assessment import assess
 from lnocl.runs.halves import Snapshot
-from lnocl.runs.held_out import assess
 from lnocl.runs.stopping import CHANGE_WINDOW, expected_deviance
 from lnocl.runs.thinning import split_counts
 from lnocl.scene.penalty import SMOOTHING, Penalty, recommend_smoothing
@@ -270,7 +270,9 @@ class TestHeldOut:
         np.testing.assert_array_equal(first.held_out, second.held_out)
 
     def test_says_that_more_iterations_are_needed(self):
-        with pytest.warns(LnoclWarning, match="too near the end to be sure: .* give n_iter 2") as caught:
+        with pytest.warns(
+            LnoclWarning, match="too near the end to be sure: .* give n_iter 2"
+        ) as caught:
             run(scene()[0], stop="held-out", n_iter=12)
         assert caught[0].filename == __file__
 
