@@ -179,12 +179,12 @@ def deconvolve(
     Held-out counts are cross-validation by data thinning. The counts are split at random into two
     halves, independent observations of the same sky. Both are reconstructed side by side, and the
     error of their sum is estimated from the products of one's estimates with the other's
-    (`lnocl.runs.assessment` has the equation). The last iteration with an error within a tenth of the
-    least is chosen, the halves run to twice that iteration, and the result is the sum of what they
-    were then: the extended source and the star fluxes; positions are the mean. All this takes about
-    four times as long as if the iteration had been known, and the memory of two runs and of about
-    twenty estimates of each. Where smoothing is "auto" the halves go on from a third of that with
-    one weight after the other until the error rises: eight to ten times as long.
+    (`lnocl.runs.assessment` has the equation). The last iteration with an error within a tenth of
+    the least is chosen, the halves run to twice that iteration, and the result is the sum of what
+    they were then: the extended source and the star fluxes; positions are the mean. All this takes
+    about four times as long as if the iteration had been known, and the memory of two runs and of
+    about twenty estimates of each. Where smoothing is "auto" the halves go on from a third of that
+    with one weight after the other until the error rises: eight to ten times as long.
 
     The split-gradient method lowers the objective at every iteration where PSFs are not negative.
     With many negative pixels, as in a raw frame of a star, the objective may rise again, and all
