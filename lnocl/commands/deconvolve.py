@@ -401,6 +401,7 @@ def _summary(
     overall: Fit | None,
 ) -> list[str]:
     objective = result.history["objective"][-1]
+    device, _, _ = result.device.partition(" (")  # the header has its platform and driver
     electrons = "electrons per second" if arguments.exposure else "electrons"
     stars = [
         f"star at ({x:.7g}, {y:.7g}): {flux:.6g} {electrons}; residuals {_rms(found.core)} in its "
@@ -410,7 +411,7 @@ def _summary(
         )
     ]
     return [
-        f"{counted(result.n_iter, 'iteration')} on {result.device}, objective {objective:.6g}",
+        f"{counted(result.n_iter, 'iteration')} on {device}, objective {objective:.6g}",
         REASONS[result.stop_reason],
         *stars,
         f"extended source: {result.extended.sum():.6g} {electrons}",

@@ -68,10 +68,9 @@ def measure_noise(observation: Observation) -> Iterator[Noise | None]:
         dark = good & (means <= np.median(means[good]))
         excess = (image - background)[:ny, :nx]  # the background may have structure that is known
         near, apart = (_block_means(_squares(excess, lag))[dark] for lag in (1, FAR))
-        level = means[dark] - _block_means(excess)[dark]
-        yield Noise(
-            *map(float, (means[dark].mean(), level.mean(), np.median(near), np.median(apart)))
-        )
+        level = means - _block_means(excess)
+        values = means[dark], level[dark], near, apart
+        yield Noise(*map(float, map(np.median, values)))  # many blocks may hold next to nothing
 
 
 def _squares(image: Array, lag: int) -> Array:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from astropy.io import fits
-from commandline import NUMPY, SHAPE, outside, run
+from commandline import GIVEN, NUMPY, PAPER, SHAPE, outside, run
 
 import lnocl
 from lnocl.commands import cli
@@ -22,7 +22,17 @@ pytestmark = pytest.mark.usefixtures("command_folder")
 
 @pytest.mark.system
 class TestProcess:
-    ARGUMENTS = ("deconvolve", "a.fits", "--psf", "k1.fits", "--n-iter", "1", *NUMPY)
+    ARGUMENTS = (
+        "deconvolve",
+        "a.fits",
+        "--psf",
+        "k1.fits",
+        "--n-iter",
+        "1",
+        *PAPER,
+        *GIVEN,
+        *NUMPY,
+    )
 
     def test_an_error_is_one_line_and_no_traceback(self):
         done = outside(*self.ARGUMENTS, "--mu", "-1", "-o", "out.fits")

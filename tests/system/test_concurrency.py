@@ -68,8 +68,8 @@ def test_one_thread_goes_on_where_another_fails():
             raise KeyError("mine")
 
     with ThreadPoolExecutor(2) as pool:
-        failing = pool.submit(lnocl.deconvolve, observation, stars, n_iter=60, callback=fail)
-        going = pool.submit(lnocl.deconvolve, observation, stars, n_iter=60)
+        failing = pool.submit(paper, observation, stars, n_iter=60, callback=fail)
+        going = pool.submit(paper, observation, stars, n_iter=60)
     assert isinstance(failing.exception(), KeyError)
     assert_same(going.result(), paper(observation, stars, n_iter=60))
 
