@@ -371,6 +371,25 @@ class TestSmoothing:
         assert (np.diff(least[:-1]) < 0).all()
         assert len(weights) == 4 or least[-1] >= least[-2]
 
+    def test_errors_are_measured_with_the_halves_that_were_not_smoothed(self, monkeypatch):
+        """Which have no bias in common; the others end at 1.5 times the iteration chosen."""
+        judged = []
+
+        def note(snapshots, reference, shape):
+            found = assess(snapshots, reference, shape)
+            judged.append((snapshots, reference, found))
+            return found
+
+        monkeypatch.setattr("lnocl.runs.held_out.assess", note)
+        result = run(scene()[0], stop="held-out", smoothing="auto")
+        n_weights = len(np.unique(result.held_out["smoothing"]))
+        *_, first = judged[: -n_weights + 1]
+        assert n_weights > 1
+        chosen = first[0][first[2].chosen].iteration
+        for snapshots, reference, _ in judged[-n_weights + 1 :]:
+            assert reference is first[0][-1] is first[1]
+            assert chosen < snapshots[-1].iteration <= 1.5 * chosen + 1
+
     @pytest.mark.parametrize("solver", ["sgm", "sgp"])
     def test_other_weights_go_on_from_a_third_of_the_iterations(self, solver):
         observation, *_ = scene()

@@ -26,6 +26,12 @@ def test_the_offset_of_a_gaussian_is_measured(x, y, width, scale):
     np.testing.assert_allclose(found, (x, y), atol=0.1 if width < 4 else 0.03)
 
 
+def test_a_ghost_is_no_part_of_the_core():
+    ghost = 0.6 * gaussian(x=10.0, y=-9.0)
+    np.testing.assert_allclose(off_centre(gaussian() + ghost), (0.0, 0.0), atol=0.01)
+    assert fwhm(gaussian() + ghost) == pytest.approx(4.0, abs=0.1)
+
+
 @given(width=st.floats(2.0, 8.0), x=st.floats(-0.5, 0.5))
 def test_the_width_of_a_gaussian_is_measured(width, x):
     assert fwhm(gaussian(width=width, x=x)) == pytest.approx(width, rel=0.1, abs=0.1)
