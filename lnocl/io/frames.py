@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.units import dimensionless_unscaled
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError, counted
+from lnocl.errors import InputError, counted, warn
 from lnocl.io import sky
 from lnocl.io.fitsread import read_extension, read_keyword, read_stack
 from lnocl.io.maps import Maps, Word
@@ -21,6 +21,9 @@ from lnocl.scene.observation import Array, Observation
 log = logging.getLogger("lnocl")
 
 Mask = NDArray[np.bool_]
+
+# The logarithm of the pixels' size in image and PSF may differ by this much.
+MAX_SCALE_ERROR = 0.02
 
 
 class Calibration(NamedTuple):
@@ -125,6 +128,7 @@ class _Reader:
                 "map, or a keyword of the header such as EXPTIME"
             )
         # Electrons in each unit of the images.
+        self._warn_of_pixel_scales()
         each = factor * (_maps(exposure) if are_rates and exposure is not None else 1.0)
         inverse = self._inverse_variance()
         mask = self._mask(exposure, inverse)
@@ -143,6 +147,20 @@ class _Reader:
         )
         sha256 = {"images": self._images.sha256, "psfs": self._psfs.sha256, **self._maps.sha256}
         return Frames(observation, self._images.header, background, sha256)
+
+    def _warn_of_pixel_scales(self) -> None:
+        """Warn of the first PSF whose pixels are of another size than those of its image."""
+        scales = [sky.pixel_scale(header) for header in self._psfs.headers]
+        if not any(scales):
+            return  # nor need the images' coordinates be read
+        for j, of_psf in enumerate(scales):
+            of_image = sky.pixel_scale(self._images.headers[min(j, len(self._paths) - 1)])
+            if of_psf and of_image and abs(np.log(of_image / of_psf)) > MAX_SCALE_ERROR:
+                warn(
+                    f"the pixels of psf {j} are of {of_psf:.4g} arcsec, those of its image of "
+                    f"{of_image:.4g}: rebin it to the image's pixels, by {of_image / of_psf:.3g}"
+                )
+                return
 
     def _electrons(self) -> tuple[float, bool]:
         """Return the electrons in a unit of the images, and whether they are per second."""

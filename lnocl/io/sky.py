@@ -65,6 +65,16 @@ def _find_wcs(header: fits.Header) -> WCS | None:
             return None
 
 
+def pixel_scale(header: fits.Header) -> float | None:
+    """Return the side of a pixel in arcsec, by PIXELSCL or the coordinates; None where unknown."""
+    scale = header.get("PIXELSCL")
+    if scale is None and "CTYPE1" in header and (wcs := _find_wcs(header)) is not None:
+        scale = float(np.sqrt(wcs.proj_plane_pixel_area().to_value("arcsec2")))
+    if isinstance(scale, (int, float)) and 0 < scale < np.inf:
+        return float(scale)
+    return None
+
+
 def to_sky(positions: Pairs, header: fits.Header) -> Pairs:
     """Return right ascension and declination (ICRS, degrees) of pixel positions, shape (n, 2).
 

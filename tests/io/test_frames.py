@@ -432,3 +432,42 @@ def test_checksums_are_kept_by_what_the_files_are():
         "exposure": 1,
         "read_noise": 1,
     }
+
+
+# Pixels of 0.05 arcsec.
+SCALE = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 10.0, "CRVAL2": 70.0,
+         "CDELT1": -0.05 / 3600, "CDELT2": 0.05 / 3600}  # fmt: skip
+
+
+class TestPixelScales:
+    def said(self, psf_cards, image_cards=None):
+        for path, image in zip(("1.fits", "2.fits"), IMAGES, strict=True):
+            save(path, image, **(SCALE if image_cards is None else image_cards))
+        save("psf.fits", np.ones((3, 3)), **psf_cards)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            observe()
+        return [str(each.message) for each in caught]
+
+    @pytest.mark.parametrize(
+        "cards",
+        [{"PIXELSCL": 0.0125}, SCALE | {"CDELT1": -0.0125 / 3600, "CDELT2": 0.0125 / 3600}],
+        ids=["PIXELSCL", "WCS"],
+    )
+    def test_a_psf_of_other_pixels_is_said(self, cards):
+        (message,) = self.said(cards)
+        assert message == (
+            "the pixels of psf 0 are of 0.0125 arcsec, those of its image of 0.05: rebin it to the "
+            "image's pixels, by 4"
+        )
+
+    @pytest.mark.parametrize(
+        "cards",
+        [{}, {"PIXELSCL": 0.0505}, SCALE, {"PIXELSCL": "fine"}, {"PIXELSCL": 0.0}],
+        ids=["none", "PIXELSCL", "WCS", "a text", "0"],
+    )
+    def test_others_are_not(self, cards):
+        assert self.said(cards) == []
+
+    def test_images_without_coordinates_tell_nothing(self):
+        assert self.said({"PIXELSCL": 0.0125}, {}) == []
