@@ -122,7 +122,8 @@ def deconvolve(
     callback : callable, optional
         ``callback(iteration, estimate)``, called after every iteration; it stops the run by
         returning True. The estimate has ``extended`` and ``star_fluxes``, which are fetched
-        from the device when they are read. With held-out counts it is the sum of both halves'.
+        from the device when they are read. With held-out counts it is the sum of both halves';
+        they go beyond the iteration of the result, and begin again for each smoothing.
     progress : bool, optional
         Show a progress bar on stderr, where that is a terminal, with the objective or the quantity
         of the stopping rule.
