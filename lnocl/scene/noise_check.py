@@ -100,7 +100,7 @@ def warn_of_noise(observation: Observation) -> None:
         (j, noise) for j, noise in enumerate(measure_noise(observation)) if noise is not None
     ]
     for j, noise in measured:
-        if noise.level - noise.mean > DARKNESS * np.sqrt(noise.mean):
+        if noise.level - noise.mean > DARKNESS * np.sqrt(noise.level):
             warn(
                 f"the background of image {j} is too high: it is {noise.level:.6g} electrons per "
                 f"pixel where the darker half of the image has {noise.mean:.6g}"

@@ -37,6 +37,15 @@ def test_nothing_is_said_of_counts(seed, level):
     assert said(counts(seed, level), background=level) == []
 
 
+@pytest.mark.parametrize("level", [1e-4, 2.5e-3, 0.02, 0.1])
+def test_nothing_is_said_of_few_counts(level):
+    """As of X-rays, where most blocks are empty."""
+    for seed in range(20):
+        image = np.random.default_rng(seed).poisson(level, SHAPE).astype(float)
+        image[60, 60] += 50.0
+        assert said(image, background=level) == []
+
+
 def test_nothing_is_said_of_counts_with_read_noise():
     image = counts() + np.random.default_rng(1).normal(0.0, 12.0, SHAPE)
     assert said(image, read_noise=12.0) == []
