@@ -184,8 +184,9 @@ def deconvolve(
     the least is chosen, the halves run to twice that iteration, and the result is the sum of what
     they were then: the extended source and the star fluxes; positions are the mean. All this takes
     about four times as long as if the iteration had been known, and the memory of two runs and of
-    about twenty estimates of each. Where smoothing is "auto" the halves go on from a third of that
-    with one weight after the other until the error rises: eight to ten times as long.
+    about twenty estimates of each. Where smoothing is "auto" the halves then continue
+    with larger and larger weights, each from a third of the chosen iteration, until the error
+    rises. That takes six times as long in the median, and up to eleven (docs/sgp.md).
 
     The split-gradient method lowers the objective at every iteration where PSFs are not negative.
     With many negative pixels, as in a raw frame of a star, the objective may rise again, and all

@@ -131,11 +131,12 @@ def judge_stars(scene: Scene, sky: Array, star_fluxes: Array) -> list[StarResidu
     """
     found = []
     ny, nx = scene.observation.shape
+    background = [np.broadcast_to(each, scene.grid) for each in scene.background()]
     width = min(fwhm(psf) for psf in scene.observation.psfs) if scene.n_stars else 0.0
     for position, flux in zip(scene.stars, star_fluxes, strict=True):
         core, wings = Fit(), Fit()
         for j in range(scene.n_images):
-            fits = _fits_at(scene, sky, star_fluxes, j, position)
+            fits = _fits_at(scene, background[j], sky, star_fluxes, j, position)
             core, wings = core.plus(fits[0]), wings.plus(fits[1])
         halo, light = _halo(sky[:ny, :nx], position, width)
         shares = (halo / max(each, np.finfo(float).tiny) for each in (float(flux), light))
@@ -144,12 +145,12 @@ def judge_stars(scene: Scene, sky: Array, star_fluxes: Array) -> list[StarResidu
 
 
 def _fits_at(
-    scene: Scene, sky: Array, star_fluxes: Array, j: int, position: Array
+    scene: Scene, background: Array, sky: Array, star_fluxes: Array, j: int, position: Array
 ) -> tuple[Fit, Fit]:
     """Return the fit in the core and in the wings of a star in one image."""
     from astropy.nddata import NoOverlapError, overlap_slices
 
-    from lnocl.scene.forward_model import model_window  # which loads scipy
+    from lnocl.scene.forward_model import add_to_window  # which loads scipy
 
     observation = scene.observation
     psf = observation.psfs[j]
@@ -170,8 +171,9 @@ def _fits_at(
         there, of_psf = overlap_slices(observation.shape, lit.shape, middle)
     except NoOverlapError:  # the star is in other images alone
         return Fit(), Fit()
-    rows, columns = (range(axis.start, axis.stop) for axis in there)
-    model = model_window(scene, sky, star_fluxes, j, rows, columns)
+    model = np.array(background[there])
+    add_to_window(model, scene, sky, star_fluxes, j, (there[0].start, there[1].start))
+    np.maximum(model, 0.0, out=model)
     if scene.weights is not None and scene.has_exposure_map:
         model *= scene.weights[j][there]
     model *= scene.scale

@@ -143,11 +143,6 @@ class Halves:
         first, second = (run.objectives()[: last - self.first + 1] for run in self._runs)
         return first + second
 
-    @property
-    def engine_name(self) -> str:
-        """The device, its platform and driver."""
-        return self._runs[0].engine.name
-
     def state(self) -> State:
         """Return the arrays that `restore` needs, as they are between iterations.
 

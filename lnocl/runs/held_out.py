@@ -164,7 +164,7 @@ class HeldOutCounts:
         return self._start.scene.observation.shape
 
     def _judge(self, halves: Halves) -> bool:
-        """Add what halves that have ended came to; return whether it is the best so far."""
+        """Record the errors of one penalty; return whether they are the least so far."""
         snapshots, trial = halves.snapshots, len(self._curves)
         if not snapshots:
             raise InputError(
@@ -303,7 +303,7 @@ class HeldOutCounts:
 
 
 class _First(NamedTuple):
-    """What the halves with the first penalty came to.
+    """The result of the halves with the first penalty.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a reconstruction comes to: its estimate, and how that was reached."""
+"""The outcome of a reconstruction: its estimate, and how that was reached."""
 
 from __future__ import annotations
 

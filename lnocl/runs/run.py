@@ -286,7 +286,7 @@ class Run:
             self.engine.ratio()
 
     def outcome(self, penalty: Penalty, stop_reason: str) -> Outcome:
-        """Return what the run has come to, once it has ended."""
+        """Return the estimate and the record of a run that has ended."""
         self.finish()
         sky = self.engine.extended()
         sky *= self.scene.unit

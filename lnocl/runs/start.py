@@ -159,7 +159,7 @@ def move_stars(
 def measure_steps(
     setup: Setup, scene: Scene, model: Model, extended: Array, star_fluxes: Array
 ) -> tuple[Array, Scaling | None]:
-    """Return the star fluxes to go on from, and the scaling where the solver has one."""
+    """Return star fluxes to continue from, and the scaling of steps for the solver that has one."""
     if setup.solver != "sgp":
         return star_fluxes, None
     from lnocl.solvers.scaling import prepare

@@ -116,27 +116,33 @@ def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[
         yield image
 
 
-def model_window(
-    scene: Scene, sky: Array, star_fluxes: Array, j: int, rows: range, columns: range
-) -> Array:
-    """Return m_j, scaled, in a window of the grid, of a sky and star fluxes in electrons."""
+def add_to_window(
+    image: Array, scene: Scene, sky: Array, star_fluxes: Array, j: int, first: tuple[int, int]
+) -> None:
+    """Add ``A_j f + sum_s c_s P_js``, scaled, to an image of a window of the grid.
+
+    Parameters
+    ----------
+    image : ndarray of float64, shape (h, w)
+        What is there already, such as the background, scaled.
+    scene : Scene
+        What is modelled.
+    sky, star_fluxes : ndarray of float64, shapes (Ny, Nx) and (n,)
+        In electrons.
+    j : int
+        Which image.
+    first : tuple of int
+        Row and column of the first pixel of the window.
+    """
+    rows, columns = (range(at, at + n) for at, n in zip(first, image.shape, strict=True))
     psf = scene.psf_stamp(j)
     height, width = psf.values.shape
     around = sky.take(
         range(rows.start - psf.y - height + 1, rows.stop - psf.y), axis=0, mode="wrap"
     ).take(range(columns.start - psf.x - width + 1, columns.stop - psf.x), axis=1, mode="wrap")
-    image = scipy.signal.fftconvolve(around / scene.unit, psf.values, mode="valid")
-    background = scene.background()[j]
-    image += (
-        background[rows.start : rows.stop, columns.start : columns.stop]
-        if np.ndim(background)
-        else background
-    )
+    image += scipy.signal.fftconvolve(around / scene.unit, psf.values, mode="valid")
     for stamp, flux in zip(scene.star_field.stamps[j], star_fluxes, strict=True):
-        y, x = stamp.rows(scene.grid) - rows.start, stamp.columns(scene.grid) - columns.start
-        y_in, x_in = (y >= 0) & (y < len(rows)), (x >= 0) & (x < len(columns))
-        image[np.ix_(y[y_in], x[x_in])] += flux / scene.unit * stamp.values[np.ix_(y_in, x_in)]
-    return np.maximum(image, 0.0, out=image)
+        stamp.add_to(image, rows, columns, scene.grid, flux / scene.unit)
 
 
 def _illuminate(image: Array, background: Array | float, starlight: Array) -> None:

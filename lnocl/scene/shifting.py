@@ -47,6 +47,15 @@ class Stamp(NamedTuple):
         """Return the columns of the grid that the values lie in."""
         return (self.x + np.arange(self.values.shape[1])) % grid[1]
 
+    def add_to(
+        self, light: Array, rows: range, columns: range, grid: tuple[int, int], flux: float
+    ) -> None:
+        """Add the values times a flux to the light in a window of the grid."""
+        y, x = self.rows(grid) - rows.start, self.columns(grid) - columns.start
+        y_in, x_in = (y >= 0) & (y < len(rows)), (x >= 0) & (x < len(columns))
+        if y_in.any() and x_in.any():
+            light[np.ix_(y[y_in], x[x_in])] += flux * self.values[np.ix_(y_in, x_in)]
+
     def aligned(self, grid: tuple[int, int]) -> Stamp:
         """Return the same values, those that fill an axis of the grid beginning at its origin."""
         y, x = (

@@ -52,6 +52,8 @@ class StarCheck(NamedTuple):
 def check_stars(scene: Scene) -> Iterator[StarCheck]:
     """Yield each star in each image that shows it bright, alone and whole."""
     observation = scene.observation
+    if not scene.n_stars:
+        return
     for j, psf in enumerate(observation.psfs):
         reach = int(np.clip(np.ceil(REACH * fwhm(psf)), LEAST_REACH, MOST_REACH))
         light = observation.images[j] - observation.background[j]
@@ -66,7 +68,9 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
             side = 2 * reach + 1
             if star.shape != (side, side) or observation.mask[j][rows, columns].any():
                 continue
-            model = scene.star_image(j, s)[rows, columns]
+            model = np.zeros((side, side))
+            window = range(rows.start, rows.stop), range(columns.start, columns.stop)
+            scene.star_stamp(j, s).add_to(model, *window, scene.grid, 1.0)
             found = _compare(star, model, observation.images[j][rows, columns])
             if found is not None:
                 yield StarCheck(j, s, *found)
