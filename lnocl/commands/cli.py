@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             flags |= parsed.command.flags(words)
             parsed.command.run(parsed)
     except InputError as error:
-        return messages.fail(messages.name_options(str(error), flags), error.exit_status)
+        return messages.fail(messages.in_shell(str(error), flags), error.exit_status)
     except LnoclError as error:
         return messages.fail(str(error), error.exit_status)
     except MemoryError:

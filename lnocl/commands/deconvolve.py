@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import inspect
 import os
+import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -95,8 +96,7 @@ OPTIONS = {
             card=("EXP", "exposure, seconds"),
             checksum="ESUM",
             help="seconds, a FITS file with a map of them, or a keyword of the images' headers "
-            "such as EXPTIME; one for all images or one for each; the result is then in electrons "
-            "per second",
+            "such as EXPTIME; one for all images or one for each; the result is then per second",
         ),
         option(
             "--gain",
@@ -157,9 +157,9 @@ OPTIONS = {
             "--zero-point",
             type=finite,
             metavar="MAG",
-            card=("ZEROPT", "magnitude of one electron (per second)"),
-            help="magnitude of one electron, or of one per second where exposures are given; adds "
-            "a column mag to the table of stars",
+            card=("ZEROPT", "magnitude of a flux of 1"),
+            help="magnitude of a flux of 1 in the unit of the result, that of the images, per "
+            "second where exposures are given; adds a column mag to the table of stars",
         ),
     ],
     "reconstruction": [
@@ -260,9 +260,9 @@ def _run(arguments: argparse.Namespace) -> None:
         repeated = given | _repeated(given, calibration, frames)
         fitswrite.write_result(
             arguments.output,
-            result.extended,
+            result.extended / frames.electrons,
             result.star_positions,
-            result.star_fluxes,
+            result.star_fluxes / frames.electrons,
             result.history,
             wcs=wcs,
             cards=[
@@ -277,13 +277,13 @@ def _run(arguments: argparse.Namespace) -> None:
             commands=record.make_commands("deconvolve", ALL_OPTIONS, repeated, folder),
             overwrite=arguments.overwrite,
             held_out=result.held_out if result.held_out.size else None,
-            per_second=bool(arguments.exposure),
-            star_columns=_star_columns(arguments, result, frames.header, at_stars),
+            unit=frames.unit,
+            star_columns=_star_columns(arguments, result, frames, at_stars),
             cubes=_cubes(arguments, result),
             offsets=offsets,
         )
         if not arguments.quiet:
-            messages.say(_summary(arguments, result, at_stars, overall))
+            messages.say(_summary(arguments, result, frames, at_stars, overall))
     interrupts.explain(arguments, result)
 
 
@@ -343,25 +343,27 @@ def _stars(arguments: argparse.Namespace, header: fits.Header) -> list[tuple[flo
 def _star_columns(
     arguments: argparse.Namespace,
     result: Result,
-    header: fits.Header,
+    frames: Frames,
     at_stars: Sequence[StarResiduals],
 ) -> list[StarColumn]:
     """Return the columns of the table of stars after positions and fluxes."""
     from lnocl.io import sky
-    from lnocl.io.fitswrite import StarColumn
+    from lnocl.io.fitswrite import StarColumn, column_unit
     from lnocl.metrics import magnitude
 
     columns = []
+    header = frames.header
     if arguments.refine_positions:
         x_error, y_error = result.star_position_errors.T
-        unit = "ct/s" if arguments.exposure else "ct"
+        flux_errors = result.star_flux_errors / frames.electrons
         columns += [
             StarColumn("x_error", x_error, "pix", "standard error"),
             StarColumn("y_error", y_error, "pix", "standard error"),
-            StarColumn("flux_error", result.star_flux_errors, unit, "standard error"),
+            StarColumn("flux_error", flux_errors, column_unit(frames.unit), "standard error"),
         ]
     if arguments.zero_point is not None:
-        magnitudes = [magnitude(flux, 1.0) + arguments.zero_point for flux in result.star_fluxes]
+        fluxes = result.star_fluxes / frames.electrons
+        magnitudes = [magnitude(flux, 1.0) + arguments.zero_point for flux in fluxes]
         columns.append(StarColumn("mag", magnitudes, "mag", "by the zero point"))
     if sky.has_celestial(header):
         ra, dec = sky.to_sky(result.star_positions, header).T
@@ -397,15 +399,16 @@ def _device_spec(arguments: argparse.Namespace) -> str | None:
 def _summary(
     arguments: argparse.Namespace,
     result: Result,
+    frames: Frames,
     at_stars: Sequence[StarResiduals],
     overall: Fit | None,
 ) -> list[str]:
     objective = result.history["objective"][-1]
     device, _, _ = result.device.partition(" (")  # the header has its platform and driver
-    electrons = "electrons per second" if arguments.exposure else "electrons"
+    unit = re.sub(r"^(electron|photon)\b", r"\1s", frames.unit)
     stars = [
-        f"star at ({x:.7g}, {y:.7g}): {flux:.6g} {electrons}; residuals {_rms(found.core)} in its "
-        f"core, {_rms(found.wings)} in its wings, where noise gives 1"
+        f"star at ({x:.7g}, {y:.7g}): {flux / frames.electrons:.6g} {unit}; residuals "
+        f"{_rms(found.core)} in its core, {_rms(found.wings)} in its wings, where noise gives 1"
         for (x, y), flux, found in zip(
             result.star_positions, result.star_fluxes, at_stars, strict=True
         )
@@ -414,7 +417,7 @@ def _summary(
         f"{counted(result.n_iter, 'iteration')} on {device}, objective {objective:.6g}",
         REASONS[result.stop_reason],
         *stars,
-        f"extended source: {result.extended.sum():.6g} {electrons}",
+        f"extended source: {result.extended.sum() / frames.electrons:.6g} {unit}",
         *([] if overall is None else [f"residuals {_rms(overall)} in all, where noise gives 1"]),
         *_shortness(arguments, result),
         *_verdict(result.star_positions, at_stars, overall),

@@ -44,8 +44,10 @@ def fail(message: str, exit_status: int) -> int:
     return exit_status
 
 
-def name_options(message: str, flags: Mapping[str, str]) -> str:
-    """Return a message of the library that names options as they are typed in a shell.
+def in_shell(message: str, flags: Mapping[str, str]) -> str:
+    """Return a message of the library as it is meant in a shell.
+
+    Options are named as they are typed; images and PSFs are counted from 1.
 
     Parameters
     ----------
@@ -66,6 +68,7 @@ def name_options(message: str, flags: Mapping[str, str]) -> str:
         message = re.sub(
             pattern, lambda found: re.sub(name, lambda each: flags[each[0]], found[0]), message
         )
+    message = re.sub(r"\b(image|psf) (\d+)\b", lambda m: f"{m[1]} {int(m[2]) + 1}", message)
     return re.sub(r"(--[\w-]+)=", r"\1 ", message)
 
 
@@ -78,8 +81,8 @@ def show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """Write a warning to stderr, with `name_options`, in place of `warnings.showwarning`."""
-    _complain("warning", name_options(str(message), flags))
+    """Write a warning to stderr, with `in_shell`, in place of `warnings.showwarning`."""
+    _complain("warning", in_shell(str(message), flags))
 
 
 @contextlib.contextmanager

@@ -47,6 +47,12 @@ class Option:
         return self.keywords.get("dest") or self.flags[-1].lstrip("-").replace("-", "_")
 
     @property
+    def default(self) -> Any:
+        """Its value where it is not given."""
+        switch = SWITCHES.get(self.keywords.get("action", ""))
+        return self.keywords.get("default", None if switch is None else not switch)
+
+    @property
     def is_positional(self) -> bool:
         """Whether it is given by its place, without a flag."""
         return not self.flags[0].startswith("-")

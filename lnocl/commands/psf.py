@@ -1,4 +1,4 @@
-"""The command ``psf``: make PSFs from a frame of a star, and report each step."""
+"""The command ``psf``: make PSFs from a frame of stars, and report each step; or check a PSF."""
 
 from __future__ import annotations
 
@@ -28,15 +28,22 @@ OPTIONS = [
         "frame",
         metavar="FRAME",
         checksum="ISUM",
-        help="FITS file with an image of a star, in any linear unit",
+        help="FITS file with an image of stars, in any linear unit; with --check, with a PSF or a "
+        "cube of them",
     ),
+    option("-o", "--output", metavar="PSF.fits", help="FITS file for the PSF or PSFs"),
     option(
-        "-o", "--output", required=True, metavar="PSF.fits", help="FITS file for the PSF or PSFs"
+        "--check",
+        action="store_true",
+        is_repeated=False,
+        help="make nothing: say where the centre of a PSF is, how wide it is, and what lies in its "
+        "wings",
     ),
     options.STARS.but(
         dest="position",
         help="position of the star to a few pixels, 0-based, x along columns (default: the "
-        "brightest pixel that is not a single hot one)",
+        "brightest pixel that is not a single hot one); several give the PSF that they share, "
+        "and an extension SCATTER with the standard deviation of theirs from it",
     ),
     option(
         "--size",
@@ -100,6 +107,9 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    if arguments.check:
+        _report(arguments)
+        return
     _check_outputs(arguments)
     folder = os.getcwd()
 
@@ -115,7 +125,7 @@ def _run(arguments: argparse.Namespace) -> None:
     stars = psf.make_psfs(
         frame,
         arguments.rotate,
-        position=arguments.position[0] if arguments.position else None,
+        position=arguments.position or None,
         size=arguments.size,
         background=arguments.background,
         mask=mask,
@@ -125,10 +135,11 @@ def _run(arguments: argparse.Namespace) -> None:
     )
     lines = _lines(stars, arguments.rotate)
     psfs = np.array([star.psf for star in stars])
+    scatters = None if stars[0].scatter is None else np.array([star.scatter for star in stars])
     given = vars(arguments)
     fitswrite.write_image(
         arguments.output,
-        psfs if len(psfs) > 1 else psfs[0],
+        _squeezed(psfs),
         cards=record.make_cards(
             OPTIONS,
             {**given, "background": stars[0].background},
@@ -138,6 +149,7 @@ def _run(arguments: argparse.Namespace) -> None:
         overwrite=arguments.overwrite,
         notes=lines,
         commands=record.make_commands("psf", OPTIONS, given, folder),
+        others={} if scatters is None else {"SCATTER": _squeezed(scatters)},
     )
     k = psfs.shape[-1]
     made = counted(len(psfs), "PSF") if len(psfs) > 1 else "a PSF"
@@ -156,10 +168,8 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     """Check the arguments that need no frame, before it is read."""
     from lnocl.io import atomic
 
-    if len(arguments.position) > 1:
-        raise InputError(
-            f"a PSF is made of one star, and {len(arguments.position)} were given; give --star once"
-        )
+    if arguments.output is None:
+        raise InputError("give -o PSF.fits for the PSF, or --check to look at one")
     inputs = options.input_paths(OPTIONS, vars(arguments))
     atomic.check_fits_output(arguments.output, arguments.overwrite, inputs)
     if arguments.plot is None:
@@ -179,6 +189,32 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
         )
     atomic.check_output(arguments.plot, arguments.overwrite, inputs)
     check_matplotlib()
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    """Say how each PSF of a file looks by itself, and what speaks against it."""
+    from lnocl.io import fitsread, sky
+    from lnocl.psf.report import examine
+
+    for each in OPTIONS:
+        is_given = each.words(vars(arguments)[each.name]) != each.words(each.default)
+        if each.name not in ("frame", "check", "quiet") and is_given:
+            raise InputError(f"--check makes nothing; leave {each.flags[0]} out")
+    with messages.shown_log(arguments.quiet):
+        stack = fitsread.read_stack([arguments.frame])
+    scale, finer = sky.pixel_scale(stack.headers[0]), sky.oversampling(stack.headers[0])
+    lines = [f"pixels: {scale:.4g} arcsec, by its header"] if scale else []
+    if finer:
+        lines.append(f"its header has OVERSAMP {finer:g}: bin it to pixels of the detector")
+    for j, report in enumerate(map(examine, stack.data), 1):
+        lines += [f"PSF {j} of {len(stack.data)}:"] * (len(stack.data) > 1)
+        lines += [*report.lines(), *(report.faults() or ["nothing speaks against it by itself"])]
+    messages.say(lines)
+
+
+def _squeezed(images: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a cube, or the one image in it."""
+    return images if len(images) > 1 else images[0]
 
 
 def _read_image(path: str) -> tuple[NDArray[np.float64], list[str]]:
@@ -210,14 +246,12 @@ def _read_mask(
 
 def _lines(stars: Sequence[StarPsf], angles: Sequence[float]) -> list[str]:
     """Return the steps: those that all PSFs share once, the others of each."""
-    from lnocl.psf.make import N_SHARED_STEPS
-
     if len(stars) == 1:
         return list(stars[0].steps)
-    lines = list(stars[0].steps[:N_SHARED_STEPS])
+    lines = list(stars[0].shared_steps)
     for j, (star, angle) in enumerate(zip(stars, angles, strict=True), 1):
         lines.append(f"PSF {j} of {len(stars)}, at {angle:g} degrees:")
-        lines += star.steps[N_SHARED_STEPS:]
+        lines += star.own_steps
     return lines
 
 
@@ -226,6 +260,7 @@ def _result_cards(stars: Sequence[StarPsf]) -> list[Card]:
     return [
         ("CENTREX", first.centre[0], "star's centre in the frame, x, 0-based"),
         ("CENTREY", first.centre[1], "star's centre in the frame, y, 0-based"),
+        ("NSTARS", len(first.centres), "stars that the PSF is made of"),
         ("NBAD", int(first.bad.sum()), "bad pixels of the frame"),
         *(
             (f"FLUX{j}", star.flux, "set to 1, unit of the frame")
@@ -242,7 +277,7 @@ def _draw(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> None:
     figure = draw_star_psf(
         first.frame - first.background,
         first.bad,
-        first.centre,
+        first.centres,
         [star.psf for star in stars],
         arguments.rotate,
     )
@@ -250,7 +285,7 @@ def _draw(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> None:
 
 
 COMMAND = Command(
-    "make a PSF, or one for each of several angles, from a frame of a star",
+    "make a PSF, or one for each of several angles, from a frame of stars; or check one",
     {"": OPTIONS},
     _run,
     "The PSFs have unit sum and are for lnocl deconvolve --psf. The background is subtracted and "

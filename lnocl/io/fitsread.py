@@ -185,11 +185,11 @@ class SavedResult(NamedTuple):
     Attributes
     ----------
     extended : ndarray of float64, shape (ny, nx)
-        Extended source, electrons per pixel.
+        Extended source, in the unit of BUNIT per pixel.
     stars : list of (x, y)
         Positions in pixels, 0-based.
     star_fluxes : ndarray of float64, shape (n,)
-        Electrons.
+        In the same unit.
     history, curve, held_out : dict of str to ndarray of float64, or None
         Columns of the tables ``HISTORY``, ``CURVE`` and ``HELDOUT``; None for a table that is
         missing.

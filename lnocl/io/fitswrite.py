@@ -43,7 +43,7 @@ def write_result(
     overwrite: bool = False,
     curve: NDArray[np.void] | None = None,
     held_out: NDArray[np.void] | None = None,
-    per_second: bool = False,
+    unit: str = "electron",
     star_columns: Sequence[StarColumn] = (),
     cubes: Mapping[str, tuple[ArrayLike, str]] = MappingProxyType({}),
     offsets: ArrayLike = (),
@@ -60,11 +60,11 @@ def write_result(
     path : str
         File to write.
     extended : array_like, shape (ny, nx)
-        Extended source, electrons per pixel.
+        Extended source, in this unit per pixel.
     stars : array_like, shape (n, 2)
         Positions (x, y) in pixels, 0-based.
     star_fluxes : array_like, shape (n,)
-        Electrons.
+        In this unit.
     history : ndarray with fields ``iteration`` and ``objective``, optional
         The objective after each iteration; a truth has no history.
     wcs : astropy.io.fits.Header, optional
@@ -79,8 +79,8 @@ def write_result(
         Restoration errors and magnitude of the star, where the truth is known.
     held_out : ndarray with fields ``smoothing``, ``iteration`` and ``error``, optional
         Relative errors that held-out counts estimate, where they were asked.
-    per_second : bool, optional
-        Whether extended source and fluxes are electrons per second.
+    unit : str, optional
+        Unit of extended source and fluxes.
     star_columns : sequence of StarColumn, optional
         Further columns of the table of stars.
     cubes : mapping of str to (array_like, str), optional
@@ -97,13 +97,13 @@ def write_result(
     coordinates = fits.Header() if wcs is None else wcs
     shared = coordinates if not np.any(offsets) else fits.Header(offset_cards(offsets))
     header = coordinates.copy()
-    header["BUNIT"] = ("electron/s" if per_second else "electron", "per pixel")
+    header["BUNIT"] = (unit, "per pixel")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
     _add_provenance(header, cards, (), commands)
     hdus = fits.HDUList(
         [
             fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
-            _star_table(stars, star_fluxes, per_second, star_columns),
+            _star_table(stars, star_fluxes, unit, star_columns),
             *([] if history is None else [_table("HISTORY", history)]),
             *([] if curve is None else [_table("CURVE", curve)]),
             *([] if held_out is None else [_table("HELDOUT", held_out)]),
@@ -121,6 +121,7 @@ def write_image(
     overwrite: bool = False,
     notes: Iterable[str] = (),
     commands: Iterable[Sequence[str]] = (),
+    others: Mapping[str, ArrayLike] = MappingProxyType({}),
 ) -> None:
     """Write an image; the same image and cards give the same bytes.
 
@@ -139,6 +140,8 @@ def write_image(
         of a shell.
     commands : iterable of sequence of str, optional
         Shell commands that repeat the run, as words; the HISTORY lines spell them out.
+    others : mapping of str to array_like, optional
+        Further images, by the names of their extensions.
 
     Raises
     ------
@@ -147,9 +150,16 @@ def write_image(
     """
     hdu = fits.PrimaryHDU(np.asarray(image, dtype=np.float64))
     _add_provenance(hdu.header, cards, notes, commands)
-    hdu.add_checksum(when="")  # astropy would note the time
+    hdus = [hdu, *(fits.ImageHDU(np.asarray(each), name=name) for name, each in others.items())]
+    for each in hdus:
+        each.add_checksum(when="")  # astropy would note the time
     with whole_file(path, overwrite) as stream:
-        fits.HDUList([hdu]).writeto(stream)
+        fits.HDUList(hdus).writeto(stream)
+
+
+def column_unit(unit: str) -> str:
+    """Return a unit for a column: FITS has none for electrons, and astropy would warn of it."""
+    return unit.replace("electron", "ct")
 
 
 def offset_cards(offsets: ArrayLike) -> list[Card]:
@@ -213,15 +223,13 @@ def _add_provenance(
 
 
 def _star_table(
-    stars: ArrayLike, fluxes: ArrayLike, per_second: bool, others: Sequence[StarColumn]
+    stars: ArrayLike, fluxes: ArrayLike, unit: str, others: Sequence[StarColumn]
 ) -> fits.BinTableHDU:
     x, y = np.asarray(stars, dtype=np.float64).reshape(-1, 2).T
-    electrons = "electrons per second" if per_second else "electrons"
     columns = [
         StarColumn("x", x, "pix", "column, 0-based"),
         StarColumn("y", y, "pix", "row, 0-based"),
-        # FITS has no name for electrons, and astropy warns of units that FITS lacks.
-        StarColumn("flux", fluxes, "ct/s" if per_second else "ct", electrons),
+        StarColumn("flux", fluxes, column_unit(unit), unit),
         *others,
     ]
     table = fits.BinTableHDU.from_columns(

@@ -77,12 +77,19 @@ class Frames(NamedTuple):
         As given, with the numbers that ``"auto"`` found.
     sha256 : dict of str to list of str
         Checksums of all files, by the option they belong to: images, psfs, background, ...
+    unit : str
+        Unit of the sky, as FITS spells it: that of the images, per second where they are counts
+        and exposures were given; electrons where they have none that is known.
+    electrons : float
+        Electrons, or electrons per second, in this unit.
     """
 
     observation: Observation
     header: fits.Header
     background: list[Word]
     sha256: dict[str, list[str]]
+    unit: str
+    electrons: float
 
 
 def read_frames(images: Sequence[str], psfs: Sequence[str], calibration: Calibration) -> Frames:
@@ -146,11 +153,22 @@ class _Reader:
             psf_centre=self._calibration.psf_centre,
         )
         sha256 = {"images": self._images.sha256, "psfs": self._psfs.sha256, **self._maps.sha256}
-        return Frames(observation, self._images.header, background, sha256)
+        unit = self._unit()
+        name, of_unit = (units.spelled(unit), factor) if units.is_known(unit) else ("electron", 1.0)
+        if exposure is not None and not are_rates:
+            name += "/s"
+        return Frames(observation, self._images.header, background, sha256, name, of_unit)
 
     def _warn_of_pixel_scales(self) -> None:
         """Warn of the first PSF whose pixels are of another size than those of its image."""
         scales = [sky.pixel_scale(header) for header in self._psfs.headers]
+        for j, header in enumerate(self._psfs.headers):
+            if scales[j] is None and (finer := sky.oversampling(header)):
+                warn(
+                    f"psf {j} is sampled {finer:g} times finer than the detector, by OVERSAMP in "
+                    "its header: bin it to the image's pixels"
+                )
+                return
         if not any(scales):
             return  # nor need the images' coordinates be read
         for j, of_psf in enumerate(scales):
@@ -282,7 +300,7 @@ class _Reader:
         return self._maps.fill(
             "background",
             self._calibration.background,
-            lambda j, word: _clipped_median(j + 1, counts[j], mask[j]) if word == "auto" else None,
+            lambda j, word: _clipped_median(j, counts[j], mask[j]) if word == "auto" else None,
         )
 
     def _offsets(self) -> Array | None:
@@ -317,7 +335,7 @@ def _clipped_median(j: int, counts: Array, mask: Mask) -> float:
     _, median, scatter = sigma_clipped_stats(good)
     log.info(
         "image %d: background %.6g electrons per pixel, scatter %.3g (sigma-clipped median)",
-        j,
+        j + 1,
         median,
         scatter,
     )

@@ -67,7 +67,7 @@ class Maps:
         are_numbers = [isinstance(word, float) for word in filled]
         if any(are_numbers) and not all(are_numbers):
             raise InputError(
-                f"image {are_numbers.index(False) + 1} has no {words[0]}; give {name} as numbers"
+                f"image {are_numbers.index(False)} has no {words[0]}; give {name} as numbers"
             )
         return filled if all(are_numbers) else list(words)
 

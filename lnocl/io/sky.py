@@ -75,6 +75,12 @@ def pixel_scale(header: fits.Header) -> float | None:
     return None
 
 
+def oversampling(header: fits.Header) -> float | None:
+    """Return how many pixels of a PSF's file make one of the detector's, where OVERSAMP says so."""
+    finer = header.get("OVERSAMP")
+    return float(finer) if isinstance(finer, (int, float)) and 1 < finer < np.inf else None
+
+
 def to_sky(positions: Pairs, header: fits.Header) -> Pairs:
     """Return right ascension and declination (ICRS, degrees) of pixel positions, shape (n, 2).
 

@@ -139,7 +139,7 @@ def draw_rows(
         axis.grid(alpha=0.3)
     error.set_ylabel("relative error (%)")
     if kind == "flux":
-        profile.set_ylabel("electrons per row")
+        profile.set_ylabel("flux per row")
         highest = true[rows].max()
         if highest > 0:
             profile.set(yscale="log", ylim=(highest * 1e-3, highest * 3))

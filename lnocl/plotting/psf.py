@@ -21,11 +21,11 @@ PSF_FLOOR = 1e-4
 def draw_star_psf(
     frame: Array,
     bad: NDArray[np.bool_],
-    centre: tuple[float, float],
+    centres: Sequence[tuple[float, float]],
     psfs: Sequence[Array],
     angles: Sequence[float],
 ) -> Figure:
-    """Draw a frame of a star, the PSFs made from it, and the PSFs' profiles.
+    """Draw a frame of stars, the PSFs made from it, and the PSFs' profiles.
 
     Parameters
     ----------
@@ -33,8 +33,8 @@ def draw_star_psf(
         The frame, its background subtracted.
     bad : ndarray of bool, shape (ny, nx)
         Its bad pixels; drawn in the first colour of the palette.
-    centre : tuple of float
-        The star's (x, y) in the frame, 0-based pixels.
+    centres : sequence of tuple of float
+        Each star's (x, y) in the frame, 0-based pixels; the first is drawn, with those near it.
     psfs : sequence of ndarray of float64, shape (k, k)
         The PSFs, centred on ``(k // 2, k // 2)``; a row of the figure each.
     angles : sequence of float
@@ -55,12 +55,14 @@ def draw_star_psf(
     good = np.where(bad, np.nan, frame)
     rows = figure.subplots(len(psfs), 3, squeeze=False)
     for (left, middle, right), psf, angle in zip(rows, psfs, angles, strict=True):
-        _draw_frame(left, good, centre, len(psf), angle)
+        _draw_frame(left, good, centres[0], len(psf), angle)
         _draw_psf(middle, psf, angle)
         _draw_middle(right, psf)
         for axis in (left, middle):
             axis.set(xlabel="x from the centre (pixels)", ylabel="y from the centre (pixels)")
             axis.plot(0, 0, "+", color="white", ms=9, mew=0.8)
+        others = np.reshape(centres[1:], (-1, 2)) - centres[0]
+        left.plot(*others.T, "+", color="white", ms=9, mew=0.8, scalex=False, scaley=False)
     return figure
 
 

@@ -165,7 +165,7 @@ def draw_panels(
     bar = part.colorbar(
         picture,
         ax=list(axes),
-        label=f"electrons per pixel, {name}",
+        label=f"flux per pixel, {name}",
         extend="both" if log else "max",
         shrink=0.85,
         pad=0.01,

@@ -105,8 +105,8 @@ def fit_gaussian(light: Array, bad: Mask, start: Pixel, level: float) -> tuple[P
     found = _fit(y, x, light[good] / peak, first, sigma)
     if found is None or max(abs(found[0] - start[0]), abs(found[1] - start[1])) > SEARCH:
         raise InputError(
-            f"no star is found within {SEARCH} pixels of where it should be; give its position, or "
-            "another background"
+            f"no star is found within {SEARCH} pixels of ({start[1]}, {start[0]}); give its "
+            "position, or another background"
         )
     # Digits beyond these are rounding of the fit: a centred star stays where it is.
     return (round(found[0], 9), round(found[1], 9)), found[2]

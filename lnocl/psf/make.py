@@ -1,4 +1,4 @@
-"""A point spread function from a frame of a star: repaired, centred, cropped, of unit sum.
+"""A point spread function from a frame of stars: repaired, centred, cropped, of unit sum.
 
 Each step says in one line what it did; the record of `make_psf` holds these lines.
 """
@@ -13,29 +13,31 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError
-from lnocl.psf import checks, resampling, steps
+from lnocl.psf import checks, effective, resampling, steps
 from lnocl.psf.centring import Mask, Pixel, Point
 
 Array = NDArray[np.float64]
-# The first steps, which do not depend on the angle: star, background, bad pixels, centre.
-N_SHARED_STEPS = 4
 
 
 @dataclass(frozen=True)
 class StarPsf:
-    """A PSF made from a frame of a star, and the record of its making.
+    """A PSF made from a frame of stars, and the record of its making.
 
     Attributes
     ----------
     psf : ndarray of float64, shape (k, k)
         Point spread function of unit sum, the star's centre at ``(k // 2, k // 2)``.
-    steps : tuple of str
-        One line for each step, in order, with its numbers. The flux left out of the crop is
-        measured with the noise of all pixels of that square.
+    scatter : ndarray of float64, shape (k, k), or None
+        By how much the stars differ from it: the standard deviation of their own PSFs, weighted by
+        flux, noise included. None where it is made of one star.
+    shared_steps, own_steps : tuple of str
+        One line for each step, in order, with its numbers: those that PSFs at all angles share,
+        and the others. The flux left out of the crop is measured with the noise of all pixels of
+        that square.
     flux : float
-        Flux of the PSF before it was normalised, in the unit of the frame.
-    centre : tuple of float
-        Position of ``(k // 2, k // 2)`` in the frame: (x, y), 0-based pixels.
+        Flux of the PSF before it was normalised, in the unit of the frame; that of all its stars.
+    centres : tuple of tuple of float
+        Position of ``(k // 2, k // 2)`` in the frame for each star: (x, y), 0-based pixels.
     background : float
         The level that was subtracted, in the unit of the frame.
     frame : ndarray of float64, shape (ny, nx)
@@ -45,12 +47,24 @@ class StarPsf:
     """
 
     psf: Array
-    steps: tuple[str, ...]
+    scatter: Array | None
+    shared_steps: tuple[str, ...]
+    own_steps: tuple[str, ...]
     flux: float
-    centre: tuple[float, float]
+    centres: tuple[tuple[float, float], ...]
     background: float
     frame: Array
     bad: Mask
+
+    @property
+    def steps(self) -> tuple[str, ...]:
+        """All steps."""
+        return self.shared_steps + self.own_steps
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """The first star's centre."""
+        return self.centres[0]
 
 
 def make_psf(
@@ -64,7 +78,7 @@ def make_psf(
     clip_negative: bool = False,
     rotate: float = 0.0,
 ) -> StarPsf:
-    r"""Return the point spread function that a frame of a star shows.
+    r"""Return the point spread function that a frame of one star or several shows.
 
     .. math:: K(r) = \frac{f(c + R^{-1} r) - b}{\sum_{r'} (f(c + R^{-1} r') - b)}
 
@@ -101,6 +115,14 @@ def make_psf(
     Fizeau PSF at Nyquist's sampling is right to 3e-5 of the peak, where cubic splines are to 4e-2
     and quintic ones to 1.4e-2.
 
+    **Several stars** give their effective PSF (Anderson & King 2000), by `effective.combine`: the
+    one that, moved to each of them as `lnocl.deconvolve` moves it, explains all of them together.
+    It has their noise together, no blur by a shift, also where they are undersampled, and no
+    neighbours: those in the list are modelled, others are masked where one star shows them and
+    another does not. Bad pixels are left to the other stars. Of four stars of 3e4 to 2e5 electrons,
+    FWHM 2.5, one with two bad pixels in its core and one with a neighbour, the PSF is right to
+    0.7 % of its peak, as noise allows; that of the brightest to 13 %, as it has the neighbour.
+
     Background and centring are the steps that any frame of a star needs, so they are done unless
     they are declined; cropping, clipping and rotating are choices, done if asked for.
 
@@ -109,23 +131,24 @@ def make_psf(
     frame : array_like, shape (ny, nx)
         Image of a star, in any linear unit. A pixel that is not finite, or that is masked in a
         `numpy.ma` array or a CCDData, is bad. Other arguments must not be masked.
-    position : tuple of float, optional
-        Position of the star: (x, y), 0-based pixels, to `NEAR` pixels. By default the brightest
-        pixel of the frame after a median filter of 3 x 3 good pixels.
+    position : array_like, shape (2,) or (n, 2), optional
+        Position of the star, or of several: (x, y), 0-based pixels, to `NEAR` pixels. By default
+        the brightest pixel of the frame after a median filter of 3 x 3 good pixels.
     size : int, optional
         Side k of the PSF, pixels, 3 or more. By default the largest that the frame has around
         the star, at this rotation.
     background : float or "auto", optional
         Level to subtract, in the unit of the frame. "auto" is the median of the good pixels, after
-        clipping at 3 sigma, in a square ring around the crop, half as wide as it; in the frame's
-        border where fewer than `MIN_SKY` are there, or where no size is given.
+        clipping at 3 sigma, in a square ring around the crop, half as wide as it, or around those
+        of all stars; in the frame's border where fewer than `MIN_SKY` are there, or where no size
+        is given.
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is bad.
     saturation : float, optional
         Pixels of this value, positive, and above are bad.
     recentre : bool, optional
         Whether to find the star's centre and to shift it to the middle of a pixel. Otherwise the
-        pixel at `position` is moved as it is.
+        pixel at `position` is moved as it is. Several stars must be recentred.
     clip_negative : bool, optional
         Whether to set negative pixels to 0; the flux of the PSF grows by their flux.
     rotate : float, optional
@@ -144,7 +167,8 @@ def make_psf(
         Where an argument has the wrong type, shape or range, or, but for the frame, holds masked
         values; where the star is outside the frame or not found; where the crop does not fit in
         the frame; where all pixels are bad; where too few pixels of the star are good to repair
-        the others; where nothing is above the background.
+        the others; where nothing is above the background; where a star has no good core, or no
+        star shows the middle.
 
     Warns
     -----
@@ -155,7 +179,7 @@ def make_psf(
     References
     ----------
     M. Unser, P. Thévenaz, L. Yaroslavsky, IEEE Trans. Image Process. 4, 1371 (1995), for rotation
-    by shears.
+    by shears. J. Anderson, I. R. King, PASP 112, 1360 (2000), for effective PSFs.
 
     Examples
     --------
@@ -255,33 +279,52 @@ def _make(
     pixels = np.where(bad, 0.0, np.minimum(given, checks.saturation_level(saturation)))
     half = None if side is None else max(resampling.reach(side, angle) for angle in angles)
 
-    start, found = steps.find_star(pixels, bad, position)
-    level, measured = steps.measure_background(background, pixels, unusable, start, half)
+    places, found = steps.find_stars(pixels, bad, position)
+    level, measured = steps.measure_background(background, pixels, unusable, places, half)
     light = np.where(unusable, 0.0, pixels - level)
-    region = steps.reachable(pixels.shape, start, half)
+    region = steps.reachable(pixels.shape, places, half)
     unrepairable, repaired = steps.repair_bad(light, unusable, saturated, region)
-    centre, shift, centred = steps.find_centre(light, unusable, start, level, recentre)
-    pixel = steps.nearest_pixel(centre)
-    side = min(steps.fitting_side(given.shape, pixel, side, angle) for angle in angles)
-    steps.refuse_hole(unrepairable, pixel)
+    centres, shift, centred = steps.find_centres(light, unusable, places, level, recentre)
+    middles = [steps.nearest_pixel(centre) for centre in centres]
+    side = min(
+        steps.fitting_side(given.shape, pixel, side, angle) for angle in angles for pixel in middles
+    )
+    scatter: Array | None = None
+    combined: tuple[str, ...] = ()
+    if len(middles) == 1:
+        (pixel,) = middles
+        steps.refuse_hole(unrepairable, pixel)
+        steps.warn_of_guess(saturated, light, pixel, side)
+    else:
+        far = max(resampling.reach(side, angle) for angle in angles) + steps.MARGIN
+        stars = effective.combine(light, unusable, centres, far)
+        centres = [(star.y, star.x) for star in stars.stars]
+        flux = sum(star.flux for star in stars.stars)
+        light, scatter, pixel, shift = flux * stars.psf, flux * stars.scatter, (far, far), None
+        combined = effective.lines(stars)
     squares = [
         _make_square(light, pixel, shift, side, angle, level, clip_negative) for angle in angles
     ]
-    steps.warn_of_guess(saturated, light, pixel, side)
     steps.warn_of_ringing([square.negative_shares for square in squares])
-    shared = (found, measured, repaired, centred)
     return [
         StarPsf(
             square.psf / square.flux,
-            (*shared, *square.lines),
+            None if scatter is None else _turn_scatter(scatter, side, angle) / square.flux,
+            (*found, measured, repaired, *centred, *combined),
+            square.lines,
             square.flux,
-            (centre[1], centre[0]),
+            tuple((x, y) for y, x in centres),
             level,
             given,
             unusable,
         )
-        for square in squares
+        for square, angle in zip(squares, angles, strict=True)
     ]
+
+
+def _turn_scatter(scatter: Array, side: int, angle: float) -> Array:
+    turned = resampling.rotate(scatter, angle) if angle else scatter
+    return steps.middle_square(turned, side).clip(min=0.0)
 
 
 class _Square(NamedTuple):

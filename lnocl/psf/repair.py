@@ -17,7 +17,7 @@ WINDOW, MIN_GOOD = 11, 40
 NEIGHBOURS = 48
 
 
-def repair(image: Array, bad: Mask, region: tuple[slice, slice]) -> tuple[Mask, Mask]:
+def repair(image: Array, bad: Mask, region: Mask) -> tuple[Mask, Mask]:
     """Interpolate the bad pixels of a region in place, by quintic radial functions.
 
     Parameters
@@ -26,8 +26,8 @@ def repair(image: Array, bad: Mask, region: tuple[slice, slice]) -> tuple[Mask, 
         Finite where it is bad too.
     bad : ndarray of bool, shape (ny, nx)
         True where a pixel is bad. All beyond the image counts as bad.
-    region : tuple of slice
-        Rows and columns.
+    region : ndarray of bool, shape (ny, nx)
+        True where bad pixels are looked at.
 
     Returns
     -------
@@ -38,10 +38,8 @@ def repair(image: Array, bad: Mask, region: tuple[slice, slice]) -> tuple[Mask, 
     n_good = (~bad).astype(np.int64)
     for axis in (0, 1):
         n_good = convolve1d(n_good, np.ones(WINDOW, int), axis, mode="constant")
-    inside = np.zeros_like(bad)
-    inside[region] = True
-    unrepairable = bad & inside & (n_good < MIN_GOOD)
-    wanted = bad & inside & ~unrepairable
+    unrepairable = bad & region & (n_good < MIN_GOOD)
+    wanted = bad & region & ~unrepairable
     near = maximum_filter(wanted, 2 * WINDOW + 1) & ~bad
     if wanted.any():
         image[wanted] = RBFInterpolator(

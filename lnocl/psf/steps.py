@@ -27,46 +27,59 @@ BORDER = 1 / 16
 RINGING, OF_NOISE = 0.01, 0.2
 
 
-def find_star(pixels: Array, bad: Mask, position: ArrayLike | None) -> tuple[Pixel, str]:
-    """Return the star's pixel: the one at `position`, or the brightest."""
+def find_stars(
+    pixels: Array, bad: Mask, position: ArrayLike | None
+) -> tuple[list[Pixel], list[str]]:
+    """Return the stars' pixels, those at `position`, or the brightest; and a line for each."""
     ny, nx = pixels.shape
     if position is None:
         start = brightest(pixels, bad)
-        return start, f"star: brightest pixel of the median-filtered frame, {_at(start)}"
+        return [start], [f"star: brightest pixel of the median-filtered frame, {_at(start)}"]
     given = numbers("position", position)
-    if given.shape != (2,) or not np.isfinite(given).all():
+    if given.shape[-1:] != (2,) or given.ndim > 2 or not given.size or not np.isfinite(given).all():
         raise InputError(f"position is {position!r}; give two finite numbers, x and y")
-    start = nearest_pixel((float(given[1]), float(given[0])))
-    if not (0 <= start[0] < ny and 0 <= start[1] < nx):
-        raise InputError(
-            f"position ({given[0]:g}, {given[1]:g}) is outside the frame of {nx} x {ny} pixels; "
-            "give x and y, 0-based"
-        )
-    return start, f"star: given at x = {given[0]:g}, y = {given[1]:g}"
+    places, lines = [], []
+    for x, y in given.reshape(-1, 2):
+        start = nearest_pixel((float(y), float(x)))
+        if not (0 <= start[0] < ny and 0 <= start[1] < nx):
+            raise InputError(
+                f"position ({x:g}, {y:g}) is outside the frame of {nx} x {ny} pixels; give x and "
+                "y, 0-based"
+            )
+        if start in places:
+            raise InputError(f"position ({x:g}, {y:g}) is given twice; give each star once")
+        places.append(start)
+        lines.append(f"star: given at x = {x:g}, y = {y:g}")
+    return places, lines
 
 
-def reachable(shape: tuple[int, ...], start: Pixel, half: int | None) -> tuple[slice, slice]:
-    """Return the rows and columns that the PSF may be made of, wherever its centre is found."""
+def reachable(shape: tuple[int, ...], starts: list[Pixel], half: int | None) -> Mask:
+    """Return the pixels that the PSF may be made of, wherever its centre is found."""
     far = max(shape) if half is None else half + MARGIN + SEARCH
-    y, x = (slice(max(i - far, 0), i + far + 1) for i in start)
-    return y, x
+    return _distance(shape, starts) <= far
+
+
+def _distance(shape: tuple[int, ...], starts: list[Pixel]) -> NDArray[np.int_]:
+    """Return how far each pixel is from the nearest star, along x or y."""
+    y, x = np.ogrid[: shape[0], : shape[1]]
+    each = [np.maximum(abs(y - row), abs(x - column)) for row, column in starts]
+    return np.min(each, axis=0)
 
 
 def measure_background(
     background: float | str,
     pixels: Array,
     bad: Mask,
-    start: Pixel,
+    starts: list[Pixel],
     half: int | None,
 ) -> tuple[float, str]:
-    """Return the background: as given, or the median around the crop or in the border."""
+    """Return the background: as given, or the median around the crops or in the border."""
     if not isinstance(background, str):
         level = one_number("background", background)
         return level, f"background: {level:g}, as given, subtracted"
     if background != "auto":
         raise InputError(f'background is {background!r}; give a number or "auto"')
-    y, x = (np.abs(np.arange(n) - i) for n, i in zip(pixels.shape, start, strict=True))
-    distance = np.maximum(y[:, None], x)
+    distance = _distance(pixels.shape, starts)
     sky, where = np.zeros_like(bad), "around the crop"
     if half is not None:
         sky = ~bad & (distance > half) & (distance <= 2 * half)
@@ -83,9 +96,7 @@ def measure_background(
     )
 
 
-def repair_bad(
-    light: Array, bad: Mask, saturated: Mask, region: tuple[slice, slice]
-) -> tuple[Mask, str]:
+def repair_bad(light: Array, bad: Mask, saturated: Mask, region: Mask) -> tuple[Mask, str]:
     """Interpolate the bad pixels of a region in place; return those that are too far inside."""
     if not bad.any():
         return bad, "bad pixels: 0 in the frame"
@@ -101,20 +112,28 @@ def repair_bad(
     )
 
 
-def find_centre(
-    light: Array, unusable: Mask, start: Pixel, level: float, recentre: bool
-) -> tuple[Point, Point | None, str]:
-    """Return the star's centre and the shift to the middle of a pixel; None for no shift."""
+def find_centres(
+    light: Array, unusable: Mask, starts: list[Pixel], level: float, recentre: bool
+) -> tuple[list[Point], Point | None, list[str]]:
+    """Return the stars' centres and the shift of one to the middle of a pixel; None for none."""
     if not recentre:
-        return (float(start[0]), float(start[1])), None, f"centre: pixel {_at(start)}; not shifted"
-    centre, sigma = fit_gaussian(light, unusable, start, level)
-    pixel = nearest_pixel(centre)
-    shift = pixel[0] - centre[0], pixel[1] - centre[1]
-    line = (
-        f"centre: x = {centre[1]:.3f}, y = {centre[0]:.3f}, FWHM {FWHM * sigma:.2f} pixels; "
-        f"shifted by x {_plain(shift[1], 3)}, y {_plain(shift[0], 3)}"
-    )
-    return centre, shift, line
+        if len(starts) > 1:
+            raise InputError("several stars must be recentred; give one, or leave recentre")
+        centre = float(starts[0][0]), float(starts[0][1])
+        return [centre], None, [f"centre: pixel {_at(starts[0])}; not shifted"]
+    centres, lines = [], []
+    for start in starts:
+        centre, sigma = fit_gaussian(light, unusable, start, level)
+        centres.append(centre)
+        lines.append(
+            f"centre: x = {centre[1]:.3f}, y = {centre[0]:.3f}, FWHM {FWHM * sigma:.2f} pixels"
+        )
+    if len(starts) > 1:
+        return centres, None, lines
+    pixel = nearest_pixel(centres[0])
+    shift = pixel[0] - centres[0][0], pixel[1] - centres[0][1]
+    moved = f"; shifted by x {_plain(shift[1], 3)}, y {_plain(shift[0], 3)}"
+    return centres, shift, [lines[0] + moved]
 
 
 def _largest(shape: tuple[int, ...], pixel: Pixel, angle: float) -> int:

@@ -83,6 +83,26 @@ def _parse(text: str) -> Any:
     return None
 
 
+def is_known(unit: Any) -> bool:
+    """Return whether a unit measures anything: a number, a per cent, a word do not."""
+    from astropy import units as u
+
+    known = isinstance(unit, u.UnitBase) and not isinstance(unit, u.UnrecognizedUnit)
+    return known and not unit.is_equivalent(u.dimensionless_unscaled)
+
+
+def spelled(unit: Any) -> str:
+    """Return a unit as FITS spells it, which has no spelling of its own for electrons.
+
+    Examples
+    --------
+    >>> from lnocl.scene.units import parse, spelled
+    >>> [spelled(parse(text)) for text in ("ELECTRONS/S", "MJy / sr", "DN", "counts")]
+    ['electron/s', 'MJy/sr', 'adu', 'ct']
+    """
+    return str(unit.to_string()).replace(" ", "")
+
+
 def count_of(unit: Any, counts: Sequence[str] = COUNTS) -> tuple[float, bool] | None:
     """Return the number of counts in a unit, and whether it is per second.
 

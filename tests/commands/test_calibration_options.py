@@ -135,16 +135,16 @@ class TestFrames:
             refine_positions=True,
         )
         found = outcome("out.fits")
-        np.testing.assert_array_equal(found["PRIMARY"], expected.extended)
+        np.testing.assert_array_equal(found["PRIMARY"], expected.extended / 1.7)
         table = found["STARS"]
         rms = [(s.core.rms, s.wings.rms, s.halo) for s in expected.star_residuals()]
         assert list(table) == ["x", "y", "flux", "x_error", "y_error", "flux_error", "mag", "ra",
                                "dec", "core_rms", "wings_rms", "halo"]  # fmt: skip
         for names, values in [
             (["x", "y"], expected.star_positions.T),
-            (["flux"], [expected.star_fluxes]),
+            (["flux"], [expected.star_fluxes / 1.7]),
             (["x_error", "y_error"], expected.star_position_errors.T),
-            (["flux_error"], [expected.star_flux_errors]),
+            (["flux_error"], [expected.star_flux_errors / 1.7]),
             (["core_rms", "wings_rms", "halo"], np.transpose(rms)),
         ]:
             np.testing.assert_array_equal([table[name] for name in names], values)
@@ -165,12 +165,12 @@ class TestFrames:
             cubes = [hdus[name].header for name in ("MODELS", "RESIDUALS")]
             assert hdus["MODELS"].header["BUNIT"] == "electron"
             assert "BUNIT" not in hdus["RESIDUALS"].header
-        assert header["BUNIT"] == "electron/s"
+        assert header["BUNIT"] == "adu/s"
         numbers = range(1, table["TFIELDS"] + 1)
         named = {table[f"TTYPE{i}"]: table.get(f"TUNIT{i}", "") for i in numbers}
         assert named == {
             **dict.fromkeys(["x", "y", "x_error", "y_error"], "pix"),
-            **dict.fromkeys(["flux", "flux_error"], "ct/s"),
+            **dict.fromkeys(["flux", "flux_error"], "adu/s"),
             "mag": "mag",
             "ra": "deg",
             "dec": "deg",
@@ -233,7 +233,7 @@ class TestFrames:
             "stars.csv: 1 star",
         ]
         assert f"image 1: background {level:.6g} electrons per pixel" in said.err
-        assert "electrons per second" in said.out
+        assert " adu/s; residuals " in said.out
         assert self.run(*self.OPTIONS, *self.sky_option, "--quiet", "--overwrite") == 0
         assert capsys.readouterr() == ("", "")
 

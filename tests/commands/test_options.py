@@ -132,6 +132,7 @@ FLAGS = {"n_iter": "--n-iter", "mu": "--mu", "pad": "--pad", "psfs": "--psf", "s
         ("give pad 5 or more, or pad less", "give --pad 5 or more, or pad less"),
         ("with pad=3 it fits", "with --pad 3 it fits"),
         ("psfs hold values", "psfs hold values"),
+        ("psf 0 of image 9 and image.fits 0", "psf 1 of image 10 and image.fits 0"),
         ("sky_brightness must be", "--sky must be"),
         ("the sky and the mask are empty", "the sky and the mask are empty"),
         ("give a mask file", "give a mask file"),
@@ -141,7 +142,7 @@ FLAGS = {"n_iter": "--n-iter", "mu": "--mu", "pad": "--pad", "psfs": "--psf", "s
     ],
 )
 def test_only_names_of_parameters_become_options(message, named):
-    assert messages.name_options(message, FLAGS) == (message if named is None else named)
+    assert messages.in_shell(message, FLAGS) == (message if named is None else named)
 
 
 def test_a_file_that_is_called_as_a_parameter_keeps_its_name(capsys):

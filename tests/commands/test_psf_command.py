@@ -14,7 +14,7 @@ from astropy.io.fits.scripts import fitscheck
 
 import lnocl
 from lnocl.commands import cli
-from lnocl.psf.make import make_psf, make_psfs
+from lnocl.psf import examine, make_psf, make_psfs
 
 SHAPE = (61, 70)
 Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -54,7 +54,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def run(*options, frame="star.fits", output="out.fits"):
-    return cli.main(["psf", frame, "-o", output, *options])
+    made = [] if output is None else ["-o", output]
+    return cli.main(["psf", frame, *made, *options])
 
 
 def complaint(captured):
@@ -146,10 +147,64 @@ class TestWhatItMakes:
         options = ("--star", "30.3,28.8", "--star", "50,45", "--engine", "numpy", "--n-iter", "30")
         options += ("--stop", "none", "--quiet")
         assert cli.main([*image, *options, "-o", "sky.fits"]) == 0
-        assert "the noise of image 1 is not that of its counts" in capsys.readouterr().err
+        assert "the noise of image 2 is not that of its counts" in capsys.readouterr().err
         flux = fits.getdata("sky.fits", "STARS")["flux"]
         expected = 2 * np.pi * 4 * np.array([9000.0, 1500.0])
         np.testing.assert_allclose(flux, expected, rtol=0.05)
+
+    def test_several_stars_give_what_they_share_and_how_they_differ(self, capsys):
+        assert run("--star", "30,29", "--star", "50,45", "--size", "15") == 0
+        expected = make_psf(FRAME, [(30, 29), (50, 45)], 15)
+        with fits.open("out.fits", checksum=True) as hdus:
+            np.testing.assert_array_equal(hdus[0].data, expected.psf)
+            np.testing.assert_array_equal(hdus["SCATTER"].data, expected.scatter)
+            assert hdus[0].header["NSTARS"] == 2
+        said = capsys.readouterr().out.splitlines()
+        assert said[:-1] == list(expected.steps)
+        assert [line.partition(":")[0] for line in said] == [
+            "star", "star", "background", "bad pixels", "centre", "centre", "star 1 of 2",
+            "star 2 of 2", "effective PSF", "crop", "negative pixels", "normalised",
+            "written to out.fits",
+        ]  # fmt: skip
+        words = shlex.split("\n".join(fits.getheader("out.fits")["HISTORY"]).replace("\\\n", ""))
+        assert words.count("--star") == 2
+
+    def test_several_stars_at_several_angles_give_two_cubes(self):
+        assert run("--star", "30,29", "--star", "50,45", "--size", "9", "--rotate", "0", "90") == 0
+        expected = make_psfs(FRAME, [0, 90], [(30, 29), (50, 45)], 9)
+        np.testing.assert_array_equal(fits.getdata("out.fits"), [e.psf for e in expected])
+        scatters = [e.scatter for e in expected]
+        np.testing.assert_array_equal(fits.getdata("out.fits", "SCATTER"), scatters)
+
+
+class TestCheck:
+    def check(self, capsys, psf, **cards):
+        fits.writeto("psf.fits", psf, fits.Header(cards))
+        assert run("--check", frame="psf.fits", output=None) == 0
+        assert not Path("out.fits").exists()
+        return capsys.readouterr().out.splitlines()
+
+    def test_a_psf_is_looked_at(self, capsys):
+        psf = star(35.0, 30.0)
+        assert self.check(capsys, psf, PIXELSCL=0.05) == [
+            "pixels: 0.05 arcsec, by its header",
+            *examine(psf).lines(),
+            "nothing speaks against it by itself",
+        ]
+
+    def test_faults_are_said(self, capsys):
+        psf = star(33.0, 30.0)
+        said = self.check(capsys, psf, OVERSAMP=4)
+        assert said[0] == "its header has OVERSAMP 4: bin it to pixels of the detector"
+        assert said[-1] == (
+            "it is 2.00 pixels off its centre, and is refused: take --psf-centre fit"
+        )
+
+    def test_all_of_a_cube_are(self, capsys):
+        said = self.check(capsys, np.array([star(35.0, 30.0), star(36.0, 30.0)]))
+        assert [line for line in said if line.startswith("PSF")] == ["PSF 1 of 2:", "PSF 2 of 2:"]
+        assert "nothing" in said[7]
+        assert "1.00 pixels off" in said[15]
 
 
 class TestTheFile:
@@ -168,6 +223,7 @@ class TestTheFile:
             "CENTREX": stars[0].centre[0],
             "CENTREY": stars[0].centre[1],
             "BKG": stars[0].background,
+            "NSTARS": 1,
             "NBAD": 3,
             "SATURATE": 8900.0,
             "RECENTRE": True,
@@ -289,11 +345,11 @@ class TestPicture:
         assert capsys.readouterr().out.splitlines()[-1] == "drew a.PNG"
         assert Path("a.PNG").read_bytes().startswith(b"\x89PNG")
         assert "--plot" not in "".join(fits.getheader("out.fits")["HISTORY"])
-        ((frame, bad, centre, psfs, angles),) = drawn
+        ((frame, bad, centres, psfs, angles),) = drawn
         header = fits.getheader("out.fits")
         np.testing.assert_array_equal(bad, BAD != 0)
         np.testing.assert_array_equal(frame[~bad], (FRAME - header["BKG"])[~bad])
-        assert centre == (header["CENTREX"], header["CENTREY"])
+        assert centres == ((header["CENTREX"], header["CENTREY"]),)
         np.testing.assert_array_equal(psfs, fits.getdata("out.fits"))
         assert angles == [0, 45]
 
@@ -324,7 +380,16 @@ REFUSED = {
         {"output": "mask.fits"}, ["--overwrite", "--mask", "mask.fits"], 2,
         "mask.fits is one of the inputs",
     ),
-    "two stars": ({}, ["--star", "1,2", "--star", "3,4"], 2, "one star, and 2 were given"),
+    "a star twice": ({}, ["--star", "30,29", "--star", "30.2,29"], 2, "is given twice"),
+    "several as they are": (
+        {}, ["--star", "30,29", "--star", "50,45", "--no-recentre"], 2, "must be recentred",
+    ),
+    "no output": ({"output": None}, [], 2, "give -o PSF.fits for the PSF, or --check"),
+    "a check that makes": ({}, ["--check"], 2, "--check makes nothing; leave -o out"),
+    "a check with a size": ({"output": None}, ["--check", "--size", "9"], 2, "leave --size out"),
+    "a check of no numbers": (
+        {"frame": "nan.fits", "output": None}, ["--check"], 2, "must be one image of finite numbers"
+    ),
     "star outside": ({}, ["--star", "70,3"], 2, "position (70, 3) is outside the frame"),
     "star at the edge": ({}, ["--star", "0,3", "--no-recentre"], 2, "at the edge of the frame"),
     "no star": ({}, ["--star", "5,8", "--background", "40"], 2, "no star is found within 16"),
@@ -373,7 +438,7 @@ def test_what_is_refused(capsys, where, options, status, message):
     assert contents() == before
 
 
-@pytest.mark.parametrize("options", [["--plot", "there.png"], ["--star", "1,2", "--star", "3,4"]])
+@pytest.mark.parametrize("options", [["--plot", "there.png"], ["-o", "there.fits"]])
 def test_outputs_are_checked_before_the_frame_is_read(capsys, options):
     assert run(*options, frame="no.fits") in (1, 2)
     assert "no.fits" not in complaint(capsys.readouterr())
@@ -382,7 +447,7 @@ def test_outputs_are_checked_before_the_frame_is_read(capsys, options):
 def test_wrong_use(capsys):
     assert cli.main(["psf"]) == 2
     assert complaint(capsys.readouterr()) == (
-        "the following arguments are required: FRAME, -o/--output; see lnocl psf --help"
+        "the following arguments are required: FRAME; see lnocl psf --help"
     )
 
 

@@ -53,7 +53,7 @@ class TestWriting:
             fitswrite.StarColumn("ra", np.array([150.25]), "deg", "right ascension, ICRS"),
             fitswrite.StarColumn("x_error", [0], "", "standard error"),
         ]
-        path = write(tmp_path / "out.fits", star_columns=columns, per_second=True)
+        path = write(tmp_path / "out.fits", star_columns=columns, unit="electron/s")
         stars = QTable.read(path, hdu="STARS")
         assert stars.colnames == ["x", "y", "flux", "mag", "ra", "x_error"]
         assert [str(stars[name].unit) for name in stars.colnames[:5]] == [
@@ -61,7 +61,7 @@ class TestWriting:
         ]  # fmt: skip
         assert [float(stars[name].value[0]) for name in ("mag", "ra")] == [17.5, 150.25]
         header = fits.getheader(path, "STARS")
-        assert header.comments["TTYPE3"] == "electrons per second"
+        assert header.comments["TTYPE3"] == "electron/s"
         assert header.comments["TTYPE4"] == "by the zero point"
         assert fits.getheader(path)["BUNIT"] == "electron/s"
         assert fitscheck.main(["--compliance", path]) == 0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from astropy import units as u
-from frame_files import IMAGES, observe, save, save_images
+from frame_files import IMAGES, observe, read, save, save_images
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,6 +20,36 @@ DIGITAL = ["DN", "adu", "ADU", "dn", "DN/pixel"]
 DIGITAL_RATES = ["ADU/s", "adu s-1", "DN/s", "DN/sec", "DN/s/pix"]
 OTHERS = ["MJy/sr", "mJy", "10**-20 erg/s/cm2", "mag", "UNKNOWN", "total nonsense", "(", "[e-]",
           "5", "1000", "%"]  # fmt: skip
+
+
+class TestTheUnitOfTheSky:
+    """That of the images, where they have one that measures anything."""
+
+    @pytest.mark.parametrize(
+        ("unit", "known", "name", "electrons"),
+        [
+            ("", {}, "electron", 1.0),
+            ("", {"gain": 2.0}, "electron", 1.0),
+            ("", {"exposure": [20.0]}, "electron/s", 1.0),
+            ("ELECTRONS", {}, "electron", 1.0),
+            ("ELECTRONS", {"exposure": [20.0]}, "electron/s", 1.0),
+            ("e-/s", {"exposure": [20.0]}, "electron/s", 1.0),
+            ("photon", {}, "ph", 1.0),
+            ("counts", {}, "ct", 1.0),
+            ("kct", {}, "kct", 1000.0),
+            ("ct/ms", {"exposure": [20.0]}, "ct/ms", 1000.0),
+            ("DN", {"gain": 2.0}, "adu", 2.0),
+            ("DN/s", {"gain": 2.0, "exposure": [20.0]}, "adu/s", 2.0),
+            ("MJy/sr", {"gain": 30.0}, "MJy/sr", 30.0),
+            ("MJy/sr", {"gain": 30.0, "exposure": [20.0]}, "MJy/sr/s", 30.0),
+            ("%", {"gain": 30.0}, "electron", 1.0),
+            ("total nonsense", {"gain": 30.0}, "electron", 1.0),
+        ],
+    )
+    def test_it_has_a_name_and_electrons(self, unit, known, name, electrons):
+        save_images(BUNIT=unit)
+        frames = read(**known)
+        assert (frames.unit, frames.electrons) == (name, electrons)
 
 
 class TestUnits:

@@ -95,8 +95,8 @@ class TestExposure:
     @pytest.mark.parametrize(
         ("cards", "exposure", "message"),
         [
-            ([{"EXPTIME": 1.0}, {}], ["EXPTIME"], "image 2 has no EXPTIME; give exposure as nu"),
-            ([{}, {"EXPTIME": 1.0}], ["EXPTIME"], "image 1 has no EXPTIME; give exposure as nu"),
+            ([{"EXPTIME": 1.0}, {}], ["EXPTIME"], "image 1 has no EXPTIME; give exposure as nu"),
+            ([{}, {"EXPTIME": 1.0}], ["EXPTIME"], "image 0 has no EXPTIME; give exposure as nu"),
             ([{"EXPTIME": 1.0}, {"EXPTIME": "long"}], ["EXPTIME"],
              "EXPTIME of 2.fits is 'long', not a number"),
             ([{"EXPTIME": True}, {"EXPTIME": 1.0}], ["EXPTIME"],
@@ -174,7 +174,7 @@ class TestBackground:
         save_images(IMAGES - 60.0)
         with pytest.raises(InputError) as caught:
             observe(background=["auto"])
-        assert str(caught.value).startswith("image 1 has a sigma-clipped median of -")
+        assert str(caught.value).startswith("image 0 has a sigma-clipped median of -")
         assert "give background 0, and its noise as read_noise or" in str(caught.value)
 
     @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ class TestBackground:
 
     def test_auto_of_an_image_without_a_good_pixel(self):
         save_images(np.array([IMAGES[0], np.full(SHAPE, np.nan)]))
-        with pytest.raises(InputError, match="image 2 has no good pixel to measure its background"):
+        with pytest.raises(InputError, match="image 1 has no good pixel to measure its background"):
             observe(background=["auto"])
 
 
@@ -468,6 +468,16 @@ class TestPixelScales:
     )
     def test_others_are_not(self, cards):
         assert self.said(cards) == []
+
+    def test_a_psf_finer_than_the_detector_is_said(self):
+        (message,) = self.said({"OVERSAMP": 4})
+        assert message == (
+            "psf 0 is sampled 4 times finer than the detector, by OVERSAMP in its header: bin it "
+            "to the image's pixels"
+        )
+        assert self.said({"OVERSAMP": 1}) == []
+        (message,) = self.said({"OVERSAMP": 4, "PIXELSCL": 0.0125})
+        assert "rebin it to the image's pixels, by 4" in message
 
     def test_images_without_coordinates_tell_nothing(self):
         assert self.said({"PIXELSCL": 0.0125}, {}) == []

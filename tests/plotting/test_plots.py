@@ -153,7 +153,7 @@ def test_a_psf_is_shown_beside_the_frame_that_it_was_made_from(angle):
     bad = np.zeros(frame.shape, bool)
     bad[28, 31] = True
     psf = frame[18:39, 20:41]
-    figure = draw_star_psf(frame, bad, (30.0, 28.0), [psf], [angle])
+    figure = draw_star_psf(frame, bad, [(30.0, 28.0)], [psf], [angle])
     left, right = panels(figure)
     assert left.get_array().mask[28, 31]
     assert left.get_array().mask.sum() == 1
@@ -172,7 +172,7 @@ def test_a_psf_is_shown_beside_the_frame_that_it_was_made_from(angle):
 def test_several_psfs_are_shown_in_a_row_each():
     frame = np.arange(900.0).reshape(30, 30)
     psfs = [frame[5:16, 5:16], frame[6:17, 6:17]]
-    figure = draw_star_psf(frame, frame < 0, (12.0, 12.0), psfs, [0.0, 90.0])
+    figure = draw_star_psf(frame, frame < 0, [(12.0, 12.0), (15.0, 9.0)], psfs, [0.0, 90.0])
     images = panels(figure)
     assert len(images) == 4
     for image, psf in zip(images[1::2], psfs, strict=True):

@@ -57,8 +57,9 @@ REFUSED = {
     "nothing within 16 pixels of the star is above the background 1e+06; give another position "
     "or a lower background": {"background": 1e6},
     "the flux of the PSF above the background 400 is": {"background": 400.0, "recentre": False},
-    "no star is found within 16 pixels of where it should be; give its position, or another "
-    "background": {"background": 40.0, "position": (47, 29)},
+    "no star is found within 16 pixels of (47, 29); give its position, or another background": {
+        "background": 40.0, "position": (47, 29),
+    },
     "saturation must be positive; -1 was given": {"saturation": -1},
     "saturation must be positive; 0 was given": {"saturation": 0},
     "rotate is inf; give one finite number": {"rotate": math.inf},

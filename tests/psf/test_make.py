@@ -7,7 +7,7 @@ import pytest
 from star_frames import STAR, fizeau, gaussian, line, quiet
 
 from lnocl.errors import InputError
-from lnocl.psf.make import N_SHARED_STEPS, make_psf, make_psfs
+from lnocl.psf.make import make_psf, make_psfs
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (65, 65), (33, 33), (64, 65)])
@@ -85,14 +85,14 @@ def test_several_angles_share_what_does_not_depend_on_them(options):
     side = min(len(make_psf(frame, rotate=a, **options).psf) for a in (0, 30, 90, -45))
     for star, angle in zip(stars, (0, 30, 90, -45), strict=True):
         assert star.psf.shape == (side, side)
-        assert star.steps[:N_SHARED_STEPS] == stars[0].steps[:N_SHARED_STEPS]
+        assert star.shared_steps == stars[0].shared_steps
         assert star.centre == stars[0].centre
         alone = make_psf(
             frame, rotate=angle, clip_negative=True,
             **options | {"size": side, "background": star.background},
         )  # fmt: skip
         np.testing.assert_allclose(star.psf, alone.psf, rtol=0, atol=1e-9)
-        assert star.steps[N_SHARED_STEPS:] == alone.steps[N_SHARED_STEPS:]
+        assert star.own_steps == alone.own_steps
 
 
 def test_the_background_of_several_angles_is_outside_all_crops():

@@ -1,0 +1,248 @@
+"""The effective PSF of several stars in one frame: what they share, and how much they differ."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from astropy.stats import sigma_clipped_stats
+from scipy.ndimage import binary_dilation, fourier_shift, maximum_filter
+
+from lnocl.errors import InputError, counted
+from lnocl.psf.centring import Array, Mask, Point
+from lnocl.psf.repair import repair
+from lnocl.psf.steps import cut_square, nearest_pixel
+from lnocl.scene.shifting import MovablePsf, Stamp
+
+# Rounds of fitting the stars and adding what is left of them to the PSF.
+ROUNDS = 12
+# Outside its core, a star's pixel is a neighbour's where it exceeds another star's by this share,
+# and by so many times the noise; and so are the pixels beside it.
+EXCESS, SIGNIFICANCE, BESIDE = 0.5, 5.0, 2
+# Half the side of the square whose light is a star's first flux.
+APERTURE = 3
+# A star's core is where it is above this share of its peak; there it is fitted.
+CORE = 0.1
+
+
+class FittedStar(NamedTuple):
+    """A star as the effective PSF fits it.
+
+    Attributes
+    ----------
+    x, y : float
+        Where it is in the frame, 0-based pixels.
+    flux : float
+        Relative to the PSF, which has unit sum.
+    misfit : float
+        The rms of what is left of it where the PSF is above `CORE` of its peak, as a share of its
+        peak.
+    """
+
+    x: float
+    y: float
+    flux: float
+    misfit: float
+
+
+class EffectivePsf(NamedTuple):
+    """A PSF that several stars share.
+
+    Attributes
+    ----------
+    psf : ndarray of float64, shape (k, k)
+        Of unit sum and odd side.
+    scatter : ndarray of float64, shape (k, k)
+        Standard deviation of the stars' own PSFs from it, noise included, weighted by their flux.
+    stars : list of FittedStar
+        The stars.
+    n_neighbours : int
+        Pixels left out, all stars together, as they show something else than the star.
+    """
+
+    psf: Array
+    scatter: Array
+    stars: list[FittedStar]
+    n_neighbours: int
+
+
+def combine(light: Array, bad: Mask, centres: list[Point], half: int) -> EffectivePsf:
+    r"""Return the PSF that explains all stars of a frame together.
+
+    .. math:: K \leftarrow K + \frac{\sum_s c_s T_s^{-1} w (d - \sum_t c_t T_t K) / \sum_t c_t}
+              {\sum_s c_s T_s^{-1} w}
+
+    with the frame d above its background, the fluxes c, the translations T to the stars, and w,
+    0 at bad pixels and at neighbours that are not in the list. Those that are in it are
+    modelled. Each round fits flux and place of each star too; their mean place stays.
+
+    Parameters
+    ----------
+    light : ndarray of float64, shape (ny, nx)
+        The frame above its background.
+    bad : ndarray of bool, shape (ny, nx)
+        True where a pixel counts for nothing.
+    centres : list of tuple of float
+        Row and column of each star.
+    half : int
+        The PSF reaches so many pixels from its middle.
+
+    Raises
+    ------
+    InputError
+        Stars with too few good pixels in their cores, or not above the background; no star shows
+        the middle of the PSF.
+
+    References
+    ----------
+    J. Anderson, I. R. King, PASP 112, 1360 (2000), for the effective PSF; A. C. Kak, M. Slaney,
+    Principles of Computerized Tomographic Imaging (1988), chapter 7, for the weights of its
+    iteration (SIRT).
+    """
+    return _Stars(light, bad, centres, half).combine()
+
+
+def lines(found: EffectivePsf) -> tuple[str, ...]:
+    """Return how well the PSF fits each star, and by how much they differ, as lines of a record."""
+    psf, side = found.psf, len(found.psf)
+    n = len(found.stars)
+    core = psf > CORE * psf.max()
+    differ = float(np.sqrt(np.mean(found.scatter[core] ** 2)) / psf.max())
+    return (
+        *(
+            f"star {s} of {n}: x = {star.x:.3f}, y = {star.y:.3f}, flux {star.flux:.6g}; "
+            f"{100 * star.misfit:.2f} % of its peak is left in its core (rms)"
+            for s, star in enumerate(found.stars, 1)
+        ),
+        f"effective PSF: {counted(n, 'star')}, {found.n_neighbours} pixels of neighbours left out "
+        f"within {side} x {side} pixels; stars differ from it by {100 * differ:.2f} % of the peak "
+        "in the core (rms, noise included)",
+    )
+
+
+class _Stars:
+    """The stars of a frame with margins, in which the PSF fits round each of them."""
+
+    def __init__(self, light: Array, bad: Mask, centres: list[Point], half: int) -> None:
+        self._half = half
+        self._repaired = np.pad(light, half)
+        self._good = np.pad(~bad, half)
+        self._light = np.where(self._good, self._repaired, 0.0)
+        self._places = np.array(centres, np.float64) + half
+        self._pixels = [nearest_pixel((y, x)) for y, x in self._places]
+        self._noise = float(sigma_clipped_stats(light[~bad])[2])
+        near = min(APERTURE, half)
+        self._fluxes = np.array(
+            [cut_square(self._repaired, pixel, near).sum() for pixel in self._pixels]
+        )
+        if not (self._fluxes > 0).all():
+            s = int(np.argmin(self._fluxes))
+            raise InputError(
+                f"the star at {self._name(s)} is not above the background; leave it out"
+            )
+
+    def combine(self) -> EffectivePsf:
+        """Return the PSF, its scatter and the stars."""
+        side = 2 * self._half + 1
+        shown = self._shown()
+        weight = np.einsum("s,syx->yx", self._fluxes, shown)
+        if not weight[self._half, self._half]:
+            raise InputError(
+                "no star shows the middle of the PSF: all are bad there; give other stars"
+            )
+        psf = np.zeros((side, side))
+        for _ in range(ROUNDS):
+            left, overlap = self._residual(psf)
+            left /= np.maximum(overlap, self._fluxes.min())
+            steps = [c * self._centred(left, s) * shown[s] for s, c in enumerate(self._fluxes)]
+            psf += np.divide(sum(steps), weight, out=np.zeros_like(psf), where=weight > 0)
+            self._fit(psf)
+            weight = np.einsum("s,syx->yx", self._fluxes, shown)
+        hidden = weight == 0
+        repair(psf, hidden, hidden)
+        return self._finished(psf, shown, weight)
+
+    def _finished(self, psf: Array, shown: Array, weight: Array) -> EffectivePsf:
+        left, _ = self._residual(psf)
+        n = (shown > 0).sum(axis=0)
+        apart = [
+            (self._centred(left, s) * shown[s]) ** 2 / self._fluxes[s] for s in range(len(shown))
+        ]
+        few = np.where(n > 1, weight * (n - 1) / np.maximum(n, 1), np.inf)
+        scatter = np.sqrt(sum(apart) / few)
+        total = psf.sum()
+        core = psf > CORE * psf.max()
+        stars = []
+        for s, (y, x) in enumerate(self._places - self._half):
+            parts = (self._centred(left, s) / self._fluxes[s])[core & (shown[s] > 0)]
+            misfit = float(np.sqrt(np.mean(parts**2)) / psf.max()) if parts.size else np.nan
+            stars.append(FittedStar(float(x), float(y), float(self._fluxes[s] * total), misfit))
+        return EffectivePsf(psf / total, scatter / total, stars, self._n_neighbours)
+
+    def _shown(self) -> Array:
+        """Return where each star's own pixels show it, neither bad nor a neighbour's: (n, k, k)."""
+        good = np.array([self._good[self._window(s)] for s in range(len(self._places))])
+        own = [self._centred(self._repaired, s) / c for s, c in enumerate(self._fluxes)]
+        most = [maximum_filter(each, 3).clip(min=0) for each in own]
+        foreign = np.zeros_like(good)
+        for s, c in enumerate(self._fluxes):
+            for t, other in enumerate(self._fluxes):
+                noise = self._noise * np.hypot(1 / c, 1 / other)
+                limit = (1 + EXCESS) * most[t] + SIGNIFICANCE * noise
+                outside = most[t] < CORE * most[t].max()
+                foreign[s] |= good[s] & good[t] & outside & (own[s] > limit)
+            foreign[s] = binary_dilation(foreign[s], iterations=BESIDE)
+        self._n_neighbours = int((foreign & good).sum())
+        return (good & ~foreign).astype(np.float64)
+
+    def _residual(self, psf: Array) -> tuple[Array, Array]:
+        """Return what the model leaves of good pixels, and the fluxes that reach each pixel."""
+        left, overlap = self._light.copy(), np.zeros_like(self._light)
+        movable = MovablePsf(psf, psf.shape)
+        for s, c in enumerate(self._fluxes):
+            left[self._window(s)] -= c * movable.at(*self._middle(s)).on_grid(psf.shape)
+            overlap[self._window(s)] += c
+        left *= self._good
+        return left, overlap
+
+    def _fit(self, psf: Array) -> None:
+        """Fit the fluxes and places of the stars, each by least squares in its core."""
+        movable = MovablePsf(psf, psf.shape)
+        left, _ = self._residual(psf)
+        steps = np.zeros((len(self._places), 2))
+        core = psf > CORE * psf.max()
+        for s, c in enumerate(self._fluxes):
+            stamp, parts = movable.with_slopes(*self._middle(s))
+            columns = [
+                Stamp(part, stamp.y, stamp.x).on_grid(psf.shape)
+                for part in (parts[0], c * parts[2], c * parts[1])
+            ]
+            used = core & self._good[self._window(s)]
+            if used.sum() < len(columns):
+                raise InputError(
+                    f"the star at {self._name(s)} has too few good pixels; leave it out"
+                )
+            design = np.array([column[used] for column in columns]).T
+            found = np.linalg.lstsq(design, left[self._window(s)][used], rcond=None)[0]
+            self._fluxes[s] = max(c + found[0], c / 2)
+            steps[s] = found[1:].clip(-0.5, 0.5)
+        self._places += steps - np.average(steps, axis=0, weights=self._fluxes)
+
+    def _name(self, s: int) -> str:
+        y, x = self._places[s] - self._half
+        return f"({x:.1f}, {y:.1f})"
+
+    def _middle(self, s: int) -> Point:
+        """Return x and y of a star's centre in its window."""
+        y, x = self._places[s] - self._pixels[s] + self._half
+        return float(x), float(y)
+
+    def _window(self, s: int) -> tuple[slice, slice]:
+        y, x = (slice(i - self._half, i + self._half + 1) for i in self._pixels[s])
+        return y, x
+
+    def _centred(self, image: Array, s: int) -> Array:
+        """Return the square round a star, moved so that the star is in its middle."""
+        fraction = self._places[s] - self._pixels[s]
+        spectrum = fourier_shift(np.fft.fft2(image[self._window(s)]), -fraction)
+        return np.asarray(np.fft.ifft2(spectrum).real)

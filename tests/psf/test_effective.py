@@ -1,0 +1,146 @@
+"""PSFs that several stars share: against the PSF that made them, and against one star's."""
+
+import warnings
+
+import numpy as np
+import pytest
+from star_frames import gaussian, quiet
+
+from lnocl.errors import InputError
+from lnocl.psf.make import make_psf, make_psfs
+
+SHAPE = (120, 140)
+PLACES = [(30.3, 30.8), (100.45, 40.1), (45.7, 90.25), (96.6, 88.5)]
+FLUXES = [1.0, 0.5, 0.8, 0.3]
+SIZE = 21
+
+
+def a_frame(fwhm, places=PLACES, fluxes=FLUXES, scale=2e5):
+    return scale * sum(
+        flux * gaussian(fwhm, x, y, SHAPE) for (x, y), flux in zip(places, fluxes, strict=True)
+    )
+
+
+def truth(fwhm):
+    psf = gaussian(fwhm, SIZE // 2, SIZE // 2, (SIZE, SIZE))
+    return psf / psf.sum()
+
+
+def error(star, fwhm):
+    expected = truth(fwhm)
+    return abs(star.psf - expected).max() / expected.max()
+
+
+@pytest.mark.parametrize(("fwhm", "most"), [(1.5, 3e-3), (2.5, 2e-5), (4.0, 2e-5)])
+def test_without_noise_it_is_the_psf_that_made_the_stars(fwhm, most):
+    star = make_psf(a_frame(fwhm), PLACES, SIZE, background=0.0)
+    assert error(star, fwhm) < most
+    np.testing.assert_allclose(star.centres, PLACES, rtol=0, atol=2e-3)
+    assert star.scatter.max() < most * star.psf.max()
+    assert star.psf.sum() == pytest.approx(1.0, abs=1e-12)
+    assert star.flux == pytest.approx(2e5 * sum(FLUXES), rel=1e-3)
+
+
+def test_an_undersampled_star_is_not_blurred_as_one_alone_is():
+    frame = a_frame(1.5)
+    alone = quiet(frame, PLACES[2], SIZE, background=0.0)
+    together = make_psf(frame, PLACES, SIZE, background=0.0)
+    assert error(alone, 1.5) > 10 * error(together, 1.5)
+
+
+def test_it_has_the_noise_of_all_stars_together():
+    rng = np.random.default_rng(3)
+    frame, found = a_frame(3.0) + 50.0, []
+    for _ in range(8):
+        counts = rng.poisson(frame).astype(float)
+        several = make_psf(counts, PLACES, SIZE, background=50.0)
+        alone = make_psf(counts, PLACES[0], SIZE, background=50.0)
+        found.append([np.linalg.norm(each.psf - truth(3.0)) for each in (several, alone)])
+    several, alone = np.sqrt(np.mean(np.square(found), axis=0))
+    variances = [sum(f * 2e5 + 50.0 * SIZE**2 for f in each) for each in (FLUXES, FLUXES[:1])]
+    noise = [
+        np.sqrt(v) / (2e5 * sum(each))
+        for v, each in zip(variances, (FLUXES, FLUXES[:1]), strict=True)
+    ]
+    assert several < 1.15 * noise[0]
+    assert alone / several > 0.8 * noise[1] / noise[0]
+
+
+def test_the_order_of_the_stars_does_not_matter():
+    frame = np.random.default_rng(4).poisson(a_frame(2.5) + 9.0) - 9.0
+    once = make_psf(frame, PLACES, SIZE, background=0.0)
+    again = make_psf(frame, PLACES[::-1], SIZE, background=0.0)
+    np.testing.assert_allclose(again.psf, once.psf, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(again.scatter, once.scatter, rtol=0, atol=1e-12)
+
+
+def test_neighbours_that_are_given_are_modelled():
+    places = [*PLACES, (38.2, 33.4)]
+    frame = a_frame(2.5, places, [*FLUXES, 0.4])
+    star = make_psf(frame, places, SIZE, background=0.0)
+    assert error(star, 2.5) < 2e-3
+
+
+def test_other_neighbours_are_left_out():
+    frame = a_frame(2.5, [*PLACES, (38.2, 33.4)], [*FLUXES, 0.2])
+    star = make_psf(frame, PLACES, SIZE, background=0.0)
+    assert error(make_psf(frame, PLACES[0], SIZE, background=0.0), 2.5) > 0.1
+    assert error(star, 2.5) < 4e-3
+    assert "0 pixels of neighbours" not in star.steps[-4]
+
+
+def test_bad_and_saturated_pixels_are_left_to_other_stars():
+    frame = a_frame(2.5)
+    frame[30:32, 30:32] = 1e7
+    frame[90, 46] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        star = make_psf(frame, PLACES, SIZE, background=0.0, saturation=1e6)
+    assert error(star, 2.5) < 1e-3
+    alone = quiet(frame, PLACES[0], SIZE, background=0.0, saturation=1e6)
+    assert error(alone, 2.5) > 0.02
+
+
+def test_stars_that_differ_show_it_in_the_scatter():
+    places = np.round(PLACES)
+    frame = a_frame(3.0, places[:3], [1.0] * 3) + a_frame(4.0, places[3:], [1.0])
+    star = make_psf(frame, places, SIZE, background=0.0)
+    core = star.psf > 0.1 * star.psf.max()
+    parts = [truth(3.0)] * 3 + [truth(4.0)]
+    fluxes = [(part * star.psf)[core].sum() / (star.psf**2)[core].sum() for part in parts]
+    squares = [(part / c - star.psf) ** 2 for part, c in zip(parts, fluxes, strict=True)]
+    expected = np.sqrt(np.average(squares, axis=0, weights=fluxes) * 4 / 3)
+    np.testing.assert_allclose(star.scatter[core], expected[core], rtol=1e-3)
+
+
+def test_all_angles_are_of_the_same_stars():
+    frame = a_frame(3.0)
+    straight, turned = make_psfs(frame, [0, 90], PLACES, SIZE, background=0.0)
+    np.testing.assert_allclose(turned.psf, np.rot90(straight.psf, -1), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(turned.scatter, np.rot90(straight.scatter, -1), rtol=0, atol=1e-12)
+    assert straight.shared_steps == turned.shared_steps
+
+
+def test_a_star_at_a_place_without_light_is_refused():
+    frame = np.random.default_rng(0).normal(0, 1, SHAPE) + a_frame(2.5)
+    with pytest.raises(InputError, match=r"no star is found within 16 pixels of \(70, 65\)"):
+        make_psf(frame, [*PLACES, (70, 65)], SIZE, background=0.0)
+
+
+def test_stars_that_all_lack_their_middle_are_refused():
+    frame = a_frame(4.0)
+    for x, y in PLACES:
+        frame[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2] = np.nan
+    with pytest.raises(InputError, match="no star shows the middle"):
+        make_psf(frame, PLACES, SIZE, background=0.0)
+
+
+def test_positions_of_another_shape_are_refused():
+    for position in (
+        [1.0, 2.0, 3.0],
+        [[[1.0, 2.0]]],
+        [[1.0, 2.0], [3.0, np.nan]],
+        np.zeros((0, 2)),
+    ):
+        with pytest.raises(InputError, match="position is"):
+            make_psf(a_frame(2.5), position)
