@@ -420,7 +420,7 @@ def _summary(
         f"extended source: {result.extended.sum() / frames.electrons:.6g} {unit}",
         *([] if overall is None else [f"residuals {_rms(overall)} in all, where noise gives 1"]),
         *_shortness(arguments, result),
-        *_verdict(result.star_positions, at_stars, overall),
+        *_verdict(result, at_stars, overall),
         f"written to {arguments.output}",
     ]
 
@@ -438,10 +438,10 @@ def _rms(fit: Fit) -> str:
     return f"{fit.rms:.2f} +- {fit.error:.2f}" if fit.n_pixels else "unknown (no good pixel)"
 
 
-def _verdict(positions: Any, at_stars: Sequence[StarResiduals], overall: Fit | None) -> list[str]:
+def _verdict(result: Result, at_stars: Sequence[StarResiduals], overall: Fit | None) -> list[str]:
     """Return whether the model fits, and where not what to do."""
     unfitted, lit = [], []
-    for (x, y), found in zip(positions, at_stars, strict=True):
+    for (x, y), found in zip(result.star_positions, at_stars, strict=True):
         if found.is_misfit:
             unfitted.append(f"({x:.7g}, {y:.7g})")
         if found.has_halo:
@@ -452,6 +452,11 @@ def _verdict(positions: Any, at_stars: Sequence[StarResiduals], overall: Fit | N
             f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
             f"{' '.join(unfitted[:3])}: its PSF or its position is wrong"
         )
+        if result.stop_reason == "held-out":
+            verdict.append(
+                "held-out counts share this error and choose too many iterations: look at fewer, "
+                "with --n-iter and --stop none"
+            )
     elif overall is not None and overall.is_misfit:
         verdict.append("the model does not fit: see to background, noise and gain")
     if lit:
