@@ -18,5 +18,5 @@ lnocl deconvolve $paper "$image" --psf "$out/psf.fits" --gain 31.306 --backgroun
     --refine --n-iter 30 --models --residuals --overwrite -o "$out/spitzer.fits"
 python "$here/real.py" figures "$out/spitzer.fits"
 python "$here/real.py" draw "$out/spitzer.png" "image, MJy/sr=$image:450,270,100:2:300" \
-    "extended, e-=$out/spitzer.fits:450,270,100:0:9000" \
+    "extended, MJy/sr=$out/spitzer.fits:450,270,100:0:290" \
     "residuals=$out/spitzer.fits,RESIDUALS:450,270,100:-20:20"
