@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Set
 from copy import copy
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from typing import Any
@@ -19,6 +20,7 @@ from lnocl.runs.held_out import HeldOutCounts
 from lnocl.runs.held_out import most_bytes as most_bytes_of_halves
 from lnocl.runs.options import (
     check_choices,
+    check_families,
     check_length,
     check_observation,
     check_types,
@@ -55,6 +57,7 @@ def deconvolve(
     callback: Callback | None = None,
     progress: bool = False,
     refine_positions: bool = False,
+    refine_psfs: Iterable[str] = (),
     checkpoint: str | PathLike[str] | None = None,
     checkpoint_every: float = 60.0,
     resume: str | PathLike[str] | None = None,
@@ -131,6 +134,14 @@ def deconvolve(
         Move the stars to where they are most likely, at most 3 pixels away, by Fisher scoring of
         all fluxes and positions with the extended source held fixed: at the start and after 3, 6,
         12, 24 ... iterations (`lnocl.solvers.positions`).
+    refine_psfs : iterable of {"shift", "jitter", "strehl", "modes"}, optional
+        Fit parameters of each PSF before the reconstruction, with the stars and with the extended
+        source marginalised (`lnocl.scene.psf_families`, `lnocl.solvers.psf_fit`): its place, the
+        covariance of a blur, the Strehl ratio between it and ``ideal_psfs``, the coefficients
+        of ``psf_modes``. The PSFs given stand unless chi squared exceeds its expectation by ten
+        for each parameter, and falls by seven tenths of that. Star positions that are not refined
+        are taken for right.
+        At least one star.
     checkpoint : str or path, optional
         File for checkpoints (FITS): written after the first iteration, then every
         `checkpoint_every` seconds, and at the end. Each replaces the one before once it is
@@ -154,7 +165,9 @@ def deconvolve(
         stars are at one position; stars are not in pixels; the start is not in counts, or is 0
         and stays so; the device does not exist, or was given for
         the reference; images or exposures are too large to be summed, or the sky for a number;
-        held-out counts were asked of images that hold no counts.
+        held-out counts were asked of images that hold no counts; PSFs are to be refined without a
+        star, in a way that is not known, or that needs what the observation lacks, or a shift of
+        one image beside free positions.
     FileError
         A checkpoint cannot be written or read, is damaged, or would replace that of another run.
     DivergedError
@@ -226,10 +239,16 @@ def deconvolve(
     initial_extended, initial_star_fluxes = read_start(
         observation, fits_stars, initial_extended, initial_star_fluxes
     )
+    families = check_families(refine_psfs, observation, positions, refine_positions)
+    setup = Setup(positions, pad, solver, precision, engine, device, refine_positions)
+    refinement = None
+    if families:
+        from lnocl.runs.psf_refinement import refine_psfs as refine  # which loads scipy
+
+        observation, refinement = refine(setup, observation, families)
     penalties = read_penalties(mu, smoothing, stop, observation)
     if engine == "opencl" and precision == "single":
         warn_of_rounding(int(n_iter))
-    setup = Setup(positions, pad, solver, precision, engine, device, refine_positions)
     inputs = partial(
         describe,
         observation,
@@ -260,7 +279,7 @@ def deconvolve(
             del start, largest  # which hold arrays of the grid
             stop_reason = _complete(run, make_rule(stop), callback, bar, checkpointer)
             outcome = run.outcome(penalties[0], stop_reason)
-        return make_result(outcome)
+        return make_result(replace(outcome, psf_refinement=refinement))
 
 
 def _choose(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.residuals import Fit, StarResiduals, judge, judge_stars, residuals
-from lnocl.runs.outcome import Outcome
+from lnocl.runs.outcome import Outcome, PsfRefinement
 from lnocl.scene.observation import Array
 
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
@@ -112,6 +112,9 @@ class Result:
     held_out : ndarray, fields ``smoothing``, ``iteration`` (int64) and ``error``
         The relative error of the extended source that held-out counts estimate, for each smoothing
         and iteration that they compared last. Empty where they did not choose.
+    psf_refinement : PsfRefinement or None
+        What became of the PSFs that were to be refined: ``parameters``, ``values``, ``misfit``
+        before and after, ``is_accepted``. None where they were not to be.
     """
 
     extended: Array
@@ -126,12 +129,18 @@ class Result:
     mu: float
     smoothing: float
     held_out: NDArray[np.void]
+    psf_refinement: PsfRefinement | None
     _outcome: Outcome = field(repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for values in vars(self).values():
             if isinstance(values, np.ndarray):
                 values.flags.writeable = False
+
+    @property
+    def psfs(self) -> Array:
+        """The PSFs of the model, shape (p, ky, kx), of unit sum: as given or refined."""
+        return self._outcome.scene.observation.psfs
 
     def models(self) -> Array:
         """Return the m_j, shape (p, ny, nx), electrons per pixel.
@@ -184,6 +193,7 @@ def make_result(outcome: Outcome) -> Result:
         mu=outcome.penalty.mu,
         smoothing=outcome.penalty.smoothing,
         held_out=outcome.curve,
+        psf_refinement=outcome.psf_refinement,
         _outcome=outcome,
     )
 

@@ -10,6 +10,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from lnocl.commands import checkpoints, messages, options, record
 from lnocl.commands.options import SEVERAL, finite, number_or_word, option, whole_or_word
 from lnocl.commands.parser import Command
@@ -17,13 +19,13 @@ from lnocl.deconvolution import deconvolve
 from lnocl.errors import counted
 from lnocl.residuals import Fit, StarResiduals
 from lnocl.result import Result
-from lnocl.runs.options import ENGINES, PRECISIONS
+from lnocl.runs.options import ENGINES, FAMILIES, PRECISIONS
 from lnocl.solvers import SOLVERS
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
-    from lnocl.io.fitswrite import StarColumn
+    from lnocl.io.fitswrite import Card, StarColumn
     from lnocl.io.frames import Calibration, Frames
 
 PARAMETERS = {
@@ -154,6 +156,33 @@ OPTIONS = {
             help="fit the positions of the stars too, each within 3 pixels of the one given",
         ),
         option(
+            "--refine-psfs",
+            nargs="+",
+            choices=FAMILIES,
+            default=[],
+            metavar="WHAT",
+            card=("REFPSF", "asked of the PSFs"),
+            help="fit the PSFs to the stars before the reconstruction, and use them where they fit "
+            "better: shift, jitter (a blur, or a sharpening), strehl (needs --ideal-psf), modes "
+            "(needs --psf-modes); at least one star",
+        ),
+        option(
+            "--ideal-psf",
+            dest="ideal_psfs",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="DSUM",
+            help="FITS file with a PSF without aberrations, of the shape of the PSFs; one for all "
+            "images or one for each",
+        ),
+        option(
+            "--psf-modes",
+            metavar="FILE",
+            checksum="LSUM",
+            help="FITS file with a cube of the ways in which the PSFs may differ, one standard "
+            "deviation each, of the shape of the PSFs and for all of them",
+        ),
+        option(
             "--zero-point",
             type=finite,
             metavar="MAG",
@@ -271,7 +300,10 @@ def _run(arguments: argparse.Namespace) -> None:
                     ALL_OPTIONS,
                     repeated | _used(repeated, frames, result),
                     frames.sha256,
-                    fitswrite.offset_cards(offsets) if arguments.align else [],
+                    [
+                        *_refinement_cards(result),
+                        *(fitswrite.offset_cards(offsets) if arguments.align else []),
+                    ],
                 ),
             ],
             commands=record.make_commands("deconvolve", ALL_OPTIONS, repeated, folder),
@@ -280,6 +312,8 @@ def _run(arguments: argparse.Namespace) -> None:
             unit=frames.unit,
             star_columns=_star_columns(arguments, result, frames, at_stars),
             cubes=_cubes(arguments, result),
+            psf_fit=_refinement_table(result),
+            psfs=result.psfs if repeated["refine_psfs"] else None,
             offsets=offsets,
         )
         if not arguments.quiet:
@@ -385,6 +419,31 @@ def _cubes(arguments: argparse.Namespace, result: Result) -> dict[str, tuple[Any
         **({"MODELS": (result.models(), "electron")} if arguments.models else {}),
         **({"RESIDUALS": (result.residuals(), "")} if arguments.residuals else {}),
     }
+
+
+def _refinement_cards(result: Result) -> list[Card]:
+    found = result.psf_refinement
+    if found is None:
+        return []
+    before, after = found.misfit
+    return [
+        ("PSFUSED", found.is_accepted, "whether refined PSFs are used"),
+        ("PSFMIS1", before, "misfit at stars, PSFs as given; 1 by noise"),
+        ("PSFMIS2", after, "misfit at stars, PSFs refined"),
+    ]
+
+
+def _refinement_table(result: Result) -> Any:
+    """Return the parameters of the PSFs, a row an image."""
+    found = result.psf_refinement
+    if found is None:
+        return None
+    names = [name.replace(" ", "_") for name in found.parameters]
+    rows = np.zeros(len(found.values), [("image", np.int64), *((name, float) for name in names)])
+    rows["image"] = np.arange(1, len(rows) + 1)
+    for name, values in zip(names, found.values.T, strict=True):
+        rows[name] = values
+    return rows
 
 
 def _device_spec(arguments: argparse.Namespace) -> str | None:

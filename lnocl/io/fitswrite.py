@@ -47,13 +47,15 @@ def write_result(
     star_columns: Sequence[StarColumn] = (),
     cubes: Mapping[str, tuple[ArrayLike, str]] = MappingProxyType({}),
     offsets: ArrayLike = (),
+    psf_fit: NDArray[np.void] | None = None,
+    psfs: ArrayLike | None = None,
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
     The primary HDU holds the extended source, the table ``STARS`` the columns x, y, flux and any
     others given, the table ``HISTORY`` iteration and objective, the table ``CURVE`` iteration,
-    rho, rho_star and magnitude, the table ``HELDOUT`` mu, smoothing, iteration and error. All have
-    CHECKSUM and DATASUM.
+    rho, rho_star and magnitude, the table ``HELDOUT`` mu, smoothing, iteration and error, the table
+    ``PSFFIT`` parameters of PSFs, ``PSFS`` the PSFs. All have CHECKSUM and DATASUM.
 
     Parameters
     ----------
@@ -88,6 +90,10 @@ def write_result(
     offsets : array_like, shape (p, 2), optional
         Offsets of these images, pixels. Where one is not 0, no coordinate system holds for all of a
         cube: it has the cards of `offset_cards` instead.
+    psf_fit : ndarray with fields ``image`` and those of the parameters, optional
+        The parameters of the PSFs that were refined.
+    psfs : array_like, shape (p, ky, kx), optional
+        The PSFs of the model.
 
     Raises
     ------
@@ -108,6 +114,8 @@ def write_result(
             *([] if curve is None else [_table("CURVE", curve)]),
             *([] if held_out is None else [_table("HELDOUT", held_out)]),
             *(_cube(name, *cube, shared) for name, cube in cubes.items()),
+            *([] if psf_fit is None else [_table("PSFFIT", psf_fit)]),
+            *([] if psfs is None else [fits.ImageHDU(np.asarray(psfs, np.float64), name="PSFS")]),
         ]
     )
     with whole_file(path, overwrite) as stream:

@@ -51,6 +51,10 @@ class Calibration(NamedTuple):
         Offsets from the headers' coordinates.
     psf_centre : {"check", "fit", "given"}
         As for `Observation`.
+    ideal_psfs : sequence of str
+        Files of the PSFs without aberrations, as for `Observation`.
+    psf_modes : str, optional
+        File of a cube of the modes of all PSFs, as for `Observation`.
     """
 
     background: Sequence[Word] = (0.0,)
@@ -62,6 +66,8 @@ class Calibration(NamedTuple):
     gain: float | None = None
     align: str | None = None
     psf_centre: str = "check"
+    ideal_psfs: Sequence[str] = ()
+    psf_modes: str | None = None
 
 
 class Frames(NamedTuple):
@@ -124,6 +130,7 @@ class _Reader:
         self._images = read_stack(images)
         self._psfs = read_stack(psfs)
         self._maps = Maps(self._images.data.shape)
+        self._sha256: dict[str, list[str]] = {}
 
     def frames(self) -> Frames:
         """Return the observation in the files."""
@@ -151,13 +158,30 @@ class _Reader:
             exposure=1.0 if exposure is None else exposure,
             offsets=self._offsets(),
             psf_centre=self._calibration.psf_centre,
+            **self._psf_errors(),
         )
-        sha256 = {"images": self._images.sha256, "psfs": self._psfs.sha256, **self._maps.sha256}
+        sha256 = {
+            "images": self._images.sha256,
+            "psfs": self._psfs.sha256,
+            **self._maps.sha256,
+            **self._sha256,
+        }
         unit = self._unit()
         name, of_unit = (units.spelled(unit), factor) if units.is_known(unit) else ("electron", 1.0)
         if exposure is not None and not are_rates:
             name += "/s"
         return Frames(observation, self._images.header, background, sha256, name, of_unit)
+
+    def _psf_errors(self) -> dict[str, Array]:
+        """Return what is known of the ways in which PSFs may be wrong."""
+        modes = self._calibration.psf_modes
+        files = {"ideal_psfs": self._calibration.ideal_psfs, "psf_modes": [modes] if modes else []}
+        found = {}
+        for name, paths in files.items():
+            if paths:
+                stack = read_stack(paths)
+                found[name], self._sha256[name] = stack.data, stack.sha256
+        return found
 
     def _warn_of_pixel_scales(self) -> None:
         """Warn of the first PSF whose pixels are of another size than those of its image."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from numbers import Real
 from typing import Any, cast
 
@@ -25,6 +26,7 @@ MULTIPLES = (1.0, 3.0, 10.0)
 
 PRECISIONS = ("single", "double")
 ENGINES = ("opencl", "numpy")
+FAMILIES = ("shift", "jitter", "strehl", "modes")
 STOPS = ("held-out", "discrepancy")
 
 # Kernels count iterations in 32 bits.
@@ -72,6 +74,36 @@ def check_choices(solver: str, precision: str, engine: str, device: object) -> N
         raise InputError(f"device must be text, PLATFORM[:DEVICE]; {device!r} was given")
     if engine == "numpy" and device is not None:
         raise InputError(f"engine numpy uses no device; leave device {device!r} out")
+
+
+def check_families(
+    names: object, observation: Observation, positions: Array, refine_positions: bool
+) -> tuple[str, ...]:
+    """Return the families of PSFs to refine.
+
+    Raises
+    ------
+    InputError
+        A name is not known, or the names are one text; there is no star; what a family needs was
+        not given; the place of one PSF is to be told from that of its stars.
+    """
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise InputError(f"refine_psfs is {names!r}; give a sequence of {', '.join(FAMILIES)}")
+    found = tuple(names)
+    for name in found:
+        if not (isinstance(name, str) and name in FAMILIES):
+            raise InputError(f"refine_psfs {name!r} is not known; give {', '.join(FAMILIES)}")
+    if found and not len(positions):
+        raise InputError("refine_psfs needs a star, whose image shows the PSF; give stars")
+    for name, needed in (("strehl", "ideal_psfs"), ("modes", "psf_modes")):
+        if name in found and not getattr(observation, needed).size:
+            raise InputError(f"refine_psfs {name} needs {needed}; give them, or leave {name} out")
+    if "shift" in found and refine_positions and observation.n_images == 1:
+        raise InputError(
+            "refine_psfs shift of one image is told from nothing but the stars' places; leave it "
+            "out, or refine_positions"
+        )
+    return found
 
 
 def check_length(n_iter: object, stop: object) -> None:

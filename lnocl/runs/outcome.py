@@ -17,6 +17,30 @@ CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("er
 
 
 @dataclass(frozen=True)
+class PsfRefinement:
+    """PSFs that were refined from the images, or would have been.
+
+    Attributes
+    ----------
+    parameters : tuple of str
+        Names of the n parameters of each PSF (`lnocl.scene.psf_families.PsfFamilies`).
+    values : ndarray of float64, shape (p, n)
+        What was found for them, whether it was accepted or not.
+    misfit : tuple of float
+        Of the given PSFs and of the refined ones: the reduced chi squared of the images, with the
+        extended source marginalised, 1 where there is noise alone.
+    is_accepted : bool
+        Whether the refined PSFs are used: chi squared of those given exceeds its expectation by
+        ten for each parameter and more, and seven tenths of that are mended.
+    """
+
+    parameters: tuple[str, ...]
+    values: Array
+    misfit: tuple[float, float]
+    is_accepted: bool
+
+
+@dataclass(frozen=True)
 class Outcome:
     """The estimate that a reconstruction ended with, and how it came there.
 
@@ -40,6 +64,8 @@ class Outcome:
         As `lnocl.Result.stop_reason`.
     curve : ndarray of `CURVE_DTYPE`
         As `lnocl.Result.held_out`.
+    psf_refinement : PsfRefinement or None
+        None where the PSFs were not to be refined.
     """
 
     scene: Scene
@@ -51,6 +77,7 @@ class Outcome:
     penalty: Penalty
     stop_reason: str
     curve: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
+    psf_refinement: PsfRefinement | None = None
 
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of star fluxes and positions; NaN where they were not moved.

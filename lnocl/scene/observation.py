@@ -67,6 +67,12 @@ class Observation:
         What becomes of a PSF whose core lies off its centre, by which it would move the sky.
         "check": it is refused where it is off by 0.8 pixels or more, with a warning from 0.25 on.
         "fit": it is moved to its centre (`lnocl.scene.shifting.place`). "given": nothing.
+    ideal_psfs : array_like, shape (p, ky, kx) or (ky, kx), optional
+        The PSFs without aberrations, limited by diffraction alone, for ``refine_psfs`` "strehl";
+        like `psfs` in shape, centre and normalisation.
+    psf_modes : array_like, shape (p, n, ky, kx) or (n, ky, kx), optional
+        Ways in which the PSFs may differ from those given, one standard deviation each, in units of
+        PSFs of unit sum, for ``refine_psfs`` "modes".
 
     Attributes
     ----------
@@ -79,6 +85,9 @@ class Observation:
         As given.
     psfs : ndarray of float64, shape (p, ky, kx)
         Of unit sum.
+    ideal_psfs, psf_modes : ndarray of float64
+        Shapes (p, ky, kx) and (p, n, ky, kx), or (0, ky, kx) and (p, 0, ky, kx) where they were not
+        given.
     mask : ndarray of bool, shape (p, ny, nx)
         True where a pixel is bad.
 
@@ -121,6 +130,8 @@ class Observation:
         exposure: ArrayLike | None = None,
         offsets: ArrayLike | None = None,
         psf_centre: str = "check",
+        ideal_psfs: ArrayLike | None = None,
+        psf_modes: ArrayLike | None = None,
     ) -> None:
         has_exposure = exposure is not None
         counts, are_rates = containers.counts("images", images, has_exposure)
@@ -128,6 +139,8 @@ class Observation:
         self.images = _stack("images", given)
         self.mask = masked.copy().reshape(self.images.shape)
         self.psfs = _check_psfs(containers.bare("psfs", psfs), self.n_images, psf_centre)
+        self.ideal_psfs = self._check_ideals(ideal_psfs, psf_centre)
+        self.psf_modes = self._check_modes(psf_modes)
         self.offsets = self._check_offsets(offsets)
         self._apply_mask(mask)
         self.exposure = self._check_exposure(1.0 if exposure is None else exposure)
@@ -160,6 +173,33 @@ class Observation:
         if self.psfs.strides[0] == 0:  # one for all images
             arrays["psfs"] = self.psfs[:1]
         return sum(array.nbytes for array in arrays.values())
+
+    def _check_ideals(self, ideals: ArrayLike | None, psf_centre: str) -> Array:
+        if ideals is None:
+            return np.zeros((0, *self.psfs.shape[1:]))
+        checked = _check_psfs(containers.bare("ideal_psfs", ideals), self.n_images, psf_centre)
+        if checked.shape != self.psfs.shape:
+            raise InputError(
+                f"ideal_psfs has PSFs of shape {checked.shape[1:]}, psfs of {self.psfs.shape[1:]}; "
+                "give them in one shape"
+            )
+        return checked
+
+    def _check_modes(self, modes: ArrayLike | None) -> Array:
+        if modes is None:
+            return np.zeros((self.n_images, 0, *self.psfs.shape[1:]))
+        given = numbers("psf_modes", containers.bare("psf_modes", modes))
+        wanted = self.psfs.shape
+        if given.ndim == 3:
+            given = given[None]
+        if given.ndim != 4 or given.shape[0] not in (1, wanted[0]) or given.shape[2:] != wanted[1:]:
+            raise InputError(
+                f"psf_modes has shape {np.shape(modes)}; give (n, ky, kx), or one such cube for "
+                f"each of the {wanted[0]} images, with PSFs of shape {wanted[1:]}"
+            )
+        if not np.isfinite(given).all():
+            raise InputError("psf_modes hold values that are not finite; repair them first")
+        return np.broadcast_to(given, (wanted[0], *given.shape[1:])).copy()
 
     def _apply_mask(self, mask: ArrayLike | None) -> None:
         if mask is not None:

@@ -81,6 +81,8 @@ class Scene:
     weights : ndarray of bool or float64, shape (p, Ny, Nx), or None
         True where a pixel was observed, or its relative exposure where exposures are maps; None
         where all were observed alike.
+    gains : ndarray of float64, shape (p,)
+        Relative exposures where they are numbers, else 1; the PSFs are multiplied by them.
     star_weights : ndarray of float64, shape (n,)
         ``sum_j <P_js, w_j>``, of each image not less than 0: the shares of the star's light that
         were observed, summed.
@@ -123,7 +125,7 @@ class Scene:
         self._mean_exposure = _mean("exposures", seen, seen.size)
         self.unit = self._sky_unit(self._mean_exposure)
         relative = exposure / self._mean_exposure
-        self._gains = np.ones(self.n_images) if has_map else relative
+        self.gains = np.ones(self.n_images) if has_map else relative
         self._psfs = [MovablePsf(psf, self.grid) for psf in self.scaled_psfs()]
         self.weights = self._weigh(relative if has_map else None)
         self._field = self._place_stars(positions)
@@ -249,7 +251,7 @@ class Scene:
 
     def scaled_psfs(self) -> list[Array]:
         """Return the PSFs times the relative exposure of their image, where that is a number."""
-        psfs = zip(self._gains, self.observation.psfs, strict=True)
+        psfs = zip(self.gains, self.observation.psfs, strict=True)
         return [psf if gain == 1.0 else gain * psf for gain, psf in psfs]
 
     def star_rows(self, s: int) -> NDArray[np.bool_]:
@@ -333,7 +335,7 @@ class Scene:
             light = np.array([float((stamp.values * w).sum()) for stamp, w in windows])
             on_good = np.array([float((stamp.values * (w > 0)).sum()) for stamp, w in windows])
             total += np.maximum(light, 0.0)
-            is_observed |= (on_good >= OBSERVED_SHARE * self._gains[j]) & (light > 0)
+            is_observed |= (on_good >= OBSERVED_SHARE * self.gains[j]) & (light > 0)
         return total, is_observed
 
     def _refuse_unobserved_stars(self, is_observed: NDArray[np.bool_]) -> None:
@@ -377,7 +379,7 @@ class Scene:
             if not may_move and (moved == np.round(moved)).all():
                 continue
             psf, moved_psf = self.observation.psfs[j], self._psfs[j].at(0.5, 0.5).values
-            dark = min(psf.min(), 0.0) - moved_psf.min() / self._gains[j]
+            dark = min(psf.min(), 0.0) - moved_psf.min() / self.gains[j]
             if dark > MAX_RINGING * psf.max():
                 warn(
                     f"psf {j} is sharper than its pixels can hold: moved between pixels it rings "

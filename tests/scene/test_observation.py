@@ -564,7 +564,17 @@ def test_the_arrays_of_an_observation_are_read_only(maps):
     given = {"background": 1.0, "read_noise": 2.0, "exposure": 3.0}
     given = {name: np.full(shape, value) if maps else value for name, value in given.items()}
     observation = lnocl.Observation(np.ones(shape), np.ones((1, 1)), **given)
-    names = ("images", "psfs", "background", "read_noise", "mask", "exposure", "offsets")
+    names = (
+        "images",
+        "psfs",
+        "background",
+        "read_noise",
+        "mask",
+        "exposure",
+        "offsets",
+        "ideal_psfs",
+        "psf_modes",
+    )
     assert set(vars(observation)) == set(names)
     for name in names:
         with pytest.raises(ValueError, match="read-only"):

@@ -1,0 +1,140 @@
+"""PSFs in error, given and refined: the error near the star beside that of the true PSFs.
+
+    python benchmarks/psfs.py [--size N] [--images P] [--seeds FIRST LAST] [--contrasts C ...]
+        [--errors NAME ...] [--device SPEC] [--output STEM]
+
+The paper's telescope and jet (hh34), the star C times as bright, P images. The images are made with
+PSFs that differ from those given:
+
+none     in nothing
+shift    by 0.2 pixels in random directions
+jitter   by a blur with variances of 0.3 to 1 square pixels
+strehl   given with a Strehl ratio of 0.5 for 0.7, and with other speckles
+speckle  with other speckles alone
+all      in all of it
+
+Columns: the best rho'' of 100 iterations with the true, the given and the refined PSFs, and rho''
+at the end of a run with the defaults; the relative error of the PSFs given and refined; the misfit;
+whether the refined ones are used; seconds for the refinement, and for the run after it.
+`refine_psfs` is shift, jitter and strehl throughout.
+"""
+
+import argparse
+import time
+import warnings
+
+import astropy.units as u
+import numpy as np
+from astropy.table import Table
+
+import lnocl
+from lnocl.metrics import restoration_error, star_rows
+from lnocl.scene.psf_families import PsfFamilies
+from lnocl.simulation import Experiment, fizeau_psf, hh34
+
+ERRORS = ("none", "shift", "jitter", "strehl", "speckle", "all")
+FAMILIES = ("shift", "jitter", "strehl")
+EXPERIMENT = Experiment()
+
+
+def fizeau(n, angle, strehl, seed=0):
+    """Return a PSF of the paper's telescope."""
+    scale = EXPERIMENT.wavelength, EXPERIMENT.pixel_scale
+    return fizeau_psf((n, n), angle * u.deg, *scale, strehl, seed)
+
+
+def make_scene(error, contrast, p, seed, n):
+    """Return images, true, given and ideal PSFs, sky, star and background."""
+    rng = np.random.default_rng([seed, p])
+    true, given, ideal = [], [], []
+    for j in range(p):
+        angle = 180.0 * j / p
+        psf = fizeau(n, angle, 0.7, 100 * seed + j)
+        other = fizeau(n, angle, 0.5 if error in ("strehl", "all") else 0.7, 100 * seed + j + 50)
+        given.append(other if error in ("strehl", "speckle", "all") else psf)
+        ideal.append(fizeau(n, angle, 1.0))
+        turn = rng.uniform(0.0, 2.0 * np.pi)
+        values = np.zeros((1, 5))
+        if error in ("shift", "all"):
+            values[0, :2] = 0.2 * np.cos(turn), 0.2 * np.sin(turn)
+        if error in ("jitter", "all"):
+            values[0, 2:] = rng.uniform(0.3, 1.0), rng.uniform(-0.2, 0.2), rng.uniform(0.3, 1.0)
+        families = PsfFamilies(FAMILIES[:2], psf[None], psf[None], np.zeros((1, 0, n, n)))
+        true.append(families.psfs(values)[0])
+    target = hh34(n)
+    flux = EXPERIMENT.source_electrons(EXPERIMENT.extended_magnitude)
+    sky = target.extended / target.extended.sum() * flux
+    star = target.stars[0].x, target.stars[0].y
+    lit = sky.copy()
+    lit[star[::-1]] += contrast * flux
+    level = EXPERIMENT.sky_electrons
+    spectra = np.fft.rfft2(lit) * np.fft.rfft2(np.fft.ifftshift(true, axes=(1, 2)))
+    means = np.fft.irfft2(spectra, lit.shape).clip(0.0) + level
+    noise = EXPERIMENT.read_noise.value
+    return rng.poisson(means) + rng.normal(0.0, noise, means.shape), true, given, ideal, sky, star
+
+
+def row(error, contrast, p, seed, n, device):
+    """Return a row of the table."""
+    images, true, given, ideal, sky, star = make_scene(error, contrast, p, seed, n)
+    rows, found = star_rows(star, sky.shape), {}
+    known = {"background": EXPERIMENT.sky_electrons, "read_noise": EXPERIMENT.read_noise.value}
+    values = {"error": error, "contrast": contrast, "p": p, "seed": seed}
+
+    def run(psfs, **options):
+        observation = lnocl.Observation(images, psfs, psf_centre="given", ideal_psfs=ideal, **known)
+        return lnocl.deconvolve(observation, [star], pad=0, device=device, **options)
+
+    def best(psfs):
+        errors = []
+        run(psfs, n_iter=100, stop=None, smoothing=0.0, callback=lambda _, estimate: errors.append(
+            restoration_error(estimate.extended, sky, rows)))  # fmt: skip
+        return min(errors)
+
+    start = time.perf_counter()
+    result = run(given, refine_psfs=FAMILIES)
+    middle = time.perf_counter()
+    found["given"] = run(given)
+    plain = time.perf_counter() - middle
+    found["refined"], found["true"] = result, run(true)
+    psfs = {"true": true, "given": given, "refined": result.psfs}
+    norm = np.linalg.norm(true)
+    for name, each in psfs.items():
+        values[f"best {name}"] = best(each)
+        values[f"end {name}"] = restoration_error(found[name].extended, sky, rows)
+    values |= {
+        f"psf {name}": float(np.linalg.norm(np.array(psfs[name]) - true) / norm)
+        for name in ("given", "refined")
+    }
+    refinement = result.psf_refinement
+    values |= {"misfit": refinement.misfit[0], "misfit refined": refinement.misfit[1]}
+    values |= {"used": refinement.is_accepted, "seconds": middle - start - plain, "run s": plain}
+    return values
+
+
+def main():
+    """Print the table, a row a scene."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--images", type=int, default=4)
+    parser.add_argument("--seeds", type=int, nargs=2, default=(0, 5))
+    parser.add_argument("--contrasts", type=float, nargs="+", default=(0.3, 1.0, 10.0, 30.0))
+    parser.add_argument("--errors", nargs="+", choices=ERRORS, default=ERRORS)
+    parser.add_argument("--device")
+    parser.add_argument("--output", metavar="STEM")
+    given = parser.parse_args()
+    rows = []
+    for error in given.errors:
+        for contrast in given.contrasts:
+            for seed in range(*given.seeds):
+                rows.append(row(error, contrast, given.images, seed, given.size, given.device))
+                print(*(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}"
+                        for k, v in rows[-1].items()), sep="  ", flush=True)  # fmt: skip
+                if given.output:
+                    Table(rows).write(f"{given.output}-p{given.images}.ecsv", overwrite=True)
+
+
+if __name__ == "__main__":
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        main()

@@ -1,0 +1,196 @@
+"""PSFs that are refined from the images before the reconstruction, and whether that helped."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lnocl.runs.outcome import PsfRefinement
+from lnocl.runs.run import Run
+from lnocl.runs.start import Setup, make_model, make_start
+from lnocl.scene.observation import Array, Observation
+from lnocl.scene.penalty import Penalty
+from lnocl.scene.psf_families import PsfFamilies
+from lnocl.scene.rings import Rings, medians
+from lnocl.scene.scene import MIN_MODEL, Scene
+from lnocl.solvers.fluxes import fit_fluxes
+from lnocl.solvers.psf_fit import Misfit, PsfStep, misfit, step
+
+log = logging.getLogger("lnocl")
+
+# Each round begins with the estimate after so many iterations with the present PSFs, and takes so
+# many steps from it.
+ITERATIONS, STEPS = (8, 15, 30), 2
+# Of the extended source, what lies all round a star is the star's: this quantile in each ring.
+ROUND = 0.4
+# So many times what the PSFs' error may fake is not the extended source's.
+FAKED = 2.0
+# Refinement looks at a window of this side, pixels.
+WINDOW = 256
+# The median of the square of a normal deviate of unit variance.
+MEDIAN = 0.455
+# PSFs are judged after so many iterations. Refined ones are used where chi squared of those given
+# exceeds its expectation by so much for each parameter, and this share of it is mended.
+JUDGED, EXCESS, MENDED = 15, 10.0, 0.7
+# A step is halved so often, at most, until no OTF exceeds its value at frequency 0.
+MAX_HALVED = 10
+
+
+def refine_psfs(
+    setup: Setup, observation: Observation, names: Sequence[str]
+) -> tuple[Observation, PsfRefinement]:
+    """Return the observation with the PSFs that fit better, and what was found.
+
+    Rounds of short runs, from the estimate of which parameters, star fluxes and perhaps positions
+    are fitted (`lnocl.solvers.psf_fit`), in a window round the stars. What the extended source has
+    all round a star is taken for the star's, and so is what the error of its PSFs may have left
+    there. The given PSFs stand where the refined ones mend too little.
+
+    Parameters
+    ----------
+    setup : Setup
+        The parameters of the runs; one star or more among them.
+    observation : Observation
+        The images and the given PSFs.
+    names : sequence of str
+        Families of `PsfFamilies`.
+    """
+    window, stars = _window(setup, observation)
+    families = PsfFamilies(names, observation.psfs, observation.ideal_psfs, observation.psf_modes)
+    given = np.zeros((observation.n_images, len(families.prior)))
+    look, values = _Look(setup, window, stars), given
+    for n_iter in ITERATIONS:
+        found = look.at(families.psfs(values), n_iter)
+        for _ in range(STEPS):
+            change = step(
+                found.scene, families, values, found.extended, found.fluxes, setup.refine_positions
+            )
+            values = _follow(families, values, change.parameters)
+            found = look.moved(found, families.psfs(values), change)
+    before, after = map(look.misfit_at, (observation.psfs, families.psfs(values)))
+    gain, excess = before.square - after.square, before.square - before.n_pixels
+    is_accepted = excess > EXCESS * values.size and gain > MENDED * excess
+    misfits = before.reduced, after.reduced
+    refinement = PsfRefinement(tuple(families.parameters), values, misfits, is_accepted)
+    log.info(_told(refinement))
+    return with_psfs(observation, families.psfs(values)) if is_accepted else observation, refinement
+
+
+def _follow(families: PsfFamilies, values: Array, change: Array) -> Array:
+    """Return the parameters after a step, shortened until the PSFs are those of some light."""
+    for _ in range(MAX_HALVED):
+        if families.are_possible(values + change):
+            return values + change
+        change = change / 2.0
+    return values
+
+
+def _told(refinement: PsfRefinement) -> str:
+    before, after = refinement.misfit
+    change = f"their misfit is {before:.3g}, refined {after:.3g}, where noise gives 1"
+    if refinement.is_accepted:
+        return f"PSFs refined: {change}"
+    return f"PSFs left as given: {change}"
+
+
+def with_psfs(observation: Observation, psfs: Array) -> Observation:
+    """Return an observation with other PSFs, as they are."""
+    other = copy(observation)
+    other.psfs = psfs
+    return other
+
+
+def _window(setup: Setup, observation: Observation) -> tuple[Observation, Array]:
+    """Return the observation cut to a window round the stars, and those in it."""
+    ny, nx = observation.shape
+    if max(ny, nx) <= WINDOW:
+        return observation, setup.stars
+    middle = (setup.stars.min(axis=0) + setup.stars.max(axis=0)) / 2.0
+    first = [
+        int(np.clip(round(at) - WINDOW // 2, 0, max(n - WINDOW, 0)))
+        for at, n in zip(middle, (nx, ny), strict=True)
+    ]
+    x, y = (slice(at, at + WINDOW) for at in first)
+    cut = copy(observation)
+    for name in ("images", "mask", "background", "exposure"):
+        values = getattr(observation, name)
+        setattr(cut, name, values[:, y, x] if values.ndim == 3 else values)
+    stars = setup.stars - first
+    height, width = cut.shape
+    inside = ((stars > -0.5) & (stars < np.array([width, height]) - 0.5)).all(axis=1)
+    return cut, stars[inside]
+
+
+class _Look:
+    """Short runs with PSFs to be judged, whose stars are refined where they are in the run."""
+
+    def __init__(self, setup: Setup, observation: Observation, stars: Array) -> None:
+        self._setup = replace(setup, solver="sgp", stars=stars)
+        self._observation = observation
+
+    def at(self, psfs: Array, n_iter: int) -> _Estimate:
+        """Return the estimate after so many iterations with these PSFs."""
+        observation = with_psfs(self._observation, psfs)
+        run = Run(make_start(self._setup, observation, Penalty()), n_iter)
+        for _ in run:
+            pass
+        return _clean(run.scene, run.engine.extended().astype(np.float64), run.engine.star_fluxes())
+
+    def misfit_at(self, psfs: Array) -> Misfit:
+        """Return how well these PSFs fit."""
+        found = self.at(psfs, JUDGED)
+        return misfit(found.scene, found.extended, found.fluxes)
+
+    def moved(self, estimate: _Estimate, psfs: Array, change: PsfStep) -> _Estimate:
+        """Return an estimate with other PSFs and stars."""
+        ny, nx = self._observation.shape
+        positions = change.positions.clip(0, (nx - 1, ny - 1))
+        scene = Scene(with_psfs(self._observation, psfs), positions, pad=self._setup.pad)
+        return replace(estimate, scene=scene, fluxes=change.fluxes)
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """An estimate without what PSFs in error may have left in its extended source."""
+
+    scene: Scene
+    extended: Array
+    fluxes: Array
+    kappa: Array
+
+
+def _clean(scene: Scene, extended: Array, fluxes: Array) -> _Estimate:
+    """Return an estimate whose extended source has nothing that the stars' PSFs may have left."""
+    model = make_model(scene)
+    shape = scene.observation.shape
+    inside = tuple(map(slice, shape))
+    rings = Rings(shape, scene.stars)
+    kept = extended.copy()
+    kept[inside] = np.maximum(kept[inside] - rings.round_stars(kept[inside], ROUND), 0.0)
+    diffuse = model.forward(kept)
+    diffuse += model.background
+    fluxes = fit_fluxes(scene, model, diffuse, fluxes)
+    excess, number = [], []
+    mean_light = np.zeros(shape)
+    for j, (counts, light) in enumerate(zip(scene.images(), model.starlight(fluxes), strict=True)):
+        total = np.maximum(diffuse[j] + light, MIN_MODEL)[inside]
+        counts, light, weights = (
+            each[inside] for each in (counts, light, np.broadcast_to(model.weights[j], scene.grid))
+        )
+        good = weights > 0
+        variance = np.divide(total, weights * scene.scale, out=np.ones(shape), where=good)
+        squares = (counts - total) ** 2 / MEDIAN
+        lit = good & (light > 0)
+        excess.append((squares - variance)[lit] / light[lit] ** 2)
+        number.append(Rings(shape, scene.stars + scene.observation.offsets[j]).number[lit])
+        mean_light += light / scene.n_images
+    kappa = np.zeros(rings.number.max() + 1)
+    found = np.sqrt(np.maximum(medians(np.concatenate(number), np.concatenate(excess)), 0.0))
+    kappa[: len(found)] = found[: len(kappa)]
+    faked = FAKED / np.sqrt(scene.n_images) * kappa[rings.number] * mean_light
+    kept[inside] = np.maximum(kept[inside] - faked, 0.0)
+    return _Estimate(scene, kept, fluxes, kappa)

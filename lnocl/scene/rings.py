@@ -1,0 +1,74 @@
+"""Rings round stars: what an image of the sky has all round them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.scene.observation import Array
+
+# A ring is a pixel wide, or this share of its radius.
+WIDTH = 0.15
+
+
+class Rings:
+    """Rings round stars, each pixel in that of the star nearest to it.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Of the images, (ny, nx).
+    positions : ndarray of float64, shape (n, 2)
+        Of the stars, (x, y), pixels; one or more.
+
+    Attributes
+    ----------
+    edges : ndarray of float64
+        Radii at which rings begin and end, pixels.
+    number : ndarray of int, shape (ny, nx)
+        The ring that each pixel is in, counted from the star outwards.
+    """
+
+    def __init__(self, shape: tuple[int, int], positions: Array) -> None:
+        y, x = np.indices(shape)
+        distances = np.array([np.hypot(x - px, y - py) for px, py in positions])
+        nearest = distances.argmin(axis=0)
+        distance = distances.min(axis=0)
+        edges = [0.0]
+        while edges[-1] <= distance.max():
+            edges.append(edges[-1] + max(1.0, WIDTH * edges[-1]))
+        self.edges = np.array(edges)
+        self.number = np.digitize(distance, self.edges) - 1
+        self._cell = nearest * len(self) + self.number
+        self._n_stars = len(positions)
+
+    def __len__(self) -> int:
+        return len(self.edges) - 1
+
+    def round_stars(self, image: Array, share: float) -> Array:
+        """Return what an image has all round each star: falling outwards, and 0 at the last ring.
+
+        In each ring that is the quantile `share` of its pixels, never more than in the ring inside.
+        """
+        levels = np.zeros(self._n_stars * len(self))
+        order = np.argsort(self._cell, axis=None)
+        cells, values = self._cell.ravel()[order], image.ravel()[order]
+        present, first = np.unique(cells, return_index=True)
+        for cell, part in zip(present, np.split(values, first[1:]), strict=True):
+            levels[cell] = np.quantile(part, share)
+        shape = self._n_stars, len(self)
+        is_there = np.isin(np.arange(levels.size), present).reshape(shape)
+        known = np.where(is_there, levels.reshape(shape), np.inf)
+        falling = np.minimum.accumulate(known, axis=1)
+        last = np.where(is_there, falling, np.inf).min(axis=1, keepdims=True)
+        return np.asarray((falling - last).ravel()[self._cell], np.float64)
+
+
+def medians(number: NDArray[np.int_], values: Array) -> Array:
+    """Return the median of the values of each number, 0 where there is none."""
+    order = np.argsort(number)
+    found = np.zeros(number.max(initial=0) + 1)
+    present, first = np.unique(number[order], return_index=True)
+    for ring, part in zip(present, np.split(values[order], first[1:]), strict=True):
+        found[ring] = np.median(part)
+    return found

@@ -1,0 +1,100 @@
+"""``lnocl deconvolve --refine-psfs``: what is written and said, and what is refused."""
+
+import shlex
+import warnings
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import lnocl
+from lnocl.commands import cli
+from lnocl.scene.psf_families import PsfFamilies
+
+N, STAR = 32, (15, 12)
+Y, X = np.indices((N, N))
+PSF = np.exp(-((X - 16) ** 2 + (Y - 16) ** 2) / 6.0)
+PSF /= PSF.sum()
+IDEAL = np.exp(-((X - 16) ** 2 + (Y - 16) ** 2) / 4.0)
+MODES = np.array([np.roll(PSF, 1, 0) - PSF, np.roll(PSF, 1, 1) - PSF])
+SKY = 200.0 * np.exp(-((X - 15) ** 2) / 6.0 - ((Y - 19) / 5.0) ** 2)
+SKY[STAR[::-1]] += 3e4
+WORDS = ["deconvolve", "image.fits", "--psf", "psf.fits", "--star", "15,12", "--background", "40",
+         "--engine", "numpy", "--n-iter", "20", "--stop", "none"]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    families = PsfFamilies(["jitter"], PSF[None], PSF[None], np.zeros((1, 0, N, N)))
+    true = families.psfs(np.array([[0.5, 0.1, 0.3]]))[0]
+    spectrum = np.fft.rfft2(SKY) * np.fft.rfft2(np.fft.ifftshift(true))
+    counts = np.random.default_rng(0).poisson(np.fft.irfft2(spectrum, SKY.shape).clip(0) + 40.0)
+    arrays = {"image": counts.astype(float), "psf": PSF, "ideal": IDEAL, "modes": MODES}
+    for name, array in arrays.items():
+        fits.writeto(f"{name}.fits", array)
+
+
+def run(*options, output="out.fits"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lnocl.errors.LnoclWarning)
+        return cli.main([*WORDS, *options, "-o", output])
+
+
+def test_the_file_has_the_psfs_and_their_parameters(capsys):
+    assert run("--refine-psfs", "shift", "jitter") == 0
+    assert "lnocl: PSFs refined: their misfit is " in capsys.readouterr().err
+    observation = lnocl.Observation(fits.getdata("image.fits"), PSF, background=40.0)
+    options = {"engine": "numpy", "n_iter": 20, "stop": None, "refine_psfs": ["shift", "jitter"]}
+    result = lnocl.deconvolve(observation, [STAR], **options)
+    with fits.open("out.fits", checksum=True) as hdus:
+        np.testing.assert_array_equal(hdus[0].data, result.extended)
+        np.testing.assert_array_equal(hdus["PSFS"].data, result.psfs)
+        table = hdus["PSFFIT"].data
+        names = ["image", "shift_x", "shift_y", "jitter_xx", "jitter_xy", "jitter_yy"]
+        assert list(table.names) == names
+        np.testing.assert_array_equal(
+            [table[name][0] for name in names[1:]], result.psf_refinement.values[0]
+        )
+        header = hdus[0].header
+    assert [header["REFPSF1"], header["REFPSF2"], header["PSFUSED"]] == ["shift", "jitter", True]
+    assert (header["PSFMIS1"], header["PSFMIS2"]) == result.psf_refinement.misfit
+    words = shlex.split("\n".join(header["HISTORY"]).replace("\\\n", ""))
+    again = words[words.index("lnocl") + 1 :]
+    assert cli.main([*again, "--overwrite"]) == 0
+    np.testing.assert_array_equal(fits.getdata("out.fits"), result.extended)
+
+
+def test_without_it_the_file_has_neither():
+    assert run() == 0
+    with fits.open("out.fits") as hdus:
+        assert not {"PSFS", "PSFFIT"} & {hdu.name for hdu in hdus}
+        assert "PSFUSED" not in hdus[0].header
+
+
+def test_files_of_ideal_psfs_and_modes():
+    files = ["--ideal-psf", "ideal.fits", "--psf-modes", "modes.fits"]
+    assert run("--refine-psfs", "strehl", "modes", *files) == 0
+    with fits.open("out.fits") as hdus:
+        assert hdus["PSFFIT"].data.names == ["image", "strehl_power", "modes_1", "modes_2"]
+        assert {"DSUM1", "LSUM1"} <= set(hdus[0].header)
+
+
+REFUSED = {
+    "unknown": (["--refine-psfs", "tilt"], "invalid choice: 'tilt'"),
+    "no ideal": (["--refine-psfs", "strehl"], "--refine-psfs strehl needs --ideal-psf"),
+    "no modes": (["--refine-psfs", "modes"], "--refine-psfs modes needs --psf-modes"),
+    "a missing file": (
+        ["--refine-psfs", "modes", "--psf-modes", "no.fits"], "no.fits cannot be opened",
+    ),
+    "modes of another shape": (
+        ["--refine-psfs", "modes", "--psf-modes", "small.fits"], "--psf-modes has shape (2, 5, 5)",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("options", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_is_refused(options, message, capsys):
+    fits.writeto("small.fits", np.ones((2, 5, 5)))
+    assert run(*options) in (1, 2)
+    assert message in capsys.readouterr().err

@@ -1,0 +1,195 @@
+"""PSFs refined from the images: found where they are wrong, left alone where they are right."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scenes import PAPER
+
+import lnocl
+from lnocl.errors import LnoclWarning
+from lnocl.metrics import restoration_error, star_rows
+from lnocl.scene.psf_families import PsfFamilies
+
+N, STAR, LEVEL = 64, (30, 24), 50.0
+Y, X = np.indices((N, N))
+R = np.hypot(X - N // 2, Y - N // 2)
+NONE = np.zeros((1, 0, N, N))
+
+
+def moffat(width, beta=2.5):
+    a = width / (2.0 * np.sqrt(2.0 ** (1.0 / beta) - 1.0))
+    psf = (1.0 + R**2 / a**2) ** -beta
+    return psf / psf.sum()
+
+
+PSF, IDEAL = moffat(4.0), moffat(2.5)
+SKY = 400.0 * np.exp(-((X - 30) ** 2) / 8.0 - ((Y - 36) / 8.0) ** 2)
+SKY += 300.0 * np.exp(-((X - 40) ** 2 + (Y - 30) ** 2) / 20.0)
+
+
+def changed(names, values, psf=PSF):
+    families = PsfFamilies(names, psf[None], IDEAL[None], NONE)
+    return families.psfs(np.array([values]))[0]
+
+
+def images_through(psfs, contrast=3.0, seed=1):
+    sky = SKY.copy()
+    sky[STAR[::-1]] += contrast * SKY.sum()
+    means = [
+        np.fft.irfft2(np.fft.rfft2(sky) * np.fft.rfft2(np.fft.ifftshift(psf)), sky.shape) + LEVEL
+        for psf in psfs
+    ]
+    return np.random.default_rng(seed).poisson(means).astype(float)
+
+
+def refine(images, psfs, names=("shift", "jitter"), n_iter=40, **options):
+    known = {"background": LEVEL, "psf_centre": "given"}
+    known |= {"ideal_psfs": IDEAL} if "strehl" in np.ravel(names) else {}
+    known |= {"psf_modes": options.pop("psf_modes")} if "psf_modes" in options else {}
+    given = {"solver": "sgp", "n_iter": n_iter, "engine": "numpy", "refine_psfs": names}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LnoclWarning)
+        observation = lnocl.Observation(images, psfs, **known)
+        return lnocl.deconvolve(observation, [STAR], **{**PAPER, **given, **options})
+
+
+def error(result):
+    return restoration_error(result.extended, SKY, star_rows(STAR, SKY.shape))
+
+
+WRONG = {
+    "shift": (("shift", "jitter"), ("shift",), (0.25, -0.15)),
+    "jitter": (("shift", "jitter"), ("jitter",), (0.6, 0.15, 0.3)),
+    "sharper": (("jitter",), ("jitter",), (-0.4, 0.0, -0.2)),
+    "strehl": (("jitter", "strehl"), ("strehl",), (-0.3,)),
+}
+
+
+@pytest.mark.parametrize(("asked", "families", "values"), WRONG.values(), ids=WRONG)
+def test_a_wrong_psf_is_mended(asked, families, values):
+    true = changed(families, values)
+    images = images_through([true])
+    result = refine(images, PSF, asked)
+    found = result.psf_refinement
+    assert found.is_accepted
+    before, after = found.misfit
+    assert after < 1.05 < before
+    assert np.linalg.norm(result.psfs[0] - true) < 0.15 * np.linalg.norm(PSF - true)
+    right, wrong = (error(refine(images, psf, ())) for psf in (true, PSF))
+    assert error(result) < right + 0.15 * (wrong - right)
+
+
+def test_its_parameters_are_found():
+    true = [changed(("shift", "jitter"), v) for v in [(0.2, 0.1, 0.5, 0, 0.5), (-0.2, 0, 0, 0, 0)]]
+    result = refine(images_through(true), [PSF, PSF])
+    assert result.psf_refinement.parameters == (
+        "shift x", "shift y", "jitter xx", "jitter xy", "jitter yy",
+    )  # fmt: skip
+    expected = [(0.2, 0.1, 0.5, 0, 0.5), (-0.2, 0, 0, 0, 0)]
+    np.testing.assert_allclose(result.psf_refinement.values, expected, rtol=0, atol=0.06)
+
+
+def test_modes_are_found():
+    mode = (moffat(4.6) - PSF)[None]
+    true = PSF + 1.5 * mode[0]
+    result = refine(images_through([true]), PSF, ["modes"], psf_modes=mode)
+    assert result.psf_refinement.is_accepted
+    assert result.psf_refinement.values == pytest.approx(1.5, abs=0.1)
+
+
+@pytest.mark.parametrize("contrast", [0.5, 3.0, 30.0])
+def test_right_psfs_are_left_as_they_are(contrast):
+    images = images_through([PSF, PSF], contrast)
+    result = refine(images, [PSF, PSF], ("shift", "jitter", "strehl"))
+    assert not result.psf_refinement.is_accepted
+    plain = refine(images, [PSF, PSF], ())
+    assert plain.psf_refinement is None
+    np.testing.assert_array_equal(result.extended, plain.extended)
+    np.testing.assert_array_equal(result.psfs, plain.psfs)
+
+
+def test_what_parameters_cannot_mend_is_left_and_said(caplog):
+    speckles = 0.3 * np.random.default_rng(2).standard_normal((N, N))
+    true = PSF * np.exp(np.fft.ifft2(np.fft.fft2(speckles) * np.fft.fft2(IDEAL)).real * 8)
+    caplog.set_level("INFO", "lnocl")
+    result = refine(images_through([true / true.sum()], 30.0), PSF, ("shift",))
+    assert not result.psf_refinement.is_accepted
+    assert result.psf_refinement.misfit[0] > 2
+    assert "PSFs left as given: their misfit is" in caplog.text
+    np.testing.assert_array_equal(result.psfs, [PSF / PSF.sum()])
+
+
+def test_a_psf_far_too_wide_is_not_sharpened_beyond_light():
+    result = refine(images_through([moffat(2.0)]), moffat(5.0), ("jitter",))
+    assert np.isfinite(result.extended).all()
+    assert abs(np.fft.rfft2(result.psfs[0])).max() <= 1.0 + 1e-6
+
+
+def test_positions_are_refined_with_them():
+    true = changed(("jitter",), (0.5, 0.0, 0.5))
+    images = images_through([true])
+    result = refine(np.roll(images, 1, axis=2), PSF, ("jitter",), refine_positions=True)
+    assert result.psf_refinement.is_accepted
+    np.testing.assert_allclose(result.star_positions, [(31, 24)], rtol=0, atol=0.05)
+
+
+def test_the_order_of_the_images_does_not_matter():
+    true = [changed(("jitter",), (0.6, 0.0, 0.2)), PSF]
+    images = images_through(true)
+    once, again = (
+        refine(images[order], [PSF, PSF]) for order in (slice(None), slice(None, None, -1))
+    )
+    values = once.psf_refinement.values, again.psf_refinement.values[::-1]
+    np.testing.assert_allclose(*values, rtol=0, atol=1e-5)  # steps halve where rounding says
+
+
+def test_images_larger_than_the_window_are_looked_at_round_the_stars(monkeypatch):
+    monkeypatch.setattr("lnocl.runs.psf_refinement.WINDOW", 48)
+    images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
+    result = refine(images, PSF, ("jitter",))
+    assert result.psf_refinement.is_accepted
+    np.testing.assert_allclose(result.psf_refinement.values, [(0.6, 0, 0.3)], rtol=0, atol=0.12)
+
+
+def test_both_engines_agree():
+    images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
+    reference = refine(images, PSF)
+    result = refine(images, PSF, engine="opencl", precision="double")
+    np.testing.assert_allclose(
+        result.psf_refinement.values, reference.psf_refinement.values, rtol=0, atol=2e-6
+    )
+    assert np.linalg.norm(result.extended - reference.extended) < 1e-4 * np.linalg.norm(SKY)
+
+
+def test_a_run_goes_on_from_its_checkpoint_bit_for_bit(tmp_path):
+    images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
+    whole = refine(images, PSF)
+    path = tmp_path / "c.fits"
+    refine(images, PSF, checkpoint=path, callback=lambda iteration, _: iteration == 15)
+    result = refine(images, PSF, resume=path)
+    np.testing.assert_array_equal(result.extended, whole.extended)
+    np.testing.assert_array_equal(result.psfs, whole.psfs)
+
+
+REFUSED = {
+    "one text": ({"names": "shift"}, "give a sequence of shift, jitter, strehl, modes"),
+    "no sequence": ({"names": 1}, "give a sequence"),
+    "unknown": ({"names": ["tilt"]}, "refine_psfs 'tilt' is not known"),
+    "no modes": ({"names": ["modes"]}, "refine_psfs modes needs psf_modes"),
+    "one free shift": ({"names": ["shift"], "refine_positions": True}, "shift of one image"),
+}
+
+
+@pytest.mark.parametrize(("options", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_is_refused(options, message):
+    with pytest.raises(lnocl.InputError, match=message):
+        refine(images_through([PSF]), PSF, **options)
+
+
+def test_a_star_is_needed():
+    observation = lnocl.Observation(images_through([PSF]), PSF)
+    with pytest.raises(lnocl.InputError, match="refine_psfs needs a star"):
+        lnocl.deconvolve(observation, refine_psfs=["shift"])
+    with pytest.raises(lnocl.InputError, match="strehl needs ideal_psfs"):
+        lnocl.deconvolve(observation, [STAR], refine_psfs=["strehl"])

@@ -1,0 +1,122 @@
+"""PSFs with parameters: each family against what it stands for, and the slopes."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import fourier_gaussian
+
+from lnocl.scene.psf_families import PsfFamilies, spectrum
+from lnocl.scene.shifting import place
+
+N = 32
+Y, X = np.indices((N, N)) - N // 2
+PSF = np.exp(-(X**2 + (Y / 1.2) ** 2) / 12.0)
+PSF /= PSF.sum()
+IDEAL = np.exp(-(X**2 + Y**2) / 6.0)
+IDEAL /= IDEAL.sum()
+RNG = np.random.default_rng(0)
+MODES = 1e-3 * RNG.standard_normal((1, 2, N, N))
+ALL = ("shift", "jitter", "strehl", "modes")
+
+
+def families(*names, psf=PSF, ideal=IDEAL, modes=MODES):
+    return PsfFamilies(names, psf[None], ideal[None], modes)
+
+
+def changed(names, *values, **known):
+    (psf,) = families(*names, **known).psfs(np.array([values]))
+    return psf
+
+
+def test_without_a_change_it_is_the_psf_given():
+    np.testing.assert_allclose(changed(ALL, *np.zeros(8)), PSF, rtol=0, atol=1e-17)
+
+
+def test_parameters_have_names_and_priors():
+    found = families("modes", "shift", "strehl")
+    assert found.parameters == ["shift x", "shift y", "strehl power", "modes 1", "modes 2"]
+    np.testing.assert_array_equal(found.prior, [0.5, 0.5, 0.7, 1.0, 1.0])
+
+
+def test_shift_moves_it():
+    moved = place(PSF, (N, N), N // 2 + 0.3, N // 2 - 0.2).on_grid((N, N))
+    np.testing.assert_allclose(changed(["shift"], 0.3, -0.2), moved, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(("xx", "yy"), [(1.5, 0.4), (0.0, 2.0)])
+def test_jitter_convolves_it_with_a_gaussian(xx, yy):
+    expected = np.fft.ifft2(fourier_gaussian(np.fft.fft2(PSF), (yy**0.5, xx**0.5))).real
+    np.testing.assert_allclose(changed(["jitter"], xx, 0.0, yy), expected, rtol=0, atol=1e-15)
+
+
+def test_jitter_has_the_covariance_that_it_says():
+    wide = changed(["jitter"], 0.7, 0.3, 1.1)
+    change = [((wide - PSF) * each).sum() for each in (X * X, X * Y, Y * Y)]
+    np.testing.assert_allclose(change, [0.7, 0.3, 1.1], rtol=3e-5)  # of light beyond the edge
+
+
+def test_jitter_that_is_negative_sharpens_it():
+    again = changed(["jitter"], -1.0, 0.2, -0.5, psf=changed(["jitter"], 1.0, -0.2, 0.5))
+    np.testing.assert_allclose(again, PSF, rtol=0, atol=1e-10)
+
+
+def test_strehl_goes_from_the_ideal_to_it_and_beyond():
+    given, ideal = spectrum(PSF, (N, N)), spectrum(IDEAL, (N, N))
+    good = abs(given) > 1e-3  # what the PSF has lost, nothing brings back
+    for power, expected in ((-1.0, ideal), (-0.5, (given * ideal) ** 0.5), (1.0, given**2 / ideal)):
+        found = spectrum(changed(["strehl"], power), (N, N))
+        np.testing.assert_allclose(found[good], expected[good], rtol=1e-9)
+
+
+def test_modes_are_added_without_their_light():
+    difference = changed(["modes"], 2.0, -1.0) - PSF
+    expected = 2.0 * MODES[0, 0] - MODES[0, 1]
+    np.testing.assert_allclose(difference, expected - expected.sum() * PSF, rtol=0, atol=1e-16)
+
+
+@pytest.mark.parametrize("names", [(name,) for name in ALL] + [ALL])
+def test_the_sum_stays(names):
+    n = len(families(*names).prior)
+    values = np.random.default_rng(3).uniform(-0.4, 0.4, n)
+    assert changed(names, *values).sum() == pytest.approx(1.0, abs=1e-14)
+
+
+@pytest.mark.parametrize("shape", [(9, 9), (8, 10), (32, 32)])
+def test_psfs_keep_their_shape_and_middle(shape):
+    y, x = (np.arange(n) - n // 2 for n in shape)
+    psf = np.exp(-(y[:, None] ** 2 + x**2) / 2.0)
+    psf /= psf.sum()
+    found = PsfFamilies(["jitter"], psf[None], psf[None], np.zeros((1, 0, *shape)))
+    (wide,) = found.psfs(np.array([[0.2, 0.0, 0.2]]))
+    assert wide.shape == shape
+    assert np.unravel_index(wide.argmax(), shape) == (shape[0] // 2, shape[1] // 2)
+
+
+def test_slopes_are_the_derivatives_of_its_spectrum():
+    found, values, h = families(*ALL), np.full(8, 0.1), 1e-6
+    factors, modes = found.slopes(0, (N, N))
+    base = spectrum(changed(ALL, *values), (N, N))
+    smooth = base - sum(0.1 * mode for mode in modes)
+    slopes = [factor * smooth for factor in factors] + modes
+    # The highest frequency of an even number has no sign, and a shift no derivative there.
+    inner = np.s_[np.r_[0 : N // 2, N // 2 + 1 : N], : N // 2]
+    for k, slope in enumerate(slopes):
+        up, down = values.copy(), values.copy()
+        up[k] += h
+        down[k] -= h
+        change = spectrum(changed(ALL, *up), (N, N)) - spectrum(changed(ALL, *down), (N, N))
+        np.testing.assert_allclose((change / (2 * h))[inner], slope[inner], rtol=0, atol=1e-8)
+
+
+def test_the_spectrum_of_a_small_psf_is_that_of_it_laid_on_the_grid():
+    small = PSF[N // 2 - 4 : N // 2 + 5, N // 2 - 4 : N // 2 + 5]
+    laid = np.zeros((16, 20))
+    laid[np.ix_(np.arange(-4, 5) % 16, np.arange(-4, 5) % 20)] = small
+    np.testing.assert_allclose(spectrum(small, (16, 20)), np.fft.rfft2(laid), rtol=0, atol=1e-15)
+
+
+def test_psfs_of_no_light_are_told():
+    found = families("jitter")
+    assert found.are_possible(np.array([[0.5, 0.1, 0.2]]))
+    assert found.are_possible(np.array([[-0.5, 0.0, -0.5]]))
+    assert not found.are_possible(np.array([[-9.0, 0.0, 0.0]]))
+    assert not found.are_possible(np.array([[np.nan, 0.0, 0.0]]))

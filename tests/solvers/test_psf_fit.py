@@ -1,0 +1,127 @@
+"""A step for PSFs and stars: its slopes by differences, the step by an explicit matrix."""
+
+import numpy as np
+import pytest
+
+import lnocl
+from lnocl.scene.forward_model import Model
+from lnocl.scene.psf_families import PsfFamilies
+from lnocl.scene.scene import Scene
+from lnocl.solvers import psf_fit
+
+N, P = 16, 2
+Y, X = np.indices((N, N)) - N // 2
+RNG = np.random.default_rng(5)
+PSFS = np.array([np.exp(-(X**2 + (Y / s) ** 2) / 4.0) for s in (1.0, 1.3)])
+PSFS /= PSFS.sum(axis=(1, 2), keepdims=True)
+IDEALS = np.array([np.exp(-(X**2 + Y**2) / 3.0)] * P)
+MODES = 0.05 * (PSFS * (X * Y + X))[:, None]
+STARS = np.array([(5.2, 9.1), (11.0, 4.6)])
+NAMES = ("shift", "jitter", "strehl", "modes")
+SKY = 4.0 * np.exp(-((X - 2) ** 2 + (Y + 1) ** 2) / 10.0)
+FLUXES = np.array([300.0, 80.0])
+MASK = RNG.random((P, N, N)) < 0.05
+EXPOSURE = np.array([1.0, 1.5])
+OFFSETS = np.array([(0.0, 0.0), (0.6, -0.3)])
+MAP = RNG.uniform(0.5, 1.5, (P, N, N))
+KNOWN = {"masked": {"mask": MASK}, "exposures": {"exposure": EXPOSURE, "offsets": OFFSETS},
+         "exposure map": {"exposure": MAP}}  # fmt: skip
+
+
+pytestmark = pytest.mark.filterwarnings("ignore:the images are shifted")
+
+
+def a_scene(psfs=PSFS, stars=STARS, **known):
+    means = 30.0 + np.zeros((P, N, N))
+    counts = np.random.default_rng(1).poisson(means + 20.0 * SKY).astype(float)
+    observation = lnocl.Observation(
+        counts, PSFS, background=30.0, ideal_psfs=IDEALS, psf_modes=MODES, **known
+    )
+    observation.psfs = psfs
+    return Scene(observation, stars)
+
+
+def families(scene):
+    observation = scene.observation
+    return PsfFamilies(NAMES, PSFS, observation.ideal_psfs, observation.psf_modes)
+
+
+@pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
+def test_slopes_are_the_derivatives_of_the_models(known):
+    scene = a_scene(**known)
+    family = families(scene)
+    k, h = len(family.prior), 1e-6
+    sky, fluxes = SKY / 10.0, FLUXES / 100.0
+    images = psf_fit._linearise(scene, family, Model(scene), sky, fluxes, True)
+    unknowns = np.zeros(P * k + 6)
+
+    def models(unknowns):
+        psfs = family.psfs(unknowns[: P * k].reshape(P, k))
+        moved = a_scene(psfs, STARS + unknowns[P * k + 2 :].reshape(2, 2).T, **known)
+        return Model(moved).images(sky, fluxes + unknowns[P * k : P * k + 2])
+
+    for which in range(len(unknowns)):
+        up, down = unknowns.copy(), unknowns.copy()
+        up[which] += h
+        down[which] -= h
+        change = (models(up) - models(down)) / (2 * h)
+        for j, image in enumerate(images):
+            at = np.flatnonzero(image.unknowns == which)
+            expected = image.slopes[at[0]].reshape(N, N) if at.size else np.zeros((N, N))
+            # Offsets and fractions move PSFs by aliases too, which slopes leave out.
+            bound = 4e-4 * max(abs(change[j]).max(), 1e-6)
+            np.testing.assert_allclose(change[j], expected, rtol=0, atol=bound)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
+def test_the_step_is_that_of_the_whole_least_squares(known, moves, monkeypatch):
+    monkeypatch.setattr(psf_fit, "N_STEPS", 2000)
+    monkeypatch.setattr(psf_fit, "FINISHED", 1e-13)
+    scene = a_scene(**known)
+    family, model = families(scene), Model(scene)
+    sky, fluxes = SKY / 10.0, FLUXES / 100.0
+    at = np.zeros(P * len(family.prior) + 2 * (3 if moves else 1))
+    at[0] = 0.2
+    prior = np.zeros(len(at))
+    prior[: P * len(family.prior)] = np.tile(family.prior**-2.0, P)
+    images = psf_fit._linearise(scene, family, model, sky, fluxes, moves)
+    fit = psf_fit._Fit(images, model, sky + 0.01, prior)
+    found = fit.solve(at)
+
+    slopes = np.zeros((P, N * N, len(at)))
+    for each, block in zip(images, slopes, strict=True):
+        block[:, each.unknowns] = each.slopes.T
+    spread = np.array(
+        [fit._spread(unit.reshape(N, N)).ravel() for unit in np.eye(N * N)]
+    ).T  # fmt: skip
+    root = np.sqrt([each.precision for each in images]).reshape(-1, 1)
+    left = np.array([each.left for each in images]).reshape(-1)
+    matrix = np.block(
+        [
+            [root * slopes.reshape(-1, len(at)), root * spread],
+            [np.diag(np.sqrt(prior)), np.zeros((len(at), N * N))],
+            [np.zeros((N * N, len(at))), np.eye(N * N)],
+        ]
+    )
+    wanted = np.concatenate([root[:, 0] * left, -np.sqrt(prior) * at, np.zeros(N * N)])
+    expected = np.linalg.lstsq(matrix, wanted, rcond=None)[0][: len(at)]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * abs(expected).max())
+
+
+def test_the_error_of_the_extended_source_has_unit_variance_and_a_width():
+    scene = a_scene()
+    model = Model(scene)
+    fit = psf_fit._Fit([], model, np.ones((N, N)), np.ones(1))
+    fields = [fit._correlate(RNG.standard_normal((N, N))) for _ in range(400)]
+    assert np.mean(np.square(fields)) == pytest.approx(1.0, rel=0.05)
+    products = [np.mean(f * np.roll(f, 3, axis=1)) for f in fields]
+    assert np.mean(products) == pytest.approx(np.exp(-(3.0**2) / (2 * 1.5**2)), abs=0.03)
+
+
+def test_steps_are_bounded():
+    scene = a_scene()
+    far = psf_fit.step(scene, families(scene), np.zeros((P, 7)), 1e-9 + 0 * SKY, 1e3 * FLUXES, True)
+    assert (abs(far.parameters) <= 3.0 * families(scene).prior * (1 + 1e-12)).all()
+    assert (abs(far.positions - STARS) <= 0.5).all()
+    assert (far.fluxes >= 0.1 * 1e3 * FLUXES * (1 - 1e-12)).all()
