@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lnocl.process import ignored_warnings
 from lnocl.runs.outcome import PsfRefinement
 from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_model, make_start
@@ -105,24 +106,21 @@ def with_psfs(observation: Observation, psfs: Array) -> Observation:
 
 
 def _window(setup: Setup, observation: Observation) -> tuple[Observation, Array]:
-    """Return the observation cut to a window round the stars, and those in it."""
-    ny, nx = observation.shape
-    if max(ny, nx) <= WINDOW:
-        return observation, setup.stars
+    """Return the observation cut to a window round most of the stars, and those in it."""
+    size = np.minimum(observation.shape[::-1], WINDOW)
+    last = np.array(observation.shape[::-1]) - size
     middle = (setup.stars.min(axis=0) + setup.stars.max(axis=0)) / 2.0
-    first = [
-        int(np.clip(round(at) - WINDOW // 2, 0, max(n - WINDOW, 0)))
-        for at, n in zip(middle, (nx, ny), strict=True)
+    firsts = [np.clip(np.round(at) - size // 2, 0, last) for at in (middle, *setup.stars)]
+    held = [
+        ((setup.stars >= at - 0.5) & (setup.stars < at + size - 0.5)).all(axis=1) for at in firsts
     ]
-    x, y = (slice(at, at + WINDOW) for at in first)
+    best = int(np.argmax(held.sum(axis=1)))
+    x, y = (slice(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
     cut = copy(observation)
     for name in ("images", "mask", "background", "exposure"):
         values = getattr(observation, name)
         setattr(cut, name, values[:, y, x] if values.ndim == 3 else values)
-    stars = setup.stars - first
-    height, width = cut.shape
-    inside = ((stars > -0.5) & (stars < np.array([width, height]) - 0.5)).all(axis=1)
-    return cut, stars[inside]
+    return cut, setup.stars[held[best]] - firsts[best]
 
 
 class _Look:
@@ -134,10 +132,10 @@ class _Look:
 
     def at(self, psfs: Array, n_iter: int) -> _Estimate:
         """Return the estimate after so many iterations with these PSFs."""
-        observation = with_psfs(self._observation, psfs)
-        run = Run(make_start(self._setup, observation, Penalty()), n_iter)
-        for _ in run:
-            pass
+        with ignored_warnings():  # those of the reconstruction are the same
+            run = Run(make_start(self._setup, self._seen_through(psfs), Penalty()), n_iter)
+            for _ in run:
+                pass
         return _clean(run.scene, run.engine.extended().astype(np.float64), run.engine.star_fluxes())
 
     def misfit_at(self, psfs: Array) -> Misfit:
@@ -149,8 +147,17 @@ class _Look:
         """Return an estimate with other PSFs and stars."""
         ny, nx = self._observation.shape
         positions = change.positions.clip(0, (nx - 1, ny - 1))
-        scene = Scene(with_psfs(self._observation, psfs), positions, pad=self._setup.pad)
+        with ignored_warnings():
+            scene = Scene(self._seen_through(psfs), positions, pad=self._setup.pad)
         return replace(estimate, scene=scene, fluxes=change.fluxes)
+
+    def _seen_through(self, psfs: Array) -> Observation:
+        """Return the observation with these PSFs, as far as the window may show them."""
+        cut = [
+            slice(n // 2 - min(n, WINDOW) // 2, n // 2 - min(n, WINDOW) // 2 + min(n, WINDOW))
+            for n in psfs.shape[1:]
+        ]
+        return with_psfs(self._observation, psfs[:, *cut])
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class PsfFamilies:
     def __init__(self, names: Sequence[str], psfs: Array, ideals: Array, modes: Array) -> None:
         self._names, self._psfs, self._ideals = names, psfs, ideals
         if "modes" not in names:
-            modes = modes[:, :0]
+            modes = np.zeros((len(psfs), 0, *psfs.shape[1:]))
         self._modes = modes - modes.sum(axis=(2, 3), keepdims=True) * psfs[:, None]
         self.parameters, prior = [], []
         scales = {"shift": SHIFT, "jitter": JITTER, "strehl": STREHL}

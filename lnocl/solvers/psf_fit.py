@@ -108,8 +108,8 @@ class Misfit(NamedTuple):
 
 def misfit(scene: Scene, extended: Array, fluxes: Array) -> Misfit:
     """Return how well the PSFs of a scene fit, with fluxes fitted and the source marginalised."""
-    observation, model = scene.observation, Model(scene)
-    held = PsfFamilies((), observation.psfs, observation.ideal_psfs, observation.psf_modes)
+    psfs, model = scene.observation.psfs, Model(scene)
+    held = PsfFamilies((), psfs, psfs, psfs)
     images = _linearise(scene, held, model, extended, fluxes, False)
     fit = _Fit(images, model, _amplitude(extended), np.zeros(len(fluxes)))
     n_pixels = sum(int(np.count_nonzero(each.precision)) for each in images)

@@ -1,6 +1,7 @@
 """PSFs refined from the images: found where they are wrong, left alone where they are right."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from scenes import PAPER
 import lnocl
 from lnocl.errors import LnoclWarning
 from lnocl.metrics import restoration_error, star_rows
+from lnocl.runs import psf_refinement
+from lnocl.runs.start import Setup
 from lnocl.scene.psf_families import PsfFamilies
 
 N, STAR, LEVEL = 64, (30, 24), 50.0
@@ -150,6 +153,22 @@ def test_images_larger_than_the_window_are_looked_at_round_the_stars(monkeypatch
     result = refine(images, PSF, ("jitter",))
     assert result.psf_refinement.is_accepted
     np.testing.assert_allclose(result.psf_refinement.values, [(0.6, 0, 0.3)], rtol=0, atol=0.12)
+
+
+def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
+    monkeypatch.setattr("lnocl.runs.psf_refinement.WINDOW", 32)
+    observation = lnocl.Observation(np.ones((1, 100, 120)), np.ones((40, 5)))
+    stars = np.array([(5.0, 90.0), (100.0, 20.0), (108.4, 24.0)])
+    setup = Setup(stars, 0, "sgp", "single", "numpy", None)
+    cut, found = psf_refinement._window(setup, observation)
+    assert cut.shape == (32, 32)
+    np.testing.assert_array_equal(found, stars[1:] - (84, 4))
+    look = psf_refinement._Look(setup, cut, found)
+    assert look._seen_through(observation.psfs).psfs.shape == (1, 32, 5)
+    whole = lnocl.Observation(np.ones((1, 20, 30)), np.ones((3, 3)))
+    cut, found = psf_refinement._window(replace(setup, stars=np.array([(3.0, 4.0)])), whole)
+    assert cut.shape == (20, 30)
+    np.testing.assert_array_equal(found, [(3.0, 4.0)])
 
 
 def test_both_engines_agree():
