@@ -111,9 +111,8 @@ def _window(setup: Setup, observation: Observation) -> tuple[Observation, Array]
     last = np.array(observation.shape[::-1]) - size
     middle = (setup.stars.min(axis=0) + setup.stars.max(axis=0)) / 2.0
     firsts = [np.clip(np.round(at) - size // 2, 0, last) for at in (middle, *setup.stars)]
-    held = [
-        ((setup.stars >= at - 0.5) & (setup.stars < at + size - 0.5)).all(axis=1) for at in firsts
-    ]
+    low = np.array(firsts)[:, None] - 0.5
+    held = ((setup.stars >= low) & (setup.stars < low + size)).all(axis=2)
     best = int(np.argmax(held.sum(axis=1)))
     x, y = (slice(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
     cut = copy(observation)
