@@ -112,7 +112,7 @@ def _window(setup: Setup, observation: Observation) -> tuple[Observation, Array]
     middle = (setup.stars.min(axis=0) + setup.stars.max(axis=0)) / 2.0
     firsts = [np.clip(np.round(at) - size // 2, 0, last) for at in (middle, *setup.stars)]
     low = np.array(firsts)[:, None] - 0.5
-    held = ((setup.stars >= low) & (setup.stars < low + size)).all(axis=2)
+    held = np.all((setup.stars >= low) & (setup.stars < low + size), axis=2)
     best = int(np.argmax(held.sum(axis=1)))
     x, y = (slice(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
     cut = copy(observation)

@@ -69,6 +69,6 @@ def medians(number: NDArray[np.int_], values: Array) -> Array:
     order = np.argsort(number)
     found = np.zeros(number.max(initial=0) + 1)
     present, first = np.unique(number[order], return_index=True)
-    for ring, part in zip(present, np.split(values[order], first[1:]), strict=True):
+    for ring, part in zip(present, np.split(values[order], first)[1:], strict=True):
         found[ring] = np.median(part)
     return found

@@ -123,10 +123,16 @@ def test_what_parameters_cannot_mend_is_left_and_said(caplog):
     np.testing.assert_array_equal(result.psfs, [PSF / PSF.sum()])
 
 
-def test_a_psf_far_too_wide_is_not_sharpened_beyond_light():
-    result = refine(images_through([moffat(2.0)]), moffat(5.0), ("jitter",))
-    assert np.isfinite(result.extended).all()
-    assert abs(np.fft.rfft2(result.psfs[0])).max() <= 1.0 + 1e-6
+def test_no_step_leads_to_psfs_of_no_light():
+    families = PsfFamilies(["jitter"], PSF[None], PSF[None], NONE)
+    start = np.zeros((1, 3))
+    short = psf_refinement._follow(families, start, np.array([[-40.0, 0.0, -40.0]]))
+    assert families.are_possible(short)
+    assert not families.are_possible(2.0 * short)
+    far = np.array([[0.5, 0.1, 0.2]])
+    np.testing.assert_array_equal(psf_refinement._follow(families, start, far), far)
+    nowhere = psf_refinement._follow(families, start, np.full((1, 3), np.nan))
+    np.testing.assert_array_equal(nowhere, start)
 
 
 def test_positions_are_refined_with_them():

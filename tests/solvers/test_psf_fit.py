@@ -119,9 +119,17 @@ def test_the_error_of_the_extended_source_has_unit_variance_and_a_width():
     assert np.mean(products) == pytest.approx(np.exp(-(3.0**2) / (2 * 1.5**2)), abs=0.03)
 
 
-def test_steps_are_bounded():
+def test_steps_are_bounded(monkeypatch):
     scene = a_scene()
-    far = psf_fit.step(scene, families(scene), np.zeros((P, 7)), 1e-9 + 0 * SKY, 1e3 * FLUXES, True)
-    assert (abs(far.parameters) <= 3.0 * families(scene).prior * (1 + 1e-12)).all()
-    assert (abs(far.positions - STARS) <= 0.5).all()
-    assert (far.fluxes >= 0.1 * 1e3 * FLUXES * (1 - 1e-12)).all()
+    family, start = families(scene), np.zeros((P, 7))
+    free = psf_fit.step(scene, family, start, SKY / 10.0, FLUXES, True)
+    assert (abs(free.parameters) / family.prior).max() > 0.02
+    monkeypatch.setattr(psf_fit, "MAX_STEP", 0.01)
+    monkeypatch.setattr(psf_fit, "MAX_MOVE", 1e-4)
+    short = psf_fit.step(scene, family, start, SKY / 10.0, FLUXES, True)
+    assert (abs(short.parameters) / family.prior).max() == pytest.approx(0.01)
+    share = short.parameters / free.parameters
+    np.testing.assert_allclose(share, share[0, 0], rtol=1e-9)
+    assert abs(short.positions - STARS).max() == pytest.approx(1e-4)
+    faint = psf_fit.step(scene, family, start, SKY / 10.0, 1e4 * FLUXES, True)
+    assert (faint.fluxes >= 0.1 * 1e4 * FLUXES * (1 - 1e-12)).all()
