@@ -428,8 +428,8 @@ def _refinement_cards(result: Result) -> list[Card]:
     before, after = found.misfit
     return [
         ("PSFUSED", found.is_accepted, "whether refined PSFs are used"),
-        ("PSFMIS1", before, "misfit at stars, PSFs as given; 1 by noise"),
-        ("PSFMIS2", after, "misfit at stars, PSFs refined"),
+        ("PSFMIS1", before, "reduced chi squared, PSFs as given"),
+        ("PSFMIS2", after, "reduced chi squared, PSFs refined"),
     ]
 
 
