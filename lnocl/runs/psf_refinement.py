@@ -71,6 +71,9 @@ def refine_psfs(
                 found.scene, families, values, found.extended, found.fluxes, setup.refine_positions
             )
             values = _follow(families, values, change.parameters)
+            if setup.refine_positions:  # which a common shift is not told from
+                values, common = families.without_common_shift(values)
+                change = change._replace(positions=change.positions + common)
             found = look.moved(found, families.psfs(values), change)
     before, after = map(look.misfit_at, (observation.psfs, families.psfs(values)))
     gain, excess = before.square - after.square, before.square - before.n_pixels

@@ -95,6 +95,14 @@ class PsfFamilies:
         otfs = (self._otf(j, each) for j, each in enumerate(values))
         return np.array([np.fft.fftshift(scipy.fft.irfft2(otf, grid)) for otf in otfs])
 
+    def without_common_shift(self, values: Array) -> tuple[Array, Array]:
+        """Return the parameters with shifts of mean 0 over the PSFs, and that mean, (x, y)."""
+        common = np.zeros(2)
+        if "shift" in self._names:
+            common = values[:, :2].mean(axis=0)
+            values = np.hstack([values[:, :2] - common, values[:, 2:]])
+        return values, common
+
     def are_possible(self, values: Array) -> bool:
         """Return whether no OTF exceeds its value at frequency 0, by more than those given do."""
         for j, each in enumerate(values):

@@ -143,6 +143,15 @@ def test_positions_are_refined_with_them():
     np.testing.assert_allclose(result.star_positions, [(31, 24)], rtol=0, atol=0.05)
 
 
+def test_a_common_shift_is_the_stars():
+    true = [changed(("shift",), (0.3, 0.1)), changed(("shift",), (0.1, -0.1))]
+    result = refine(images_through(true), [PSF, PSF], ("shift",), refine_positions=True)
+    assert result.psf_refinement.is_accepted
+    expected = [(0.1, 0.1), (-0.1, -0.1)]
+    np.testing.assert_allclose(result.psf_refinement.values, expected, rtol=0, atol=0.02)
+    np.testing.assert_allclose(result.star_positions, [np.add(STAR, (0.2, 0.0))], atol=0.03)
+
+
 def test_the_order_of_the_images_does_not_matter():
     true = [changed(("jitter",), (0.6, 0.0, 0.2)), PSF]
     images = images_through(true)
