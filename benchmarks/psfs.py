@@ -16,7 +16,8 @@ all      in all of it
 Columns: the best rho'' of 100 iterations with the true, the given and the refined PSFs, and rho''
 at the end of a run with the defaults; the relative error of the PSFs given and refined; the misfit;
 whether the refined ones are used; seconds for the refinement, and for the run after it.
-`refine_psfs` is shift, jitter and strehl throughout.
+`refine_psfs` is shift, jitter and strehl throughout. With --draw FILE.png the rows of STEM-pP.ecsv
+are drawn instead.
 """
 
 import argparse
@@ -112,6 +113,32 @@ def row(error, contrast, p, seed, n, device):
     return values
 
 
+def draw(table, path):
+    """Draw rho'' with true, given and refined PSFs against the contrast, a panel an error."""
+    from lnocl.plotting.figure import line_style, new_figure, save_figure
+
+    figure = new_figure(11.0, 6.4)
+    axes = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
+    for axis, error in zip(axes, ERRORS, strict=True):
+        rows = table[table["error"] == error]
+        contrasts = sorted(set(rows["contrast"]))
+        for i, name in enumerate(("true", "given", "refined")):
+            for part, alpha in (("best", 1.0), ("end", 0.35)):
+                values = [
+                    np.median(rows[rows["contrast"] == c][f"{part} {name}"]) for c in contrasts
+                ]
+                label = f"{name} PSF" if part == "best" else None
+                axis.plot(contrasts, values, **line_style(i), label=label, alpha=alpha)
+        axis.set(xscale="log", yscale="log", ylim=(0.05, 4.0), title=error)
+        axis.grid(alpha=0.3)
+    for axis in axes[3:]:
+        axis.set_xlabel("flux of the star over that of the jet")
+    for axis in axes[::3]:
+        axis.set_ylabel("error near the star, rho''")
+    axes[0].legend(fontsize=9)
+    save_figure(figure, path, True)
+
+
 def main():
     """Print the table, a row a scene."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -122,7 +149,11 @@ def main():
     parser.add_argument("--errors", nargs="+", choices=ERRORS, default=ERRORS)
     parser.add_argument("--device")
     parser.add_argument("--output", metavar="STEM")
+    parser.add_argument("--draw", metavar="FILE.png")
     given = parser.parse_args()
+    if given.draw:
+        draw(Table.read(f"{given.output}-p{given.images}.ecsv"), given.draw)
+        return
     rows = []
     for error in given.errors:
         for contrast in given.contrasts:
