@@ -140,8 +140,8 @@ def deconvolve(
         covariance of a blur, the Strehl ratio between it and ``ideal_psfs``, the coefficients
         of ``psf_modes``. The PSFs given stand unless chi squared exceeds its expectation by ten
         for each parameter, and falls by seven tenths of that. Star positions that are not refined
-        are taken for right.
-        At least one star.
+        are taken for right. Where the PSFs used have a reduced chi squared above 2, their error,
+        as residuals show it, is added to the noise. At least one star.
     checkpoint : str or path, optional
         File for checkpoints (FITS): written after the first iteration, then every
         `checkpoint_every` seconds, and at the end. Each replaces the one before once it is

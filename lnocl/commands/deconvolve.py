@@ -430,6 +430,7 @@ def _refinement_cards(result: Result) -> list[Card]:
         ("PSFUSED", found.is_accepted, "whether refined PSFs are used"),
         ("PSFMIS1", before, "reduced chi squared, PSFs as given"),
         ("PSFMIS2", after, "reduced chi squared, PSFs refined"),
+        ("PSFERR", found.psf_error, "relative error of the PSFs in the noise"),
     ]
 
 

@@ -32,12 +32,16 @@ class PsfRefinement:
     is_accepted : bool
         Whether the refined PSFs are used: chi squared of those given exceeds its expectation by
         ten for each parameter and more, and seven tenths of that are mended.
+    psf_error : float
+        Relative error that the PSFs used still have, weighted by their squares, which was made a
+        part of the noise as it makes their misfit more than 2; else 0.
     """
 
     parameters: tuple[str, ...]
     values: Array
     misfit: tuple[float, float]
     is_accepted: bool
+    psf_error: float
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,9 @@ MEDIAN = 0.455
 # PSFs are judged after so many iterations. Refined ones are used where chi squared of those given
 # exceeds its expectation by so much for each parameter, and this share of it is mended.
 JUDGED, EXCESS, MENDED = 15, 10.0, 0.7
+# Where the PSFs that are used have a larger reduced chi squared, their error is made a part of the
+# noise: else held-out counts, which do not see it, run until it ruins the sky near the star.
+RUINOUS = 2.0
 # A step is halved so often, at most, until no OTF exceeds its value at frequency 0.
 MAX_HALVED = 10
 
@@ -60,7 +63,7 @@ def refine_psfs(
     names : sequence of str
         Families of `PsfFamilies`.
     """
-    window, stars = _window(setup, observation)
+    window, stars, first = _window(setup, observation)
     families = PsfFamilies(names, observation.psfs, observation.ideal_psfs, observation.psf_modes)
     given = np.zeros((observation.n_images, len(families.prior)))
     look, values = _Look(setup, window, stars), given
@@ -75,13 +78,21 @@ def refine_psfs(
                 values, common = families.without_common_shift(values)
                 change = change._replace(positions=change.positions + common)
             found = look.moved(found, families.psfs(values), change)
-    before, after = map(look.misfit_at, (observation.psfs, families.psfs(values)))
+    (before, of_given), (after, of_refined) = map(
+        look.judge, (observation.psfs, families.psfs(values))
+    )
     gain, excess = before.square - after.square, before.square - before.n_pixels
     is_accepted = excess > EXCESS * values.size and gain > MENDED * excess
+    final, estimate = (after, of_refined) if is_accepted else (before, of_given)
+    if is_accepted:
+        observation = with_psfs(observation, families.psfs(values))
+    error = 0.0
+    if final.reduced > RUINOUS:
+        observation, error = _with_errors(observation, estimate, first)
     misfits = before.reduced, after.reduced
-    refinement = PsfRefinement(tuple(families.parameters), values, misfits, is_accepted)
+    refinement = PsfRefinement(tuple(families.parameters), values, misfits, is_accepted, error)
     log.info(_told(refinement))
-    return with_psfs(observation, families.psfs(values)) if is_accepted else observation, refinement
+    return observation, refinement
 
 
 def _follow(families: PsfFamilies, values: Array, change: Array) -> Array:
@@ -96,9 +107,9 @@ def _follow(families: PsfFamilies, values: Array, change: Array) -> Array:
 def _told(refinement: PsfRefinement) -> str:
     before, after = refinement.misfit
     change = f"their misfit is {before:.3g}, refined {after:.3g}, where noise gives 1"
-    if refinement.is_accepted:
-        return f"PSFs refined: {change}"
-    return f"PSFs left as given: {change}"
+    if refinement.psf_error:
+        change += f"; an error of {100 * refinement.psf_error:.2g} % is added to the noise"
+    return f"PSFs {'refined' if refinement.is_accepted else 'left as given'}: {change}"
 
 
 def with_psfs(observation: Observation, psfs: Array) -> Observation:
@@ -108,8 +119,39 @@ def with_psfs(observation: Observation, psfs: Array) -> Observation:
     return other
 
 
-def _window(setup: Setup, observation: Observation) -> tuple[Observation, Array]:
-    """Return the observation cut to a window round most of the stars, and those in it."""
+def _with_errors(
+    observation: Observation, estimate: _Estimate, first: Array
+) -> tuple[Observation, float]:
+    """Return an observation with the PSFs' error in its noise, and that error.
+
+    Its variance is ``(2 kappa(r) sum_s c_s P_js)^2``; as that of read noise it is added to images
+    and background.
+    """
+    fluxes = estimate.fluxes * estimate.scene.unit
+    with ignored_warnings():
+        scene = Scene(observation, estimate.scene.stars + first)
+    images, read_noise = observation.images.copy(), np.empty_like(observation.images)
+    background = np.empty_like(images)
+    ny, nx = observation.shape
+    errors, lights = 0.0, 0.0
+    for j, offset in enumerate(observation.offsets):
+        light = scene.star_field.light(j, fluxes / scene.unit)[:ny, :nx] * scene.scale
+        if scene.weights is not None and scene.has_exposure_map:
+            light *= scene.weights[j][:ny, :nx]
+        number = Rings((ny, nx), scene.stars + offset).number
+        error = estimate.kappa[np.minimum(number, len(estimate.kappa) - 1)] * light
+        errors, lights = errors + float((error**2).sum()), lights + float((light**2).sum())
+        variance = (FAKED * error) ** 2
+        images[j] += np.where(observation.mask[j], 0.0, variance)
+        background[j] = observation.background[j] + variance
+        read_noise[j] = np.sqrt(observation.read_noise[j] ** 2 + variance)
+    noisy = copy(observation)
+    noisy.images, noisy.background, noisy.read_noise = images, background, read_noise
+    return noisy, float(np.sqrt(errors / lights))
+
+
+def _window(setup: Setup, observation: Observation) -> tuple[Observation, Array, Array]:
+    """Return the observation cut to a window round most of the stars, these, and its corner."""
     size = np.minimum(observation.shape[::-1], WINDOW)
     last = np.array(observation.shape[::-1]) - size
     middle = (setup.stars.min(axis=0) + setup.stars.max(axis=0)) / 2.0
@@ -122,7 +164,7 @@ def _window(setup: Setup, observation: Observation) -> tuple[Observation, Array]
     for name in ("images", "mask", "background", "exposure"):
         values = getattr(observation, name)
         setattr(cut, name, values[:, y, x] if values.ndim == 3 else values)
-    return cut, setup.stars[held[best]] - firsts[best]
+    return cut, setup.stars[held[best]] - firsts[best], firsts[best]
 
 
 class _Look:
@@ -140,10 +182,10 @@ class _Look:
                 pass
         return _clean(run.scene, run.engine.extended().astype(np.float64), run.engine.star_fluxes())
 
-    def misfit_at(self, psfs: Array) -> Misfit:
-        """Return how well these PSFs fit."""
+    def judge(self, psfs: Array) -> tuple[Misfit, _Estimate]:
+        """Return how well these PSFs fit, and the estimate by which that is judged."""
         found = self.at(psfs, JUDGED)
-        return misfit(found.scene, found.extended, found.fluxes)
+        return misfit(found.scene, found.extended, found.fluxes), found
 
     def moved(self, estimate: _Estimate, psfs: Array, change: PsfStep) -> _Estimate:
         """Return an estimate with other PSFs and stars."""
@@ -164,7 +206,12 @@ class _Look:
 
 @dataclass(frozen=True)
 class _Estimate:
-    """An estimate without what PSFs in error may have left in its extended source."""
+    """An estimate without what PSFs in error may have left in its extended source.
+
+    `kappa` is the relative error of the PSFs in each of the `Rings` round the stars, as far as
+    residuals show it beyond the noise of the counts: the root of the median of
+    ``((g - m)^2 / 0.455 - m) / (sum_s c_s P_js)^2``.
+    """
 
     scene: Scene
     extended: Array

@@ -50,11 +50,12 @@ def refine(images, psfs, names=("shift", "jitter"), n_iter=40, **options):
     known = {"background": LEVEL, "psf_centre": "given"}
     known |= {"ideal_psfs": IDEAL} if "strehl" in np.ravel(names) else {}
     known |= {"psf_modes": options.pop("psf_modes")} if "psf_modes" in options else {}
+    star = options.pop("star", STAR)
     given = {"solver": "sgp", "n_iter": n_iter, "engine": "numpy", "refine_psfs": names}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LnoclWarning)
         observation = lnocl.Observation(images, psfs, **known)
-        return lnocl.deconvolve(observation, [STAR], **{**PAPER, **given, **options})
+        return lnocl.deconvolve(observation, [star], **{**PAPER, **given, **options})
 
 
 def error(result):
@@ -123,6 +124,37 @@ def test_what_parameters_cannot_mend_is_left_and_said(caplog):
     np.testing.assert_array_equal(result.psfs, [PSF / PSF.sum()])
 
 
+class TestAnErrorThatIsLeft:
+    SPECKLES = np.random.default_rng(4).standard_normal((N, N))
+    SMOOTH = np.fft.ifft2(np.fft.fft2(SPECKLES) * np.fft.fft2(np.fft.ifftshift(IDEAL))).real
+    TRUE = PSF * (1.0 + 0.15 * SMOOTH / SMOOTH.std())
+    TRUE = TRUE / TRUE.sum()
+
+    def test_it_is_measured_and_made_a_part_of_the_noise(self, caplog):
+        caplog.set_level("INFO", "lnocl")
+        images = images_through([self.TRUE], 30.0)
+        result = refine(images, PSF, ("shift",), n_iter=300)
+        true = np.linalg.norm(self.TRUE - PSF) / np.linalg.norm(PSF)
+        assert result.psf_refinement.psf_error == pytest.approx(true, rel=0.3)
+        assert "is added to the noise" in caplog.text
+        plain = refine(images, PSF, (), n_iter=300)
+        assert error(result) < 0.2 * error(plain)
+        variance = result._outcome.scene.observation.read_noise[0] ** 2
+        assert variance.max() > 1e3 > 1.0 > variance[60, 60]
+
+    def test_it_is_0_where_psfs_fit(self):
+        assert refine(images_through([PSF]), PSF).psf_refinement.psf_error == 0
+
+    def test_it_is_that_of_mirrored_images(self):
+        images = images_through([self.TRUE], 30.0)
+        once = refine(images, PSF, ("shift",)).psf_refinement
+        again = refine(
+            images[:, :, ::-1], np.roll(PSF[:, ::-1], 1, 1), ("shift",), star=(N - 1 - STAR[0], 24)
+        )
+        assert again.psf_refinement.psf_error == pytest.approx(once.psf_error, rel=0.05)
+        assert once.psf_error > 0.1
+
+
 def test_no_step_leads_to_psfs_of_no_light():
     families = PsfFamilies(["jitter"], PSF[None], PSF[None], NONE)
     start = np.zeros((1, 3))
@@ -175,13 +207,14 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
     observation = lnocl.Observation(np.ones((1, 100, 120)), np.ones((40, 5)))
     stars = np.array([(5.0, 90.0), (100.0, 20.0), (108.4, 24.0)])
     setup = Setup(stars, 0, "sgp", "single", "numpy", None)
-    cut, found = psf_refinement._window(setup, observation)
+    cut, found, first = psf_refinement._window(setup, observation)
     assert cut.shape == (32, 32)
+    np.testing.assert_array_equal(first, (84, 4))
     np.testing.assert_array_equal(found, stars[1:] - (84, 4))
     look = psf_refinement._Look(setup, cut, found)
     assert look._seen_through(observation.psfs).psfs.shape == (1, 32, 5)
     whole = lnocl.Observation(np.ones((1, 20, 30)), np.ones((3, 3)))
-    cut, found = psf_refinement._window(replace(setup, stars=np.array([(3.0, 4.0)])), whole)
+    cut, found, _ = psf_refinement._window(replace(setup, stars=np.array([(3.0, 4.0)])), whole)
     assert cut.shape == (20, 30)
     np.testing.assert_array_equal(found, [(3.0, 4.0)])
 
