@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lnocl.errors import warn
 from lnocl.process import ignored_warnings
 from lnocl.runs.outcome import PsfRefinement
 from lnocl.runs.run import Run
@@ -40,6 +41,8 @@ JUDGED, EXCESS, MENDED = 15, 10.0, 0.7
 # Where the PSFs that are used have a larger reduced chi squared, their error is made a part of the
 # noise: else held-out counts, which do not see it, run until it ruins the sky near the star.
 RUINOUS = 2.0
+# PSFs that are wrong by more than this are not told from the sky, whatever their noise.
+HOPELESS = 0.25
 # A step is halved so often, at most, until no OTF exceeds its value at frequency 0.
 MAX_HALVED = 10
 
@@ -88,7 +91,15 @@ def refine_psfs(
         observation = with_psfs(observation, families.psfs(values))
     error = 0.0
     if final.reduced > RUINOUS:
-        observation, error = _with_errors(observation, estimate, first)
+        noisy, error = _with_errors(observation, estimate, first)
+        if error > HOPELESS:
+            warn(
+                f"the PSFs do not fit the stars, by {100 * error:.2g} %: the sky near the stars, "
+                "and their fluxes, are not to be trusted; give other PSFs"
+            )
+            error = 0.0
+        else:
+            observation = noisy
     misfits = before.reduced, after.reduced
     refinement = PsfRefinement(tuple(families.parameters), values, misfits, is_accepted, error)
     log.info(_told(refinement))
@@ -128,11 +139,11 @@ def _with_errors(
     and background.
     """
     fluxes = estimate.fluxes * estimate.scene.unit
+    ny, nx = observation.shape
     with ignored_warnings():
-        scene = Scene(observation, estimate.scene.stars + first)
+        scene = Scene(observation, (estimate.scene.stars + first).clip(0, (nx - 1, ny - 1)))
     images, read_noise = observation.images.copy(), np.empty_like(observation.images)
     background = np.empty_like(images)
-    ny, nx = observation.shape
     errors, lights = 0.0, 0.0
     for j, offset in enumerate(observation.offsets):
         light = scene.star_field.light(j, fluxes / scene.unit)[:ny, :nx] * scene.scale

@@ -142,6 +142,16 @@ class TestAnErrorThatIsLeft:
         variance = result._outcome.scene.observation.read_noise[0] ** 2
         assert variance.max() > 1e3 > 1.0 > variance[60, 60]
 
+    def test_of_a_psf_that_is_all_wrong_it_is_said_and_nothing_done(self):
+        observation = lnocl.Observation(images_through([moffat(2.5)], 30.0), moffat(6.0))
+        options = {"engine": "numpy", "n_iter": 20, "stop": None, "refine_psfs": ["shift"]}
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result = lnocl.deconvolve(observation, [STAR], **options)
+        assert any("the PSFs do not fit the stars, by" in str(each.message) for each in caught)
+        assert result.psf_refinement.psf_error == 0
+        np.testing.assert_array_equal(result._outcome.scene.observation.read_noise, [0.0])
+
     def test_it_is_0_where_psfs_fit(self):
         assert refine(images_through([PSF]), PSF).psf_refinement.psf_error == 0
 
