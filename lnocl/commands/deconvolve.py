@@ -19,7 +19,8 @@ from lnocl.deconvolution import deconvolve
 from lnocl.errors import counted
 from lnocl.residuals import Fit, StarResiduals
 from lnocl.result import Result
-from lnocl.runs.options import ENGINES, FAMILIES, PRECISIONS
+from lnocl.runs.options import ENGINES, PRECISIONS
+from lnocl.scene.psf_families import FAMILIES
 from lnocl.solvers import SOLVERS
 
 if TYPE_CHECKING:
@@ -158,7 +159,7 @@ OPTIONS = {
         option(
             "--refine-psfs",
             nargs="+",
-            choices=FAMILIES,
+            choices=tuple(FAMILIES),
             default=[],
             metavar="WHAT",
             card=("REFPSF", "asked of the PSFs"),
@@ -507,6 +508,12 @@ def _verdict(result: Result, at_stars: Sequence[StarResiduals], overall: Fit | N
         if found.has_halo:
             lit.append(f"({x:.7g}, {y:.7g}), {100 * found.halo:.0f} %")
     verdict = []
+    refinement = result.psf_refinement
+    if refinement is not None and refinement.psf_error:
+        verdict.append(
+            f"the PSFs are wrong by {100 * refinement.psf_error:.2g} %, which the noise at the "
+            "stars was raised by: do not trust the sky near them, and give better PSFs"
+        )
     if unfitted:
         verdict.append(
             f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "

@@ -20,8 +20,6 @@ SAMPLED = 2.0
 # of the radius look like a background. PSFs of eight public sets that are in order have at most
 # 0.3 %, 1.6 % and 2.2 %.
 MUCH_NEGATIVE, MUCH_NOISE, MUCH_AT_BORDER, BACKGROUND_FALL = 0.01, 0.05, 0.05, 1.0
-
-
 # The mean deviation of white noise over the median of what a median filter of 3 x 3 leaves of it.
 OF_NOISE = 1.372
 BETTER = "make it from brighter or more stars"

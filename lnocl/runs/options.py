@@ -14,6 +14,7 @@ from lnocl.errors import InputError, warn
 from lnocl.scene.containers import counts
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.penalty import Penalty, recommend_smoothing
+from lnocl.scene.psf_families import FAMILIES
 from lnocl.solvers import SOLVERS
 
 log = logging.getLogger("lnocl")
@@ -26,7 +27,6 @@ MULTIPLES = (1.0, 3.0, 10.0)
 
 PRECISIONS = ("single", "double")
 ENGINES = ("opencl", "numpy")
-FAMILIES = ("shift", "jitter", "strehl", "modes")
 STOPS = ("held-out", "discrepancy")
 
 # Kernels count iterations in 32 bits.
@@ -84,8 +84,8 @@ def check_families(
     Raises
     ------
     InputError
-        A name is not known, or the names are one text; there is no star; what a family needs was
-        not given; the place of one PSF is to be told from that of its stars.
+        A name is unknown, or a text stands for the sequence; there is no star; the observation
+        lacks the ideal PSFs or modes; a shift of one image is asked beside free positions.
     """
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise InputError(f"refine_psfs is {names!r}; give a sequence of {', '.join(FAMILIES)}")

@@ -68,42 +68,37 @@ def refine_psfs(
     """
     window, stars, first = _window(setup, observation)
     families = PsfFamilies(names, observation.psfs, observation.ideal_psfs, observation.psf_modes)
-    given = np.zeros((observation.n_images, len(families.prior)))
-    look, values = _Look(setup, window, stars), given
-    for n_iter in ITERATIONS:
-        found = look.at(families.psfs(values), n_iter)
-        for _ in range(STEPS):
-            change = step(
-                found.scene, families, values, found.extended, found.fluxes, setup.refine_positions
-            )
-            values = _follow(families, values, change.parameters)
-            if setup.refine_positions:  # which a common shift is not told from
-                values, common = families.without_common_shift(values)
-                change = change._replace(positions=change.positions + common)
-            found = look.moved(found, families.psfs(values), change)
-    (before, of_given), (after, of_refined) = map(
-        look.judge, (observation.psfs, families.psfs(values))
-    )
+    look = _Look(setup, window, stars)
+    values = _find(look, families, setup.refine_positions)
+    refined = families.psfs(values)
+    (before, of_given), (after, of_refined) = map(look.judge, (observation.psfs, refined))
     gain, excess = before.square - after.square, before.square - before.n_pixels
     is_accepted = excess > EXCESS * values.size and gain > MENDED * excess
-    final, estimate = (after, of_refined) if is_accepted else (before, of_given)
+    final, estimate = before, of_given
     if is_accepted:
-        observation = with_psfs(observation, families.psfs(values))
+        observation, final, estimate = _with_psfs(observation, refined), after, of_refined
     error = 0.0
     if final.reduced > RUINOUS:
-        noisy, error = _with_errors(observation, estimate, first)
-        if error > HOPELESS:
-            warn(
-                f"the PSFs do not fit the stars, by {100 * error:.2g} %: the sky near the stars, "
-                "and their fluxes, are not to be trusted; give other PSFs"
-            )
-            error = 0.0
-        else:
-            observation = noisy
+        observation, error = _allow_for_errors(observation, estimate, first)
     misfits = before.reduced, after.reduced
     refinement = PsfRefinement(tuple(families.parameters), values, misfits, is_accepted, error)
     log.info(_told(refinement))
     return observation, refinement
+
+
+def _find(look: _Look, families: PsfFamilies, moves: bool) -> Array:
+    """Return the parameters of the PSFs that fit best; the stars' places may be fitted too."""
+    values = np.zeros((look.n_images, len(families.prior)))
+    for n_iter in ITERATIONS:
+        found = look.at(families.psfs(values), n_iter)
+        for _ in range(STEPS):
+            change = step(found.scene, families, values, found.extended, found.fluxes, moves)
+            values = _follow(families, values, change.parameters)
+            if moves:  # which a common shift is not told from
+                values, common = families.without_common_shift(values)
+                change = change._replace(positions=change.positions + common)
+            found = look.moved(found, families.psfs(values), change)
+    return values
 
 
 def _follow(families: PsfFamilies, values: Array, change: Array) -> Array:
@@ -123,17 +118,17 @@ def _told(refinement: PsfRefinement) -> str:
     return f"PSFs {'refined' if refinement.is_accepted else 'left as given'}: {change}"
 
 
-def with_psfs(observation: Observation, psfs: Array) -> Observation:
+def _with_psfs(observation: Observation, psfs: Array) -> Observation:
     """Return an observation with other PSFs, as they are."""
     other = copy(observation)
     other.psfs = psfs
     return other
 
 
-def _with_errors(
+def _allow_for_errors(
     observation: Observation, estimate: _Estimate, first: Array
 ) -> tuple[Observation, float]:
-    """Return an observation with the PSFs' error in its noise, and that error.
+    """Return an observation with the PSFs' error in its noise, and that error; 0 where hopeless.
 
     Its variance is ``(2 kappa(r) sum_s c_s P_js)^2``; as that of read noise it is added to images
     and background.
@@ -156,9 +151,16 @@ def _with_errors(
         images[j] += np.where(observation.mask[j], 0.0, variance)
         background[j] = observation.background[j] + variance
         read_noise[j] = np.sqrt(observation.read_noise[j] ** 2 + variance)
+    found = float(np.sqrt(errors / lights))
+    if found > HOPELESS:
+        warn(
+            f"the PSFs do not fit the stars, by {100 * found:.2g} %: the sky near the stars, and "
+            "their fluxes, are not to be trusted; give other PSFs"
+        )
+        return observation, 0.0
     noisy = copy(observation)
     noisy.images, noisy.background, noisy.read_noise = images, background, read_noise
-    return noisy, float(np.sqrt(errors / lights))
+    return noisy, found
 
 
 def _window(setup: Setup, observation: Observation) -> tuple[Observation, Array, Array]:
@@ -184,6 +186,11 @@ class _Look:
     def __init__(self, setup: Setup, observation: Observation, stars: Array) -> None:
         self._setup = replace(setup, solver="sgp", stars=stars)
         self._observation = observation
+
+    @property
+    def n_images(self) -> int:
+        """Number of images."""
+        return self._observation.n_images
 
     def at(self, psfs: Array, n_iter: int) -> _Estimate:
         """Return the estimate after so many iterations with these PSFs."""
@@ -212,7 +219,7 @@ class _Look:
             slice(n // 2 - min(n, WINDOW) // 2, n // 2 - min(n, WINDOW) // 2 + min(n, WINDOW))
             for n in psfs.shape[1:]
         ]
-        return with_psfs(self._observation, psfs[:, *cut])
+        return _with_psfs(self._observation, psfs[:, *cut])
 
 
 @dataclass(frozen=True)

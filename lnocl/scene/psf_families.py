@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from lnocl.scene.shifting import fold
@@ -93,7 +92,7 @@ class PsfFamilies:
         """Return the PSFs of parameters of shape (p, n), shape (p, ky, kx), wrapped round."""
         grid = self._grid
         otfs = (self._otf(j, each) for j, each in enumerate(values))
-        return np.array([np.fft.fftshift(scipy.fft.irfft2(otf, grid)) for otf in otfs])
+        return np.array([np.fft.fftshift(np.fft.irfft2(otf, grid)) for otf in otfs])
 
     def without_common_shift(self, values: Array) -> tuple[Array, Array]:
         """Return the parameters with shifts of mean 0 over the PSFs, and that mean, (x, y)."""
@@ -127,5 +126,5 @@ def spectrum(psf: Array, grid: tuple[int, int]) -> Spectrum:
     """Return the spectrum of a PSF on a grid, its middle at the origin, wrapped round if larger."""
     for axis, n in enumerate(grid):
         psf = fold(psf, n, axis)
-    values: Spectrum = scipy.fft.rfft2(np.fft.ifftshift(psf))
+    values: Spectrum = np.fft.rfft2(np.fft.ifftshift(psf))
     return values

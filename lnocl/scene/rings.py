@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from lnocl.scene.observation import Array
 
@@ -31,9 +32,7 @@ class Rings:
 
     def __init__(self, shape: tuple[int, int], positions: Array) -> None:
         y, x = np.indices(shape)
-        distances = np.array([np.hypot(x - px, y - py) for px, py in positions])
-        nearest = distances.argmin(axis=0)
-        distance = distances.min(axis=0)
+        distance, nearest = KDTree(positions).query(np.stack([x, y], axis=-1))
         edges = [0.0]
         while edges[-1] <= distance.max():
             edges.append(edges[-1] + max(1.0, WIDTH * edges[-1]))

@@ -78,10 +78,11 @@ def step(
     at, prior = np.zeros((2, n_psf + n * (3 if moves else 1)))
     at[:n_psf], prior[:n_psf] = parameters.ravel(), np.tile(families.prior**-2.0, len(parameters))
     change = _Fit(images, model, _amplitude(extended), prior).solve(at)
-    of_psfs = change[:n_psf].reshape(parameters.shape)
-    change *= MAX_STEP / (abs(of_psfs) / families.prior).max(initial=MAX_STEP)
+    longest = (abs(change[:n_psf].reshape(parameters.shape)) / families.prior).max(initial=0.0)
+    change *= MAX_STEP / max(longest, MAX_STEP)
     to = np.maximum(fluxes + change[n_psf : n_psf + n], MAX_FADING * fluxes)
     moved = change[n_psf + n :].reshape(-1, n).T.clip(-MAX_MOVE, MAX_MOVE)
+    of_psfs = change[:n_psf].reshape(parameters.shape)
     return PsfStep(of_psfs, to, scene.stars + moved if moves else scene.stars)
 
 

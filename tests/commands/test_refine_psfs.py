@@ -98,3 +98,18 @@ def test_what_is_refused(options, message, capsys):
     fits.writeto("small.fits", np.ones((2, 5, 5)))
     assert run(*options) in (1, 2)
     assert message in capsys.readouterr().err
+
+
+def test_an_error_that_is_left_is_said_in_the_verdict(capsys):
+    sky = SKY.copy()
+    sky[STAR[::-1]] = 3e6
+    ripple = 1.0 + 0.15 * np.cos(X * 0.9) * np.cos(Y * 0.7)
+    true = PSF * ripple / (PSF * ripple).sum()
+    spectrum = np.fft.rfft2(sky) * np.fft.rfft2(np.fft.ifftshift(true))
+    counts = np.random.default_rng(0).poisson(np.fft.irfft2(spectrum, sky.shape).clip(0) + 40.0)
+    fits.writeto("image.fits", counts.astype(float), overwrite=True)
+    assert run("--refine-psfs", "shift") == 0
+    said = capsys.readouterr().out
+    assert "the PSFs are wrong by " in said
+    assert "the model fits" not in said
+    assert 0.01 < fits.getheader("out.fits")["PSFERR"] < 0.25
