@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import inspect
 import os
-import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +14,9 @@ import numpy as np
 from lnocl.commands import checkpoints, messages, options, record
 from lnocl.commands.options import SEVERAL, finite, number_or_word, option, whole_or_word
 from lnocl.commands.parser import Command
+from lnocl.commands.summary import summarise
 from lnocl.deconvolution import deconvolve
-from lnocl.errors import counted
-from lnocl.residuals import Fit, StarResiduals
+from lnocl.residuals import StarResiduals
 from lnocl.result import Result
 from lnocl.runs.options import ENGINES, PRECISIONS
 from lnocl.scene.psf_families import FAMILIES
@@ -31,18 +30,6 @@ if TYPE_CHECKING:
 
 PARAMETERS = {
     name: parameter.default for name, parameter in inspect.signature(deconvolve).parameters.items()
-}
-
-
-REASONS = {
-    "n_iter": "all iterations were done",
-    "held-out": "held-out counts chose this iteration",
-    "discrepancy": "the data are fitted as well as noise allows",
-    "change": "the objective hardly changed any more",
-    "converged": "no step lowers the objective any more",
-    "diverged": "the objective rose after this iteration",
-    "not finite": "the objective was not finite after this iteration",
-    "interrupt": "it was interrupted",
 }
 
 
@@ -318,7 +305,7 @@ def _run(arguments: argparse.Namespace) -> None:
             offsets=offsets,
         )
         if not arguments.quiet:
-            messages.say(_summary(arguments, result, frames, at_stars, overall))
+            messages.say(summarise(arguments, result, frames, at_stars, overall))
     interrupts.explain(arguments, result)
 
 
@@ -455,86 +442,6 @@ def _device_spec(arguments: argparse.Namespace) -> str | None:
     from lnocl.opencl import device
 
     return device.spec_of(device.choose(arguments.device).device)
-
-
-def _summary(
-    arguments: argparse.Namespace,
-    result: Result,
-    frames: Frames,
-    at_stars: Sequence[StarResiduals],
-    overall: Fit | None,
-) -> list[str]:
-    objective = result.history["objective"][-1]
-    device, _, _ = result.device.partition(" (")  # the header has its platform and driver
-    unit = re.sub(r"^(electron|photon)\b", r"\1s", frames.unit)
-    stars = [
-        f"star at ({x:.7g}, {y:.7g}): {flux / frames.electrons:.6g} {unit}; residuals "
-        f"{_rms(found.core)} in its core, {_rms(found.wings)} in its wings, where noise gives 1"
-        for (x, y), flux, found in zip(
-            result.star_positions, result.star_fluxes, at_stars, strict=True
-        )
-    ]
-    return [
-        f"{counted(result.n_iter, 'iteration')} on {device}, objective {objective:.6g}",
-        REASONS[result.stop_reason],
-        *stars,
-        f"extended source: {result.extended.sum() / frames.electrons:.6g} {unit}",
-        *([] if overall is None else [f"residuals {_rms(overall)} in all, where noise gives 1"]),
-        *_shortness(arguments, result),
-        *_verdict(result, at_stars, overall),
-        f"written to {arguments.output}",
-    ]
-
-
-def _shortness(arguments: argparse.Namespace, result: Result) -> list[str]:
-    if result.n_iter > 1 or result.n_iter == arguments.n_iter or result.stop_reason == "interrupt":
-        return []
-    return [
-        f"it ended after {counted(result.n_iter, 'iteration')}: there is little but noise, or PSF, "
-        "background or noise are wrong"
-    ]
-
-
-def _rms(fit: Fit) -> str:
-    return f"{fit.rms:.2f} +- {fit.error:.2f}" if fit.n_pixels else "unknown (no good pixel)"
-
-
-def _verdict(result: Result, at_stars: Sequence[StarResiduals], overall: Fit | None) -> list[str]:
-    """Return whether the model fits, and where not what to do."""
-    unfitted, lit = [], []
-    for (x, y), found in zip(result.star_positions, at_stars, strict=True):
-        if found.is_misfit:
-            unfitted.append(f"({x:.7g}, {y:.7g})")
-        if found.has_halo:
-            lit.append(f"({x:.7g}, {y:.7g}), {100 * found.halo:.0f} %")
-    verdict = []
-    refinement = result.psf_refinement
-    if refinement is not None and refinement.psf_error:
-        verdict.append(
-            f"the PSFs are wrong by {100 * refinement.psf_error:.2g} %, which the noise at the "
-            "stars was raised by: do not trust the sky near them, and give better PSFs"
-        )
-    if unfitted:
-        verdict.append(
-            f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
-            f"{' '.join(unfitted[:3])}: its PSF or its position is wrong"
-        )
-        if result.stop_reason == "held-out":
-            verdict.append(
-                "held-out counts share this error and choose too many iterations: look at fewer, "
-                "with --n-iter and --stop none"
-            )
-    elif overall is not None and overall.is_misfit:
-        verdict.append("the model does not fit: see to background, noise and gain")
-    if lit:
-        verdict.append(
-            f"light lies all round {counted(len(lit), 'star')}, as a share of its flux: "
-            f"{'; '.join(lit[:3])}: the PSF is too narrow or lacks its wings, the background is "
-            "too low, or a source lies there"
-        )
-    if at_stars or overall is not None:
-        verdict = verdict or ["the model fits"]
-    return verdict
 
 
 COMMAND = Command(

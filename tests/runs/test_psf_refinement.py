@@ -141,6 +141,9 @@ class TestAnErrorThatIsLeft:
         assert error(result) < 0.2 * error(plain)
         variance = result._outcome.scene.observation.read_noise[0] ** 2
         assert variance.max() > 1e3 > 1.0 > variance[60, 60]
+        noisy = result._outcome.scene.observation
+        np.testing.assert_allclose(noisy.background[0] - LEVEL, variance, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(noisy.images[0] - images[0], variance, rtol=1e-9, atol=1e-9)
 
     def test_of_a_psf_that_is_all_wrong_it_is_said_and_nothing_done(self):
         observation = lnocl.Observation(images_through([moffat(2.5)], 30.0), moffat(6.0))

@@ -120,3 +120,16 @@ def test_psfs_of_no_light_are_told():
     assert found.are_possible(np.array([[-0.5, 0.0, -0.5]]))
     assert not found.are_possible(np.array([[-9.0, 0.0, 0.0]]))
     assert not found.are_possible(np.array([[np.nan, 0.0, 0.0]]))
+
+
+def test_a_common_shift_is_taken_out():
+    both = np.array([PSF, PSF])
+    found = PsfFamilies(["shift", "jitter"], both, both, np.zeros((2, 0, N, N)))
+    values = np.array([[0.3, 0.1, 0.5, 0.0, 0.2], [0.1, -0.3, 0.4, 0.1, 0.3]])
+    apart, common = found.without_common_shift(values)
+    np.testing.assert_allclose(common, (0.2, -0.1))
+    np.testing.assert_allclose(apart[:, :2], [(0.1, 0.2), (-0.1, -0.2)])
+    np.testing.assert_array_equal(apart[:, 2:], values[:, 2:])
+    alone, none = families("jitter").without_common_shift(values[:1, 2:])
+    np.testing.assert_array_equal(alone, values[:1, 2:])
+    np.testing.assert_array_equal(none, (0.0, 0.0))
