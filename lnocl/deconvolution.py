@@ -58,6 +58,7 @@ def deconvolve(
     progress: bool = False,
     refine_positions: bool = False,
     refine_psfs: Iterable[str] = (),
+    round_source: bool = False,
     checkpoint: str | PathLike[str] | None = None,
     checkpoint_every: float = 60.0,
     resume: str | PathLike[str] | None = None,
@@ -134,14 +135,19 @@ def deconvolve(
         Move the stars to where they are most likely, at most 3 pixels away, by Fisher scoring of
         all fluxes and positions with the extended source held fixed: at the start and after 3, 6,
         12, 24 ... iterations (`lnocl.solvers.positions`).
-    refine_psfs : iterable of {"shift", "jitter", "strehl", "modes"}, optional
+    refine_psfs : iterable of {"shift", "jitter", "strehl", "pupil", "modes", "pixels"}, optional
         Fit parameters of each PSF before the reconstruction, with the stars and with the extended
         source marginalised (`lnocl.scene.psf_families`, `lnocl.solvers.psf_fit`): its place, the
-        covariance of a blur, the Strehl ratio between it and ``ideal_psfs``, the coefficients
-        of ``psf_modes``. The PSFs given stand unless chi squared exceeds its expectation by ten
-        for each parameter, and falls by seven tenths of that. Star positions that are not refined
-        are taken for right. Where the PSFs used have a reduced chi squared above 2, their error,
-        as residuals show it, is added to the noise. At least one star.
+        covariance of a blur, the Strehl ratio between it and ``ideal_psfs``, phases across
+        ``pupils``, the coefficients of ``psf_modes``; and with two stars or more each pixel, as far
+        as ``psf_scatter``, or what residuals show, allows. The PSFs given stand unless chi squared
+        exceeds its expectation by ten for each parameter, and falls by seven tenths of that. Star
+        positions that are not refined are taken for right. The error that is left is estimated;
+        where the PSFs used have a reduced chi squared above 2 it is added to the noise, and always
+        where it is given as ``psf_scatter``. At least one star.
+    round_source : bool, optional
+        Whether the extended source lies all round a star, as a disc, a ring or a host: else what
+        does is taken for the star's while its PSF is refined.
     checkpoint : str or path, optional
         File for checkpoints (FITS): written after the first iteration, then every
         `checkpoint_every` seconds, and at the end. Each replaces the one before once it is
@@ -231,7 +237,9 @@ def deconvolve(
     observation = copy(observation)  # its arrays are read-only, but its attributes may be replaced
     check_choices(solver, precision, engine, device)
     check_length(n_iter, stop)
-    check_types(callback, progress=progress, refine_positions=refine_positions)
+    check_types(
+        callback, progress=progress, refine_positions=refine_positions, round_source=round_source
+    )
     fits_stars = solver == "sgp" or bool(refine_positions)
     # What can be read once, or has no order that NumPy knows, is no array_like.
     listed: Any = list(stars) if isinstance(stars, (Iterator, Set)) else stars
@@ -242,10 +250,10 @@ def deconvolve(
     families = check_families(refine_psfs, observation, positions, refine_positions)
     setup = Setup(positions, pad, solver, precision, engine, device, refine_positions)
     refinement = None
-    if families:
+    if families or len(observation.psf_scatter):
         from lnocl.runs.psf_refinement import refine_psfs as refine  # which loads scipy
 
-        observation, refinement = refine(setup, observation, families)
+        observation, refinement = refine(setup, observation, families, round_source)
     penalties = read_penalties(mu, smoothing, stop, observation)
     if engine == "opencl" and precision == "single":
         warn_of_rounding(int(n_iter))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError
-from lnocl.scene.observation import numbers, unmasked
+from lnocl.scene.arrays import numbers, unmasked
 
 Array = NDArray[np.float64]
 

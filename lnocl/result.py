@@ -113,8 +113,10 @@ class Result:
         The relative error of the extended source that held-out counts estimate, for each smoothing
         and iteration that they compared last. Empty where they did not choose.
     psf_refinement : PsfRefinement or None
-        What became of the PSFs that were to be refined: ``parameters``, ``values``, ``misfit``
-        before and after, ``is_accepted``. None where they were not to be.
+        What became of the PSFs that were to be refined, or have a scatter that is given:
+        ``parameters``, ``values``, ``misfit`` before and after, ``is_accepted``, and the error that
+        is left: ``psf_error``, ``edges``, ``errors_in_rings``, ``is_noise``, ``may_be_faked``. None
+        without either.
     """
 
     extended: Array
@@ -141,6 +143,16 @@ class Result:
     def psfs(self) -> Array:
         """The PSFs of the model, shape (p, ky, kx), of unit sum: as given or refined."""
         return self._outcome.scene.observation.psfs
+
+    @property
+    def doubtful(self) -> NDArray[np.bool_]:
+        """Pixels of the extended source, shape (ny, nx), that errors of the PSFs may have faked.
+
+        Those below ``psf_refinement.may_be_faked``; none where that was not asked for.
+        """
+        if self.psf_refinement is None:
+            return np.zeros(self.extended.shape, np.bool_)
+        return self.extended < self.psf_refinement.may_be_faked
 
     def models(self) -> Array:
         """Return the m_j, shape (p, ny, nx), electrons per pixel.

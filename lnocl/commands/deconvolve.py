@@ -151,8 +151,9 @@ OPTIONS = {
             metavar="WHAT",
             card=("REFPSF", "asked of the PSFs"),
             help="fit the PSFs to the stars before the reconstruction, and use them where they fit "
-            "better: shift, jitter (a blur, or a sharpening), strehl (needs --ideal-psf), modes "
-            "(needs --psf-modes); at least one star",
+            "better: shift, jitter (a blur, or a sharpening), strehl (needs --ideal-psf or "
+            "--pupil), pupil (phases; needs --pupil), modes (needs --psf-modes), pixels "
+            "(needs two stars); at least one star",
         ),
         option(
             "--ideal-psf",
@@ -164,11 +165,38 @@ OPTIONS = {
             "images or one for each",
         ),
         option(
+            "--pupil",
+            dest="pupils",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="TSUM",
+            help="FITS file with the transmission of a pupil, of the shape of the PSFs and in "
+            "their frequencies, its middle at (ky // 2, kx // 2); one for all images or one "
+            "for each",
+        ),
+        option(
             "--psf-modes",
             metavar="FILE",
             checksum="LSUM",
             help="FITS file with a cube of the ways in which the PSFs may differ, one standard "
             "deviation each, of the shape of the PSFs and for all of them",
+        ),
+        option(
+            "--psf-scatter",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="SSUM",
+            help="FITS file with the standard deviation of the pixels of a PSF of unit sum, such "
+            "as psf.fits[SCATTER] of lnocl psf: it is added to the noise at the stars; one for "
+            "all images or one for each",
+        ),
+        option(
+            "--round-source",
+            action="store_true",
+            default=None,  # for no card where it is not given
+            card=("ROUND", "the source lies all round a star"),
+            help="with --refine-psfs: a disc, ring or host lies all round a star, so that what "
+            "does is not the PSF's",
         ),
         option(
             "--zero-point",
@@ -302,6 +330,8 @@ def _run(arguments: argparse.Namespace) -> None:
             cubes=_cubes(arguments, result),
             psf_fit=_refinement_table(result),
             psfs=result.psfs if repeated["refine_psfs"] else None,
+            psf_errors=_psf_errors(result),
+            doubtful=None if result.psf_refinement is None else result.doubtful,
             offsets=offsets,
         )
         if not arguments.quiet:
@@ -418,8 +448,21 @@ def _refinement_cards(result: Result) -> list[Card]:
         ("PSFUSED", found.is_accepted, "whether refined PSFs are used"),
         ("PSFMIS1", before, "reduced chi squared, PSFs as given"),
         ("PSFMIS2", after, "reduced chi squared, PSFs refined"),
-        ("PSFERR", found.psf_error, "relative error of the PSFs in the noise"),
+        ("PSFERR", found.psf_error, "relative error that the PSFs used have"),
+        ("PSFNOISE", found.is_noise, "whether it was added to the noise"),
     ]
+
+
+def _psf_errors(result: Result) -> Any:
+    """Return the relative error of the PSFs, a row a ring."""
+    found = result.psf_refinement
+    if found is None:
+        return None
+    columns = {"from": found.edges[:-1], "to": found.edges[1:], "error": found.errors_in_rings}
+    rows = np.zeros(len(found.errors_in_rings), [(name, float) for name in columns])
+    for name, values in columns.items():
+        rows[name] = values
+    return rows
 
 
 def _refinement_table(result: Result) -> Any:

@@ -79,7 +79,7 @@ def _verdict(result: Result, at_stars: Sequence[StarResiduals], overall: Fit | N
             lit.append(f"({x:.7g}, {y:.7g}), {100 * found.halo:.0f} %")
     verdict = []
     refinement = result.psf_refinement
-    if refinement is not None and refinement.psf_error:
+    if refinement is not None and refinement.is_noise:
         verdict.append(
             f"the PSFs are wrong by {100 * refinement.psf_error:.2g} %, which the noise at the "
             "stars was raised by: do not trust the sky near them, and give better PSFs"

@@ -193,6 +193,8 @@ class SavedResult(NamedTuple):
     history, curve, held_out : dict of str to ndarray of float64, or None
         Columns of the tables ``HISTORY``, ``CURVE`` and ``HELDOUT``; None for a table that is
         missing.
+    doubtful : ndarray of bool, shape (ny, nx), or None
+        The image ``DOUBTFUL``, where it is there.
     header : astropy.io.fits.Header
         Header of the extended source.
     path : str
@@ -205,6 +207,7 @@ class SavedResult(NamedTuple):
     history: dict[str, NDArray[np.float64]] | None
     curve: dict[str, NDArray[np.float64]] | None
     held_out: dict[str, NDArray[np.float64]] | None
+    doubtful: NDArray[np.bool_] | None
     header: fits.Header
     path: str
 
@@ -238,13 +241,15 @@ def read_result(path: str) -> SavedResult:
         A file that `read_stack` refuses, or whose tables are not those of a result.
     """
     image: tuple[NDArray[np.float64], fits.Header] | None = None
-    tables = {}
+    tables, doubtful = {}, None
     with open_fits(path) as file:
         for hdu in file.hdus():
             if image is None and has_pixels(hdu):
                 image = file.pixels(hdu), readable(hdu.header)
             elif isinstance(hdu, fits.BinTableHDU) and hdu.name in RESULT_TABLES:
                 tables[hdu.name] = file.columns(hdu)
+            elif has_pixels(hdu) and hdu.name == "DOUBTFUL":
+                doubtful = file.pixels(hdu) != 0
     if image is None:
         raise _NoImageError(f"{path} holds no image")
     extended, header = image
@@ -265,6 +270,7 @@ def read_result(path: str) -> SavedResult:
         tables.get("HISTORY"),
         tables.get("CURVE"),
         tables.get("HELDOUT"),
+        doubtful,
         header,
         path,
     )

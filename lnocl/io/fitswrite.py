@@ -49,6 +49,8 @@ def write_result(
     offsets: ArrayLike = (),
     psf_fit: NDArray[np.void] | None = None,
     psfs: ArrayLike | None = None,
+    psf_errors: NDArray[np.void] | None = None,
+    doubtful: ArrayLike | None = None,
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
@@ -94,6 +96,10 @@ def write_result(
         The parameters of the PSFs that were refined.
     psfs : array_like, shape (p, ky, kx), optional
         The PSFs of the model.
+    psf_errors : ndarray with fields ``from``, ``to`` and ``error``, optional
+        The relative error of the PSFs in rings round a star.
+    doubtful : array_like of bool, shape (ny, nx), optional
+        Pixels in which errors of the PSFs may have faked all there is.
 
     Raises
     ------
@@ -116,6 +122,8 @@ def write_result(
             *(_cube(name, *cube, shared) for name, cube in cubes.items()),
             *([] if psf_fit is None else [_table("PSFFIT", psf_fit)]),
             *([] if psfs is None else [fits.ImageHDU(np.asarray(psfs, np.float64), name="PSFS")]),
+            *([] if psf_errors is None else [_table("PSFERRORS", psf_errors)]),
+            *([] if doubtful is None else [_flags("DOUBTFUL", doubtful, shared)]),
         ]
     )
     with whole_file(path, overwrite) as stream:
@@ -257,6 +265,10 @@ def _cube(name: str, images: ArrayLike, unit: str, header: fits.Header) -> fits.
     if unit:
         hdu.header["BUNIT"] = unit
     return hdu
+
+
+def _flags(name: str, flags: ArrayLike, header: fits.Header) -> fits.ImageHDU:
+    return fits.ImageHDU(np.asarray(flags, dtype=np.uint8), header, name=name)
 
 
 def _table(name: str, rows: NDArray[np.void]) -> fits.BinTableHDU:

@@ -53,6 +53,8 @@ class Calibration(NamedTuple):
         As for `Observation`.
     ideal_psfs : sequence of str
         Files of the PSFs without aberrations, as for `Observation`.
+    pupils, psf_scatter : sequence of str
+        Files of pupils, and of the scatter of PSFs, as for `Observation`.
     psf_modes : str, optional
         File of a cube of the modes of all PSFs, as for `Observation`.
     """
@@ -67,6 +69,8 @@ class Calibration(NamedTuple):
     align: str | None = None
     psf_centre: str = "check"
     ideal_psfs: Sequence[str] = ()
+    pupils: Sequence[str] = ()
+    psf_scatter: Sequence[str] = ()
     psf_modes: str | None = None
 
 
@@ -174,8 +178,13 @@ class _Reader:
 
     def _psf_errors(self) -> dict[str, Array]:
         """Return what is known of the ways in which PSFs may be wrong."""
-        modes = self._calibration.psf_modes
-        files = {"ideal_psfs": self._calibration.ideal_psfs, "psf_modes": [modes] if modes else []}
+        given = self._calibration
+        files = {
+            "ideal_psfs": given.ideal_psfs,
+            "pupils": given.pupils,
+            "psf_scatter": given.psf_scatter,
+            "psf_modes": [given.psf_modes] if given.psf_modes else [],
+        }
         found = {}
         for name, paths in files.items():
             if paths:

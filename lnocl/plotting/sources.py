@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl import metrics
 
@@ -36,12 +37,15 @@ class Source:
         Whether the star is part of it (RLM) rather than a component of its own (MC-RL).
     note : str
         A line under its name, in titles.
+    doubtful : ndarray of bool, shape (ny, nx), or None
+        Pixels to outline, where errors of the PSFs may have faked what is there.
     """
 
     name: str
     extended: Array
     holds_star: bool = False
     note: str = ""
+    doubtful: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +153,8 @@ def draw_panels(
             extent=(x[0] - step, x[-1] + step, y[0] - step, y[-1] + step),
         )
         axis.set_title("\n".join(filter(None, (source.name, source.note))), fontsize=11)
+        if source.doubtful is not None and source.doubtful.any():
+            axis.contour(x, y, source.doubtful, [0.5], colors="red", linewidths=0.8)
         if last is None or last.is_last_row():
             axis.set_xlabel(frame.label("x"))
         if frame.star is not None:

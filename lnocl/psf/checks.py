@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError
 from lnocl.psf.centring import Array, Mask
-from lnocl.scene.observation import numbers, unmasked, values_and_mask
+from lnocl.scene.arrays import numbers, unmasked, values_and_mask
 
 MIN_SIZE = 3
 # Values beyond this have no finite variance in float64.

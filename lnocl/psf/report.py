@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import median_filter
 
 from lnocl.errors import InputError
+from lnocl.scene.arrays import numbers
 from lnocl.scene.cores import centre, fwhm, off_centre
-from lnocl.scene.observation import FAR_OFF_CENTRE, LITTLE_OFF_CENTRE, numbers
+from lnocl.scene.observation import FAR_OFF_CENTRE, LITTLE_OFF_CENTRE
 
 # Wings and border are squares round the centre, as shares of half the side.
 WINGS, BORDER = (0.55, 0.7), (0.85, 1.0)

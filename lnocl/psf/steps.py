@@ -14,7 +14,7 @@ from lnocl.psf import resampling
 from lnocl.psf.centring import FWHM, SEARCH, Array, Mask, Pixel, Point, brightest, fit_gaussian
 from lnocl.psf.checks import MIN_SIZE, one_number
 from lnocl.psf.repair import WINDOW, repair
-from lnocl.scene.observation import numbers
+from lnocl.scene.arrays import numbers
 
 # Pixels around the crop while it is shifted and rotated: both wrap round its edges.
 MARGIN = 16

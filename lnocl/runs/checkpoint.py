@@ -20,7 +20,8 @@ from lnocl.runs.held_out import HeldOutCounts
 from lnocl.runs.run import Run, Setup, engine_name
 from lnocl.runs.saved import Saved
 from lnocl.runs.stopping import Rule
-from lnocl.scene.observation import Observation, numbers
+from lnocl.scene.arrays import numbers
+from lnocl.scene.observation import Observation
 from lnocl.solvers.engine import State
 
 OBSERVED = ("images", "psfs", "background", "mask", "exposure", "offsets")

@@ -85,7 +85,8 @@ def check_families(
     ------
     InputError
         A name is unknown, or a text stands for the sequence; there is no star; the observation
-        lacks the ideal PSFs or modes; a shift of one image is asked beside free positions.
+        lacks the ideal PSFs, pupils or modes; pupils differ in their apertures; pixels are asked of
+        one star, or a shift of one image beside free positions.
     """
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise InputError(f"refine_psfs is {names!r}; give a sequence of {', '.join(FAMILIES)}")
@@ -95,9 +96,22 @@ def check_families(
             raise InputError(f"refine_psfs {name!r} is not known; give {', '.join(FAMILIES)}")
     if found and not len(positions):
         raise InputError("refine_psfs needs a star, whose image shows the PSF; give stars")
-    for name, needed in (("strehl", "ideal_psfs"), ("modes", "psf_modes")):
+    if len(observation.psf_scatter) and not len(positions):
+        raise InputError("psf_scatter is the noise at stars; give stars, or leave psf_scatter out")
+    needs = {"strehl": "ideal_psfs", "pupil": "pupils", "modes": "psf_modes"}
+    for name, needed in needs.items():
         if name in found and not getattr(observation, needed).size:
             raise InputError(f"refine_psfs {name} needs {needed}; give them, or leave {name} out")
+    if "pupil" in found:
+        from lnocl.scene.pupils import Pupil  # which loads scipy
+
+        if len({Pupil(each).n_phases for each in observation.pupils}) > 1:
+            raise InputError("pupils differ in their number of apertures; give as many in each")
+    if "pixels" in found and len(positions) < 2:
+        raise InputError(
+            "refine_psfs pixels needs two stars or more, since the pixels of one PSF may mimic any "
+            "sky; give more stars, or leave pixels out"
+        )
     if "shift" in found and refine_positions and observation.n_images == 1:
         raise InputError(
             "refine_psfs shift of one image is told from nothing but the stars' places; leave it "

@@ -33,8 +33,17 @@ class PsfRefinement:
         Whether the refined PSFs are used: chi squared of those given exceeds its expectation by
         ten for each parameter and more, and seven tenths of that are mended.
     psf_error : float
-        Relative error that the PSFs used still have, weighted by their squares, which was made a
-        part of the noise as it makes their misfit more than 2; else 0.
+        Relative error that the PSFs used still have, by the corrections of their pixels that fit
+        the images best (`lnocl.runs.psf_errors`), or as given by ``psf_scatter``. A PSF that is too
+        wide or too narrow it hardly shows where a wider source explains the images as well.
+    edges, errors_in_rings : ndarray of float64, shapes (k + 1,) and (k,)
+        Radii of rings round a star, pixels, and that error in each.
+    is_noise : bool
+        Whether this error was made a part of the noise: it was given, or the misfit of the PSFs
+        used is more than 2, and the error at most 0.15.
+    may_be_faked : ndarray of float64, shape (ny, nx)
+        What this error may fake in the sky, electrons per pixel: in each ring its share of the
+        stars, seen through the PSFs, over the square root of p.
     """
 
     parameters: tuple[str, ...]
@@ -42,6 +51,10 @@ class PsfRefinement:
     misfit: tuple[float, float]
     is_accepted: bool
     psf_error: float
+    edges: Array
+    errors_in_rings: Array
+    is_noise: bool
+    may_be_faked: Array
 
 
 @dataclass(frozen=True)

@@ -7,18 +7,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, counted, warn
 from lnocl.scene import containers
+from lnocl.scene.arrays import numbers, refuse_masked, unmasked, values_and_mask
 from lnocl.scene.cores import centre, off_centre, peak
+from lnocl.scene.psf_errors import check_modes, check_pixels
 
 Array = NDArray[np.float64]
-
-# The advice where these have masked values, which only images and frames of stars may have.
-UNMASK = {
-    "psfs": "repair {them} first, as lnocl.psf.make_psf does",
-    "background": "fill {them} and add {their} mask to mask",
-    "read_noise": "fill {them} and add {their} mask to mask",
-    "exposure": "fill {them} and add {their} mask to mask",
-}
-
 
 # An array whose last axis is so short, and the others so long, has its channels last.
 MAX_CHANNELS = 4
@@ -69,10 +62,17 @@ class Observation:
         "fit": it is moved to its centre (`lnocl.scene.shifting.place`). "given": nothing.
     ideal_psfs : array_like, shape (p, ky, kx) or (ky, kx), optional
         The PSFs without aberrations, limited by diffraction alone, for ``refine_psfs`` "strehl";
-        like `psfs` in shape, centre and normalisation.
+        like `psfs` in shape, centre and normalisation. By default those of `pupils`.
+    pupils : array_like, shape (p, ky, kx) or (ky, kx), optional
+        Transmissions of the pupils, zero or more, of the shape of the PSFs, for ``refine_psfs``
+        "pupil" and "strehl". They are sampled at the frequencies of a PSF's transform, 0 in the
+        middle, ``(ky // 2, kx // 2)``: along x a pixel is wavelength / (kx * pixel scale) long.
     psf_modes : array_like, shape (p, n, ky, kx) or (n, ky, kx), optional
         Ways in which the PSFs may differ from those given, one standard deviation each, in units of
         PSFs of unit sum, for ``refine_psfs`` "modes".
+    psf_scatter : array_like, shape (p, ky, kx) or (ky, kx), optional
+        Standard deviation of the pixels of the PSFs, zero or more, in units of PSFs of unit sum,
+        as far as it is known: for the noise near stars, and ``refine_psfs`` "pixels".
 
     Attributes
     ----------
@@ -85,9 +85,10 @@ class Observation:
         As given.
     psfs : ndarray of float64, shape (p, ky, kx)
         Of unit sum.
-    ideal_psfs, psf_modes : ndarray of float64
-        Shapes (p, ky, kx) and (p, n, ky, kx), or (0, ky, kx) and (p, 0, ky, kx) where they were not
-        given.
+    ideal_psfs, pupils, psf_scatter : ndarray of float64
+        Shape (p, ky, kx), or (0, ky, kx) where they were not given.
+    psf_modes : ndarray of float64, shape (p, n, ky, kx)
+        n is 0 where they were not given.
     mask : ndarray of bool, shape (p, ny, nx)
         True where a pixel is bad.
 
@@ -131,7 +132,9 @@ class Observation:
         offsets: ArrayLike | None = None,
         psf_centre: str = "check",
         ideal_psfs: ArrayLike | None = None,
+        pupils: ArrayLike | None = None,
         psf_modes: ArrayLike | None = None,
+        psf_scatter: ArrayLike | None = None,
     ) -> None:
         has_exposure = exposure is not None
         counts, are_rates = containers.counts("images", images, has_exposure)
@@ -139,8 +142,10 @@ class Observation:
         self.images = _stack("images", given)
         self.mask = masked.copy().reshape(self.images.shape)
         self.psfs = _check_psfs(containers.bare("psfs", psfs), self.n_images, psf_centre)
+        self.pupils = check_pixels("pupils", pupils, self.psfs)
         self.ideal_psfs = self._check_ideals(ideal_psfs, psf_centre)
-        self.psf_modes = self._check_modes(psf_modes)
+        self.psf_modes = check_modes(psf_modes, self.psfs)
+        self.psf_scatter = check_pixels("psf_scatter", psf_scatter, self.psfs)
         self.offsets = self._check_offsets(offsets)
         self._apply_mask(mask)
         self.exposure = self._check_exposure(1.0 if exposure is None else exposure)
@@ -175,6 +180,10 @@ class Observation:
         return sum(array.nbytes for array in arrays.values())
 
     def _check_ideals(self, ideals: ArrayLike | None, psf_centre: str) -> Array:
+        if ideals is None and len(self.pupils):
+            from lnocl.scene.pupils import Pupil  # which loads scipy
+
+            return np.array([Pupil(pupil).ideal_psf() for pupil in self.pupils])
         if ideals is None:
             return np.zeros((0, *self.psfs.shape[1:]))
         checked = _check_psfs(containers.bare("ideal_psfs", ideals), self.n_images, psf_centre)
@@ -184,22 +193,6 @@ class Observation:
                 "give them in one shape"
             )
         return checked
-
-    def _check_modes(self, modes: ArrayLike | None) -> Array:
-        if modes is None:
-            return np.zeros((self.n_images, 0, *self.psfs.shape[1:]))
-        given = numbers("psf_modes", containers.bare("psf_modes", modes))
-        wanted = self.psfs.shape
-        if given.ndim == 3:
-            given = given[None]
-        if given.ndim != 4 or given.shape[0] not in (1, wanted[0]) or given.shape[2:] != wanted[1:]:
-            raise InputError(
-                f"psf_modes has shape {np.shape(modes)}; give (n, ky, kx), or one such cube for "
-                f"each of the {wanted[0]} images, with PSFs of shape {wanted[1:]}"
-            )
-        if not np.isfinite(given).all():
-            raise InputError("psf_modes hold values that are not finite; repair them first")
-        return np.broadcast_to(given, (wanted[0], *given.shape[1:])).copy()
 
     def _apply_mask(self, mask: ArrayLike | None) -> None:
         if mask is not None:
@@ -307,48 +300,6 @@ class Observation:
                 f"{_pixels(n_negative, 'image', 'negative', 'set to 0')}; if the images are "
                 "background-subtracted, add the background back and give it as background"
             )
-
-
-def values_and_mask(name: str, values: ArrayLike) -> tuple[NDArray, NDArray[np.bool_]]:
-    """Return values as an array, and where they are masked, by whatever class or in a list."""
-    try:
-        array: NDArray = np.ma.asanyarray(values)
-    except (TypeError, ValueError) as error:
-        if "inhomogeneous" not in str(error):
-            raise InputError(f"{name} cannot be read as an array: {error}") from error
-        raise InputError(f"{name} cannot be read as an array: its rows differ") from None
-    except MemoryError:
-        raise
-    except Exception as error:  # the caller's own __array__ may raise any
-        words = f"{type(error).__name__}: {error}"
-        raise InputError(f"{name} cannot be read as an array: {words}") from error
-    return np.ma.getdata(array, subok=False), np.ma.getmaskarray(array)
-
-
-def unmasked(name: str, values: ArrayLike) -> NDArray:
-    """Return values as an array; refuse masked ones."""
-    array, masked = values_and_mask(name, values)
-    refuse_masked(name, masked)
-    return array
-
-
-def refuse_masked(name: str, masked: NDArray[np.bool_]) -> None:
-    """Refuse masked values: below a mask there may be anything."""
-    if n_masked := int(np.count_nonzero(masked)):
-        them, their = ("it", "its") if n_masked == 1 else ("them", "their")
-        advice = UNMASK.get(name, "fill {them} or leave {them} out")
-        raise InputError(
-            f"{name} has {counted(n_masked, 'masked value')}; "
-            f"{advice.format(them=them, their=their)}"
-        )
-
-
-def numbers(name: str, values: ArrayLike) -> Array:
-    """Return a float64 copy of real numbers, none of them masked."""
-    array = unmasked(name, values)
-    if array.dtype.kind not in "biuf":
-        raise InputError(f"{name} holds {array.dtype}; give real numbers")
-    return array.astype(np.float64)
 
 
 def _stack(name: str, values: ArrayLike) -> Array:

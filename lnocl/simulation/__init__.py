@@ -7,6 +7,7 @@ source, one PSF for each hour angle, photon noise of target and sky, and read no
 from lnocl.simulation.fizeau import fizeau_psf
 from lnocl.simulation.images import Simulation, simulate
 from lnocl.simulation.photometry import electrons, photon_rate, pixel_magnitude
+from lnocl.simulation.pupil import circular_pupil, fizeau_pupil
 from lnocl.simulation.targets import Star, Target, hh34, load_target
 from lnocl.simulation.telescope import Experiment, collecting_area
 
@@ -15,9 +16,11 @@ __all__ = [
     "Simulation",
     "Star",
     "Target",
+    "circular_pupil",
     "collecting_area",
     "electrons",
     "fizeau_psf",
+    "fizeau_pupil",
     "hh34",
     "load_target",
     "photon_rate",

@@ -14,7 +14,7 @@ from scipy.special import expit
 
 from lnocl.errors import InputError
 from lnocl.io import fitsread
-from lnocl.scene.observation import unmasked
+from lnocl.scene.arrays import unmasked
 from lnocl.simulation.checks import check_shape, number
 
 # Below this the 24 rows around the star of `hh34` do not fit.

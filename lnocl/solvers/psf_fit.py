@@ -1,20 +1,21 @@
-r"""PSFs from the images themselves: a few parameters of each, the extended source marginalised.
+r"""PSFs from the images themselves: parameters of each, the extended source marginalised.
 
 The model of image j is ``m_j = A_j f + sum_s c_s P_js + b_j``, all of which hangs on the
 parameters theta_j of PSF j. Near an estimate
 
-.. math:: g_j \approx m_j + J \eta + A_j (a \psi), \qquad \psi \sim N(0, C)
+.. math:: g_j \approx m_j + J \eta + A_j (a C^{1/2} x) + D_j(y) * (f + \sum_s c_s \delta_s)
 
-with the changes eta of parameters, fluxes and positions, J the derivatives of the models, and an
-error of the extended source that is as large as it is, smoothed, a, and correlated over C. Both are
-fitted at once, weighted by 1 / m_j: eta is eliminated, psi found by conjugate gradients. Where f is
-held instead, it takes up a part of what is wrong with the PSFs, and eta lags and is biased.
+with the changes eta of parameters, fluxes and positions, J the derivatives of the models; an error
+of the extended source that is as large as it is, smoothed, a, and correlated over C; and, where
+they are free, the corrections D_j of the PSFs' pixels. The fields x and y are of N(0, 1). All are
+fitted at once, weighted by 1 / m_j: eta is eliminated, x and y found by conjugate gradients. Where
+f is held instead, it takes up a part of what is wrong with the PSFs, and eta lags and is biased.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import scipy.fft
@@ -24,7 +25,8 @@ from scipy.ndimage import gaussian_filter
 
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
-from lnocl.scene.psf_families import PsfFamilies
+from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
+from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.solvers.fluxes import MAX_FADING
 
@@ -33,6 +35,8 @@ from lnocl.solvers.fluxes import MAX_FADING
 CORRELATED, SMOOTHED = 1.5, 4.0
 # Steps of conjugate gradients, and the share of the gradient at which they end.
 N_STEPS, FINISHED = 40, 1e-4
+# Chi squared exceeds its expectation by so many of its standard deviations where PSFs are wrong.
+SIGNIFICANT = 5.0
 # Of the information's diagonal.
 ROUNDING = 1e-12
 # A step moves no parameter by more of its prior's standard deviations, and no star by more pixels.
@@ -40,9 +44,9 @@ MAX_STEP, MAX_MOVE = 3.0, 0.5
 
 
 class PsfStep(NamedTuple):
-    """Changes of PSF parameters, shape (p, k), and the stars' new fluxes and positions."""
+    """Changes of PSF parameters, and the stars' new fluxes and positions."""
 
-    parameters: Array
+    parameters: PsfParameters
     fluxes: Array
     positions: Array
 
@@ -50,7 +54,7 @@ class PsfStep(NamedTuple):
 def step(
     scene: Scene,
     families: PsfFamilies,
-    parameters: Array,
+    parameters: PsfParameters,
     extended: Array,
     fluxes: Array,
     moves: bool,
@@ -63,7 +67,7 @@ def step(
         Its PSFs are those of the parameters.
     families : PsfFamilies
         What the PSFs may be.
-    parameters : ndarray of float64, shape (p, k)
+    parameters : PsfParameters
         The present ones.
     extended : ndarray of float64, shape (Ny, Nx)
         Extended source, on the grid and scaled.
@@ -72,17 +76,21 @@ def step(
     moves : bool
         Whether the stars' positions are fitted too.
     """
-    model = Model(scene)
-    images = _linearise(scene, families, model, extended, fluxes, moves)
-    n, n_psf = len(fluxes), parameters.size
+    model, values = Model(scene), parameters.values
+    images = _linearise(scene, families, values, model, extended, fluxes, moves)
+    n, n_psf = len(fluxes), values.size
     at, prior = np.zeros((2, n_psf + n * (3 if moves else 1)))
-    at[:n_psf], prior[:n_psf] = parameters.ravel(), np.tile(families.prior**-2.0, len(parameters))
-    change = _Fit(images, model, _amplitude(extended), prior).solve(at)
-    longest = (abs(change[:n_psf].reshape(parameters.shape)) / families.prior).max(initial=0.0)
+    at[:n_psf], prior[:n_psf] = values.ravel(), np.tile(families.prior**-2.0, len(values))
+    fields: list[_Field] = [_SourceError(model, extended)]
+    if families.pixels is not None:
+        fields.append(_PixelErrors(scene, families.pixels, extended, fluxes, parameters.pixels))
+    change, changes = _Fit(images, fields, prior).solve(at)
+    longest = (abs(change[:n_psf].reshape(values.shape)) / families.prior).max(initial=0.0)
     change *= MAX_STEP / max(longest, MAX_STEP)
     to = np.maximum(fluxes + change[n_psf : n_psf + n], MAX_FADING * fluxes)
     moved = change[n_psf + n :].reshape(-1, n).T.clip(-MAX_MOVE, MAX_MOVE)
-    of_psfs = change[:n_psf].reshape(parameters.shape)
+    pixels = parameters.pixels if families.pixels is None else changes[1]
+    of_psfs = PsfParameters(change[:n_psf].reshape(values.shape), pixels)
     return PsfStep(of_psfs, to, scene.stars + moved if moves else scene.stars)
 
 
@@ -106,20 +114,24 @@ class Misfit(NamedTuple):
         """The square over its expectation: 1 where there is noise alone."""
         return self.square / self.n_pixels
 
+    @property
+    def excess(self) -> float:
+        """The square beyond its expectation."""
+        return self.square - self.n_pixels
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether the excess is one that noise may have, of five standard deviations at most."""
+        return bool(self.excess <= SIGNIFICANT * np.sqrt(2.0 * self.n_pixels))
+
 
 def misfit(scene: Scene, extended: Array, fluxes: Array) -> Misfit:
     """Return how well the PSFs of a scene fit, with fluxes fitted and the source marginalised."""
-    psfs, model = scene.observation.psfs, Model(scene)
-    held = PsfFamilies((), psfs, psfs, psfs)
-    images = _linearise(scene, held, model, extended, fluxes, False)
-    fit = _Fit(images, model, _amplitude(extended), np.zeros(len(fluxes)))
+    model, held = Model(scene), PsfFamilies((), scene.observation)
+    images = _linearise(scene, held, held.first().values, model, extended, fluxes, False)
+    fit = _Fit(images, [_SourceError(model, extended)], np.zeros(len(fluxes)))
     n_pixels = sum(int(np.count_nonzero(each.precision)) for each in images)
     return Misfit(fit.least_square(), n_pixels)
-
-
-def _amplitude(extended: Array) -> Array:
-    """Return how large the error of an extended source may be."""
-    return np.asarray(gaussian_filter(extended, SMOOTHED, mode="wrap"), np.float64)
 
 
 class _Image(NamedTuple):
@@ -146,6 +158,7 @@ class _Image(NamedTuple):
 def _linearise(
     scene: Scene,
     families: PsfFamilies,
+    values: Array,
     model: Model,
     extended: Array,
     fluxes: Array,
@@ -158,7 +171,8 @@ def _linearise(
         stars = [scene.star_image(j, s) for s in range(n)]
         light = diffuse[j] + sum(c * star for c, star in zip(fluxes, stars, strict=True))
         total = np.maximum(light + model.background[j], MIN_MODEL)
-        slopes = [*_psf_slopes(scene, families, j, light, extended, fluxes), *stars]
+        factors, modes = families.slopes(j, scene.grid, values[j])
+        slopes = [*_scaled(light, factors), *_convolved(scene, j, extended, fluxes, modes), *stars]
         if moves:
             slopes += _star_slopes(stars, fluxes)
         images.append(
@@ -172,24 +186,32 @@ def _linearise(
     return images
 
 
-def _psf_slopes(
-    scene: Scene, families: PsfFamilies, j: int, light: Array, extended: Array, fluxes: Array
-) -> Iterator[Array]:
-    """Yield the derivatives of a model with respect to the parameters of its PSF."""
-    factors, modes = families.slopes(j, scene.grid)
+def _scaled(light: Array, factors: Sequence[Any]) -> Iterator[Array]:
+    """Yield the light of an image, its spectrum multiplied by each factor."""
     whole = scipy.fft.rfft2(light)
     for factor in factors:
-        yield scipy.fft.irfft2(factor * whole, scene.grid)
+        yield scipy.fft.irfft2(factor * whole, light.shape)
+
+
+def _convolved(
+    scene: Scene, j: int, extended: Array, fluxes: Array, modes: Sequence[Spectrum]
+) -> Iterator[Array]:
+    """Yield the sky of an image seen through each mode."""
     if not modes:
         return
+    sky = _sky(scene, j, extended, fluxes)
+    for mode in modes:
+        yield scipy.fft.irfft2(mode * sky, scene.grid)
+
+
+def _sky(scene: Scene, j: int, extended: Array, fluxes: Array) -> Spectrum:
+    """Return the spectrum of all that PSF j is convolved with, stars and extended source."""
     u, v = _frequencies(scene.grid)
     dx, dy = scene.observation.offsets[j]
     sky = scipy.fft.rfft2(extended)
     for c, (x, y) in zip(fluxes, scene.stars, strict=True):
         sky = sky + c * np.exp(-2j * np.pi * (u * x + v * y))
-    sky *= scene.gains[j] * np.exp(-2j * np.pi * (u * dx + v * dy))
-    for mode in modes:
-        yield scipy.fft.irfft2(mode * sky, scene.grid)
+    return np.asarray(sky * (scene.gains[j] * np.exp(-2j * np.pi * (u * dx + v * dy))))
 
 
 def _star_slopes(stars: Sequence[Array], fluxes: Array) -> list[Array]:
@@ -207,27 +229,87 @@ def _frequencies(grid: tuple[int, ...]) -> tuple[Any, Any]:
     return np.fft.rfftfreq(grid[1])[None, :], np.fft.fftfreq(grid[0])[:, None]
 
 
+class _Field(Protocol):
+    """A field of many numbers x ~ N(0, 1), and what it changes in the images, linearly.
+
+    Attributes
+    ----------
+    at : ndarray of float64
+        x, where it is.
+    """
+
+    at: Array
+
+    def forward(self, x: Array) -> Iterable[Array]:
+        """Return the changes of the images, shape (p, Ny, Nx)."""
+
+    def adjoint(self, images: Sequence[Array]) -> Array:
+        """Return what `forward` is the transpose of, of the shape of x."""
+
+
+class _SourceError:
+    """The error of the extended source, ``A_j (a C^(1/2) x)``."""
+
+    def __init__(self, model: Model, extended: Array) -> None:
+        self._model = model
+        self._amplitude = gaussian_filter(extended, SMOOTHED, mode="wrap")
+        u, v = _frequencies(extended.shape)
+        root = np.exp(-((np.pi * CORRELATED) ** 2) * (u**2 + v**2))
+        self._root = root / np.sqrt(scipy.fft.irfft2(root**2, extended.shape)[0, 0])
+        self.at = np.zeros(extended.shape)
+
+    def forward(self, x: Array) -> Array:
+        return self._model.forward(self._amplitude * self._correlate(x))
+
+    def adjoint(self, images: Sequence[Array]) -> Array:
+        return self._correlate(self._amplitude * self._model.adjoint(images))
+
+    def _correlate(self, field: Array) -> Array:
+        spectrum = self._root * scipy.fft.rfft2(field, workers=-1)
+        return np.asarray(scipy.fft.irfft2(spectrum, field.shape, workers=-1), np.float64)
+
+
+class _PixelErrors:
+    """The errors of the pixels of the PSFs, ``D_j * (f + sum_s c_s delta_s)``."""
+
+    def __init__(
+        self, scene: Scene, pixels: PsfPixels, extended: Array, fluxes: Array, at: Array
+    ) -> None:
+        self._pixels, self._grid, self.at = pixels, scene.grid, at
+        self._skies = [_sky(scene, j, extended, fluxes) for j in range(scene.n_images)]
+        places = [np.arange(k) - k // 2 for k in at.shape[1:]]
+        self._places = np.ix_(*(at % n for at, n in zip(places, self._grid, strict=True)))
+
+    def forward(self, x: Array) -> Iterator[Array]:
+        for j, (field, sky) in enumerate(zip(x, self._skies, strict=True)):
+            change = spectrum(self._pixels.correction(j, field), self._grid)
+            yield scipy.fft.irfft2(change * sky, self._grid, workers=-1)
+
+    def adjoint(self, images: Sequence[Array]) -> Array:
+        fields = np.empty_like(self.at)
+        for j, (image, sky) in enumerate(zip(images, self._skies, strict=True)):
+            back = sky.conj() * scipy.fft.rfft2(image, workers=-1)
+            of_psf = scipy.fft.irfft2(back, self._grid, workers=-1)[self._places]
+            fields[j] = self._pixels.adjoint(j, of_psf)
+        return fields
+
+
 class _Fit:
-    """The least squares of unknowns and of the error of the extended source.
+    """The least squares of a few unknowns, and of fields.
 
     Parameters
     ----------
     images : list of _Image
         The images.
-    model : Model
-        For the A_j.
-    amplitude : ndarray of float64, shape (Ny, Nx)
-        a, how large the error of the extended source may be.
+    fields : list of _Field
+        The fields; one at least.
     prior : ndarray of float64, shape (k,)
         One over the variance of the prior of each unknown, 0 for none; its mean is 0.
     """
 
-    def __init__(self, images: list[_Image], model: Model, amplitude: Array, prior: Array) -> None:
-        self._images, self._model = images, model
-        self._amplitude, self._prior, self._grid = amplitude, prior, model.shape[1:]
-        u, v = _frequencies(self._grid)
-        root = np.exp(-((np.pi * CORRELATED) ** 2) * (u**2 + v**2))
-        self._root = root / np.sqrt(scipy.fft.irfft2(root**2, self._grid)[0, 0])
+    def __init__(self, images: list[_Image], fields: Sequence[_Field], prior: Array) -> None:
+        self._images, self._fields, self._prior = images, fields, prior
+        self._ends = np.cumsum([field.at.size for field in fields])[:-1]
         information = np.diag(prior)
         for each in images:
             block = (each.slopes * each.precision.ravel()) @ each.slopes.T
@@ -237,60 +319,68 @@ class _Fit:
         # Stars that nothing tells apart leave it singular.
         self._factor = scipy.linalg.cho_factor(scaled + ROUNDING * np.eye(len(prior)))
 
-    def solve(self, at: Array) -> Array:
-        """Return the change of the unknowns from where they are."""
-        return self._solve(self._prior * at)[0]
+    def solve(self, at: Array) -> tuple[Array, list[Array]]:
+        """Return the changes of the unknowns, from where they are, and of the fields."""
+        change, x = self._solve(self._prior * at)
+        return change, self._each(x)
 
     def least_square(self) -> float:
         """Return the least sum of squares, from unknowns at the means of their priors."""
-        change, psi = self._solve(np.zeros_like(self._prior))
-        left = self._left() - self._changes(change) - self._spread(psi)
+        change, x = self._solve(np.zeros_like(self._prior))
+        left = self._left() - self._changes(change) - self._forward(x)
         squares = [
-            float((e.precision * x * x).sum()) for e, x in zip(self._images, left, strict=True)
+            float((e.precision * r * r).sum()) for e, r in zip(self._images, left, strict=True)
         ]
-        return sum(squares) + float((psi * psi).sum() + self._prior @ change**2)
+        return sum(squares) + float((x * x).sum() + self._prior @ change**2)
 
     def _left(self) -> Array:
         return np.array([each.left for each in self._images])
 
     def _solve(self, pull: Array) -> tuple[Array, Array]:
-        """Return the change of the unknowns, and psi."""
+        """Return the changes of the unknowns, and of the fields, one after the other."""
         left = self._left()
         direct = self._invert(self._moments(left) - pull)
-        psi = self._find_psi(self._spread_adjoint(left - self._changes(direct)))
-        return self._invert(self._moments(left - self._spread(psi)) - pull), psi
+        at = np.concatenate([field.at.ravel() for field in self._fields])
+        x = self._find_fields(self._adjoint(left - self._changes(direct)) - at)
+        return self._invert(self._moments(left - self._forward(x)) - pull), x
 
-    def _find_psi(self, wanted: Array) -> Array:
-        """Return the error of the extended source, by conjugate gradients."""
-        psi, rest, along = np.zeros_like(wanted), wanted, wanted
-        square = first = float((rest * rest).sum())
+    def _find_fields(self, wanted: Array) -> Array:
+        """Return the changes of the fields, by conjugate gradients."""
+        x, rest, along = np.zeros_like(wanted), wanted, wanted
+        square = first = float(rest @ rest)
         for _ in range(N_STEPS):
             if square <= FINISHED**2 * first:
                 break
             image = self._curvature(along)
-            share = square / float((along * image).sum())
-            psi, rest = psi + share * along, rest - share * image
-            before, square = square, float((rest * rest).sum())
+            share = square / float(along @ image)
+            x, rest = x + share * along, rest - share * image
+            before, square = square, float(rest @ rest)
             along = rest + square / before * along
-        return psi
+        return x
 
-    def _curvature(self, psi: Array) -> Array:
-        """Return the second derivative along psi, the unknowns following it."""
-        images = self._spread(psi)
+    def _curvature(self, x: Array) -> Array:
+        """Return the second derivative along x, the unknowns following it."""
+        images = self._forward(x)
         images -= self._changes(self._invert(self._moments(images)))
-        return psi + self._spread_adjoint(images)
+        return x + self._adjoint(images)
 
-    def _spread(self, psi: Array) -> Array:
-        """Return the ``A_j (a C^(1/2) psi)``, shape (p, Ny, Nx)."""
-        return self._model.forward(self._amplitude * self._correlate(psi))
+    def _each(self, x: Array) -> list[Array]:
+        """Return each field, in its shape."""
+        parts = zip(np.split(x, self._ends), self._fields, strict=True)
+        return [part.reshape(field.at.shape) for part, field in parts]
 
-    def _spread_adjoint(self, images: Array) -> Array:
-        weighted = (each.precision * x for each, x in zip(self._images, images, strict=True))
-        return self._correlate(self._amplitude * self._model.adjoint(weighted))
+    def _forward(self, x: Array) -> Array:
+        """Return what the fields change in the images, shape (p, Ny, Nx)."""
+        images = np.zeros((len(self._images), *self._images[0].left.shape))
+        for field, part in zip(self._fields, self._each(x), strict=True):
+            for image, change in zip(images, field.forward(part), strict=True):
+                image += change
+        return images
 
-    def _correlate(self, field: Array) -> Array:
-        spectrum = self._root * scipy.fft.rfft2(field, workers=-1)
-        return np.asarray(scipy.fft.irfft2(spectrum, self._grid, workers=-1), np.float64)
+    def _adjoint(self, images: Array) -> Array:
+        """Return what `_forward` is the transpose of, the images weighted."""
+        weighted = [each.precision * x for each, x in zip(self._images, images, strict=True)]
+        return np.concatenate([field.adjoint(weighted).ravel() for field in self._fields])
 
     def _moments(self, images: Array) -> Array:
         """Return the products of images with the slopes, weighted."""
@@ -301,8 +391,12 @@ class _Fit:
 
     def _changes(self, change: Array) -> Array:
         """Return the changes of the models, shape (p, Ny, Nx), where the unknowns change."""
-        changes = [change[each.unknowns] @ each.slopes for each in self._images]
-        return np.array(changes).reshape(self._model.shape)
+        return np.array(
+            [
+                (change[each.unknowns] @ each.slopes).reshape(each.left.shape)
+                for each in self._images
+            ]
+        )
 
     def _invert(self, moments: Array) -> Array:
         return np.asarray(self._units * scipy.linalg.cho_solve(self._factor, self._units * moments))

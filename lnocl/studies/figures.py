@@ -69,7 +69,7 @@ def draw(
     _check_saved([*([] if true is None else [true]), *saved])
     names = _names(results, saved)
     sources = [
-        Source(name, each.extended, holds_star=not each.stars)
+        Source(name, each.extended, not each.stars, _note(each), each.doubtful)
         for name, each in zip(names, saved, strict=True)
     ]
     frame = _frame([*([] if true is None else [true]), *saved])
@@ -118,6 +118,12 @@ def _check_saved(saved: Sequence[fitsread.SavedResult]) -> None:
         for x, y in each.stars:
             if not (-0.5 <= x < nx - 0.5 and -0.5 <= y < ny - 0.5):
                 raise InputError(f"{each.path} has a star at ({x:g}, {y:g}), outside its image")
+
+
+def _note(result: fitsread.SavedResult) -> str:
+    """Return what the outline of a result means, where there is one."""
+    is_outlined = result.doubtful is not None and result.doubtful.any()
+    return "red: the PSF's error may be all there is" if is_outlined else ""
 
 
 def _names(paths: Sequence[str], saved: Sequence[fitsread.SavedResult]) -> list[str]:

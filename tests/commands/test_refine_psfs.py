@@ -18,7 +18,7 @@ PSF /= PSF.sum()
 IDEAL = np.exp(-((X - 16) ** 2 + (Y - 16) ** 2) / 4.0)
 MODES = np.array([np.roll(PSF, 1, 0) - PSF, np.roll(PSF, 1, 1) - PSF])
 SKY = 200.0 * np.exp(-((X - 15) ** 2) / 6.0 - ((Y - 19) / 5.0) ** 2)
-SKY[STAR[::-1]] += 3e4
+SKY[STAR[::-1]] += 1e5
 WORDS = ["deconvolve", "image.fits", "--psf", "psf.fits", "--star", "15,12", "--background", "40",
          "--engine", "numpy", "--n-iter", "20", "--stop", "none"]  # fmt: skip
 
@@ -26,8 +26,8 @@ WORDS = ["deconvolve", "image.fits", "--psf", "psf.fits", "--star", "15,12", "--
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    families = PsfFamilies(["jitter"], PSF[None], PSF[None], np.zeros((1, 0, N, N)))
-    true = families.psfs(np.array([[0.5, 0.1, 0.3]]))[0]
+    families = PsfFamilies(["jitter"], lnocl.Observation(np.ones((N, N)), PSF))
+    (true,) = families.psfs(families.first()._replace(values=np.array([[0.5, 0.1, 0.3]])))
     spectrum = np.fft.rfft2(SKY) * np.fft.rfft2(np.fft.ifftshift(true))
     counts = np.random.default_rng(0).poisson(np.fft.irfft2(spectrum, SKY.shape).clip(0) + 40.0)
     arrays = {"image": counts.astype(float), "psf": PSF, "ideal": IDEAL, "modes": MODES}

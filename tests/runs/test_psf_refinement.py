@@ -10,14 +10,13 @@ from scenes import PAPER
 import lnocl
 from lnocl.errors import LnoclWarning
 from lnocl.metrics import restoration_error, star_rows
-from lnocl.runs import psf_refinement
+from lnocl.runs import psf_refinement, short_runs
 from lnocl.runs.start import Setup
 from lnocl.scene.psf_families import PsfFamilies
 
 N, STAR, LEVEL = 64, (30, 24), 50.0
 Y, X = np.indices((N, N))
 R = np.hypot(X - N // 2, Y - N // 2)
-NONE = np.zeros((1, 0, N, N))
 
 
 def moffat(width, beta=2.5):
@@ -32,8 +31,8 @@ SKY += 300.0 * np.exp(-((X - 40) ** 2 + (Y - 30) ** 2) / 20.0)
 
 
 def changed(names, values, psf=PSF):
-    families = PsfFamilies(names, psf[None], IDEAL[None], NONE)
-    return families.psfs(np.array([values]))[0]
+    families = PsfFamilies(names, lnocl.Observation(np.ones((N, N)), psf, ideal_psfs=IDEAL))
+    return families.psfs(families.first()._replace(values=np.array([values])))[0]
 
 
 def images_through(psfs, contrast=3.0, seed=1):
@@ -135,8 +134,10 @@ class TestAnErrorThatIsLeft:
         images = images_through([self.TRUE], 30.0)
         result = refine(images, PSF, ("shift",), n_iter=300)
         true = np.linalg.norm(self.TRUE - PSF) / np.linalg.norm(PSF)
-        assert result.psf_refinement.psf_error == pytest.approx(true, rel=0.3)
-        assert "is added to the noise" in caplog.text
+        found = result.psf_refinement
+        assert found.psf_error == pytest.approx(true, rel=0.3)
+        assert found.is_noise
+        assert "PSFs left as given" in caplog.text
         plain = refine(images, PSF, (), n_iter=300)
         assert error(result) < 0.2 * error(plain)
         variance = result._outcome.scene.observation.read_noise[0] ** 2
@@ -152,11 +153,17 @@ class TestAnErrorThatIsLeft:
             warnings.simplefilter("always")
             result = lnocl.deconvolve(observation, [STAR], **options)
         assert any("the PSFs do not fit the stars, by" in str(each.message) for each in caught)
-        assert result.psf_refinement.psf_error == 0
+        assert result.psf_refinement.psf_error > 0.25
+        assert not result.psf_refinement.is_noise
         np.testing.assert_array_equal(result._outcome.scene.observation.read_noise, [0.0])
 
-    def test_it_is_0_where_psfs_fit(self):
-        assert refine(images_through([PSF]), PSF).psf_refinement.psf_error == 0
+    @pytest.mark.parametrize("contrast", [1.0, 10.0, 100.0])
+    def test_it_is_0_where_psfs_fit(self, contrast):
+        result = refine(images_through([PSF, PSF], contrast), [PSF, PSF])
+        found = result.psf_refinement
+        assert found.psf_error == 0
+        assert not found.is_noise
+        assert not result.doubtful.any()
 
     def test_it_is_that_of_mirrored_images(self):
         images = images_through([self.TRUE], 30.0)
@@ -169,15 +176,18 @@ class TestAnErrorThatIsLeft:
 
 
 def test_no_step_leads_to_psfs_of_no_light():
-    families = PsfFamilies(["jitter"], PSF[None], PSF[None], NONE)
-    start = np.zeros((1, 3))
-    short = psf_refinement._follow(families, start, np.array([[-40.0, 0.0, -40.0]]))
+    families = PsfFamilies(["jitter"], lnocl.Observation(np.ones((N, N)), PSF))
+    start = families.first()
+
+    def follow(*values):
+        change = start._replace(values=np.array([values]))
+        return psf_refinement._follow(families, start, change)
+
+    short = follow(-40.0, 0.0, -40.0)
     assert families.are_possible(short)
-    assert not families.are_possible(2.0 * short)
-    far = np.array([[0.5, 0.1, 0.2]])
-    np.testing.assert_array_equal(psf_refinement._follow(families, start, far), far)
-    nowhere = psf_refinement._follow(families, start, np.full((1, 3), np.nan))
-    np.testing.assert_array_equal(nowhere, start)
+    assert not families.are_possible(short.plus(short))
+    np.testing.assert_array_equal(follow(0.5, 0.1, 0.2).values, [(0.5, 0.1, 0.2)])
+    np.testing.assert_array_equal(follow(*3 * [np.nan]).values, start.values)
 
 
 def test_positions_are_refined_with_them():
@@ -208,7 +218,7 @@ def test_the_order_of_the_images_does_not_matter():
 
 
 def test_images_larger_than_the_window_are_looked_at_round_the_stars(monkeypatch):
-    monkeypatch.setattr("lnocl.runs.psf_refinement.WINDOW", 48)
+    monkeypatch.setattr("lnocl.runs.short_runs.WINDOW", 48)
     images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
     result = refine(images, PSF, ("jitter",))
     assert result.psf_refinement.is_accepted
@@ -216,18 +226,18 @@ def test_images_larger_than_the_window_are_looked_at_round_the_stars(monkeypatch
 
 
 def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
-    monkeypatch.setattr("lnocl.runs.psf_refinement.WINDOW", 32)
+    monkeypatch.setattr("lnocl.runs.short_runs.WINDOW", 32)
     observation = lnocl.Observation(np.ones((1, 100, 120)), np.ones((40, 5)))
     stars = np.array([(5.0, 90.0), (100.0, 20.0), (108.4, 24.0)])
     setup = Setup(stars, 0, "sgp", "single", "numpy", None)
-    cut, found, first = psf_refinement._window(setup, observation)
+    cut, found, first = short_runs.find_window(setup, observation)
     assert cut.shape == (32, 32)
     np.testing.assert_array_equal(first, (84, 4))
     np.testing.assert_array_equal(found, stars[1:] - (84, 4))
-    look = psf_refinement._Look(setup, cut, found)
-    assert look._seen_through(observation.psfs).psfs.shape == (1, 32, 5)
+    runs = short_runs.ShortRuns(setup, cut, found, False)
+    assert runs._seen_through(observation.psfs).psfs.shape == (1, 32, 5)
     whole = lnocl.Observation(np.ones((1, 20, 30)), np.ones((3, 3)))
-    cut, found, _ = psf_refinement._window(replace(setup, stars=np.array([(3.0, 4.0)])), whole)
+    cut, found, _ = short_runs.find_window(replace(setup, stars=np.array([(3.0, 4.0)])), whole)
     assert cut.shape == (20, 30)
     np.testing.assert_array_equal(found, [(3.0, 4.0)])
 
@@ -253,7 +263,7 @@ def test_a_run_goes_on_from_its_checkpoint_bit_for_bit(tmp_path):
 
 
 REFUSED = {
-    "one text": ({"names": "shift"}, "give a sequence of shift, jitter, strehl, modes"),
+    "one text": ({"names": "shift"}, "give a sequence of shift, jitter, strehl, pupil, modes"),
     "no sequence": ({"names": 1}, "give a sequence"),
     "unknown": ({"names": ["tilt"]}, "refine_psfs 'tilt' is not known"),
     "no modes": ({"names": ["modes"]}, "refine_psfs modes needs psf_modes"),

@@ -574,6 +574,8 @@ def test_the_arrays_of_an_observation_are_read_only(maps):
         "offsets",
         "ideal_psfs",
         "psf_modes",
+        "pupils",
+        "psf_scatter",
     )
     assert set(vars(observation)) == set(names)
     for name in names:

@@ -1,5 +1,7 @@
 """A step for PSFs and stars: its slopes by differences, the step by an explicit matrix."""
 
+from copy import copy
+
 import numpy as np
 import pytest
 
@@ -42,8 +44,9 @@ def a_scene(psfs=PSFS, stars=STARS, **known):
 
 
 def families(scene):
-    observation = scene.observation
-    return PsfFamilies(NAMES, PSFS, observation.ideal_psfs, observation.psf_modes)
+    given = copy(scene.observation)
+    given.psfs = PSFS
+    return PsfFamilies(NAMES, given, 0.1 * PSFS)
 
 
 @pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)

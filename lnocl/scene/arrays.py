@@ -1,0 +1,60 @@
+"""Arrays of numbers from whatever a caller gives, masked or not."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lnocl.errors import InputError, counted
+
+Array = NDArray[np.float64]
+
+# The advice where these have masked values, which only images and frames of stars may have.
+UNMASK = {
+    "psfs": "repair {them} first, as lnocl.psf.make_psf does",
+    "background": "fill {them} and add {their} mask to mask",
+    "read_noise": "fill {them} and add {their} mask to mask",
+    "exposure": "fill {them} and add {their} mask to mask",
+}
+
+
+def values_and_mask(name: str, values: ArrayLike) -> tuple[NDArray, NDArray[np.bool_]]:
+    """Return values as an array, and where they are masked, by whatever class or in a list."""
+    try:
+        array: NDArray = np.ma.asanyarray(values)
+    except (TypeError, ValueError) as error:
+        if "inhomogeneous" not in str(error):
+            raise InputError(f"{name} cannot be read as an array: {error}") from error
+        raise InputError(f"{name} cannot be read as an array: its rows differ") from None
+    except MemoryError:
+        raise
+    except Exception as error:  # the caller's own __array__ may raise any
+        words = f"{type(error).__name__}: {error}"
+        raise InputError(f"{name} cannot be read as an array: {words}") from error
+    return np.ma.getdata(array, subok=False), np.ma.getmaskarray(array)
+
+
+def unmasked(name: str, values: ArrayLike) -> NDArray:
+    """Return values as an array; refuse masked ones."""
+    array, masked = values_and_mask(name, values)
+    refuse_masked(name, masked)
+    return array
+
+
+def refuse_masked(name: str, masked: NDArray[np.bool_]) -> None:
+    """Refuse masked values: below a mask there may be anything."""
+    if n_masked := int(np.count_nonzero(masked)):
+        them, their = ("it", "its") if n_masked == 1 else ("them", "their")
+        advice = UNMASK.get(name, "fill {them} or leave {them} out")
+        raise InputError(
+            f"{name} has {counted(n_masked, 'masked value')}; "
+            f"{advice.format(them=them, their=their)}"
+        )
+
+
+def numbers(name: str, values: ArrayLike) -> Array:
+    """Return a float64 copy of real numbers, none of them masked."""
+    array = unmasked(name, values)
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{name} holds {array.dtype}; give real numbers")
+    return array.astype(np.float64)

@@ -1,0 +1,48 @@
+"""Pixels of PSFs that are free, within what is known of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Errors of PSFs are correlated over this, pixels.
+CORRELATED = 0.6
+
+
+class PsfPixels:
+    r"""Corrections of PSFs G, pixel by pixel.
+
+    .. math:: D = \delta - G \sum \delta, \qquad \delta = s \, C^{1/2} x, \qquad x \sim N(0, 1)
+
+    with the scatter s of the PSF, correlated over C; no light is won or lost.
+
+    Parameters
+    ----------
+    psfs : ndarray of float64, shape (p, ky, kx)
+        The given PSFs.
+    scatter : ndarray of float64, shape (p, ky, kx)
+        The standard deviations of their pixels.
+    """
+
+    def __init__(self, psfs: Array, scatter: Array) -> None:
+        self._psfs, self._scatter = psfs, scatter
+        self.shape = psfs.shape[1:]
+        u, v = scipy.fft.rfftfreq(self.shape[1]), scipy.fft.fftfreq(self.shape[0])[:, None]
+        root = np.exp(-((np.pi * CORRELATED) ** 2) * (u**2 + v**2))
+        self._root = root / np.sqrt(scipy.fft.irfft2(root**2, self.shape)[0, 0])
+
+    def correction(self, j: int, field: Array) -> Array:
+        """Return the correction of PSF j, shape (ky, kx)."""
+        change = self._scatter[j] * self._correlate(field)
+        return np.asarray(change - change.sum() * self._psfs[j])
+
+    def adjoint(self, j: int, image: Array) -> Array:
+        """Return what `correction` is the transpose of."""
+        return self._correlate(self._scatter[j] * (image - (self._psfs[j] * image).sum()))
+
+    def _correlate(self, field: Array) -> Array:
+        spectrum = self._root * scipy.fft.rfft2(field, workers=-1)
+        return np.asarray(scipy.fft.irfft2(spectrum, self.shape, workers=-1), np.float64)

@@ -1,0 +1,111 @@
+"""Pupils of telescopes, sampled for the PSFs that they make."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from astropy import units as u
+
+from lnocl.errors import InputError
+from lnocl.simulation.checks import Array, check_shape, number, positive
+from lnocl.simulation.telescope import APERTURE_DIAMETER, BASELINE, OBSCURATION_DIAMETER
+
+# A pixel that an edge cuts is open by the share of its points inside, so many along an axis.
+POINTS = 8
+
+
+def circular_pupil(
+    shape: tuple[int, int],
+    wavelength: u.Quantity,
+    pixel_scale: u.Quantity,
+    diameter: u.Quantity,
+    obscuration: u.Quantity = 0.0 * u.m,
+    centres: Sequence[u.Quantity] = ((0.0, 0.0) * u.m,),
+) -> Array:
+    r"""Return the transmission of a pupil of circular apertures, for `Observation`'s ``pupils``.
+
+    A pixel is ``wavelength / (n pixel_scale)`` long, with n the PSF's pixels along the axis, so
+    that the PSF without aberrations is :math:`|F(P)|^2`, light beyond its frame wrapped round.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Shape (ny, nx) of the PSF; each even and `MIN_SIZE` or more.
+    wavelength : Quantity
+        A length, positive.
+    pixel_scale : Quantity
+        Angle per pixel of the PSF, positive.
+    diameter, obscuration : Quantity
+        Of each aperture, and of what stands in its middle; lengths, the first more than the second.
+    centres : sequence of Quantity, each of shape (2,), optional
+        (x, y) of the apertures, lengths; by default one in the middle.
+
+    Returns
+    -------
+    ndarray of float64, shape (ny, nx)
+        In 0 to 1; the middle of the pupil is at ``(ny // 2, nx // 2)``.
+
+    Raises
+    ------
+    InputError
+        An argument has the wrong unit or is out of range, or an aperture lies beyond the frame.
+
+    References
+    ----------
+    J. W. Goodman, "Introduction to Fourier Optics", section 6.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from lnocl.simulation import circular_pupil
+    >>> pupil = circular_pupil((64, 64), 1 * u.um, 10 * u.mas, 8 * u.m)
+    >>> bool(pupil[32, 32] == 1), bool(pupil[0, 0] == 0)
+    (True, True)
+    """
+    ny, nx = check_shape(shape)
+    length = positive("wavelength", wavelength, u.m)
+    scale = positive("pixel_scale", pixel_scale, u.rad)
+    outer = positive("diameter", diameter, u.m) / 2.0
+    inner = number("obscuration", obscuration, u.m, 0.0) / 2.0
+    if inner >= outer:
+        raise InputError(f"obscuration must be less than diameter; {obscuration} was given")
+    y, x = (length / scale * _points(n) for n in (ny, nx))
+    pupil = np.zeros((ny * POINTS, nx * POINTS))
+    for centre in centres:
+        at_x, at_y = (number("centres", value, u.m) for value in centre)
+        if abs(at_x) + outer > x[-1] or abs(at_y) + outer > y[-1]:
+            raise InputError(
+                f"an aperture reaches beyond the frame of {2 * x[-1]:.3g} m: give finer pixels"
+            )
+        r = np.hypot(y[:, None] - at_y, x - at_x)
+        pupil += (r <= outer) & (r >= inner)
+    return pupil.reshape(ny, POINTS, nx, POINTS).mean(axis=(1, 3))
+
+
+def fizeau_pupil(
+    shape: tuple[int, int], angle: u.Quantity, wavelength: u.Quantity, pixel_scale: u.Quantity
+) -> Array:
+    """Return the two apertures of the Large Binocular Telescope: those of `fizeau_psf`.
+
+    Parameters, shape, middle and errors are those of `circular_pupil`; `angle` is that of the
+    baseline, from the x axis towards the y axis.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from lnocl.simulation import fizeau_pupil
+    >>> pupil = fizeau_pupil((128, 128), 0 * u.deg, 2.12 * u.um, 5 * u.mas)
+    >>> bool(pupil[64, 64] == 0), round(float(pupil.sum() * (2.12e-6 / 5 * 206264806 / 128) ** 2))
+    (True, 110)
+    """
+    theta = number("angle", angle, u.rad)
+    half = BASELINE / 2.0 * (math.cos(theta), math.sin(theta))
+    apertures = APERTURE_DIAMETER, OBSCURATION_DIAMETER, (half, -half)
+    return circular_pupil(shape, wavelength, pixel_scale, *apertures)
+
+
+def _points(n: int) -> Array:
+    """Return where the points in the pixels of an axis lie, 0 in the middle of pixel n // 2."""
+    return ((np.arange(n * POINTS) + 0.5) / POINTS - 0.5 - n // 2) / n
