@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -30,9 +29,9 @@ class PsfPixels:
     def __init__(self, psfs: Array, scatter: Array) -> None:
         self._psfs, self._scatter = psfs, scatter
         self.shape = psfs.shape[1:]
-        u, v = scipy.fft.rfftfreq(self.shape[1]), scipy.fft.fftfreq(self.shape[0])[:, None]
+        u, v = np.fft.rfftfreq(self.shape[1]), np.fft.fftfreq(self.shape[0])[:, None]
         root = np.exp(-((np.pi * CORRELATED) ** 2) * (u**2 + v**2))
-        self._root = root / np.sqrt(scipy.fft.irfft2(root**2, self.shape)[0, 0])
+        self._root = root / np.sqrt(np.fft.irfft2(root**2, self.shape)[0, 0])
 
     def correction(self, j: int, field: Array) -> Array:
         """Return the correction of PSF j, shape (ky, kx)."""
@@ -44,5 +43,5 @@ class PsfPixels:
         return self._correlate(self._scatter[j] * (image - (self._psfs[j] * image).sum()))
 
     def _correlate(self, field: Array) -> Array:
-        spectrum = self._root * scipy.fft.rfft2(field, workers=-1)
-        return np.asarray(scipy.fft.irfft2(spectrum, self.shape, workers=-1), np.float64)
+        spectrum = self._root * np.fft.rfft2(field)
+        return np.asarray(np.fft.irfft2(spectrum, self.shape), np.float64)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 Array = NDArray[np.float64]
 
@@ -39,9 +37,10 @@ class Pupil:
 
     def __init__(self, transmission: Array) -> None:
         self.shape = transmission.shape
-        self._lit = transmission > 0
+        apertures = _apertures(transmission > 0)
+        self._lit = np.any(apertures, axis=0)
         self._transmission = transmission[self._lit]
-        self._phases = _phases(transmission, self._lit)
+        self._phases = _phases(transmission, apertures, self._lit)
         self.n_phases = len(self._phases)
 
     def ideal_psf(self) -> Array:
@@ -66,34 +65,36 @@ class Pupil:
     def _field(self, wave: NDArray[np.complex128]) -> NDArray[np.complex128]:
         pupil = np.zeros(self.shape, complex)
         pupil[self._lit] = wave
-        return np.asarray(scipy.fft.fftshift(scipy.fft.fft2(scipy.fft.ifftshift(pupil))))
-
-
-def n_apertures(transmission: Array) -> int:
-    """Return the number of connected parts of a pupil."""
-    return len(_apertures(transmission > 0))
+        return np.asarray(np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(pupil))))
 
 
 def _apertures(lit: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    from scipy.ndimage import label  # which takes its time to load
+
     labels, n = label(lit, structure=np.ones((3, 3)))
     parts = [labels == i for i in range(1, n + 1)]
     least = LEAST_APERTURE * max((part.sum() for part in parts), default=0)
     return [part for part in parts if part.sum() >= least]
 
 
-def _phases(transmission: Array, lit: NDArray[np.bool_]) -> Array:
-    """Return the phases at the pixels of the pupil, shape (n, n_lit)."""
+def _phases(
+    transmission: Array, apertures: list[NDArray[np.bool_]], lit: NDArray[np.bool_]
+) -> Array:
+    """Return the phases at the pixels of the apertures, shape (n, n_lit)."""
     y, x = (each / max(lit.shape) for each in np.indices(lit.shape))
     columns = [np.ones(lit.shape), x, y]
     powers = [(a, d - a) for d in range(DEGREE + 1) for a in range(d, -1, -1)]
-    for part in _apertures(lit):
+    for part in apertures:
         reach = np.sqrt(part.sum()) / max(lit.shape)
         xs, ys = ((each - each[part].mean()) / reach * part for each in (x, y))
         columns += [part * xs**a * ys**b for a, b in powers]
-    weights = transmission[lit] ** 2 / (transmission[lit] ** 2).sum()
-    matrix = np.array([column[lit] for column in columns]).T * np.sqrt(weights)[:, None]
-    matrix /= np.linalg.norm(matrix, axis=0)
-    basis, triangle = np.linalg.qr(matrix)
-    own = np.abs(np.diag(triangle)) > SAME
-    own[:3] = False
-    return np.asarray((basis[:, own] / np.sqrt(weights)[:, None]).T)
+    weights = np.sqrt(transmission[lit] ** 2 / (transmission[lit] ** 2).sum())
+    basis: list[Array] = []
+    for column in columns:
+        own = weights * column[lit]
+        length = np.linalg.norm(own)
+        for _ in range(2):  # rounding leaves something of the others the first time
+            own = own - sum((each * (each @ own) for each in basis), 0.0)
+        if np.linalg.norm(own) > SAME * length:
+            basis.append(own / np.linalg.norm(own))
+    return np.array(basis[3:]).reshape(-1, lit.sum()) / weights

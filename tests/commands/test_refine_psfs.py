@@ -9,6 +9,8 @@ from astropy.io import fits
 
 import lnocl
 from lnocl.commands import cli
+from lnocl.io.fitsread import read_result
+from lnocl.plotting.sources import Frame, Source, draw_objects
 from lnocl.scene.psf_families import PsfFamilies
 
 N, STAR = 32, (15, 12)
@@ -56,9 +58,14 @@ def test_the_file_has_the_psfs_and_their_parameters(capsys):
         np.testing.assert_array_equal(
             [table[name][0] for name in names[1:]], result.psf_refinement.values[0]
         )
+        rings = hdus["PSFERRORS"].data
+        np.testing.assert_array_equal(rings["from"][1:], rings["to"][:-1])
+        np.testing.assert_array_equal(rings["error"], result.psf_refinement.errors_in_rings)
+        np.testing.assert_array_equal(hdus["DOUBTFUL"].data, result.doubtful)
         header = hdus[0].header
     assert [header["REFPSF1"], header["REFPSF2"], header["PSFUSED"]] == ["shift", "jitter", True]
     assert (header["PSFMIS1"], header["PSFMIS2"]) == result.psf_refinement.misfit
+    assert (header["PSFERR"], header["PSFNOISE"]) == (result.psf_refinement.psf_error, False)
     words = shlex.split("\n".join(header["HISTORY"]).replace("\\\n", ""))
     again = words[words.index("lnocl") + 1 :]
     assert cli.main([*again, "--overwrite"]) == 0
@@ -68,7 +75,7 @@ def test_the_file_has_the_psfs_and_their_parameters(capsys):
 def test_without_it_the_file_has_neither():
     assert run() == 0
     with fits.open("out.fits") as hdus:
-        assert not {"PSFS", "PSFFIT"} & {hdu.name for hdu in hdus}
+        assert not {"PSFS", "PSFFIT", "PSFERRORS", "DOUBTFUL"} & {hdu.name for hdu in hdus}
         assert "PSFUSED" not in hdus[0].header
 
 
@@ -78,6 +85,34 @@ def test_files_of_ideal_psfs_and_modes():
     with fits.open("out.fits") as hdus:
         assert hdus["PSFFIT"].data.names == ["image", "strehl_power", "modes_1", "modes_2"]
         assert {"DSUM1", "LSUM1"} <= set(hdus[0].header)
+
+
+def test_files_of_pupils_and_scatter():
+    fits.writeto("pupil.fits", (np.hypot(X - 16, Y - 16) < 6.0).astype(float))
+    fits.writeto("scatter.fits", 0.02 * PSF)
+    assert run("--refine-psfs", "pupil", "strehl", "--pupil", "pupil.fits", "--round-source",
+               "--psf-scatter", "scatter.fits") == 0  # fmt: skip
+    with fits.open("out.fits") as hdus:
+        names = ["image", "strehl_power", *(f"pupil_{i}" for i in range(1, 8))]
+        assert hdus["PSFFIT"].data.names == names
+        header = hdus[0].header
+        assert {"TSUM1", "SSUM1"} <= set(header)
+        assert header["ROUND"] is True
+        assert header["PSFNOISE"] is True
+        assert header["PSFERR"] == pytest.approx(0.02, rel=0.1)  # of other PSFs
+        assert hdus["DOUBTFUL"].data[STAR[::-1]] == 1
+
+
+def test_doubtful_pixels_are_outlined_and_said(capsys):
+    fits.writeto("scatter.fits", 0.05 * PSF)
+    assert run("--psf-scatter", "scatter.fits") == 0
+    assert cli.main(["plot", "out.fits", "--output", "figures"]) == 0
+    doubtful = read_result("out.fits").doubtful
+    np.testing.assert_array_equal(doubtful, fits.getdata("out.fits", "DOUBTFUL") == 1)
+    source = Source("found", fits.getdata("out.fits"), doubtful=doubtful)
+    figure = draw_objects(None, [source], Frame())
+    lines = [type(artist).__name__ for axis in figure.axes[:2] for artist in axis.collections]
+    assert lines == 2 * ["QuadContourSet"]
 
 
 REFUSED = {

@@ -13,6 +13,7 @@ from lnocl.metrics import restoration_error, star_rows
 from lnocl.runs import psf_refinement, short_runs
 from lnocl.runs.start import Setup
 from lnocl.scene.psf_families import PsfFamilies
+from lnocl.scene.pupils import Pupil
 
 N, STAR, LEVEL = 64, (30, 24), 50.0
 Y, X = np.indices((N, N))
@@ -267,6 +268,9 @@ REFUSED = {
     "no sequence": ({"names": 1}, "give a sequence"),
     "unknown": ({"names": ["tilt"]}, "refine_psfs 'tilt' is not known"),
     "no modes": ({"names": ["modes"]}, "refine_psfs modes needs psf_modes"),
+    "pixels of one star": ({"names": ["pixels"]}, "refine_psfs pixels needs two stars or more"),
+    "no pupils": ({"names": ["pupil"]}, "refine_psfs pupil needs pupils"),
+    "round": ({"round_source": 1}, "round_source must be True or False"),
     "one free shift": ({"names": ["shift"], "refine_positions": True}, "shift of one image"),
 }
 
@@ -283,3 +287,135 @@ def test_a_star_is_needed():
         lnocl.deconvolve(observation, refine_psfs=["shift"])
     with pytest.raises(lnocl.InputError, match="strehl needs ideal_psfs"):
         lnocl.deconvolve(observation, [STAR], refine_psfs=["strehl"])
+
+
+class TestPixels:
+    STARS = ((30, 24), (12, 50), (50, 12), (54, 52))
+    SPECKLES = np.random.default_rng(8).standard_normal((N, N))
+    SMOOTH = np.fft.ifft2(np.fft.fft2(SPECKLES) * np.fft.fft2(np.fft.ifftshift(IDEAL))).real
+    TRUE = PSF * (1.0 + 0.2 * SMOOTH / SMOOTH.std())
+    TRUE = TRUE / TRUE.sum()
+
+    def images(self, psf):
+        sky = SKY.copy()
+        for x, y in self.STARS:
+            sky[y, x] += 3.0 * SKY.sum()
+        spectrum = np.fft.rfft2(sky) * np.fft.rfft2(np.fft.ifftshift(psf))
+        means = np.fft.irfft2(spectrum, sky.shape).clip(0.0) + LEVEL
+        return np.random.default_rng(1).poisson(means).astype(float)[None]
+
+    def run(self, images, psf, names=("pixels",), **known):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LnoclWarning)
+            observation = lnocl.Observation(
+                images, psf, background=LEVEL, psf_centre="given", **known
+            )
+            options = {"n_iter": 40, "stop": None, "engine": "numpy", "pad": 0, "smoothing": 0}
+            return lnocl.deconvolve(observation, self.STARS, refine_psfs=names, **options)
+
+    def test_they_are_found_where_several_stars_show_them(self):
+        result = self.run(self.images(self.TRUE), PSF)
+        assert result.psf_refinement.is_accepted
+        assert result.psf_refinement.parameters == ()
+        assert np.linalg.norm(result.psfs[0] - self.TRUE) < 0.2 * np.linalg.norm(PSF - self.TRUE)
+        fluxes = result.star_fluxes / (3.0 * SKY.sum())
+        np.testing.assert_allclose(fluxes, 1.0, rtol=0, atol=0.02)
+        plain = self.run(self.images(self.TRUE), PSF, ())
+        assert error(result) < 0.5 * error(plain)
+
+    def test_of_right_psfs_they_stay(self):
+        result = self.run(self.images(PSF), PSF)
+        assert not result.psf_refinement.is_accepted
+        np.testing.assert_array_equal(result.psfs[0], PSF / PSF.sum())
+
+    def test_they_keep_to_the_scatter_that_is_given(self):
+        images = self.images(self.TRUE)
+        scatter = abs(self.TRUE - PSF) + 1e-9
+        free = self.run(images, PSF, psf_scatter=scatter)
+        assert free.psf_refinement.is_accepted
+        assert not free.psf_refinement.is_noise
+        held = self.run(images, PSF, psf_scatter=1e-4 * scatter)
+        assert not held.psf_refinement.is_accepted
+
+
+class TestAScatterThatIsGiven:
+    def test_it_is_the_noise_of_the_stars(self):
+        images, scatter = images_through([PSF], 30.0), 0.05 * PSF
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LnoclWarning)
+            observation = lnocl.Observation(images, PSF, background=LEVEL, psf_scatter=scatter)
+            result = lnocl.deconvolve(observation, [STAR], engine="numpy", pad=0, n_iter=5)
+        found = result.psf_refinement
+        assert found.is_noise
+        assert not found.is_accepted
+        assert found.psf_error == pytest.approx(0.05)
+        light = 30.0 * SKY.sum() * np.roll(PSF, (STAR[1] - N // 2, STAR[0] - N // 2), (0, 1))
+        variance = result._outcome.scene.observation.read_noise[0] ** 2
+        np.testing.assert_allclose(variance, (4 * 0.05 * light) ** 2, rtol=0.05, atol=1e-6)
+        np.testing.assert_allclose(found.may_be_faked, 0.05 * light, rtol=0.03, atol=1e-6)
+
+    def test_it_needs_a_star(self):
+        observation = lnocl.Observation(images_through([PSF]), PSF, psf_scatter=PSF)
+        with pytest.raises(lnocl.InputError, match="psf_scatter is the noise at stars; give stars"):
+            lnocl.deconvolve(observation)
+
+
+@pytest.mark.parametrize("exposure", [1.0, 40.0])
+def test_what_may_be_faked_is_the_share_of_the_light_in_the_sky(exposure):
+    true = TestAnErrorThatIsLeft.TRUE
+    images = images_through([true, true], 2.0)
+    observation = lnocl.Observation(
+        images, [PSF, PSF], background=LEVEL, psf_centre="given", exposure=exposure
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LnoclWarning)
+        result = lnocl.deconvolve(
+            observation, [STAR], refine_psfs=["shift"], engine="numpy", pad=0, n_iter=10, stop=None
+        )
+    found = result.psf_refinement
+    x, y = STAR
+    assert len(found.edges) == len(found.errors_in_rings) + 1
+    peak = found.errors_in_rings[0] * result.star_fluxes[0] * PSF.max() / np.sqrt(2)
+    assert found.may_be_faked[y, x] == pytest.approx(peak, rel=0.1)
+    np.testing.assert_array_equal(result.doubtful, result.extended < found.may_be_faked)
+    assert 0.0 < result.doubtful[y - 4 : y + 5, x - 4 : x + 5].mean() < 1.0
+
+
+def test_phases_across_a_pupil_are_found():
+    pupil = np.clip(12.5 - np.hypot(X - N // 2, Y - N // 2), 0.0, 1.0)
+    given = Pupil(pupil)
+    z = np.array([0.25, 0.1, -0.15, 0.1, 0.0, 0.15, 0.0])
+    ideal, true = given.ideal_psf(), given.psf(z)
+    options = {"n_iter": 40, "stop": None, "engine": "numpy", "pad": 0, "smoothing": 0}
+    results = []
+    for names in (("pupil",), ()):
+        observation = lnocl.Observation(
+            images_through([true]), ideal, background=LEVEL, psf_centre="given", pupils=pupil
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LnoclWarning)
+            results.append(lnocl.deconvolve(observation, [STAR], refine_psfs=names, **options))
+    found, plain = results
+    assert found.psf_refinement.is_accepted
+    assert found.psf_refinement.parameters == tuple(f"pupil {i}" for i in range(1, 8))
+    assert np.linalg.norm(found.psfs[0] - true) < 0.15 * np.linalg.norm(ideal - true)
+    assert error(found) < 0.5 * error(plain)
+
+
+def test_a_round_source_is_not_taken_for_the_star():
+    """A ring round a faint star, whose light is the star's by the rule, with the right PSF."""
+    ring = 400.0 * np.exp(-((np.hypot(X - STAR[0], Y - STAR[1]) - 6.0) ** 2) / 4.0)
+    sky = ring.copy()
+    sky[STAR[::-1]] += 0.3 * ring.sum()
+    spectrum = np.fft.rfft2(sky) * np.fft.rfft2(np.fft.ifftshift(PSF))
+    means = np.fft.irfft2(spectrum, sky.shape).clip(0.0) + LEVEL
+    images = np.random.default_rng(0).poisson(means).astype(float)
+    by_rule, free = (
+        refine(images, PSF, ("jitter", "strehl"), round_source=is_round)
+        for is_round in (False, True)
+    )
+    assert by_rule.psf_refinement.is_accepted
+    assert not free.psf_refinement.is_accepted
+    rows = star_rows(STAR, sky.shape)
+    errors = [restoration_error(each.extended, ring, rows) for each in (by_rule, free)]
+    assert errors[1] < 0.5 * errors[0]

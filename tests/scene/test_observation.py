@@ -412,6 +412,17 @@ REFUSED = {
         {"read_noise": IMAGES - 2},
         "read_noise must be finite and not negative; -1 was given",
     ),
+    "pupils of another shape": (
+        {"pupils": np.ones((2, 2))},
+        "pupils has shape (2, 2); give (2, 3), the shape of the PSFs, or one such map for each",
+    ),
+    "pupils below 0": ({"pupils": -np.ones((2, 3))}, "pupils hold values that are negative or not"),
+    "pupils that are closed": ({"pupils": np.zeros((2, 3))}, "pupils hold a map that is all 0"),
+    "scatter that is not finite": (
+        {"psf_scatter": np.full((2, 3), np.nan)},
+        "psf_scatter hold values that are negative or not finite; repair them first",
+    ),
+    "scatters of too few PSFs": ({"psf_scatter": np.ones((2, 2, 3))}, "psf_scatter has shape"),
     "all masked": ({"mask": np.ones((4, 4), bool)}, "all pixels are masked"),
     "all masked by numpy.ma": ({"images": np.ma.masked_all((3, 4, 4))}, "all pixels are masked"),
 }
@@ -583,3 +594,18 @@ def test_the_arrays_of_an_observation_are_read_only(maps):
             getattr(observation, name)[...] = 0
     for name, array in given.items():
         assert not maps or array.flags.writeable, name
+
+
+def test_ideal_psfs_are_those_of_the_pupils():
+    pupil = np.zeros((2, 3))
+    pupil[1, 1] = 1.0
+    observation = observe(pupils=pupil)
+    assert observation.pupils.shape == observation.psfs.shape
+    np.testing.assert_allclose(observation.ideal_psfs, 1.0 / 6.0)  # of one point
+    given = observe(pupils=pupil, ideal_psfs=PSF)
+    np.testing.assert_array_equal(given.ideal_psfs[0], PSF / PSF.sum())
+
+
+def test_one_scatter_serves_all_images():
+    scatter = observe(psf_scatter=0.1 * PSF).psf_scatter
+    np.testing.assert_array_equal(scatter, [0.1 * PSF] * len(IMAGES))
