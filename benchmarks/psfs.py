@@ -18,7 +18,7 @@ Columns: the best rho'' of 100 iterations with the true, the given and the refin
 at the end of a run with the defaults; the relative error of the PSFs given, of those used, and that
 which is said of these; the largest relative error of a star's flux at the best iteration; the
 misfit; whether the refined ones are used; seconds for the refinement, and for the run after it.
-`refine_psfs` is shift, jitter and strehl; pupil for phases; pixels for several stars. With --draw
+`refine_psfs` is shift, jitter and strehl; pupil for phases; and pixels for several stars. With --draw
 FILE.png the rows of STEM-pP.ecsv are drawn instead.
 """
 
@@ -111,7 +111,7 @@ def row(error, contrast, p, seed, n, n_stars, device):
     rows, found = star_rows(stars[0], sky.shape), {}
     families = ("pupil",) if error == "phase" else FAMILIES
     if n_stars > 1:
-        families = ("pixels",)
+        families = (*families, "pixels")
     known |= {"background": EXPERIMENT.sky_electrons, "read_noise": EXPERIMENT.read_noise.value}
     values = {"error": error, "contrast": contrast, "p": p, "seed": seed}
 

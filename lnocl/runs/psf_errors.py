@@ -16,6 +16,8 @@ from lnocl.solvers.psf_fit import Misfit, step
 
 # The error of PSFs, so many times, is their noise: residuals show less of it than there is.
 ALLOWED = 4.0
+# Corrections may be so many times as large as residuals show.
+LOOSE = 2.0
 
 
 class PsfErrors:
@@ -117,7 +119,7 @@ class PsfErrors:
 def _corrections(estimate: Estimate) -> Array:
     """Return the corrections of the PSFs' pixels that fit best, shape (p, ky, kx)."""
     observation = estimate.scene.observation
-    scatter = estimate_scatter(observation.psfs, estimate.kappa)
+    scatter = LOOSE * estimate_scatter(observation.psfs, estimate.kappa)
     families = PsfFamilies(("pixels",), observation, scatter)
     fit = step(
         estimate.scene, families, families.first(), estimate.extended, estimate.fluxes, False

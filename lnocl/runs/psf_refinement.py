@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
+import numpy as np
+
 from lnocl.errors import warn
 from lnocl.runs.outcome import PsfRefinement
 from lnocl.runs.psf_errors import PsfErrors
-from lnocl.runs.short_runs import ShortRuns, estimate_scatter, find_window, with_psfs
+from lnocl.runs.short_runs import Estimate, ShortRuns, estimate_scatter, find_window, with_psfs
 from lnocl.runs.start import Setup
-from lnocl.scene.observation import Observation
+from lnocl.scene.observation import Array, Observation
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters
 from lnocl.solvers.psf_fit import Misfit, step
 
@@ -22,6 +24,8 @@ ITERATIONS, STEPS = (8, 15, 30), 2
 # Refined PSFs are used where chi squared of those given exceeds its expectation by so much for each
 # parameter, and this share of it is mended.
 EXCESS, MENDED = 10.0, 0.7
+# Free pixels may err by so many times what residuals show.
+LOOSE = 3.0
 # Where the PSFs that are used have a larger reduced chi squared, their error is made a part of the
 # noise: else held-out counts, which do not see it, run until it ruins the sky near the star.
 RUINOUS = 2.0
@@ -57,14 +61,17 @@ def refine_psfs(
     window, stars, first = find_window(setup, observation)
     runs = ShortRuns(setup, window, stars, is_round)
     before, of_given = runs.judge(observation.psfs)
-    scatter = observation.psf_scatter
-    if "pixels" in names and not len(scatter):
-        scatter = estimate_scatter(observation.psfs, of_given.kappa)
-    families = PsfFamilies(names, observation, scatter)
-    parameters = _find(runs, families, setup.refine_positions)
-    refined = families.psfs(parameters)
-    after, of_refined = runs.judge(refined)
-    is_accepted = _mends(families, parameters, before, after)
+    families = PsfFamilies([name for name in names if name != "pixels"], observation)
+    values = np.zeros((observation.n_images, 0))
+    refined, after, of_refined = observation.psfs, before, of_given
+    if families.parameters:
+        refined, values = _find(runs, families, setup.refine_positions)
+        after, of_refined = runs.judge(refined)
+    if "pixels" in names:  # which are to mend what the others leave
+        pixels = _pixels(observation, refined, of_refined)
+        refined, _ = _find(runs, pixels, setup.refine_positions)
+        after, of_refined = runs.judge(refined)
+    is_accepted = _mends(before, after, values.size, "pixels" in names)
     final, estimate, known = before, of_given, observation.psf_scatter
     if is_accepted:
         observation, final, estimate = with_psfs(observation, refined), after, of_refined
@@ -73,7 +80,7 @@ def refine_psfs(
     is_noise = len(known) > 0 or (final.reduced > RUINOUS and errors.overall <= HOPELESS)
     refinement = PsfRefinement(
         tuple(families.parameters),
-        parameters.values,
+        values,
         (before.reduced, after.reduced),
         is_accepted,
         errors.overall,
@@ -87,11 +94,19 @@ def refine_psfs(
     return errors.as_noise() if is_noise else observation, refinement
 
 
-def _mends(families: PsfFamilies, parameters: PsfParameters, before: Misfit, after: Misfit) -> bool:
+def _pixels(observation: Observation, psfs: Array, estimate: Estimate) -> PsfFamilies:
+    """Return PSFs whose pixels are free, as far as their scatter is given, or residuals show it."""
+    scatter = observation.psf_scatter
+    if not len(scatter):
+        scatter = LOOSE * estimate_scatter(psfs, estimate.kappa)
+    return PsfFamilies(("pixels",), with_psfs(observation, psfs), scatter)
+
+
+def _mends(before: Misfit, after: Misfit, n_values: int, are_pixels_free: bool) -> bool:
     """Return whether refined PSFs mend so much that they are used."""
-    if families.pixels is not None and before.is_noise:  # which they may follow
+    if are_pixels_free and before.is_noise:  # which they may follow
         return False
-    is_wrong = before.excess > EXCESS * parameters.values.size
+    is_wrong = before.excess > EXCESS * n_values
     return is_wrong and before.square - after.square > MENDED * before.excess
 
 
@@ -113,8 +128,8 @@ def _warn(refinement: PsfRefinement) -> None:
         warn(f"{words}: trust nothing fainter than this near the stars")
 
 
-def _find(runs: ShortRuns, families: PsfFamilies, moves: bool) -> PsfParameters:
-    """Return the parameters of the PSFs that fit best; the stars' places may be fitted too."""
+def _find(runs: ShortRuns, families: PsfFamilies, moves: bool) -> tuple[Array, Array]:
+    """Return the PSFs that fit best, and their values; the stars' places may be fitted too."""
     parameters = families.first()
     for n_iter in ITERATIONS:
         found = runs.at(families.psfs(parameters), n_iter)
@@ -125,7 +140,7 @@ def _find(runs: ShortRuns, families: PsfFamilies, moves: bool) -> PsfParameters:
                 parameters, common = families.without_common_shift(parameters)
                 change = change._replace(positions=change.positions + common)
             found = runs.moved(found, families.psfs(parameters), change)
-    return parameters
+    return families.psfs(parameters), parameters.values
 
 
 def _follow(

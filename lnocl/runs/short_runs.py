@@ -31,9 +31,8 @@ MEDIAN = 0.455
 MOST_WRONG = 1.0
 # PSFs are judged after so many iterations.
 JUDGED = 15
-# The error of a PSF's pixel is so many times what residuals show, a share of the PSF smoothed over
-# so many pixels.
-LOOSE, SPREAD = 2.0, 2.0
+# The error of a PSF's pixel is a share of the PSF, smoothed over so many pixels.
+SPREAD = 2.0
 
 
 def find_window(setup: Setup, observation: Observation) -> tuple[Observation, Array, Array]:
@@ -162,7 +161,7 @@ def estimate_scatter(psfs: Array, kappa: Array) -> Array:
     kappa : ndarray of float64
         The error that residuals show in each ring, as `Estimate.kappa`.
     """
-    share = LOOSE * at_rings(kappa, rings_of(psfs))
+    share = at_rings(kappa, rings_of(psfs))
     return np.array([share * gaussian_filter(psf, SPREAD).clip(0.0) for psf in psfs])
 
 
