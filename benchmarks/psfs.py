@@ -18,8 +18,8 @@ Columns: the best rho'' of 100 iterations with the true, the given and the refin
 at the end of a run with the defaults; the relative error of the PSFs given, of those used, and that
 which is said of these; the largest relative error of a star's flux at the best iteration; the
 misfit; whether the refined ones are used; seconds for the refinement, and for the run after it.
-`refine_psfs` is shift, jitter and strehl; pupil for phases; and pixels for several stars. With --draw
-FILE.png the rows of STEM-pP.ecsv are drawn instead.
+`refine_psfs` is shift, jitter and strehl; pupil for phases; pixels too for several stars. With
+--draw FILE.png the rows of STEM-pP.ecsv are drawn instead.
 """
 
 import argparse

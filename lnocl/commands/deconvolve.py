@@ -179,16 +179,17 @@ OPTIONS = {
             metavar="FILE",
             checksum="LSUM",
             help="FITS file with a cube of the ways in which the PSFs may differ, one standard "
-            "deviation each, of the shape of the PSFs and for all of them",
+            "deviation each, of the shape of the PSFs and for all of them; in an extension MODES, "
+            "as lnocl psf --modes writes it, or as its image",
         ),
         option(
             "--psf-scatter",
             **SEVERAL,
             metavar="FILE",
             checksum="SSUM",
-            help="FITS file with the standard deviation of the pixels of a PSF of unit sum, such "
-            "as psf.fits[SCATTER] of lnocl psf: it is added to the noise at the stars; one for "
-            "all images or one for each",
+            help="FITS file with the standard deviation of the pixels of a PSF of unit sum, in an "
+            "extension SCATTER, as lnocl psf writes it, or as its image: it is added to the noise "
+            "at the stars; one for all images or one for each",
         ),
         option(
             "--round-source",

@@ -46,6 +46,15 @@ OPTIONS = [
         "and an extension SCATTER with the standard deviation of theirs from it",
     ),
     option(
+        "--modes",
+        type=int,
+        metavar="N",
+        card=("NMODES", "ways in which the PSFs differ"),
+        help="FRAME is a cube of frames of a star: make the mean of their PSFs, with extensions "
+        "MODES, the N ways in which they differ most, one standard deviation each, and SCATTER, "
+        "the standard deviation of each pixel",
+    ),
+    option(
         "--size",
         type=int,
         metavar="K",
@@ -110,6 +119,9 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.check:
         _report(arguments)
         return
+    if arguments.modes is not None:
+        _make_modes(arguments)
+        return
     _check_outputs(arguments)
     folder = os.getcwd()
 
@@ -160,6 +172,67 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.plot is not None:
         _draw(arguments, stars)
         lines.append(f"drew {arguments.plot}")
+    if not arguments.quiet:
+        messages.say(lines)
+
+
+def _make_modes(arguments: argparse.Namespace) -> None:
+    """Make the mean of the PSFs of several frames, and say how they differ."""
+    _check_outputs(arguments)
+    if arguments.plot is not None or len(arguments.rotate) > 1 or arguments.mask is not None:
+        raise InputError(
+            "--modes makes one PSF of all frames; leave --plot, --rotate and --mask out"
+        )
+    folder = os.getcwd()
+
+    from lnocl import psf
+    from lnocl.io import fitsread, fitswrite
+
+    with messages.shown_log(arguments.quiet):
+        stack = fitsread.read_stack([arguments.frame])
+    stars = [
+        psf.make_psf(
+            frame,
+            rotate=arguments.rotate[0],
+            position=arguments.position or None,
+            size=arguments.size,
+            background=arguments.background,
+            saturation=arguments.saturation,
+            recentre=arguments.recentre,
+            clip_negative=arguments.clip_negative,
+        )
+        for frame in stack.data
+    ]
+    sizes = sorted({len(star.psf) for star in stars})
+    if len(sizes) > 1:
+        raise InputError(
+            f"the PSFs of the frames would have {sizes[0]} to {sizes[-1]} pixels; give --size "
+            f"{sizes[0]} or less"
+        )
+    found = psf.find_modes([star.psf for star in stars], arguments.modes)
+    given = vars(arguments)
+    lines = [
+        f"frame {j}: the star at ({star.centre[0]:.2f}, {star.centre[1]:.2f}), flux {star.flux:.6g}"
+        for j, star in enumerate(stars, 1)
+    ]
+    scatter = np.linalg.norm(found.scatter) / np.linalg.norm(found.mean)
+    lines.append(
+        f"the PSFs differ from their mean by {100 * scatter:.2g} %; "
+        f"{counted(arguments.modes, 'mode')} of {100 * found.share:.3g} % of that variance"
+    )
+    fitswrite.write_image(
+        arguments.output,
+        found.mean,
+        cards=record.make_cards(OPTIONS, given, {"frame": stack.sha256}, []),
+        overwrite=arguments.overwrite,
+        notes=lines,
+        commands=record.make_commands("psf", OPTIONS, given, folder),
+        others={"MODES": found.modes, "SCATTER": found.scatter},
+    )
+    k = len(found.mean)
+    lines.append(
+        f"written to {arguments.output}: the mean of {len(stars)} PSFs of {k} x {k} pixels"
+    )
     if not arguments.quiet:
         messages.say(lines)
 

@@ -24,6 +24,8 @@ Mask = NDArray[np.bool_]
 
 # The logarithm of the pixels' size in image and PSF may differ by this much.
 MAX_SCALE_ERROR = 0.02
+# The extensions in which `lnocl psf` writes what it finds beside a PSF.
+MADE_OF_PSFS = {"psf_modes": "MODES", "psf_scatter": "SCATTER"}
 
 
 class Calibration(NamedTuple):
@@ -54,9 +56,11 @@ class Calibration(NamedTuple):
     ideal_psfs : sequence of str
         Files of the PSFs without aberrations, as for `Observation`.
     pupils, psf_scatter : sequence of str
-        Files of pupils, and of the scatter of PSFs, as for `Observation`.
+        Files of pupils, and of the scatter of PSFs, as for `Observation`; of the latter their
+        extension SCATTER, where they have one.
     psf_modes : str, optional
-        File of a cube of the modes of all PSFs, as for `Observation`.
+        File of a cube of the modes of all PSFs, as for `Observation`: its extension MODES, where it
+        has one.
     """
 
     background: Sequence[Word] = (0.0,)
@@ -190,6 +194,10 @@ class _Reader:
             if paths:
                 stack = read_stack(paths)
                 found[name], self._sha256[name] = stack.data, stack.sha256
+                if name in MADE_OF_PSFS:
+                    parts = [read_extension(path, MADE_OF_PSFS[name]) for path in paths]
+                    held = [np.atleast_3d(part.T).T for part in parts if part is not None]
+                    found[name] = np.concatenate(held) if held else found[name]
         return found
 
     def _warn_of_pixel_scales(self) -> None:

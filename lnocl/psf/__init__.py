@@ -1,6 +1,7 @@
 """PSFs made from frames of stars, and looked at."""
 
 from lnocl.psf.make import StarPsf, make_psf, make_psfs
+from lnocl.psf.modes import PsfModes, find_modes
 from lnocl.psf.report import PsfReport, examine
 
-__all__ = ["PsfReport", "StarPsf", "examine", "make_psf", "make_psfs"]
+__all__ = ["PsfModes", "PsfReport", "StarPsf", "examine", "find_modes", "make_psf", "make_psfs"]
