@@ -27,8 +27,9 @@ FAKED = 2.0
 WINDOW = 256
 # The median of the square of a normal deviate of unit variance.
 MEDIAN = 0.455
-# Where a star gives next to no light, residuals show nothing of its PSF: no more than this is said.
-MOST_WRONG = 1.0
+# Where stars give so little of their peak, residuals show nothing of their PSFs; nor do they show
+# more than this of those.
+DARK, MOST_WRONG = 1e-9, 1.0
 # PSFs are judged after so many iterations.
 JUDGED = 15
 # The error of a PSF's pixel is a share of the PSF, smoothed over so many pixels.
@@ -139,7 +140,7 @@ def _clean(scene: Scene, extended: Array, fluxes: Array, share: float) -> Estima
         good = weights > 0
         variance = np.divide(total, weights * scene.scale, out=np.ones(shape), where=good)
         squares = (counts - total) ** 2 / MEDIAN
-        lit = good & (light > 0)
+        lit = good & (light > DARK * light.max())
         excess.append((squares - variance)[lit] / light[lit] ** 2)
         number.append(Rings(shape, scene.stars + scene.observation.offsets[j]).number[lit])
         mean_light += light / scene.n_images

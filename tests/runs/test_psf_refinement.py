@@ -12,8 +12,10 @@ from lnocl.errors import LnoclWarning
 from lnocl.metrics import restoration_error, star_rows
 from lnocl.runs import psf_refinement, short_runs
 from lnocl.runs.start import Setup
+from lnocl.scene.padding import choose_pad
 from lnocl.scene.psf_families import PsfFamilies
 from lnocl.scene.pupils import Pupil
+from lnocl.solvers.psf_fit import Misfit
 
 N, STAR, LEVEL = 64, (30, 24), 50.0
 Y, X = np.indices((N, N))
@@ -419,3 +421,38 @@ def test_a_round_source_is_not_taken_for_the_star():
     rows = star_rows(STAR, sky.shape)
     errors = [restoration_error(each.extended, ring, rows) for each in (by_rule, free)]
     assert errors[1] < 0.5 * errors[0]
+
+
+def test_the_grid_stays_though_wider_psfs_would_take_a_larger_one():
+    n, star = 60, (30, 30)
+    y, x = np.indices((n, n)) - n // 2
+    given, wide = (np.exp(-(x**2 + y**2) / (2.0 * variance)) for variance in (0.8, 1.8))
+    sky = np.full((n, n), 300.0)  # which runs over the edges
+    sky[star[::-1]] += 1e6
+    spectrum = np.fft.rfft2(sky) * np.fft.rfft2(np.fft.ifftshift(wide / wide.sum()))
+    images = np.random.default_rng(0).poisson(np.fft.irfft2(spectrum, sky.shape)).astype(float)
+    pads = [choose_pad(lnocl.Observation(images, psf)) for psf in (given, wide)]
+    assert pads[0] <= 2 < pads[1]  # a grid of 64, and of 128
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LnoclWarning)
+        observation = lnocl.Observation(images, given)
+        options = {"engine": "numpy", "n_iter": 3, "stop": None, "refine_psfs": ["jitter"]}
+        result = lnocl.deconvolve(observation, [star], **options)
+    assert result.psf_refinement.is_accepted
+    np.testing.assert_allclose(result.psf_refinement.values, [(1.0, 0.0, 1.0)], rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "n_values", "are_free", "expected"),
+    [
+        (13000.0, 10000.0, 5, False, True),
+        (13000.0, 11000.0, 5, False, False),  # too little is mended
+        (10049.0, 10000.0, 5, False, False),  # too little is wrong
+        (10051.0, 10000.0, 5, False, True),
+        (10700.0, 9000.0, 0, True, False),  # five standard deviations are 707
+        (10710.0, 9000.0, 0, True, True),
+    ],
+)
+def test_what_is_accepted(before, after, n_values, are_free, expected):
+    misfits = Misfit(before, 10000), Misfit(after, 10000)
+    assert psf_refinement._mends(*misfits, n_values, are_free) is expected
