@@ -31,7 +31,7 @@ class PsfRefinement:
         extended source marginalised, 1 where there is noise alone.
     is_accepted : bool
         Whether the refined PSFs are used: chi squared of those given exceeds its expectation by
-        ten for each parameter and more, and seven tenths of that are mended.
+        ten for each parameter and more, and 0.65 of that is mended.
     psf_error : float
         Relative error that the PSFs used still have, by the corrections of their pixels that fit
         the images best (`lnocl.runs.psf_errors`), or as given by ``psf_scatter``. A PSF that is too
@@ -39,8 +39,8 @@ class PsfRefinement:
     edges, errors_in_rings : ndarray of float64, shapes (k + 1,) and (k,)
         Radii of rings round a star, pixels, and that error in each.
     is_noise : bool
-        Whether this error was made a part of the noise: it was given, or the misfit of the PSFs
-        used is more than 2, and the error at most 0.15.
+        Whether this error was made a part of the noise: it was given, or exceeds the noise of the
+        counts at the stars, and is at most 0.15.
     may_be_faked : ndarray of float64, shape (ny, nx)
         What this error may fake in the sky, electrons per pixel: in each ring its share of the
         stars, seen through the PSFs, over the square root of p.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from copy import copy
 
 import numpy as np
@@ -11,7 +12,7 @@ from lnocl.runs.short_runs import Estimate, at_rings, estimate_scatter, rings_of
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.psf_families import PsfFamilies
 from lnocl.scene.rings import Rings
-from lnocl.scene.scene import Scene
+from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.solvers.psf_fit import Misfit, step
 
 # The error of PSFs, so many times, is their noise: residuals show less of it than there is.
@@ -44,6 +45,8 @@ class PsfErrors:
     ----------
     overall : float
         Their norm, relative to that of the PSFs.
+    over_noise : float
+        Their square over the variance of the counts at the stars, the mean weighted by starlight.
     edges, at_radius : ndarray of float64, shapes (k + 1,) and (k,)
         Radii of rings round the middle of the PSFs, pixels, and the same number in each.
     """
@@ -73,6 +76,7 @@ class PsfErrors:
         self.overall = float(np.sqrt(squares.sum() / lights.sum()))
         self.edges = rings.edges[: len(squares) + 1]
         self.at_radius = np.sqrt(squares / np.maximum(lights, np.finfo(float).tiny))
+        self.over_noise = self._compare_with_noise()
 
     def as_noise(self) -> Observation:
         """Return the observation with these errors in its noise.
@@ -83,7 +87,7 @@ class PsfErrors:
         observation = self._observation
         images, read_noise = observation.images.copy(), np.empty_like(observation.images)
         background = np.empty_like(images)
-        for j, error in enumerate(self._in_images(observation)):
+        for j, (error, _) in enumerate(self._in_images(observation)):
             variance = (ALLOWED * error) ** 2
             images[j] += np.where(observation.mask[j], 0.0, variance)
             background[j] = observation.background[j] + variance
@@ -100,20 +104,29 @@ class PsfErrors:
         sky = copy(self._observation)
         sky.offsets = np.zeros_like(sky.offsets)
         sky.exposure = np.ones(sky.n_images)
-        return np.asarray(np.mean(self._in_images(sky), axis=0) / np.sqrt(sky.n_images))
+        errors = [error for error, _ in self._in_images(sky)]
+        return np.asarray(np.mean(errors, axis=0) / np.sqrt(sky.n_images))
 
-    def _in_images(self, observation: Observation) -> list[Array]:
-        """Return the errors in images of the stars, electrons."""
+    def _compare_with_noise(self) -> float:
+        observation, ratios, weights = self._observation, 0.0, 0.0
+        for j, (error, light) in enumerate(self._in_images(observation)):
+            variance = np.maximum(light + observation.background[j], MIN_MODEL)
+            ratios += float((light * error**2 / variance).sum())
+            weights += float(light.sum())
+        return ratios / weights
+
+    def _in_images(self, observation: Observation) -> Iterator[tuple[Array, Array]]:
+        """Yield the errors in each image of the stars, and these, electrons."""
         seen = with_psfs(observation, self._scatter) if len(self._scatter) else observation
         with ignored_warnings():
             scene = Scene(seen, self._stars)
-        errors = []
+            stars = Scene(observation, self._stars)
         for j, offset in enumerate(observation.offsets):
-            error = _starlight(scene, j, self._fluxes)
+            error, light = (_starlight(each, j, self._fluxes) for each in (scene, stars))
             if not len(self._scatter):
-                error *= at_rings(self.at_radius, Rings(observation.shape, scene.stars + offset))
-            errors.append(error)
-        return errors
+                rings = Rings(observation.shape, stars.stars + offset)
+                error = light * at_rings(self.at_radius, rings)
+            yield error, light
 
 
 def _corrections(estimate: Estimate) -> Array:

@@ -23,12 +23,12 @@ log = logging.getLogger("lnocl")
 ITERATIONS, STEPS = (8, 15, 30), 2
 # Refined PSFs are used where chi squared of those given exceeds its expectation by so much for each
 # parameter, and this share of it is mended.
-EXCESS, MENDED = 10.0, 0.7
+EXCESS, MENDED = 10.0, 0.65
 # Free pixels may err by so many times what residuals show.
 LOOSE = 3.0
-# Where the PSFs that are used have a larger reduced chi squared, their error is made a part of the
-# noise: else held-out counts, which do not see it, run until it ruins the sky near the star.
-RUINOUS = 2.0
+# Where the PSFs' error exceeds the noise at the stars so many times, it is made a part of it: else
+# held-out counts, which do not see it, run until it ruins the sky near the star.
+RUINOUS = 4.0
 # PSFs that are wrong by more than this are not told from the sky, whatever their noise.
 HOPELESS = 0.15
 # Of PSFs that are wrong by more than this it is warned.
@@ -77,7 +77,7 @@ def refine_psfs(
         observation, final, estimate = with_psfs(observation, refined), after, of_refined
         known = known[:0] if "pixels" in names else known  # what was scattered is found
     errors = PsfErrors(observation, estimate, first, final, known)
-    is_noise = len(known) > 0 or (final.reduced > RUINOUS and errors.overall <= HOPELESS)
+    is_noise = len(known) > 0 or (errors.over_noise > RUINOUS and errors.overall <= HOPELESS)
     refinement = PsfRefinement(
         tuple(families.parameters),
         values,
