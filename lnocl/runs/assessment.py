@@ -77,7 +77,7 @@ def assess(
     for k, snapshot in enumerate(snapshots):
         a, b = snapshot.extended
         squares, mixed = product(a, a) + product(b, b), 2.0 * product(a, b)
-        noise[k] = squares - mixed
+        noise[k] = max(squares - mixed, 0.0)  # which rounding leaves below it where both are equal
         excess[k] = squares + mixed - 4.0 * (product(a, b_last) + product(b, a_last))
     refuse_not_finite(*excess, *noise)
     best = int(np.argmin(excess))

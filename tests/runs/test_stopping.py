@@ -183,6 +183,15 @@ def test_estimated_errors_are_unbiased(seed):
     assert found.squared_norm == pytest.approx(np.linalg.norm(truth) ** 2, rel=0.01)
 
 
+@given(seed=st.integers(0, 2**32 - 1))
+def test_halves_that_are_nearly_the_same_are_judged(seed):
+    """In single precision, in which rounding leaves their squared difference below 0."""
+    a = np.random.default_rng(seed).random(400).astype(np.float32)
+    found = assess([snapshot(1, a, np.nextafter(a, np.float32(2)))], snapshot(2, a, a), (1, 400))
+    assert found.noise[0] >= 0
+    assert found.best == found.chosen == 0
+
+
 @pytest.mark.parametrize("n_last", [12, 20])
 def test_the_last_iteration_within_a_tenth_of_the_least_error_is_chosen(n_last):
     """Halves of a truth of 10, first far from it, then noisy; best is iteration 12."""
