@@ -84,9 +84,9 @@ def check_families(
     Raises
     ------
     InputError
-        A name is unknown, or a text stands for the sequence; there is no star; the observation
-        lacks the ideal PSFs, pupils or modes; pupils differ in their apertures; pixels are asked of
-        one star, or a shift of one image beside free positions.
+        A name is unknown, or one text is given instead of several; there is no star; ideal PSFs,
+        pupils or modes are lacking; pupils differ in their apertures; pixels are asked of one star,
+        or a shift of one image beside free positions.
     """
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise InputError(f"refine_psfs is {names!r}; give a sequence of {', '.join(FAMILIES)}")

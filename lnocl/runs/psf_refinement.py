@@ -112,6 +112,8 @@ def _mends(before: Misfit, after: Misfit, n_values: int, are_pixels_free: bool) 
 
 def _told(refinement: PsfRefinement) -> str:
     before, after = refinement.misfit
+    if before == after:  # nothing was asked to be refined
+        return f"the misfit of the PSFs is {before:.3g}, where noise gives 1"
     words = "refined" if refinement.is_accepted else "left as given"
     return f"PSFs {words}: their misfit is {before:.3g}, refined {after:.3g}, where noise gives 1"
 
@@ -121,7 +123,7 @@ def _warn(refinement: PsfRefinement) -> None:
         return
     words = f"the PSFs do not fit the stars, by {100 * refinement.psf_error:.2g} %"
     if refinement.psf_error > HOPELESS:
-        warn(f"{words}: the sky near the stars, and their fluxes, are not to be trusted")
+        warn(f"{words}: give better ones; trust neither the sky near the stars nor their fluxes")
     elif refinement.is_noise:
         warn(f"{words}, which is added to the noise: trust nothing faint near the stars")
     else:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.smooth_field import SmoothField
+
 Array = NDArray[np.float64]
 
 # Errors of PSFs are correlated over this, pixels.
@@ -29,19 +31,13 @@ class PsfPixels:
     def __init__(self, psfs: Array, scatter: Array) -> None:
         self._psfs, self._scatter = psfs, scatter
         self.shape = psfs.shape[1:]
-        u, v = np.fft.rfftfreq(self.shape[1]), np.fft.fftfreq(self.shape[0])[:, None]
-        root = np.exp(-((np.pi * CORRELATED) ** 2) * (u**2 + v**2))
-        self._root = root / np.sqrt(np.fft.irfft2(root**2, self.shape)[0, 0])
+        self._smooth = SmoothField(self.shape, CORRELATED)
 
     def correction(self, j: int, field: Array) -> Array:
         """Return the correction of PSF j, shape (ky, kx)."""
-        change = self._scatter[j] * self._correlate(field)
+        change = self._scatter[j] * self._smooth.apply(field)
         return np.asarray(change - change.sum() * self._psfs[j])
 
     def adjoint(self, j: int, image: Array) -> Array:
         """Return what `correction` is the transpose of."""
-        return self._correlate(self._scatter[j] * (image - (self._psfs[j] * image).sum()))
-
-    def _correlate(self, field: Array) -> Array:
-        spectrum = self._root * np.fft.rfft2(field)
-        return np.asarray(np.fft.irfft2(spectrum, self.shape), np.float64)
+        return self._smooth.apply(self._scatter[j] * (image - (self._psfs[j] * image).sum()))

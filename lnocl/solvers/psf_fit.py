@@ -28,6 +28,7 @@ from lnocl.scene.observation import Array
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.scene import MIN_MODEL, Scene
+from lnocl.scene.smooth_field import SmoothField
 from lnocl.solvers.fluxes import MAX_FADING
 
 # The error of the extended source is correlated over this, pixels, and as large as it is smoothed
@@ -253,20 +254,14 @@ class _SourceError:
     def __init__(self, model: Model, extended: Array) -> None:
         self._model = model
         self._amplitude = gaussian_filter(extended, SMOOTHED, mode="wrap")
-        u, v = _frequencies(extended.shape)
-        root = np.exp(-((np.pi * CORRELATED) ** 2) * (u**2 + v**2))
-        self._root = root / np.sqrt(scipy.fft.irfft2(root**2, extended.shape)[0, 0])
+        self._smooth = SmoothField(extended.shape, CORRELATED)
         self.at = np.zeros(extended.shape)
 
     def forward(self, x: Array) -> Array:
-        return self._model.forward(self._amplitude * self._correlate(x))
+        return self._model.forward(self._amplitude * self._smooth.apply(x))
 
     def adjoint(self, images: Sequence[Array]) -> Array:
-        return self._correlate(self._amplitude * self._model.adjoint(images))
-
-    def _correlate(self, field: Array) -> Array:
-        spectrum = self._root * scipy.fft.rfft2(field, workers=-1)
-        return np.asarray(scipy.fft.irfft2(spectrum, field.shape, workers=-1), np.float64)
+        return self._smooth.apply(self._amplitude * self._model.adjoint(images))
 
 
 class _PixelErrors:

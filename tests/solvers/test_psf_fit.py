@@ -139,7 +139,7 @@ def test_the_error_of_the_extended_source_has_unit_variance_and_a_width():
     scene = a_scene()
     model = Model(scene)
     error = psf_fit._SourceError(model, np.ones((N, N)))
-    fields = [error._correlate(RNG.standard_normal((N, N))) for _ in range(400)]
+    fields = [error._smooth.apply(RNG.standard_normal((N, N))) for _ in range(400)]
     assert np.mean(np.square(fields)) == pytest.approx(1.0, rel=0.05)
     products = [np.mean(f * np.roll(f, 3, axis=1)) for f in fields]
     assert np.mean(products) == pytest.approx(np.exp(-(3.0**2) / (2 * 1.5**2)), abs=0.03)
