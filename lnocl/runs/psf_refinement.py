@@ -19,8 +19,10 @@ from lnocl.solvers.psf_fit import Misfit, step
 log = logging.getLogger("lnocl")
 
 # Each round begins with the estimate after so many iterations with the present PSFs, and takes so
-# many steps from it.
-ITERATIONS, STEPS = (8, 15, 30), 2
+# many steps from it. After fewer than 15 the extended source is too smooth, and the PSFs follow it.
+ITERATIONS, STEPS = (15, 15, 30), 2
+# Free pixels follow the noise in more steps than these.
+PIXEL_ITERATIONS, PIXEL_STEPS = (15, 15, 15, 15), 1
 # Refined PSFs are used where chi squared of those given exceeds its expectation by so much for each
 # parameter, and this share of it is mended.
 EXCESS, MENDED = 10.0, 0.65
@@ -69,7 +71,9 @@ def refine_psfs(
         after, of_refined = runs.judge(refined)
     if "pixels" in names:  # which are to mend what the others leave
         pixels = _pixels(observation, refined, of_refined)
-        refined, _ = _find(runs, pixels, setup.refine_positions)
+        schedule = PIXEL_ITERATIONS, PIXEL_STEPS
+        found = _search(runs, pixels, pixels.first(), schedule, setup.refine_positions)
+        refined = pixels.psfs(found)
         after, of_refined = runs.judge(refined)
     is_accepted = _mends(before, after, values.size, "pixels" in names)
     final, estimate, known = before, of_given, observation.psf_scatter
@@ -132,17 +136,45 @@ def _warn(refinement: PsfRefinement) -> None:
 
 def _find(runs: ShortRuns, families: PsfFamilies, moves: bool) -> tuple[Array, Array]:
     """Return the PSFs that fit best, and their values; the stars' places may be fitted too."""
-    parameters = families.first()
-    for n_iter in ITERATIONS:
+    firsts = [families.first(search) for search in range(families.n_searches)]
+    schedule = ITERATIONS[:-1], STEPS
+    found = [_search(runs, families, first, schedule, moves) for first in firsts]
+    parameters = found[0]
+    if len(found) > 1:
+        parameters = _best_of_each_image(runs, families, found)
+    parameters = _search(runs, families, parameters, (ITERATIONS[-1:], STEPS), moves)
+    return families.psfs(parameters), parameters.values
+
+
+def _best_of_each_image(
+    runs: ShortRuns, families: PsfFamilies, found: Sequence[PsfParameters]
+) -> PsfParameters:
+    """Return for each image the parameters that fit it best, of those that were found."""
+    squares = [runs.judge(families.psfs(each))[0].squares for each in found]
+    best = np.argmin(squares, axis=0)
+    values = [found[search].values[j] for j, search in enumerate(best)]
+    return found[0]._replace(values=np.array(values))
+
+
+def _search(
+    runs: ShortRuns,
+    families: PsfFamilies,
+    parameters: PsfParameters,
+    schedule: tuple[Sequence[int], int],
+    moves: bool,
+) -> PsfParameters:
+    """Return the parameters after rounds of so many iterations each, and so many steps."""
+    iterations, steps = schedule
+    for n_iter in iterations:
         found = runs.at(families.psfs(parameters), n_iter)
-        for _ in range(STEPS):
+        for _ in range(steps):
             change = step(found.scene, families, parameters, found.extended, found.fluxes, moves)
             parameters = _follow(families, parameters, change.parameters)
             if moves:  # which a common shift is not told from
                 parameters, common = families.without_common_shift(parameters)
                 change = change._replace(positions=change.positions + common)
             found = runs.moved(found, families.psfs(parameters), change)
-    return families.psfs(parameters), parameters.values
+    return parameters
 
 
 def _follow(

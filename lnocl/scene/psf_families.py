@@ -35,9 +35,10 @@ NO_SCATTER = np.zeros((0, 0, 0))
 LEAST_OTF = 1e-4
 # Of a transform.
 ROUNDING = 1e-9
-# An even phase and its negative have one PSF, so that at 0 nothing says which way to go: the search
-# begins with this share of the prior.
-FIRST = 0.3
+# An even phase and its negative have nearly one PSF, so that at 0 nothing says which way to go, and
+# every fifth search ends with the wrong one: so many begin, at random phases of this share of the
+# prior.
+SEARCHES, FIRST = 3, 0.3
 
 
 class PsfParameters(NamedTuple):
@@ -96,6 +97,8 @@ class PsfFamilies:
         Standard deviations of their priors.
     pixels : PsfPixels or None
         None where they are not asked for.
+    n_searches : int
+        How many searches find the best parameters.
     """
 
     def __init__(
@@ -117,11 +120,12 @@ class PsfFamilies:
                 self.parameters += [f"{name} {each}" for each in own]
                 prior += [scales.get(name, MODE)] * len(own)
         self.prior = np.array(prior)
+        self.n_searches = SEARCHES if self._pupils else 1
 
-    def first(self) -> PsfParameters:
+    def first(self, search: int = 0) -> PsfParameters:
         """Return parameters to begin a search with: those of the given PSFs, but for phases."""
         values = np.zeros((len(self._psfs), len(self.prior)))
-        start = np.random.default_rng(0).standard_normal((len(self._psfs), self._n_phases))
+        start = np.random.default_rng(search).standard_normal((len(self._psfs), self._n_phases))
         values[:, self._phases] = FIRST * PUPIL * start
         return PsfParameters(values, self._no_pixels())
 

@@ -100,15 +100,23 @@ class Misfit(NamedTuple):
 
     Attributes
     ----------
-    square : float
-        The least squares of `_Fit` with the PSFs held: a sum of squares of residuals, weighted, and
-        of psi. Noise alone gives `n_pixels`.
+    squares : ndarray of float64, shape (p,)
+        The least squares of `_Fit` with the PSFs held: those of the residuals of each image,
+        weighted.
+    of_source : float
+        And that of the error of the extended source.
     n_pixels : int
         Pixels observed.
     """
 
-    square: float
+    squares: Array
+    of_source: float
     n_pixels: int
+
+    @property
+    def square(self) -> float:
+        """The sum of all: noise alone gives `n_pixels`."""
+        return float(self.squares.sum()) + self.of_source
 
     @property
     def reduced(self) -> float:
@@ -132,7 +140,7 @@ def misfit(scene: Scene, extended: Array, fluxes: Array) -> Misfit:
     images = _linearise(scene, held, held.first().values, model, extended, fluxes, False)
     fit = _Fit(images, [_SourceError(model, extended)], np.zeros(len(fluxes)))
     n_pixels = sum(int(np.count_nonzero(each.precision)) for each in images)
-    return Misfit(fit.least_square(), n_pixels)
+    return Misfit(*fit.least_squares(), n_pixels)
 
 
 class _Image(NamedTuple):
@@ -319,14 +327,14 @@ class _Fit:
         change, x = self._solve(self._prior * at)
         return change, self._each(x)
 
-    def least_square(self) -> float:
-        """Return the least sum of squares, from unknowns at the means of their priors."""
+    def least_squares(self) -> tuple[Array, float]:
+        """Return the least squares of the images and of priors, from unknowns at their means."""
         change, x = self._solve(np.zeros_like(self._prior))
         left = self._left() - self._changes(change) - self._forward(x)
         squares = [
             float((e.precision * r * r).sum()) for e, r in zip(self._images, left, strict=True)
         ]
-        return sum(squares) + float((x * x).sum() + self._prior @ change**2)
+        return np.array(squares), float((x * x).sum() + self._prior @ change**2)
 
     def _left(self) -> Array:
         return np.array([each.left for each in self._images])

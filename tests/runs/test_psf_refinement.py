@@ -454,5 +454,5 @@ def test_the_grid_stays_though_wider_psfs_would_take_a_larger_one():
     ],
 )
 def test_what_is_accepted(before, after, n_values, are_free, expected):
-    misfits = Misfit(before, 10000), Misfit(after, 10000)
+    misfits = (Misfit(np.array([square]), 0.0, 10000) for square in (before, after))
     assert psf_refinement._mends(*misfits, n_values, are_free) is expected
