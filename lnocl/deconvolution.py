@@ -80,9 +80,11 @@ def deconvolve(
     ----------
     observation : Observation
         The p images of shape (ny, nx), with their PSFs, backgrounds, noise and masks.
-    stars : iterable of (x, y), optional
+    stars : iterable of (x, y) or astropy.table.Table, optional
         Positions of the point sources in pixels of an image without offset, 0-based, x along
-        columns; they may be a Quantity in pixels. Two are at least a thousandth of a pixel apart.
+        columns; they may be a Quantity in pixels, or a table with columns x and y, or as photutils
+        or SExtractor name them (`lnocl.scene.star_tables.IN_PIXELS`; those of SExtractor are
+        counted from 1). Two are at least a thousandth of a pixel apart.
         Between pixels a star's image is the PSF moved in its spectrum
         (`lnocl.scene.shifting.place`).
     mu : float, optional

@@ -133,7 +133,8 @@ OPTIONS = {
             metavar="FILE",
             dest="star_table",
             is_input=True,
-            help="table of stars in any format of astropy, with columns x and y, or ra and dec",
+            help="table of stars in any format of astropy, with columns x and y, or ra and dec, "
+            "or as photutils, SExtractor, Gaia and VizieR name them",
         ),
         option(
             "--refine",

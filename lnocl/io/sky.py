@@ -23,13 +23,15 @@ from lnocl.errors import FileError, InputError, LnoclError, counted
 from lnocl.io.fitsfile import open_fits, open_regular
 from lnocl.io.headers import make_wcs, quiet_log
 from lnocl.process import ignored_warnings
-from lnocl.scene.units import parse
+from lnocl.scene import star_tables
 
 log = logging.getLogger("lnocl")
 
 # Largest variation of the offset between two images over them, in pixels, from rotation, scale and
 # distortion.
 MAX_OFFSET_VARIATION = 0.1
+# Positions by pixels and by the sky may differ by so many pixels, as catalogues round them.
+SAME_PLACE = 1.0
 # Points across an image at which the offset is computed.
 POINTS = 5
 
@@ -157,8 +159,9 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
     Parameters
     ----------
     path : str
-        Any table that astropy reads, with the columns x and y, in pixels and 0-based, or ra and
-        dec, in their units or else in degrees. Upper or lower case does not matter.
+        Any table that astropy reads, with columns of `star_tables.IN_PIXELS` or `ON_SKY`, or with
+        a `SkyCoord`. Upper or lower case does not matter. Right ascension and declination are in
+        the columns' units, or else in degrees.
     header : astropy.io.fits.Header
         Header of the image, whose coordinates ra and dec need.
     image : str
@@ -169,29 +172,62 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
     FileError
         A file that cannot be read.
     InputError
-        A table without these columns, or ra and dec for an image without WCS.
+        A table without these columns; coordinates on the sky for an image without WCS; those of
+        pixels and of the sky are of different places.
     """
     table = _read_table(path)
-    columns = {name.lower(): table[name] for name in table.colnames}
-    if {"x", "y"} <= columns.keys():
-        found = np.array([_numbers(path, columns[name], u.pix) for name in "xy"]).T
-    elif {"ra", "dec"} <= columns.keys():
-        found = _from_sky(path, columns["ra"], columns["dec"], header, image)
+    columns = star_tables.find_columns(table.colnames, star_tables.IN_PIXELS)
+    of_sky, sky_columns = _coordinates(path, table)
+    if columns is not None:
+        found = star_tables.in_pixels(table, columns, path)
+        names: Sequence[str] = columns[:2]
+        if of_sky is not None and has_celestial(header):
+            _compare(path, found, names, of_sky, sky_columns, header, image)
+    elif of_sky is not None:
+        found = to_pixels(of_sky, celestial_wcs(header, image), image)
+        names = sky_columns
     else:
         raise InputError(
             f"{path} has neither columns x and y nor ra and dec; it has "
-            f"{', '.join(table.colnames) or 'no columns'}"
+            f"{', '.join(table.colnames) or 'no columns'}: rename two of them"
         )
-    log.info("%s: %s", path, counted(len(found), "star"))
+    origin = ", the first pixel 1" if columns is not None and columns.origin else ""
+    log.info("%s: %s, by %s%s", path, counted(len(found), "star"), " and ".join(names), origin)
     return found
 
 
-def _from_sky(path: str, ra: Any, dec: Any, header: fits.Header, image: str) -> Pairs:
-    wcs = celestial_wcs(header, image)
-    degrees = _numbers(path, ra, u.deg), _numbers(path, dec, u.deg)
-    if (abs(degrees[1]) > 90).any():
-        raise InputError(f"column {dec.name} of {path} has rows beyond 90 degrees")
-    return to_pixels(SkyCoord(*degrees, unit="deg"), wcs, image)
+def _coordinates(path: str, table: Table) -> tuple[SkyCoord | None, tuple[str, ...]]:
+    """Return the coordinates in a table and the names of their columns; None where it has none."""
+    for column in table.itercols():
+        if isinstance(column, SkyCoord):
+            return column.icrs, (column.info.name,)
+    columns = star_tables.find_columns(table.colnames, star_tables.ON_SKY)
+    if columns is None:
+        return None, ()
+    ra, dec = (star_tables.column_numbers(table[name], path, "deg") for name in columns[:2])
+    if (abs(dec) > 90).any():
+        raise InputError(f"column {columns.second} of {path} has rows beyond 90 degrees")
+    return SkyCoord(ra, dec, unit="deg"), columns[:2]
+
+
+def _compare(
+    path: str,
+    positions: Pairs,
+    names: Sequence[str],
+    of_sky: SkyCoord,
+    sky_names: Sequence[str],
+    header: fits.Header,
+    image: str,
+) -> None:
+    """Refuse positions that are another image's, by the coordinates beside them."""
+    by_sky = to_pixels(of_sky, celestial_wcs(header, image), image)
+    away = np.hypot(*(by_sky - positions).T)
+    for row in np.flatnonzero(away > SAME_PLACE)[:1]:
+        raise InputError(
+            f"{path} has its star in row {row} at {positions[row][0]:.2f}, {positions[row][1]:.2f} "
+            f"by {' and '.join(names)}, which {image} has at {by_sky[row][0]:.2f}, "
+            f"{by_sky[row][1]:.2f} by {' and '.join(sky_names)}: leave one of the two out"
+        )
 
 
 def _read_table(path: str) -> Table:
@@ -232,20 +268,6 @@ def _check_votable(path: str, content: IO[bytes]) -> None:
                     "holds them"
                 )
     content.seek(0)
-
-
-def _numbers(path: str, column: Any, unit: u.UnitBase) -> Pairs:
-    try:
-        values = np.array(getattr(column, "unmasked", column), float)
-        given = parse(str(column.unit or unit))
-        values = values * given.to(unit)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"column {column.name} of {path} is not a position: {error}") from None
-    if values.ndim != 1:
-        raise InputError(f"column {column.name} of {path} has several numbers in a row")
-    if not np.isfinite(values).all() or np.any(getattr(column, "mask", False)):
-        raise InputError(f"column {column.name} of {path} has rows without a number")
-    return values
 
 
 def offsets(headers: Sequence[fits.Header], paths: Sequence[str], shape: tuple[int, int]) -> Pairs:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError
-from lnocl.scene import containers
+from lnocl.scene import containers, star_tables
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
 
@@ -190,10 +190,13 @@ def check_positions(stars: ArrayLike, observation: Observation) -> Array:
     Raises
     ------
     InputError
-        They are not pairs of numbers, or not in pixels; one lies outside all images; two are at one
-        position.
+        They are not pairs of numbers, or not in pixels; a table that `star_tables.positions`
+        refuses; one lies outside all images; two are at one position.
     """
-    positions = numbers("stars", containers.pixels("stars", stars))
+    if hasattr(stars, "colnames"):  # a table of astropy
+        positions = star_tables.positions(stars)
+    else:
+        positions = numbers("stars", containers.pixels("stars", stars))
     if positions.size == 0:
         return np.zeros((0, 2))
     if positions.ndim != 2 or positions.shape[1] != 2:

@@ -230,7 +230,7 @@ class TestFrames:
             "image 2: 0 pixels masked without inverse variance",
             next(line for line in said.err.splitlines() if "sigma-clipped" in line)[7:],
             "image 2: offset 1.250, -0.500 pixels in x, y, from the WCS",
-            "stars.csv: 1 star",
+            "stars.csv: 1 star, by ra and dec",
         ]
         assert f"image 1: background {level:.6g} electrons per pixel" in said.err
         assert " adu/s; residuals " in said.out

@@ -218,7 +218,8 @@ class TestTables:
             name, **({"format": "votable"} if name == "t.vot" else {})
         )
         np.testing.assert_array_equal(stars(name, fits.Header()), POSITIONS)
-        assert [record.getMessage() for record in caplog.records] == [f"{name}: 2 stars"]
+        said = [record.getMessage() for record in caplog.records]
+        assert said == [f"{name}: 2 stars, by X and y"]
 
     @pytest.mark.parametrize("name", ["t.ecsv", "t.fits"])
     @pytest.mark.parametrize("unit", [u.deg, u.rad, u.hourangle, u.arcsec])
@@ -233,9 +234,61 @@ class TestTables:
         Table({"ra": ICRS.ra.deg, "dec": ICRS.dec.deg}).write("t.csv")
         np.testing.assert_allclose(stars("t.csv"), POSITIONS, atol=1e-6)
 
-    def test_pixels_go_before_the_sky(self):
-        save("t.csv", "ra,dec,x,y\n0,0,1,2\n")
-        np.testing.assert_array_equal(stars("t.csv"), [(1, 2)])
+    @pytest.mark.parametrize("given", [header(), fits.Header()], ids=["wcs", "no wcs"])
+    def test_pixels_go_before_the_sky(self, given):
+        table = Table({"ra": ICRS.ra.deg, "dec": ICRS.dec.deg, "x": POSITIONS[:, 0] + 0.6})
+        table["y"] = POSITIONS[:, 1]
+        table.write("t.csv")
+        np.testing.assert_array_equal(stars("t.csv", given), np.add(POSITIONS, (0.6, 0)))
+
+    def test_pixels_of_another_image_are_refused(self):
+        table = Table({"ra": ICRS.ra.deg, "dec": ICRS.dec.deg, "x": POSITIONS[:, 0]})
+        table["y"] = POSITIONS[:, 1] + (0.0, 1.1)
+        table.write("t.csv")
+        with pytest.raises(InputError) as caught:
+            stars("t.csv")
+        assert str(caught.value) == (
+            "t.csv has its star in row 1 at 7.00, 12.35 by x and y, which a.fits has at 7.00, "
+            "11.25 by ra and dec: leave one of the two out"
+        )
+
+    @pytest.mark.parametrize(
+        ("names", "origin"),
+        [
+            ("x_centroid y_centroid", 0),  # photutils, by age
+            ("xcentroid ycentroid", 0),
+            ("x_fit y_fit", 0),
+            ("x_peak y_peak", 0),
+            ("X_IMAGE Y_IMAGE", 1),  # SExtractor
+            ("XWIN_IMAGE YWIN_IMAGE", 1),
+            ("XPSF_IMAGE YPSF_IMAGE", 1),
+        ],
+    )
+    def test_pixels_as_others_name_them(self, caplog, names, origin):
+        caplog.set_level(logging.INFO, "lnocl")
+        Table((POSITIONS + origin), names=names.split()).write("t.fits")
+        np.testing.assert_array_equal(stars("t.fits"), POSITIONS)
+        note = ", the first pixel 1" * origin
+        assert caplog.messages == [f"t.fits: 2 stars, by {names.replace(' ', ' and ')}{note}"]
+
+    @pytest.mark.parametrize(
+        "names",
+        ["RA_ICRS DE_ICRS", "_RAJ2000 _DEJ2000", "RAJ2000 DEJ2000", "ALPHA_J2000 DELTA_J2000",
+         "ALPHAWIN_J2000 DELTAWIN_J2000", "ra dec"],
+    )  # fmt: skip
+    def test_the_sky_as_others_name_it(self, names):
+        Table([ICRS.ra, ICRS.dec], names=names.split()).write("t.vot", format="votable")
+        np.testing.assert_allclose(stars("t.vot"), POSITIONS, atol=1e-6)
+
+    def test_coordinates_in_one_column(self):
+        """As photutils writes them; in another frame."""
+        QTable({"sky_centroid": ICRS.galactic, "flux": [1.0, 2.0]}).write("t.ecsv")
+        np.testing.assert_allclose(stars("t.ecsv"), POSITIONS, atol=1e-6)
+
+    def test_a_table_of_sextractor(self):
+        text = "#   1 NUMBER     Running object number\n#   2 X_IMAGE    Position along x [pixel]\n"
+        text += "#   3 Y_IMAGE    Position along y [pixel]\n    1   3.5000   4.0000\n"
+        np.testing.assert_array_equal(stars(save("test.cat", text)), [(2.5, 3.0)])
 
     @pytest.mark.parametrize("name", ["t.txt", "t.dat", "stars"])
     def test_plain_text_of_any_name(self, name):
@@ -274,7 +327,10 @@ class TestTables:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("x,mag\n1,2\n", "t.csv has neither columns x and y nor ra and dec; it has x, mag"),
+            (
+                "x,mag\n1,2\n",
+                "t.csv has neither columns x and y nor ra and dec; it has x, mag: rename two of",
+            ),
             ("", "t.csv has neither columns x and y nor ra and dec; it has no columns"),
             ("no table\nat all\n", "t.csv has neither columns x and y nor ra and dec; it has no"),
             (
