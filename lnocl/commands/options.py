@@ -8,6 +8,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from lnocl.io.names import file_of
+
 # The values for which a switch is on the command line.
 SWITCHES = {"store_true": True, "store_false": False}
 # The keywords of an option that takes several values and may be repeated.
@@ -107,7 +109,7 @@ def option(
 
 def input_paths(options: Sequence[Option], values: Mapping[str, Any]) -> list[str]:
     """Return the names in the values of arguments that may be those of files to read."""
-    return [path for each in options for path in each.inputs(values[each.name])]
+    return [file_of(path) for each in options for path in each.inputs(values[each.name])]
 
 
 def _listed(value: Any) -> list[Any]:
@@ -177,7 +179,8 @@ IMAGES = option(
     metavar="IMAGE",
     checksum="ISUM",
     help="FITS file with an image, or one file with a cube of them, in the unit of its BUNIT, or "
-    "else in electrons per pixel",
+    "else in electrons per pixel; an extension of any FITS file is named as in 'FILE[SCI]', "
+    "'FILE[SCI,2]' or 'FILE[1]'",
 )
 PSFS = option(
     "--psf",

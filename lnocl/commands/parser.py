@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from lnocl.commands.options import Options
 from lnocl.errors import InputError
+from lnocl.io.names import file_of
 
 
 class Command(NamedTuple):
@@ -87,7 +88,7 @@ class Parser(argparse.ArgumentParser):
             elif flag:
                 taken.setdefault(flag, []).append(word)
         for flag, values in reversed(taken.items()):
-            if len(values) > 1 and os.path.exists(values[-1]):
+            if len(values) > 1 and os.path.exists(file_of(values[-1])):
                 return (
                     f"; {flag} has taken {values[-1]}: put it before the options, or after --, as "
                     f"in {flag} {values[0]} -- {values[-1]}"

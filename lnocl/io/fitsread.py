@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.fitsfile import open_fits
 from lnocl.io.headers import make_wcs, number, quiet_log, readable
-from lnocl.io.selection import choose, describe, has_pixels, only
+from lnocl.io.names import parse_name
+from lnocl.io.selection import choose, describe, find, has_pixels, only
 from lnocl.process import ignored_warnings
 
 log = logging.getLogger("lnocl")
@@ -55,8 +56,9 @@ class Stack(NamedTuple):
 def read_stack(paths: Sequence[str]) -> Stack:
     """Read images: one FITS file each, or one file with a cube.
 
-    The image of a file is the extension SCI, else the primary HDU, else an image extension that
-    is not auxiliary (`lnocl.io.selection.choose`); an extension is named in the log. BSCALE, BZERO
+    The image of a file is the one named, as in ``FILE[SCI,1]`` (`lnocl.io.names`); else the
+    extension SCI, or DET_DIST of a PSF, else the primary HDU, else an image extension that is not
+    auxiliary (`lnocl.io.selection.choose`); an extension is named in the log. BSCALE, BZERO
     and BLANK are applied (a blank pixel is NaN). A file may be compressed as a whole (gzip, bzip2,
     xz), but not in tiles.
 
@@ -77,7 +79,7 @@ def read_stack(paths: Sequence[str]) -> Stack:
         or whose image is larger than the memory.
     InputError
         An image of another dimension or shape than the others; several images in a file that have
-        an equal claim.
+        an equal claim; none that is named.
 
     Warns
     -----
@@ -111,6 +113,8 @@ def read_single(path: str) -> Stack:
 def read_extension(path: str, name: str) -> NDArray[np.float64] | None:
     """Return the image extension of this name of a file, or None where the file lacks it.
 
+    It has the version of the image, where the path names one: ``DQ,2`` beside ``FILE[SCI,2]``.
+
     Raises
     ------
     FileError
@@ -137,7 +141,8 @@ def read_keyword(path: str, header: fits.Header, keyword: str) -> str | float | 
     """
     if keyword in header or "XTENSION" not in header:  # it is the primary header itself
         return header.get(keyword)
-    with ignored_warnings(), open_fits(path) as file:  # shown when the image was read
+    # Warnings were shown when the image was read.
+    with ignored_warnings(), open_fits(parse_name(path).file) as file:
         primary = readable(next(file.hdus()).header)
     return primary.get(keyword)
 
@@ -283,10 +288,16 @@ class _NoImageError(FileError):
 def _read_file(
     path: str, extension: str | None = None
 ) -> tuple[NDArray[np.float64], fits.Header, str]:
-    """Return an image in a file, its header and the checksum of the file."""
-    with open_fits(path) as file:
+    """Return an image in a file, or the extension beside it, its header and the checksum."""
+    name = parse_name(path)
+    with open_fits(name.file) as file:
         hdus = list(file.hdus())
-        index = choose(path, hdus) if extension is None else only(path, hdus, extension)
+        if extension is not None:
+            index = only(name.file, hdus, extension, name.version)
+        elif name.is_chosen:
+            index = find(name, hdus)
+        else:
+            index = choose(path, hdus)
         if index is None:
             raise _NoImageError(f"{path} holds no image")
         if index and extension is None:

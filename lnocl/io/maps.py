@@ -9,6 +9,7 @@ import numpy as np
 
 from lnocl.errors import InputError, counted
 from lnocl.io.fitsread import read_stack
+from lnocl.io.names import file_of
 from lnocl.scene import units
 from lnocl.scene.observation import Array
 
@@ -82,7 +83,7 @@ class Maps:
         if all(isinstance(word, float) for word in words):
             return np.array(words, float)
         for word in words:
-            if isinstance(word, str) and not os.path.exists(word):
+            if isinstance(word, str) and not os.path.exists(file_of(word)):
                 raise InputError(
                     f"{name} {word!r} is not a number, {OTHER_WORDS.get(name, '')}or a file that "
                     "exists"

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from lnocl.errors import InputError
+from lnocl.io.names import ImageName
 
-SCIENCE = "SCI"
+# Names of extensions that go before all others: the image, and STPSF's PSF as the detector sees it.
+SCIENCE = ("SCI", "DET_DIST")
 
 # Extensions that belong to an image: errors, flags, weights, exposures, backgrounds, PSFs and
 # tables of distortions, as telescopes, surveys and astropy's CCDData name them.
@@ -40,9 +42,9 @@ def describe(index: int, hdu: Any) -> str:
 def choose(path: str, hdus: Sequence[Any]) -> int | None:
     """Return the index of the HDU with the image of a file; None where no HDU has pixels.
 
-    The extension SCI comes first. Without one it is the primary HDU, which may be followed by other
-    images of its height and width; else the only image extension that is not auxiliary, by its
-    name; else the only image of the file.
+    The extensions SCI and DET_DIST come first. Without them it is the primary HDU, which may be
+    followed by other images of its height and width; else the only image extension that is not
+    auxiliary, by its name; else the only image of the file.
 
     Parameters
     ----------
@@ -58,7 +60,7 @@ def choose(path: str, hdus: Sequence[Any]) -> int | None:
     """
     images = [i for i, hdu in enumerate(hdus) if has_pixels(hdu)]
     images = [i for i in images if len(hdus[i].shape) in DIMENSIONS] or images
-    science = [i for i in images if name_of(hdus[i]) == SCIENCE]
+    science = [i for i in images if name_of(hdus[i]) in SCIENCE]
     others = [i for i in images if not AUXILIARY.fullmatch(name_of(hdus[i]))]
     claims = science or others or images
     if claims[:1] == [0] and not science:
@@ -68,15 +70,46 @@ def choose(path: str, hdus: Sequence[Any]) -> int | None:
     return claims[0] if claims else None
 
 
-def only(path: str, hdus: Sequence[Any], name: str) -> int | None:
+def find(name: ImageName, hdus: Sequence[Any]) -> int:
+    """Return the index of the HDU that the name of an image means.
+
+    Raises
+    ------
+    InputError
+        The file lacks it; several extensions have the name.
+    """
+    if name.hdu is None:
+        found = only(name.file, hdus, name.extension, name.version)
+    else:
+        is_image = name.hdu < len(hdus) and has_pixels(hdus[name.hdu])
+        found = name.hdu if is_image else None
+    if found is None:
+        wanted = f"HDU {name.hdu}" if name.hdu is not None else f"extension {name.extension}"
+        version = "" if name.version is None else f",{name.version}"
+        held = [describe(i, hdu) for i, hdu in enumerate(hdus) if has_pixels(hdu)]
+        raise InputError(
+            f"{name.file} has no image {wanted}{version}; it has {', '.join(held) or 'none'}"
+        )
+    return found
+
+
+def only(path: str, hdus: Sequence[Any], name: str, version: int | None = None) -> int | None:
     """Return the index of the one image extension of this name; None where the file lacks it.
+
+    Where a version is given, EXTVER, it is the one with that; without it any.
 
     Raises
     ------
     InputError
         Several extensions have the name.
     """
-    claims = [i for i, hdu in enumerate(hdus) if has_pixels(hdu) and name_of(hdu) == name]
+    claims = [
+        i
+        for i, hdu in enumerate(hdus)
+        if has_pixels(hdu)
+        and name_of(hdu) == name
+        and version in (None, hdu.header.get("EXTVER", 1))
+    ]
     if len(claims) > 1:
         raise _ambiguous(path, hdus, claims)
     return claims[0] if claims else None
@@ -87,6 +120,6 @@ def _ambiguous(path: str, hdus: Sequence[Any], claims: Sequence[int]) -> InputEr
         f"{describe(i, hdus[i])} of {' x '.join(map(str, hdus[i].shape))} pixels" for i in claims
     ]
     return InputError(
-        f"{path} holds {len(claims)} images that may be meant: {', '.join(named)}; save the one to "
-        "use in a file of its own, such as with getdata and writeto of astropy.io.fits"
+        f"{path} holds {len(claims)} images that may be meant: {', '.join(named)}; name the one to "
+        f"use, as in '{path}[{claims[0]}]'"
     )

@@ -38,6 +38,13 @@ BAD_FILES = {
         2,
         "a.fits is one of the inputs",
     ),
+    "output is the file of an input": (
+        {"image": "a.fits[0]", "output": "a.fits", "engine": (*NUMPY, "--overwrite")},
+        2,
+        "a.fits is one of the inputs",
+    ),
+    "no such extension": ({"image": "a.fits[SCI]"}, 2, "a.fits has no image extension SCI; it has"),
+    "missing, named": ({"image": "no.fits[1]"}, 1, "no.fits cannot be opened: No such file"),
 }
 
 BAD_ARGUMENTS = {

@@ -5,9 +5,12 @@ import logging
 import numpy as np
 import pytest
 from astropy.io import fits
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lnocl.errors import InputError
 from lnocl.io import fitsread
+from lnocl.io.names import parse_name
 from lnocl.io.selection import AUXILIARY
 
 IMAGE, OTHER, THUMBNAIL = np.full((10, 12), 1.0), np.full((10, 12), 2.0), np.full((3, 4), 3.0)
@@ -75,8 +78,8 @@ def test_several_that_may_be_meant_are_refused(tmp_path, case):
     with pytest.raises(InputError) as caught:
         fitsread.read_stack([path])
     assert str(caught.value) == (
-        f"{path} holds 2 images that may be meant: {named}; save the one to use in a file of its "
-        "own, such as with getdata and writeto of astropy.io.fits"
+        f"{path} holds 2 images that may be meant: {named}; name the one to use, as in "
+        f"'{path}[{named[4]}]'"
     )
 
 
@@ -84,6 +87,72 @@ def test_two_extensions_of_one_name_are_refused(tmp_path):
     path = save(tmp_path / "a.fits", None, ("SCI", IMAGE), ("DQ", OTHER), ("DQ", IMAGE))
     with pytest.raises(InputError, match=r"HDU 2 \(DQ\) of 10 x 12 pixels, HDU 3 \(DQ\)"):
         fitsread.read_extension(path, "DQ")
+
+
+def chips(path):
+    """Write a file of two chips with flags, as a camera of HST does."""
+    hdus = [fits.PrimaryHDU()]
+    for version, image in ((1, OTHER), (2, IMAGE)):
+        hdus += [
+            fits.ImageHDU(image, name="SCI", ver=version),
+            fits.ImageHDU(10.0 * image, name="DQ", ver=version),
+        ]
+    fits.HDUList(hdus).writeto(path)
+    return str(path)
+
+
+@pytest.mark.parametrize("part", ["[SCI,2]", "[sci, 2]", "[3]"])
+def test_the_one_that_is_named(tmp_path, part):
+    path = chips(tmp_path / "a.fits")
+    found = fitsread.read_stack([path + part])
+    np.testing.assert_array_equal(found.data, IMAGE[None])
+    assert found.sha256 == [fitsread._read_file(f"{path}[1]")[2]]
+    assert fitsread.read_keyword(path + part, found.header, "SIMPLE") is True
+
+
+def test_what_belongs_to_the_one_that_is_named(tmp_path):
+    path = chips(tmp_path / "a.fits")
+    np.testing.assert_array_equal(fitsread.read_extension(f"{path}[SCI,2]", "DQ"), 10.0 * IMAGE)
+    assert fitsread.read_extension(f"{path}[SCI,2]", "ERR") is None
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ("[SCI,3]", "has no image extension SCI,3; it has HDU 1 (SCI), HDU 2 (DQ), HDU 3 (SCI), "),
+        ("[ERR]", "has no image extension ERR; it has HDU 1 (SCI), "),
+        ("[0]", "has no image HDU 0; it has HDU 1 (SCI), "),
+        ("[5]", "has no image HDU 5; it has HDU 1 (SCI), "),
+        ("[SCI]", "holds 2 images that may be meant: HDU 1 (SCI) of 10 x 12 pixels, HDU 3 (SCI) "),
+    ],
+)
+def test_names_that_the_file_lacks(tmp_path, part, message):
+    path = chips(tmp_path / "a.fits")
+    with pytest.raises(InputError) as caught:
+        fitsread.read_stack([path + part])
+    assert str(caught.value).startswith(f"{path} {message}")
+
+
+def test_a_file_that_is_called_so(tmp_path):
+    save(tmp_path / "a.fits", OTHER)
+    path = save(tmp_path / "a.fits[0]", IMAGE)
+    np.testing.assert_array_equal(fitsread.read_stack([path]).data, IMAGE[None])
+
+
+def test_a_psf_as_the_detector_sees_it(tmp_path):
+    """Of the four that STPSF writes."""
+    names = "DET_SAMP", "OVERDIST", "DET_DIST"
+    path = save(tmp_path / "a.fits", CUBE[0], *zip(names, (OTHER, CUBE[0], IMAGE), strict=True))
+    np.testing.assert_array_equal(fitsread.read_stack([path]).data, IMAGE[None])
+    np.testing.assert_array_equal(fitsread.read_stack([f"{path}[DET_SAMP]"]).data, OTHER[None])
+
+
+@settings(max_examples=200)
+@given(st.text("a[]0,. S", max_size=12))
+def test_any_name_has_a_file(name):
+    found = parse_name(name)
+    assert name.startswith(found.file)
+    assert found.is_chosen == (found.file != name)
 
 
 @pytest.mark.parametrize(

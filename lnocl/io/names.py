@@ -1,0 +1,67 @@
+"""Names of images in files: ``FILE``, ``FILE[SCI]``, ``FILE[SCI,2]`` or ``FILE[1]``."""
+
+from __future__ import annotations
+
+import os
+import re
+from typing import NamedTuple
+
+_NAMED = re.compile(
+    r"(?P<file>.+)\[((?P<number>\d+)|(?P<name>[^\[\],]+?)(,\s*(?P<version>\d+))?)\]"
+)
+
+
+class ImageName(NamedTuple):
+    """An image in a file.
+
+    Attributes
+    ----------
+    file : str
+        The file.
+    hdu : int or None
+        The number of its HDU, counted from 0, where that is given.
+    extension : str
+        The name of its extension, EXTNAME, in capital letters; empty where none is given.
+    version : int or None
+        Its EXTVER, where that is given.
+    """
+
+    file: str
+    hdu: int | None = None
+    extension: str = ""
+    version: int | None = None
+
+    @property
+    def is_chosen(self) -> bool:
+        """Whether one of the images of the file is named."""
+        return self.hdu is not None or bool(self.extension)
+
+
+def parse_name(path: str) -> ImageName:
+    """Return the image that a name means, as astropy and fitsio write it.
+
+    A file that is called so is taken whole.
+
+    Examples
+    --------
+    >>> from lnocl.io.names import parse_name
+    >>> parse_name("a.fits[sci, 2]")
+    ImageName(file='a.fits', hdu=None, extension='SCI', version=2)
+    >>> parse_name("a.fits[0]").hdu
+    0
+    """
+    match = None if os.path.exists(path) else _NAMED.fullmatch(path)
+    if match is None:
+        return ImageName(path)
+    number, version = match["number"], match["version"]
+    return ImageName(
+        match["file"],
+        None if number is None else int(number),
+        (match["name"] or "").strip().upper(),
+        None if version is None else int(version),
+    )
+
+
+def file_of(path: str) -> str:
+    """Return the file that the name of an image begins with."""
+    return parse_name(path).file
