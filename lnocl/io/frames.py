@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lnocl.errors import InputError, counted, warn
 from lnocl.io import sky
 from lnocl.io.fitsread import read_extension, read_keyword, read_stack
+from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of
 from lnocl.io.maps import Maps, Word
 from lnocl.scene import units
 from lnocl.scene.observation import Array, Observation
@@ -24,6 +25,8 @@ Mask = NDArray[np.bool_]
 
 # The logarithm of the pixels' size in image and PSF may differ by this much.
 MAX_SCALE_ERROR = 0.02
+# Of more masked pixels than this share of an image it is warned.
+MUCH_MASKED = 0.1
 # The extensions in which `lnocl psf` writes what it finds beside a PSF.
 MADE_OF_PSFS = {"psf_modes": "MODES", "psf_scatter": "SCATTER"}
 
@@ -44,6 +47,8 @@ class Calibration(NamedTuple):
         Seconds: numbers, maps, or a keyword of the headers, of the images or their files.
     mask : sequence of str
         Maps, not 0 where a pixel is bad; or ``"dq"``, the extension DQ of each image's file.
+    good_bits : str, optional
+        Flags of DQ that are no fault, as for `flags.bad_pixels`; by default those of the mission.
     saturation : float, optional
         Pixels of this value and above, in units of the images, are bad.
     gain : float, optional
@@ -68,6 +73,7 @@ class Calibration(NamedTuple):
     inverse_variance: Sequence[str] = ()
     exposure: Sequence[Word] = ()
     mask: Sequence[str] = ()
+    good_bits: str | None = None
     saturation: float | None = None
     gain: float | None = None
     align: str | None = None
@@ -296,6 +302,12 @@ class _Reader:
             for j, count in enumerate((bad & ~masked).sum(axis=(1, 2)), 1):
                 log.info("image %d: %s masked %s", j, counted(count, "pixel"), why)
             masked |= bad
+        for j, share in enumerate(masked.mean(axis=(1, 2))):
+            if share > MUCH_MASKED:
+                warn(
+                    f"{100 * share:.0f} % of image {j} are masked: look at why, above; leave mask "
+                    "out, or give other good_bits, if they are good"
+                )
         return masked
 
     def _bad_pixels(
@@ -305,6 +317,8 @@ class _Reader:
             yield "by the mask", self._maps.read("mask", paths) != 0  # NaN is not 0 either
         if "dq" in self._calibration.mask:
             yield "by the extension DQ", self._data_quality()
+        elif self._calibration.good_bits is not None:
+            raise InputError("good_bits are flags of the extension DQ; give mask dq too")
         level = self._calibration.saturation
         if level is not None:
             yield f"as saturated, at {level:g} or above", self._images.data >= level
@@ -318,7 +332,7 @@ class _Reader:
         # A file holds one image, or a cube of all images.
         shapes = images.shape[1:], images.shape if len(self._paths) == 1 else images.shape[1:]
         flagged = []
-        for path in self._paths:
+        for path, header in zip(self._paths, self._images.headers, strict=True):
             flags = read_extension(path, "DQ")
             if flags is None:
                 raise InputError(f"{path} has no extension DQ; give a mask file, or leave dq out")
@@ -327,7 +341,16 @@ class _Reader:
                     f"the extension DQ of {path} has the shape {flags.shape}, its image "
                     f"{shapes[-1]}; give a mask file"
                 )
-            flagged.append(flags != 0)
+            good_bits = self._calibration.good_bits
+            if good_bits is None:
+                words = (
+                    str(read_keyword(path, header, keyword) or "").strip()
+                    for keyword in ("TELESCOP", "INSTRUME", "DETECTOR")
+                )
+                good_bits = good_bits_of(*words)
+            if good_bits != NO_BITS:
+                log.info("%s: of the flags in DQ %s are no fault", path, good_bits)
+            flagged.append(bad_pixels(flags, good_bits, path))
         return np.broadcast_to(np.array(flagged).reshape(-1, *images.shape[1:]), images.shape)
 
     def _read_noise(self, each: Array | float, inverse: Array | None, mask: Mask) -> Array:

@@ -152,6 +152,7 @@ class TestBackground:
         found = read(background=["map.fits", "auto"]).observation.background
         np.testing.assert_array_equal(found, [MAP, np.full(SHAPE, median)])
 
+    @pytest.mark.filterwarnings("ignore:.* % of image . are masked")
     def test_auto_leaves_bad_pixels_out(self):
         image = np.full(SHAPE, 5.0)
         image[:3], image[3:6], image[6] = np.nan, 90.0, 3000.0
@@ -273,9 +274,12 @@ class TestNoise:
             observe(inverse_variance=["inverse.fits"])
 
 
-def save_with_dq(path, image, flags):
+def save_with_dq(path, image, flags, **cards):
     extensions = [] if flags is None else [fits.ImageHDU(flags, name="DQ")]
-    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(image, name="SCI"), *extensions]).writeto(path)
+    primary = fits.PrimaryHDU(header=fits.Header(cards))
+    fits.HDUList([primary, fits.ImageHDU(image, name="SCI"), *extensions]).writeto(
+        path, overwrite=True
+    )
 
 
 class TestMask:
@@ -322,6 +326,55 @@ class TestMask:
         np.testing.assert_array_equal(observe("cube.fits", mask=["dq"]).mask, flags != 0)
         np.testing.assert_array_equal(observe("flat.fits", mask=["dq"]).mask, [flags[1] != 0] * 2)
 
+    @pytest.mark.parametrize(
+        ("words", "bits", "expected"),
+        [
+            ("JWST NIRCAM NRCALONG", None, [1, 5]),
+            ("HST ACS WFC", None, [1, 5, 4, 256, 512]),
+            ("HST WFC3 UVIS", None, [1, 5, 4, 256, 512]),
+            ("HST WFC3 IR", None, [1, 5, 4, 16, 64, 256]),
+            ("HST STIS CCD", None, [1, 5, 4, 16, 64, 256, 512]),
+            ("Keck", None, [1, 5, 4, 16, 64, 256, 512]),
+            ("HST ACS WFC", "0", [1, 5, 4, 16, 64, 256, 512]),
+            ("HST ACS WFC", "256", [1, 5, 4, 16, 64, 512]),
+            ("Keck", "~4,64", [5, 4, 64]),
+        ],
+    )
+    def test_flags_that_are_no_fault(self, words, bits, expected):
+        sums = [0, 1, 5, 4, 16, 64, 256, 512]
+        flags = NONE[0].astype("u4")
+        flags[0, : len(sums)] = sums
+        keywords = zip(("TELESCOP", "INSTRUME", "DETECTOR"), words.split(), strict=False)
+        save_with_dq("1.fits", IMAGES[0], flags, **dict(keywords))
+        masked = observe("1.fits", mask=["dq"], good_bits=bits).mask[0]
+        assert flags[masked].tolist() == [each for each in sums if each in expected]
+
+    @pytest.mark.parametrize("bits", ["", "a", "3,5", "-1", "1.5", "~", "16 64"])
+    def test_what_are_no_flags(self, bits):
+        save_with_dq("1.fits", IMAGES[0], NONE[0].astype("i2"))
+        with pytest.raises(InputError) as caught:
+            observe("1.fits", mask=["dq"], good_bits=bits)
+        assert str(caught.value) == (
+            f"good_bits {bits!r} are no flags; give powers of 2, such as 16,64, or ~1 for all but 1"
+        )
+
+    def test_flags_without_dq_and_dq_without_flags(self):
+        save_with_dq("1.fits", IMAGES[0], NONE[0] + 0.5)
+        with pytest.raises(InputError, match=r"^good_bits are flags of the extension DQ; give mas"):
+            observe("1.fits", good_bits="16")
+        with pytest.raises(InputError, match=r"^the extension DQ of 1\.fits does not hold whole"):
+            observe("1.fits", mask=["dq"])
+
+    def test_much_masked_is_warned_of(self):
+        flags = NONE[0].astype("i2")
+        flags.ravel()[:12] = 1  # a tenth
+        save_with_dq("1.fits", IMAGES[0], flags)
+        observe("1.fits", mask=["dq"])
+        flags.ravel()[12] = 1
+        save_with_dq("1.fits", IMAGES[0], flags)
+        with pytest.warns(LnoclWarning, match=r"^11 % of image 0 are masked: look at why, above"):
+            observe("1.fits", mask=["dq"])
+
     def test_dq_that_is_not_there_or_does_not_fit(self):
         save_with_dq("1.fits", IMAGES[0], NONE[0].astype("i2"))
         save_with_dq("2.fits", IMAGES[1], None)
@@ -360,6 +413,7 @@ class TestMask:
         with pytest.raises(FileError, match=r"no\.fits cannot be opened"):
             observe(mask=["no.fits"])
 
+    @pytest.mark.filterwarnings("ignore:.* % of image . are masked")
     @settings(
         max_examples=30,
         deadline=None,
