@@ -90,10 +90,11 @@ OPTIONS = {
         ),
         option(
             "--gain",
-            type=finite,
+            type=number_or_word,
             metavar="G",
             card=("GAIN", "electrons for each unit of the images"),
-            help="electrons for each adu, or for each of whatever unit the images have",
+            help="electrons for each adu, or for each of whatever unit the images have; or a "
+            "keyword of the images' headers such as GAIN",
         ),
         option(
             "--mask",
@@ -381,6 +382,7 @@ def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[s
         "mu": result.mu,
         "smoothing": result.smoothing,
         "device": result.device,
+        "gain": frames.gain,
         "pad": choose_pad(frames.observation) if repeated["pad"] == "auto" else repeated["pad"],
         **({"exposure": exposure.tolist()} if repeated["exposure"] and exposure.ndim == 1 else {}),
     }

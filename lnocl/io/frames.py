@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,9 +52,9 @@ class Calibration(NamedTuple):
         Flags of DQ that are no fault, as for `flags.bad_pixels`; by default those of the mission.
     saturation : float, optional
         Pixels of this value and above, in units of the images, are bad.
-    gain : float, optional
-        Electrons for each adu or count, or for each of whatever unit the images have. Counts per
-        time stay counts per time.
+    gain : float or str, optional
+        Electrons for each adu or count, or for each of whatever unit the images have; or a keyword
+        of the headers, of the images or their files. Counts per time stay counts per time.
     align : {"wcs"}, optional
         Offsets from the headers' coordinates.
     psf_centre : {"check", "fit", "given"}
@@ -75,7 +76,7 @@ class Calibration(NamedTuple):
     mask: Sequence[str] = ()
     good_bits: str | None = None
     saturation: float | None = None
-    gain: float | None = None
+    gain: Word | None = None
     align: str | None = None
     psf_centre: str = "check"
     ideal_psfs: Sequence[str] = ()
@@ -102,6 +103,8 @@ class Frames(NamedTuple):
         and exposures were given; electrons where they have none that is known.
     electrons : float
         Electrons, or electrons per second, in this unit.
+    gain : float, optional
+        As given, or as the headers have it.
     """
 
     observation: Observation
@@ -110,6 +113,7 @@ class Frames(NamedTuple):
     sha256: dict[str, list[str]]
     unit: str
     electrons: float
+    gain: float | None
 
 
 def read_frames(images: Sequence[str], psfs: Sequence[str], calibration: Calibration) -> Frames:
@@ -184,7 +188,9 @@ class _Reader:
         name, of_unit = (units.spelled(unit), factor) if units.is_known(unit) else ("electron", 1.0)
         if exposure is not None and not are_rates:
             name += "/s"
-        return Frames(observation, self._images.header, background, sha256, name, of_unit)
+        return Frames(
+            observation, self._images.header, background, sha256, name, of_unit, self._gain
+        )
 
     def _psf_errors(self) -> dict[str, Array]:
         """Return what is known of the ways in which PSFs may be wrong."""
@@ -229,7 +235,7 @@ class _Reader:
 
     def _electrons(self) -> tuple[float, bool]:
         """Return the electrons in a unit of the images, and whether they are per second."""
-        gain = self._calibration.gain
+        gain = self._gain
         if gain is not None and not (np.isfinite(gain) and gain > 0):
             raise InputError(f"gain must be more than 0; {gain:g} was given")
         unit = self._unit()
@@ -245,6 +251,22 @@ class _Reader:
                 "the electrons for each of these units"
             )
         return counts
+
+    @cached_property
+    def _gain(self) -> float | None:
+        word = self._calibration.gain
+        if not isinstance(word, str):
+            return word
+        found = [self._from_header("gain", j, word) for j in range(len(self._paths))]
+        for path, gain in zip(self._paths, found, strict=True):
+            if gain is None:
+                raise InputError(f"{path} has no {word} in its header; give gain as a number")
+            if gain != found[0]:
+                raise InputError(
+                    f"the images have several gains: {word} of {self._paths[0]} is {found[0]:g}, "
+                    f"of {path} {gain:g}; convert them to electrons"
+                )
+        return found[0]
 
     def _unit(self) -> Any:
         """Return the unit of the images, without dimension where their headers have no unit."""
@@ -264,11 +286,14 @@ class _Reader:
         words = self._calibration.exposure
         if not words:
             return None
-        return self._maps.combine(
-            "exposure", self._maps.fill("exposure", words, self._exposure_from_header)
-        )
 
-    def _exposure_from_header(self, j: int, keyword: str) -> float | None:
+        def seconds(j: int, keyword: str) -> float | None:
+            return self._from_header("exposure", j, keyword, " seconds")
+
+        return self._maps.combine("exposure", self._maps.fill("exposure", words, seconds))
+
+    def _from_header(self, name: str, j: int, keyword: str, unit: str = "") -> float | None:
+        """Return the number that a keyword has for image j, or None."""
         of_file = min(j, len(self._paths) - 1)  # a cube has one header
         path = self._paths[of_file]
         value = read_keyword(path, self._images.headers[of_file], keyword)
@@ -276,9 +301,9 @@ class _Reader:
             return None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise InputError(
-                f"{keyword} of {path} is {value!r}, not a number; give exposure as numbers"
+                f"{keyword} of {path} is {value!r}, not a number; give {name} as a number"
             )
-        log.info("image %d: exposure %g seconds, from %s", j + 1, value, keyword)
+        log.info("image %d: %s %g%s, from %s", j + 1, name, value, unit, keyword)
         return float(value)
 
     def _inverse_variance(self) -> Array | None:

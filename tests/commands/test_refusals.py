@@ -97,7 +97,8 @@ BAD_ARGUMENTS = {
     ),
     "exposure zero": (["--exposure", "0"], 2, "--exposure must be finite and more than zero; 0"),
     "gain": (["--gain", "-1"], 2, "--gain must be more than 0; -1 was given"),
-    "gain a word": (["--gain", "GAIN"], 2, "argument --gain: 'GAIN' is not a finite number"),
+    "gain nan": (["--gain", "nan"], 2, "--gain must be more than 0; nan was given"),
+    "gain a word": (["--gain", "GAIN"], 2, "a.fits has no GAIN in its header; give --gain as a "),
     "saturation": (
         ["--saturation", "nan"],
         2,

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from astropy import units as u
-from frame_files import IMAGES, observe, read, save, save_images
+from astropy.io import fits
+from frame_files import IMAGES, notes, observe, read, save, save_images
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -73,6 +74,30 @@ class TestUnits:
             observe()
         with pytest.raises(InputError, match="holds counts per time"):
             observe(gain=2.0)
+
+    def test_the_gain_may_be_in_the_headers(self, log):
+        save_images(BUNIT="adu", EGAIN=2.5)
+        found = read(gain="EGAIN")
+        np.testing.assert_array_equal(found.observation.images, 2.5 * IMAGES)
+        assert (found.gain, found.electrons, found.unit) == (2.5, 2.5, "adu")
+        assert notes(log) == ["image 1: gain 2.5, from EGAIN", "image 2: gain 2.5, from EGAIN"]
+
+    def test_gains_in_headers_that_are_none(self):
+        save_images(BUNIT="adu", EGAIN=2.5, TEXT="a", ZERO=0.0)
+        with pytest.raises(InputError, match=r"^1\.fits has no GAIN in its header; give gain as a"):
+            observe(gain="GAIN")
+        with pytest.raises(InputError, match=r"^TEXT of 1\.fits is 'a', not a number; give gain"):
+            observe(gain="TEXT")
+        with pytest.raises(InputError, match=r"^gain must be more than 0; 0 was given"):
+            observe(gain="ZERO")
+        with fits.open("2.fits", mode="update") as file:
+            file[0].header["EGAIN"] = 3.0
+        with pytest.raises(InputError) as caught:
+            observe(gain="EGAIN")
+        assert str(caught.value) == (
+            "the images have several gains: EGAIN of 1.fits is 2.5, of 2.fits 3; convert them to "
+            "electrons"
+        )
 
     @pytest.mark.parametrize("unit", [*DIGITAL, *DIGITAL_RATES, *OTHERS])
     def test_other_units_need_the_gain(self, unit):
