@@ -121,6 +121,28 @@ OPTIONS = {
             "where a pixel is bad; one for all images or one for each",
         ),
         option(
+            "--variance",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="WSUM",
+            help="the same with their variance",
+        ),
+        option(
+            "--rms",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="QSUM",
+            help="the same with their standard deviation",
+        ),
+        option(
+            "--error",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="NSUM",
+            help="the same with the standard deviation of all noise, that of the source's counts "
+            "too; or err, the extension ERR of each image",
+        ),
+        option(
             "--align",
             choices=("wcs",),
             help="take the offsets between the images from their sky coordinates",

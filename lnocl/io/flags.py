@@ -60,7 +60,7 @@ def bad_pixels(flags: NDArray[Any], good_bits: str, path: str) -> NDArray[np.boo
     sums = np.array(flags).astype(np.int64, casting="unsafe")
     if not (sums == flags).all():
         raise InputError(
-            f"the extension DQ of {path} does not hold whole numbers; give a mask file"
+            f"the extension DQ of {path} does not hold whole numbers; give mask as a file"
         )
     try:
         good = None if "-" in good_bits else interpret_bit_flags(good_bits)

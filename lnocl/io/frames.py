@@ -17,6 +17,7 @@ from lnocl.io import sky
 from lnocl.io.fitsread import read_extension, read_keyword, read_stack
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of
 from lnocl.io.maps import Maps, Word
+from lnocl.io.noise import VARIANCES, NoiseMap, read_noise_map
 from lnocl.scene import units
 from lnocl.scene.observation import Array, Observation
 
@@ -42,8 +43,12 @@ class Calibration(NamedTuple):
         sigma-clipped median of the image.
     read_noise : sequence of Word
         Standard deviation, electrons: numbers or maps.
-    inverse_variance : sequence of str
-        Maps of one over the variance of all noise but that of the source, in units of the images.
+    inverse_variance, variance, rms : sequence of str
+        Maps of one over the variance of all noise but that of the source, of this variance, or of
+        its root, in units of the images; one kind at most. 0 where a pixel is bad.
+    error : sequence of str
+        Maps of the standard deviation of all noise, that of the source's counts too; or ``"err"``,
+        the extension ERR of each image's file.
     exposure : sequence of Word
         Seconds: numbers, maps, or a keyword of the headers, of the images or their files.
     mask : sequence of str
@@ -72,6 +77,9 @@ class Calibration(NamedTuple):
     background: Sequence[Word] = (0.0,)
     read_noise: Sequence[Word] = (0.0,)
     inverse_variance: Sequence[str] = ()
+    variance: Sequence[str] = ()
+    rms: Sequence[str] = ()
+    error: Sequence[str] = ()
     exposure: Sequence[Word] = ()
     mask: Sequence[str] = ()
     good_bits: str | None = None
@@ -162,8 +170,8 @@ class _Reader:
         # Electrons in each unit of the images.
         self._warn_of_pixel_scales()
         each = factor * (_maps(exposure) if are_rates and exposure is not None else 1.0)
-        inverse = self._inverse_variance()
-        mask = self._mask(exposure, inverse)
+        noise = self._noise_map()
+        mask = self._mask(exposure, noise)
         counts = self._images.data
         counts *= each
         background = self._background(counts, mask)
@@ -171,7 +179,7 @@ class _Reader:
             counts,
             self._psfs.data,
             background=self._maps.combine("background", background),
-            read_noise=self._read_noise(each, inverse, mask),
+            read_noise=self._read_noise(counts, each, noise, mask),
             mask=mask if mask.any() else None,
             exposure=1.0 if exposure is None else exposure,
             offsets=self._offsets(),
@@ -306,24 +314,17 @@ class _Reader:
         log.info("image %d: %s %g%s, from %s", j + 1, name, value, unit, keyword)
         return float(value)
 
-    def _inverse_variance(self) -> Array | None:
-        paths = self._calibration.inverse_variance
-        if not paths:
-            return None
-        if any(self._calibration.read_noise):
-            raise InputError("give read_noise or inverse_variance, which includes it, not both")
-        inverse = self._maps.read("inverse_variance", paths)
-        if (inverse < 0).any():
-            raise InputError(
-                f"inverse_variance {paths[0]} has negative pixels; they must be 0 or more, and 0 "
-                "where a pixel is bad"
-            )
-        return inverse
+    def _noise_map(self) -> NoiseMap | None:
+        given = {kind: getattr(self._calibration, kind) for kind in VARIANCES}
+        found = read_noise_map(given, self._maps, lambda: self._extensions("ERR", "error"))
+        if found is not None and any(self._calibration.read_noise):
+            raise InputError(f"give read_noise or {found.kind}, which includes it, not both")
+        return found
 
-    def _mask(self, exposure: Array | None, inverse: Array | None) -> Mask:
+    def _mask(self, exposure: Array | None, noise: NoiseMap | None) -> Mask:
         """Return which pixels are bad, and log their number, each pixel for its first reason."""
         masked = np.zeros(self._images.data.shape, bool)
-        for why, bad in self._bad_pixels(exposure, inverse):
+        for why, bad in self._bad_pixels(exposure, noise):
             for j, count in enumerate((bad & ~masked).sum(axis=(1, 2)), 1):
                 log.info("image %d: %s masked %s", j, counted(count, "pixel"), why)
             masked |= bad
@@ -336,7 +337,7 @@ class _Reader:
         return masked
 
     def _bad_pixels(
-        self, exposure: Array | None, inverse: Array | None
+        self, exposure: Array | None, noise: NoiseMap | None
     ) -> Iterator[tuple[str, Mask]]:
         if paths := [word for word in self._calibration.mask if word != "dq"]:
             yield "by the mask", self._maps.read("mask", paths) != 0  # NaN is not 0 either
@@ -349,24 +350,14 @@ class _Reader:
             yield f"as saturated, at {level:g} or above", self._images.data >= level
         if exposure is not None and exposure.ndim == 3:
             yield "without exposure", exposure == 0
-        if inverse is not None:
-            yield "without inverse variance", ~np.isfinite(inverse) | (inverse == 0)
+        if noise is not None:
+            yield f"without {noise.kind.replace('_', ' ')}", noise.variance == 0
 
     def _data_quality(self) -> Mask:
-        images = self._images.data
-        # A file holds one image, or a cube of all images.
-        shapes = images.shape[1:], images.shape if len(self._paths) == 1 else images.shape[1:]
-        flagged = []
-        for path, header in zip(self._paths, self._images.headers, strict=True):
-            flags = read_extension(path, "DQ")
-            if flags is None:
-                raise InputError(f"{path} has no extension DQ; give a mask file, or leave dq out")
-            if flags.shape not in shapes:
-                raise InputError(
-                    f"the extension DQ of {path} has the shape {flags.shape}, its image "
-                    f"{shapes[-1]}; give a mask file"
-                )
-            good_bits = self._calibration.good_bits
+        sums = self._extensions("DQ", "mask")
+        flagged = np.empty(sums.shape, bool)
+        for j, header in enumerate(self._images.headers):
+            path, good_bits = self._paths[j], self._calibration.good_bits
             if good_bits is None:
                 words = (
                     str(read_keyword(path, header, keyword) or "").strip()
@@ -375,14 +366,37 @@ class _Reader:
                 good_bits = good_bits_of(*words)
             if good_bits != NO_BITS:
                 log.info("%s: of the flags in DQ %s are no fault", path, good_bits)
-            flagged.append(bad_pixels(flags, good_bits, path))
-        return np.broadcast_to(np.array(flagged).reshape(-1, *images.shape[1:]), images.shape)
+            of_file = slice(None) if len(self._paths) == 1 else slice(j, j + 1)
+            flagged[of_file] = bad_pixels(sums[of_file], good_bits, path)
+        return flagged
 
-    def _read_noise(self, each: Array | float, inverse: Array | None, mask: Mask) -> Array:
-        if inverse is None:
+    def _extensions(self, name: str, instead: str) -> Array:
+        """Return the extensions of this name beside the images, shape (p, ny, nx)."""
+        images = self._images.data
+        # A file holds one image, or a cube of all images.
+        shapes = images.shape[1:], images.shape if len(self._paths) == 1 else images.shape[1:]
+        found = []
+        for path in self._paths:
+            values = read_extension(path, name)
+            if values is None:
+                raise InputError(
+                    f"{path} has no extension {name}; give {instead} as a file, or leave "
+                    f"{name.lower()} out"
+                )
+            if values.shape not in shapes:
+                raise InputError(
+                    f"the extension {name} of {path} has the shape {values.shape}, its image "
+                    f"{shapes[-1]}; give {instead} as a file"
+                )
+            found.append(values)
+        return np.broadcast_to(np.array(found).reshape(-1, *images.shape[1:]), images.shape)
+
+    def _read_noise(
+        self, counts: Array, each: Array | float, noise: NoiseMap | None, mask: Mask
+    ) -> Array:
+        if noise is None:
             return self._maps.combine("read_noise", self._calibration.read_noise)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(mask, 0.0, each / np.sqrt(inverse))
+        return noise.read_noise(counts, each, mask)
 
     def _background(self, counts: Array, mask: Mask) -> list[Word]:
         """Return the background with numbers in the place of "auto"."""

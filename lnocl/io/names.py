@@ -7,7 +7,7 @@ import re
 from typing import NamedTuple
 
 _NAMED = re.compile(
-    r"(?P<file>.+)\[((?P<number>\d+)|(?P<name>[^\[\],]+?)(,\s*(?P<version>\d+))?)\]"
+    r"(?P<file>.+)\[((?P<number>\d+)|(?P<name>[^\[\],\s][^\[\],]*)(,\s*(?P<version>\d+))?)\]"
 )
 
 

@@ -239,6 +239,68 @@ class TestNoise:
             observation.background, [MAP * factor**2] * 2, rtol=1e-14, atol=0
         )
 
+    @pytest.mark.parametrize(
+        ("kind", "values"),
+        [("inverse_variance", 1.0 / MAP), ("variance", MAP), ("rms", np.sqrt(MAP))],
+    )
+    def test_other_maps_of_the_same_noise(self, log, kind, values):
+        save_images(BUNIT="adu")
+        values = values.copy()
+        values[0, 1], values[2, 3], values[4, 5] = 0.0, np.nan, np.inf
+        bad = (values == 0) | ~np.isfinite(values)
+        save("map.fits", values)
+        found = read(**{kind: ["map.fits"]}, gain=1.5)
+        np.testing.assert_array_equal(found.observation.mask, [bad, bad])
+        background = found.observation.background[0]
+        np.testing.assert_allclose(background[~bad], 2.25 * MAP[~bad], rtol=1e-14)
+        assert f"image 1: 3 pixels masked without {kind.replace('_', ' ')}" in notes(log)
+        assert len(found.sha256[kind]) == 1
+
+    def test_errors_with_those_of_the_counts(self, log):
+        """As HST writes them: in counts, the noise of which is in them where there are any."""
+        counts = IMAGES.copy()
+        counts[0, 0, 0] = -0.5
+        errors = np.sqrt(counts.clip(0.0) / 2.0 + MAP)
+        errors[1, 5, 5], errors[1, 6, 6] = 0.0, np.sqrt(0.5 * counts[1, 6, 6] - 0.1)
+        for j in range(2):
+            hdus = [fits.PrimaryHDU(), fits.ImageHDU(counts[j], name="SCI")]
+            hdus += [fits.ImageHDU(errors[j], name="ERR")]
+            hdus[1].header["BUNIT"] = "adu"
+            fits.HDUList(hdus).writeto(f"{j + 1}.fits")
+        save("errors.fits", errors)
+        for source in ("err", "errors.fits"):
+            log.clear()
+            found = observe(error=[source], gain=2.0)
+            expected = np.array([MAP, MAP]) * 4.0
+            expected[1, 6, 6] = 0.0
+            bad = errors == 0
+            np.testing.assert_array_equal(found.mask, bad)
+            np.testing.assert_allclose(found.background[~bad], expected[~bad], rtol=1e-12, atol=0)
+            assert notes(log)[-2].endswith("0 pixels with less than that of the counts have none")
+            assert notes(log)[-1].startswith("image 2: noise besides its counts 2.44 electrons in")
+            assert notes(log)[-1].endswith("1 pixel with less than that of the counts has none")
+
+    def test_errors_that_leave_the_source_out(self):
+        save_images()
+        save("errors.fits", MAP)
+        with pytest.raises(InputError) as caught:
+            observe(error=["errors.fits"])
+        assert str(caught.value) == (
+            "error of image 0 is less than the noise of its counts in most pixels; see to gain and "
+            "exposure, or give it as rms if it leaves the source out"
+        )
+
+    def test_no_errors_and_two_kinds(self):
+        save_images()
+        save("map.fits", MAP)
+        with pytest.raises(InputError) as caught:
+            observe(error=["err"])
+        assert str(caught.value) == (
+            "1.fits has no extension ERR; give error as a file, or leave err out"
+        )
+        with pytest.raises(InputError, match=r"^give variance, or give rms: each is all there"):
+            observe(rms=["map.fits"], variance=["map.fits"])
+
     def test_where_it_is_0_or_nan_pixels_are_bad(self, log):
         save_images()
         inverse = 1.0 / MAP
@@ -380,13 +442,15 @@ class TestMask:
         save_with_dq("2.fits", IMAGES[1], None)
         with pytest.raises(InputError) as caught:
             observe(mask=["dq"])
-        assert str(caught.value) == "2.fits has no extension DQ; give a mask file, or leave dq out"
+        assert (
+            str(caught.value) == "2.fits has no extension DQ; give mask as a file, or leave dq out"
+        )
         save_with_dq("3.fits", IMAGES[1], NONE[1].T.astype("i2"))
         with pytest.raises(InputError) as caught:
             observe("1.fits", "3.fits", mask=["dq"])
         assert str(caught.value) == (
-            "the extension DQ of 3.fits has the shape (12, 10), its image (10, 12); give a mask "
-            "file"
+            "the extension DQ of 3.fits has the shape (12, 10), its image (10, 12); give mask as "
+            "a file"
         )
 
     def test_saturation_is_in_units_of_the_images(self, log):

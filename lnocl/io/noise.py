@@ -1,0 +1,117 @@
+"""Maps of the noise of images, as telescopes write them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.errors import InputError, counted
+from lnocl.io.maps import Maps
+from lnocl.scene.observation import Array
+
+log = logging.getLogger("lnocl")
+
+# The variance of each kind of map, in units of the images squared.
+VARIANCES: Mapping[str, Callable[[Array], Array]] = {
+    "inverse_variance": lambda values: 1.0 / values,
+    "variance": lambda values: values,
+    "rms": np.square,
+    "error": np.square,
+}
+# The kind that has the noise of the source's own counts too.
+WITH_SOURCE = "error"
+
+
+class NoiseMap(NamedTuple):
+    """A map of the noise of images.
+
+    Attributes
+    ----------
+    kind : str
+        Of `VARIANCES`.
+    variance : ndarray of float64, shape (p, ny, nx)
+        In units of the images squared; 0 where a pixel is bad.
+    """
+
+    kind: str
+    variance: Array
+
+    def read_noise(self, counts: Array, each: Array | float, mask: NDArray[np.bool_]) -> Array:
+        """Return what has the variance of all noise but that of the source's counts, electrons.
+
+        Parameters
+        ----------
+        counts : ndarray of float64, shape (p, ny, nx)
+            Electrons.
+        each : ndarray or float
+            Electrons in each unit of the images.
+        mask : ndarray of bool, shape (p, ny, nx)
+            Where it is not needed.
+
+        Raises
+        ------
+        InputError
+            A map with the source's noise that has less of it than counts have.
+        """
+        variance = np.where(mask, 0.0, each**2 * self.variance)
+        if self.kind != WITH_SOURCE:
+            return np.asarray(np.sqrt(variance))
+        variance -= np.where(mask, 0.0, counts.clip(0.0))
+        for j, (left, bad) in enumerate(zip(variance, mask, strict=True)):
+            n_below = int((left < 0).sum())
+            if n_below > 0.5 * (~bad).sum():
+                raise InputError(
+                    f"error of image {j} is less than the noise of its counts in most pixels; see "
+                    "to gain and exposure, or give it as rms if it leaves the source out"
+                )
+            median = np.sqrt(np.median(left[~bad].clip(0.0))) if not bad.all() else 0.0
+            log.info(
+                "image %d: noise besides its counts %.3g electrons in the median; %s with less "
+                "than that of the counts %s none",
+                j + 1,
+                median,
+                counted(n_below, "pixel"),
+                "has" if n_below == 1 else "have",
+            )
+        return np.asarray(np.sqrt(variance.clip(0.0)))
+
+
+def read_noise_map(
+    given: Mapping[str, Sequence[str]], maps: Maps, errors: Callable[[], Array]
+) -> NoiseMap | None:
+    """Return the map of noise that is given, None where none is.
+
+    Parameters
+    ----------
+    given : mapping of str to sequence of str
+        Files, by the kind of their map.
+    maps : Maps
+        Their reader.
+    errors : callable
+        ``errors()`` returns the extensions ERR of the images, which ``"err"`` means.
+
+    Raises
+    ------
+    FileError, InputError
+        As `Maps.read`; several kinds; negative values.
+    """
+    kinds = [kind for kind in VARIANCES if given.get(kind)]
+    if not kinds:
+        return None
+    if len(kinds) > 1:
+        raise InputError(f"give {kinds[0]}, or give {kinds[1]}: each is all there is of noise")
+    (kind,) = kinds
+    is_extension = kind == WITH_SOURCE and list(given[kind]) == ["err"]
+    values = errors() if is_extension else maps.read(kind, given[kind])
+    if (values < 0).any():
+        raise InputError(
+            f"{kind} {given[kind][0]} has negative pixels; they must be 0 or more, and 0 where a "
+            "pixel is bad"
+        )
+    with np.errstate(divide="ignore", over="ignore"):
+        variance = VARIANCES[kind](values)
+    return NoiseMap(kind, np.where(np.isfinite(values) & np.isfinite(variance), variance, 0.0))
