@@ -27,6 +27,13 @@ RESULT_TABLES = {
     "HELDOUT": ("smoothing", "iteration", "error"),
 }
 
+# Beginnings of CTYPE3 of cubes whose planes are not of one sky: colours, energies, velocities,
+# polarisations.
+NOT_EXPOSURES = (
+    *("WAVE", "AWAV", "WAVN", "LAMBDA", "FREQ", "ENER", "VRAD", "VOPT", "VELO", "FELO", "ZOPT"),
+    *("BETA", "STOKES", "COLOR", "COLOUR", "BAND", "FILTER"),
+)
+
 _WCS_KEYWORD = re.compile(r"(?:CTYPE|CRPIX|CRVAL|CDELT)1([A-Z]?)")
 
 
@@ -78,8 +85,8 @@ def read_stack(paths: Sequence[str]) -> Stack:
         A file that is missing, damaged, truncated, tile-compressed or not FITS, that has no image,
         or whose image is larger than the memory.
     InputError
-        An image of another dimension or shape than the others; several images in a file that have
-        an equal claim; none that is named.
+        An image of another dimension or shape than the others; a cube of colours or energies by its
+        CTYPE3; several images in a file that have an equal claim; none that is named.
 
     Warns
     -----
@@ -89,6 +96,8 @@ def read_stack(paths: Sequence[str]) -> Stack:
     images, headers, sha256 = zip(*(_read_file(path) for path in paths), strict=True)
     for path, image in zip(paths, images, strict=True):
         _check_shape(path, image.shape, paths[0], images[0].shape, alone=len(paths) == 1)
+    if images[0].ndim == 3 and len(images[0]) > 1:
+        _refuse_colours(paths[0], str(headers[0].get("CTYPE3", "")).strip().upper())
     ny, nx = images[0].shape[-2:]
     data = images[0] if len(images) == 1 else np.stack(images)
     return Stack(data.reshape(-1, ny, nx), list(headers), list(sha256))
@@ -321,4 +330,12 @@ def _check_shape(
     if shape != first_shape:
         raise InputError(
             f"{path} has the shape {shape} and {first_path} {first_shape}; they must be the same"
+        )
+
+
+def _refuse_colours(path: str, kind: str) -> None:
+    if kind.startswith(NOT_EXPOSURES):
+        raise InputError(
+            f"{path} is a cube along {kind}, which are not several images of one sky; give one "
+            "plane in a file of its own, or take CTYPE3 out of its header if they are"
         )

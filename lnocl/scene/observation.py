@@ -313,8 +313,8 @@ def _stack(name: str, values: ArrayLike) -> Array:
         raise InputError(f"{name} is empty: its shape is {array.shape}")
     if array.ndim == 3 and array.shape[2] <= MAX_CHANNELS and min(array.shape[:2]) >= MIN_SIDE:
         raise InputError(
-            f"{name} has shape {array.shape}, but its axes are (p, ny, nx): give "
-            f"np.moveaxis({name}, -1, 0)"
+            f"{name} has shape {array.shape}, but its axes are (p, ny, nx): of colours give one, "
+            f"{name}[:, :, 0]; if they are of one sky, np.moveaxis({name}, -1, 0)"
         )
     return array.reshape((-1, *array.shape[-2:]))
 

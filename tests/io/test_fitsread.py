@@ -211,6 +211,26 @@ class TestRefusedFiles:
         with pytest.raises(InputError, match=f"a.fits has an image of {len(shape)} dimension"):
             fitsread.read_stack([path])
 
+    @pytest.mark.parametrize("kind", ["WAVE", "FREQ-LSR", "stokes", "VELO", "ENERGY"])
+    def test_cubes_of_colours(self, tmp_path, kind):
+        hdu = fits.PrimaryHDU(np.array([IMAGE, IMAGE]))
+        hdu.header["CTYPE3"] = kind
+        path = save(tmp_path / "a.fits", hdu)
+        with pytest.raises(InputError) as caught:
+            fitsread.read_stack([path])
+        assert str(caught.value) == (
+            f"{path} is a cube along {kind.upper()}, which are not several images of one sky; give "
+            "one plane in a file of its own, or take CTYPE3 out of its header if they are"
+        )
+
+    @pytest.mark.parametrize(
+        ("kind", "n"), [("TIME", 2), ("", 2), ("EXPOSURE", 2), ("FREQ", 1), ("STOKES", 1)]
+    )
+    def test_cubes_of_exposures_and_of_one_plane(self, tmp_path, kind, n):
+        hdu = fits.PrimaryHDU(np.array([IMAGE] * n))
+        hdu.header["CTYPE3"] = kind
+        assert len(fitsread.read_stack([save(tmp_path / "a.fits", hdu)]).data) == n
+
     def test_a_cube_among_several_files(self, tmp_path):
         image = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE))
         cube = save(tmp_path / "b.fits", fits.PrimaryHDU(np.array([IMAGE, IMAGE])))
@@ -267,7 +287,7 @@ class TestCoordinates:
     def test_a_result_lies_where_the_image_lies(self, tmp_path, cards, shape):
         header = fits.Header(cards | PHYSICAL)
         if len(shape) == 3:
-            header.update(CTYPE3="WAVE", CRVAL3=1e-6, CD3_3=1e-9)
+            header.update(CTYPE3="TIME", CRVAL3=1.0, CD3_3=60.0)
         source = save(tmp_path / "a.fits", fits.PrimaryHDU(np.ones(shape), header))
         stack = fitsread.read_stack([source])
         output = str(tmp_path / "out.fits")

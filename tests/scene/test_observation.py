@@ -253,11 +253,12 @@ REFUSED = {
     "images without pixels": ({"images": IMAGES[:, :, :0]}, "images is empty"),
     "channels last": (
         {"images": np.ones((64, 48, 3))},
-        "images has shape (64, 48, 3), but its axes are (p, ny, nx): give np.moveaxis(images, -1,",
+        "images has shape (64, 48, 3), but its axes are (p, ny, nx): of colours give one, "
+        "images[:, :, 0]; if they are of one sky, np.moveaxis(images, -1, 0)",
     ),
     "channels of PSFs last": (
         {"psfs": np.ones((8, 9, 4))},
-        "psfs has shape (8, 9, 4), but its axes are (p, ny, nx): give np.moveaxis(psfs, -1, 0)",
+        "psfs has shape (8, 9, 4), but its axes are (p, ny, nx): of colours give one, psfs[:, ",
     ),
     "complex images": ({"images": IMAGES + 0j}, "images holds complex128"),
     "text for images": ({"images": [["1", "2"]]}, "images holds <U1"),
