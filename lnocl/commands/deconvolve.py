@@ -386,7 +386,7 @@ def _repeated(given: Mapping[str, Any], calibration: Calibration, frames: Frames
     """Return the values of the command that repeats the run, where others were given."""
     return {
         "background": frames.background,
-        "read_noise": list(calibration.read_noise),
+        "read_noise": frames.read_noise,
         "star_sky": [],
         "star_table": None,
         "precision": given["precision"] if given["engine"] == "opencl" else "double",

@@ -208,8 +208,9 @@ READ_NOISE = option(
     metavar="S",
     card=("RON", "read noise, electrons"),
     checksum="RSUM",
-    help="standard deviation in electrons, or a FITS file with a map of it; one for all images or "
-    "one for each (default: 0)",
+    help="standard deviation in electrons, a FITS file with a map of it, or auto, what the "
+    "scatter of the sky has beyond the noise of its counts; one for all images or one for each "
+    "(default: 0)",
 )
 SATURATION = option(
     "--saturation",

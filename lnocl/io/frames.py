@@ -42,7 +42,8 @@ class Calibration(NamedTuple):
         Electrons per pixel, one or one for each image: a number, a map, or ``"auto"``, the
         sigma-clipped median of the image.
     read_noise : sequence of Word
-        Standard deviation, electrons: numbers or maps.
+        Standard deviation, electrons: numbers, maps, or ``"auto"``, what the sigma-clipped scatter
+        of the image has beyond the noise of its counts.
     inverse_variance, variance, rms : sequence of str
         Maps of one over the variance of all noise but that of the source, of this variance, or of
         its root, in units of the images; one kind at most. 0 where a pixel is bad.
@@ -102,7 +103,7 @@ class Frames(NamedTuple):
         In electrons; its sky per second where exposures were given.
     header : astropy.io.fits.Header
         Header of the first image.
-    background : list of Word
+    background, read_noise : list of Word
         As given, with the numbers that ``"auto"`` found.
     sha256 : dict of str to list of str
         Checksums of all files, by the option they belong to: images, psfs, background, ...
@@ -118,6 +119,7 @@ class Frames(NamedTuple):
     observation: Observation
     header: fits.Header
     background: list[Word]
+    read_noise: list[Word]
     sha256: dict[str, list[str]]
     unit: str
     electrons: float
@@ -175,11 +177,14 @@ class _Reader:
         counts = self._images.data
         counts *= each
         background = self._background(counts, mask)
+        read_noise = self._read_noise_words(counts, mask)
         observation = Observation(
             counts,
             self._psfs.data,
             background=self._maps.combine("background", background),
-            read_noise=self._read_noise(counts, each, noise, mask),
+            read_noise=self._maps.combine("read_noise", read_noise)
+            if noise is None
+            else noise.read_noise(counts, each, mask),
             mask=mask if mask.any() else None,
             exposure=1.0 if exposure is None else exposure,
             offsets=self._offsets(),
@@ -197,7 +202,14 @@ class _Reader:
         if exposure is not None and not are_rates:
             name += "/s"
         return Frames(
-            observation, self._images.header, background, sha256, name, of_unit, self._gain
+            observation,
+            self._images.header,
+            background,
+            read_noise,
+            sha256,
+            name,
+            of_unit,
+            self._gain,
         )
 
     def _psf_errors(self) -> dict[str, Array]:
@@ -391,19 +403,23 @@ class _Reader:
             found.append(values)
         return np.broadcast_to(np.array(found).reshape(-1, *images.shape[1:]), images.shape)
 
-    def _read_noise(
-        self, counts: Array, each: Array | float, noise: NoiseMap | None, mask: Mask
-    ) -> Array:
-        if noise is None:
-            return self._maps.combine("read_noise", self._calibration.read_noise)
-        return noise.read_noise(counts, each, mask)
-
     def _background(self, counts: Array, mask: Mask) -> list[Word]:
         """Return the background with numbers in the place of "auto"."""
         return self._maps.fill(
             "background",
             self._calibration.background,
-            lambda j, word: _clipped_median(j, counts[j], mask[j]) if word == "auto" else None,
+            lambda j, word: _sky_level(j, counts[j], mask[j]) if word == "auto" else None,
+        )
+
+    def _read_noise_words(self, counts: Array, mask: Mask) -> list[Word]:
+        """Return the read noise with numbers in the place of "auto"."""
+        words = list(self._calibration.read_noise)
+        if "auto" not in words:
+            return words
+        return self._maps.fill(
+            "read_noise",
+            words,
+            lambda j, word: _sky_noise(j, counts[j], mask[j]) if word == "auto" else None,
         )
 
     def _offsets(self) -> Array | None:
@@ -425,17 +441,9 @@ def _maps(values: Array) -> Array:
     return values if values.ndim == 3 else values[:, None, None]
 
 
-def _clipped_median(j: int, counts: Array, mask: Mask) -> float:
+def _sky_level(j: int, counts: Array, mask: Mask) -> float:
     """Return the background of image j: the sigma-clipped median of its good pixels."""
-    from astropy.stats import sigma_clipped_stats
-
-    good = counts[~mask & np.isfinite(counts)]
-    if good.size == 0:
-        raise InputError(
-            f"image {j} has no good pixel to measure its background; leave the image out, or give "
-            "background as a number"
-        )
-    _, median, scatter = sigma_clipped_stats(good)
+    median, scatter = _clipped(j, counts, mask)
     log.info(
         "image %d: background %.6g electrons per pixel, scatter %.3g (sigma-clipped median)",
         j + 1,
@@ -445,7 +453,28 @@ def _clipped_median(j: int, counts: Array, mask: Mask) -> float:
     if median < 0:
         raise InputError(
             f"image {j} has a sigma-clipped median of {median:.6g} electrons: its background was "
-            "subtracted already; give background 0, and its noise as read_noise or "
-            "inverse_variance"
+            "subtracted already; give background 0, and its noise as read_noise, which may be auto"
         )
-    return float(median)
+    return median
+
+
+def _sky_noise(j: int, counts: Array, mask: Mask) -> float:
+    """Return the noise that the sky of image j has beside that of its counts, electrons."""
+    median, scatter = _clipped(j, counts, mask)
+    noise = float(np.sqrt(max(scatter**2 - max(median, 0.0), 0.0)))
+    log.info("image %d: read noise %.4g electrons (sigma-clipped scatter)", j + 1, noise)
+    return noise
+
+
+def _clipped(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
+    """Return the sigma-clipped median and scatter of the good pixels of image j."""
+    from astropy.stats import sigma_clipped_stats
+
+    good = counts[~mask & np.isfinite(counts)]
+    if good.size == 0:
+        raise InputError(
+            f"image {j} has no good pixel to measure its sky; leave the image out, or give "
+            "background and read_noise as numbers"
+        )
+    _, median, scatter = sigma_clipped_stats(good)
+    return float(median), float(scatter)

@@ -19,7 +19,11 @@ Word = str | float
 UNITS = {"background": units.COUNTS, "read_noise": units.COUNTS, "exposure": ("second",)}
 
 # The words that a quantity may be, besides a number and a file.
-OTHER_WORDS = {"background": "auto, ", "exposure": "a keyword of the images' headers, "}
+OTHER_WORDS = {
+    "background": "auto, ",
+    "read_noise": "auto, ",
+    "exposure": "a keyword of the images' headers, ",
+}
 
 
 class Maps:

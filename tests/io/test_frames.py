@@ -176,7 +176,9 @@ class TestBackground:
         with pytest.raises(InputError) as caught:
             observe(background=["auto"])
         assert str(caught.value).startswith("image 0 has a sigma-clipped median of -")
-        assert "give background 0, and its noise as read_noise or" in str(caught.value)
+        assert "give background 0, and its noise as read_noise, which may be auto" in str(
+            caught.value
+        )
 
     @pytest.mark.parametrize(
         ("background", "message"),
@@ -201,7 +203,7 @@ class TestBackground:
 
     def test_auto_of_an_image_without_a_good_pixel(self):
         save_images(np.array([IMAGES[0], np.full(SHAPE, np.nan)]))
-        with pytest.raises(InputError, match="image 1 has no good pixel to measure its background"):
+        with pytest.raises(InputError, match="image 1 has no good pixel to measure its sky"):
             observe(background=["auto"])
 
 
@@ -216,7 +218,7 @@ class TestNoise:
         mixed = observe(read_noise=[2.0, "map.fits"])
         np.testing.assert_array_equal(mixed.background, [np.full(SHAPE, 4.0), MAP**2])
         with pytest.raises(
-            InputError, match="read_noise 'none' is not a number, or a file that exists"
+            InputError, match="read_noise 'none' is not a number, auto, or a file that exists"
         ):
             observe(read_noise=["none"])
 
@@ -279,6 +281,22 @@ class TestNoise:
             assert notes(log)[-2].endswith("0 pixels with less than that of the counts have none")
             assert notes(log)[-1].startswith("image 2: noise besides its counts 2.44 electrons in")
             assert notes(log)[-1].endswith("1 pixel with less than that of the counts has none")
+
+    def test_what_the_sky_has_beyond_its_counts(self, log):
+        """Of a sky of 50 electrons, 30 of which were subtracted, and a read noise of 8."""
+        rng = np.random.default_rng(0)
+        images = rng.poisson(50.0, (2, 100, 100)) - 30.0 + rng.normal(0.0, 8.0, (2, 100, 100))
+        images[:, 50, 50] = 1e4
+        save_images(images)
+        found = read(read_noise=["auto"])
+        expected = [
+            np.sqrt(sigma_clipped_stats(image)[2] ** 2 - np.median(image)) for image in images
+        ]
+        np.testing.assert_allclose(found.read_noise, expected, rtol=2e-3)
+        np.testing.assert_allclose(found.read_noise, np.sqrt(30.0 + 64.0), rtol=0.03)
+        assert notes(log)[-1].startswith("image 2: read noise 9.")
+        save_images(np.full((2, 8, 8), 100.0))  # with less noise than counts have
+        assert read(read_noise=["auto"]).read_noise == [0.0, 0.0]
 
     def test_errors_that_leave_the_source_out(self):
         save_images()
