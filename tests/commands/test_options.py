@@ -93,7 +93,7 @@ COMPLAINTS = {
     "--background": (["--background", "-1"], "--background must be finite and not negative"),
     "--background auto": (["--background", "Auto"], "--background 'Auto' is not a number, auto"),
     "--read-noise": (["--read-noise", "-1"], "--read-noise must be finite and not negative"),
-    "--read-noise word": (["--read-noise", "low"], "--read-noise 'low' is not a number, auto, or a"),
+    "--read-noise word": (["--read-noise", "low"], "--read-noise 'low' is not a number, auto"),
     "--read-noise large": (["--read-noise", "1e200"], "the square of --read-noise must be finite"),
     "--read-noise map": (["--read-noise", "oblong.fits"], "--read-noise oblong.fits has the shape"),
     "--exposure": (["--exposure", "0"], "--exposure must be finite and more than zero; 0 was"),
