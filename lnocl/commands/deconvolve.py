@@ -94,7 +94,8 @@ OPTIONS = {
             metavar="G",
             card=("GAIN", "electrons for each unit of the images"),
             help="electrons for each adu, or for each of whatever unit the images have; or a "
-            "keyword of the images' headers such as GAIN",
+            "keyword of the images' headers such as GAIN; or their extension with the variance of "
+            "counts, as VAR_POISSON of JWST",
         ),
         option(
             "--mask",
@@ -308,7 +309,7 @@ ALL_OPTIONS = [each for group in OPTIONS.values() for each in group]
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.io import atomic, fitsread, fitswrite
+    from lnocl.io import atomic, fitsread, fitswrite, missions
     from lnocl.io.frames import Calibration, read_frames
     from lnocl.io.headers import observed_cards
 
@@ -318,6 +319,7 @@ def _run(arguments: argparse.Namespace) -> None:
     folder = os.getcwd()
     given = {**vars(arguments), "device": _device_spec(arguments)}
     with messages.shown_log(arguments.quiet), checkpoints.Interrupts() as interrupts:
+        given |= missions.calibrate(arguments.images[0], given)
         calibration = Calibration(**_given(given, Calibration._fields))
         frames = read_frames(arguments.images, arguments.psfs, calibration)
         given["stars"] = _stars(arguments, frames.header)

@@ -15,7 +15,7 @@ from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.fitsfile import open_fits
 from lnocl.io.headers import make_wcs, number, quiet_log, readable
 from lnocl.io.names import parse_name
-from lnocl.io.selection import choose, describe, find, has_pixels, only
+from lnocl.io.selection import choose, describe, find, has_pixels, name_of, only
 from lnocl.process import ignored_warnings
 
 log = logging.getLogger("lnocl")
@@ -154,6 +154,44 @@ def read_keyword(path: str, header: fits.Header, keyword: str) -> str | float | 
     with ignored_warnings(), open_fits(parse_name(path).file) as file:
         primary = readable(next(file.hdus()).header)
     return primary.get(keyword)
+
+
+class Contents(NamedTuple):
+    """What a file holds, its pixels unread.
+
+    Attributes
+    ----------
+    header, primary : astropy.io.fits.Header
+        Of its image, and of its primary HDU.
+    extensions : frozenset of str
+        Names of its image extensions, in capital letters.
+    """
+
+    header: fits.Header
+    primary: fits.Header
+    extensions: frozenset[str]
+
+    def value(self, keyword: str) -> str:
+        """Return what a keyword has for the image, or else for the file; empty where neither."""
+        return str(self.header.get(keyword, self.primary.get(keyword, ""))).strip()
+
+
+def read_contents(path: str) -> Contents:
+    """Return what the file of an image holds; warnings are left to those who read its pixels.
+
+    Raises
+    ------
+    FileError, InputError
+        As `read_stack`.
+    """
+    name = parse_name(path)
+    with ignored_warnings(), open_fits(name.file) as file:
+        hdus = list(file.hdus())
+        index = find(name, hdus) if name.is_chosen else choose(path, hdus)
+        if index is None:
+            raise _NoImageError(f"{path} holds no image")
+        names = frozenset(name_of(hdu) for hdu in hdus[1:] if has_pixels(hdu))
+        return Contents(readable(hdus[index].header), readable(hdus[0].header), names)
 
 
 def wcs_cards(header: fits.Header) -> fits.Header:

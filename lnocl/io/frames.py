@@ -17,7 +17,7 @@ from lnocl.io import sky
 from lnocl.io.fitsread import read_extension, read_keyword, read_stack
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of
 from lnocl.io.maps import Maps, Word
-from lnocl.io.noise import VARIANCES, NoiseMap, read_noise_map
+from lnocl.io.noise import VARIANCES, NoiseMap, electrons_by_variance, read_noise_map
 from lnocl.scene import units
 from lnocl.scene.observation import Array, Observation
 
@@ -60,7 +60,9 @@ class Calibration(NamedTuple):
         Pixels of this value and above, in units of the images, are bad.
     gain : float or str, optional
         Electrons for each adu or count, or for each of whatever unit the images have; or a keyword
-        of the headers, of the images or their files. Counts per time stay counts per time.
+        of the headers, of the images or their files; or the extension of the images' files with the
+        variance of their counts, such as JWST's ``"VAR_POISSON"``. Counts per time stay counts per
+        time.
     align : {"wcs"}, optional
         Offsets from the headers' coordinates.
     psf_centre : {"check", "fit", "given"}
@@ -255,6 +257,8 @@ class _Reader:
 
     def _electrons(self) -> tuple[float, bool]:
         """Return the electrons in a unit of the images, and whether they are per second."""
+        if self._electrons_in_units is not None:
+            return 1.0, True
         gain = self._gain
         if gain is not None and not (np.isfinite(gain) and gain > 0):
             raise InputError(f"gain must be more than 0; {gain:g} was given")
@@ -273,10 +277,32 @@ class _Reader:
         return counts
 
     @cached_property
-    def _gain(self) -> float | None:
+    def _electrons_in_units(self) -> Array | None:
+        """The electrons in a unit of each image, where gain names the variance of their counts.
+
+        They are to the image what an exposure is to a rate.
+        """
         word = self._calibration.gain
         if not isinstance(word, str):
-            return word
+            return None
+        planes = [read_extension(path, word.upper()) for path in self._paths]
+        if any(plane is None for plane in planes):
+            return None
+        found = [
+            electrons_by_variance(image, variance, path)
+            for image, variance, path in zip(
+                self._images.data, self._extensions(word.upper(), "gain"), self._paths, strict=True
+            )
+        ]
+        for j, electrons in enumerate(found, 1):
+            log.info("image %d: %.4g electrons in its unit, by %s", j, electrons, word.upper())
+        return np.array(found)
+
+    @cached_property
+    def _gain(self) -> float | None:
+        word = self._calibration.gain
+        if not isinstance(word, str) or self._electrons_in_units is not None:
+            return word if isinstance(word, float) else None
         found = [self._from_header("gain", j, word) for j in range(len(self._paths))]
         for path, gain in zip(self._paths, found, strict=True):
             if gain is None:
@@ -304,6 +330,12 @@ class _Reader:
 
     def _exposure(self) -> Array | None:
         words = self._calibration.exposure
+        if self._electrons_in_units is not None:
+            if words:
+                raise InputError(
+                    f"give exposure or gain {self._calibration.gain}, which has it, not both"
+                )
+            return self._electrons_in_units
         if not words:
             return None
 

@@ -22,6 +22,8 @@ VARIANCES: Mapping[str, Callable[[Array], Array]] = {
     "rms": np.square,
     "error": np.square,
 }
+# The share of pixels that are the brightest.
+BRIGHT = 0.01
 # The kind that has the noise of the source's own counts too.
 WITH_SOURCE = "error"
 
@@ -78,6 +80,41 @@ class NoiseMap(NamedTuple):
                 "has" if n_below == 1 else "have",
             )
         return np.asarray(np.sqrt(variance.clip(0.0)))
+
+
+def electrons_by_variance(image: Array, variance: Array, path: str) -> float:
+    """Return the electrons in a unit of an image, by the variance of their counts.
+
+    Counts n = e g of an image g have the variance g / e in its units: e is the difference of image
+    between the brightest hundredth of its pixels and the median one, over that of the variance. A
+    sky that was subtracted, and the variance of the dark current, cancel.
+
+    Parameters
+    ----------
+    image, variance : ndarray of float64, shape (ny, nx)
+        In units of the image, and those squared; not finite or 0 where they are not known.
+    path : str
+        Their file, for messages.
+
+    Raises
+    ------
+    InputError
+        The variance does not grow with the image.
+    """
+    known = np.isfinite(image) & np.isfinite(variance) & (variance > 0)
+    values, variances = image[known], variance[known]
+    electrons = 0.0
+    if values.size:
+        bright = values >= np.quantile(values, 1.0 - BRIGHT)
+        middle = values <= np.median(values)
+        rise = variances[bright].mean() - variances[middle].mean()
+        electrons = (values[bright].mean() - values[middle].mean()) / rise if rise > 0 else 0.0
+    if not 0.0 < electrons < np.inf:
+        raise InputError(
+            f"the variance of the counts of {path} does not grow with its image; give gain as a "
+            "number, the electrons in its unit"
+        )
+    return float(electrons)
 
 
 def read_noise_map(

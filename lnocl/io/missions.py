@@ -1,0 +1,69 @@
+"""What the files of space telescopes say of themselves: how their images are calibrated."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from lnocl.io.fitsread import Contents, read_contents
+from lnocl.scene import units
+
+log = logging.getLogger("lnocl")
+
+# Those whose files are known.
+TELESCOPES = ("HST", "JWST")
+# Kinds of noise, of which one is enough.
+NOISE = ("read_noise", "inverse_variance", "variance", "rms", "error")
+
+
+def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the calibration of an image of JWST or HST, where it is not given.
+
+    Errors and flags are those of the extensions ERR and DQ where there are such; without ERR, as in
+    a mosaic of HST, the noise is that of the sky, which was subtracted. A rate of electrons is
+    times EXPTIME; the electrons in a MJy/sr of JWST follow from VAR_POISSON.
+
+    Parameters
+    ----------
+    path : str
+        The first image.
+    given : mapping of str to value
+        What is given, of the fields of `frames.Calibration`.
+
+    Returns
+    -------
+    dict
+        Values of other fields; empty for an image of another telescope.
+
+    Raises
+    ------
+    FileError, InputError
+        As `fitsread.read_contents`.
+    """
+    contents = read_contents(path)
+    telescope = contents.value("TELESCOP").upper()
+    if telescope not in TELESCOPES:
+        return {}
+    found: dict[str, Any] = {}
+    has_errors = "ERR" in contents.extensions
+    if not any(given.get(kind) for kind in NOISE):
+        found |= {"error": ["err"]} if has_errors else {"read_noise": ["auto"]}
+    if not given.get("mask") and "DQ" in contents.extensions:
+        found["mask"] = ["dq"]
+    if not given.get("background") and has_errors:
+        found["background"] = ["auto"]
+    if not (given.get("gain") or given.get("exposure")):
+        found |= _electrons(contents)
+    for name, value in found.items():
+        words = value if isinstance(value, str) else " ".join(value)
+        log.info("%s: %s %s, as for images of %s", path, name, words, telescope)
+    return found
+
+
+def _electrons(contents: Contents) -> dict[str, Any]:
+    """Return what makes electrons of the unit of the image."""
+    counts = units.count_of(units.parse(contents.value("BUNIT")))
+    if counts is not None:
+        return {"exposure": ["EXPTIME"]} if counts[1] else {}
+    return {"gain": "VAR_POISSON"} if "VAR_POISSON" in contents.extensions else {}
