@@ -23,9 +23,9 @@ log = logging.getLogger("lnocl")
 ITERATIONS, STEPS = (15, 15, 30), 2
 # Free pixels follow the noise in more steps than these.
 PIXEL_ITERATIONS, PIXEL_STEPS = (15, 15, 15, 15), 1
-# Refined PSFs are used where chi squared of those given exceeds its expectation by so much for each
-# parameter, and this share of it is mended.
-EXCESS, MENDED = 10.0, 0.65
+# Refined PSFs are used where chi squared of those given exceeds its expectation by so many standard
+# deviations, and this share of that is mended.
+WRONG, MENDED = 2.0, 0.65
 # Free pixels may err by so many times what residuals show.
 LOOSE = 3.0
 # Where the PSFs' error exceeds the noise at the stars so many times, it is made a part of it: else
@@ -75,7 +75,7 @@ def refine_psfs(
         found = _search(runs, pixels, pixels.first(), schedule, setup.refine_positions)
         refined = pixels.psfs(found)
         after, of_refined = runs.judge(refined)
-    is_accepted = _mends(before, after, values.size, "pixels" in names)
+    is_accepted = _mends(before, after, "pixels" in names)
     final, estimate, known = before, of_given, observation.psf_scatter
     if is_accepted:
         observation, final, estimate = with_psfs(observation, refined), after, of_refined
@@ -106,11 +106,11 @@ def _pixels(observation: Observation, psfs: Array, estimate: Estimate) -> PsfFam
     return PsfFamilies(("pixels",), with_psfs(observation, psfs), scatter)
 
 
-def _mends(before: Misfit, after: Misfit, n_values: int, are_pixels_free: bool) -> bool:
+def _mends(before: Misfit, after: Misfit, are_pixels_free: bool) -> bool:
     """Return whether refined PSFs mend so much that they are used."""
     if are_pixels_free and before.is_noise:  # which they may follow
         return False
-    is_wrong = before.excess > EXCESS * n_values
+    is_wrong = before.significance > WRONG
     return is_wrong and before.square - after.square > MENDED * before.excess
 
 

@@ -129,9 +129,14 @@ class Misfit(NamedTuple):
         return self.square - self.n_pixels
 
     @property
+    def significance(self) -> float:
+        """The excess in standard deviations of that of noise."""
+        return float(self.excess / np.sqrt(2.0 * self.n_pixels))
+
+    @property
     def is_noise(self) -> bool:
         """Whether the excess is one that noise may have, of five standard deviations at most."""
-        return bool(self.excess <= SIGNIFICANT * np.sqrt(2.0 * self.n_pixels))
+        return self.significance <= SIGNIFICANT
 
 
 def misfit(scene: Scene, extended: Array, fluxes: Array) -> Misfit:
