@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from lnocl.residuals import Fit, StarResiduals, judge, judge_stars, residuals
 from lnocl.runs.outcome import Outcome, PsfRefinement
 from lnocl.scene.observation import Array
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
 
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
@@ -170,6 +173,25 @@ class Result:
         observation = self._outcome.scene.observation
         images = zip(observation.images, observation.mask, _models(self._outcome), strict=True)
         return np.array([residuals(*each) for each in images])
+
+    def to_table(self) -> QTable:
+        """Return the stars as a table of astropy, which `deconvolve` takes as stars again.
+
+        Columns x and y in pixels, 0-based, and flux in electrons, per second where exposures were
+        given; with x_error, y_error and flux_error, standard errors, where positions were refined.
+        """
+        from astropy import units as u
+        from astropy.table import QTable  # which takes its time to load
+
+        exposure = self._outcome.scene.observation.exposure
+        unit = u.electron if (exposure == 1.0).all() else u.electron / u.s
+        x, y = self.star_positions.T
+        columns = {"x": x * u.pix, "y": y * u.pix, "flux": self.star_fluxes * unit}
+        if np.isfinite(self.star_flux_errors).any():
+            x_error, y_error = self.star_position_errors.T
+            columns |= {"x_error": x_error * u.pix, "y_error": y_error * u.pix}
+            columns["flux_error"] = self.star_flux_errors * unit
+        return QTable(columns)
 
     def fit(self) -> Fit:
         """Return how well the model fits all good pixels.

@@ -36,6 +36,31 @@ def test_errors_of_stars_that_were_not_refined_are_nan(refine_positions):
         assert np.isnan(errors).all() != refine_positions
 
 
+@pytest.mark.parametrize("exposure", [1.0, 4.0])
+@pytest.mark.parametrize("refine_positions", [False, True])
+def test_the_table_of_stars(exposure, refine_positions):
+    image, stars = np.full((8, 8), 5.0), [(3, 4), (6, 1)]
+    image[[4, 1], [3, 6]] = 500.0
+    observation = lnocl.Observation(image, np.ones((1, 1)), exposure=exposure)
+    options = {"n_iter": 3, "engine": "numpy", "refine_positions": refine_positions}
+    result = paper(observation, stars=stars, **options)
+    table = result.to_table()
+    errors = ["x_error", "y_error", "flux_error"] if refine_positions else []
+    assert table.colnames == ["x", "y", "flux", *errors]
+    unit = u.electron if exposure == 1.0 else u.electron / u.s
+    np.testing.assert_array_equal(table["flux"].to_value(unit), result.star_fluxes)
+    again = paper(observation, stars=table["x", "y"], n_iter=1, engine="numpy")
+    np.testing.assert_array_equal(again.star_positions, result.star_positions)
+    if refine_positions:
+        found = np.array([table[name].to_value("pix") for name in errors[:2]]).T
+        np.testing.assert_array_equal(found, result.star_position_errors)
+        assert table["flux_error"].unit == unit
+
+
+def test_no_stars_are_an_empty_table():
+    assert len(deconvolve().to_table()) == 0
+
+
 DARK_STARTS = {
     "extended source": (
         {"initial_extended": np.zeros((8, 8))},
