@@ -19,7 +19,7 @@ from astropy.wcs import WCS
 from astropy.wcs.utils import pixel_to_pixel
 from numpy.typing import NDArray
 
-from lnocl.errors import FileError, InputError, LnoclError, counted
+from lnocl.errors import FileError, InputError, LnoclError, counted, warn
 from lnocl.io.fitsfile import open_fits, open_regular
 from lnocl.io.headers import make_wcs, quiet_log
 from lnocl.process import ignored_warnings
@@ -173,7 +173,12 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
         A file that cannot be read.
     InputError
         A table without these columns; coordinates on the sky for an image without WCS; those of
-        pixels and of the sky are of different places.
+        pixels and of the sky are of different places; no star lies on the image.
+
+    Warns
+    -----
+    LnoclWarning
+        Stars that lie outside the image, and are left out.
     """
     table = _read_table(path)
     columns = star_tables.find_columns(table.colnames, star_tables.IN_PIXELS)
@@ -193,7 +198,25 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
         )
     origin = ", the first pixel 1" if columns is not None and columns.origin else ""
     log.info("%s: %s, by %s%s", path, counted(len(found), "star"), " and ".join(names), origin)
-    return found
+    return _within(path, found, header, image)
+
+
+def _within(path: str, positions: Pairs, header: fits.Header, image: str) -> Pairs:
+    """Return the positions that lie on an image: catalogues hold its surroundings too.
+
+    Raises
+    ------
+    InputError
+        None does.
+    """
+    size = np.array([header.get("NAXIS1", np.inf), header.get("NAXIS2", np.inf)])
+    lies = ((positions >= -0.5) & (positions < size - 0.5)).all(axis=1)
+    n, n_outside = len(positions), int((~lies).sum())
+    if n_outside == n > 0:
+        raise InputError(f"{path} has no star on {image}: see whether it is of the same field")
+    if n_outside:
+        warn(f"{n_outside} of {counted(n, 'star')} of {path} lie outside {image} and are left out")
+    return np.asarray(positions[lies])
 
 
 def _coordinates(path: str, table: Table) -> tuple[SkyCoord | None, tuple[str, ...]]:

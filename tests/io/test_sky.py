@@ -12,7 +12,7 @@ from astropy.wcs import WCS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lnocl.errors import FileError, InputError
+from lnocl.errors import FileError, InputError, LnoclWarning
 from lnocl.io import sky
 from lnocl.io.headers import make_wcs
 
@@ -279,6 +279,21 @@ class TestTables:
     def test_the_sky_as_others_name_it(self, names):
         Table([ICRS.ra, ICRS.dec], names=names.split()).write("t.vot", format="votable")
         np.testing.assert_allclose(stars("t.vot"), POSITIONS, atol=1e-6)
+
+    def test_stars_outside_the_image_are_left_out(self):
+        sized = header(NAXIS1=12, NAXIS2=16)
+        save("t.csv", "x,y\n1,2\n-0.5,-0.5\n11.4,15.4\n-0.6,3\n11.5,3\n3,15.5\n")
+        with pytest.warns(LnoclWarning) as caught:
+            found = stars("t.csv", sized)
+        np.testing.assert_array_equal(found, [(1, 2), (-0.5, -0.5), (11.4, 15.4)])
+        assert str(caught[0].message) == (
+            "3 of 6 stars of t.csv lie outside a.fits and are left out"
+        )
+        with pytest.raises(InputError) as refused:
+            stars(save("t.csv", "x,y\n12,2\n"), sized)
+        assert str(refused.value) == (
+            "t.csv has no star on a.fits: see whether it is of the same field"
+        )
 
     def test_coordinates_in_one_column(self):
         """As photutils writes them; in another frame."""
