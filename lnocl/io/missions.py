@@ -65,5 +65,5 @@ def _electrons(contents: Contents) -> dict[str, Any]:
     """Return what makes electrons of the unit of the image."""
     counts = units.count_of(units.parse(contents.value("BUNIT")))
     if counts is not None:
-        return {"exposure": ["EXPTIME"]} if counts[1] else {}
+        return {"exposure": ["EXPTIME"]} if counts[1] and contents.value("EXPTIME") else {}
     return {"gain": "VAR_POISSON"} if "VAR_POISSON" in contents.extensions else {}

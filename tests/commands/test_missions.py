@@ -165,6 +165,13 @@ class TestWhatIsGiven:
         ]:
             assert calibrate("ir.fits", {name: value}).keys() == every - without
 
+    def test_a_rate_without_its_exposure_says_none(self, capsys):
+        cards = {"BUNIT": "ELECTRONS/S"}
+        write("ir.fits", {"TELESCOP": "HST"}, (np.ones((N, N)), cards))
+        assert calibrate("ir.fits", {}).keys() == {"read_noise"}
+        assert cli.main(["deconvolve", "ir.fits", "--psf", "k1.fits", "-o", "o.fits"]) == 2
+        assert "ir.fits holds counts per time; give --exposure, in " in capsys.readouterr().err
+
     def test_other_telescopes_say_nothing(self):
         write("other.fits", {"TELESCOP": "Keck"}, (np.ones((N, N)), {}), ERR=np.ones((N, N)))
         assert calibrate("other.fits", {}) == {}
