@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lnocl.errors import warn
+from lnocl.errors import counted, warn
 from lnocl.scene.cores import Array, centroid, fwhm
 from lnocl.scene.scene import Scene
 
@@ -95,15 +95,35 @@ def _compare(
     return (fwhm(star), fwhm(model)), (column - model_column, row - model_row), contrast
 
 
+def _masked_stars(scene: Scene) -> Iterator[int]:
+    """Yield the stars whose middle is on a bad pixel, or outside, in every image."""
+    observation = scene.observation
+    size = observation.shape[::-1]
+    for s, star in enumerate(scene.stars):
+        nearest = np.round(star + observation.offsets).astype(int)
+        inside = ((nearest >= 0) & (nearest < size)).all(axis=1)
+        bad = [observation.mask[j][tuple(nearest[j][::-1])] for j in np.flatnonzero(inside)]
+        if all(bad):
+            yield s
+
+
 def warn_of_stars(scene: Scene) -> None:
-    """Warn of the PSF whose width fits a star least, and of the star farthest from its place.
+    """Warn of masked stars, of the PSF whose width fits a star least, and of the star farthest off.
 
     Warns
     -----
     LnoclWarning
-        A PSF is a tenth wider or narrower than a star; a star lies more than 0.15 pixels, and more
-        than what is beside it explains, from where its PSF is.
+        A star lies on a bad pixel of every image; a PSF is a tenth wider or narrower than a star; a
+        star lies more than 0.15 pixels, and more than what is beside it explains, from where its
+        PSF is.
     """
+    if masked := list(_masked_stars(scene)):
+        x, y = scene.stars[masked[0]]
+        others = f", as {counted(len(masked) - 1, 'other')}" if len(masked) > 1 else ""
+        warn(
+            f"the star at ({x:.7g}, {y:.7g}) lies on bad pixels{others}: its flux rests on its "
+            "wings, and so on the PSF's; see to the mask"
+        )
     found = list(check_stars(scene))
     if not found:
         return

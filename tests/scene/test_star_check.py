@@ -47,6 +47,21 @@ def test_nothing_is_said_of_a_psf_that_fits(seed, flux):
     assert said(observe(moffat(WIDTH), flux, seed=seed)) == []
 
 
+def test_a_masked_star_is_said():
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[STAR[1] - 2 : STAR[1] + 3, STAR[0] - 2 : STAR[0] + 3] = True
+    observation = observe(moffat(WIDTH), mask=mask)
+    assert said(observation) == [
+        "the star at (50, 44) lies on bad pixels: its flux rests on its wings, and so on the "
+        "PSF's; see to the mask"
+    ]
+    assert said(observation, (47.4, 44.0)) == []
+    two = lnocl.Observation(
+        [observation.images[0]] * 2, moffat(WIDTH), mask=[mask, ~mask], background=LEVEL
+    )
+    assert [each for each in said(two) if "bad pixels" in each] == []
+
+
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.2, 1.35, 2.0, 5.0])
 def test_a_psf_of_another_width_is_said(factor):
     (message,) = said(observe(moffat(factor * WIDTH)))

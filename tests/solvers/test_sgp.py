@@ -272,6 +272,7 @@ def small_scenes(share):
     )
 
 
+@pytest.mark.filterwarnings("ignore:the star at .* lies on bad pixels")
 @settings(max_examples=60, deadline=None)
 @given(scene=small_scenes(st.just(0.0) | logarithmic(-3, 3)), mu=st.just(0.0) | logarithmic(-6, 1))
 def test_objective_never_rises_in_any_scene(scene, mu):
