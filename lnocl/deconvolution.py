@@ -143,10 +143,10 @@ def deconvolve(
         covariance of a blur, the Strehl ratio between it and ``ideal_psfs``, phases across
         ``pupils``, the coefficients of ``psf_modes``; and with two stars or more each pixel, as far
         as ``psf_scatter``, or what residuals show, allows. The PSFs given stand unless chi squared
-        exceeds its expectation by ten for each parameter, and falls by 0.65 of that. Star positions
-        that are not refined are taken for right. The error that is left is estimated; where it
-        exceeds the noise at the stars it is added to that, and always where it is given as
-        ``psf_scatter``. At least one star.
+        exceeds its expectation by two standard deviations, with "pixels" by five, and falls by 0.65
+        of that. Star positions that are not refined are taken for right. The error that is left is
+        estimated; where it exceeds the noise at the stars it is added to that, and always where it
+        is given as ``psf_scatter``. At least one star.
     round_source : bool, optional
         Whether the extended source lies all round a star, as a disc, a ring or a host: else what
         does is taken for the star's while its PSF is refined.

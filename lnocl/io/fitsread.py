@@ -172,7 +172,7 @@ class Contents(NamedTuple):
     extensions: frozenset[str]
 
     def value(self, keyword: str) -> str:
-        """Return what a keyword has for the image, or else for the file; empty where neither."""
+        """Return the value of a keyword as text: the image's, else the file's, else nothing."""
         return str(self.header.get(keyword, self.primary.get(keyword, ""))).strip()
 
 

@@ -16,6 +16,7 @@ from lnocl.errors import InputError, counted, warn
 from lnocl.io import sky
 from lnocl.io.fitsread import read_extension, read_keyword, read_stack
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of
+from lnocl.io.levels import sky_level, sky_noise
 from lnocl.io.maps import Maps, Word
 from lnocl.io.noise import VARIANCES, NoiseMap, electrons_by_variance, read_noise_map
 from lnocl.scene import units
@@ -440,7 +441,7 @@ class _Reader:
         return self._maps.fill(
             "background",
             self._calibration.background,
-            lambda j, word: _sky_level(j, counts[j], mask[j]) if word == "auto" else None,
+            lambda j, word: sky_level(j, counts[j], mask[j]) if word == "auto" else None,
         )
 
     def _read_noise_words(self, counts: Array, mask: Mask) -> list[Word]:
@@ -451,7 +452,7 @@ class _Reader:
         return self._maps.fill(
             "read_noise",
             words,
-            lambda j, word: _sky_noise(j, counts[j], mask[j]) if word == "auto" else None,
+            lambda j, word: sky_noise(j, counts[j], mask[j]) if word == "auto" else None,
         )
 
     def _offsets(self) -> Array | None:
@@ -471,42 +472,3 @@ class _Reader:
 
 def _maps(values: Array) -> Array:
     return values if values.ndim == 3 else values[:, None, None]
-
-
-def _sky_level(j: int, counts: Array, mask: Mask) -> float:
-    """Return the background of image j: the sigma-clipped median of its good pixels."""
-    median, scatter = _clipped(j, counts, mask)
-    log.info(
-        "image %d: background %.6g electrons per pixel, scatter %.3g (sigma-clipped median)",
-        j + 1,
-        median,
-        scatter,
-    )
-    if median < 0:
-        raise InputError(
-            f"image {j} has a sigma-clipped median of {median:.6g} electrons: its background was "
-            "subtracted already; give background 0, and its noise as read_noise, which may be auto"
-        )
-    return median
-
-
-def _sky_noise(j: int, counts: Array, mask: Mask) -> float:
-    """Return the noise that the sky of image j has beside that of its counts, electrons."""
-    median, scatter = _clipped(j, counts, mask)
-    noise = float(np.sqrt(max(scatter**2 - max(median, 0.0), 0.0)))
-    log.info("image %d: read noise %.4g electrons (sigma-clipped scatter)", j + 1, noise)
-    return noise
-
-
-def _clipped(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
-    """Return the sigma-clipped median and scatter of the good pixels of image j."""
-    from astropy.stats import sigma_clipped_stats
-
-    good = counts[~mask & np.isfinite(counts)]
-    if good.size == 0:
-        raise InputError(
-            f"image {j} has no good pixel to measure its sky; leave the image out, or give "
-            "background and read_noise as numbers"
-        )
-    _, median, scatter = sigma_clipped_stats(good)
-    return float(median), float(scatter)

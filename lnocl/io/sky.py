@@ -207,7 +207,7 @@ def _within(path: str, positions: Pairs, header: fits.Header, image: str) -> Pai
     Raises
     ------
     InputError
-        None does.
+        No star does.
     """
     size = np.array([header.get("NAXIS1", np.inf), header.get("NAXIS2", np.inf)])
     lies = ((positions >= -0.5) & (positions < size - 0.5)).all(axis=1)
