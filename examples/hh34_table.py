@@ -19,7 +19,7 @@ from astropy.table import Table
 
 from lnocl import metrics
 from lnocl.errors import InputError, LnoclError
-from lnocl.io import atomic, fitsread, fitswrite
+from lnocl.io import atomic, fitswrite, saved_results
 from lnocl.simulation import Experiment, load_target, simulate
 from lnocl.simulation.targets import SCENES
 from lnocl.studies import experiment, files
@@ -76,14 +76,14 @@ def compute(path, simulation, observation, method, mu, n_iter, every, patience, 
 
 def read_row(path, method, mu, cards):
     """Return a saved reconstruction; refuse one of another experiment."""
-    saved = fitsread.read_result(str(path))
+    saved = saved_results.read_result(str(path))
     for keyword, value, _ in [("METHOD", method, ""), ("MU", mu, ""), *cards]:
         if saved.header.get(keyword) != value:
             raise InputError(
                 f"{path} is of another experiment: its {keyword} is {saved.header.get(keyword)} "
                 f"and {value} is asked for; give another folder"
             )
-    if saved.curve is None or "MINUTES" not in saved.header:
+    if "CURVE" not in saved.tables or "MINUTES" not in saved.header:
         raise InputError(f"{path} was not written by this script; give another folder")
     return saved
 
@@ -91,8 +91,8 @@ def read_row(path, method, mu, cards):
 def row(simulation, saved):
     """Return the table's row of a saved reconstruction."""
     method, mu = saved.header["METHOD"], saved.header["MU"]
-    curve = np.zeros(len(saved.curve["iteration"]), experiment.CURVE_DTYPE)
-    for name, values in saved.curve.items():
+    curve = np.zeros(len(saved.tables["CURVE"]["iteration"]), experiment.CURVE_DTYPE)
+    for name, values in saved.tables["CURVE"].items():
         curve[name] = values
     if method == "MC-RL":
         flux = float(saved.star_fluxes[0])
@@ -134,7 +134,7 @@ def keep_truth(path, simulation):
             ],
         )
         return
-    saved = fitsread.read_result(str(path))
+    saved = saved_results.read_result(str(path))
     same = (
         saved.extended.shape == simulation.extended.shape
         and saved.stars == simulation.stars

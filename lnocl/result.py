@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.notebook import html_card
+from lnocl.plotting.result import ResultView, draw_result
 from lnocl.residuals import Fit, StarResiduals, judge, judge_stars, residuals
 from lnocl.runs.outcome import Outcome, PsfRefinement
 from lnocl.scene.observation import Array
 
 if TYPE_CHECKING:
+    from astropy.io import fits
     from astropy.table import QTable
+    from matplotlib.figure import Figure
+
+# Stars that a notebook lists.
+MAX_LISTED = 10
 
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
@@ -163,15 +172,18 @@ class Result:
         ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j``, in double precision. As in the observation,
         the square of the read noise is included.
         """
-        return np.array(list(_models(self._outcome)))
+        return np.array(list(models_of(self._outcome)))
 
     def residuals(self) -> Array:
         """Return ``(g_j - m_j) / sqrt(m_j)``, shape (p, ny, nx): about 1 where only noise is left.
 
         NaN where a pixel is bad, or the model is 0.
         """
+        return self._residuals(models_of(self._outcome))
+
+    def _residuals(self, models: Iterable[Array]) -> Array:
         observation = self._outcome.scene.observation
-        images = zip(observation.images, observation.mask, _models(self._outcome), strict=True)
+        images = zip(observation.images, observation.mask, models, strict=True)
         return np.array([residuals(*each) for each in images])
 
     def to_table(self) -> QTable:
@@ -183,8 +195,7 @@ class Result:
         from astropy import units as u
         from astropy.table import QTable  # which takes its time to load
 
-        exposure = self._outcome.scene.observation.exposure
-        unit = u.electron if (exposure == 1.0).all() else u.electron / u.s
+        unit = u.electron / u.s if self._is_rate else u.electron
         x, y = self.star_positions.T
         columns = {"x": x * u.pix, "y": y * u.pix, "flux": self.star_fluxes * unit}
         if np.isfinite(self.star_flux_errors).any():
@@ -193,12 +204,98 @@ class Result:
             columns["flux_error"] = self.star_flux_errors * unit
         return QTable(columns)
 
+    def plot(self) -> Figure:
+        """Return a picture: image, model, residuals and extended source, whole and at each star.
+
+        `lnocl.plotting.result.draw_result` says what it shows; ``savefig`` of it writes a file.
+
+        Raises
+        ------
+        LnoclError
+            matplotlib is missing.
+        """
+        return draw_result(view_of(self))
+
+    def write(
+        self, path: str, *, header: fits.Header | None = None, overwrite: bool = False
+    ) -> None:
+        """Write a FITS file as ``lnocl deconvolve`` does, which ``lnocl plot`` and ``report`` read.
+
+        The primary HDU has the extended source, the tables STARS, HISTORY and HELDOUT what their
+        names say, MODELS and RESIDUALS those of each image; PSFS and others are there where PSFs
+        were refined. Units are electrons, per second where exposures were given.
+
+        Parameters
+        ----------
+        path : str
+            File to write.
+        header : astropy.io.fits.Header, optional
+            Header of the first image: its coordinates, and what was observed, are taken over.
+        overwrite : bool, optional
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        FileError
+            The file cannot be written, or exists and must not be overwritten.
+        InputError
+            A name that does not end in .fits, .fit or .fts.
+        """
+        from lnocl.io import atomic, fitswrite
+        from lnocl.io.fitsread import wcs_cards
+        from lnocl.io.headers import observed_cards
+
+        path = os.fspath(path)
+        atomic.check_fits_output(path, overwrite)
+        models = self.models()
+        parts = saved_parts(self)
+        fitswrite.write_result(
+            path,
+            self.extended,
+            self.star_positions,
+            self.star_fluxes,
+            wcs=None if header is None else wcs_cards(header),
+            cards=[
+                *([] if header is None else observed_cards(header)),
+                ("CREATOR", f"lnocl {version('lnocl')}", "program that wrote this file"),
+                ("NITER", self.n_iter, "iterations done"),
+                ("STOPPED", self.stop_reason, "why it stopped"),
+                ("MU", self.mu, "weight of the Tikhonov term, per electron"),
+                ("SMOOTHIN", self.smoothing, "weight of the edge-preserving term"),
+                ("DEVICE", self.device, "device"),
+                *parts.pop("cards"),
+            ],
+            overwrite=overwrite,
+            unit="electron/s" if self._is_rate else "electron",
+            cubes={"MODELS": (models, "electron"), "RESIDUALS": (self._residuals(models), "")},
+            **parts,
+        )
+
+    def _repr_html_(self) -> str:
+        """Return a table for a notebook, with a thumbnail where matplotlib is there."""
+        stars = [
+            f"({x:.2f}, {y:.2f}): {flux:.5g}"
+            for (x, y), flux in zip(self.star_positions, self.star_fluxes, strict=True)
+        ]
+        shown = [*stars[:MAX_LISTED], *(["..."] if len(stars) > MAX_LISTED else [])]
+        rows = {
+            "iterations": f"{self.n_iter} ({self.stop_reason})",
+            "stars": "\n".join(shown) or "none",
+            "extended source": f"{self.extended.sum():.5g}",
+            "device": self.device,
+        }
+        return html_card("lnocl.Result", rows, self.extended)
+
+    @property
+    def _is_rate(self) -> bool:
+        return not (self._outcome.scene.observation.exposure == 1.0).all()
+
     def fit(self) -> Fit:
         """Return how well the model fits all good pixels.
 
         It takes a convolution of each image in double precision on the host.
         """
-        return judge(self._outcome.scene.observation, _models(self._outcome))
+        return judge(self._outcome.scene.observation, models_of(self._outcome))
 
     def star_residuals(self) -> list[StarResiduals]:
         """Return how well the model fits at each star: in its core, its wings and round it."""
@@ -232,7 +329,47 @@ def make_result(outcome: Outcome) -> Result:
     )
 
 
-def _models(outcome: Outcome) -> Iterator[Array]:
+def saved_parts(result: Result) -> dict[str, Any]:
+    """Return the arguments of `lnocl.io.fitswrite.write_result` that follow from a result alone."""
+    refinement = result.psf_refinement
+    parts: dict[str, Any] = {
+        "history": result.history,
+        "held_out": result.held_out if result.held_out.size else None,
+        "offsets": result._outcome.scene.observation.offsets,
+        "cards": [],
+    }
+    if refinement is not None:
+        parts |= {
+            "psf_fit": refinement.table(),
+            "psf_errors": refinement.errors_table(),
+            "doubtful": result.doubtful,
+            "psfs": result.psfs,
+            "cards": refinement.cards(),
+        }
+    return parts
+
+
+def view_of(result: Result) -> ResultView:
+    """Return what the picture of a result shows."""
+    observation = result._outcome.scene.observation
+    models = result.models()
+    return ResultView(
+        extended=result.extended,
+        stars=[(x, y) for x, y in result.star_positions.tolist()],
+        star_fluxes=result.star_fluxes,
+        n_iter=result.n_iter,
+        history={name: result.history[name] for name in HISTORY_DTYPE.names or ()},
+        held_out={name: result.held_out[name] for name in result.held_out.dtype.names or ()},
+        images=np.where(observation.mask, np.nan, observation.images),
+        models=models,
+        residuals=result._residuals(models),
+        offsets=observation.offsets,
+        doubtful=None if result.psf_refinement is None else result.doubtful,
+        unit="electron/s" if result._is_rate else "electron",
+    )
+
+
+def models_of(outcome: Outcome) -> Iterator[Array]:
     """Yield the m_j, electrons per pixel."""
     from lnocl.scene.forward_model import model_images  # which loads scipy
 

@@ -12,7 +12,7 @@ from astropy.table import Table
 from scenes import make_psfs
 from wcs_headers import PHYSICAL, SIP
 
-from lnocl.io import fitsread, fitswrite, sky
+from lnocl.io import fitsread, fitswrite, saved_results, sky
 from lnocl.io.frames import Calibration, read_frames
 from lnocl.runs import checkpoint
 from lnocl.simulation import load_target
@@ -131,7 +131,7 @@ def read_scene(sound, damaged, name):
 
 
 def read_saved(sound, damaged, name):
-    fitsread.read_result(damaged)
+    saved_results.read_result(damaged)
 
 
 def draw(sound, damaged, name):

@@ -7,8 +7,9 @@ import logging
 import os
 import re
 import sys
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TextIO
+from typing import Any, TextIO
 
 # A parameter whose name is an ordinary word, such as pad, is meant where it begins a message or
 # follows one of these.
@@ -83,6 +84,23 @@ def show_warning(
 ) -> None:
     """Write a warning to stderr, with `in_shell`, in place of `warnings.showwarning`."""
     _complain("warning", in_shell(str(message), flags))
+
+
+@contextlib.contextmanager
+def recorded_warnings(flags: Mapping[str, str]) -> Iterator[list[str]]:
+    """Yield a list to which each warning that is shown is added, as it is meant in a shell."""
+    lines: list[str] = []
+    show = warnings.showwarning
+
+    def record(message: Warning | str, *where: Any, **more: Any) -> None:
+        lines.append(f"warning: {in_shell(str(message), flags)}")
+        show(message, *where, **more)
+
+    warnings.showwarning = record
+    try:
+        yield lines
+    finally:
+        warnings.showwarning = show
 
 
 @contextlib.contextmanager

@@ -243,6 +243,13 @@ QUIET = option(
 )
 
 
+PICTURE = option(
+    "--plot",
+    metavar="FILE.png",
+    is_repeated=False,
+)
+
+
 def output_folder(content: str, **keywords: Any) -> list[Option]:
     """Return the option for the folder of the output, and that to replace files in it."""
     default = " (default: %(default)s)" if "default" in keywords else ""

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.commands import messages, options, record
+from lnocl.commands import messages, options, pictures, record
 from lnocl.commands.options import number_or_word, option
 from lnocl.commands.parser import Command
 from lnocl.errors import InputError, counted
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from lnocl.io.fitswrite import Card
     from lnocl.psf.make import StarPsf
 
@@ -104,12 +106,7 @@ OPTIONS = [
         card=("CLIPPED", "negative pixels set to 0"),
         help="set negative pixels of the PSF to 0",
     ),
-    option(
-        "--plot",
-        metavar="FILE.png",
-        is_repeated=False,
-        help="picture of frame, PSFs and profiles",
-    ),
+    options.PICTURE.but(help="picture of frame, PSFs and profiles"),
     options.OVERWRITE,
     options.QUIET,
 ]
@@ -170,8 +167,7 @@ def _run(arguments: argparse.Namespace) -> None:
         f"({k // 2}, {k // 2})"
     )
     if arguments.plot is not None:
-        _draw(arguments, stars)
-        lines.append(f"drew {arguments.plot}")
+        lines.append(pictures.draw(arguments, _figure(arguments, stars)))
     if not arguments.quiet:
         messages.say(lines)
 
@@ -245,23 +241,11 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
         raise InputError("give -o PSF.fits for the PSF, or --check to look at one")
     inputs = options.input_paths(OPTIONS, vars(arguments))
     atomic.check_fits_output(arguments.output, arguments.overwrite, inputs)
-    if arguments.plot is None:
-        return
-
-    from lnocl.plotting.figure import check_matplotlib
-
-    if not arguments.plot.lower().endswith(".png"):
-        raise InputError(
-            f"the picture is a PNG file; give --plot a name ending in .png, not {arguments.plot}"
-        )
-    if os.path.realpath(arguments.plot) == os.path.realpath(arguments.output):
-        raise InputError(f"the picture {arguments.plot} is the output too; give it another name")
-    if len(arguments.rotate) > MAX_DRAWN:
+    if arguments.plot is not None and len(arguments.rotate) > MAX_DRAWN:
         raise InputError(
             f"--plot draws {MAX_DRAWN} PSFs at most, and {len(arguments.rotate)} angles were given"
         )
-    atomic.check_output(arguments.plot, arguments.overwrite, inputs)
-    check_matplotlib()
+    pictures.check(arguments, inputs)
 
 
 def _report(arguments: argparse.Namespace) -> None:
@@ -342,19 +326,17 @@ def _result_cards(stars: Sequence[StarPsf]) -> list[Card]:
     ]
 
 
-def _draw(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> None:
-    from lnocl.plotting.figure import save_figure
+def _figure(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> Figure:
     from lnocl.plotting.psf import draw_star_psf
 
     first = stars[0]
-    figure = draw_star_psf(
+    return draw_star_psf(
         first.frame - first.background,
         first.bad,
         first.centres,
         [star.psf for star in stars],
         arguments.rotate,
     )
-    save_figure(figure, arguments.plot, arguments.overwrite)
 
 
 COMMAND = Command(

@@ -52,7 +52,6 @@ def summarise(
         *([] if overall is None else [f"residuals {_rms(overall)} in all, where noise gives 1"]),
         *_shortness(arguments, result),
         *_verdict(result, at_stars, overall),
-        f"written to {arguments.output}",
     ]
 
 

@@ -1,4 +1,4 @@
-"""FITS in: images and PSFs, their coordinates, and results that were saved."""
+"""FITS in: images and PSFs, and their coordinates."""
 
 from __future__ import annotations
 
@@ -13,19 +13,12 @@ from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.fitsfile import open_fits
-from lnocl.io.headers import make_wcs, number, quiet_log, readable
+from lnocl.io.headers import make_wcs, quiet_log, readable
 from lnocl.io.names import parse_name
 from lnocl.io.selection import choose, describe, find, has_pixels, name_of, only
 from lnocl.process import ignored_warnings
 
 log = logging.getLogger("lnocl")
-
-RESULT_TABLES = {
-    "STARS": ("x", "y", "flux"),
-    "HISTORY": ("iteration", "objective"),
-    "CURVE": ("iteration", "rho", "rho_star", "magnitude"),
-    "HELDOUT": ("smoothing", "iteration", "error"),
-}
 
 # Beginnings of CTYPE3 of cubes whose planes are not of one sky: colours, energies, velocities,
 # polarisations.
@@ -229,103 +222,6 @@ def wcs_cards(header: fits.Header) -> fits.Header:
                 f"copied and are left out: {error}"
             )
     return cards
-
-
-class SavedResult(NamedTuple):
-    """A result, or a truth, that was read.
-
-    Attributes
-    ----------
-    extended : ndarray of float64, shape (ny, nx)
-        Extended source, in the unit of BUNIT per pixel.
-    stars : list of (x, y)
-        Positions in pixels, 0-based.
-    star_fluxes : ndarray of float64, shape (n,)
-        In the same unit.
-    history, curve, held_out : dict of str to ndarray of float64, or None
-        Columns of the tables ``HISTORY``, ``CURVE`` and ``HELDOUT``; None for a table that is
-        missing.
-    doubtful : ndarray of bool, shape (ny, nx), or None
-        The image ``DOUBTFUL``, where it is there.
-    header : astropy.io.fits.Header
-        Header of the extended source.
-    path : str
-        The file.
-    """
-
-    extended: NDArray[np.float64]
-    stars: list[tuple[float, float]]
-    star_fluxes: NDArray[np.float64]
-    history: dict[str, NDArray[np.float64]] | None
-    curve: dict[str, NDArray[np.float64]] | None
-    held_out: dict[str, NDArray[np.float64]] | None
-    doubtful: NDArray[np.bool_] | None
-    header: fits.Header
-    path: str
-
-    def number(self, keyword: str) -> float | None:
-        """Return the number that a keyword of the header gives; None where it is missing.
-
-        Raises
-        ------
-        InputError
-            Its value is not a finite number.
-        """
-        return number(self.path, self.header, keyword)
-
-
-def read_result(path: str) -> SavedResult:
-    """Read a result that `fitswrite.write_result` has written.
-
-    Parameters
-    ----------
-    path : str
-        File with an image (ny, nx) and a table ``STARS`` with the columns x, y and flux.
-
-    Returns
-    -------
-    SavedResult
-        The extended source, the stars, and the tables that are there.
-
-    Raises
-    ------
-    FileError
-        A file that `read_stack` refuses, or whose tables are not those of a result.
-    """
-    image: tuple[NDArray[np.float64], fits.Header] | None = None
-    tables, doubtful = {}, None
-    with open_fits(path) as file:
-        for hdu in file.hdus():
-            if image is None and has_pixels(hdu):
-                image = file.pixels(hdu), readable(hdu.header)
-            elif isinstance(hdu, fits.BinTableHDU) and hdu.name in RESULT_TABLES:
-                tables[hdu.name] = file.columns(hdu)
-            elif has_pixels(hdu) and hdu.name == "DOUBTFUL":
-                doubtful = file.pixels(hdu) != 0
-    if image is None:
-        raise _NoImageError(f"{path} holds no image")
-    extended, header = image
-    lacking = [
-        f"{table} {name}"
-        for table, names in RESULT_TABLES.items()
-        for name in names
-        if (table in tables or table == "STARS") and name not in tables.get(table, ())
-    ]
-    if lacking or extended.ndim != 2:
-        fault = f"there is no column {lacking[0]}" if lacking else "the image is a cube"
-        raise FileError(f"{path} is not a result or truth written by lnocl: {fault}")
-    stars = tables["STARS"]
-    return SavedResult(
-        extended,
-        list(zip(stars["x"].tolist(), stars["y"].tolist(), strict=True)),
-        stars["flux"],
-        tables.get("HISTORY"),
-        tables.get("CURVE"),
-        tables.get("HELDOUT"),
-        doubtful,
-        header,
-        path,
-    )
 
 
 class _NoImageError(FileError):

@@ -51,6 +51,7 @@ def write_result(
     psfs: ArrayLike | None = None,
     psf_errors: NDArray[np.void] | None = None,
     doubtful: ArrayLike | None = None,
+    said: Sequence[str] = (),
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
@@ -100,6 +101,8 @@ def write_result(
         The relative error of the PSFs in rings round a star.
     doubtful : array_like of bool, shape (ny, nx), optional
         Pixels in which errors of the PSFs may have faked all there is.
+    said : sequence of str, optional
+        What the run said, a line each: the table ``MESSAGES``.
 
     Raises
     ------
@@ -124,6 +127,7 @@ def write_result(
             *([] if psfs is None else [fits.ImageHDU(np.asarray(psfs, np.float64), name="PSFS")]),
             *([] if psf_errors is None else [_table("PSFERRORS", psf_errors)]),
             *([] if doubtful is None else [_flags("DOUBTFUL", doubtful, shared)]),
+            *([_lines("MESSAGES", "message", said)] if said else []),
         ]
     )
     with whole_file(path, overwrite) as stream:
@@ -276,6 +280,12 @@ def _table(name: str, rows: NDArray[np.void]) -> fits.BinTableHDU:
         fits.Column(field, "K" if rows[field].dtype.kind == "i" else "D", array=rows[field])
         for field in rows.dtype.names or ()
     ]
+    return fits.BinTableHDU.from_columns(columns, name=name)
+
+
+def _lines(name: str, column: str, lines: Sequence[str]) -> fits.BinTableHDU:
+    texts = np.array([_ascii(line) for line in lines])
+    columns = [fits.Column(column, f"{texts.dtype.itemsize // 4}A", array=texts)]
     return fits.BinTableHDU.from_columns(columns, name=name)
 
 

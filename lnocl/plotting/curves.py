@@ -1,4 +1,4 @@
-"""Errors, magnitudes, objectives and costs as curves."""
+"""Errors, magnitudes and costs as curves."""
 
 from __future__ import annotations
 
@@ -85,69 +85,6 @@ def draw_magnitudes(curves: Mapping[str, Mapping[str, Array]], true: float | Non
     axis.invert_yaxis()
     axis.grid(alpha=0.3)
     axis.legend(fontsize=9)
-    return figure
-
-
-def draw_objectives(histories: Mapping[str, Mapping[str, Array]]) -> Figure:
-    """Draw the objective against the iterations, above the smallest one of each.
-
-    Parameters
-    ----------
-    histories : mapping of str to mapping of str to ndarray
-        For each name the columns ``iteration`` and ``objective``.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel.
-
-    Raises
-    ------
-    LnoclError
-        Where matplotlib is missing.
-    """
-    figure = new_figure(6.5, 4.0)
-    axis = figure.subplots()
-    for i, (name, history) in enumerate(histories.items()):
-        later = history["iteration"] > 0
-        axis.plot(
-            history["iteration"][later], history["objective"][later], **line_style(i), label=name
-        )
-    axis.set(xscale="log", yscale="log", xlabel="iteration", ylabel="objective J")
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=9)
-    return figure
-
-
-def draw_held_out_errors(tables: Mapping[str, Mapping[str, Array]]) -> Figure:
-    """Draw the errors that held-out counts estimate, a line for each smoothing.
-
-    Parameters
-    ----------
-    tables : mapping of str to mapping of str to ndarray
-        For each name the columns ``smoothing``, ``iteration`` and ``error``.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A panel for each name.
-
-    Raises
-    ------
-    LnoclError
-        Where matplotlib is missing.
-    """
-    figure = new_figure(6.5 * len(tables), 4.0)
-    panels = figure.subplots(1, len(tables), squeeze=False)[0]
-    for axis, (name, table) in zip(panels, tables.items(), strict=True):
-        for i, value in enumerate(np.unique(table["smoothing"])):
-            rows = table["smoothing"] == value
-            label = f"{value:.2g}"
-            axis.plot(table["iteration"][rows], table["error"][rows], **line_style(i), label=label)
-        axis.set(xscale="log", yscale="log", xlabel="iteration", ylabel="estimated relative error")
-        axis.set_title(name, fontsize=10)
-        axis.grid(alpha=0.3, which="both")
-        axis.legend(fontsize=9, title="smoothing")
     return figure
 
 

@@ -56,6 +56,34 @@ class PsfRefinement:
     is_noise: bool
     may_be_faked: Array
 
+    def table(self) -> NDArray[np.void]:
+        """Return the parameters of the PSFs, a row an image, for a FITS table."""
+        names = [name.replace(" ", "_") for name in self.parameters]
+        rows = np.zeros(len(self.values), [("image", np.int64), *((name, float) for name in names)])
+        rows["image"] = np.arange(1, len(rows) + 1)
+        for name, values in zip(names, self.values.T, strict=True):
+            rows[name] = values
+        return rows
+
+    def errors_table(self) -> NDArray[np.void]:
+        """Return the relative error of the PSFs, a row a ring, for a FITS table."""
+        columns = {"from": self.edges[:-1], "to": self.edges[1:], "error": self.errors_in_rings}
+        rows = np.zeros(len(self.errors_in_rings), [(name, float) for name in columns])
+        for name, values in columns.items():
+            rows[name] = values
+        return rows
+
+    def cards(self) -> list[tuple[str, bool | float, str]]:
+        """Return what became of the PSFs as cards of a FITS header."""
+        before, after = self.misfit
+        return [
+            ("PSFUSED", self.is_accepted, "whether refined PSFs are used"),
+            ("PSFMIS1", before, "reduced chi squared, PSFs as given"),
+            ("PSFMIS2", after, "reduced chi squared, PSFs refined"),
+            ("PSFERR", self.psf_error, "relative error that the PSFs used have"),
+            ("PSFNOISE", self.is_noise, "whether it was added to the noise"),
+        ]
+
 
 @dataclass(frozen=True)
 class Outcome:

@@ -102,6 +102,7 @@ def _reconstruct(
         found,
         commands=[["cd", os.getcwd()], command],
         overwrite=overwrite,
+        observation=observation,
     )
     return found
 

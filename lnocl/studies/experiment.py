@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lnocl import metrics
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
-from lnocl.result import HISTORY_DTYPE, Estimate
+from lnocl.result import HISTORY_DTYPE, Estimate, models_of
 from lnocl.runs.options import PAPER
 from lnocl.scene.observation import Array, Observation
 from lnocl.simulation import Simulation
@@ -55,6 +55,8 @@ class Reconstruction:
         Fields ``iteration`` and ``objective``, for every iteration.
     device : str
         Name of the device.
+    models : ndarray of float64, shape (p, ny, nx)
+        The models of that estimate, as `lnocl.Result.models`.
     """
 
     method: str
@@ -64,6 +66,7 @@ class Reconstruction:
     star_flux: float
     history: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, HISTORY_DTYPE))
     device: str = ""
+    models: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     def best(self, field: str) -> tuple[int, float]:
         """Return the iteration and the value at which ``rho`` or ``rho_star`` is smallest."""
@@ -198,6 +201,8 @@ def reconstruct(
     stars = [] if method == "RLM" else simulation.stars
     keywords = PAPER | keywords
     result = deconvolve(observation, stars, mu=mu, n_iter=n_iter, callback=tracker, **keywords)
+    fluxes = np.array([tracker.star_flux] if stars else [])
+    best = replace(result._outcome, sky=tracker.extended, star_fluxes=fluxes)
     return Reconstruction(
         method,
         mu,
@@ -206,6 +211,7 @@ def reconstruct(
         tracker.star_flux,
         result.history,
         result.device,
+        np.array(list(models_of(best))),
     )
 
 

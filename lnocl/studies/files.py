@@ -6,8 +6,12 @@ import json
 import os
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
 from lnocl import __version__
 from lnocl.io import atomic, fitswrite
+from lnocl.residuals import residuals
+from lnocl.scene.observation import Array, Observation
 from lnocl.simulation import Simulation
 from lnocl.studies.experiment import Reconstruction
 
@@ -81,6 +85,7 @@ def write_reconstruction(
     cards: Iterable[fitswrite.Card] = (),
     commands: Iterable[Sequence[str]] = (),
     overwrite: bool = False,
+    observation: Observation | None = None,
 ) -> None:
     """Write a reconstruction like a result of `lnocl deconvolve`, with the curve of its errors.
 
@@ -98,6 +103,8 @@ def write_reconstruction(
         Shell commands that repeat the run, as words.
     overwrite : bool, optional
         Whether an existing file may be replaced.
+    observation : Observation, optional
+        What was reconstructed; with it models and residuals are written too.
 
     Raises
     ------
@@ -127,7 +134,16 @@ def write_reconstruction(
         commands=commands,
         overwrite=overwrite,
         curve=found.curve,
+        cubes={} if observation is None else _cubes(observation, found),
     )
+
+
+def _cubes(observation: Observation, found: Reconstruction) -> dict[str, tuple[Array, str]]:
+    images = zip(observation.images, observation.mask, found.models, strict=True)
+    return {
+        "MODELS": (found.models, "electron"),
+        "RESIDUALS": (np.array([residuals(*each) for each in images]), ""),
+    }
 
 
 # The words of `lnocl.runs.options.PAPER`.

@@ -100,7 +100,7 @@ class TestFrames:
         assert cli.main(words[1:]) == 0
         assert capsys.readouterr().out == captured.out
         again = outcome("out.fits")
-        assert set(again) == {"PRIMARY", "STARS", "HISTORY", "MODELS", "RESIDUALS"}
+        assert set(again) == {"PRIMARY", "STARS", "HISTORY", "MODELS", "RESIDUALS", "MESSAGES"}
         for name, data in first.items():
             np.testing.assert_equal(again[name], data)
         assert fits.getheader("out.fits")["HISTORY"] == header["HISTORY"]
@@ -267,5 +267,5 @@ class TestFrames:
         capsys.readouterr()
         assert cli.main(["plot", "out.fits", "-o", "figures"]) == 0
         written = capsys.readouterr().out
-        assert "figures/objects.png" in written
-        assert Path("figures/objects.png").stat().st_size > 1000
+        assert "figures/result.png" in written
+        assert Path("figures/result.png").stat().st_size > 1000

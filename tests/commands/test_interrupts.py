@@ -40,14 +40,15 @@ def interrupted(small_command, monkeypatch):
 
 def assert_whole(path):
     with fits.open(path, checksum=True) as hdus:
-        assert [hdu.name for hdu in hdus[1:]] == ["STARS", "HISTORY", "MODELS", "RESIDUALS"]
+        names = ["STARS", "HISTORY", "MODELS", "RESIDUALS", "MESSAGES"]
+        assert [hdu.name for hdu in hdus[1:]] == names
         assert (hdus[0].header["STOPPED"], hdus[0].header["NITER"]) == ("n_iter", 3)
 
 
 IN_THE_END = [
     "lnocl.deconvolution.make_result",
     "lnocl.result.Result.models",
-    "lnocl.result.Result.residuals",
+    "lnocl.commands.deconvolve.view_of",
     "lnocl.io.fitswrite.write_result",
     "lnocl.io.atomic.os.fsync",
 ]

@@ -15,8 +15,8 @@ from lnocl.io.frames import Calibration
 pytestmark = pytest.mark.usefixtures("command_folder")
 
 # Options of lnocl deconvolve that no function takes as they are.
-OF_THE_SHELL = {"images", "output", "overwrite", "quiet", "models", "residuals", "star_sky",
-                "star_table", "zero_point"}  # fmt: skip
+OF_THE_SHELL = {"images", "output", "overwrite", "plot", "quiet", "models", "residuals",
+                "star_sky", "star_table", "zero_point"}  # fmt: skip
 # Parameters of lnocl.deconvolve that the shell gives itself, or that no option gives.
 NOT_OPTIONS = {"observation", "callback", "progress", "initial_extended", "initial_star_fluxes"}
 

@@ -9,7 +9,7 @@ from astropy.io import fits
 
 import lnocl
 from lnocl.commands import cli
-from lnocl.io.fitsread import read_result
+from lnocl.io.saved_results import read_result
 from lnocl.plotting.sources import Frame, Source, draw_objects
 from lnocl.scene.psf_families import PsfFamilies
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from lnocl.commands import cli
 from lnocl.errors import FileError, InputError
-from lnocl.io import atomic, fitsread, fitswrite
+from lnocl.io import atomic, fitswrite, saved_results
 from lnocl.plotting.figure import save_figure
 
 IMAGE = np.arange(1.0, 121.0).reshape(10, 12)
@@ -362,7 +362,7 @@ class TestCommandLine:
             "--n-iter", "1", "--engine", "numpy", "-o", f"./{name}out.fits",
         ]  # fmt: skip
         assert cli.main(arguments) == 0
-        assert fitsread.read_result(f"{name}out.fits").stars == [(3.0, 4.0)]
+        assert saved_results.read_result(f"{name}out.fits").stars == [(3.0, 4.0)]
         ends = [path.removeprefix(name) for path in sorted(os.listdir())]
         assert ends == sorted([".csv", "a.fits", "k.fits", "out.fits"])
 
@@ -372,7 +372,7 @@ class TestCommandLine:
         self.fails(capsys, message, "--stars", name, "-o", "out.fits")
         Path(name).write_text("x y\n3 4\n")
         assert cli.main([*self.COMMAND, "--stars", name, "-o", "out.fits"]) == 0
-        assert fitsread.read_result("out.fits").stars == [(3.0, 4.0)]
+        assert saved_results.read_result("out.fits").stars == [(3.0, 4.0)]
 
     def test_paths_in_a_header_lead_nowhere(self, tmp_path):
         names_of_files = ("EXTNAME", "FILENAME", "OBJECT", "ORIGIN", "CTYPE1", "DP1", "CPDIS1")

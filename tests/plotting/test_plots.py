@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lnocl.errors import LnoclError
-from lnocl.plotting.curves import draw_errors, draw_magnitudes, draw_objectives
+from lnocl.plotting.curves import draw_errors, draw_magnitudes
 from lnocl.plotting.figure import save_figure
 from lnocl.plotting.overview import draw_overview
 from lnocl.plotting.profiles import draw_profiles
@@ -86,12 +86,6 @@ def test_magnitudes_are_bright_upwards():
     assert set(lines(axis)) == {"RLM", "truth"}
     (axis,) = draw_magnitudes({"RLM": CURVE}, None).axes
     assert set(lines(axis)) == {"RLM"}
-
-
-def test_objectives_begin_after_the_start():
-    history = {"iteration": np.arange(3.0), "objective": np.array([9.0, 5.0, 4.0])}
-    (axis,) = draw_objectives({"a": history}).axes
-    assert lines(axis)["a"][1].tolist() == [5.0, 4.0]
 
 
 @pytest.mark.parametrize(("kind", "expected"), [("flux", 10.0), ("width", 0.0)])

@@ -23,7 +23,7 @@ from sound_files import (
 from wcs_headers import SIP
 
 from lnocl.errors import FileError, InputError, LnoclWarning
-from lnocl.io import fitsread, fitswrite, sky
+from lnocl.io import fitsread, fitswrite, saved_results, sky
 from lnocl.process import ignored_warnings
 
 BLOCK = 2880
@@ -221,7 +221,7 @@ def test_a_table_that_does_not_match_its_datasum_is_announced(sound, tmp_path):
     path = tmp_path / "damaged"
     path.write_bytes(content)
     with pytest.warns(LnoclWarning, match="the data do not match their DATASUM"):
-        fitsread.read_result(str(path))
+        saved_results.read_result(str(path))
 
 
 def test_a_column_with_several_numbers_in_a_row(tmp_path):
@@ -230,4 +230,4 @@ def test_a_column_with_several_numbers_in_a_row(tmp_path):
     table = fits.BinTableHDU.from_columns(columns, name="STARS")
     fits.HDUList([fits.PrimaryHDU(COUNTS), table]).writeto(path)
     with pytest.raises(FileError, match=r"several numbers in a row of column x of STARS"):
-        fitsread.read_result(str(path))
+        saved_results.read_result(str(path))

@@ -14,7 +14,7 @@ from astropy.io import fits
 
 import lnocl
 from lnocl.commands import cli, messages
-from lnocl.io import fitsread, fitswrite
+from lnocl.io import fitswrite, saved_results
 from lnocl.simulation import Experiment, Star, Target, hh34, load_target, simulate
 from lnocl.simulation.photometry import MAG_PER_ARCSEC2
 from lnocl.studies import demo, experiment, figures, files
@@ -61,15 +61,16 @@ class TestDemo:
         }
         pytest.importorskip("matplotlib")
         pictures = {path.stem: path.stat().st_size for path in files.glob("*.png")}
-        assert set(pictures) == {"demo", "objects", "errors", "magnitude", "flux", "width"}
-        assert max(pictures.values()) < 200_000
+        names = {"demo", "objects", "errors", "magnitude", "flux", "width", "result_1", "result_2"}
+        assert set(pictures) == names
+        assert max(pictures.values()) < 400_000
 
     def test_its_table_has_the_numbers_of_its_files(self, run):
         files, said = run
         rows = [line.split() for line in said if line.startswith(("RLM ", "MC-RL "))]
         assert [row[0] for row in rows] == ["RLM", "MC-RL"]
         for row, name in zip(rows, ("rlm", "mc-rl"), strict=True):
-            curve = fitsread.read_result(str(files / f"{name}.fits")).curve
+            curve = saved_results.read_result(str(files / f"{name}.fits")).tables["CURVE"]
             assert f"{curve['rho'].min():.2%}" in row
             assert f"{curve['rho_star'].min():.2%}" in row
         assert float(rows[0][3].rstrip("%")) > float(rows[1][4].rstrip("%"))
@@ -82,11 +83,13 @@ class TestDemo:
         assert Path(home[1]) == files.parent
         monkeypatch.chdir(files.parent)
         assert cli.main([*words[1:-1], str(folder / "again.fits"), "--quiet"]) == 0
-        again = fitsread.read_result(str(folder / "again.fits"))
-        first = fitsread.read_result(str(files / "mc-rl.fits"))
+        again = saved_results.read_result(str(folder / "again.fits"))
+        first = saved_results.read_result(str(files / "mc-rl.fits"))
         np.testing.assert_array_equal(again.extended, first.extended)
         np.testing.assert_array_equal(again.star_fluxes, first.star_fluxes)
-        np.testing.assert_array_equal(again.history["objective"], first.history["objective"])
+        np.testing.assert_array_equal(
+            again.tables["HISTORY"]["objective"], first.tables["HISTORY"]["objective"]
+        )
 
     @pytest.mark.exhaustive
     def test_the_same_numbers_each_time(self, run, capsys, monkeypatch):
@@ -222,11 +225,11 @@ class TestSimulate:
             with fits.open(f"out/image_{j}.fits", checksum=True) as hdus:
                 np.testing.assert_array_equal(hdus[0].data, expected.images[j - 1])
             np.testing.assert_array_equal(fits.getdata(f"out/psf_{j}.fits"), expected.psfs[j - 1])
-        truth = fitsread.read_result("out/truth.fits")
+        truth = saved_results.read_result("out/truth.fits")
         np.testing.assert_array_equal(truth.extended, expected.extended)
         assert truth.stars == [(20.0, 30.0)]
         np.testing.assert_array_equal(truth.star_fluxes, expected.star_fluxes)
-        assert (truth.history, truth.curve) == (None, None)
+        assert set(truth.tables) == {"STARS"}
         record = json.loads(Path("out/record.json").read_text())
         assert record == {"lnocl": lnocl.__version__, "scene": "hh34", **expected.record()}
         assert len(os.listdir("out")) == 6
@@ -275,7 +278,7 @@ class TestSimulate:
         image[20:30, 18:22] = 1.0
         fits.writeto("mine.fits", image, fits.Header({"STARX": 20, "STARY": 24}))
         assert cli.main(["simulate", "mine.fits", "-o", "out", "--angle", "0"]) == 0
-        assert fitsread.read_result("out/truth.fits").stars == [(20.0, 24.0)]
+        assert saved_results.read_result("out/truth.fits").stars == [(20.0, 24.0)]
 
     @pytest.mark.parametrize(
         ("arguments", "status", "message"), BAD_SIMULATE.values(), ids=BAD_SIMULATE
@@ -308,35 +311,51 @@ class TestPlot:
         results = [str(files / f"{name}.fits") for name in ("rlm", "mc-rl")]
         truth = str(files / "truth.fits")
         assert cli.main(["plot", *results, "--truth", truth, "-o", "out"]) == 0
-        names = ["objects", "errors", "magnitude", "flux", "width"]
+        names = ["result_1", "result_2", "errors", "magnitude", "objects", "flux", "width"]
         assert capsys.readouterr().out.splitlines() == [f"drew out/{name}.png" for name in names]
         assert sorted(os.listdir("out")) == sorted(f"{name}.png" for name in names)
 
-    def test_what_is_not_there_is_skipped_with_a_line(self, capsys):
+    def test_of_one_result_its_picture_is_drawn(self, capsys):
         image = np.ones((32, 32))
         history = np.array([(0, 3.5), (1, 2.5)], [("iteration", int), ("objective", float)])
         fitswrite.write_result("a.fits", image, [], [], history)
         assert cli.main(["plot", "a.fits", "-o", "out"]) == 0
         assert capsys.readouterr().out.splitlines() == [
-            "drew out/objects.png",
-            "errors and magnitude skipped: no file has a table CURVE (lnocl demo writes it)",
-            "drew out/objective.png",
-            "flux and width skipped: they need --truth with a star",
+            "drew out/result.png",
+            "a.fits has no models and residuals to show: repeat its run with --models --residuals, "
+            "or draw them in the run, with --plot",
+        ]
+        assert os.listdir("out") == ["result.png"]
+
+    def test_several_results_of_several_stars_are_compared(self, capsys):
+        cubes = {"MODELS": (np.ones((1, 32, 32)), ""), "RESIDUALS": (np.ones((1, 32, 32)), "")}
+        for name in "ab":
+            fitswrite.write_result(
+                f"{name}.fits", np.ones((32, 32)), [(3, 4), (9, 9)], [2.0, 1.0], cubes=cubes
+            )
+        fitswrite.write_result("truth.fits", np.ones((32, 32)), [(3, 4), (9, 9)], [2.0, 1.0])
+        assert cli.main(["plot", "a.fits", "b.fits", "-o", "out"]) == 0
+        drawn = ["drew out/result_1.png", "drew out/result_2.png", "drew out/objects.png"]
+        assert capsys.readouterr().out.splitlines() == drawn
+        assert cli.main(["plot", "a.fits", "b.fits", "--truth", "truth.fits", "-o", "more"]) == 0
+        assert capsys.readouterr().out.splitlines()[2:] == [
+            "drew more/objects.png",
+            "flux and width skipped: they are profiles beside one star",
         ]
 
     def test_names_tell_results_apart(self):
-        for name, stars in (("a", []), ("b", [(3, 4)]), ("c", [(3, 4)]), ("d", [(3, 4)])):
+        for name, method in (("a", "RLM"), ("b", "MC-RL"), ("c", "MC-RL"), ("d", "MC-RL"), ("e", "")):
             cards = [("MU", 1e-8 if name == "d" else 0.0, "")]
-            fitswrite.write_result(
-                f"{name}.fits", np.ones((8, 8)), stars, [1.0] * len(stars), cards=cards
-            )
-        paths = [f"{name}.fits" for name in "abcd"]
-        saved = [fitsread.read_result(path) for path in paths]
+            cards += [("METHOD", method, "")] if method else []
+            fitswrite.write_result(f"{name}.fits", np.ones((8, 8)), [], [], cards=cards)
+        paths = [f"{name}.fits" for name in "abcde"]
+        saved = [saved_results.read_result(path) for path in paths]
         assert figures._names(paths, saved) == [
             "RLM",
-            "MC-RL mu=0 (b.fits)",
-            "MC-RL mu=0 (c.fits)",
+            "MC-RL (b.fits)",
+            "MC-RL (c.fits)",
             "MC-RL mu=1e-08",
+            "e",
         ]
 
     @pytest.mark.parametrize(
@@ -347,8 +366,8 @@ class TestPlot:
             (["image.fits"], 1, "image.fits is not a result or truth written by lnocl"),
             (["a.fits", "b.fits"], 2, "b.fits has the shape (8, 8) and a.fits (9, 8)"),
             (["b.fits", "--truth", "a.fits"], 2, "b.fits has the shape (8, 8) and a.fits (9, 8)"),
-            (["nan.fits"], 2, "nan.fits holds values that are not finite, or no flux"),
-            (["a.fits", "--truth", "dark.fits"], 2, "dark.fits holds values that are not finite"),
+            (["nan.fits"], 2, "nan.fits holds values that are not finite"),
+            (["a.fits", "--truth", "dark.fits"], 2, "dark.fits holds no flux; give another --truth"),
             (
                 ["a.fits", "-o", "full"],
                 1,

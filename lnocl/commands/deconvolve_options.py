@@ -1,0 +1,296 @@
+"""The arguments of the command ``deconvolve``."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from lnocl.commands import checkpoints, options
+from lnocl.commands.options import SEVERAL, finite, number_or_word, option, whole_or_word
+from lnocl.deconvolution import deconvolve
+from lnocl.runs.options import ENGINES, PRECISIONS
+from lnocl.scene.psf_families import FAMILIES
+from lnocl.solvers import SOLVERS
+
+PARAMETERS = {
+    name: parameter.default for name, parameter in inspect.signature(deconvolve).parameters.items()
+}
+
+
+def _parameter(flag: str, **keywords: Any) -> options.Option:
+    """Return the option for a parameter of `lnocl.deconvolve`, with the same default."""
+    given = option(flag, **keywords)
+    return given.but(default=PARAMETERS[given.name])
+
+
+OPTIONS = {
+    "input": [
+        options.IMAGES,
+        options.PSFS.but(required=True),
+        option(
+            "--psf-centre",
+            choices=("check", "fit", "given"),
+            default="check",
+            card=("PSFCENTR", "what became of PSFs off their centre"),
+            help="what becomes of a PSF whose core lies off its centre, (ky // 2, kx // 2): check, "
+            "it is refused; fit, it is moved there; given, nothing (default: %(default)s)",
+        ),
+    ],
+    "output": [
+        option(
+            "-o",
+            "--output",
+            required=True,
+            metavar="OUT.fits",
+            help="FITS file for the extended source, the stars and the history of the objective",
+        ),
+        options.OVERWRITE.but(help="replace OUT.fits if it exists"),
+        option(
+            "--models",
+            action="store_true",
+            help="add a cube with the model of each image, in electrons; its header has the "
+            "coordinates of the image where all images share them, else their offsets",
+        ),
+        option(
+            "--residuals",
+            action="store_true",
+            help="add a cube with the residuals of each image, (image - model) / sqrt(model), with "
+            "the same header; say how well the model fits in all pixels",
+        ),
+        options.PICTURE.but(
+            help="picture of image, model, residuals and extended source, whole and at each star, "
+            "and of how the iteration was chosen"
+        ),
+        options.QUIET,
+    ],
+    "calibration": [
+        options.BACKGROUND,
+        options.READ_NOISE,
+        option(
+            "--exposure",
+            **SEVERAL,
+            type=number_or_word,
+            metavar="T",
+            card=("EXP", "exposure, seconds"),
+            checksum="ESUM",
+            help="seconds, a FITS file with a map of them, or a keyword of the images' headers "
+            "such as EXPTIME; one for all images or one for each; the result is then per second",
+        ),
+        option(
+            "--gain",
+            type=number_or_word,
+            metavar="G",
+            card=("GAIN", "electrons for each unit of the images"),
+            help="electrons for each adu, or for each of whatever unit the images have; or a "
+            "keyword of the images' headers such as GAIN; or their extension with the variance of "
+            "counts, as VAR_POISSON of JWST",
+        ),
+        option(
+            "--mask",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="MSUM",
+            help="FITS file that is not 0 where a pixel is bad, or dq, the extension DQ of each "
+            "image; one for all images or one for each",
+        ),
+        option(
+            "--good-bits",
+            metavar="BITS",
+            card=("GOODBITS", "flags of DQ that are no fault"),
+            help="with --mask dq: flags that are no fault, as in 16,64, or ~1 for all but 1; 0 for "
+            "none (default: of JWST ~1, of HST those of pixels that were corrected, else 0)",
+        ),
+        options.SATURATION,
+        option(
+            "--inverse-variance",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="VSUM",
+            help="FITS file with 1 / variance of sky and read noise, in units of the images, 0 "
+            "where a pixel is bad; one for all images or one for each",
+        ),
+        option(
+            "--variance",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="WSUM",
+            help="the same with their variance",
+        ),
+        option(
+            "--rms",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="QSUM",
+            help="the same with their standard deviation",
+        ),
+        option(
+            "--error",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="NSUM",
+            help="the same with the standard deviation of all noise, that of the source's counts "
+            "too; or err, the extension ERR of each image",
+        ),
+        option(
+            "--align",
+            choices=("wcs",),
+            help="take the offsets between the images from their sky coordinates",
+        ),
+    ],
+    "stars": [
+        options.STARS,
+        option(
+            "--star-sky",
+            action="append",
+            default=[],
+            metavar="RA,DEC",
+            help="position of a star on the sky (ICRS), in degrees or as hh:mm:ss,dd:mm:ss; may "
+            "be repeated",
+        ),
+        option(
+            "--stars",
+            metavar="FILE",
+            dest="star_table",
+            is_input=True,
+            help="table of stars in any format of astropy, with columns x and y, or ra and dec, "
+            "or as photutils, SExtractor, Gaia and VizieR name them",
+        ),
+        option(
+            "--refine",
+            action="store_true",
+            default=None,  # for no card where it is not given
+            dest="refine_positions",
+            card=("REFINED", "star positions"),
+            help="fit the positions of the stars too, each within 3 pixels of the one given",
+        ),
+        option(
+            "--refine-psfs",
+            nargs="+",
+            choices=tuple(FAMILIES),
+            default=[],
+            metavar="WHAT",
+            card=("REFPSF", "asked of the PSFs"),
+            help="fit the PSFs to the stars before the reconstruction, and use them where they fit "
+            "better: shift, jitter (a blur, or a sharpening), strehl (needs --ideal-psf or "
+            "--pupil), pupil (phases; needs --pupil), modes (needs --psf-modes), pixels "
+            "(needs two stars); at least one star",
+        ),
+        option(
+            "--ideal-psf",
+            dest="ideal_psfs",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="DSUM",
+            help="FITS file with a PSF without aberrations, of the shape of the PSFs; one for all "
+            "images or one for each",
+        ),
+        option(
+            "--pupil",
+            dest="pupils",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="TSUM",
+            help="FITS file with the transmission of a pupil, of the shape of the PSFs and in "
+            "their frequencies, its middle at (ky // 2, kx // 2); one for all images or one "
+            "for each",
+        ),
+        option(
+            "--psf-modes",
+            metavar="FILE",
+            checksum="LSUM",
+            help="FITS file with a cube of the ways in which the PSFs may differ, one standard "
+            "deviation each, of the shape of the PSFs and for all of them; in an extension MODES, "
+            "as lnocl psf --modes writes it, or as its image",
+        ),
+        option(
+            "--psf-scatter",
+            **SEVERAL,
+            metavar="FILE",
+            checksum="SSUM",
+            help="FITS file with the standard deviation of the pixels of a PSF of unit sum, in an "
+            "extension SCATTER, as lnocl psf writes it, or as its image: it is added to the noise "
+            "at the stars; one for all images or one for each",
+        ),
+        option(
+            "--round-source",
+            action="store_true",
+            default=None,  # for no card where it is not given
+            card=("ROUND", "the source lies all round a star"),
+            help="with --refine-psfs: a disc, ring or host lies all round a star, so that what "
+            "does is not the PSF's",
+        ),
+        option(
+            "--zero-point",
+            type=finite,
+            metavar="MAG",
+            card=("ZEROPT", "magnitude of a flux of 1"),
+            help="magnitude of a flux of 1 in the unit of the result, that of the images, per "
+            "second where exposures are given; adds a column mag to the table of stars",
+        ),
+    ],
+    "reconstruction": [
+        _parameter(
+            "--n-iter",
+            type=int,
+            metavar="N",
+            card=("NITER", "iterations done"),
+            help="largest number of iterations (default: %(default)s)",
+        ),
+        _parameter(
+            "--stop",
+            type=number_or_word,
+            metavar="RULE",
+            card=("STOPPED", "why it stopped"),
+            help="when to stop before N iterations: held-out, at the iteration that held-out "
+            "counts choose; discrepancy, when the data are fitted as well as noise allows; a "
+            "number below 1, when the objective changes relatively by less in an iteration; or "
+            "none (default: %(default)s)",
+        ),
+        _parameter(
+            "--solver",
+            choices=tuple(SOLVERS),
+            card=("SOLVER", "iteration"),
+            help="scaled gradient projection, or the split-gradient method, the paper's, which "
+            "needs ten times the iterations and more (default: %(default)s)",
+        ),
+        _parameter(
+            "--mu",
+            type=float,
+            metavar="MU",
+            card=("MU", "weight of the Tikhonov term, per electron"),
+            help="weight of the Tikhonov term on the extended source, per electron (default: "
+            "%(default)s)",
+        ),
+        _parameter(
+            "--smoothing",
+            type=number_or_word,
+            metavar="WEIGHT",
+            card=("SMOOTHIN", "weight of the edge-preserving term"),
+            help="weight of an edge-preserving term against noise, or auto: that which suits the "
+            "noise of the counts (default: %(default)s)",
+        ),
+        _parameter(
+            "--pad",
+            type=whole_or_word,
+            metavar="N",
+            card=("PAD", "least unobserved pixels round the images"),
+            help="smallest number of unobserved pixels round the images; auto: where light runs "
+            "over the edge as many as the PSFs need, else 0 (default: %(default)s)",
+        ),
+        _parameter(
+            "--precision",
+            choices=PRECISIONS,
+            card=("PRECISIO", "precision of the arithmetic"),
+            help="arithmetic on the OpenCL device (default: %(default)s)",
+        ),
+        options.DEVICE,
+        _parameter(
+            "--engine",
+            choices=ENGINES,
+            card=("ENGINE", "engine"),
+            help="OpenCL, or the NumPy reference, which computes in double (default: %(default)s)",
+        ),
+    ],
+    "long runs": checkpoints.OPTIONS,
+}
+ALL_OPTIONS = [each for group in OPTIONS.values() for each in group]

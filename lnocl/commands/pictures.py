@@ -1,0 +1,48 @@
+"""The option ``--plot`` of several subcommands: a picture beside what they write."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from lnocl.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def check(arguments: argparse.Namespace, inputs: Iterable[str]) -> None:
+    """Check that the picture can be drawn and written, where one is asked for.
+
+    Raises
+    ------
+    InputError
+        Its name does not end in .png, or is that of the output or an input.
+    FileError
+        It exists and must not be overwritten, or cannot be written.
+    LnoclError
+        matplotlib is missing.
+    """
+    if arguments.plot is None:
+        return
+    from lnocl.io import atomic
+    from lnocl.plotting.figure import check_matplotlib
+
+    if not arguments.plot.lower().endswith(".png"):
+        raise InputError(
+            f"the picture is a PNG file; give --plot a name ending in .png, not {arguments.plot}"
+        )
+    if os.path.realpath(arguments.plot) == os.path.realpath(arguments.output):
+        raise InputError(f"the picture {arguments.plot} is the output too; give it another name")
+    atomic.check_output(arguments.plot, arguments.overwrite, inputs)
+    check_matplotlib()
+
+
+def draw(arguments: argparse.Namespace, figure: Figure) -> str:
+    """Write the picture, and return a line that names its file."""
+    from lnocl.plotting.figure import save_figure
+
+    save_figure(figure, arguments.plot, arguments.overwrite)
+    return f"drew {arguments.plot}"

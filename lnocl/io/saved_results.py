@@ -1,0 +1,171 @@
+"""FITS in: results that `lnocl.io.fitswrite.write_result` has written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from lnocl.errors import FileError
+from lnocl.io.fitsfile import FitsFile, open_fits
+from lnocl.io.headers import number, readable
+from lnocl.io.selection import has_pixels
+
+Columns = dict[str, NDArray[np.float64]]
+
+# The columns that a table must have.
+TABLES = {
+    "STARS": ("x", "y", "flux"),
+    "HISTORY": ("iteration", "objective"),
+    "CURVE": ("iteration", "rho", "rho_star", "magnitude"),
+    "HELDOUT": ("smoothing", "iteration", "error"),
+}
+CUBES = ("MODELS", "RESIDUALS")
+
+
+@dataclass(frozen=True, eq=False)
+class SavedResult:
+    """A result, or a truth, that was read.
+
+    Attributes
+    ----------
+    path : str
+        The file.
+    header : astropy.io.fits.Header
+        Header of the extended source.
+    extended : ndarray of float64, shape (ny, nx)
+        Extended source, in the unit of BUNIT per pixel.
+    tables : dict of str to dict of str to ndarray of float64
+        Columns of the tables `TABLES` that are there; ``STARS`` always is.
+    cubes : dict of str to ndarray of float64, shape (p, ny, nx)
+        ``MODELS`` and ``RESIDUALS``, where both are there.
+    offsets : ndarray of float64, shape (p, 2)
+        Of the images, pixels; 0 where the cubes have none.
+    doubtful : ndarray of bool, shape (ny, nx), or None
+        The image ``DOUBTFUL``, where it is there.
+    messages : list of str
+        The table ``MESSAGES``: what the run said.
+    """
+
+    path: str
+    header: fits.Header
+    extended: NDArray[np.float64]
+    tables: dict[str, Columns]
+    cubes: dict[str, NDArray[np.float64]]
+    offsets: NDArray[np.float64]
+    doubtful: NDArray[np.bool_] | None
+    messages: list[str]
+
+    @property
+    def stars(self) -> list[tuple[float, float]]:
+        """Positions (x, y) of the stars, pixels, 0-based."""
+        stars = self.tables["STARS"]
+        return list(zip(stars["x"].tolist(), stars["y"].tolist(), strict=True))
+
+    @property
+    def star_fluxes(self) -> NDArray[np.float64]:
+        """Fluxes of the stars, in the unit of the extended source."""
+        return self.tables["STARS"]["flux"]
+
+    def commands(self) -> str:
+        """Return the lines of a shell that repeat the run, as its header has them."""
+        return "\n".join(map(str, self.header.get("HISTORY", ())))
+
+    def number(self, keyword: str) -> float | None:
+        """Return the number that a keyword of the header gives; None where it is missing.
+
+        Raises
+        ------
+        InputError
+            Its value is not a finite number.
+        """
+        return number(self.path, self.header, keyword)
+
+
+def read_result(path: str) -> SavedResult:
+    """Read a result, or a truth.
+
+    Parameters
+    ----------
+    path : str
+        File with an image (ny, nx) and a table ``STARS`` with the columns x, y and flux.
+
+    Raises
+    ------
+    FileError
+        A file that is missing, damaged or not FITS, or whose images and tables are not those of a
+        result.
+    """
+    image: tuple[NDArray[np.float64], fits.Header] | None = None
+    tables: dict[str, Columns] = {}
+    cubes: dict[str, NDArray[np.float64]] = {}
+    cards, doubtful, messages = fits.Header(), None, []
+    with open_fits(path) as file:
+        for hdu in file.hdus():
+            is_table = isinstance(hdu, fits.BinTableHDU)
+            if image is None and has_pixels(hdu):
+                image = file.pixels(hdu), readable(hdu.header)
+            elif is_table and hdu.name in TABLES:
+                tables[hdu.name] = file.columns(hdu)
+            elif is_table and hdu.name == "MESSAGES":
+                messages = _texts(file, hdu)
+            elif has_pixels(hdu) and hdu.name in CUBES:
+                cubes[hdu.name], cards = file.pixels(hdu), readable(hdu.header)
+            elif has_pixels(hdu) and hdu.name == "DOUBTFUL":
+                doubtful = file.pixels(hdu) != 0
+    if image is None:
+        raise FileError(f"{path} holds no image")
+    extended, header = image
+    if len(cubes) < len(CUBES):
+        cubes = {}
+    if fault := _fault(extended, tables, cubes, doubtful):
+        raise FileError(f"{path} is not a result or truth written by lnocl: {fault}")
+    p = len(cubes["MODELS"]) if cubes else 0
+    offsets = [
+        [number(path, cards, f"OFF{axis}{j}") or 0.0 for axis in "XY"] for j in range(1, p + 1)
+    ]
+    return SavedResult(
+        path,
+        header,
+        extended,
+        tables,
+        cubes,
+        np.reshape(offsets, (p, 2)),
+        doubtful,
+        messages,
+    )
+
+
+def _texts(file: FitsFile, table: Any) -> list[str]:
+    """Return the lines of the table of messages."""
+    if "message" not in table.columns.names or table.columns["message"].format[-1:] != "A":
+        raise FileError(f"{file.path} has no column message of text in {table.name}")
+    return [str(line) for line in table.data["message"]]
+
+
+def _fault(
+    extended: NDArray[np.float64],
+    tables: dict[str, Columns],
+    cubes: dict[str, NDArray[np.float64]],
+    doubtful: NDArray[np.bool_] | None,
+) -> str:
+    """Return why these are not the parts of a result; nothing where they are."""
+    for table, names in TABLES.items():
+        for name in names:
+            if (table in tables or table == "STARS") and name not in tables.get(table, ()):
+                return f"there is no column {table} {name}"
+    if extended.ndim != 2:
+        return "the image is a cube"
+    for name, cube in cubes.items():
+        if (
+            cube.ndim != 3
+            or cube.shape[1:] != extended.shape
+            or cube.shape != cubes[CUBES[0]].shape
+        ):
+            return f"{name} has the shape {cube.shape}"
+    if doubtful is not None and doubtful.shape != extended.shape:
+        return f"DOUBTFUL has the shape {doubtful.shape}"
+    return ""

@@ -1,0 +1,307 @@
+"""A result at a glance: image, model, residuals and extended source, whole and round each star."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+from lnocl.plotting.figure import COLOUR_MAP, Array, line_style, new_figure
+
+# Stars that are shown enlarged, the brightest; more are not numbered from as many on.
+MAX_ZOOMS, MAX_NUMBERS = 6, 40
+# Half the side of an enlarged region: pixels, and share of the longer side of the frame.
+ZOOM, ZOOM_SHARE = 16, 1 / 16
+# Residuals are shown between these, in standard deviations of the noise.
+MAX_SIGMA = 5.0
+# An extended source is shown down to this share of its brightest pixel, nearly logarithmically.
+FAINT_SHARE = 3e-3
+PANEL, CURVE_HEIGHT = 2.7, 2.3
+
+Columns = Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class ResultView:
+    """What the picture of a result shows.
+
+    Attributes
+    ----------
+    extended : ndarray of float64, shape (ny, nx)
+        Extended source.
+    stars : sequence of (x, y)
+        Positions, pixels.
+    star_fluxes : ndarray of float64, shape (n,)
+        In any unit.
+    n_iter : int
+        The iteration of the estimate.
+    history : mapping of str to ndarray
+        Columns ``iteration`` and ``objective``; empty where it is not known.
+    held_out : mapping of str to ndarray
+        Columns ``smoothing``, ``iteration`` and ``error``; empty where held-out counts did not
+        choose.
+    images, models, residuals : ndarray, shape (p, ny, nx)
+        As of `lnocl.Result`, NaN where a pixel of the images is bad; p is 0 where they are unknown.
+    offsets : ndarray of float64, shape (p, 2)
+        Of the images, pixels.
+    doubtful : ndarray of bool, shape (ny, nx), or None
+        Pixels to outline, where errors of the PSFs may have faked what is there.
+    unit : str
+        Unit of the extended source, per pixel.
+    """
+
+    extended: Array
+    stars: Sequence[tuple[float, float]]
+    star_fluxes: Array
+    n_iter: int
+    history: Columns
+    held_out: Columns
+    images: NDArray[Any]
+    models: NDArray[Any]
+    residuals: NDArray[Any]
+    offsets: Array
+    doubtful: NDArray[np.bool_] | None = None
+    unit: str = "electron"
+
+    def zooms(self) -> list[int]:
+        """Return the stars to enlarge: the brightest, in the order that they have."""
+        brightest = np.argsort(-np.asarray(self.star_fluxes), kind="stable")[:MAX_ZOOMS]
+        return sorted(brightest.tolist())
+
+    def half(self) -> int:
+        """Return half the side of an enlarged region, pixels."""
+        return max(ZOOM, round(ZOOM_SHARE * max(self.extended.shape)))
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of the sky.
+
+    Attributes
+    ----------
+    name : str
+        Title of its row.
+    middle : (x, y) or None
+        Pixels of the sky; None for the whole frame.
+    half : int
+        Half its side, pixels.
+    """
+
+    name: str
+    middle: tuple[float, float] | None = None
+    half: int = 0
+
+    def slices(self, shape: Sequence[int], offset: Sequence[float] = (0.0, 0.0)) -> Any:
+        """Return rows and columns of an image of this shape, in which the sky is offset."""
+        if self.middle is None:
+            return np.s_[:, :]
+        parts = []
+        for at, shift, n in zip(self.middle[::-1], offset[::-1], shape, strict=True):
+            first = round(at + shift) - self.half
+            parts.append(slice(min(max(first, 0), n), min(max(first + 2 * self.half + 1, 0), n)))
+        return tuple(parts)
+
+
+def draw_result(view: ResultView) -> Figure:
+    """Draw a result: the whole frame, each star enlarged, and how the iteration was chosen.
+
+    Parameters
+    ----------
+    view : ResultView
+        Without images only the extended source is shown.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A row for the whole frame and one for each of the six brightest stars: image, model,
+        residuals and extended source. Of several images a row shows that whose residuals there are
+        largest. Below them the errors that held-out counts estimate, or else the objective.
+
+    Raises
+    ------
+    LnoclError
+        Where matplotlib is missing.
+    """
+    stars = view.zooms()
+    regions = [Region("whole frame")]
+    regions += [Region(f"star {s + 1}", view.stars[s], view.half()) for s in stars]
+    has_images = len(view.images) > 0
+    shape = (len(regions), 4) if has_images else (-(-len(regions) // 4), min(len(regions), 4))
+    height = PANEL * shape[0]
+    figure = new_figure(max(3.0 * shape[1], 6.0), height + CURVE_HEIGHT + 0.6)
+    parts: Any = figure.subfigures(2, 1, height_ratios=(height, CURVE_HEIGHT))
+    axes = parts[0].subplots(*shape, squeeze=False)
+    if has_images:
+        for row, region in zip(axes, regions, strict=True):
+            _draw_images(row[:3], view, region)
+            _draw_extended(row[3], view, region, "extended source")
+    else:
+        for axis, region in zip(axes.flat, regions, strict=False):
+            _draw_extended(axis, view, region, f"extended source, {region.name}")
+        for axis in axes.flat[len(regions) :]:
+            axis.set_axis_off()
+    for axis in axes[-1]:
+        axis.set_xlabel("x (pixels)", fontsize=9)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("y (pixels)", fontsize=9)
+    if len(view.stars) > len(stars):
+        parts[0].suptitle(f"enlarged: the {len(stars)} brightest of {len(view.stars)} stars")
+    _draw_choice(parts[1].subplots(), view)
+    return figure
+
+
+def worst_image(view: ResultView, region: Region) -> int:
+    """Return the image whose residuals in a region are largest, of those that see it."""
+    squares = []
+    for values, offset in zip(view.residuals, view.offsets, strict=True):
+        there = values[region.slices(values.shape, offset)]
+        good = there[np.isfinite(there)]
+        squares.append(float(np.mean(good**2)) if good.size else -1.0)
+    return int(np.argmax(squares))
+
+
+def image_limits(image: NDArray[Any]) -> tuple[float, float, float]:
+    """Return the darkest and the brightest level of an image, and the noise of its sky.
+
+    The noise is 1.4826 times the median deviation from the median; the darkest level is three times
+    that below the median, or the lowest pixel.
+    """
+    good = image[np.isfinite(image)]
+    if not good.size:
+        return 0.0, 1.0, 1.0
+    middle = float(np.median(good))
+    noise = 1.4826 * float(np.median(abs(good - middle)))
+    low, high = max(middle - 3 * noise, float(good.min())), float(good.max())
+    span = high - low or abs(high) or 1.0
+    return low, max(high, low + 1e-6 * span), noise or 1e-3 * span
+
+
+def _draw_images(axes: Sequence[Axes], view: ResultView, region: Region) -> None:
+    """Draw image, model and residuals of a region."""
+    from matplotlib.colors import AsinhNorm, Normalize
+
+    j = worst_image(view, region)
+    offset = view.offsets[j]
+    there = region.slices(view.extended.shape, offset)
+    _, _, noise = image_limits(view.images[j])
+    low, high, _ = image_limits(view.images[j][there])
+    name = "image" if len(view.images) == 1 else f"image {j + 1} of {len(view.images)}"
+    for axis, cube, title in zip(
+        axes,
+        (view.images, view.models, view.residuals),
+        (f"{name}, {region.name}", "model", "residuals / noise"),
+        strict=True,
+    ):
+        if cube is view.residuals:
+            norm, colours = Normalize(-MAX_SIGMA, MAX_SIGMA), "RdBu_r"
+        else:
+            norm, colours = AsinhNorm(noise, low, high), COLOUR_MAP
+        shown = _draw_region(axis, cube[j], there, norm, colours)
+        axis.set_title(title, fontsize=10)
+        label = "sigma" if cube is view.residuals else "electron"
+        _add_bar(axis, shown, label)
+        if cube is view.images:
+            _mark_stars(axis, view, offset)
+
+
+def _draw_extended(axis: Axes, view: ResultView, region: Region, title: str) -> None:
+    from matplotlib.colors import AsinhNorm
+
+    there = region.slices(view.extended.shape)
+    top = float(view.extended[there].max(initial=0.0)) or 1.0
+    shown = _draw_region(
+        axis, view.extended, there, AsinhNorm(FAINT_SHARE * top, 0.0, top), COLOUR_MAP
+    )
+    if view.doubtful is not None and view.doubtful[there].any():
+        axis.contour(view.doubtful, [0.5], colors="red", linewidths=0.8)
+        title += "\nred: the PSF's error may be all there is"
+    axis.set_title(title, fontsize=10)
+    _add_bar(axis, shown, view.unit)
+    _mark_stars(axis, view)
+
+
+def _draw_region(axis: Axes, image: NDArray[Any], there: Any, norm: Any, colours: str) -> Any:
+    """Draw a part of an image; bad pixels are grey."""
+    from matplotlib import colormaps
+
+    # A part alone is drawn, since matplotlib scales all that it is given.
+    rows, columns = (part.indices(n) for part, n in zip(there, image.shape, strict=True))
+    extent = (columns[0] - 0.5, columns[1] - 0.5, rows[0] - 0.5, rows[1] - 0.5)
+    part = image[there]
+    if not part.size:
+        axis.text(0.5, 0.5, "not in this image", transform=axis.transAxes, ha="center")
+        part, extent = np.full((1, 1), np.nan), (-0.5, 0.5, -0.5, 0.5)
+    return axis.imshow(
+        part,
+        norm=norm,
+        cmap=colormaps[colours].with_extremes(bad="0.6"),
+        origin="lower",
+        interpolation="nearest",
+        extent=extent,
+    )
+
+
+def _add_bar(axis: Axes, shown: Any, label: str) -> None:
+    bar = axis.figure.colorbar(shown, ax=axis, shrink=0.85, pad=0.02)
+    bar.set_label(label, fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+    axis.tick_params(labelsize=7)
+
+
+def _mark_stars(axis: Axes, view: ResultView, offset: Sequence[float] = (0.0, 0.0)) -> None:
+    """Circle the stars inside the axes, and number them where they are not too many."""
+    (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
+    inside = [
+        (s, x + offset[0], y + offset[1])
+        for s, (x, y) in enumerate(view.stars, 1)
+        if left <= x + offset[0] <= right and bottom <= y + offset[1] <= top
+    ]
+    for s, x, y in inside:
+        for colour, width in (("black", 2.4), ("white", 1.1)):
+            axis.plot(x, y, "o", ms=11, mfc="none", mec=colour, mew=width)
+        if len(inside) <= MAX_NUMBERS:
+            axis.annotate(
+                f"{s}", (x, y), (6, 6), textcoords="offset points", color="white", fontsize=8
+            )
+    axis.set(xlim=(left, right), ylim=(bottom, top))
+
+
+def _draw_choice(axis: Axes, view: ResultView) -> None:
+    """Draw the error that held-out counts estimate for each smoothing, or the objective."""
+    if view.held_out and len(view.held_out["iteration"]):
+        table = view.held_out
+        for i, value in enumerate(np.unique(table["smoothing"])):
+            rows = table["smoothing"] == value
+            name = f"{value:.2g}"
+            axis.plot(table["iteration"][rows], table["error"][rows], **line_style(i), label=name)
+        axis.set_ylabel("estimated relative error", fontsize=9)
+        axis.legend(fontsize=8, title="smoothing", title_fontsize=8)
+    elif view.history:
+        later = np.asarray(view.history["iteration"]) > 0
+        axis.plot(
+            view.history["iteration"][later], view.history["objective"][later], **line_style(1)
+        )
+        axis.set_ylabel("objective J", fontsize=9)
+    else:
+        axis.set_axis_off()
+        return
+    if view.n_iter:
+        axis.axvline(view.n_iter, color="0.4", lw=1, ls=":")
+        axis.annotate(
+            f"iteration {view.n_iter} ",
+            (view.n_iter, 0.95),
+            xycoords=("data", "axes fraction"),
+            ha="right",
+            va="top",
+            fontsize=8,
+            color="0.4",
+        )
+    axis.set(xscale="log", yscale="log", xlabel="iteration")
+    axis.grid(alpha=0.3, which="both")

@@ -1,0 +1,192 @@
+"""The picture of a result shows what the result has, in memory and from its file."""
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+from scenes import Recipe
+
+from lnocl.errors import LnoclError
+from lnocl.io.saved_results import read_result
+from lnocl.plotting.result import (
+    MAX_SIGMA,
+    MAX_ZOOMS,
+    Region,
+    ResultView,
+    draw_result,
+    image_limits,
+    worst_image,
+)
+from lnocl.result import view_of
+from lnocl.studies import figures
+
+pytest.importorskip("matplotlib")
+
+
+def panels(figure):
+    """Return the images of a figure by the titles of their panels, colour bars apart."""
+    parts = [axis for part in figure.subfigs for axis in part.axes]
+    return [(axis.get_title(), axis.images[0]) for axis in parts if axis.images]
+
+
+def make_view(p=2, n_stars=1, shape=(60, 70), **changes):
+    chance = np.random.default_rng(3)
+    models = np.full((p, *shape), 50.0)
+    residuals = chance.normal(size=models.shape)
+    stars = [(10.0 + 5 * s, 20.0) for s in range(n_stars)]
+    iterations = np.arange(4.0)
+    view = ResultView(
+        extended=chance.random(shape),
+        stars=stars,
+        star_fluxes=np.arange(n_stars, 0.0, -1.0),
+        n_iter=3,
+        history={"iteration": iterations, "objective": 9.0 - iterations},
+        held_out={},
+        images=models + np.sqrt(models) * residuals,
+        models=models,
+        residuals=residuals,
+        offsets=np.zeros((p, 2)),
+    )
+    return dataclasses.replace(view, **changes)
+
+
+@pytest.fixture(scope="module")
+def result():
+    made = Recipe((40, 36), n_images=2, n_stars=2, masked=0.1).make()
+    return made.deconvolve(engine="numpy", n_iter=3)
+
+
+def test_a_row_for_the_frame_and_one_for_each_star():
+    shown = panels(draw_result(make_view(p=1, n_stars=2)))
+    assert [title for title, _ in shown] == [
+        *("image, whole frame", "model", "residuals / noise", "extended source"),
+        *("image, star 1", "model", "residuals / noise", "extended source"),
+        *("image, star 2", "model", "residuals / noise", "extended source"),
+    ]
+
+
+def test_what_is_shown_of_each():
+    view = make_view(p=1)
+    (_, image), (_, model), (_, residuals), (_, extended), *zoom = panels(draw_result(view))
+    np.testing.assert_array_equal(image.get_array(), view.images[0])
+    np.testing.assert_array_equal(model.get_array(), view.models[0])
+    np.testing.assert_array_equal(residuals.get_array(), view.residuals[0])
+    np.testing.assert_array_equal(extended.get_array(), view.extended)
+    assert (image.norm.vmin, image.norm.vmax) == (model.norm.vmin, model.norm.vmax)
+    assert (residuals.norm.vmin, residuals.norm.vmax) == (-MAX_SIGMA, MAX_SIGMA)
+    # The star at (10, 20), and 16 pixels round it, cut at the frame.
+    np.testing.assert_array_equal(zoom[0][1].get_array(), view.images[0][4:37, :27])
+    assert zoom[0][1].get_extent() == [-0.5, 26.5, 3.5, 36.5]
+
+
+def test_the_image_of_the_largest_residuals_is_shown():
+    view = make_view(p=3)
+    view.residuals[1, 50:, 60:] = 40.0  # far from the star
+    view.residuals[2, 20, 10] = 40.0
+    assert worst_image(view, Region("whole frame")) == 1
+    assert worst_image(view, Region("star 1", (10.0, 20.0), 5)) == 2
+    titles = [title for title, _ in panels(draw_result(view))]
+    assert titles[0] == "image 2 of 3, whole frame"
+    assert titles[4] == "image 3 of 3, star 1"
+
+
+def test_an_image_that_does_not_see_a_star_is_not_shown_for_it():
+    view = make_view(p=2, offsets=np.array([[0.0, 0.0], [-40.0, 0.0]]))
+    view.residuals[1] = 99.0
+    assert worst_image(view, Region("star 1", (10.0, 20.0), 5)) == 0
+
+
+def test_regions_follow_the_offsets():
+    view = make_view(p=1, offsets=np.array([[7.0, -3.0]]))
+    zoom = panels(draw_result(view))[4][1]
+    np.testing.assert_array_equal(zoom.get_array(), view.images[0][1:34, 1:34])
+
+
+def test_bad_pixels_are_grey_and_change_no_stretch():
+    view = make_view(p=1)
+    before = image_limits(view.images[0])
+    view.images[0, 5, 5] = view.residuals[0, 5, 5] = np.nan
+    _, image = panels(draw_result(view))[0]
+    assert image.get_array().mask[5, 5]
+    assert image_limits(view.images[0])[2] == pytest.approx(before[2], rel=0.01)
+    assert image_limits(np.full((3, 3), np.nan)) == (0.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("value", [0.0, 5.0])
+def test_a_flat_image_and_an_empty_source_are_drawn(value, tmp_path):
+    flat = np.full((1, 60, 70), value)
+    view = make_view(p=1, images=flat, models=flat, extended=np.zeros((60, 70)))
+    draw_result(view).savefig(tmp_path / "flat.png")
+
+
+def test_of_many_stars_the_brightest_are_enlarged():
+    view = make_view(p=1, n_stars=9)
+    view.star_fluxes[8] = 100.0
+    figure = draw_result(view)
+    titles = [title for title, _ in panels(figure) if title.startswith("image")]
+    assert titles[1:] == [f"image, star {s}" for s in (1, 2, 3, 4, 5, 9)]
+    assert len(titles) == 1 + MAX_ZOOMS
+    assert "6 brightest of 9 stars" in figure.subfigs[0].get_suptitle()
+
+
+def test_stars_are_circled_in_image_and_source():
+    figure = draw_result(make_view(p=1, offsets=np.array([[2.0, 0.0]])))
+    whole = figure.subfigs[0].axes[:4]
+    marks = [[line.get_data()[0][0] for line in axis.lines] for axis in whole]
+    assert marks == [[12.0, 12.0], [], [], [10.0, 10.0]]
+    assert [text.get_text() for text in whole[0].texts] == ["1"]
+
+
+def test_what_errors_of_the_psf_may_fake_is_outlined():
+    doubtful = np.zeros((60, 70), bool)
+    doubtful[15:25, 5:15] = True
+    titles = [title for title, _ in panels(draw_result(make_view(p=1, doubtful=doubtful)))]
+    assert titles[3] == "extended source\nred: the PSF's error may be all there is"
+
+
+def test_the_choice_is_that_of_held_out_counts_or_the_objective():
+    def curve(view):
+        (axis,) = draw_result(view).subfigs[1].axes
+        return axis.get_ylabel(), {line.get_label(): line.get_ydata() for line in axis.lines}
+
+    name, found = curve(make_view())
+    assert name == "objective J"
+    assert next(iter(found.values())).tolist() == [8.0, 7.0, 6.0]  # after the start
+    table = {"smoothing": [0.0, 0.0, 3.0], "iteration": [1, 2, 1], "error": [0.5, 0.25, 0.4]}
+    table = {key: np.array(column) for key, column in table.items()}
+    name, found = curve(make_view(held_out=table))
+    assert name == "estimated relative error"
+    assert found["0"].tolist() == [0.5, 0.25]
+    assert found["3"].tolist() == [0.4]
+
+
+def test_from_a_file_it_is_the_same(result, tmp_path):
+    path = tmp_path / "result.fits"
+    result.write(path)
+    before = panels(result.plot())
+    after = panels(draw_result(figures.view_of(read_result(str(path)))))
+    assert [title for title, _ in before] == [title for title, _ in after]
+    for (_, one), (_, other) in zip(before, after, strict=True):
+        assert one.get_extent() == other.get_extent()
+        np.testing.assert_allclose(one.get_array(), other.get_array(), rtol=1e-5, atol=1e-5)
+    held = view_of(result), figures.view_of(read_result(str(path)))
+    assert held[0].n_iter == held[1].n_iter == 3
+    assert held[0].stars == held[1].stars
+    np.testing.assert_array_equal(*(view.history["objective"] for view in held))
+
+
+def test_without_models_the_source_alone_is_shown():
+    none = np.zeros((0, 60, 70))
+    view = make_view(p=0, n_stars=5, images=none, models=none, residuals=none)
+    shown = panels(draw_result(view))
+    assert [title for title, _ in shown] == [
+        "extended source, whole frame",
+        *(f"extended source, star {s}" for s in range(1, 6)),
+    ]
+
+
+def test_without_matplotlib_one_line_says_what_to_install(result, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(LnoclError, match=r"pip install matplotlib$"):
+        result.plot()
