@@ -256,7 +256,7 @@ class Result:
             self.star_fluxes,
             wcs=None if header is None else wcs_cards(header),
             cards=[
-                *([] if header is None else observed_cards(header)),
+                *([] if header is None else observed_cards(header, header)),
                 ("CREATOR", f"lnocl {version('lnocl')}", "program that wrote this file"),
                 ("NITER", self.n_iter, "iterations done"),
                 ("STOPPED", self.stop_reason, "why it stopped"),

@@ -86,9 +86,10 @@ def _write(
     said: Sequence[str],
 ) -> None:
     """Write the result with the command that repeats it."""
-    from lnocl.io import fitswrite
+    from lnocl.io import fitsread, fitswrite
     from lnocl.io.headers import observed_cards
 
+    primary = fitsread.read_contents(arguments.images[0]).primary
     parts, offsets = saved_parts(result), frames.observation.offsets
     repeated = {**given, **_repeated(given, frames)}
     fitswrite.write_result(
@@ -98,7 +99,7 @@ def _write(
         result.star_fluxes / frames.electrons,
         wcs=wcs,
         cards=[
-            *observed_cards(frames.header),
+            *observed_cards(frames.header, primary),
             *record.make_cards(
                 ALL_OPTIONS,
                 repeated | _used(repeated, frames, result),

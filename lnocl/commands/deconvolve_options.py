@@ -90,15 +90,15 @@ OPTIONS = {
             **SEVERAL,
             metavar="FILE",
             checksum="MSUM",
-            help="FITS file that is not 0 where a pixel is bad, or dq, the extension DQ of each "
-            "image; one for all images or one for each",
+            help="FITS file that is not 0 where a pixel is bad; or dq, the extension DQ of each "
+            "image, or wht, where its extension WHT is 0; one for all images or one for each",
         ),
         option(
             "--good-bits",
             metavar="BITS",
             card=("GOODBITS", "flags of DQ that are no fault"),
             help="with --mask dq: flags that are no fault, as in 16,64, or ~1 for all but 1; 0 for "
-            "none (default: of JWST ~1, of HST those of pixels that were corrected, else 0)",
+            "none (default: of JWST ~1,512, of HST those of pixels that were corrected, else 0)",
         ),
         options.SATURATION,
         option(

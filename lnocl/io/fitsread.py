@@ -115,7 +115,8 @@ def read_single(path: str) -> Stack:
 def read_extension(path: str, name: str) -> NDArray[np.float64] | None:
     """Return the image extension of this name of a file, or None where the file lacks it.
 
-    It has the version of the image, where the path names one: ``DQ,2`` beside ``FILE[SCI,2]``.
+    It has the version of the image, where the path names that or an HDU: ``DQ,2`` beside
+    ``FILE[SCI,2]``.
 
     Raises
     ------
@@ -204,8 +205,8 @@ def wcs_cards(header: fits.Header) -> fits.Header:
     Warns
     -----
     LnoclWarning
-        A system that astropy cannot read or that needs tables besides the header (``-TAB``,
-        lookup tables of distortions); it is left out.
+        A system that astropy cannot read or that needs tables besides the header (``-TAB``); it
+        is left out.
     """
     cards = fits.Header()
     for key in sorted({match[1] for match in map(_WCS_KEYWORD.fullmatch, header) if match}):
@@ -236,7 +237,10 @@ def _read_file(
     with open_fits(name.file) as file:
         hdus = list(file.hdus())
         if extension is not None:
-            index = only(name.file, hdus, extension, name.version)
+            version = name.version
+            if name.hdu is not None:
+                version = hdus[find(name, hdus)].header.get("EXTVER", 1)
+            index = only(name.file, hdus, extension, version)
         elif name.is_chosen:
             index = find(name, hdus)
         else:

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from lnocl.errors import InputError
 
 # Flags that are no fault, as astropy spells them, by the words of TELESCOP, INSTRUME and DETECTOR:
-# of JWST all but DO_NOT_USE; of HST hot and warm pixels, whose dark current was subtracted, and on
-# the infrared detector blobs, a signal in the first read, and cosmic rays, which its ramps show.
+# of JWST all but DO_NOT_USE and NON_SCIENCE; of HST hot and warm pixels, whose dark current was
+# subtracted, and on the infrared detector blobs, a signal in the first read, and cosmic rays, which
+# its ramps show.
 GOOD_BITS = {
-    "JWST": "~1",
+    "JWST": "~1,512",
     "HST ACS": "16,64",
     "HST WFC3 UVIS": "16,64",
-    "HST WFC3 IR": "512,2048,8192",
+    "HST WFC3 IR": "16,512,2048,8192",
 }
 # None are.
 NO_BITS = "0"
@@ -29,7 +30,7 @@ def good_bits_of(telescope: str, instrument: str, detector: str) -> str:
     --------
     >>> from lnocl.io.flags import good_bits_of
     >>> good_bits_of("JWST", "NIRCAM", "NRCALONG"), good_bits_of("Keck", "", "")
-    ('~1', '0')
+    ('~1,512', '0')
     """
     words = f"{telescope} {instrument} {detector} ".upper()
     found = (bits for name, bits in GOOD_BITS.items() if words.startswith(f"{name} "))

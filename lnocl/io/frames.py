@@ -30,6 +30,8 @@ Mask = NDArray[np.bool_]
 MAX_SCALE_ERROR = 0.02
 # Of more masked pixels than this share of an image it is warned.
 MUCH_MASKED = 0.1
+# Words for masks in the images' own files.
+MASK_WORDS = ("dq", "wht")
 # The extensions in which `lnocl psf` writes what it finds beside a PSF.
 MADE_OF_PSFS = {"psf_modes": "MODES", "psf_scatter": "SCATTER"}
 
@@ -289,11 +291,10 @@ class _Reader:
         planes = [read_extension(path, word.upper()) for path in self._paths]
         if any(plane is None for plane in planes):
             return None
+        variances = self._extensions(word.upper(), "gain")
         found = [
-            electrons_by_variance(image, variance, path)
-            for image, variance, path in zip(
-                self._images.data, self._extensions(word.upper(), "gain"), self._paths, strict=True
-            )
+            electrons_by_variance(image, variance, path, read_extension(path, "DQ"))
+            for image, variance, path in zip(self._images.data, variances, self._paths, strict=True)
         ]
         for j, electrons in enumerate(found, 1):
             log.info("image %d: %.4g electrons in its unit, by %s", j, electrons, word.upper())
@@ -384,12 +385,14 @@ class _Reader:
     def _bad_pixels(
         self, exposure: Array | None, noise: NoiseMap | None
     ) -> Iterator[tuple[str, Mask]]:
-        if paths := [word for word in self._calibration.mask if word != "dq"]:
+        if paths := [word for word in self._calibration.mask if word not in MASK_WORDS]:
             yield "by the mask", self._maps.read("mask", paths) != 0  # NaN is not 0 either
         if "dq" in self._calibration.mask:
             yield "by the extension DQ", self._data_quality()
         elif self._calibration.good_bits is not None:
             raise InputError("good_bits are flags of the extension DQ; give mask dq too")
+        if "wht" in self._calibration.mask:
+            yield "without weight", self._extensions("WHT", "mask") == 0
         level = self._calibration.saturation
         if level is not None:
             yield f"as saturated, at {level:g} or above", self._images.data >= level

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 import re
 from collections.abc import Iterator
@@ -17,6 +18,8 @@ from lnocl.process import ignored_warnings
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
+log = logging.getLogger("lnocl")
+
 # Counts that astropy allocates memory for, and the largest that FITS and SIP allow: with an A_ORDER
 # of 3000 it takes half a minute.
 _NUMBERS = re.compile("(CRPIX|CRVAL|CDELT|CROTA)[0-9]+[A-Z]?|(CD|PC)[0-9]+_[0-9]+[A-Z]?")
@@ -26,7 +29,12 @@ _LIMITS = (
 )
 
 # What was observed, when and with what.
-OBSERVED = ("OBJECT", "TELESCOP", "INSTRUME", "FILTER", "DATE-OBS", "EXPTIME")
+OBSERVED = (
+    *("OBJECT", "TARGNAME", "TELESCOP", "INSTRUME", "FILTER", "FILTER1", "FILTER2", "DATE-OBS"),
+    *("EXPTIME", "EFFEXPTM"),
+)
+# Distortions of HST that need tables beside the header; they are at most 0.1 pixel.
+_TABLED = re.compile("(CPDIS|CPERR|DP|D2IM(DIS|ERR|EXT|ARR)?)[0-9]*([.].*)?")
 
 
 def readable(header: fits.Header) -> fits.Header:
@@ -48,9 +56,14 @@ def readable(header: fits.Header) -> fits.Header:
     return cleaned
 
 
-def observed_cards(header: fits.Header) -> list[tuple[str, str | int | float, str]]:
-    """Return the cards that say what was observed, when and with what, without damaged ones."""
-    cards = [(keyword, header.get(keyword)) for keyword in OBSERVED]
+def observed_cards(
+    header: fits.Header, primary: fits.Header
+) -> list[tuple[str, str | int | float, str]]:
+    """Return the cards that say what was observed, when and with what, without damaged ones.
+
+    They are those of the image, else those of the primary header of its file.
+    """
+    cards = [(keyword, header.get(keyword, primary.get(keyword))) for keyword in OBSERVED]
     return [
         (keyword, value, "of the first image")
         for keyword, value in cards
@@ -77,6 +90,8 @@ def number(path: str, header: fits.Header, keyword: str) -> float | None:
 def make_wcs(header: fits.Header, key: str = " ") -> WCS:
     """Return a coordinate system of the first two axes, without astropy's warnings and notes.
 
+    Distortions in tables beside the header, such as the 0.1 pixel of HST's detectors, are left out.
+
     Raises
     ------
     InputError
@@ -94,6 +109,11 @@ def make_wcs(header: fits.Header, key: str = " ") -> WCS:
         for pattern, largest in _LIMITS:
             if pattern.fullmatch(keyword) and not 0 <= header[keyword] <= largest:
                 raise InputError(f"{keyword} is {header[keyword]}; at most {largest} is allowed")
+    if any("LOOKUP" in str(header.get(f"{name}1", "")).upper() for name in ("CPDIS", "D2IMDIS")):
+        log.info("distortions in tables, which are below 0.1 pixel, are left out of coordinates")
+        header = header.copy()
+        for keyword in [word for word in header if _TABLED.fullmatch(word)]:
+            header.remove(keyword, ignore_missing=True, remove_all=True)
     with ignored_warnings(), quiet_log():
         return WCS(header, key=key, naxis=2)
 

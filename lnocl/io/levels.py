@@ -16,12 +16,12 @@ Mask = NDArray[np.bool_]
 
 
 def sky_level(j: int, counts: Array, mask: Mask) -> float:
-    """Return the background of image j: the sigma-clipped median of its good pixels.
+    """Return the background of image j: the sigma-clipped median of its good pixels, or 0.
 
     Raises
     ------
     InputError
-        No pixel is good, or the median is negative, as the sky was subtracted.
+        No pixel is good.
     """
     median, scatter = _clipped(j, counts, mask)
     log.info(
@@ -31,11 +31,12 @@ def sky_level(j: int, counts: Array, mask: Mask) -> float:
         scatter,
     )
     if median < 0:
-        raise InputError(
-            f"image {j} has a sigma-clipped median of {median:.6g} electrons: its background was "
-            "subtracted already; give background 0, and its noise as read_noise, which may be auto"
+        log.info(
+            "image %d: its sky was subtracted; taken are a background of 0, and its noise as "
+            "read noise, which may be auto",
+            j + 1,
         )
-    return median
+    return max(median, 0.0)
 
 
 def sky_noise(j: int, counts: Array, mask: Mask) -> float:

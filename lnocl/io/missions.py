@@ -6,6 +6,7 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
+from lnocl.errors import InputError
 from lnocl.io.fitsread import Contents, read_contents
 from lnocl.scene import units
 
@@ -13,6 +14,8 @@ log = logging.getLogger("lnocl")
 
 # Those whose files are known.
 TELESCOPES = ("HST", "JWST")
+# Instruments whose files call electrons counts.
+IN_ELECTRONS = ("ACS", "WFC3")
 # Kinds of noise, of which one is enough.
 NOISE = ("read_noise", "inverse_variance", "variance", "rms", "error")
 
@@ -21,8 +24,8 @@ def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the calibration of an image of JWST or HST, where it is not given.
 
     Errors and flags are those of the extensions ERR and DQ where there are such; without ERR, as in
-    a mosaic of HST, the noise is that of the sky, which was subtracted. A rate of electrons is
-    times EXPTIME; the electrons in a MJy/sr of JWST follow from VAR_POISSON.
+    a mosaic of HST, the noise is that of the sky, and pixels of weight 0 are bad. A rate of
+    electrons is times EXPTIME; the electrons in a MJy/sr of JWST follow from VAR_POISSON.
 
     Parameters
     ----------
@@ -39,31 +42,37 @@ def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
     Raises
     ------
     FileError, InputError
-        As `fitsread.read_contents`.
+        As `fitsread.read_contents`; counts of HST that may not be electrons.
     """
     contents = read_contents(path)
     telescope = contents.value("TELESCOP").upper()
     if telescope not in TELESCOPES:
         return {}
     found: dict[str, Any] = {}
-    has_errors = "ERR" in contents.extensions
+    held = contents.extensions
     if not any(given.get(kind) for kind in NOISE):
-        found |= {"error": ["err"]} if has_errors else {"read_noise": ["auto"]}
-    if not given.get("mask") and "DQ" in contents.extensions:
-        found["mask"] = ["dq"]
-    if not given.get("background") and has_errors:
+        found |= {"error": ["err"]} if "ERR" in held else {"read_noise": ["auto"]}
+    if not given.get("mask") and held & {"DQ", "WHT"}:
+        found["mask"] = ["dq"] if "DQ" in held else ["wht"]
+    if not given.get("background"):
         found["background"] = ["auto"]
     if not (given.get("gain") or given.get("exposure")):
-        found |= _electrons(contents)
+        found |= _electrons(path, contents)
     for name, value in found.items():
         words = value if isinstance(value, str) else " ".join(value)
         log.info("%s: %s %s, as for images of %s", path, name, words, telescope)
     return found
 
 
-def _electrons(contents: Contents) -> dict[str, Any]:
+def _electrons(path: str, contents: Contents) -> dict[str, Any]:
     """Return what makes electrons of the unit of the image."""
-    counts = units.count_of(units.parse(contents.value("BUNIT")))
+    unit = contents.value("BUNIT")
+    if unit.upper().startswith("COUNT") and contents.value("INSTRUME").upper() not in IN_ELECTRONS:
+        raise InputError(
+            f"{path} is in counts of its converter; give gain, a number or a keyword of its "
+            "header, such as ATODGAIN"
+        )
+    counts = units.count_of(units.parse(unit))
     if counts is not None:
         return {"exposure": ["EXPTIME"]} if counts[1] and contents.value("EXPTIME") else {}
     return {"gain": "VAR_POISSON"} if "VAR_POISSON" in contents.extensions else {}

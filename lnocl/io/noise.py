@@ -24,6 +24,9 @@ VARIANCES: Mapping[str, Callable[[Array], Array]] = {
 }
 # The share of pixels that are the brightest.
 BRIGHT = 0.01
+# The flags DO_NOT_USE, SATURATED and JUMP_DET of JWST: the counts of such a pixel were not summed
+# over the whole exposure, so that their variance in its units is larger.
+CUT_SHORT = 1 | 2 | 4
 # The kind that has the noise of the source's own counts too.
 WITH_SOURCE = "error"
 
@@ -82,7 +85,9 @@ class NoiseMap(NamedTuple):
         return np.asarray(np.sqrt(variance.clip(0.0)))
 
 
-def electrons_by_variance(image: Array, variance: Array, path: str) -> float:
+def electrons_by_variance(
+    image: Array, variance: Array, path: str, flags: Array | None = None
+) -> float:
     """Return the electrons in a unit of an image, by the variance of their counts.
 
     Counts n = e g of an image g have the variance g / e in its units: e is the difference of image
@@ -95,6 +100,8 @@ def electrons_by_variance(image: Array, variance: Array, path: str) -> float:
         In units of the image, and those squared; not finite or 0 where they are not known.
     path : str
         Their file, for messages.
+    flags : ndarray, shape (ny, nx), optional
+        Sums of flags; pixels with one of `CUT_SHORT` are left out.
 
     Raises
     ------
@@ -102,6 +109,8 @@ def electrons_by_variance(image: Array, variance: Array, path: str) -> float:
         The variance does not grow with the image.
     """
     known = np.isfinite(image) & np.isfinite(variance) & (variance > 0)
+    if flags is not None:
+        known &= (np.nan_to_num(flags).astype(np.int64) & CUT_SHORT) == 0
     values, variances = image[known], variance[known]
     electrons = 0.0
     if values.size:

@@ -121,5 +121,17 @@ def _ambiguous(path: str, hdus: Sequence[Any], claims: Sequence[int]) -> InputEr
     ]
     return InputError(
         f"{path} holds {len(claims)} images that may be meant: {', '.join(named)}; name the one to "
-        f"use, as in '{path}[{claims[0]}]'"
+        f"use, as in '{path}[{_word(hdus, claims)}]'"
     )
+
+
+def _word(hdus: Sequence[Any], claims: Sequence[int]) -> str:
+    """Return what names the first of these HDUs: its name, with its version, or its number."""
+    names = [name_of(hdus[i]) for i in claims]
+    versions = [
+        f"{name},{hdus[i].header.get('EXTVER', 1)}" for name, i in zip(names, claims, strict=True)
+    ]
+    for words in (names, versions):
+        if names[0] and words.count(words[0]) == 1:
+            return words[0]
+    return f"{claims[0]}"

@@ -1,6 +1,7 @@
 """Files of space telescopes as they come, with no option but the PSF and the star."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from astropy.io import fits
 from lnocl.commands import cli
 from lnocl.io.missions import calibrate
 
+HEADERS = Path(__file__).parent / "headers"
 N, AT = 72, (37, 31)
 Y, X = np.indices((N, N))
 SKY, STAR = 400.0, 2.0e5
@@ -30,70 +32,93 @@ def noise(seed, scatter):
     return np.random.default_rng(seed + 100).normal(0.0, scatter, (N, N))
 
 
-def write(path, primary, science, **extensions):
+def headers_of(name):
+    """Return the cards of the HDUs of a real file, by their names, from its copy in headers/."""
+    parts = re.split(r"^# (\w+)\n", (HEADERS / f"{name}.hdr").read_text(), flags=re.MULTILINE)
+    return {
+        part: fits.Header.fromstring(cards, sep="\n")
+        for part, cards in zip(parts[1::2], parts[2::2], strict=True)
+    }
+
+
+def write(path, headers, science, **extensions):
     """Write a file as a pipeline does: no pixels in the primary HDU, then SCI and others."""
-    image, cards = science
-    hdus = [fits.PrimaryHDU(header=fits.Header(primary))]
-    hdus.append(fits.ImageHDU(image.astype("f4"), fits.Header(cards), name="SCI"))
-    hdus += [fits.ImageHDU(values, name=name) for name, values in extensions.items()]
+    hdus = [fits.PrimaryHDU(header=headers["PRIMARY"])]
+    for name, values in {"SCI": science, **extensions}.items():
+        cards = headers.get(name, fits.Header())
+        if "CRPIX1" in cards:
+            cards["CRPIX1"] = cards["CRPIX2"] = N / 2
+        hdus.append(fits.ImageHDU(values.astype("f4") if values.dtype == float else values, cards))
+        hdus[-1].name = name
     fits.HDUList(hdus).writeto(path)
 
 
 def of_nircam(kind):
-    """Return MJy/sr, of a gain of 1.8 electrons in a DN, 300 s, and 0.4 MJy/sr in a DN/s."""
-    each = 1.8 * 300.0 / 0.4
+    """Return MJy/sr, of a gain of 1.8 electrons in a DN."""
+    headers = headers_of(f"nircam_{kind}")
+    seconds, in_dn = headers["PRIMARY"]["EFFEXPTM"], headers["SCI"]["PHOTMJSR"]
+    each = 1.8 * seconds / in_dn
     image = (electrons(1) + noise(1, 12.0)) / each
     counts = (image / each).clip(0.0)
     read = np.full((N, N), (12.0 / each) ** 2)
     planes = {"ERR": np.sqrt(counts + read), "VAR_POISSON": counts, "VAR_RNOISE": read}
-    primary = {"TELESCOP": "JWST", "INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "FILTER": "F444W"}
-    cards = {"BUNIT": "MJy/sr", "PHOTMJSR": 0.4, "PIXAR_SR": 9.3e-14, "XPOSURE": 300.0}
     if kind == "cal":
         flags = np.random.default_rng(2).choice([0, 4], (N, N), p=[0.8, 0.2]).astype("u4")
-        flags[3, 5] = flags[40, 60] = 1 + 2
+        # The ramps in the core of the star saturated after a third, and a fifth has jumps.
+        flags[np.hypot(X - AT[0], Y - AT[1]) < 3] |= 2
+        cut = flags > 0
+        more = 0.5 * (counts + read)[cut]
+        image[cut] += np.random.default_rng(3).normal(0.0, np.sqrt(more))
+        for plane in (counts, read):
+            plane[cut] *= 1.5
+        planes["ERR"] = np.sqrt(counts + read)
+        flags[3, 5] = 1 + 2
         image[flags % 2 == 1] = np.nan
-        planes = {"DQ": flags, "AREA": np.ones((N, N)), **planes}
+        planes = {"DQ": flags, **planes}
     else:
         for values in (image, *planes.values()):
             values[:, :2] = np.nan
         planes |= {"CON": np.ones((1, N, N), "i4"), "WHT": np.ones((N, N))}
-    write(f"{kind}.fits", primary, (image, cards), **{k: v.astype("f4") if v.dtype == float else v
-          for k, v in planes.items()})  # fmt: skip
+    write(f"{kind}.fits", headers, image, **planes)
     return each, "MJy/sr"
 
 
 def of_acs(kind):
     image = electrons(3) + noise(3, 5.0)
     errors = np.sqrt(image.clip(0.0) + 25.0)
-    flags = np.random.default_rng(4).choice([0, 64], (N, N), p=[0.8, 0.2]).astype("u2")
+    flags = np.random.default_rng(4).choice([0, 64], (N, N), p=[0.8, 0.2]).astype("i2")
     flags[50, 20], image[50, 20] = 4096, 1e5  # a cosmic ray
-    primary = {"TELESCOP": "HST", "INSTRUME": "ACS", "DETECTOR": "WFC", "EXPTIME": 500.0}
-    write(
-        f"{kind}.fits", primary, (image, {"BUNIT": "ELECTRONS"}), ERR=errors.astype("f4"), DQ=flags
-    )
+    write(f"{kind}.fits", headers_of(f"acs_{kind}"), image, ERR=errors, DQ=flags)
     return 1.0, "electron"
 
 
 def of_wfc3_ir(kind):
-    image = (electrons(5) + noise(5, 14.0)) / 250.0
-    errors = np.sqrt((250.0 * image).clip(0.0) + 14.0**2) / 250.0
-    flags = np.full((N, N), 8192, "u2")
+    headers = headers_of("wfc3_ir_flt")
+    seconds = headers["PRIMARY"]["EXPTIME"]
+    image = (electrons(5) + noise(5, 14.0)) / seconds
+    errors = np.sqrt((seconds * image).clip(0.0) + 14.0**2) / seconds
+    flags = np.random.default_rng(4).choice([0, 512, 16], (N, N), p=[0.6, 0.2, 0.2]).astype("i2")
     flags[10, 12], image[10, 12] = 4, 900.0
-    primary = {"TELESCOP": "HST", "INSTRUME": "WFC3", "DETECTOR": "IR", "EXPTIME": 250.0}
-    cards = {"BUNIT": "ELECTRONS/S"}
-    write(f"{kind}.fits", primary, (image, cards), ERR=errors.astype("f4"), DQ=flags)
-    return 250.0, "electron/s"
+    write(f"{kind}.fits", headers, image, ERR=errors, DQ=flags)
+    return seconds, "electron/s"
 
 
 def of_drizzle(kind):
-    """Return a mosaic of which the sky was subtracted."""
-    image = (electrons(6) + noise(6, 8.0) - SKY) / 1200.0
-    image[:, -3:] = np.nan
-    primary = {"TELESCOP": "HST", "INSTRUME": "ACS", "DETECTOR": "WFC", "EXPTIME": 1200.0}
-    weights = np.full((N, N), 1200.0, "f4")
-    context = np.ones((N, N), "i4")
-    write(f"{kind}.fits", primary, (image, {"BUNIT": "ELECTRONS/S"}), WHT=weights, CTX=context)
-    return 1200.0, "electron/s"
+    """Return a mosaic, of which the sky was subtracted, or not, with bad pixels of no weight."""
+    headers = headers_of("wfc3_ir_drz")
+    seconds = headers["PRIMARY"]["EXPTIME"]
+    sky = 0.0 if kind == "single" else SKY
+    image = (electrons(6) + noise(6, 8.0) - sky) / seconds
+    weights = np.full((N, N), seconds, "f4")
+    weights[:, -3:] = weights[50:53, 20:23] = 0.0
+    image[:, -3:], image[50:53, 20:23] = np.nan, 999.0
+    write(f"{kind}.fits", headers, image, WHT=weights, CTX=np.ones((N, N), "i4"))
+    return seconds, "electron/s"
+
+
+def write_plainly(path, primary, cards, **extensions):
+    headers = {"PRIMARY": fits.Header(primary), "SCI": fits.Header(cards)}
+    write(path, headers, np.ones((N, N)), **extensions)
 
 
 def write_stpsf():
@@ -113,7 +138,9 @@ def write_stpsf():
         (of_nircam, "i2d"),
         (of_acs, "flt"),
         (of_wfc3_ir, "ir"),
+        (of_acs, "flc"),
         (of_drizzle, "drz"),
+        (of_drizzle, "single"),
     ],
 )
 def test_photometry_and_noise(command_folder, capsys, make, kind):
@@ -134,6 +161,9 @@ def test_photometry_and_noise(command_folder, capsys, make, kind):
         found = file["STARS"].data["flux"][0] + (file[0].data * near).sum()
         assert found * each == pytest.approx(STAR, rel=0.01)
         sky = file["RESIDUALS"].data[0][GOOD]
+        assert file[0].header["TELESCOP"] in said
+        assert "DATE-OBS" in file[0].header
+        assert file[0].header["CTYPE1"].startswith("RA---TAN")
         command = "".join(file[0].header["HISTORY"]).replace("\\", "")
     assert np.nanstd(sky) == pytest.approx(1.0, abs=0.05)
     for option in EXPECTED[kind]:
@@ -144,8 +174,10 @@ EXPECTED = {
     "cal": ["--gain VAR_POISSON", "--error err", "--mask dq"],
     "i2d": ["--gain VAR_POISSON", "--error err"],
     "flt": ["--error err", "--mask dq"],
+    "flc": ["--error err", "--mask dq"],
     "ir": ["--exposure EXPTIME", "--error err", "--mask dq"],
-    "drz": ["--exposure EXPTIME"],
+    "drz": ["--exposure EXPTIME", "--mask wht"],
+    "single": ["--exposure EXPTIME", "--mask wht"],
 }
 
 
@@ -167,13 +199,22 @@ class TestWhatIsGiven:
 
     def test_a_rate_without_its_exposure_says_none(self, capsys):
         cards = {"BUNIT": "ELECTRONS/S"}
-        write("ir.fits", {"TELESCOP": "HST"}, (np.ones((N, N)), cards))
-        assert calibrate("ir.fits", {}).keys() == {"read_noise"}
+        write_plainly("ir.fits", {"TELESCOP": "HST"}, cards)
+        assert calibrate("ir.fits", {}).keys() == {"read_noise", "background"}
         assert cli.main(["deconvolve", "ir.fits", "--psf", "k1.fits", "-o", "o.fits"]) == 2
         assert "ir.fits holds counts per time; give --exposure, in " in capsys.readouterr().err
 
+    def test_counts_of_a_converter_are_not_taken_for_electrons(self, capsys):
+        cards = {"BUNIT": "COUNTS"}
+        write_plainly("wfpc2.fits", {"TELESCOP": "HST", "INSTRUME": "WFPC2"}, cards)
+        assert cli.main(["deconvolve", "wfpc2.fits", "--psf", "k1.fits", "-o", "o.fits"]) == 2
+        assert "wfpc2.fits is in counts of its converter; give --gain" in capsys.readouterr().err
+        assert "gain" not in calibrate("wfpc2.fits", {"gain": "ATODGAIN"})
+        write_plainly("acs.fits", {"TELESCOP": "HST", "INSTRUME": "ACS"}, cards)
+        assert calibrate("acs.fits", {}).keys() == {"read_noise", "background"}
+
     def test_other_telescopes_say_nothing(self):
-        write("other.fits", {"TELESCOP": "Keck"}, (np.ones((N, N)), {}), ERR=np.ones((N, N)))
+        write_plainly("other.fits", {"TELESCOP": "Keck"}, {}, ERR=np.ones((N, N)))
         assert calibrate("other.fits", {}) == {}
         assert calibrate("a.fits", {}) == {}
 

@@ -323,15 +323,21 @@ class TestCoordinates:
         [
             {"CTYPE1": "DEC--TAN"},
             {"CD1_1": 0.0, "CD1_2": 0.0},
-            {"CPDIS1": "LOOKUP", "DP1": "EXTVER: 1"},
             {"CTYPE1": "WAVE-TAB", "CTYPE2": "STOKES", "PS1_0": "coordinates"},
         ],
-        ids=["axes", "singular", "lookup", "tab"],
+        ids=["axes", "singular", "tab"],
     )
     def test_coordinates_that_cannot_be_kept_are_announced(self, broken):
         with pytest.warns(LnoclWarning, match="of the first image cannot be copied"):
             cards = fitsread.wcs_cards(fits.Header(LINEAR | broken))
         assert len(cards) == 0
+
+    def test_distortions_in_tables_are_left_out_and_said(self, caplog):
+        tabled = {"CPDIS1": "Lookup", "DP1.EXTVER": 1.0, "D2IMDIS2": "LOOKUP", "D2IMERR2": 0.06}
+        with caplog.at_level("INFO", "lnocl"):
+            cards = fitsread.wcs_cards(fits.Header(LINEAR | tabled))
+        assert "distortions in tables" in caplog.text
+        assert repr(cards) == repr(fitsread.wcs_cards(fits.Header(LINEAR)))
 
     def test_a_broken_system_leaves_the_others(self):
         with pytest.warns(LnoclWarning, match=r"\(WCS\) of the first image") as caught:

@@ -171,14 +171,11 @@ class TestBackground:
             )
         assert found.background == [5.0]
 
-    def test_auto_of_a_subtracted_image_is_refused(self):
+    def test_auto_of_a_subtracted_image_is_0_and_said(self, caplog):
         save_images(IMAGES - 60.0)
-        with pytest.raises(InputError) as caught:
-            observe(background=["auto"])
-        assert str(caught.value).startswith("image 0 has a sigma-clipped median of -")
-        assert "give background 0, and its noise as read_noise, which may be auto" in str(
-            caught.value
-        )
+        with caplog.at_level("INFO", "lnocl"), pytest.warns(LnoclWarning, match="negative"):
+            assert read("1.fits", background=["auto"]).background == [0.0]
+        assert "image 1: its sky was subtracted; taken are a background of 0" in caplog.text
 
     @pytest.mark.parametrize(
         ("background", "message"),
@@ -409,10 +406,10 @@ class TestMask:
     @pytest.mark.parametrize(
         ("words", "bits", "expected"),
         [
-            ("JWST NIRCAM NRCALONG", None, [1, 5]),
+            ("JWST NIRCAM NRCALONG", None, [1, 5, 512]),
             ("HST ACS WFC", None, [1, 5, 4, 256, 512]),
             ("HST WFC3 UVIS", None, [1, 5, 4, 256, 512]),
-            ("HST WFC3 IR", None, [1, 5, 4, 16, 64, 256]),
+            ("HST WFC3 IR", None, [1, 5, 4, 64, 256]),
             ("HST STIS CCD", None, [1, 5, 4, 16, 64, 256, 512]),
             ("Keck", None, [1, 5, 4, 16, 64, 256, 512]),
             ("HST ACS WFC", "0", [1, 5, 4, 16, 64, 256, 512]),

@@ -71,6 +71,10 @@ AMBIGUOUS = {
 }
 
 
+# How the first of them is named, where not by its number.
+WORDS = {"two chips": "CHIP1", "errors and flags alone": "ERR"}
+
+
 @pytest.mark.parametrize("case", AMBIGUOUS)
 def test_several_that_may_be_meant_are_refused(tmp_path, case):
     hdus, named = AMBIGUOUS[case]
@@ -79,8 +83,16 @@ def test_several_that_may_be_meant_are_refused(tmp_path, case):
         fitsread.read_stack([path])
     assert str(caught.value) == (
         f"{path} holds 2 images that may be meant: {named}; name the one to use, as in "
-        f"'{path}[{named[4]}]'"
+        f"'{path}[{WORDS.get(case, named[4])}]'"
     )
+
+
+def test_of_two_chips_the_version_is_named_and_that_of_an_hdu_is_heeded(tmp_path):
+    path = chips(tmp_path / "a.fits")
+    with pytest.raises(InputError, match=r"as in '\S+a.fits\[SCI,1\]'$"):
+        fitsread.read_stack([path])
+    np.testing.assert_array_equal(fitsread.read_extension(f"{path}[1]", "DQ"), 10.0 * OTHER)
+    np.testing.assert_array_equal(fitsread.read_extension(f"{path}[3]", "DQ"), 10.0 * IMAGE)
 
 
 def test_two_extensions_of_one_name_are_refused(tmp_path):

@@ -344,7 +344,13 @@ class TestPlot:
         ]
 
     def test_names_tell_results_apart(self):
-        for name, method in (("a", "RLM"), ("b", "MC-RL"), ("c", "MC-RL"), ("d", "MC-RL"), ("e", "")):
+        for name, method in (
+            ("a", "RLM"),
+            ("b", "MC-RL"),
+            ("c", "MC-RL"),
+            ("d", "MC-RL"),
+            ("e", ""),
+        ):
             cards = [("MU", 1e-8 if name == "d" else 0.0, "")]
             cards += [("METHOD", method, "")] if method else []
             fitswrite.write_result(f"{name}.fits", np.ones((8, 8)), [], [], cards=cards)
@@ -367,7 +373,11 @@ class TestPlot:
             (["a.fits", "b.fits"], 2, "b.fits has the shape (8, 8) and a.fits (9, 8)"),
             (["b.fits", "--truth", "a.fits"], 2, "b.fits has the shape (8, 8) and a.fits (9, 8)"),
             (["nan.fits"], 2, "nan.fits holds values that are not finite"),
-            (["a.fits", "--truth", "dark.fits"], 2, "dark.fits holds no flux; give another --truth"),
+            (
+                ["a.fits", "--truth", "dark.fits"],
+                2,
+                "dark.fits holds no flux; give another --truth",
+            ),
             (
                 ["a.fits", "-o", "full"],
                 1,
