@@ -6,6 +6,7 @@ import base64
 import html
 import io
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,20 +59,26 @@ def thumbnail(image: NDArray[np.float64]) -> str:
     except ImportError:
         return ""
     step = -(-max(image.shape) // SIDE)
-    ny, nx = (n // step * step for n in image.shape)
-    blocks = image[:ny, :nx].reshape(ny // step, step, nx // step, step)
-    known = np.isfinite(blocks)
-    n_known = known.sum(axis=(1, 3))
-    sums = np.where(known, blocks, 0.0).sum(axis=(1, 3))
-    small = np.divide(sums, n_known, out=np.zeros(sums.shape), where=n_known > 0)
+    means = block_means(image, step)
+    small = np.nan_to_num(means)
     low, high = float(np.percentile(small, 1)), float(small.max())
     scale = LINEAR_SHARE * (high - low) or 1.0
     shown = np.arcsinh((small - low).clip(0.0) / scale) / np.arcsinh(1.0 / LINEAR_SHARE)
     colours = colormaps["viridis"](shown.clip(0.0, 1.0), bytes=True)
-    colours[n_known == 0] = (150, 150, 150, 255)
+    colours[np.isnan(means)] = (150, 150, 150, 255)
     with io.BytesIO() as stream:
         imsave(stream, colours[::-1], format="png")
         return base64.b64encode(stream.getvalue()).decode("ascii")
+
+
+def block_means(image: NDArray[Any], step: int) -> NDArray[np.float64]:
+    """Return the means of blocks of good pixels, NaN where there is none; a rest is left out."""
+    ny, nx = (n // step for n in image.shape)
+    blocks = image[: ny * step, : nx * step].reshape(ny, step, nx, step).astype(np.float64)
+    known = np.isfinite(blocks)
+    sums = np.where(known, blocks, 0.0).sum(axis=(1, 3))
+    counts = known.sum(axis=(1, 3))
+    return np.divide(sums, counts, out=np.full(sums.shape, np.nan), where=counts > 0)
 
 
 def _escaped(text: str) -> str:

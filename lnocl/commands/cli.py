@@ -17,6 +17,7 @@ from lnocl.commands import (
     messages,
     plot,
     psf,
+    report,
     selftest,
     simulate,
 )
@@ -32,6 +33,7 @@ COMMANDS = {
     "deconvolve": deconvolve.COMMAND,
     "psf": psf.COMMAND,
     "plot": plot.COMMAND,
+    "report": report.COMMAND,
     "demo": demo.COMMAND,
     "simulate": simulate.COMMAND,
     "bench": bench.COMMAND,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,12 +63,21 @@ def save_figure(figure: Figure, path: str, overwrite: bool = False) -> None:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of a size in inches, apart from pyplot's state."""
+    """Return an empty figure of a size in inches, apart from pyplot's state.
+
+    A notebook shows it, whether it has imported pyplot or not.
+    """
     check_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    class ShownFigure(Figure):
+        def _repr_png_(self) -> bytes:
+            with io.BytesIO() as stream:
+                self.savefig(stream, format="png", dpi=DPI)
+                return stream.getvalue()
+
+    figure = ShownFigure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

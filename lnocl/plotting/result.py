@@ -153,7 +153,7 @@ def draw_result(view: ResultView) -> Figure:
         axis.set_ylabel("y (pixels)", fontsize=9)
     if len(view.stars) > len(stars):
         parts[0].suptitle(f"enlarged: the {len(stars)} brightest of {len(view.stars)} stars")
-    _draw_choice(parts[1].subplots(), view)
+    draw_choice(parts[1].subplots(), view)
     return figure
 
 
@@ -273,7 +273,7 @@ def _mark_stars(axis: Axes, view: ResultView, offset: Sequence[float] = (0.0, 0.
     axis.set(xlim=(left, right), ylim=(bottom, top))
 
 
-def _draw_choice(axis: Axes, view: ResultView) -> None:
+def draw_choice(axis: Axes, view: ResultView) -> None:
     """Draw the error that held-out counts estimate for each smoothing, or the objective."""
     if view.held_out and len(view.held_out["iteration"]):
         table = view.held_out

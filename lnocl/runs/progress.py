@@ -13,9 +13,13 @@ PROGRESS_INTERVAL = 0.1
 
 
 def make_bar(total: int, unit: str, progress: bool) -> tqdm:
-    """Return a progress bar of so many steps, quiet where stderr is closed or not a terminal."""
-    # With disable=None, tqdm is quiet where stderr is not a terminal.
-    return tqdm(total=total, unit=unit, disable=None if progress and sys.stderr else True)
+    """Return a progress bar of so many steps: in a notebook, or on stderr if it is a terminal."""
+    if not (progress and sys.stderr):
+        return tqdm(total=total, unit=unit, disable=True)
+    from tqdm.auto import tqdm as bar  # which takes its time to load
+
+    # With disable=None, it is quiet where stderr is not a terminal.
+    return bar(total=total, unit=unit, disable=None)
 
 
 class Bar:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, counted, warn
+from lnocl.notebook import html_card
 from lnocl.scene import containers
 from lnocl.scene.arrays import numbers, refuse_masked, unmasked, values_and_mask
 from lnocl.scene.cores import centre, off_centre, peak
@@ -179,6 +180,21 @@ class Observation:
             arrays["psfs"] = self.psfs[:1]
         return sum(array.nbytes for array in arrays.values())
 
+    def _repr_html_(self) -> str:
+        """Return a table for a notebook, with a thumbnail of the first image."""
+        ny, nx = self.shape
+        rows = {
+            "images": f"{self.n_images} of {nx} x {ny} pixels",
+            "PSFs": f"{' x '.join(map(str, self.psfs.shape[:0:-1]))} pixels",
+            "background": _range(self.background),
+            "read noise": f"{_range(self.read_noise)}, its square in images and background",
+            "bad pixels": f"{100 * self.mask.mean():.2g} %",
+        }
+        if (self.exposure != 1.0).any():
+            rows["exposure"] = _range(self.exposure)
+        image = np.where(self.mask[0], np.nan, self.images[0])
+        return html_card("lnocl.Observation", rows, image)
+
     def _check_ideals(self, ideals: ArrayLike | None, psf_centre: str) -> Array:
         if ideals is None and len(self.pupils):
             from lnocl.scene.pupils import Pupil  # which loads scipy
@@ -300,6 +316,11 @@ class Observation:
                 f"{_pixels(n_negative, 'image', 'negative', 'set to 0')}; if the images are "
                 "background-subtracted, add the background back and give it as background"
             )
+
+
+def _range(values: Array) -> str:
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.5g}" if low == high else f"{low:.5g} to {high:.5g}"
 
 
 def _stack(name: str, values: ArrayLike) -> Array:

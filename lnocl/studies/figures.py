@@ -15,6 +15,7 @@ from lnocl.io.saved_results import SavedResult, read_result
 from lnocl.plotting.curves import draw_errors, draw_magnitudes
 from lnocl.plotting.figure import check_matplotlib, save_figure
 from lnocl.plotting.profiles import draw_profiles
+from lnocl.plotting.report import make_report
 from lnocl.plotting.result import ResultView, draw_result
 from lnocl.plotting.sources import Frame, Source, draw_objects
 from lnocl.studies import experiment
@@ -101,6 +102,32 @@ def draw(
     for kind in ("flux", "width"):
         figure = draw_profiles(kind, original, sources, frame, experiment.NEAR_STAR, threshold)
         yield save(folder, kind, figure, overwrite)
+
+
+def report(path: str) -> str:
+    """Return a page of HTML that shows a saved result.
+
+    Raises
+    ------
+    LnoclError
+        matplotlib is missing.
+    FileError
+        The file cannot be read, or is not a result.
+    InputError
+        It holds values that are not finite, or a star outside its image.
+    """
+    check_matplotlib()
+    saved = read_result(path)
+    _check_saved([saved])
+    target = str(saved.header.get("OBJECT") or saved.header.get("TARGNAME") or "").strip()
+    title = os.path.basename(path) + (f": {target}" if target else "")
+    cards = [
+        (card.keyword, card.value, card.comment)
+        for card in saved.header.cards
+        if card.keyword not in ("", "COMMENT", "HISTORY", "SIMPLE", "BITPIX", "EXTEND")
+    ]
+    stars = {name: column.tolist() for name, column in saved.tables["STARS"].items()}
+    return make_report(view_of(saved), title, saved.messages, stars, cards, saved.commands())
 
 
 def view_of(saved: SavedResult) -> ResultView:

@@ -1,10 +1,10 @@
 """The picture of a result shows what the result has, in memory and from its file."""
 
-import dataclasses
 import sys
 
 import numpy as np
 import pytest
+from result_views import make_view
 from scenes import Recipe
 
 from lnocl.errors import LnoclError
@@ -13,7 +13,6 @@ from lnocl.plotting.result import (
     MAX_SIGMA,
     MAX_ZOOMS,
     Region,
-    ResultView,
     draw_result,
     image_limits,
     worst_image,
@@ -28,27 +27,6 @@ def panels(figure):
     """Return the images of a figure by the titles of their panels, colour bars apart."""
     parts = [axis for part in figure.subfigs for axis in part.axes]
     return [(axis.get_title(), axis.images[0]) for axis in parts if axis.images]
-
-
-def make_view(p=2, n_stars=1, shape=(60, 70), **changes):
-    chance = np.random.default_rng(3)
-    models = np.full((p, *shape), 50.0)
-    residuals = chance.normal(size=models.shape)
-    stars = [(10.0 + 5 * s, 20.0) for s in range(n_stars)]
-    iterations = np.arange(4.0)
-    view = ResultView(
-        extended=chance.random(shape),
-        stars=stars,
-        star_fluxes=np.arange(n_stars, 0.0, -1.0),
-        n_iter=3,
-        history={"iteration": iterations, "objective": 9.0 - iterations},
-        held_out={},
-        images=models + np.sqrt(models) * residuals,
-        models=models,
-        residuals=residuals,
-        offsets=np.zeros((p, 2)),
-    )
-    return dataclasses.replace(view, **changes)
 
 
 @pytest.fixture(scope="module")

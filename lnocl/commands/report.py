@@ -1,0 +1,42 @@
+"""The command ``report``: a result as one page of HTML."""
+
+from __future__ import annotations
+
+import argparse
+
+from lnocl.commands import messages, options
+from lnocl.commands.options import option
+from lnocl.commands.parser import Command
+from lnocl.errors import InputError
+
+OPTIONS = [
+    option(
+        "result",
+        metavar="RESULT",
+        is_input=True,
+        help="FITS file that lnocl deconvolve has written, with --models and --residuals",
+    ),
+    option("-o", "--output", required=True, metavar="REPORT.html", help="page to write"),
+    options.OVERWRITE.but(help="replace REPORT.html if it exists"),
+]
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from lnocl.io import atomic
+    from lnocl.studies import figures
+
+    if not arguments.output.lower().endswith((".html", ".htm")):
+        raise InputError(
+            f"the report is a page of HTML; give it a name ending in .html, not {arguments.output}"
+        )
+    atomic.check_output(arguments.output, arguments.overwrite, [arguments.result])
+    page = figures.report(arguments.result)
+    atomic.write_text(arguments.output, page, arguments.overwrite)
+    messages.say([f"written to {arguments.output}: open it in a browser"])
+
+
+COMMAND = Command(
+    "write a result as one page of HTML: images to blink and stretch, tables, what the run said",
+    {"": OPTIONS},
+    _run,
+)
