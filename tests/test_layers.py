@@ -11,7 +11,7 @@ import lnocl
 FLOORS = [
     {"errors", "process", "notebook", "kernels"},
     {"scene"},
-    {"metrics", "residuals", "psf", "io", "reference", "solvers", "opencl"},
+    {"metrics", "residuals", "detection", "psf", "io", "reference", "solvers", "opencl"},
     {"simulation", "plotting"},
     {"engines"},
     {"runs"},

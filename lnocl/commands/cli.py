@@ -20,6 +20,7 @@ from lnocl.commands import (
     report,
     selftest,
     simulate,
+    stars,
 )
 from lnocl.commands.parser import Parser
 from lnocl.commands.signals import ENDING, Terminated, first_handled, terminate
@@ -32,6 +33,7 @@ INTERRUPTED = 130
 COMMANDS = {
     "deconvolve": deconvolve.COMMAND,
     "psf": psf.COMMAND,
+    "stars": stars.COMMAND,
     "plot": plot.COMMAND,
     "report": report.COMMAND,
     "demo": demo.COMMAND,

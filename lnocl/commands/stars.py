@@ -1,0 +1,145 @@
+"""The command ``stars``: find the stars in an image, for ``lnocl deconvolve --stars``."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+from typing import IO, TYPE_CHECKING
+
+import numpy as np
+
+from lnocl.commands import messages, options, pictures
+from lnocl.commands.options import option
+from lnocl.commands.parser import Command
+from lnocl.errors import InputError, counted
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+# The formats of tables, by their endings, as astropy names them.
+FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
+
+OPTIONS = [
+    option("image", metavar="IMAGE", is_input=True, help="FITS file with an image"),
+    option(
+        "-o",
+        "--output",
+        required=True,
+        metavar="STARS.ecsv",
+        help="table of the stars, in a format by its ending: .ecsv, .csv or .fits",
+    ),
+    option(
+        "--psf",
+        metavar="PSF",
+        is_input=True,
+        help="FITS file with its PSF: its width is that of a star, and what may be in the wings of "
+        "brighter stars is left out (default: a width measured on the image's stars)",
+    ),
+    option(
+        "--threshold",
+        type=float,
+        default=5.0,
+        metavar="S",
+        help="smallest significance of a star, in standard deviations (default: %(default)s)",
+    ),
+    option(
+        "--mask",
+        metavar="FILE",
+        is_input=True,
+        help="FITS file that is not 0 where a pixel is bad; pixels that are NaN are bad too",
+    ),
+    options.SATURATION.but(
+        help="pixels of this value and above are saturated, in the unit of the image"
+    ),
+    options.PICTURE.but(help="picture of the image with the stars and their numbers"),
+    options.OVERWRITE,
+    options.QUIET,
+]
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from lnocl.detection import find_stars
+    from lnocl.io import atomic, fitsread, sky
+
+    ending = next((end for end in FORMATS if arguments.output.lower().endswith(end)), None)
+    if ending is None:
+        raise InputError(
+            f"the table of stars is ECSV, CSV or FITS; give it a name ending in .ecsv, .csv or "
+            f".fits, not {arguments.output}"
+        )
+    inputs = options.input_paths(OPTIONS, vars(arguments))
+    atomic.check_output(arguments.output, arguments.overwrite, inputs)
+    pictures.check(arguments, inputs)
+    with messages.shown_log(arguments.quiet):
+        stack = fitsread.read_single(arguments.image)
+        image = stack.data[0]
+        psf = None if arguments.psf is None else fitsread.read_single(arguments.psf).data[0]
+        mask = None
+        if arguments.mask is not None:
+            mask = fitsread.read_single(arguments.mask).data[0] != 0
+        stars = find_stars(
+            image,
+            psf,
+            threshold=arguments.threshold,
+            mask=mask,
+            saturation=arguments.saturation,
+        )
+    stars.add_column(np.arange(1, len(stars) + 1), name="star", index=0)
+    if len(stars) and sky.has_celestial(stack.header):
+        positions = np.array([stars["x"], stars["y"]]).T
+        stars["ra"], stars["dec"] = sky.to_sky(positions, stack.header).T
+        stars["ra"].unit = stars["dec"].unit = "deg"
+    stars.meta = {"IMAGE": os.path.basename(arguments.image), "ORIGIN": "x and y begin at 0"}
+    for name in ("x", "y"):
+        stars[name].format, stars[name].unit = ".3f", "pix"
+    for name in ("peak", "significance"):
+        stars[name].format = ".5g"
+    with atomic.whole_file(arguments.output, arguments.overwrite) as stream:
+        _write(stars, stream, FORMATS[ending])
+    said = [*_told(stars), f"written to {arguments.output}"]
+    if arguments.plot is not None:
+        from lnocl.plotting.stars import draw_stars
+
+        said.append(pictures.draw(arguments, draw_stars(image, stars)))
+    if not arguments.quiet:
+        messages.say(said)
+
+
+def _write(stars: Table, stream: IO[bytes], kind: str) -> None:
+    """Write the table; astropy writes texts to text streams."""
+    if kind == "fits":
+        stars.write(stream, format=kind)
+        return
+    text = io.StringIO()
+    stars.write(text, format=kind)
+    stream.write(text.getvalue().encode())
+
+
+def _told(stars: Table) -> list[str]:
+    """Return how many stars there are, and which are saturated."""
+    n = len(stars)
+    if not n:
+        return [
+            "no star is found: give --psf with the PSF of the image, or a lower --threshold, and "
+            "look at the image"
+        ]
+    saturated = [str(number) for number in stars["star"][stars["saturated"]]]
+    lines = [
+        f"{counted(n, 'star')} found, the brightest at ({stars['x'][0]:.2f}, {stars['y'][0]:.2f})"
+    ]
+    if saturated:
+        shown = ", ".join(saturated[:10]) + (", ..." if len(saturated) > 10 else "")
+        lines.append(
+            f"{counted(len(saturated), 'star')} saturated: {shown}; mask their cores in lnocl "
+            "deconvolve, by --saturation or --mask, and their fluxes follow from their wings"
+        )
+    return lines
+
+
+COMMAND = Command(
+    "find the stars in an image: a table for lnocl deconvolve --stars, and a picture with numbers",
+    {"": OPTIONS},
+    _run,
+    "Stars are found by DAOFIND of photutils, which pip install photutils brings.",
+)

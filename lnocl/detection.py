@@ -1,0 +1,292 @@
+"""Stars found in an image, by photutils."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from lnocl.errors import InputError, LnoclError, counted
+from lnocl.process import ignored_warnings
+from lnocl.scene.arrays import numbers
+from lnocl.scene.cores import fwhm
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+# The sky's level is a median over boxes of so many PSF widths, and of this many pixels or more.
+BOX_WIDTHS, MIN_BOX = 12, 24
+# A PSF width to begin with where none is known, and the stars that it is then measured on.
+FIRST_WIDTH, MEASURED = 3.0, 20
+# Two stars are nearer to each other than so many PSF widths only where one is saturated.
+SEPARATION = 0.9
+# What lies in the wings of brighter stars must be brighter than this share of them: PSFs err.
+OF_WINGS = 0.5
+# What has so many times the light of a star of its peak is extended.
+EXTENDED = 1.7
+# A Gaussian is one standard deviation below its median in this share of all.
+DARKER = 0.1587
+# A box with more bad pixels than this, percent, says nothing of the sky.
+MOST_BAD = 50.0
+# Side of the square in which a star's width is fitted, pixels, and the least width that is one.
+FIT_SIDE, LEAST_WIDTH = 11, 0.8
+# A saturated star is a region of bad pixels up to so many PSF widths across, inside a ring whose
+# median is so many times as significant as a star must be.
+MOST_SATURATED, OF_RING = 4.0, 4.0
+# Pixels above this share of the brightest star are a ring, where darker ones lie inside them.
+HOLLOW = 0.3
+
+
+def find_stars(
+    image: ArrayLike,
+    psf: ArrayLike | None = None,
+    *,
+    threshold: float = 5.0,
+    mask: ArrayLike | None = None,
+    saturation: float | None = None,
+) -> Table:
+    r"""Return the stars in an image: local maxima of the shape of the PSF, by DAOFIND.
+
+    The sky's level and noise are sigma-clipped medians in boxes, between which they are
+    interpolated; stars are sought in the image less its level, over its noise. What is fainter than
+    half of the wings of brighter stars, as the PSF has them, is left out.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        In any linear unit; pixels that are not finite are bad.
+    psf : array_like, shape (ky, kx), optional
+        Its PSF. Without it the width is measured on the image's own stars, and no wings are known.
+    threshold : float, optional
+        Smallest significance of a star, that of its image through a filter of the PSF's width;
+        more than 0.
+    mask : array_like of bool, shape (ny, nx), optional
+        True where a pixel is bad.
+    saturation : float, optional
+        Pixels of this value and above are saturated.
+
+    Returns
+    -------
+    astropy.table.Table
+        Columns ``x`` and ``y``, pixels, 0-based; ``peak``, the brightest pixel above the sky, in
+        the unit of the image; ``significance``, over the noise of a pixel; ``saturated``, whether
+        a pixel in the core is saturated or bad. The brightest comes first.
+
+    Raises
+    ------
+    InputError
+        An array of another shape or type; a threshold that is not more than 0; an image without a
+        good pixel.
+    LnoclError
+        photutils is not installed.
+
+    References
+    ----------
+    P. B. Stetson, PASP 99, 191 (1987), for DAOFIND.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lnocl.detection import find_stars
+    >>> y, x = np.indices((64, 64))
+    >>> noise = np.random.default_rng(1).normal(0, 1, (64, 64))
+    >>> image = noise + 200 * np.exp(-((x - 30.2) ** 2 + (y - 20) ** 2) / 8)
+    >>> stars = find_stars(image)
+    >>> print(len(stars), stars["x"][0].round(1), stars["y"][0].round(1))
+    1 30.2 20.0
+    """
+    pixels, bad = _check(image, mask, threshold)
+    shape = None if psf is None else _check_psf(psf)
+    width = FIRST_WIDTH if shape is None else fwhm(shape)
+    above, noise = _significance(pixels, bad, width)
+    if shape is None:
+        width = _measure_width(above, bad, threshold)
+        above, noise = _significance(pixels, bad, width)
+    found = _candidates(above, bad, width, threshold)
+    saturated = bad | _holes(above * noise)
+    if saturation is not None:
+        saturated |= pixels >= saturation
+    cores = _saturated_stars(above, saturated, width, threshold)
+    apart = [np.hypot(*(star[:2] - cores[:, :2]).T).min(initial=np.inf) for star in found]
+    found = found[np.array(apart) > MOST_SATURATED * width / 2.0]
+    stars, is_saturated = (
+        np.concatenate([cores, found]),
+        np.arange(len(cores) + len(found)) < len(cores),
+    )
+    if shape is not None:
+        kept = ~_in_wings(stars, shape)
+        stars, is_saturated = stars[kept], is_saturated[kept]
+    return _table(stars, is_saturated, noise)
+
+
+def _check(
+    image: ArrayLike, mask: ArrayLike | None, threshold: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the pixels, and which of them are bad."""
+    pixels = numbers("image", image)
+    if pixels.ndim != 2:
+        raise InputError(f"image has {counted(pixels.ndim, 'dimension')}; give one image")
+    if not threshold > 0:
+        raise InputError(f"threshold must be more than 0; {threshold:g} was given")
+    bad = ~np.isfinite(pixels)
+    if mask is not None:
+        given = np.asarray(mask)
+        if given.dtype != np.bool_ or given.shape != pixels.shape:
+            raise InputError(
+                f"mask of type {given.dtype} and shape {given.shape} must be booleans of the shape "
+                f"of image, {pixels.shape}"
+            )
+        bad |= given
+    if bad.all():
+        raise InputError("image has no good pixel; give another, or another mask")
+    return pixels, bad
+
+
+def _check_psf(psf: ArrayLike) -> NDArray[np.float64]:
+    light = numbers("psf", psf)
+    if light.ndim != 2 or not np.isfinite(light).all() or not light.sum() > 0:
+        raise InputError(
+            f"psf of shape {light.shape} must be one image of finite numbers with a positive sum"
+        )
+    return light
+
+
+def _import_photutils() -> Any:
+    try:
+        import photutils.background
+        import photutils.detection
+        import photutils.psf
+    except ImportError:
+        raise LnoclError(
+            "stars are found by photutils, which is not installed: pip install photutils"
+        ) from None
+    return photutils
+
+
+def _significance(
+    pixels: NDArray[np.float64], bad: NDArray[np.bool_], width: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what is above the sky over its noise, 0 where a pixel is bad; and that noise."""
+    photutils = _import_photutils()
+    box = min(max(MIN_BOX, round(BOX_WIDTHS * width)), *pixels.shape)
+    with ignored_warnings():  # of pixels that are not finite
+        sky = photutils.background.Background2D(
+            pixels, box, mask=bad, exclude_percentile=MOST_BAD, fill_value=np.nan
+        )
+    noise = np.where(sky.background_rms > 0, sky.background_rms, np.finfo(float).tiny)
+    is_known = ~bad & (sky.background_rms > 0)
+    return np.divide(pixels - sky.background, noise, np.zeros(noise.shape), where=is_known), noise
+
+
+def _candidates(
+    above: NDArray[np.float64], bad: NDArray[np.bool_], width: float, threshold: float
+) -> NDArray[np.float64]:
+    """Return x, y and brightest pixel of the local maxima that look like stars."""
+    photutils = _import_photutils()
+    filled = _filled(above, bad, width)
+    finder = photutils.detection.DAOStarFinder(1.0, width)
+    filtered = ndimage.convolve(filled, finder.kernel.data, mode="nearest")[~bad]
+    # By its darker half, in which no star is; neighbouring pixels may share their noise.
+    noise = float(np.median(filtered) - np.quantile(filtered, DARKER))
+    finder = photutils.detection.DAOStarFinder(
+        threshold * noise, width, min_separation=SEPARATION * width, scale_threshold=False
+    )
+    with ignored_warnings():  # that there is no star
+        found = finder(filled)
+    if found is None:
+        return np.zeros((0, 3))
+    width_of = found["flux"] / found["peak"]  # the square of a width
+    brightest = np.argsort(-found["peak"])[:MEASURED]
+    found = found[width_of < EXTENDED * np.median(width_of[brightest])]
+    return np.array([found["x_centroid"], found["y_centroid"], found["peak"]], float).T
+
+
+def _filled(
+    above: NDArray[np.float64], bad: NDArray[np.bool_], width: float
+) -> NDArray[np.float64]:
+    """Return an image whose bad pixels have the mean of those near them."""
+    from astropy.convolution import Gaussian2DKernel, convolve_fft
+
+    if not bad.any():
+        return above
+    smooth = convolve_fft(
+        np.where(bad, np.nan, above), Gaussian2DKernel(width / 2.0), boundary="fill"
+    )
+    return np.where(bad, np.nan_to_num(smooth), above)
+
+
+def _measure_width(above: NDArray[np.float64], bad: NDArray[np.bool_], threshold: float) -> float:
+    """Return the width of the brightest stars of an image, the median of Gaussians fitted."""
+    photutils = _import_photutils()
+    found = _candidates(above, bad, FIRST_WIDTH, threshold)
+    brightest = found[np.argsort(-found[:, 2])][:MEASURED]
+    if not len(brightest):
+        return FIRST_WIDTH
+    with ignored_warnings():  # of fits that fail
+        widths = photutils.psf.fit_fwhm(
+            above, xypos=brightest[:, :2], fwhm=FIRST_WIDTH, fit_shape=FIT_SIDE, mask=bad
+        )
+    good = widths[(widths > LEAST_WIDTH) & (widths < FIT_SIDE)]
+    return float(np.median(good)) if good.size else FIRST_WIDTH
+
+
+def _holes(light: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return dark pixels inside bright ones: cores in which counts were lost."""
+    peak = ndimage.median_filter(light, 3).max()  # single bright pixels are no stars
+    bright = light > HOLLOW * max(peak, 0.0)
+    return ndimage.binary_fill_holes(bright) & ~bright
+
+
+def _saturated_stars(
+    above: NDArray[np.float64], saturated: NDArray[np.bool_], width: float, threshold: float
+) -> NDArray[np.float64]:
+    """Return x, y and brightest pixel round them of compact bad regions inside bright rings."""
+    labels, _ = ndimage.label(saturated, np.ones((3, 3)))
+    stars = []
+    for label, there in enumerate(ndimage.find_objects(labels), 1):
+        if max(part.stop - part.start for part in there) > MOST_SATURATED * width:
+            continue
+        wider = tuple(slice(max(part.start - 2, 0), part.stop + 2) for part in there)
+        core = labels[wider] == label
+        ring = ndimage.binary_dilation(core, iterations=2) & ~saturated[wider]
+        if not ring.any() or np.median(above[wider][ring]) < OF_RING * threshold:
+            continue
+        y, x = ndimage.center_of_mass(core)
+        stars.append((x + wider[1].start, y + wider[0].start, above[wider][ring].max()))
+    return np.reshape(stars, (-1, 3))
+
+
+def _in_wings(stars: NDArray[np.float64], psf: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which stars are no more than the wings of brighter ones may be."""
+    order = np.argsort(-stars[:, 2])
+    is_wing = np.zeros(len(stars), bool)
+    y0, x0 = (n // 2 for n in psf.shape)
+    relative = psf / psf.max()
+    wings = np.zeros(len(stars))
+    for i in order:
+        is_wing[i] = stars[i, 2] < (1.0 + OF_WINGS) * wings[i]
+        if not is_wing[i]:
+            dx, dy = (stars[:, :2] - stars[i, :2]).T
+            fainter = stars[:, 2] < stars[i, 2]
+            share = ndimage.map_coordinates(relative, [y0 + dy, x0 + dx], order=1)
+            wings += np.where(fainter, stars[i, 2] * share.clip(0.0), 0.0)
+    return is_wing
+
+
+def _table(
+    stars: NDArray[np.float64], saturated: NDArray[np.bool_], noise: NDArray[np.float64]
+) -> Table:
+    """Return the stars, the brightest first."""
+    from astropy.table import Table
+
+    x, y, significance = stars.T
+    row, column = (
+        np.round(each).astype(int).clip(0, n - 1)
+        for each, n in zip((y, x), noise.shape, strict=True)
+    )
+    peak = significance * noise[row, column]
+    order = np.lexsort((-peak, ~saturated))
+    columns = {"x": x, "y": y, "peak": peak, "significance": significance, "saturated": saturated}
+    return Table({name: values[order] for name, values in columns.items()})

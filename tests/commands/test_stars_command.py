@@ -1,0 +1,117 @@
+"""Stars found from the command line, and taken by ``lnocl deconvolve``."""
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+from lnocl.commands import cli
+
+pytest.importorskip("photutils", reason="photutils is not installed")
+
+N = 64
+WCS = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 15.25, "CRVAL2": -3.0,
+       "CRPIX1": 32.0, "CRPIX2": 32.0, "CDELT1": -1e-4, "CDELT2": 1e-4}  # fmt: skip
+
+
+def gaussian(n, x, y):
+    rows, columns = np.indices((n, n))
+    light = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 4.5)
+    return light / light.sum()
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    light = 50.0 + 3e4 * gaussian(N, 20.3, 40.1) + 8e3 * gaussian(N, 45.0, 18.6)
+    counts = np.random.default_rng(1).poisson(light).astype(float)
+    fits.writeto("image.fits", counts, fits.Header(WCS))
+    fits.writeto("psf.fits", gaussian(25, 12, 12))
+    return tmp_path
+
+
+@pytest.mark.parametrize("output", ["stars.ecsv", "stars.csv", "stars.fits"])
+def test_the_table_is_taken_by_deconvolve(output, capsys):
+    assert cli.main(["stars", "image.fits", "--psf", "psf.fits", "-o", output]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("2 stars found, the brightest at (20.")
+    assert said[1:] == [f"written to {output}"]
+    stars = Table.read(output)
+    assert stars["star"].tolist() == [1, 2]
+    command = ["deconvolve", "image.fits", "--psf", "psf.fits", "--background", "50"]
+    command += ["--stars", output, "--n-iter", "3", "--stop", "none", "--engine", "numpy"]
+    assert cli.main([*command, "-o", "out.fits"]) == 0
+    found = fits.getdata("out.fits", "STARS")
+    np.testing.assert_allclose(found["x"], stars["x"], atol=1e-9)
+    np.testing.assert_allclose(found["y"], stars["y"], atol=1e-9)
+    np.testing.assert_allclose(found["flux"], [3e4, 8e3], rtol=0.1)
+
+
+def test_the_picture_has_the_stars_and_their_numbers(capsys):
+    pytest.importorskip("matplotlib")
+    from lnocl.plotting.stars import draw_stars
+
+    assert cli.main(["stars", "image.fits", "-o", "stars.ecsv", "--plot", "stars.png"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "drew stars.png"
+    assert Path("stars.png").read_bytes().startswith(b"\x89PNG")
+    stars = Table.read("stars.ecsv")
+    stars["saturated"][1] = True
+    (axis,) = draw_stars(fits.getdata("image.fits"), stars).axes
+    places = [line.get_data()[0].tolist() for line in axis.lines]
+    assert places == [[stars["x"][0]], [stars["x"][1]]]
+    assert [text.get_text() for text in axis.texts] == ["1", "2"]
+    assert axis.get_title() == "2 stars; orange: saturated"
+
+
+def test_saturated_stars_are_named(capsys):
+    counts = fits.getdata("image.fits").clip(max=1500.0)
+    fits.writeto("image.fits", counts, overwrite=True)
+    command = ["stars", "image.fits", "--saturation", "1500", "-o", "stars.ecsv"]
+    assert cli.main(command) == 0
+    assert "1 star saturated: 1; mask their cores in lnocl deconvolve" in capsys.readouterr().out
+    stars = Table.read("stars.ecsv")
+    assert stars["saturated"].tolist() == [True, False]
+    assert "ra" not in stars.colnames
+
+
+def test_where_there_is_no_star_it_says_what_to_do(capsys):
+    noise = np.random.default_rng(2).normal(50.0, 5.0, (N, N))
+    fits.writeto("noise.fits", noise)
+    assert cli.main(["stars", "noise.fits", "-o", "stars.ecsv"]) == 0
+    assert "no star is found: give --psf" in capsys.readouterr().out
+    assert len(Table.read("stars.ecsv")) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["image.fits", "-o", "stars.txt"], 2, "a name ending in .ecsv, .csv or .fits, not stars"),
+        (["image.fits", "-o", "image.fits", "--overwrite"], 2, "is one of the inputs"),
+        (["image.fits", "-o", "there.csv"], 1, "the output there.csv exists"),
+        (["no.fits", "-o", "a.csv"], 1, "no.fits cannot be opened"),
+        (["image.fits", "-o", "a.csv", "--threshold", "0"], 2, "--threshold must be more than 0"),
+        (["image.fits", "-o", "a.csv", "--mask", "psf.fits"], 2, "--mask of type bool and shape"),
+        (["image.fits", "-o", "a.csv", "--plot", "a.jpg"], 2, "a name ending in .png"),
+        (["cube.fits", "-o", "a.csv"], 2, "cube.fits holds 2 images"),
+    ],
+)
+def test_refusals(arguments, status, message, capsys):
+    Path("there.csv").write_text("kept")
+    fits.writeto("cube.fits", np.ones((2, 9, 9)))
+    before = sorted(os.listdir())
+    assert cli.main(["stars", *arguments]) == status
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert sorted(os.listdir()) == before
+    assert Path("there.csv").read_text() == "kept"
+
+
+def test_without_photutils_one_line_says_what_to_install(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "photutils.background", None)
+    assert cli.main(["stars", "image.fits", "-o", "stars.ecsv"]) == 1
+    assert "pip install photutils" in capsys.readouterr().err

@@ -1,0 +1,149 @@
+"""Stars are found where they are, and nothing else is."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from lnocl.errors import InputError, LnoclError
+
+pytest.importorskip("photutils", reason="photutils is not installed")
+from lnocl.detection import find_stars
+
+SHAPE = (96, 110)
+Y, X = np.indices(SHAPE)
+PLACES = np.array([(30.3, 25.8), (80.1, 30.4), (45.0, 70.5), (36.0, 27.0), (105.2, 3.1)])
+PEAKS = np.array([2000.0, 500.0, 90.0, 700.0, 300.0])
+
+
+def gaussian(x, y, sigma=1.5, shape=SHAPE):
+    rows, columns = np.indices(shape)
+    return np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2.0 * sigma**2))
+
+
+PSF = gaussian(15, 15, shape=(31, 31))
+
+
+def make_image(seed=0, level=100.0, scatter=5.0, places=PLACES, peaks=PEAKS):
+    noise = np.random.default_rng(seed).normal(level, scatter, SHAPE)
+    return noise + sum(peak * gaussian(*place) for place, peak in zip(places, peaks, strict=True))
+
+
+def assert_found(stars, places=PLACES, peaks=PEAKS, within=0.2):
+    assert len(stars) == len(places)
+    order = np.argsort(-peaks)
+    found = np.array([stars["x"], stars["y"]]).T
+    assert np.abs(found - places[order]).max() < within
+    np.testing.assert_allclose(stars["peak"], peaks[order], rtol=0.25)
+
+
+@pytest.mark.parametrize("psf", [None, PSF])
+@pytest.mark.parametrize("seed", range(3))
+def test_all_are_found_the_brightest_first(psf, seed):
+    stars = find_stars(make_image(seed), psf)
+    assert_found(stars)
+    assert not stars["saturated"].any()
+    assert stars["significance"][0] == pytest.approx(stars["peak"][0] / 5.0, rel=0.3)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_units_do_not_matter(scale):
+    one, other = find_stars(make_image()), find_stars(scale * make_image())
+    np.testing.assert_allclose(one["x"], other["x"], atol=1e-6)
+    np.testing.assert_allclose(scale * one["peak"], other["peak"])
+    np.testing.assert_allclose(one["significance"], other["significance"])
+
+
+def test_in_noise_alone_there_are_none():
+    none = make_image(places=PLACES[:0], peaks=PEAKS[:0])
+    assert len(find_stars(none)) == 0
+    assert len(find_stars(none, PSF)) == 0
+    assert find_stars(none).colnames == ["x", "y", "peak", "significance", "saturated"]
+
+
+def test_noise_that_pixels_share_is_no_star():
+    from scipy.ndimage import gaussian_filter
+
+    noise = 5.0 * gaussian_filter(np.random.default_rng(1).normal(0, 1, SHAPE), 0.8)
+    assert len(find_stars(noise + 100.0, PSF)) == 0
+
+
+def test_a_slope_and_an_extended_source_are_no_stars():
+    image = make_image() + 0.3 * X + 400.0 * gaussian(60, 48, sigma=6.0)
+    assert_found(find_stars(image, PSF), within=0.4)
+
+
+def test_what_lies_in_the_wings_is_no_star_unless_it_is_brighter():
+    rows, columns = np.indices((61, 61)) - 30
+    ring = gaussian(30, 30, shape=(61, 61))
+    ring += 0.03 * np.exp(-((np.hypot(columns - 7, rows)) ** 2) / 4.5)  # a speckle
+    image = np.random.default_rng(0).normal(100.0, 1.0, SHAPE)
+    image[18:79, 20:81] += 5000.0 * ring
+    assert len(find_stars(image)) == 2  # without wings nothing tells the speckle from a star
+    assert len(find_stars(image, ring)) == 1
+    image += 400.0 * gaussian(57, 48)
+    assert len(find_stars(image, ring)) == 2
+
+
+class TestSaturated:
+    @pytest.mark.parametrize("core", ["level", "NaN", "mask", "hole"])
+    def test_they_are_found_once_and_named(self, core):
+        image = make_image(peaks=PEAKS * [20.0, 1.0, 1.0, 1.0, 1.0])
+        given = {}
+        lost = image > 9000.0
+        lost[60:, :] = False
+        assert lost.sum() > 10
+        if core == "level":
+            image[lost] = 9000.0
+            given["saturation"] = 9000.0
+        elif core == "NaN":
+            image[lost] = np.nan
+        elif core == "mask":
+            image[lost] = 7.0
+            given["mask"] = lost
+        else:
+            image[np.hypot(X - 30.3, Y - 25.8) < 1.6] = 3000.0
+        stars = find_stars(image, PSF, **given)
+        assert np.hypot(stars["x"][0] - 30.3, stars["y"][0] - 25.8) < 0.6
+        assert stars["saturated"].tolist()[:1] == [True]
+        assert stars["saturated"].sum() == 1
+        others = np.array([stars["x"], stars["y"]]).T[1:]
+        for place in PLACES[[1, 2, 4]]:
+            assert np.hypot(*(others - place).T).min() < 0.3
+
+    def test_bad_pixels_in_the_sky_are_no_stars(self):
+        image = make_image()
+        image[50:54, 60:63] = image[80, :] = np.nan
+        image[10, 90] = 1e6
+        mask = np.zeros(SHAPE, bool)
+        mask[10, 90] = True
+        assert_found(find_stars(image, PSF, mask=mask))
+
+
+@pytest.mark.parametrize(
+    ("image", "given", "message"),
+    [
+        (np.ones((2, 9, 9)), {}, "image has 3 dimensions; give one image"),
+        (np.full((9, 9), np.nan), {}, "image has no good pixel"),
+        (np.ones((9, 9)), {"threshold": 0.0}, "threshold must be more than 0; 0 was given"),
+        (np.ones((9, 9)), {"threshold": np.nan}, "threshold must be more than 0; nan was given"),
+        (np.ones((9, 9)), {"mask": np.zeros((9, 8), bool)}, r"shape \(9, 8\) must be booleans"),
+        (np.ones((9, 9)), {"mask": np.zeros((9, 9))}, "mask of type float64"),
+        (np.ones((9, 9)), {"psf": np.zeros((5, 5))}, "psf of shape .* positive"),
+        (np.ones((9, 9)), {"psf": np.ones(5)}, "psf of shape"),
+    ],
+)
+def test_refusals(image, given, message):
+    with pytest.raises(InputError, match=message):
+        find_stars(image, **given)
+
+
+@pytest.mark.parametrize("value", [0.0, 5.0])
+def test_a_flat_image_has_no_star(value):
+    assert len(find_stars(np.full((40, 40), value))) == 0
+
+
+def test_without_photutils_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "photutils.background", None)
+    with pytest.raises(LnoclError, match=r"pip install photutils$"):
+        find_stars(make_image())
