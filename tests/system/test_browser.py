@@ -2,12 +2,15 @@
 
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 from result_views import make_view
 
 from lnocl.plotting.report import make_report
+
+PAGES = sorted((Path(__file__).parents[2] / "docs" / "look").glob("*.html"))
 
 pytestmark = pytest.mark.system
 selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
@@ -86,6 +89,17 @@ def test_it_loads_without_a_fault_and_asks_for_no_file(page):
     entries = "return performance.getEntriesByType('resource').map((each) => each.name)"
     assert all(name.startswith("data:") for name in page.execute_script(entries))
     assert "the model fits" in page.find_element("tag name", "body").text
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_the_pages_in_docs_are_shown(path, browser):
+    assert path.stat().st_size < 3e6
+    browser.get_log("browser")
+    browser.get(path.as_uri())
+    wait_for(browser, lambda: layer(browser) == "image")
+    browser.find_element("tag name", "body").send_keys("4")
+    wait_for(browser, lambda: layer(browser) == "extended source")
+    assert browser.get_log("browser") == []
 
 
 def test_each_button_shows_its_picture(page):
