@@ -21,6 +21,8 @@ REACH, SECTORS = 12.0, 8
 MUCH_HALO, MUCH_SHARE = 0.1, 0.05
 # A misfit is this many times the noise, and as many standard errors above it.
 MISFIT, SIGNIFICANCE = 1.5, 5.0
+# Less than this share of the noise is not what an estimate that follows it leaves.
+OVERFIT = 0.6
 
 
 class Fit(NamedTuple):
@@ -70,6 +72,11 @@ class Fit(NamedTuple):
     def is_misfit(self) -> bool:
         """Whether the rms is far above what noise gives."""
         return self.rms > max(MISFIT, 1.0 + SIGNIFICANCE * self.error)
+
+    @property
+    def is_overfit(self) -> bool:
+        """Whether the rms is far below what noise gives."""
+        return self.rms < min(OVERFIT, 1.0 - SIGNIFICANCE * self.error)
 
 
 class StarResiduals(NamedTuple):

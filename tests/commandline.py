@@ -54,7 +54,9 @@ def command_files(tmp_path_factory):
         "nanpsf": nan_psf,
         "negative": psfs[0] - 1e-3,
     }
-    header = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 15.25})
+    header = fits.Header(
+        {"BUNIT": "electron", "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 15.25}
+    )
     for name, array in arrays.items():
         fits.writeto(folder / f"{name}.fits", array, header)
     (folder / "text.fits").write_text("no FITS at all\n" * 400)

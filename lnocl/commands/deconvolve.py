@@ -55,7 +55,7 @@ def _run(arguments: argparse.Namespace) -> None:
         at_stars = result.star_residuals()
         view = _view(arguments, result, frames)
         overall = Fit.of(view.residuals, view.models) if arguments.residuals and view else None
-        said = summarise(arguments, result, frames, at_stars, overall)
+        said = summarise(arguments, result, frames, at_stars, overall, bool(warned))
         _write(arguments, result, frames, given, at_stars, view, wcs, [*warned, *said])
         said.append(f"written to {arguments.output}")
         if arguments.plot is not None and view is not None:

@@ -32,6 +32,7 @@ def summarise(
     frames: Frames,
     at_stars: Sequence[StarResiduals],
     overall: Fit | None,
+    is_warned: bool,
 ) -> list[str]:
     """Return how a reconstruction ended, what it found, and whether the model fits, a line each."""
     objective = result.history["objective"][-1]
@@ -51,7 +52,7 @@ def summarise(
         f"extended source: {result.extended.sum() / frames.electrons:.6g} {unit}",
         *([] if overall is None else [f"residuals {_rms(overall)} in all, where noise gives 1"]),
         *_shortness(arguments, result),
-        *_verdict(result, at_stars, overall),
+        *_verdict(result, at_stars, overall, is_warned),
     ]
 
 
@@ -68,10 +69,16 @@ def _rms(fit: Fit) -> str:
     return f"{fit.rms:.2f} +- {fit.error:.2f}" if fit.n_pixels else "unknown (no good pixel)"
 
 
-def _verdict(result: Result, at_stars: Sequence[StarResiduals], overall: Fit | None) -> list[str]:
+def _verdict(
+    result: Result, at_stars: Sequence[StarResiduals], overall: Fit | None, is_warned: bool
+) -> list[str]:
     """Return whether the model fits, and where not what to do."""
-    unfitted, lit = [], []
-    for (x, y), found in zip(result.star_positions, at_stars, strict=True):
+    unfitted, lit, dark = [], [], []
+    for (x, y), flux, found in zip(
+        result.star_positions, result.star_fluxes, at_stars, strict=True
+    ):
+        if not flux > 0:
+            dark.append(f"({x:.7g}, {y:.7g})")
         if found.is_misfit:
             unfitted.append(f"({x:.7g}, {y:.7g})")
         if found.has_halo:
@@ -95,6 +102,17 @@ def _verdict(result: Result, at_stars: Sequence[StarResiduals], overall: Fit | N
             )
     elif overall is not None and overall.is_misfit:
         verdict.append("the model does not fit: see to background, noise and gain")
+    if dark:
+        verdict.append(
+            f"no light is left for {counted(len(dark), 'star')}, {' '.join(dark[:3])}: there is "
+            "none, or it is elsewhere; lnocl stars finds where"
+        )
+    fits = [overall] if overall is not None else [found.wings for found in at_stars]
+    if any(fit.is_overfit for fit in fits):
+        verdict.append(
+            "the residuals are far less than noise: the noise that is taken is too large; see to "
+            "unit, gain, exposure, background and read noise"
+        )
     if lit:
         verdict.append(
             f"light lies all round {counted(len(lit), 'star')}, as a share of its flux: "
@@ -102,5 +120,6 @@ def _verdict(result: Result, at_stars: Sequence[StarResiduals], overall: Fit | N
             "too low, or a source lies there"
         )
     if at_stars or overall is not None:
-        verdict = verdict or ["the model fits"]
+        fitting = "the model fits, but see the warnings above" if is_warned else "the model fits"
+        verdict = verdict or [fitting]
     return verdict

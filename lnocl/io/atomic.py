@@ -86,11 +86,11 @@ def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None
     """
     if path.lower().endswith(COMPRESSED):
         raise InputError(f"the output {path} is not compressed; give it a name ending in .fits")
+    for source in inputs:
+        if os.path.exists(path) and os.path.exists(source) and os.path.samefile(source, path):
+            raise InputError(f"the output {path} is one of the inputs; give it another name")
     _check_replaceable(path, overwrite)
     target = os.path.realpath(path)
-    for source in inputs:
-        if os.path.exists(target) and os.path.exists(source) and os.path.samefile(source, target):
-            raise InputError(f"the output {path} is one of the inputs; give it another name")
     if not os.path.isdir(os.path.dirname(target)):
         raise FileError(f"the folder of the output {path} does not exist; create it first")
     temporary = _temporary_beside(target)

@@ -20,6 +20,9 @@ from lnocl.process import ignored_warnings
 
 log = logging.getLogger("lnocl")
 
+# A last axis that is so short, with longer ones before it, is none of pixels.
+MAX_CHANNELS = 4
+
 # Beginnings of CTYPE3 of cubes whose planes are not of one sky: colours, energies, velocities,
 # polarisations.
 NOT_EXPOSURES = (
@@ -262,7 +265,15 @@ def _check_shape(
 ) -> None:
     found = f"{path} has an image of {counted(len(shape), 'dimension')}"
     if alone and len(shape) not in (2, 3):
-        raise InputError(f"{found}; two are needed, or three for a cube")
+        raise InputError(
+            f"{found}; two are needed, or three for a cube of images: leave out the others, such "
+            "as axes of length 1"
+        )
+    if alone and shape[-1] <= MAX_CHANNELS < min(shape[:-1]):
+        raise InputError(
+            f"{path} has the shape {shape}: its last axis is of colours or channels; give one of "
+            "them, as an image of its own"
+        )
     if not alone and len(shape) != 2:
         raise InputError(f"{found}; each of several files needs two (a cube must be the only file)")
     if shape != first_shape:
@@ -274,6 +285,7 @@ def _check_shape(
 def _refuse_colours(path: str, kind: str) -> None:
     if kind.startswith(NOT_EXPOSURES):
         raise InputError(
-            f"{path} is a cube along {kind}, which are not several images of one sky; give one "
-            "plane in a file of its own, or take CTYPE3 out of its header if they are"
+            f"{path} is a cube along {kind}, whose planes are not images of one sky; give one "
+            "plane, in a file of its own. If they are images of one sky, take CTYPE3 out of its "
+            "header"
         )

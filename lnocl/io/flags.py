@@ -37,6 +37,22 @@ def good_bits_of(telescope: str, instrument: str, detector: str) -> str:
     return next(found, NO_BITS)
 
 
+def most_common_flag(sums: NDArray[Any]) -> tuple[int, int]:
+    """Return the flag that most sums of flags have, and how many have it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lnocl.io.flags import most_common_flag
+    >>> most_common_flag(np.array([1 + 4, 4, 16]))
+    (4, 2)
+    """
+    whole = np.asarray(sums).astype(np.int64)
+    counts = {1 << bit: int(((whole >> bit) & 1).sum()) for bit in range(32)}
+    flag = max(counts, key=lambda each: counts[each])
+    return flag, counts[flag]
+
+
 def bad_pixels(flags: NDArray[Any], good_bits: str, path: str) -> NDArray[np.bool_]:
     """Return where flags have any that are a fault.
 

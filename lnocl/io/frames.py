@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lnocl.errors import InputError, counted, warn
 from lnocl.io import sky
 from lnocl.io.fitsread import read_extension, read_keyword, read_stack
-from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of
+from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
 from lnocl.io.levels import sky_level, sky_noise
 from lnocl.io.maps import Maps, Word
 from lnocl.io.noise import VARIANCES, NoiseMap, electrons_by_variance, read_noise_map
@@ -272,10 +272,12 @@ class _Reader:
             factor, are_rates = units.count_of(unit, (*units.COUNTS, "adu")) or (1.0, False)
             return gain * factor, are_rates
         counts = units.count_of(unit)
+        if not self._bunit(0):
+            log.info("%s has no BUNIT: its unit is taken to be electrons", self._paths[0])
         if counts is None:
             raise InputError(
-                f"{self._paths[0]} is in {self._bunit(0)}, not in counts; give gain, "
-                "the electrons for each of these units"
+                f"{self._paths[0]} is in {self._bunit(0)}, not in counts; give gain, the electrons "
+                "for each of these units: a number, or a keyword of its header such as GAIN"
             )
         return counts
 
@@ -308,7 +310,9 @@ class _Reader:
         found = [self._from_header("gain", j, word) for j in range(len(self._paths))]
         for path, gain in zip(self._paths, found, strict=True):
             if gain is None:
-                raise InputError(f"{path} has no {word} in its header; give gain as a number")
+                raise InputError(
+                    f"{path} has no {word} in its header; give gain as a number or another keyword"
+                )
             if gain != found[0]:
                 raise InputError(
                     f"the images have several gains: {word} of {self._paths[0]} is {found[0]:g}, "
@@ -364,7 +368,7 @@ class _Reader:
         given = {kind: getattr(self._calibration, kind) for kind in VARIANCES}
         found = read_noise_map(given, self._maps, lambda: self._extensions("ERR", "error"))
         if found is not None and any(self._calibration.read_noise):
-            raise InputError(f"give read_noise or {found.kind}, which includes it, not both")
+            raise InputError(f"give read_noise, or give {found.kind}, which includes it, not both")
         return found
 
     def _mask(self, exposure: Array | None, noise: NoiseMap | None) -> Mask:
@@ -416,6 +420,9 @@ class _Reader:
                 log.info("%s: of the flags in DQ %s are no fault", path, good_bits)
             of_file = slice(None) if len(self._paths) == 1 else slice(j, j + 1)
             flagged[of_file] = bad_pixels(sums[of_file], good_bits, path)
+            flag, n = most_common_flag(sums[of_file][flagged[of_file]])
+            if n:
+                log.info("%s: %s the flag %d of DQ", path, _have(n), flag)
         return flagged
 
     def _extensions(self, name: str, instead: str) -> Array:
@@ -428,8 +435,7 @@ class _Reader:
             values = read_extension(path, name)
             if values is None:
                 raise InputError(
-                    f"{path} has no extension {name}; give {instead} as a file, or leave "
-                    f"{name.lower()} out"
+                    f"{path} has no extension {name}; give {instead} as a file, or leave it out"
                 )
             if values.shape not in shapes:
                 raise InputError(
@@ -471,6 +477,10 @@ class _Reader:
         for j, (dx, dy) in enumerate(found[1:], 2):
             log.info("image %d: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
         return found
+
+
+def _have(n: int) -> str:
+    return f"{counted(n, 'pixel')} {'has' if n == 1 else 'have'}"
 
 
 def _maps(values: Array) -> Array:

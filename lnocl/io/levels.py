@@ -23,7 +23,7 @@ def sky_level(j: int, counts: Array, mask: Mask) -> float:
     InputError
         No pixel is good.
     """
-    median, scatter = _clipped(j, counts, mask)
+    median, scatter = clipped_sky(j, counts, mask)
     log.info(
         "image %d: background %.6g electrons per pixel, scatter %.3g (sigma-clipped median)",
         j + 1,
@@ -47,14 +47,20 @@ def sky_noise(j: int, counts: Array, mask: Mask) -> float:
     InputError
         No pixel is good.
     """
-    median, scatter = _clipped(j, counts, mask)
+    median, scatter = clipped_sky(j, counts, mask)
     noise = float(np.sqrt(max(scatter**2 - max(median, 0.0), 0.0)))
     log.info("image %d: read noise %.4g electrons (sigma-clipped scatter)", j + 1, noise)
     return noise
 
 
-def _clipped(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
-    """Return the sigma-clipped median and scatter of the good pixels of image j."""
+def clipped_sky(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
+    """Return the sigma-clipped median and scatter of the good pixels of image j.
+
+    Raises
+    ------
+    InputError
+        No pixel is good.
+    """
     from astropy.stats import sigma_clipped_stats
 
     good = counts[~mask & np.isfinite(counts)]

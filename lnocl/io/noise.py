@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError, counted
+from lnocl.io.levels import clipped_sky
 from lnocl.io.maps import Maps
 from lnocl.scene.observation import Array
 
@@ -22,6 +23,8 @@ VARIANCES: Mapping[str, Callable[[Array], Array]] = {
     "rms": np.square,
     "error": np.square,
 }
+# No image has so many times the noise that its sky shows.
+TOO_NOISY = 5.0
 # The share of pixels that are the brightest.
 BRIGHT = 0.01
 # The flags DO_NOT_USE, SATURATED and JUMP_DET of JWST: the counts of such a pixel were not summed
@@ -60,9 +63,11 @@ class NoiseMap(NamedTuple):
         Raises
         ------
         InputError
-            A map with the source's noise that has less of it than counts have.
+            A map whose noise is far more than the sky scatters; one with the source's noise that
+            has less of it than counts have.
         """
         variance = np.where(mask, 0.0, each**2 * self.variance)
+        self._refuse_other_kinds(counts, variance, mask)
         if self.kind != WITH_SOURCE:
             return np.asarray(np.sqrt(variance))
         variance -= np.where(mask, 0.0, counts.clip(0.0))
@@ -83,6 +88,21 @@ class NoiseMap(NamedTuple):
                 "has" if n_below == 1 else "have",
             )
         return np.asarray(np.sqrt(variance.clip(0.0)))
+
+    def _refuse_other_kinds(self, counts: Array, variance: Array, mask: NDArray[np.bool_]) -> None:
+        """Refuse a map of another kind than it is given as: its noise is not in the image."""
+        for j, bad in enumerate(mask):
+            if bad.all():
+                continue
+            noise = float(np.sqrt(np.median(variance[j][~bad])))
+            _, scatter = clipped_sky(j, counts[j], bad)
+            if noise > TOO_NOISY * scatter > 0:
+                others = ", ".join(kind for kind in VARIANCES if kind != self.kind)
+                raise InputError(
+                    f"{self.kind} says that the noise of image {j} is {noise:.3g} electrons, and "
+                    f"its sky scatters by {scatter:.3g}: see to its unit, or give it as what it is "
+                    f"({others})"
+                )
 
 
 def electrons_by_variance(

@@ -122,7 +122,10 @@ def read_result(path: str) -> SavedResult:
     if len(cubes) < len(CUBES):
         cubes = {}
     if fault := _fault(extended, tables, cubes, doubtful):
-        raise FileError(f"{path} is not a result or truth written by lnocl: {fault}")
+        raise FileError(
+            f"{path} is not a result or truth written by lnocl, such as OUT.fits of lnocl "
+            f"deconvolve: {fault}"
+        )
     p = len(cubes["MODELS"]) if cubes else 0
     offsets = [
         [number(path, cards, f"OFF{axis}{j}") or 0.0 for axis in "XY"] for j in range(1, p + 1)

@@ -249,7 +249,7 @@ def _compare(
         raise InputError(
             f"{path} has its star in row {row} at {positions[row][0]:.2f}, {positions[row][1]:.2f} "
             f"by {' and '.join(names)}, which {image} has at {by_sky[row][0]:.2f}, "
-            f"{by_sky[row][1]:.2f} by {' and '.join(sky_names)}: leave one of the two out"
+            f"{by_sky[row][1]:.2f} by {' and '.join(sky_names)}: delete the columns that are wrong"
         )
 
 

@@ -123,8 +123,8 @@ def _by_spec(spec: str, source: str) -> cl.Device:
     if platform is not None:
         device = _pick(_devices_of(platform), device_part or "0", lambda candidate: candidate.name)
     if device is None:
-        known = "; ".join(f"{spec_of(found)} is {describe(found)}" for found in find_devices())
-        raise InputError(f"{source} {spec!r} fits no OpenCL device; {known}")
+        known = "; ".join(f"{spec_of(found)} for {describe(found)}" for found in find_devices())
+        raise InputError(f"{source} {spec!r} fits no OpenCL device; give one of these: {known}")
     return device
 
 

@@ -281,7 +281,7 @@ def draw_choice(axis: Axes, view: ResultView) -> None:
             rows = table["smoothing"] == value
             name = f"{value:.2g}"
             axis.plot(table["iteration"][rows], table["error"][rows], **line_style(i), label=name)
-        axis.set_title("held-out counts: the last iteration within a tenth of the least", fontsize=9)
+        axis.set_title("held-out counts: the last within a tenth of the least is taken", fontsize=9)
         axis.set_ylabel("estimated relative error", fontsize=9)
         axis.legend(fontsize=8, title="smoothing", title_fontsize=8)
     elif view.history:

@@ -229,7 +229,10 @@ class Observation:
 
     def _refuse_all_masked(self) -> None:
         if self.mask.all():
-            raise InputError("all pixels are masked; there is nothing to reconstruct from")
+            raise InputError(
+                "all pixels are masked; a mask is True, or not 0, where a pixel is bad: turn it "
+                "round if it marks the good ones"
+            )
         self.images[self.mask] = 0.0
 
     def _check_exposure(self, exposure: ArrayLike) -> Array:
@@ -313,8 +316,9 @@ class Observation:
         if n_negative := int(negative.sum()):
             self.images[negative] = 0.0
             warn(
-                f"{_pixels(n_negative, 'image', 'negative', 'set to 0')}; if the images are "
-                "background-subtracted, add the background back and give it as background"
+                f"{_pixels(n_negative, 'image', 'negative', 'set to 0')}; if the sky was "
+                "subtracted, give the noise that it left as read_noise, or add the sky to the "
+                "images and give it as background"
             )
 
 
@@ -373,8 +377,12 @@ def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:
             f"{counted(len(stack), 'psf')} for {counted(n_images, 'image')}; give one, or one for "
             "each image"
         )
-    if not np.isfinite(stack).all():
-        raise InputError("psfs hold values that are not finite; repair them first")
+    if (bad := ~np.isfinite(stack)).any():
+        j, y, x = np.argwhere(bad)[0]
+        raise InputError(
+            f"psf {j} is not finite in {counted(int(bad[j].sum()), 'pixel')}, the first at "
+            f"({x}, {y}): interpolate, or make it of the star's frame with lnocl psf"
+        )
     with np.errstate(over="ignore", invalid="ignore"):
         sums = stack.sum(axis=(1, 2), keepdims=True)
         sizes = np.array([abs(psf).sum(keepdims=True) for psf in stack])
@@ -384,7 +392,7 @@ def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:
         j = int(np.argmax(unusable))
         raise InputError(
             f"psf {j} has the sum {sums.flat[j]:g}; it must be positive, finite and more than the "
-            "rounding of its values"
+            "rounding of its values: give another, or subtract less of a background from it"
         )
     if n_negative := int((stack < 0).sum()):
         warn(_pixels(n_negative, "psf", "negative", "kept"))

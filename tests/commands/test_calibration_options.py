@@ -222,6 +222,8 @@ class TestFrames:
             "image 2: exposure 60 seconds, from EXPTIME",
             "image 1: 1 pixel masked by the mask",
             "image 2: 1 pixel masked by the mask",
+            "f1.fits: 1 pixel has the flag 8 of DQ",
+            "f2.fits: 1 pixel has the flag 8 of DQ",
             "image 1: 1 pixel masked by the extension DQ",
             "image 2: 1 pixel masked by the extension DQ",
             "image 1: 1 pixel masked as saturated, at 1000 or above",

@@ -30,7 +30,7 @@ BAD_FILES = {
     "missing psf": ({"psf": "no.fits"}, 1, "no.fits cannot be opened"),
     "psf count": ({"psf": "three.fits"}, 2, "3 psfs for 1 image"),
     "zero psf": ({"psf": "zero.fits"}, 2, "sum"),
-    "nan psf": ({"psf": "nanpsf.fits"}, 2, "psfs hold values that are not finite"),
+    "nan psf": ({"psf": "nanpsf.fits"}, 2, "psf 1 is not finite in 1 pixel, the first at (0, 0)"),
     "output exists": ({"output": "there.fits"}, 1, "there.fits exists; give another name"),
     "no folder": ({"output": "no/out.fits"}, 1, "the folder of the output no/out.fits does not"),
     "output is input": (
@@ -114,7 +114,7 @@ BAD_ARGUMENTS = {
     "mask": (
         ["--mask", "dq"],
         2,
-        "a.fits has no extension DQ; give --mask as a file, or leave dq out",
+        "a.fits has no extension DQ; give --mask as a file, or leave it out",
     ),
     "error": (["--error", "err"], 2, "a.fits has no extension ERR; give --error as a file, or "),
     "two kinds of noise": (

@@ -219,8 +219,9 @@ class TestRefusedFiles:
         with pytest.raises(InputError) as caught:
             fitsread.read_stack([path])
         assert str(caught.value) == (
-            f"{path} is a cube along {kind.upper()}, which are not several images of one sky; give "
-            "one plane in a file of its own, or take CTYPE3 out of its header if they are"
+            f"{path} is a cube along {kind.upper()}, whose planes are not images of one sky; give "
+            "one plane, in a file of its own. If they are images of one sky, take CTYPE3 out of "
+            "its header"
         )
 
     @pytest.mark.parametrize(

@@ -105,7 +105,8 @@ class TestUnits:
         with pytest.raises(InputError) as caught:
             observe(exposure=[20.0])
         assert str(caught.value) == (
-            f"1.fits is in {unit}, not in counts; give gain, the electrons for each of these units"
+            f"1.fits is in {unit}, not in counts; give gain, the electrons "
+            "for each of these units: a number, or a keyword of its header such as GAIN"
         )
         expected = IMAGES * (2.0 if unit not in DIGITAL_RATES else 40.0)
         np.testing.assert_array_equal(observe(exposure=[20.0], gain=2.0).images, expected)

@@ -311,7 +311,7 @@ class TestNoise:
         with pytest.raises(InputError) as caught:
             observe(error=["err"])
         assert str(caught.value) == (
-            "1.fits has no extension ERR; give error as a file, or leave err out"
+            "1.fits has no extension ERR; give error as a file, or leave it out"
         )
         with pytest.raises(InputError, match=r"^give variance, or give rms: each is all there"):
             observe(rms=["map.fits"], variance=["map.fits"])
@@ -342,7 +342,7 @@ class TestNoise:
             observe(inverse_variance=["inverse.fits"])
         save("inverse.fits", MAP)
         with pytest.raises(
-            InputError, match="give read_noise or inverse_variance, which includes it"
+            InputError, match="give read_noise, or give inverse_variance, which includes it"
         ):
             observe(inverse_variance=["inverse.fits"], read_noise=[1.0])
         observe(inverse_variance=["inverse.fits"], read_noise=[0.0])
@@ -391,6 +391,8 @@ class TestMask:
             "2.fits: the image is HDU 1 (SCI)",
             "image 1: 1 pixel masked by the mask",
             "image 2: 1 pixel masked by the mask",
+            "1.fits: 1 pixel has the flag 4 of DQ",
+            "2.fits: 1 pixel has the flag 4096 of DQ",
             "image 1: 0 pixels masked by the extension DQ",
             "image 2: 1 pixel masked by the extension DQ",
         ]
@@ -458,7 +460,7 @@ class TestMask:
         with pytest.raises(InputError) as caught:
             observe(mask=["dq"])
         assert (
-            str(caught.value) == "2.fits has no extension DQ; give mask as a file, or leave dq out"
+            str(caught.value) == "2.fits has no extension DQ; give mask as a file, or leave it out"
         )
         save_with_dq("3.fits", IMAGES[1], NONE[1].T.astype("i2"))
         with pytest.raises(InputError) as caught:

@@ -249,7 +249,7 @@ class TestTables:
             stars("t.csv")
         assert str(caught.value) == (
             "t.csv has its star in row 1 at 7.00, 12.35 by x and y, which a.fits has at 7.00, "
-            "11.25 by ra and dec: leave one of the two out"
+            "11.25 by ra and dec: delete the columns that are wrong"
         )
 
     @pytest.mark.parametrize(

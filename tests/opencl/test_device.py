@@ -67,7 +67,9 @@ def test_environment_decides_where_nothing_is_asked_for(machine, monkeypatch):
 
 @pytest.mark.parametrize("spec", ["2", "0:2", "nosuch", "vendor:cpu", "", ":0"])
 def test_unknown_device_is_refused_with_what_there_is(machine, spec):
-    with pytest.raises(lnocl.InputError, match=r"fits no OpenCL device; 0:0 is Slow CPU") as error:
+    with pytest.raises(
+        lnocl.InputError, match=r"fits no OpenCL device; give one of these: 0:0 for Slow CPU"
+    ) as error:
         device.choose(spec)
     assert "\n" not in str(error.value)
 

@@ -273,8 +273,11 @@ REFUSED = {
     "PSF that sums to zero": ({"psfs": [PSF, PSF, 0 * PSF]}, "psf 2 has the sum 0;"),
     "PSF with a negative sum": ({"psfs": [PSF, -PSF, PSF]}, "psf 1 has the sum -8;"),
     "two such PSFs": ({"psfs": [PSF, 0 * PSF, -PSF]}, "psf 1 has the sum 0;"),
-    "NaN in a PSF": ({"psfs": [PSF, PSF, PSF * np.nan]}, "psfs hold values that are not finite"),
-    "infinite PSF": ({"psfs": np.where(PSF == 4, np.inf, PSF)}, "psfs hold values that are not"),
+    "NaN in a PSF": ({"psfs": [PSF, PSF, PSF * np.nan]}, "is not finite in "),
+    "infinite PSF": (
+        {"psfs": np.where(PSF == 4, np.inf, PSF)},
+        "is not finite in 1 pixel, the first at (1, 1): ",
+    ),
     "PSF whose sum overflows": (
         {"psfs": [PSF, np.full((2, 3), 1e308), PSF]},
         "psf 1 has the sum inf; it must be positive, finite and more than",
@@ -552,7 +555,7 @@ def test_one_pixel_is_said_to_be_one():
     _, messages, _ = announced(images=images, psfs=np.where(PSF == 2, -0.5, PSF))
     starts = ("1 psf pixel is negative and was kept", "1 image pixel is not finite and was masked")
     assert tuple(messages[:2]) == starts
-    assert messages[2].startswith("1 image pixel is negative and was set to 0; if the images are ")
+    assert messages[2].startswith("1 image pixel is negative and was set to 0; if the sky was ")
 
 
 def test_negative_psf_pixels_are_kept_and_counted():

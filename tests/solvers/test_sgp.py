@@ -281,6 +281,7 @@ def test_objective_never_rises_in_any_scene(scene, mu):
 
 
 @settings(max_examples=10, deadline=None)
+@pytest.mark.filterwarnings("ignore:.*lies on bad pixels")
 @given(scene=small_scenes(logarithmic(-3, 3)), mu=logarithmic(-5, 1))
 def test_convergence_is_claimed_at_the_minimum_alone(scene, mu):
     result = solve(**scene, mu=mu, n_iter=600)  # of which three quarters converge
