@@ -32,9 +32,11 @@ DARKER = 0.1587
 MOST_BAD = 50.0
 # Side of the square in which a star's width is fitted, pixels, and the least width that is one.
 FIT_SIDE, LEAST_WIDTH = 11, 0.8
-# A saturated star is a region of bad pixels up to so many PSF widths across, inside a ring whose
-# median is so many times as significant as a star must be.
-MOST_SATURATED, OF_RING = 4.0, 4.0
+# A saturated star is a region of bad pixels inside a ring whose median is so many times as
+# significant as a star must be.
+OF_RING = 4.0
+# Trails of bleeding are so many rows or columns wide, at most.
+TRAIL = 3
 # Pixels above this share of the brightest star are a ring, where darker ones lie inside them.
 HOLLOW = 0.3
 
@@ -56,7 +58,8 @@ def find_stars(
     Parameters
     ----------
     image : array_like, shape (ny, nx)
-        In any linear unit; pixels that are not finite are bad.
+        In any linear unit; pixels that are not finite are bad, and so are blocks of exactly 0 in an
+        image that is not of whole counts.
     psf : array_like, shape (ky, kx), optional
         Its PSF. Without it the width is measured on the image's own stars, and no wings are known.
     threshold : float, optional
@@ -105,16 +108,14 @@ def find_stars(
         width = _measure_width(above, bad, threshold)
         above, noise = _significance(pixels, bad, width)
     found = _candidates(above, bad, width, threshold)
-    saturated = bad | _holes(above * noise)
+    saturated = bad | _holes(above * np.where(np.isfinite(noise), noise, 0.0))
     if saturation is not None:
         saturated |= pixels >= saturation
-    cores = _saturated_stars(above, saturated, width, threshold)
-    apart = [np.hypot(*(star[:2] - cores[:, :2]).T).min(initial=np.inf) for star in found]
-    found = found[np.array(apart) > MOST_SATURATED * width / 2.0]
-    stars, is_saturated = (
-        np.concatenate([cores, found]),
-        np.arange(len(cores) + len(found)) < len(cores),
-    )
+    cores, covered = _saturated_stars(above, saturated, width, threshold)
+    found = found[~_at(covered, found)]
+    touched = ndimage.binary_dilation(saturated, np.ones((3, 3)))
+    stars = np.concatenate([cores, found])
+    is_saturated = np.concatenate([np.ones(len(cores), bool), _at(touched, found)])
     if shape is not None:
         kept = ~_in_wings(stars, shape)
         stars, is_saturated = stars[kept], is_saturated[kept]
@@ -130,7 +131,7 @@ def _check(
         raise InputError(f"image has {counted(pixels.ndim, 'dimension')}; give one image")
     if not threshold > 0:
         raise InputError(f"threshold must be more than 0; {threshold:g} was given")
-    bad = ~np.isfinite(pixels)
+    bad = ~np.isfinite(pixels) | _outside(pixels)
     if mask is not None:
         given = np.asarray(mask)
         if given.dtype != np.bool_ or given.shape != pixels.shape:
@@ -142,6 +143,36 @@ def _check(
     if bad.all():
         raise InputError("image has no good pixel; give another, or another mask")
     return pixels, bad
+
+
+def _at(flags: NDArray[np.bool_], stars: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return the flags at the pixels of stars."""
+    row, column = _pixels_of(stars, flags.shape)
+    return flags[row, column]
+
+
+def _pixels_of(
+    stars: NDArray[np.float64], shape: tuple[int, ...]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return row and column of the pixel of each star, or of the nearest to it."""
+    x, y = np.round(stars[:, :2].T).astype(np.int64)
+    return y.clip(0, shape[0] - 1), x.clip(0, shape[1] - 1)
+
+
+def _outside(pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return blocks of pixels of exactly 0 in an image that is not of whole counts.
+
+    They are outside the field: a mosaic has 0 there.
+    """
+    empty = pixels == 0
+    if not empty.any() or _are_counts(pixels[np.isfinite(pixels)]) or not pixels.any():
+        return np.zeros(pixels.shape, bool)
+    return ndimage.binary_opening(empty, np.ones((3, 3)))
+
+
+def _are_counts(values: NDArray[np.float64]) -> bool:
+    """Return whether these are whole counts, and not all of them alike."""
+    return bool((values >= 0).all() and (values == np.round(values)).all() and np.ptp(values) > 0)
 
 
 def _check_psf(psf: ArrayLike) -> NDArray[np.float64]:
@@ -165,19 +196,41 @@ def _import_photutils() -> Any:
     return photutils
 
 
-def _significance(
+def _sky(
     pixels: NDArray[np.float64], bad: NDArray[np.bool_], width: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what is above the sky over its noise, 0 where a pixel is bad; and that noise."""
+    """Return the sky's level and its noise at each pixel; the noise is 0 where all is flat.
+
+    Of whole counts it is that of Poisson counts at least, since a median of few counts is 0.
+    """
+    from astropy.stats import sigma_clipped_stats
+
     photutils = _import_photutils()
     box = min(max(MIN_BOX, round(BOX_WIDTHS * width)), *pixels.shape)
     with ignored_warnings():  # of pixels that are not finite
-        sky = photutils.background.Background2D(
-            pixels, box, mask=bad, exclude_percentile=MOST_BAD, fill_value=np.nan
-        )
-    noise = np.where(sky.background_rms > 0, sky.background_rms, np.finfo(float).tiny)
-    is_known = ~bad & (sky.background_rms > 0)
-    return np.divide(pixels - sky.background, noise, np.zeros(noise.shape), where=is_known), noise
+        try:
+            sky = photutils.background.Background2D(
+                pixels, box, mask=bad, exclude_percentile=MOST_BAD
+            )
+        except ValueError:  # no box has enough good pixels
+            _, level, noise = sigma_clipped_stats(pixels[~bad])
+            return np.full(pixels.shape, level), np.full(pixels.shape, noise)
+    noise = sky.background_rms
+    if _are_counts(pixels[~bad]):
+        means = ndimage.uniform_filter(np.where(bad, 0.0, pixels), box)[~bad]
+        noise = np.maximum(noise, np.sqrt(max(float(np.quantile(means, 0.25)), 1.0 / box**2)))
+    return sky.background, noise
+
+
+def _significance(
+    pixels: NDArray[np.float64], bad: NDArray[np.bool_], width: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what is above the sky over its noise, 0 where it is not known; and that noise."""
+    level, noise = _sky(pixels, bad, width)
+    # In a flat part, such as one outside the field, there is no noise to compare with.
+    is_known = ~bad & (noise > 1e-6 * np.median(noise[~bad]))
+    noise = np.where(is_known, noise, np.inf)
+    return np.where(is_known, (pixels - level) / noise, 0.0), noise
 
 
 def _candidates(
@@ -187,9 +240,11 @@ def _candidates(
     photutils = _import_photutils()
     filled = _filled(above, bad, width)
     finder = photutils.detection.DAOStarFinder(1.0, width)
-    filtered = ndimage.convolve(filled, finder.kernel.data, mode="nearest")[~bad]
+    filtered = ndimage.convolve(filled, finder.kernel.data, mode="nearest")[~bad & (above != 0)]
     # By its darker half, in which no star is; neighbouring pixels may share their noise.
-    noise = float(np.median(filtered) - np.quantile(filtered, DARKER))
+    noise = float(np.median(filtered) - np.quantile(filtered, DARKER)) if filtered.size else 0.0
+    if not noise > 0:
+        return np.zeros((0, 3))
     finder = photutils.detection.DAOStarFinder(
         threshold * noise, width, min_separation=SEPARATION * width, scale_threshold=False
     )
@@ -207,14 +262,12 @@ def _filled(
     above: NDArray[np.float64], bad: NDArray[np.bool_], width: float
 ) -> NDArray[np.float64]:
     """Return an image whose bad pixels have the mean of those near them."""
-    from astropy.convolution import Gaussian2DKernel, convolve_fft
-
     if not bad.any():
         return above
-    smooth = convolve_fft(
-        np.where(bad, np.nan, above), Gaussian2DKernel(width / 2.0), boundary="fill"
-    )
-    return np.where(bad, np.nan_to_num(smooth), above)
+    known = ndimage.gaussian_filter((~bad).astype(float), width / 2.0)
+    smooth = ndimage.gaussian_filter(np.where(bad, 0.0, above), width / 2.0)
+    near = np.divide(smooth, known, out=np.zeros(above.shape), where=known > 1e-6)
+    return np.where(bad, near, above)
 
 
 def _measure_width(above: NDArray[np.float64], bad: NDArray[np.bool_], threshold: float) -> float:
@@ -241,21 +294,28 @@ def _holes(light: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def _saturated_stars(
     above: NDArray[np.float64], saturated: NDArray[np.bool_], width: float, threshold: float
-) -> NDArray[np.float64]:
-    """Return x, y and brightest pixel round them of compact bad regions inside bright rings."""
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return x, y and the brightest pixel round them of bad regions inside bright rings.
+
+    Of a region with trails of bleeding it is the part that is wider than those. The second array
+    says which pixels are of these regions, or within a PSF width of them.
+    """
     labels, _ = ndimage.label(saturated, np.ones((3, 3)))
-    stars = []
+    stars, covered = [], np.zeros(saturated.shape, bool)
+    reach = max(1, round(width))
     for label, there in enumerate(ndimage.find_objects(labels), 1):
-        if max(part.stop - part.start for part in there) > MOST_SATURATED * width:
-            continue
-        wider = tuple(slice(max(part.start - 2, 0), part.stop + 2) for part in there)
-        core = labels[wider] == label
+        wider = tuple(slice(max(part.start - reach, 0), part.stop + reach) for part in there)
+        region = labels[wider] == label
+        lines = np.ones((1, TRAIL + 1)), np.ones((TRAIL + 1, 1))
+        thick = np.all([ndimage.binary_opening(region, line) for line in lines], axis=0)
+        core = thick if thick.any() else region
         ring = ndimage.binary_dilation(core, iterations=2) & ~saturated[wider]
         if not ring.any() or np.median(above[wider][ring]) < OF_RING * threshold:
             continue
         y, x = ndimage.center_of_mass(core)
         stars.append((x + wider[1].start, y + wider[0].start, above[wider][ring].max()))
-    return np.reshape(stars, (-1, 3))
+        covered[wider] |= ndimage.binary_dilation(region, iterations=reach)
+    return np.reshape(stars, (-1, 3)), covered
 
 
 def _in_wings(stars: NDArray[np.float64], psf: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -282,11 +342,9 @@ def _table(
     from astropy.table import Table
 
     x, y, significance = stars.T
-    row, column = (
-        np.round(each).astype(int).clip(0, n - 1)
-        for each, n in zip((y, x), noise.shape, strict=True)
-    )
-    peak = significance * noise[row, column]
+    at = noise[_pixels_of(stars, noise.shape)]
+    known = noise[np.isfinite(noise)]
+    peak = significance * np.where(np.isfinite(at), at, np.median(known) if known.size else 0.0)
     order = np.lexsort((-peak, ~saturated))
     columns = {"x": x, "y": y, "peak": peak, "significance": significance, "saturated": saturated}
     return Table({name: values[order] for name, values in columns.items()})

@@ -72,9 +72,14 @@ def thumbnail(image: NDArray[np.float64]) -> str:
 
 
 def block_means(image: NDArray[Any], step: int) -> NDArray[np.float64]:
-    """Return the means of blocks of good pixels, NaN where there is none; a rest is left out."""
-    ny, nx = (n // step for n in image.shape)
-    blocks = image[: ny * step, : nx * step].reshape(ny, step, nx, step).astype(np.float64)
+    """Return the means of the good pixels of blocks, NaN where there is none.
+
+    The last blocks are smaller where the step does not divide the sides.
+    """
+    rest = [(0, -n % step) for n in image.shape]
+    whole = np.pad(image.astype(np.float64), rest, constant_values=np.nan)
+    ny, nx = (n // step for n in whole.shape)
+    blocks = whole.reshape(ny, step, nx, step)
     known = np.isfinite(blocks)
     sums = np.where(known, blocks, 0.0).sum(axis=(1, 3))
     counts = known.sum(axis=(1, 3))

@@ -219,11 +219,12 @@ class Result:
     def write(
         self, path: str, *, header: fits.Header | None = None, overwrite: bool = False
     ) -> None:
-        """Write a FITS file as ``lnocl deconvolve`` does, which ``lnocl plot`` and ``report`` read.
+        """Write a FITS file, which ``lnocl plot`` and ``lnocl report`` read.
 
-        The primary HDU has the extended source, the tables STARS, HISTORY and HELDOUT what their
-        names say, MODELS and RESIDUALS those of each image; PSFS and others are there where PSFs
-        were refined. Units are electrons, per second where exposures were given.
+        It is that of ``lnocl deconvolve --models --residuals``, without the command and what was
+        said: the primary HDU has the extended source, the tables STARS, HISTORY and HELDOUT what
+        their names say, MODELS and RESIDUALS those of each image; PSFS and others are there where
+        PSFs were refined. Units are electrons, per second where exposures were given.
 
         Parameters
         ----------
@@ -247,8 +248,8 @@ class Result:
 
         path = os.fspath(path)
         atomic.check_fits_output(path, overwrite)
-        models = self.models()
-        parts = saved_parts(self)
+        models, parts = self.models(), saved_parts(self)
+        unit = "electron/s" if self._is_rate else "electron"
         fitswrite.write_result(
             path,
             self.extended,
@@ -266,7 +267,12 @@ class Result:
                 *parts.pop("cards"),
             ],
             overwrite=overwrite,
-            unit="electron/s" if self._is_rate else "electron",
+            unit=unit,
+            star_columns=fitswrite.error_columns(
+                self.star_position_errors, self.star_flux_errors, unit
+            )
+            if np.isfinite(self.star_flux_errors).any()
+            else [],
             cubes={"MODELS": (models, "electron"), "RESIDUALS": (self._residuals(models), "")},
             **parts,
         )

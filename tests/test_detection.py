@@ -111,6 +111,20 @@ class TestSaturated:
         for place in PLACES[[1, 2, 4]]:
             assert np.hypot(*(others - place).T).min() < 0.3
 
+    def test_trails_of_bleeding_are_no_stars(self):
+        image = make_image(peaks=PEAKS * [40.0, 1.0, 1.0, 1.0, 1.0])
+        image[5:80, 29:32] = 3e4
+        image = image.clip(max=9000.0)
+        stars = find_stars(image, PSF, saturation=9000.0)
+        assert np.hypot(stars["x"][0] - 30.3, stars["y"][0] - 25.8) < 1.0
+        assert stars["saturated"].tolist() == [True, False, False, False]
+
+    def test_a_large_core_is_one_star(self):
+        image = make_image() + 3e6 * gaussian(60, 60, 4.0)
+        stars = find_stars(image.clip(max=3000.0), PSF, saturation=3000.0)
+        assert np.hypot(stars["x"][0] - 60, stars["y"][0] - 60) < 0.2
+        assert stars["saturated"].sum() == 1
+
     def test_bad_pixels_in_the_sky_are_no_stars(self):
         image = make_image()
         image[50:54, 60:63] = image[80, :] = np.nan
@@ -136,6 +150,29 @@ class TestSaturated:
 def test_refusals(image, given, message):
     with pytest.raises(InputError, match=message):
         find_stars(image, **given)
+
+
+@pytest.mark.parametrize("share", [0.35, 0.51, 0.7])
+@pytest.mark.parametrize("outside", [0.0, np.nan])
+def test_what_is_outside_the_field_has_no_stars(share, outside):
+    inside = PLACES[:, 0] > share * SHAPE[1] + 4
+    image = make_image(4, places=PLACES[inside], peaks=PEAKS[inside])
+    image[:, : int(share * SHAPE[1])] = outside
+    found = find_stars(image, PSF)
+    assert len(found) == inside.sum()
+    for place in PLACES[inside]:
+        assert np.hypot(found["x"] - place[0], found["y"] - place[1]).min() < 0.3
+
+
+def test_pixels_without_counts_are_data():
+    counts = np.random.default_rng(3).poisson(0.03 + 40 * gaussian(50, 50)).astype(float)
+    assert np.hypot(find_stars(counts, PSF)["x"][0] - 50, 0) < 0.3
+
+
+def test_an_island_of_good_pixels():
+    image = np.full(SHAPE, np.nan)
+    image[16:36, 20:40] = make_image()[16:36, 20:40]
+    assert np.hypot(find_stars(image, PSF)["x"][0] - 30.3, 0) < 0.3
 
 
 @pytest.mark.parametrize("value", [0.0, 5.0])

@@ -37,8 +37,16 @@ def test_a_large_image_is_shown_in_blocks():
 def test_means_of_blocks_leave_bad_pixels_out():
     image = np.arange(20.0).reshape(4, 5)
     image[0, 0] = image[2:, 2:4] = np.nan
-    expected = [[(1 + 5 + 6) / 3, 5.0], [13.0, np.nan]]
+    expected = [[(1 + 5 + 6) / 3, 5.0, 6.5], [13.0, np.nan, 16.5]]
     np.testing.assert_allclose(block_means(image, 2), expected)
+
+
+@pytest.mark.parametrize("shape", [(10, 5000), (5000, 10), (1, 257)])
+def test_a_long_image_is_shown(shape):
+    pytest.importorskip("matplotlib")
+    step = -(-max(shape) // 256)
+    expected = tuple(-(-n // step) for n in shape)
+    assert pixels(thumbnail(np.ones(shape))).shape[:2] == expected
 
 
 @pytest.mark.parametrize("value", [0.0, 5.0, np.nan])
@@ -101,6 +109,18 @@ class TestWrite:
             models, residuals = file["MODELS"].data, file["RESIDUALS"].data
             np.testing.assert_array_equal(models, result.models().astype("f4"))
             np.testing.assert_array_equal(residuals, result.residuals().astype("f4"))
+
+    @pytest.mark.filterwarnings("ignore:psf 0 is sharper than its pixels")
+    def test_errors_of_refined_stars_are_columns(self, tmp_path):
+        from astropy.table import Table
+
+        made = Recipe((24, 24), n_stars=1, smooth=True).make()
+        result = made.deconvolve(n_iter=3, engine="numpy", refine_positions=True)
+        result.write(tmp_path / "a.fits")
+        table, stars = Table.read(tmp_path / "a.fits", hdu="STARS"), result.to_table()
+        assert table.colnames == stars.colnames
+        for name in table.colnames:
+            np.testing.assert_array_equal(table[name], stars[name].value)
 
     def test_refusals(self, result, tmp_path):
         (tmp_path / "there.fits").write_text("kept")

@@ -46,15 +46,16 @@ OPTIONS = [
 
 
 def check(arguments: argparse.Namespace, inputs: Iterable[str]) -> None:
-    """Refuse a checkpoint that would take the place of the output or an input."""
+    """Refuse a checkpoint that would take the place of an output or an input."""
     if arguments.checkpoint is None:
         return
-    taken = {os.path.realpath(path) for path in (arguments.output, *inputs)}
+    outputs = [path for path in (arguments.output, arguments.plot) if path is not None]
+    taken = {os.path.realpath(path) for path in (*outputs, *inputs)}
     if arguments.resume is not None:  # which the checkpoint may replace
         taken.discard(os.path.realpath(arguments.resume))
     if os.path.realpath(arguments.checkpoint) in taken:
         raise InputError(
-            f"the checkpoint {arguments.checkpoint} is the output or an input; give it another name"
+            f"the checkpoint {arguments.checkpoint} is an output or an input; give it another name"
         )
 
 

@@ -185,19 +185,14 @@ def _star_columns(
 ) -> list[StarColumn]:
     """Return the columns of the table of stars after positions and fluxes."""
     from lnocl.io import sky
-    from lnocl.io.fitswrite import StarColumn, column_unit
+    from lnocl.io.fitswrite import StarColumn, error_columns
     from lnocl.metrics import magnitude
 
     columns = []
     header = frames.header
     if arguments.refine_positions:
-        x_error, y_error = result.star_position_errors.T
         flux_errors = result.star_flux_errors / frames.electrons
-        columns += [
-            StarColumn("x_error", x_error, "pix", "standard error"),
-            StarColumn("y_error", y_error, "pix", "standard error"),
-            StarColumn("flux_error", flux_errors, column_unit(frames.unit), "standard error"),
-        ]
+        columns += error_columns(result.star_position_errors, flux_errors, frames.unit)
     if arguments.zero_point is not None:
         fluxes = result.star_fluxes / frames.electrons
         magnitudes = [magnitude(flux, 1.0) + arguments.zero_point for flux in fluxes]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import io
-import os
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.commands import messages, options, pictures
 from lnocl.commands.options import option
@@ -47,7 +47,9 @@ OPTIONS = [
         "--mask",
         metavar="FILE",
         is_input=True,
-        help="FITS file that is not 0 where a pixel is bad; pixels that are NaN are bad too",
+        help="FITS file that is not 0 where a pixel is bad; or dq, the extension DQ of the image, "
+        "or wht, where its extension WHT is 0 (default: of JWST and HST what their files have); "
+        "pixels that are NaN are bad too",
     ),
     options.SATURATION.but(
         help="pixels of this value and above are saturated, in the unit of the image"
@@ -75,9 +77,7 @@ def _run(arguments: argparse.Namespace) -> None:
         stack = fitsread.read_single(arguments.image)
         image = stack.data[0]
         psf = None if arguments.psf is None else fitsread.read_single(arguments.psf).data[0]
-        mask = None
-        if arguments.mask is not None:
-            mask = fitsread.read_single(arguments.mask).data[0] != 0
+        mask = _mask(arguments)
         stars = find_stars(
             image,
             psf,
@@ -90,7 +90,7 @@ def _run(arguments: argparse.Namespace) -> None:
         positions = np.array([stars["x"], stars["y"]]).T
         stars["ra"], stars["dec"] = sky.to_sky(positions, stack.header).T
         stars["ra"].unit = stars["dec"].unit = "deg"
-    stars.meta = {"IMAGE": os.path.basename(arguments.image), "ORIGIN": "x and y begin at 0"}
+    stars.meta = {"ORIGIN": "x and y begin at 0"}
     for name in ("x", "y"):
         stars[name].format, stars[name].unit = ".3f", "pix"
     for name in ("peak", "significance"):
@@ -104,6 +104,28 @@ def _run(arguments: argparse.Namespace) -> None:
         said.append(pictures.draw(arguments, draw_stars(image, stars)))
     if not arguments.quiet:
         messages.say(said)
+
+
+def _mask(arguments: argparse.Namespace) -> NDArray[np.bool_] | None:
+    """Return which pixels are bad, by a file or an extension of the image; None without either."""
+    from lnocl.io import fitsread, flags, missions
+
+    contents = fitsread.read_contents(arguments.image)
+    word = arguments.mask or missions.mask_word(contents)
+    if not word:
+        return None
+    if word not in ("dq", "wht"):
+        return fitsread.read_single(word).data[0] != 0
+    values = fitsread.read_extension(arguments.image, word.upper())
+    if values is None:
+        raise InputError(
+            f"{arguments.image} has no extension {word.upper()}; give mask as a file, or leave it "
+            "out"
+        )
+    if word == "wht":
+        return values == 0
+    good_bits = flags.good_bits_of(*map(contents.value, ("TELESCOP", "INSTRUME", "DETECTOR")))
+    return flags.bad_pixels(values, good_bits, arguments.image)
 
 
 def _write(stars: Table, stream: IO[bytes], kind: str) -> None:

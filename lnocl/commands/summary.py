@@ -110,8 +110,9 @@ def _verdict(
     fits = [overall] if overall is not None else [found.wings for found in at_stars]
     if any(fit.is_overfit for fit in fits):
         verdict.append(
-            "the residuals are far less than noise: the noise that is taken is too large; see to "
-            "unit, gain, exposure, background and read noise"
+            "the residuals are far less than noise: the noise that is taken is too large (see to "
+            "unit, gain, exposure, background and read noise), or the model follows the noise "
+            "(take fewer iterations, or --smoothing)"
         )
     if lit:
         verdict.append(

@@ -269,7 +269,7 @@ def _check_shape(
             f"{found}; two are needed, or three for a cube of images: leave out the others, such "
             "as axes of length 1"
         )
-    if alone and shape[-1] <= MAX_CHANNELS < min(shape[:-1]):
+    if len(shape) == 3 and shape[-1] <= MAX_CHANNELS < min(shape[:-1]):
         raise InputError(
             f"{path} has the shape {shape}: its last axis is of colours or channels; give one of "
             "them, as an image of its own"

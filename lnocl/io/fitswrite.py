@@ -177,6 +177,18 @@ def write_image(
         fits.HDUList(hdus).writeto(stream)
 
 
+def error_columns(
+    position_errors: ArrayLike, flux_errors: ArrayLike, unit: str
+) -> list[StarColumn]:
+    """Return the columns of the standard errors of stars, positions in pixels."""
+    x_error, y_error = np.asarray(position_errors).T
+    return [
+        StarColumn("x_error", x_error, "pix", "standard error"),
+        StarColumn("y_error", y_error, "pix", "standard error"),
+        StarColumn("flux_error", flux_errors, column_unit(unit), "standard error"),
+    ]
+
+
 def column_unit(unit: str) -> str:
     """Return a unit for a column: FITS has none for electrons, and astropy would warn of it."""
     return unit.replace("electron", "ct")

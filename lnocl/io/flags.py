@@ -74,8 +74,9 @@ def bad_pixels(flags: NDArray[Any], good_bits: str, path: str) -> NDArray[np.boo
     # Which takes its time to load.
     from astropy.nddata.bitmask import bitfield_to_boolean_mask, interpret_bit_flags
 
-    sums = np.array(flags).astype(np.int64, casting="unsafe")
-    if not (sums == flags).all():
+    are_whole = np.isfinite(flags).all() and (np.floor(flags) == flags).all()
+    sums = np.array(flags).astype(np.int64) if are_whole else None
+    if sums is None:
         raise InputError(
             f"the extension DQ of {path} does not hold whole numbers; give mask as a file"
         )

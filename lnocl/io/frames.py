@@ -290,13 +290,15 @@ class _Reader:
         word = self._calibration.gain
         if not isinstance(word, str):
             return None
-        planes = [read_extension(path, word.upper()) for path in self._paths]
-        if any(plane is None for plane in planes):
+        if any(read_extension(path, word.upper()) is None for path in self._paths):
             return None
         variances = self._extensions(word.upper(), "gain")
+        has_flags = all(read_extension(path, "DQ") is not None for path in self._paths)
+        flags = self._extensions("DQ", "mask") if has_flags else [None] * len(variances)
+        planes = zip(self._images.data, variances, flags, strict=True)
         found = [
-            electrons_by_variance(image, variance, path, read_extension(path, "DQ"))
-            for image, variance, path in zip(self._images.data, variances, self._paths, strict=True)
+            electrons_by_variance(image, variance, self._paths[min(j, len(self._paths) - 1)], sums)
+            for j, (image, variance, sums) in enumerate(planes)
         ]
         for j, electrons in enumerate(found, 1):
             log.info("image %d: %.4g electrons in its unit, by %s", j, electrons, word.upper())

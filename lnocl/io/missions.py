@@ -14,8 +14,8 @@ log = logging.getLogger("lnocl")
 
 # Those whose files are known.
 TELESCOPES = ("HST", "JWST")
-# Instruments whose files call electrons counts.
-IN_ELECTRONS = ("ACS", "WFC3")
+# Detectors that count photons, so that a count is one.
+PHOTON_COUNTING = ("SBC", "FUV-MAMA", "NUV-MAMA")
 # Kinds of noise, of which one is enough.
 NOISE = ("read_noise", "inverse_variance", "variance", "rms", "error")
 
@@ -52,8 +52,8 @@ def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
     held = contents.extensions
     if not any(given.get(kind) for kind in NOISE):
         found |= {"error": ["err"]} if "ERR" in held else {"read_noise": ["auto"]}
-    if not given.get("mask") and held & {"DQ", "WHT"}:
-        found["mask"] = ["dq"] if "DQ" in held else ["wht"]
+    if not given.get("mask") and (word := mask_word(contents)):
+        found["mask"] = [word]
     if not given.get("background"):
         found["background"] = ["auto"]
     if not (given.get("gain") or given.get("exposure")):
@@ -64,10 +64,17 @@ def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
+def mask_word(contents: Contents) -> str:
+    """Return which extension of an image of JWST or HST says what is bad: dq, wht, or nothing."""
+    held, is_known = contents.extensions, contents.value("TELESCOP").upper() in TELESCOPES
+    words = [word for word in ("dq", "wht") if is_known and word.upper() in held]
+    return words[0] if words else ""
+
+
 def _electrons(path: str, contents: Contents) -> dict[str, Any]:
     """Return what makes electrons of the unit of the image."""
     unit = contents.value("BUNIT")
-    if unit.upper().startswith("COUNT") and contents.value("INSTRUME").upper() not in IN_ELECTRONS:
+    if unit.upper().startswith("COUNT") and contents.value("DETECTOR") not in PHOTON_COUNTING:
         raise InputError(
             f"{path} is in counts of its converter; give gain, a number or a keyword of its "
             "header, such as ATODGAIN"

@@ -146,7 +146,7 @@ def _texts(file: FitsFile, table: Any) -> list[str]:
     """Return the lines of the table of messages."""
     if "message" not in table.columns.names or table.columns["message"].format[-1:] != "A":
         raise FileError(f"{file.path} has no column message of text in {table.name}")
-    return [str(line) for line in table.data["message"]]
+    return [str(line).encode("ascii").decode("unicode_escape") for line in table.data["message"]]
 
 
 def _fault(

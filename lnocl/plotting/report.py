@@ -21,6 +21,7 @@ from lnocl.plotting.result import (
     MAX_SIGMA,
     Region,
     ResultView,
+    brightest,
     draw_choice,
     image_limits,
     worst_image,
@@ -87,7 +88,7 @@ def make_report(
         commands=html.escape(commands),
         cards=_cards(cards),
         note=html.escape(" ".join(notes)),
-        data=json.dumps(data).replace("<", "\\u003c"),
+        data=json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
     )
 
 
@@ -118,7 +119,7 @@ def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
             ]
         )
     there = region.slices(view.extended.shape)
-    top = float(view.extended[there].max(initial=0.0)) or 1.0
+    top = brightest(view.extended[there])
     source = _layer(
         "extended source",
         block_means(view.extended[there], step),

@@ -24,6 +24,8 @@ MAX_SIGMA = 5.0
 # An extended source is shown down to this share of its brightest pixel, nearly logarithmically.
 FAINT_SHARE = 3e-3
 PANEL, CURVE_HEIGHT = 2.7, 2.3
+# What red lines are.
+OUTLINED = "red: the PSF's error may be all there is"
 
 Columns = Mapping[str, Array]
 
@@ -183,6 +185,12 @@ def image_limits(image: NDArray[Any]) -> tuple[float, float, float]:
     return low, max(high, low + 1e-6 * span), noise or 1e-3 * span
 
 
+def brightest(extended: Array) -> float:
+    """Return the brightest pixel, or 1 where there is nothing that colours can show."""
+    top = float(extended.max(initial=0.0))
+    return top if top > np.sqrt(np.finfo(float).tiny) else 1.0
+
+
 def _draw_images(axes: Sequence[Axes], view: ResultView, region: Region) -> None:
     """Draw image, model and residuals of a region."""
     from matplotlib.colors import AsinhNorm, Normalize
@@ -215,16 +223,25 @@ def _draw_extended(axis: Axes, view: ResultView, region: Region, title: str) -> 
     from matplotlib.colors import AsinhNorm
 
     there = region.slices(view.extended.shape)
-    top = float(view.extended[there].max(initial=0.0)) or 1.0
+    top = brightest(view.extended[there])
     shown = _draw_region(
         axis, view.extended, there, AsinhNorm(FAINT_SHARE * top, 0.0, top), COLOUR_MAP
     )
     if view.doubtful is not None and view.doubtful[there].any():
-        axis.contour(view.doubtful, [0.5], colors="red", linewidths=0.8)
-        title += "\nred: the PSF's error may be all there is"
+        outline(axis, view.doubtful, there)
+        title += f"\n{OUTLINED}"
     axis.set_title(title, fontsize=10)
     _add_bar(axis, shown, view.unit)
     _mark_stars(axis, view)
+
+
+def outline(axis: Axes, flags: NDArray[np.bool_], there: Any = np.s_[:, :]) -> None:
+    """Outline flagged pixels of a part of an image, and leave the limits of the axes."""
+    limits = axis.get_xlim(), axis.get_ylim()
+    y, x = (np.arange(n)[part] for part, n in zip(there, flags.shape, strict=True))
+    if min(len(x), len(y)) > 1:  # else there is nothing to draw a line between
+        axis.contour(x, y, flags[there], [0.5], colors="red", linewidths=0.8)
+    axis.set(xlim=limits[0], ylim=limits[1])
 
 
 def _draw_region(axis: Axes, image: NDArray[Any], there: Any, norm: Any, colours: str) -> Any:
@@ -263,13 +280,14 @@ def _mark_stars(axis: Axes, view: ResultView, offset: Sequence[float] = (0.0, 0.
         for s, (x, y) in enumerate(view.stars, 1)
         if left <= x + offset[0] <= right and bottom <= y + offset[1] <= top
     ]
-    for s, x, y in inside:
+    if inside:
+        _, x, y = np.transpose(inside)
         for colour, width in (("black", 2.4), ("white", 1.1)):
             axis.plot(x, y, "o", ms=11, mfc="none", mec=colour, mew=width)
-        if len(inside) <= MAX_NUMBERS:
-            axis.annotate(
-                f"{s}", (x, y), (6, 6), textcoords="offset points", color="white", fontsize=8
-            )
+    for s, left_of, below in inside if len(inside) <= MAX_NUMBERS else []:
+        axis.annotate(
+            f"{s}", (left_of, below), (6, 6), textcoords="offset points", color="white", fontsize=8
+        )
     axis.set(xlim=(left, right), ylim=(bottom, top))
 
 
@@ -277,23 +295,29 @@ def draw_choice(axis: Axes, view: ResultView) -> None:
     """Draw the error that held-out counts estimate for each smoothing, or the objective."""
     if view.held_out and len(view.held_out["iteration"]):
         table = view.held_out
-        for i, value in enumerate(np.unique(table["smoothing"])):
-            rows = table["smoothing"] == value
-            name = f"{value:.2g}"
-            axis.plot(table["iteration"][rows], table["error"][rows], **line_style(i), label=name)
+        curves = {
+            f"{value:.2g}": (table["smoothing"] == value, table["error"])
+            for value in np.unique(table["smoothing"])
+        }
         axis.set_title("held-out counts: the last within a tenth of the least is taken", fontsize=9)
-        axis.set_ylabel("estimated relative error", fontsize=9)
-        axis.legend(fontsize=8, title="smoothing", title_fontsize=8)
-    elif view.history:
-        later = np.asarray(view.history["iteration"]) > 0
-        axis.plot(
-            view.history["iteration"][later], view.history["objective"][later], **line_style(1)
-        )
-        axis.set_ylabel("objective J", fontsize=9)
+        label = "estimated relative error"
     else:
+        table = view.history
+        curves = {"": (np.s_[:], table["objective"])} if table else {}
+        label = "objective J"
+    n_drawn = 0
+    for i, (name, (rows, values)) in enumerate(curves.items()):
+        x, y = (np.asarray(each, float)[rows] for each in (table["iteration"], values))
+        shown = (x > 0) & (y > 0) & np.isfinite(y)  # those that a logarithmic scale has
+        n_drawn += int(shown.sum())
+        axis.plot(x[shown], y[shown], **line_style(i), label=name)
+    if not n_drawn:
+        axis.clear()
         axis.set_axis_off()
         return
-    if view.n_iter:
+    if len(curves) > 1 or next(iter(curves)):
+        axis.legend(fontsize=8, title="smoothing", title_fontsize=8)
+    if view.n_iter > 0:
         axis.axvline(view.n_iter, color="0.4", lw=1, ls=":")
         axis.annotate(
             f"iteration {view.n_iter} ",
@@ -305,4 +329,5 @@ def draw_choice(axis: Axes, view: ResultView) -> None:
             color="0.4",
         )
     axis.set(xscale="log", yscale="log", xlabel="iteration")
+    axis.set_ylabel(label, fontsize=9)
     axis.grid(alpha=0.3, which="both")

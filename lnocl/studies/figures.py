@@ -16,13 +16,17 @@ from lnocl.plotting.curves import draw_errors, draw_magnitudes
 from lnocl.plotting.figure import check_matplotlib, save_figure
 from lnocl.plotting.profiles import draw_profiles
 from lnocl.plotting.report import make_report
-from lnocl.plotting.result import ResultView, draw_result
+from lnocl.plotting.result import OUTLINED, ResultView, draw_result
 from lnocl.plotting.sources import Frame, Source, draw_objects
 from lnocl.studies import experiment
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# What is larger is no number of a result, and differences of such are not finite.
+LARGEST = 1e300
+# Refined stars may lie so many pixels outside their image; profiles beside one need it inside.
+REACH = 3.0
 FIGURES = ("objects", "errors", "magnitude", "flux", "width")
 
 
@@ -64,7 +68,7 @@ def draw(
     atomic.check_folder(folder, overwrite, outputs, make=False)
     saved = [read_result(path) for path in results]
     true = None if truth is None else read_result(truth)
-    _check_saved([*([] if true is None else [true]), *saved])
+    _check_saved([*([] if true is None else [true]), *saved], REACH if true is None else 0.0)
     if true is not None and not true.extended.max() > 0:
         raise InputError(f"{true.path} holds no flux; give another --truth, or leave it out")
     names = _names(results, saved)
@@ -118,7 +122,7 @@ def report(path: str) -> str:
     """
     check_matplotlib()
     saved = read_result(path)
-    _check_saved([saved])
+    _check_saved([saved], REACH)
     target = str(saved.header.get("OBJECT") or saved.header.get("TARGNAME") or "").strip()
     title = os.path.basename(path) + (f": {target}" if target else "")
     cards = [
@@ -133,8 +137,10 @@ def report(path: str) -> str:
 def view_of(saved: SavedResult) -> ResultView:
     """Return what the picture of a saved result shows."""
     nothing = np.zeros((0, *saved.extended.shape))
-    models = saved.cubes.get("MODELS", nothing)
-    residuals = saved.cubes.get("RESIDUALS", nothing)
+    models, residuals = (
+        np.where(abs(cube) < LARGEST, cube, np.nan)
+        for cube in (saved.cubes.get(name, nothing) for name in ("MODELS", "RESIDUALS"))
+    )
     return ResultView(
         extended=saved.extended,
         stars=saved.stars,
@@ -158,7 +164,7 @@ def save(folder: str, name: str, figure: Figure, overwrite: bool) -> str:
     return f"drew {path}"
 
 
-def _check_saved(saved: Sequence[SavedResult]) -> None:
+def _check_saved(saved: Sequence[SavedResult], room: float) -> None:
     first = saved[0]
     ny, nx = first.extended.shape
     for each in saved:
@@ -167,17 +173,17 @@ def _check_saved(saved: Sequence[SavedResult]) -> None:
                 f"{each.path} has the shape {each.extended.shape} and {first.path} {(ny, nx)}; "
                 "they must be the same"
             )
-        if not np.isfinite(each.extended).all():
+        if not (abs(each.extended) < LARGEST).all():
             raise InputError(f"{each.path} holds values that are not finite; draw another")
         for x, y in each.stars:
-            if not (-0.5 <= x < nx - 0.5 and -0.5 <= y < ny - 0.5):
+            if not (-room <= x + 0.5 < nx + room and -room <= y + 0.5 < ny + room):
                 raise InputError(f"{each.path} has a star at ({x:g}, {y:g}), outside its image")
 
 
 def _note(result: SavedResult) -> str:
     """Return what the outline of a result means, where there is one."""
     is_outlined = result.doubtful is not None and result.doubtful.any()
-    return "red: the PSF's error may be all there is" if is_outlined else ""
+    return OUTLINED if is_outlined else ""
 
 
 def _names(paths: Sequence[str], saved: Sequence[SavedResult]) -> list[str]:

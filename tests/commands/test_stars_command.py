@@ -78,6 +78,27 @@ def test_saturated_stars_are_named(capsys):
     assert "ra" not in stars.colnames
 
 
+@pytest.mark.parametrize("word", ["given", "default"])
+def test_flags_and_weights_of_the_file_are_heeded(word, capsys):
+    counts = fits.getdata("image.fits")
+    flags, weights = np.zeros((2, N, N), "i2")
+    flags[17:21, 43:48], weights[:] = 4096, 1  # on the second star
+    weights[30:50, 10:30] = 0  # on the first
+    for name, values in (("dq", flags), ("wht", weights)):
+        primary = fits.PrimaryHDU(header=fits.Header({"TELESCOP": "HST", "INSTRUME": "ACS"}))
+        hdus = [fits.ImageHDU(counts, name="SCI"), fits.ImageHDU(values, name=name.upper())]
+        fits.HDUList([primary, *hdus]).writeto(f"{name}.fits")
+        chosen = ["--mask", name] if word == "given" else []
+        assert cli.main(["stars", f"{name}.fits", *chosen, "-o", f"{name}.csv"]) == 0
+    by_flags, by_weights = Table.read("dq.csv"), Table.read("wht.csv")
+    is_second = np.hypot(by_flags["x"] - 45.0, by_flags["y"] - 18.6) < 5
+    assert is_second.any()
+    assert ((by_flags["saturated"] == "True") == is_second).all()
+    assert np.hypot(by_weights["x"] - 20.3, by_weights["y"] - 40.1).min() > 5
+    assert cli.main(["stars", "image.fits", "--mask", "dq", "-o", "a.csv"]) == 2
+    assert "image.fits has no extension DQ; give --mask as a file" in capsys.readouterr().err
+
+
 def test_where_there_is_no_star_it_says_what_to_do(capsys):
     noise = np.random.default_rng(2).normal(50.0, 5.0, (N, N))
     fits.writeto("noise.fits", noise)

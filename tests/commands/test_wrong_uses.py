@@ -92,7 +92,10 @@ def test_there_are_forty_and_more():
 def test_the_line_says_what_is_wrong_and_what_to_do(command, lines, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
-    status = cli.main(shlex.split(command.replace(";", r"\;")))
+    words = shlex.split(command.replace(";", r"\;"))
+    if words[0] == "deconvolve" and "--device" not in words:
+        words += ["--engine", "numpy"]  # which builds no programs
+    status = cli.main(words)
     captured = capsys.readouterr()
     said = captured.err.splitlines() + captured.out.splitlines()
     for line in lines.splitlines():

@@ -333,6 +333,11 @@ class TestCoordinates:
             cards = fitsread.wcs_cards(fits.Header(LINEAR | broken))
         assert len(cards) == 0
 
+    @pytest.mark.parametrize("shape", [(64, 3), (9, 1), (3, 64)])
+    def test_a_narrow_image_is_one(self, shape, tmp_path):
+        fits.writeto(tmp_path / "a.fits", np.ones(shape))
+        assert fitsread.read_stack([str(tmp_path / "a.fits")]).data.shape == (1, *shape)
+
     def test_distortions_in_tables_are_left_out_and_said(self, caplog):
         tabled = {"CPDIS1": "Lookup", "DP1.EXTVER": 1.0, "D2IMDIS2": "LOOKUP", "D2IMERR2": 0.06}
         with caplog.at_level("INFO", "lnocl"):

@@ -88,6 +88,12 @@ def test_it_is_small_whatever_the_images(p, side):
     assert f"blocks of {step} x {step} pixels" in page
 
 
+def test_a_long_frame_is_shown():
+    page = make_report(make_view(p=20, n_stars=0, shape=(2, 60000)), "a")
+    assert len(page) < 3e6
+    assert decoded(data_of(page)["regions"][0]["source"]).shape[0] == 1
+
+
 def test_residuals_of_blocks_are_over_the_noise_of_blocks():
     view = make_view(p=1, n_stars=0, shape=(1400, 1400))
     residuals = decoded(data_of(make_report(view, "a"))["regions"][0]["images"][0][2])
@@ -138,6 +144,18 @@ class TestCommand:
                      "<li class=warning>warning: it is noisy", "<td>7.5</td>"):  # fmt: skip
             assert part in page
         assert len(data_of(page)["regions"]) == 2
+
+    def test_a_star_that_was_moved_over_the_edge_is_shown(self):
+        cube = np.ones((1, 32, 32))
+        said = ["café \\ tab"]
+        fitswrite.write_result("b.fits", cube[0], [(-1, 4)], [7.5], said=said)
+        with fits.open("b.fits", mode="append") as file:
+            file.append(fits.ImageHDU(1e308 * cube, name="MODELS"))
+            file.append(fits.ImageHDU(np.inf * cube, name="RESIDUALS"))
+        assert cli.main(["report", "b.fits", "-o", "b.html"]) == 0
+        page = Path("b.html").read_text()
+        assert data_of(page)["stars"] == [[-1.0, 4.0]]
+        assert "café \\ tab" in page
 
     def test_a_result_without_models_says_what_it_lacks(self, capsys):
         fitswrite.write_result("b.fits", np.ones((32, 32)), [], [])

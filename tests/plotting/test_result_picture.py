@@ -1,5 +1,6 @@
 """The picture of a result shows what the result has, in memory and from its file."""
 
+import dataclasses
 import sys
 
 import numpy as np
@@ -91,6 +92,14 @@ def test_bad_pixels_are_grey_and_change_no_stretch():
     assert image_limits(np.full((3, 3), np.nan)) == (0.0, 1.0, 1.0)
 
 
+@pytest.mark.parametrize("scale", [0.0, 1e-320, 1e-20, 1e200])
+def test_any_unit_is_drawn(scale, tmp_path):
+    view = make_view(p=1)
+    draw_result(dataclasses.replace(view, extended=scale * view.extended)).savefig(
+        tmp_path / "a.png"
+    )
+
+
 @pytest.mark.parametrize("value", [0.0, 5.0])
 def test_a_flat_image_and_an_empty_source_are_drawn(value, tmp_path):
     flat = np.full((1, 60, 70), value)
@@ -123,6 +132,15 @@ def test_what_errors_of_the_psf_may_fake_is_outlined():
     assert titles[3] == "extended source\nred: the PSF's error may be all there is"
 
 
+@pytest.mark.parametrize("shape", [(60, 70), (1, 70), (60, 1)])
+def test_an_outline_leaves_the_enlarged_part_as_it_is(shape):
+    view = make_view(p=1, shape=shape, stars=[(0.0, 0.0)], doubtful=np.ones(shape, bool))
+    for _, image in panels(draw_result(view)):
+        left, right, bottom, top = image.get_extent()
+        assert image.axes.get_xlim() == (left, right)
+        assert image.axes.get_ylim() == (bottom, top)
+
+
 def test_the_choice_is_that_of_held_out_counts_or_the_objective():
     def curve(view):
         (axis,) = draw_result(view).subfigs[1].axes
@@ -137,6 +155,14 @@ def test_the_choice_is_that_of_held_out_counts_or_the_objective():
     assert name == "estimated relative error"
     assert found["0"].tolist() == [0.5, 0.25]
     assert found["3"].tolist() == [0.4]
+
+
+@pytest.mark.parametrize("objectives", [[7.0], [7.0, np.nan], [7.0, -1.0], []])
+def test_a_run_without_a_curve_is_drawn(objectives, tmp_path):
+    history = {"iteration": np.arange(len(objectives)), "objective": np.array(objectives)}
+    figure = draw_result(make_view(history=history if objectives else {}, n_iter=0))
+    figure.savefig(tmp_path / "a.png")
+    assert not figure.subfigs[1].axes[0].lines
 
 
 def test_from_a_file_it_is_the_same(result, tmp_path):
