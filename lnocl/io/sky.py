@@ -13,6 +13,7 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.io.registry import identify_format
 from astropy.table import Table
+from astropy.time import Time
 from astropy.utils.data import get_readable_fileobj
 from astropy.utils.xml.iterparser import get_xml_iterator
 from astropy.wcs import WCS
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError, LnoclError, counted, warn
 from lnocl.io.fitsfile import open_fits, open_regular
+from lnocl.io.fitsread import read_keyword
 from lnocl.io.headers import make_wcs, quiet_log
 from lnocl.process import ignored_warnings
 from lnocl.scene import star_tables
@@ -32,6 +34,8 @@ log = logging.getLogger("lnocl")
 MAX_OFFSET_VARIATION = 0.1
 # Positions by pixels and by the sky may differ by so many pixels, as catalogues round them.
 SAME_PLACE = 1.0
+# Keywords with the date of an image, and their formats.
+DATES = {"MJD-AVG": "mjd", "MJD-OBS": "mjd", "DATE-OBS": "fits"}
 # Points across an image at which the offset is computed.
 POINTS = 5
 
@@ -161,7 +165,8 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
     path : str
         Any table that astropy reads, with columns of `star_tables.IN_PIXELS` or `ON_SKY`, or with
         a `SkyCoord`. Upper or lower case does not matter. Right ascension and declination are in
-        the columns' units, or else in degrees.
+        the columns' units, or else in degrees. With columns pmra and pmdec, mas a year, and
+        ref_epoch, a year, as Gaia has them, stars are moved to the date of the image.
     header : astropy.io.fits.Header
         Header of the image, whose coordinates ra and dec need.
     image : str
@@ -183,6 +188,8 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
     table = _read_table(path)
     columns = star_tables.find_columns(table.colnames, star_tables.IN_PIXELS)
     of_sky, sky_columns = _coordinates(path, table)
+    if of_sky is not None:
+        of_sky = _moved(path, of_sky, table, _date(header, image))
     if columns is not None:
         found = star_tables.in_pixels(table, columns, path)
         names: Sequence[str] = columns[:2]
@@ -231,6 +238,49 @@ def _coordinates(path: str, table: Table) -> tuple[SkyCoord | None, tuple[str, .
     if (abs(dec) > 90).any():
         raise InputError(f"column {columns.second} of {path} has rows beyond 90 degrees")
     return SkyCoord(ra, dec, unit="deg"), columns[:2]
+
+
+def _date(header: fits.Header, image: str) -> Time | None:
+    """Return when an image was taken, by its header; None where that does not say."""
+    for keyword, kind in DATES.items():
+        value = read_keyword(image, header, keyword)
+        try:
+            return Time(value, format=kind, scale="utc")
+        except (TypeError, ValueError):
+            continue
+    return None
+
+
+def _moved(path: str, of_sky: SkyCoord, table: Table, date: Time | None) -> SkyCoord:
+    """Return coordinates at a date, where the table has proper motions as Gaia's do.
+
+    A row without them stays where it is.
+    """
+    names = {name.lower(): name for name in table.colnames}
+    if not {"pmra", "pmdec"} <= set(names):
+        return of_sky
+    if date is None or "ref_epoch" not in names:
+        lacking = "the image has no date" if date is None else "there is no column ref_epoch"
+        log.info("%s: its proper motions are not heeded, as %s", path, lacking)
+        return of_sky
+    motions: list[NDArray[np.float64]] = [
+        np.nan_to_num(np.ma.filled(np.ma.asarray(table[names[name]], float), 0.0))
+        for name in ("pmra", "pmdec")
+    ]
+    epoch = star_tables.column_numbers(table[names["ref_epoch"]], path, "yr")
+    with ignored_warnings():  # that distances are not known
+        now = SkyCoord(
+            of_sky.ra,
+            of_sky.dec,
+            pm_ra_cosdec=motions[0] * u.mas / u.yr,
+            pm_dec=motions[1] * u.mas / u.yr,
+            obstime=Time(epoch, format="jyear"),
+        ).apply_space_motion(new_obstime=date)
+    farthest = of_sky.separation(now).arcsec.max(initial=0.0)
+    log.info(
+        "%s: moved by proper motions to %.2f, by %.3g arcsec at most", path, date.jyear, farthest
+    )
+    return SkyCoord(now.ra, now.dec)
 
 
 def _compare(

@@ -234,6 +234,41 @@ class TestTables:
         Table({"ra": ICRS.ra.deg, "dec": ICRS.dec.deg}).write("t.csv")
         np.testing.assert_allclose(stars("t.csv"), POSITIONS, atol=1e-6)
 
+    @pytest.mark.parametrize(
+        ("date", "years"),
+        [({"DATE-OBS": "2024-01-01T00:00:00"}, 8.0), ({"MJD-AVG": 58849.0}, 4.0)],
+    )
+    def test_stars_of_gaia_are_moved_to_the_date_of_the_image(self, caplog, date, years):
+        caplog.set_level(logging.INFO, "lnocl")
+        table = Table({"ra": ICRS.ra.deg, "dec": ICRS.dec.deg, "ref_epoch": [2016.0, 2016.0]})
+        table["pmra"] = np.ma.MaskedArray([-50.0, 7.0], [False, True])  # mas a year
+        table["pmdec"] = np.ma.MaskedArray([30.0, 7.0], [False, True])
+        table.write("t.ecsv")
+        found = stars("t.ecsv", header(**date)) - POSITIONS
+        moved = SkyCoord(
+            ICRS.ra + np.array([-0.05, 0.0]) * years * u.arcsec / np.cos(ICRS.dec),
+            ICRS.dec + np.array([0.03, 0.0]) * years * u.arcsec,
+        )
+        expected = np.transpose(WCS(header()).world_to_pixel(moved)) - POSITIONS
+        np.testing.assert_allclose(found, expected, atol=2e-3 * abs(expected).max())
+        assert abs(expected[0]).max() > 1
+        assert "t.ecsv: moved by proper motions to" in caplog.text
+
+    @pytest.mark.parametrize(
+        ("columns", "cards", "lacking"),
+        [
+            ({"ref_epoch": [2016.0, 2016.0]}, {}, "the image has no date"),
+            ({"ref_epoch": [2016.0, 2016.0]}, {"DATE-OBS": "long ago"}, "the image has no date"),
+            ({}, {"DATE-OBS": "2024-01-01"}, "there is no column ref_epoch"),
+        ],
+    )
+    def test_proper_motions_that_cannot_be_heeded_are_said(self, caplog, columns, cards, lacking):
+        caplog.set_level(logging.INFO, "lnocl")
+        motions = {"pmra": [1e3, 1e3], "pmdec": [1e3, 1e3]}
+        Table({"ra": ICRS.ra.deg, "dec": ICRS.dec.deg, **motions, **columns}).write("t.ecsv")
+        np.testing.assert_allclose(stars("t.ecsv", header(**cards)), POSITIONS, atol=1e-6)
+        assert f"t.ecsv: its proper motions are not heeded, as {lacking}" in caplog.text
+
     @pytest.mark.parametrize("given", [header(), fits.Header()], ids=["wcs", "no wcs"])
     def test_pixels_go_before_the_sky(self, given):
         table = Table({"ra": ICRS.ra.deg, "dec": ICRS.dec.deg, "x": POSITIONS[:, 0] + 0.6})
