@@ -1,4 +1,4 @@
-"""The command ``plot``: draw the figures from results."""
+"""The command ``plot``: draw pictures and figures from results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 COMMAND = Command(
-    "draw the paper's figures from results: objects, errors, magnitude and profiles",
+    "draw a picture of each result, several beside each other, and the paper's figures where the "
+    "truth is given",
     {"": OPTIONS},
     _run,
 )

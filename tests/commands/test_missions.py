@@ -6,6 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
+from astropy.time import Time
+from astropy.wcs import WCS
 
 from lnocl.commands import cli
 from lnocl.io.missions import calibrate
@@ -168,6 +171,37 @@ def test_photometry_and_noise(command_folder, capsys, make, kind):
     assert np.nanstd(sky) == pytest.approx(1.0, abs=0.05)
     for option in EXPECTED[kind]:
         assert f" {option} " in command
+
+
+@pytest.mark.parametrize("kind", ["photutils", "SExtractor", "Gaia"])
+def test_tables_of_stars(command_folder, capsys, kind):
+    seconds, _ = of_wfc3_ir("ir")
+    write_stpsf()
+    x, y = (np.array([float(at)]) for at in AT)
+    header = fits.getheader("ir.fits", "SCI")
+    place = WCS(header).pixel_to_world(x, y)
+    epoch = Time(fits.getval("ir.fits", "DATE-OBS")).jyear
+    columns = {
+        "photutils": {"id": [1], "xcentroid": x, "ycentroid": y},
+        "SExtractor": {"NUMBER": [1], "X_IMAGE": x + 1, "Y_IMAGE": y + 1},
+        # It was elsewhere, and has come to its place by the date of the image.
+        "Gaia": {
+            "ra": place.ra.deg,
+            "dec": place.dec.deg - (epoch - 2016.0) * 40.0 / 3.6e6,
+            "ref_epoch": [2016.0],
+            "pmra": [0.0],
+            "pmdec": [40.0],
+        },
+    }
+    Table(columns[kind]).write("t.vot", format="votable")
+    options = ["--psf", "stpsf.fits", "--stars", "t.vot", "-o", "o.fits"]
+    assert cli.main(["deconvolve", "ir.fits", *options]) == 0
+    with fits.open("o.fits") as file:
+        stars = file["STARS"].data
+        np.testing.assert_allclose([stars["x"][0], stars["y"][0]], AT, atol=0.01)
+        near = np.hypot(X - AT[0], Y - AT[1]) < 9
+        found = stars["flux"][0] + (file[0].data * near).sum()
+    assert found * seconds == pytest.approx(STAR, rel=0.01)
 
 
 EXPECTED = {
