@@ -107,7 +107,7 @@ class TestLensedQuasar:
         assert ["share their noise" in line for line in warned] == [True]  # it was drizzled
         check_file("out.fits")
         with fits.open("out.fits") as hdus:
-            extended, stars, history = (hdu.data for hdu in hdus)
+            extended, stars, history, _ = (hdu.data for hdu in hdus)
             kept = WCS(hdus[0].header)
         assert extended.shape == (120, 120)
         assert extended.sum() > 0
@@ -342,8 +342,8 @@ class TestExamples:
         sci, exptime = (where / f"quasar_F814W_{name}.fits" for name in ("sci", "exptime"))
         example.stars_psf(sci, exptime, "psf.fits")
         stars = [word for x, y in example.IMAGES for word in ("--star", f"{x},{y}")]
-        words = [sci, "--psf", "psf.fits", "--exposure", exptime, "--read-noise", 5.187, "--pad", 4,
-                 *stars]  # fmt: skip
+        words = [sci, "--psf", "psf.fits", "--exposure", exptime, "--background", 0,
+                 "--read-noise", 5.187, "--pad", 4, *stars]  # fmt: skip
         for how, whole, refined in [
             (["--n-iter", 30], 3.31, 0.95),
             (["--smoothing", 30, "--n-iter", 300], 3.04, 0.98),
