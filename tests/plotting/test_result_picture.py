@@ -174,6 +174,9 @@ def test_from_a_file_it_is_the_same(result, tmp_path):
     for (_, one), (_, other) in zip(before, after, strict=True):
         assert one.get_extent() == other.get_extent()
         np.testing.assert_allclose(one.get_array(), other.get_array(), rtol=1e-5, atol=1e-5)
+    bad = result._outcome.scene.observation.mask
+    assert bad.any()
+    np.testing.assert_array_equal(np.isnan(view_of(result).images), bad)
     held = view_of(result), figures.view_of(read_result(str(path)))
     assert held[0].n_iter == held[1].n_iter == 3
     assert held[0].stars == held[1].stars

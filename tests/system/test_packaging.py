@@ -156,6 +156,7 @@ def test_it_runs_without_the_functions_that_windows_lacks(tmp_path):
 
 
 def test_no_advice_names_a_package_that_no_index_has():
-    texts = {name: (ROOT / name).read_text() for name in tracked("*.py", "*.md", "*.sh", "*.ipynb", ".ci")}
+    names = tracked("*.py", "*.md", "*.sh", "*.ipynb", ".ci")
+    texts = {name: (ROOT / name).read_text() for name in names}
     advice = re.compile(r"pip install [^\n&]*\blnocl\b")
     assert [name for name, text in texts.items() if advice.search(text)] == []
