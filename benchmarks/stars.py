@@ -45,7 +45,7 @@ def crowded(seed):
 
 
 def matches(found, places, reach=1.5):
-    """Return which of the places were found, and how many detections are none of them."""
+    """Return which of the places were found, and the number of false detections."""
     was_found, false = np.zeros(len(places), bool), 0
     for position in np.array([found["x"], found["y"]]).T:
         distances = np.hypot(*(places - position).T)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from lnocl.errors import InputError, LnoclError, counted
 from lnocl.process import ignored_warnings
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 BOX_WIDTHS, MIN_BOX = 12, 24
 # A PSF width to begin with where none is known, and the stars that it is then measured on.
 FIRST_WIDTH, MEASURED = 3.0, 20
-# Two stars are nearer to each other than so many PSF widths only where one is saturated.
+# Of maxima nearer to each other than so many PSF widths one is taken.
 SEPARATION = 0.9
 # What lies in the wings of brighter stars must be brighter than this share of them: PSFs err.
 OF_WINGS = 0.5
@@ -52,8 +53,8 @@ def find_stars(
     r"""Return the stars in an image: local maxima of the shape of the PSF, by DAOFIND.
 
     The sky's level and noise are sigma-clipped medians in boxes, between which they are
-    interpolated; stars are sought in the image less its level, over its noise. What is fainter than
-    half of the wings of brighter stars, as the PSF has them, is left out.
+    interpolated; stars are sought in the image less its level, over its noise. What is not half as
+    bright again as the wings of brighter stars, as the PSF has them, is left out.
 
     Parameters
     ----------
@@ -227,7 +228,7 @@ def _significance(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return what is above the sky over its noise, 0 where it is not known; and that noise."""
     level, noise = _sky(pixels, bad, width)
-    # In a flat part, such as one outside the field, there is no noise to compare with.
+    # A flat part, such as one outside the field, has no noise.
     is_known = ~bad & (noise > 1e-6 * np.median(noise[~bad]))
     noise = np.where(is_known, noise, np.inf)
     return np.where(is_known, (pixels - level) / noise, 0.0), noise
@@ -248,7 +249,7 @@ def _candidates(
     finder = photutils.detection.DAOStarFinder(
         threshold * noise, width, min_separation=SEPARATION * width, scale_threshold=False
     )
-    with ignored_warnings():  # that there is no star
+    with ignored_warnings():  # photutils warns where it finds nothing
         found = finder(filled)
     if found is None:
         return np.zeros((0, 3))
@@ -302,8 +303,13 @@ def _saturated_stars(
     """
     labels, _ = ndimage.label(saturated, np.ones((3, 3)))
     stars, covered = [], np.zeros(saturated.shape, bool)
-    reach = max(1, round(width))
-    for label, there in enumerate(ndimage.find_objects(labels), 1):
+    reach = max(2, round(width))
+    # Most regions are single bad pixels in the sky, of which a frame may have a million.
+    near = ndimage.maximum_filter(np.where(saturated, 0.0, above), 5)
+    places = ndimage.find_objects(labels)
+    brightest = ndimage.maximum(near, labels, np.arange(1, len(places) + 1))
+    for label in np.flatnonzero(np.asarray(brightest) >= OF_RING * threshold) + 1:
+        there = places[label - 1]
         wider = tuple(slice(max(part.start - reach, 0), part.stop + reach) for part in there)
         region = labels[wider] == label
         lines = np.ones((1, TRAIL + 1)), np.ones((TRAIL + 1, 1))
@@ -325,13 +331,15 @@ def _in_wings(stars: NDArray[np.float64], psf: NDArray[np.float64]) -> NDArray[n
     y0, x0 = (n // 2 for n in psf.shape)
     relative = psf / psf.max()
     wings = np.zeros(len(stars))
+    neighbours = KDTree(stars[:, :2]) if len(stars) else None
     for i in order:
         is_wing[i] = stars[i, 2] < (1.0 + OF_WINGS) * wings[i]
-        if not is_wing[i]:
-            dx, dy = (stars[:, :2] - stars[i, :2]).T
-            fainter = stars[:, 2] < stars[i, 2]
+        if neighbours is not None and not is_wing[i]:
+            lit = np.array(neighbours.query_ball_point(stars[i, :2], float(np.hypot(*psf.shape))))
+            lit = lit[stars[lit, 2] < stars[i, 2]]
+            dx, dy = (stars[lit, :2] - stars[i, :2]).T
             share = ndimage.map_coordinates(relative, [y0 + dy, x0 + dx], order=1)
-            wings += np.where(fainter, stars[i, 2] * share.clip(0.0), 0.0)
+            wings[lit] += stars[i, 2] * share.clip(0.0)
     return is_wing
 
 

@@ -235,7 +235,7 @@ class _NoImageError(FileError):
 def _read_file(
     path: str, extension: str | None = None
 ) -> tuple[NDArray[np.float64], fits.Header, str]:
-    """Return an image in a file, or the extension beside it, its header and the checksum."""
+    """Return an image in a file, its header and the checksum; or an extension, without one."""
     name = parse_name(path)
     with open_fits(name.file) as file:
         hdus = list(file.hdus())
@@ -253,7 +253,8 @@ def _read_file(
         if index and extension is None:
             log.info("%s: the image is %s", path, describe(index, hdus[index]))
         hdu = hdus[index]
-        return file.pixels(hdu), readable(hdu.header), file.sha256()
+        checksum = file.sha256() if extension is None else ""  # which reads all of the file
+        return file.pixels(hdu), readable(hdu.header), checksum
 
 
 def _check_shape(

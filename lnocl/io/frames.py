@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lnocl.errors import InputError, counted, warn
 from lnocl.io import sky
-from lnocl.io.fitsread import read_extension, read_keyword, read_stack
+from lnocl.io.fitsread import read_contents, read_extension, read_keyword, read_stack
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
 from lnocl.io.levels import sky_level, sky_noise
 from lnocl.io.maps import Maps, Word
@@ -290,11 +290,11 @@ class _Reader:
         word = self._calibration.gain
         if not isinstance(word, str):
             return None
-        if any(read_extension(path, word.upper()) is None for path in self._paths):
+        held = frozenset.intersection(*(read_contents(path).extensions for path in self._paths))
+        if word.upper() not in held:
             return None
         variances = self._extensions(word.upper(), "gain")
-        has_flags = all(read_extension(path, "DQ") is not None for path in self._paths)
-        flags = self._extensions("DQ", "mask") if has_flags else [None] * len(variances)
+        flags = self._extensions("DQ", "mask") if "DQ" in held else [None] * len(variances)
         planes = zip(self._images.data, variances, flags, strict=True)
         found = [
             electrons_by_variance(image, variance, self._paths[min(j, len(self._paths) - 1)], sums)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,8 +72,10 @@ class SavedResult:
         return self.tables["STARS"]["flux"]
 
     def commands(self) -> str:
-        """Return the lines of a shell that repeat the run, as its header has them."""
-        return "\n".join(map(str, self.header.get("HISTORY", ())))
+        """Return the lines of a shell that repeat the run in its folder, which is left out."""
+        lines = "\n".join(map(str, self.header.get("HISTORY", ())))
+        commands = re.split(r"(?<!\\)\n", lines)
+        return "\n".join(command for command in commands if not command.startswith("cd "))
 
     def number(self, keyword: str) -> float | None:
         """Return the number that a keyword of the header gives; None where it is missing.

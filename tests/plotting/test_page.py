@@ -131,7 +131,7 @@ class TestCommand:
             [(3, 4)],
             [7.5],
             cards=[("OBJECT", "RW Aur", "")],
-            commands=[["lnocl", "deconvolve", "b.fits"]],
+            commands=[["cd", "/home/me/" + "data" * 30], ["lnocl", "deconvolve", "b.fits"]],
             cubes={"MODELS": (cube, "electron"), "RESIDUALS": (cube, "")},
             said=["warning: it is noisy", "the model fits"],
         )
@@ -143,6 +143,8 @@ class TestCommand:
         for part in ("<title>a.fits: RW Aur</title>", "lnocl deconvolve b.fits", "the model fits",
                      "<li class=warning>warning: it is noisy", "<td>7.5</td>"):  # fmt: skip
             assert part in page
+        assert "/home/me" not in page
+        assert "datadata" not in page
         assert len(data_of(page)["regions"]) == 2
 
     def test_a_star_that_was_moved_over_the_edge_is_shown(self):
