@@ -36,6 +36,8 @@ FIT_SIDE, LEAST_WIDTH = 11, 0.8
 # A saturated star is a region of bad pixels inside a ring whose median is so many times as
 # significant as a star must be.
 OF_RING = 4.0
+# So few bad pixels are not the core of a saturated star, where a maximum was found beside them.
+FEW_PIXELS = 4
 # Trails of bleeding are so many rows or columns wide, at most.
 TRAIL = 3
 # Pixels above this share of the brightest star are a ring, where darker ones lie inside them.
@@ -112,7 +114,7 @@ def find_stars(
     saturated = bad | _holes(above * np.where(np.isfinite(noise), noise, 0.0))
     if saturation is not None:
         saturated |= pixels >= saturation
-    cores, covered = _saturated_stars(above, saturated, width, threshold)
+    cores, covered = _saturated_stars(above, saturated, found, width, threshold)
     found = found[~_at(covered, found)]
     touched = ndimage.binary_dilation(saturated, np.ones((3, 3)))
     stars = np.concatenate([cores, found])
@@ -294,12 +296,17 @@ def _holes(light: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _saturated_stars(
-    above: NDArray[np.float64], saturated: NDArray[np.bool_], width: float, threshold: float
+    above: NDArray[np.float64],
+    saturated: NDArray[np.bool_],
+    found: NDArray[np.float64],
+    width: float,
+    threshold: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return x, y and the brightest pixel round them of bad regions inside bright rings.
 
-    Of a region with trails of bleeding it is the part that is wider than those. The second array
-    says which pixels are of these regions, or within a PSF width of them.
+    Of a region with trails of bleeding it is the part that is wider than those. A few bad pixels
+    beside a maximum that was found are a part of that star. The second array says which pixels are
+    of these regions, or within a PSF width of them.
     """
     labels, _ = ndimage.label(saturated, np.ones((3, 3)))
     stars, covered = [], np.zeros(saturated.shape, bool)
@@ -318,8 +325,11 @@ def _saturated_stars(
         ring = ndimage.binary_dilation(core, iterations=2) & ~saturated[wider]
         if not ring.any() or np.median(above[wider][ring]) < OF_RING * threshold:
             continue
-        y, x = ndimage.center_of_mass(core)
-        stars.append((x + wider[1].start, y + wider[0].start, above[wider][ring].max()))
+        y, x = np.add(ndimage.center_of_mass(core), [part.start for part in wider])
+        beside = np.hypot(found[:, 0] - x, found[:, 1] - y) < width
+        if region.sum() <= FEW_PIXELS and beside.any():
+            continue
+        stars.append((x, y, above[wider][ring].max()))
         covered[wider] |= ndimage.binary_dilation(region, iterations=reach)
     return np.reshape(stars, (-1, 3)), covered
 

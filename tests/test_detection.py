@@ -125,6 +125,17 @@ class TestSaturated:
         assert np.hypot(stars["x"][0] - 60, stars["y"][0] - 60) < 0.2
         assert stars["saturated"].sum() == 1
 
+    @pytest.mark.parametrize("at", [(30, 26), (32, 26), (29, 24)])
+    def test_a_bad_pixel_in_a_star_is_no_star_of_its_own(self, at):
+        places, peaks = PLACES[:3], PEAKS[:3]
+        image = make_image(places=places, peaks=peaks)
+        mask = np.zeros(SHAPE, bool)
+        mask[at[1], at[0]] = True
+        stars = find_stars(image, PSF, mask=mask)
+        assert len(stars) == 3
+        assert np.hypot(stars["x"] - 30.3, stars["y"] - 25.8).min() < 0.7
+        assert stars["saturated"].sum() <= 1
+
     def test_bad_pixels_in_the_sky_are_no_stars(self):
         image = make_image()
         image[50:54, 60:63] = image[80, :] = np.nan
