@@ -21,8 +21,7 @@ import pyopencl as cl
 
 from lnocl.errors import DeviceError
 from lnocl.opencl import kernel_cache
-
-POCL = "Portable Computing Language"
+from lnocl.opencl.unknown_cpu import POCL
 
 # What the outcome may hang on, besides the device.
 VARIABLES = ("PATH", "COMPILER_PATH", "LIBRARY_PATH", "TMPDIR", "TEMP", "TMP")
@@ -32,8 +31,10 @@ TRIAL = """
 import sys
 import numpy
 import pyopencl as cl
+from lnocl.opencl.unknown_cpu import name_level
 platform, device = map(int, sys.argv[1:])
 context = cl.Context([cl.get_platforms()[platform].get_devices()[device]])
+name_level(context.devices[0])
 queue, found = cl.CommandQueue(context), numpy.zeros(1, numpy.float32)
 buffer = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, 4)
 cl.Program(context, "__kernel void f(__global float *x) { *x = 1; }").build().f(

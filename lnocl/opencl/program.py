@@ -16,7 +16,7 @@ import numpy as np
 import pyopencl as cl
 
 from lnocl.errors import DeviceError
-from lnocl.opencl import kernel_cache, linking
+from lnocl.opencl import kernel_cache, linking, unknown_cpu
 from lnocl.opencl.device import describe, has_double
 from lnocl.opencl.faults import after_fault, build_failure
 from lnocl.process import LOCK, ignored_warnings
@@ -268,7 +268,7 @@ class _Built:
     ) -> None:
         self._file, self._process = file, os.getpid()
         self._content = kernel_cache.read(file)
-        self._is_pocl = context.devices[0].platform.name == linking.POCL
+        self._is_pocl = context.devices[0].platform.name == unknown_cpu.POCL
         if self._is_pocl:
             self._folders = kernel_cache.unpack(self._content)
             before = kernel_cache.folders()
@@ -320,6 +320,7 @@ def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
     """Return a program that the process has, that a file holds, or that is compiled now."""
     key = context, text, options
     with LOCK:
+        unknown_cpu.name_level(context.devices[0])
         linking.check(context.devices[0])
         if key not in _programs:
             name = "\n".join([describe(context.devices[0]), *options, text])
