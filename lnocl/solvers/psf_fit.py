@@ -14,13 +14,11 @@ f is held instead, it takes up a part of what is wrong with the PSFs, and eta la
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.fft
-import scipy.linalg
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from lnocl.scene.forward_model import Model
@@ -28,8 +26,8 @@ from lnocl.scene.observation import Array
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.scene import MIN_MODEL, Scene
-from lnocl.scene.smooth_field import SmoothField
 from lnocl.solvers.fluxes import MAX_FADING
+from lnocl.solvers.least_squares import Field, LeastSquares, LinearImage, SourceError
 
 # The error of the extended source is correlated over this, pixels, and as large as it is smoothed
 # over that.
@@ -38,8 +36,6 @@ CORRELATED, SMOOTHED = 1.5, 4.0
 N_STEPS, FINISHED = 40, 1e-4
 # Chi squared exceeds its expectation by so many of its standard deviations where PSFs are wrong.
 SIGNIFICANT = 5.0
-# Of the information's diagonal.
-ROUNDING = 1e-12
 # A step moves no parameter by more of its prior's standard deviations, and no star by more pixels.
 MAX_STEP, MAX_MOVE = 3.0, 0.5
 
@@ -82,10 +78,10 @@ def step(
     n, n_psf = len(fluxes), values.size
     at, prior = np.zeros((2, n_psf + n * (3 if moves else 1)))
     at[:n_psf], prior[:n_psf] = values.ravel(), np.tile(families.prior**-2.0, len(values))
-    fields: list[_Field] = [_SourceError(model, extended)]
+    fields: list[Field] = [_source_error(model, extended)]
     if families.pixels is not None:
         fields.append(_PixelErrors(scene, families.pixels, extended, fluxes, parameters.pixels))
-    change, changes = _Fit(images, fields, prior).solve(at)
+    change, changes = _fit(images, fields, prior).solve(at)
     longest = (abs(change[:n_psf].reshape(values.shape)) / families.prior).max(initial=0.0)
     change *= MAX_STEP / max(longest, MAX_STEP)
     to = np.maximum(fluxes + change[n_psf : n_psf + n], MAX_FADING * fluxes)
@@ -101,8 +97,7 @@ class Misfit(NamedTuple):
     Attributes
     ----------
     squares : ndarray of float64, shape (p,)
-        The least squares of `_Fit` with the PSFs held: those of the residuals of each image,
-        weighted.
+        The least squares with the PSFs held: those of the residuals of each image, weighted.
     of_source : float
         And that of the error of the extended source.
     n_pixels : int
@@ -143,30 +138,18 @@ def misfit(scene: Scene, extended: Array, fluxes: Array) -> Misfit:
     """Return how well the PSFs of a scene fit, with fluxes fitted and the source marginalised."""
     model, held = Model(scene), PsfFamilies((), scene.observation)
     images = _linearise(scene, held, held.first().values, model, extended, fluxes, False)
-    fit = _Fit(images, [_SourceError(model, extended)], np.zeros(len(fluxes)))
+    fit = _fit(images, [_source_error(model, extended)], np.zeros(len(fluxes)))
     n_pixels = sum(int(np.count_nonzero(each.precision)) for each in images)
     return Misfit(*fit.least_squares(), n_pixels)
 
 
-class _Image(NamedTuple):
-    """One image near an estimate.
+def _fit(images: list[LinearImage], fields: Sequence[Field], prior: Array) -> LeastSquares:
+    return LeastSquares(images, fields, prior, N_STEPS, FINISHED)
 
-    Attributes
-    ----------
-    slopes : ndarray of float64, shape (k, Ny * Nx)
-        Derivatives of its model with respect to its k unknowns.
-    unknowns : ndarray of int, shape (k,)
-        Which they are.
-    left : ndarray of float64, shape (Ny, Nx)
-        ``g_j - m_j``.
-    precision : ndarray of float64, shape (Ny, Nx)
-        One over the variance of that, for Poisson counts.
-    """
 
-    slopes: Array
-    unknowns: NDArray[np.int_]
-    left: Array
-    precision: Array
+def _source_error(model: Model, extended: Array) -> SourceError:
+    amplitude = gaussian_filter(extended, SMOOTHED, mode="wrap")
+    return SourceError(model.forward, model.adjoint, amplitude, CORRELATED)
 
 
 def _linearise(
@@ -177,7 +160,7 @@ def _linearise(
     extended: Array,
     fluxes: Array,
     moves: bool,
-) -> list[_Image]:
+) -> list[LinearImage]:
     p, k, n = scene.n_images, len(families.prior), len(fluxes)
     shared = p * k + np.arange(n * (3 if moves else 1))
     diffuse, images = model.forward(extended), []
@@ -190,7 +173,7 @@ def _linearise(
         if moves:
             slopes += _star_slopes(stars, fluxes)
         images.append(
-            _Image(
+            LinearImage(
                 np.array(slopes).reshape(len(slopes), -1),
                 np.concatenate([np.arange(j * k, (j + 1) * k), shared]),
                 counts - total,
@@ -243,40 +226,6 @@ def _frequencies(grid: tuple[int, ...]) -> tuple[Any, Any]:
     return np.fft.rfftfreq(grid[1])[None, :], np.fft.fftfreq(grid[0])[:, None]
 
 
-class _Field(Protocol):
-    """A field of many numbers x ~ N(0, 1), and what it changes in the images, linearly.
-
-    Attributes
-    ----------
-    at : ndarray of float64
-        x, where it is.
-    """
-
-    at: Array
-
-    def forward(self, x: Array) -> Iterable[Array]:
-        """Return the changes of the images, shape (p, Ny, Nx)."""
-
-    def adjoint(self, images: Sequence[Array]) -> Array:
-        """Return what `forward` is the transpose of, of the shape of x."""
-
-
-class _SourceError:
-    """The error of the extended source, ``A_j (a C^(1/2) x)``."""
-
-    def __init__(self, model: Model, extended: Array) -> None:
-        self._model = model
-        self._amplitude = gaussian_filter(extended, SMOOTHED, mode="wrap")
-        self._smooth = SmoothField(extended.shape, CORRELATED)
-        self.at = np.zeros(extended.shape)
-
-    def forward(self, x: Array) -> Array:
-        return self._model.forward(self._amplitude * self._smooth.apply(x))
-
-    def adjoint(self, images: Sequence[Array]) -> Array:
-        return self._smooth.apply(self._amplitude * self._model.adjoint(images))
-
-
 class _PixelErrors:
     """The errors of the pixels of the PSFs, ``D_j * (f + sum_s c_s delta_s)``."""
 
@@ -300,111 +249,3 @@ class _PixelErrors:
             of_psf = scipy.fft.irfft2(back, self._grid, workers=-1)[self._places]
             fields[j] = self._pixels.adjoint(j, of_psf)
         return fields
-
-
-class _Fit:
-    """The least squares of a few unknowns, and of fields.
-
-    Parameters
-    ----------
-    images : list of _Image
-        The images.
-    fields : list of _Field
-        The fields; one at least.
-    prior : ndarray of float64, shape (k,)
-        One over the variance of the prior of each unknown, 0 for none; its mean is 0.
-    """
-
-    def __init__(self, images: list[_Image], fields: Sequence[_Field], prior: Array) -> None:
-        self._images, self._fields, self._prior = images, fields, prior
-        self._ends = np.cumsum([field.at.size for field in fields])[:-1]
-        information = np.diag(prior)
-        for each in images:
-            block = (each.slopes * each.precision.ravel()) @ each.slopes.T
-            information[np.ix_(each.unknowns, each.unknowns)] += block
-        self._units = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-        scaled = information * self._units * self._units[:, None]
-        # Stars that nothing tells apart leave it singular.
-        self._factor = scipy.linalg.cho_factor(scaled + ROUNDING * np.eye(len(prior)))
-
-    def solve(self, at: Array) -> tuple[Array, list[Array]]:
-        """Return the changes of the unknowns, from where they are, and of the fields."""
-        change, x = self._solve(self._prior * at)
-        return change, self._each(x)
-
-    def least_squares(self) -> tuple[Array, float]:
-        """Return the least squares of the images and of priors, from unknowns at their means."""
-        change, x = self._solve(np.zeros_like(self._prior))
-        left = self._left() - self._changes(change) - self._forward(x)
-        squares = [
-            float((e.precision * r * r).sum()) for e, r in zip(self._images, left, strict=True)
-        ]
-        return np.array(squares), float((x * x).sum() + self._prior @ change**2)
-
-    def _left(self) -> Array:
-        return np.array([each.left for each in self._images])
-
-    def _solve(self, pull: Array) -> tuple[Array, Array]:
-        """Return the changes of the unknowns, and of the fields, one after the other."""
-        left = self._left()
-        direct = self._invert(self._moments(left) - pull)
-        at = np.concatenate([field.at.ravel() for field in self._fields])
-        x = self._find_fields(self._adjoint(left - self._changes(direct)) - at)
-        return self._invert(self._moments(left - self._forward(x)) - pull), x
-
-    def _find_fields(self, wanted: Array) -> Array:
-        """Return the changes of the fields, by conjugate gradients."""
-        x, rest, along = np.zeros_like(wanted), wanted, wanted
-        square = first = float(rest @ rest)
-        for _ in range(N_STEPS):
-            if square <= FINISHED**2 * first:
-                break
-            image = self._curvature(along)
-            share = square / float(along @ image)
-            x, rest = x + share * along, rest - share * image
-            before, square = square, float(rest @ rest)
-            along = rest + square / before * along
-        return x
-
-    def _curvature(self, x: Array) -> Array:
-        """Return the second derivative along x, the unknowns following it."""
-        images = self._forward(x)
-        images -= self._changes(self._invert(self._moments(images)))
-        return x + self._adjoint(images)
-
-    def _each(self, x: Array) -> list[Array]:
-        """Return each field, in its shape."""
-        parts = zip(np.split(x, self._ends), self._fields, strict=True)
-        return [part.reshape(field.at.shape) for part, field in parts]
-
-    def _forward(self, x: Array) -> Array:
-        """Return what the fields change in the images, shape (p, Ny, Nx)."""
-        images = np.zeros((len(self._images), *self._images[0].left.shape))
-        for field, part in zip(self._fields, self._each(x), strict=True):
-            for image, change in zip(images, field.forward(part), strict=True):
-                image += change
-        return images
-
-    def _adjoint(self, images: Array) -> Array:
-        """Return what `_forward` is the transpose of, the images weighted."""
-        weighted = [each.precision * x for each, x in zip(self._images, images, strict=True)]
-        return np.concatenate([field.adjoint(weighted).ravel() for field in self._fields])
-
-    def _moments(self, images: Array) -> Array:
-        """Return the products of images with the slopes, weighted."""
-        moments = np.zeros(len(self._prior))
-        for each, image in zip(self._images, images, strict=True):
-            moments[each.unknowns] += each.slopes @ (each.precision * image).ravel()
-        return moments
-
-    def _changes(self, change: Array) -> Array:
-        """Return the changes of the models, shape (p, Ny, Nx), where the unknowns change."""
-        return np.array(
-            [
-                (change[each.unknowns] @ each.slopes).reshape(each.left.shape)
-                for each in self._images
-            ]
-        )
-
-    def _invert(self, moments: Array) -> Array:
-        return np.asarray(self._units * scipy.linalg.cho_solve(self._factor, self._units * moments))

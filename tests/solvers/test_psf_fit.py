@@ -93,11 +93,11 @@ def test_the_step_is_that_of_the_whole_least_squares(known, moves, names, monkey
     prior = np.zeros(len(at))
     prior[: P * len(family.prior)] = np.tile(family.prior**-2.0, P)
     images = psf_fit._linearise(scene, family, family.first().values, model, sky, fluxes, moves)
-    fields = [psf_fit._SourceError(model, sky)]
+    fields = [psf_fit._source_error(model, sky)]
     if "pixels" in names:
         pixels = 0.3 * RNG.standard_normal((P, N, N))
         fields.append(psf_fit._PixelErrors(scene, family.pixels, sky, fluxes, pixels))
-    fit = psf_fit._Fit(images, fields, prior)
+    fit = psf_fit._fit(images, fields, prior)
     found, of_fields = fit.solve(at)
 
     slopes = np.zeros((P, N * N, len(at)))
@@ -118,6 +118,9 @@ def test_the_step_is_that_of_the_whole_least_squares(known, moves, names, monkey
     expected = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
     everything = np.concatenate([found, *(each.ravel() for each in of_fields)])
     np.testing.assert_allclose(everything, expected, rtol=0, atol=1e-7 * abs(expected).max())
+    covariance = np.linalg.inv(matrix.T @ matrix)
+    for unknown in (0, len(at) - 1):
+        assert fit.variance(unknown) == pytest.approx(covariance[unknown, unknown], rel=1e-9)
 
 
 def test_pixels_change_the_images_as_another_psf_does():
@@ -138,7 +141,7 @@ def test_pixels_change_the_images_as_another_psf_does():
 def test_the_error_of_the_extended_source_has_unit_variance_and_a_width():
     scene = a_scene()
     model = Model(scene)
-    error = psf_fit._SourceError(model, np.ones((N, N)))
+    error = psf_fit._source_error(model, np.ones((N, N)))
     fields = [error._smooth.apply(RNG.standard_normal((N, N))) for _ in range(400)]
     assert np.mean(np.square(fields)) == pytest.approx(1.0, rel=0.05)
     products = [np.mean(f * np.roll(f, 3, axis=1)) for f in fields]
