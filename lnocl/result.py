@@ -98,11 +98,12 @@ class Result:
     star_positions : ndarray of float64, shape (n, 2)
         (x, y) in pixels, as given or refined.
     star_flux_errors : ndarray of float64, shape (n,)
-        Standard errors of the fluxes, electrons. They are those of the Fisher information of fluxes
-        and positions, with the extended source taken as known. NaN where positions were not refined
-        or the images do not determine them, such as those of stars that have moved to one place.
+        Standard errors of the fluxes, electrons: of the joint Fisher information of all stars and
+        of the extended source, which is not taken as known (`lnocl.solvers.star_errors`,
+        docs/errors.md). They are computed when they are first read. NaN where the images do not
+        determine them, such as those of stars that have moved to one place.
     star_position_errors : ndarray of float64, shape (n, 2)
-        Standard errors of the positions, pixels, likewise.
+        Standard errors of the positions, pixels, likewise; NaN where they were not refined.
     n_iter : int
         The iteration of the estimate.
     stop_reason : str
@@ -134,8 +135,6 @@ class Result:
     extended: Array
     star_fluxes: Array
     star_positions: Array
-    star_flux_errors: Array
-    star_position_errors: Array
     n_iter: int
     stop_reason: str
     device: str
@@ -150,6 +149,23 @@ class Result:
         for values in vars(self).values():
             if isinstance(values, np.ndarray):
                 values.flags.writeable = False
+
+    @property
+    def star_flux_errors(self) -> Array:
+        """Standard errors of the star fluxes, electrons, shape (n,)."""
+        return self._star_errors[0]
+
+    @property
+    def star_position_errors(self) -> Array:
+        """Standard errors of the star positions, pixels, shape (n, 2)."""
+        return self._star_errors[1]
+
+    @cached_property
+    def _star_errors(self) -> tuple[Array, Array]:
+        errors = self._outcome.star_errors()
+        for each in errors:
+            each.flags.writeable = False
+        return errors
 
     @property
     def psfs(self) -> Array:
@@ -190,7 +206,7 @@ class Result:
         """Return the stars as a table of astropy, which `deconvolve` takes as stars again.
 
         Columns x and y in pixels, 0-based, and flux in electrons, per second where exposures were
-        given; with x_error, y_error and flux_error, standard errors, where positions were refined.
+        given; with standard errors flux_error and, where positions were refined, x_error, y_error.
         """
         from astropy import units as u
         from astropy.table import QTable  # which takes its time to load
@@ -198,10 +214,10 @@ class Result:
         unit = u.electron / u.s if self._is_rate else u.electron
         x, y = self.star_positions.T
         columns = {"x": x * u.pix, "y": y * u.pix, "flux": self.star_fluxes * unit}
-        if np.isfinite(self.star_flux_errors).any():
+        if np.isfinite(self.star_position_errors).any():
             x_error, y_error = self.star_position_errors.T
             columns |= {"x_error": x_error * u.pix, "y_error": y_error * u.pix}
-            columns["flux_error"] = self.star_flux_errors * unit
+        columns["flux_error"] = self.star_flux_errors * unit
         return QTable(columns)
 
     def plot(self) -> Figure:
@@ -270,9 +286,7 @@ class Result:
             unit=unit,
             star_columns=fitswrite.error_columns(
                 self.star_position_errors, self.star_flux_errors, unit
-            )
-            if np.isfinite(self.star_flux_errors).any()
-            else [],
+            ),
             cubes={"MODELS": (models, "electron"), "RESIDUALS": (self._residuals(models), "")},
             **parts,
         )
@@ -315,14 +329,11 @@ def make_result(outcome: Outcome) -> Result:
     history = np.zeros(len(outcome.objectives), HISTORY_DTYPE)
     history["iteration"] = np.arange(len(history))
     history["objective"] = outcome.objectives
-    flux_errors, position_errors = outcome.star_errors()
     ny, nx = scene.observation.shape
     return Result(
         extended=outcome.sky[:ny, :nx],
         star_fluxes=outcome.star_fluxes,
         star_positions=scene.stars,
-        star_flux_errors=flux_errors,
-        star_position_errors=position_errors,
         n_iter=len(history) - 1,
         stop_reason=outcome.stop_reason,
         device=outcome.engine_name,

@@ -188,11 +188,9 @@ def _star_columns(
     from lnocl.io.fitswrite import StarColumn, error_columns
     from lnocl.metrics import magnitude
 
-    columns = []
     header = frames.header
-    if arguments.refine_positions:
-        flux_errors = result.star_flux_errors / frames.electrons
-        columns += error_columns(result.star_position_errors, flux_errors, frames.unit)
+    flux_errors = result.star_flux_errors / frames.electrons
+    columns = error_columns(result.star_position_errors, flux_errors, frames.unit)
     if arguments.zero_point is not None:
         fluxes = result.star_fluxes / frames.electrons
         magnitudes = [magnitude(flux, 1.0) + arguments.zero_point for flux in fluxes]

@@ -180,13 +180,15 @@ def write_image(
 def error_columns(
     position_errors: ArrayLike, flux_errors: ArrayLike, unit: str
 ) -> list[StarColumn]:
-    """Return the columns of the standard errors of stars, positions in pixels."""
-    x_error, y_error = np.asarray(position_errors).T
-    return [
-        StarColumn("x_error", x_error, "pix", "standard error"),
-        StarColumn("y_error", y_error, "pix", "standard error"),
-        StarColumn("flux_error", flux_errors, column_unit(unit), "standard error"),
-    ]
+    """Return the columns of the standard errors of stars, of positions only where there are any."""
+    columns = []
+    if np.isfinite(position_errors).any():
+        x_error, y_error = np.asarray(position_errors).T
+        columns = [
+            StarColumn("x_error", x_error, "pix", "standard error"),
+            StarColumn("y_error", y_error, "pix", "standard error"),
+        ]
+    return [*columns, StarColumn("flux_error", flux_errors, column_unit(unit), "standard error")]
 
 
 def column_unit(unit: str) -> str:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import warn
-from lnocl.runs.start import make_model
 from lnocl.scene.observation import Array
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
@@ -125,28 +124,26 @@ class Outcome:
     psf_refinement: PsfRefinement | None = None
 
     def star_errors(self) -> tuple[Array, Array]:
-        """Return the standard errors of star fluxes and positions; NaN where they were not moved.
+        """Return the standard errors of star fluxes and positions, the extended source not known.
+
+        `lnocl.solvers.star_errors` has the equation. NaN for positions that were not fitted, and
+        where the images do not determine them.
 
         Warns
         -----
         LnoclWarning
             The images do not determine flux and position of a star.
         """
-        n = self.scene.n_stars
-        if self.given_stars is None:
-            return np.full(n, np.nan), np.full((n, 2), np.nan)
-        from lnocl.solvers.positions import StarFit, Stars
+        from lnocl.solvers.star_errors import standard_errors
 
-        scene = self.scene
-        fit = StarFit(scene, make_model(scene), self.sky / scene.unit, self.given_stars)
-        errors = fit.errors(Stars(self.star_fluxes / scene.unit, scene.stars))
-        is_blended = np.isnan(errors.fluxes) | np.isnan(errors.positions).any(axis=1)
-        if is_blended.any():
-            named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in scene.stars[is_blended])
+        scene, moves = self.scene, self.given_stars is not None
+        sky, fluxes = self.sky / scene.unit, self.star_fluxes / scene.unit
+        errors = standard_errors(scene, sky, fluxes, moves)
+        is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (fluxes > 0)
+        if is_lost.any():
+            named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in scene.stars[is_lost])
             warn(
                 f"the images do not determine flux and position of each star at {named}, so that "
                 "these errors are NaN; leave out stars that lie on others"
             )
-        # J is divided by the scale too, so that its information is that of as many fewer counts.
-        root = 1.0 / np.sqrt(scene.scale)
-        return errors.fluxes * scene.unit * root, errors.positions * root
+        return errors[:, 0] * scene.unit, errors[:, 1:]

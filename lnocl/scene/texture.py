@@ -1,13 +1,13 @@
 r"""What a sky may hold that an estimate of it does not: detail below the resolution.
 
-An estimate is smoother than the sky, and a star takes the light that lies under its core. The sky
-is taken for
+An estimate is smoother than the sky, and what lies under the core of a star it may give to either.
+The sky is expected to be
 
-.. math:: \max(f + a\, C^{1/2} x, 0), \qquad x \sim N(0, 1),
+.. math:: \max(\bar f + a\, C^{1/2} x, 0), \qquad x \sim N(0, 1).
 
-with an amplitude a that is a share of the extended source f, smoothed, near stars of the brightest
-there, and a correlation C over a part of the resolution. How large these are was measured on
-simulated skies: docs/errors.md.
+The mean is the estimate f, but under a star's core it is the mean of f round it. The amplitude a is
+a share of f, smoothed; near a star a share of the brightest there. C is a correlation over a part
+of the resolution. How large these are was measured on simulated skies: docs/errors.md.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.smooth_field import SmoothField
 
-# Of the extended source.
-SHARE = 0.4
-# Of the resolution: widths of the correlation, of the smoothing of the amplitude and of that near
-# stars; and the distances from a star within which light is looked for, and may lie.
+# Amplitudes, of the extended source and of the brightest near a star.
+SHARE, SHARE_NEAR = 0.3, 0.8
+# All lengths are in resolutions. Widths of the correlation, of the smoothing of the amplitude, and
+# of that near stars.
 CORRELATED, SMOOTHED, SMOOTHED_NEAR = 0.25, 0.35, 0.175
-LOOKED_FOR, NEAR = 1.05, 0.7
+# What lies to the first distance of a star is its core, to the second it is near, to the third
+# round it; the core ends over a width.
+CORE, NEAR, ROUND, EDGE = 0.55, 0.7, 1.05, 0.25
 
 
 class Texture:
-    """Detail that an estimate may lack, as a Gaussian field on the grid.
+    """The skies that an estimate may stand for, as a Gaussian field on the grid.
 
     Parameters
     ----------
@@ -40,47 +42,53 @@ class Texture:
 
     Attributes
     ----------
-    amplitude : ndarray of float64, shape (Ny, Nx)
-        Standard deviation of the field, in the unit of `extended`.
+    mean, amplitude : ndarray of float64, shape (Ny, Nx)
+        Mean and standard deviation, in the unit of `extended`.
     resolution : float
         Full width at half maximum of the narrowest PSF, pixels.
+    width : float
+        Pixels over which the field is correlated (`lnocl.scene.smooth_field.SmoothField`).
     """
 
     def __init__(self, scene: Scene, extended: Array) -> None:
         self.resolution = resolution(scene)
-        self._extended = extended
-        smooth = gaussian_filter(extended, SMOOTHED * self.resolution, mode="wrap")
-        self._brighten_near_stars(scene, smooth)
-        self.amplitude = SHARE * smooth
-        self._correlate = SmoothField(extended.shape, CORRELATED * self.resolution).apply
+        self.width = CORRELATED * self.resolution
+        self.mean = extended.copy()
+        self.amplitude = SHARE * _smooth(extended, SMOOTHED * self.resolution)
+        self._correlate = SmoothField(extended.shape, self.width).apply
+        bright = _smooth(extended, SMOOTHED_NEAR * self.resolution)
+        for star in scene.stars:
+            self._fill(star, extended, bright)
 
-    def _brighten_near_stars(self, scene: Scene, smooth: Array) -> None:
-        light = gaussian_filter(self._extended, SMOOTHED_NEAR * self.resolution, mode="wrap")
-        half = int(np.ceil(LOOKED_FOR * self.resolution))
-        offsets = np.arange(-half, half + 1)
-        for x, y in scene.stars:
-            rows, columns = (round(at) + offsets for at in (y, x))
-            distance = np.hypot((rows - y)[:, None], columns - x) / self.resolution
-            window = np.ix_(rows % smooth.shape[0], columns % smooth.shape[1])
-            brightest = light[window][distance <= LOOKED_FOR].max()
-            smooth[window] = np.where(
-                distance <= NEAR, np.maximum(smooth[window], brightest), smooth[window]
-            )
+    def _fill(self, star: Array, extended: Array, bright: Array) -> None:
+        """Expect under a star's core what lies round it, and near it as much as the brightest."""
+        grid = extended.shape
+        half = min(int(np.ceil(ROUND * self.resolution)), (min(grid) - 1) // 2)
+        columns, rows = (round(at) + np.arange(-half, half + 1) for at in star)
+        distance = np.hypot((rows - star[1])[:, None], columns - star[0]) / self.resolution
+        window = np.ix_(rows % grid[0], columns % grid[1])
+        is_round = (distance > CORE) & (distance <= ROUND)
+        if not is_round.any():  # the grid is smaller than this
+            return
+        least = np.where(distance <= NEAR, SHARE_NEAR * bright[window][distance <= ROUND].max(), 0)
+        self.amplitude[window] = np.maximum(self.amplitude[window], least)
+        share = np.clip((CORE - distance) / EDGE + 1.0, 0.0, 1.0)
+        around = extended[window][is_round].mean()
+        self.mean[window] += share * (around - self.mean[window])
 
     def apply(self, x: Array) -> Array:
         """Return the field ``a C^(1/2) x`` of white noise x."""
         return self.amplitude * self._correlate(x)
 
-    def adjoint(self, sky: Array) -> Array:
-        """Return ``C^(1/2) (a sky)``, of which `apply` is the transpose."""
-        return self._correlate(self.amplitude * sky)
-
     def draw(self, rng: np.random.Generator) -> Array:
-        """Return a sky like the estimate, with detail of its own."""
-        noise = rng.standard_normal(self._extended.shape)
-        return np.maximum(self._extended + self.apply(noise), 0.0)
+        """Return a sky, shape (Ny, Nx)."""
+        return np.maximum(self.mean + self.apply(rng.standard_normal(self.mean.shape)), 0.0)
 
 
 def resolution(scene: Scene) -> float:
     """Return the full width at half maximum of the narrowest PSF, pixels."""
     return min(fwhm(psf) for psf in scene.observation.psfs)
+
+
+def _smooth(sky: Array, width: float) -> Array:
+    return np.asarray(gaussian_filter(sky, width, mode="wrap"), np.float64)

@@ -75,6 +75,11 @@ class SourceError:
         a, its standard deviation.
     width : float
         Pixels over which it is correlated (`lnocl.scene.smooth_field.SmoothField`).
+
+    Attributes
+    ----------
+    images_of : callable
+        `forward`, of a sky.
     """
 
     def __init__(
@@ -84,13 +89,13 @@ class SourceError:
         amplitude: Array,
         width: float,
     ) -> None:
-        self._forward, self._adjoint, self._amplitude = forward, adjoint, amplitude
+        self.images_of, self._adjoint, self._amplitude = forward, adjoint, amplitude
         self._smooth = SmoothField(amplitude.shape, width)
         self.at = np.zeros(amplitude.shape)
 
     def forward(self, x: Array) -> Array:
         """Return the changes of the images, shape (p, Ny, Nx)."""
-        return self._forward(self._amplitude * self._smooth.apply(x))
+        return self.images_of(self._amplitude * self._smooth.apply(x))
 
     def adjoint(self, images: Sequence[Array]) -> Array:
         """Return what `forward` is the transpose of, shape (Ny, Nx)."""
@@ -112,6 +117,11 @@ class LeastSquares:
         Steps of conjugate gradients, at most.
     finished : float
         The share of the gradient at which they end.
+
+    Attributes
+    ----------
+    information : ndarray of float64, shape (k, k)
+        The Fisher information of the unknowns, the fields held.
     """
 
     def __init__(
@@ -125,7 +135,7 @@ class LeastSquares:
         self._images, self._fields, self._prior = images, fields, prior
         self._n_steps, self._finished = n_steps, finished
         self._ends = np.cumsum([field.at.size for field in fields])[:-1]
-        information = np.diag(prior)
+        self.information = information = np.diag(prior)
         for each in images:
             block = (each.slopes * each.precision.ravel()) @ each.slopes.T
             information[np.ix_(each.unknowns, each.unknowns)] += block

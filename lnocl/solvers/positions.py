@@ -14,7 +14,7 @@ from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
 from lnocl.scene.stars import Piece, StarImages, light_up, overlap, places
-from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood, invert, variances
+from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood, invert
 
 # How far from where it was given a star may go, in pixels.
 RADIUS = 3.0
@@ -171,13 +171,6 @@ class StarFit:
         fluxes = np.maximum(stars.fluxes + step[:n], MAX_FADING * stars.fluxes)
         moves = _shorten(step[n:].reshape(2, n).T, MAX_STEP)
         return Stars(fluxes, self._given + _shorten(stars.positions + moves - self._given, RADIUS))
-
-    def errors(self, stars: Stars) -> Stars:
-        """Return standard errors, the roots of the `fluxes.variances`."""
-        n = len(stars.fluxes)
-        _, information = self.derivatives(stars)
-        errors = np.sqrt(variances(information))
-        return Stars(errors[:n], errors[n:].reshape(2, n).T)
 
 
 class _MovableStars:

@@ -259,7 +259,7 @@ class TestFrames:
         assert self.run("--gain", "1", "--exposure", "1", "--zero-point", "25", "--refine",
                         "--n-iter", "1", "--models") == 0  # fmt: skip
         found = outcome("out.fits")
-        columns = ["x", "y", "flux", "x_error", "y_error", "flux_error", "mag"]
+        columns = ["x", "y", "flux", "flux_error", "mag"]
         assert list(found["STARS"]) == [*columns, "core_rms", "wings_rms", "halo"]
         assert found["MODELS"].shape == (2, *SHAPE)
 
