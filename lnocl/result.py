@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from astropy.table import QTable
     from matplotlib.figure import Figure
 
+    from lnocl.runs.bootstrap import Bootstrap
+
 # Stars that a notebook lists.
 MAX_LISTED = 10
 
@@ -219,6 +221,64 @@ class Result:
             columns |= {"x_error": x_error * u.pix, "y_error": y_error * u.pix}
         columns["flux_error"] = self.star_flux_errors * unit
         return QTable(columns)
+
+    def bootstrap(
+        self,
+        n: int = 50,
+        *,
+        regions: str | os.PathLike[str] | Iterable[Any] = (),
+        header: fits.Header | None = None,
+        seed: int = 0,
+        progress: bool = False,
+        earlier: Bootstrap | None = None,
+        callback: Callable[[Bootstrap], None] | None = None,
+    ) -> Bootstrap:
+        """Return the errors of stars, regions and pixels, by replicas of this reconstruction.
+
+        A replica is a sky that the result may stand for, observed and reconstructed as the images
+        were, by as many iterations (`lnocl.runs.replicas`, docs/errors.md). It costs as much as a
+        run of all counts of that length; n of them use its buffers and programs.
+
+        Parameters
+        ----------
+        n : int, optional
+            Replicas, ten or more.
+        regions : str, path or iterable of regions.Region, optional
+            Regions whose light of the extended source is measured: a file of them, as DS9 writes,
+            or these, of the package regions.
+        header : astropy.io.fits.Header, optional
+            Header of the first image, for regions on the sky.
+        seed : int, optional
+            Zero or more. The same seed gives the same numbers on the same device.
+        progress : bool, optional
+            Show a progress bar on stderr, where that is a terminal.
+        earlier : Bootstrap, optional
+            Replicas of this result, regions and seed that are there already: the rest is added, and
+            all is bit for bit as if it had been computed at once.
+        callback : callable, optional
+            Is given the errors so far after each replica.
+
+        Raises
+        ------
+        InputError
+            n is less than 10, the seed negative; a region lies outside the images or encloses
+            nothing, or is on the sky without a header; earlier replicas are of something else.
+        FileError
+            The file of regions is missing, or holds none.
+        LnoclError
+            The package regions is missing.
+        DeviceError
+            As `lnocl.deconvolve`.
+        """
+        from lnocl.io.regions import read_apertures
+        from lnocl.runs.bootstrap import bootstrap, check_number
+
+        check_number(n, seed)
+        if not isinstance(regions, (str, os.PathLike)):
+            regions = list(regions)
+        shape = self._outcome.scene.observation.shape
+        apertures = read_apertures(regions, header, shape) if regions else []
+        return bootstrap(self._outcome, n, apertures, seed, progress, earlier, callback)
 
     def plot(self) -> Figure:
         """Return a picture: image, model, residuals and extended source, whole and at each star.

@@ -14,6 +14,7 @@ from lnocl.commands import (
     demo,
     devices,
     environment,
+    errors,
     messages,
     plot,
     psf,
@@ -32,6 +33,7 @@ INTERRUPTED = 130
 # In the order of the help.
 COMMANDS = {
     "deconvolve": deconvolve.COMMAND,
+    "errors": errors.COMMAND,
     "psf": psf.COMMAND,
     "stars": stars.COMMAND,
     "plot": plot.COMMAND,

@@ -6,9 +6,9 @@ import argparse
 import dataclasses
 import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from lnocl.commands import checkpoints, messages, options, pictures, record
+from lnocl.commands import bootstrap, checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
 from lnocl.commands.summary import summarise
@@ -22,33 +22,52 @@ if TYPE_CHECKING:
     from lnocl.io.fitswrite import StarColumn
     from lnocl.io.frames import Frames
     from lnocl.plotting.result import ResultView
+    from lnocl.scene.apertures import Aperture
+
+
+class Solved(NamedTuple):
+    """A run that has ended: its result, what it was made of, and the values that it was given."""
+
+    result: Result
+    frames: Frames
+    given: dict[str, Any]
+    apertures: list[Aperture]
+
+
+def solve(arguments: argparse.Namespace, interrupts: checkpoints.Interrupts) -> Solved:
+    """Read what the arguments of ``lnocl deconvolve`` name, and run."""
+    from lnocl.io import missions
+    from lnocl.io.frames import Calibration, read_frames
+
+    given = {**vars(arguments), "device": _device_spec(arguments)}
+    given |= missions.calibrate(arguments.images[0], given)
+    calibration = Calibration(**_given(given, Calibration._fields))
+    frames = read_frames(arguments.images, arguments.psfs, calibration)
+    given["stars"] = _stars(arguments, frames.header)
+    apertures = bootstrap.read(arguments, frames)
+    result = deconvolve(
+        frames.observation,
+        **_parameters(given),
+        progress=not arguments.quiet,
+        callback=interrupts.callback,
+    )
+    return Solved(result, frames, given, apertures)
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.io import atomic, fitsread, missions
-    from lnocl.io.frames import Calibration, read_frames
+    from lnocl.io import atomic, fitsread
 
     inputs = options.input_paths(ALL_OPTIONS, vars(arguments))
     atomic.check_fits_output(arguments.output, arguments.overwrite, inputs)
     pictures.check(arguments, inputs)
     checkpoints.check(arguments, inputs)
-    given = {**vars(arguments), "device": _device_spec(arguments)}
+    bootstrap.check(arguments)
     with (
         messages.shown_log(arguments.quiet),
         messages.recorded_warnings(COMMAND.flags()) as warned,
         checkpoints.Interrupts() as interrupts,
     ):
-        given |= missions.calibrate(arguments.images[0], given)
-        calibration = Calibration(**_given(given, Calibration._fields))
-        frames = read_frames(arguments.images, arguments.psfs, calibration)
-        given["stars"] = _stars(arguments, frames.header)
-        wcs = fitsread.wcs_cards(frames.header)
-        result = deconvolve(
-            frames.observation,
-            **_parameters(given),
-            progress=not arguments.quiet,
-            callback=interrupts.callback,
-        )
+        result, frames, given, apertures = solve(arguments, interrupts)
         interrupts.listen()  # a run that was resumed at its end has no iteration to start from
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
@@ -56,6 +75,7 @@ def _run(arguments: argparse.Namespace) -> None:
         view = _view(arguments, result, frames)
         overall = Fit.of(view.residuals, view.models) if arguments.residuals and view else None
         said = summarise(arguments, result, frames, at_stars, overall, bool(warned))
+        wcs = fitsread.wcs_cards(frames.header)
         _write(arguments, result, frames, given, at_stars, view, wcs, [*warned, *said])
         said.append(f"written to {arguments.output}")
         if arguments.plot is not None and view is not None:
@@ -65,6 +85,12 @@ def _run(arguments: argparse.Namespace) -> None:
         if not arguments.quiet:
             messages.say(said)
     interrupts.explain(arguments, result)
+    if arguments.bootstrap is not None:
+        said = bootstrap.add_errors(
+            arguments, result, frames, apertures, arguments.output, continues=False
+        )
+        if not arguments.quiet:
+            messages.say(said)
 
 
 def _view(arguments: argparse.Namespace, result: Result, frames: Frames) -> ResultView | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
-from lnocl.commands import checkpoints, options
+from lnocl.commands import bootstrap, checkpoints, options
 from lnocl.commands.options import SEVERAL, finite, number_or_word, option, whole_or_word
 from lnocl.deconvolution import deconvolve
 from lnocl.runs.options import ENGINES, PRECISIONS
@@ -291,6 +291,7 @@ OPTIONS = {
             help="OpenCL, or the NumPy reference, which computes in double (default: %(default)s)",
         ),
     ],
+    "errors": bootstrap.OPTIONS,
     "long runs": checkpoints.OPTIONS,
 }
 ALL_OPTIONS = [each for group in OPTIONS.values() for each in group]

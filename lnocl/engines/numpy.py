@@ -34,13 +34,17 @@ class ReferenceEngine:
         self.scene, self.scaling = scene, scaling
         if scaling is not None:
             self.set_scaling(scaling)
-        self._images = np.array(list(scene.images()))
+        self.take_images()
         background = scene.background()
         self._background = background if background.ndim == 3 else background[:, None, None]
         self._otfs = np.array([otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)])
         self.move_stars()
         self._inverse_weight = self._invert_weight()
         self._slope = self._curvature = np.zeros(scene.grid)
+
+    def take_images(self) -> None:
+        """Take the images that the scene has now, all else being as it was; forget the record."""
+        self._images = np.array(list(self.scene.images()))
         self._objectives: list[float] = []
         self._n_fetched = 0
 

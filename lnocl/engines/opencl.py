@@ -76,7 +76,7 @@ class OpenCLEngine:
         half: int | None = None,
     ) -> None:
         self.name, self.bytes_needed = "the device", 0
-        self._n_objectives = self._n_restored = 0
+        self._forget_record()
         chosen = choose(device).device
         self.name = describe(chosen)
         self.scene, self.scaling = scene, scaling
@@ -109,11 +109,6 @@ class OpenCLEngine:
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
         self._memory = Memory(self._queue, self.layout, scene.scale)
-        self._pending_objective: Transfer | None = None
-        self._n_scaled = 0
-        self._last_mark: cl.Event | None = None
-        self._unchecked: Transfer | None = None
-        self._fetched: list[float] = []
         self._observed: NDArray[np.bool_] | None = None
         self._memory.allocate(**sizes)
         self._upload_scene()
@@ -228,7 +223,7 @@ class OpenCLEngine:
 
     def _upload_scene(self) -> None:
         scene, memory = self.scene, self._memory
-        memory.upload_pixels("images", self._marked_images())
+        self.take_images()
         if scene.weights is not None and scene.has_exposure_map:
             memory.upload_pixels("exposure", scene.weights)
         background = scene.background()
@@ -241,6 +236,19 @@ class OpenCLEngine:
         self.move_stars()
         if scene.weights is not None:
             self._invert_weights(scene.weights)
+
+    def take_images(self) -> None:
+        """Take the images that the scene has now, all else being as it was; forget the record."""
+        self._memory.upload_pixels("images", self._marked_images())
+        self._forget_record()
+
+    def _forget_record(self) -> None:
+        self._n_objectives = self._n_restored = 0
+        self._pending_objective: Transfer | None = None
+        self._n_scaled = 0
+        self._last_mark: cl.Event | None = None
+        self._unchecked: Transfer | None = None
+        self._fetched: list[float] = []
 
     def _marked_images(self) -> Iterator[Array]:
         """Yield the images; unobserved pixels are -1, unless a map of exposures marks them."""

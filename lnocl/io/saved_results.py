@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shlex
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +27,10 @@ TABLES = {
     "HELDOUT": ("smoothing", "iteration", "error"),
 }
 CUBES = ("MODELS", "RESIDUALS")
+
+
+# Words of a shell with bytes that FITS does not allow, as `fitswrite.history_lines` writes them.
+QUOTED = re.compile(r"\$'((?:[^'\\]|\\.)*)'")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +82,20 @@ class SavedResult:
         lines = "\n".join(map(str, self.header.get("HISTORY", ())))
         commands = re.split(r"(?<!\\)\n", lines)
         return "\n".join(command for command in commands if not command.startswith("cd "))
+
+    def command_words(self) -> list[list[str]]:
+        """Return the commands that repeat the run, as words: ``cd`` to its folder, and it.
+
+        Raises
+        ------
+        FileError
+            The header holds no such commands.
+        """
+        text = "\n".join(map(str, self.header.get("HISTORY", ()))).replace("\\\n", "")
+        try:
+            return [shlex.split(line) for line in QUOTED.sub(_unquoted, text).split("\n")]
+        except ValueError as error:
+            raise FileError(f"{self.path} has a damaged command in its header") from error
 
     def number(self, keyword: str) -> float | None:
         """Return the number that a keyword of the header gives; None where it is missing.
@@ -143,6 +163,11 @@ def read_result(path: str) -> SavedResult:
         doubtful,
         messages,
     )
+
+
+def _unquoted(quoted: re.Match[str]) -> str:
+    raw = quoted[1].encode("ascii").decode("unicode_escape").encode("latin-1")
+    return shlex.quote(os.fsdecode(raw))
 
 
 def _texts(file: FitsFile, table: Any) -> list[str]:

@@ -221,6 +221,7 @@ class HeldOutCounts:
             engine_name=engine_name(start.setup),
             penalty=penalty,
             stop_reason=stop_reason,
+            restart=start.again,
         )
 
     def state(self) -> State:

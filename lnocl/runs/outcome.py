@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import warn
+from lnocl.runs.start import Start
 from lnocl.scene.observation import Array
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
@@ -108,6 +110,8 @@ class Outcome:
         As `lnocl.Result.stop_reason`.
     curve : ndarray of `CURVE_DTYPE`
         As `lnocl.Result.held_out`.
+    restart : callable
+        Returns where a run of the observation starts, given the penalty.
     psf_refinement : PsfRefinement or None
         None where the PSFs were not to be refined.
     """
@@ -120,6 +124,7 @@ class Outcome:
     engine_name: str
     penalty: Penalty
     stop_reason: str
+    restart: Callable[[Penalty], Start]
     curve: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
     psf_refinement: PsfRefinement | None = None
 

@@ -17,7 +17,7 @@ from lnocl.runs.descent import Descent
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.saved import LARGEST, Saved, Shape
 from lnocl.runs.start import Setup, Start, make_model, measure_steps, move_stars
-from lnocl.scene.observation import Array
+from lnocl.scene.observation import Array, Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.solvers import SOLVERS
@@ -65,10 +65,33 @@ class Run:
         self._setup, self.n_iter, self._half = start.setup, n_iter, half
         self.scene = copy(start.scene)
         self._given_stars, self._refines = start.given_stars, start.refines
+        self._restart = start.again
         self.engine = _make_engine(self._setup, self.scene, n_iter, start.scaling, half)
+        self._begin(start)
+
+    def _begin(self, start: Start) -> None:
         self.engine.start(start.extended, start.star_fluxes)
         self.done = 0
         self._begin_stage()
+
+    def repeat(self, start: Start, observation: Observation) -> None:
+        """Begin again where the run started, with other images; buffers and programs stay.
+
+        Parameters
+        ----------
+        start : Start
+            Where the run started.
+        observation : Observation
+            That of the run, but for its images.
+        """
+        self.scene.observation = observation
+        if self._refines:
+            self.scene.move_stars(start.scene.stars)
+            self.engine.move_stars()
+            if start.scaling is not None:
+                self.engine.set_scaling(start.scaling)
+        self.engine.take_images()
+        self._begin(start)
 
     def __iter__(self) -> Iterator[int]:
         solve = SOLVERS[self._setup.solver]
@@ -299,6 +322,7 @@ class Run:
             engine_name=self.engine.name,
             penalty=penalty,
             stop_reason=stop_reason,
+            restart=self._restart,
         )
 
     def _forget_end(self) -> None:

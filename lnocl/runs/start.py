@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
@@ -48,6 +50,8 @@ class Start:
         Star fluxes.
     scaling : Scaling or None
         For the scaled gradient projection method.
+    again : callable
+        Returns this start, made anew, for a penalty.
     """
 
     setup: Setup
@@ -56,6 +60,7 @@ class Start:
     extended: Array
     star_fluxes: Array
     scaling: Scaling | None
+    again: Callable[[Penalty], Start]
 
     @property
     def refines(self) -> bool:
@@ -124,7 +129,14 @@ def make_start(
         if refines:
             star_fluxes = move_stars(scene, model, extended, star_fluxes, given, look_round=True)
         star_fluxes, scaling = measure_steps(setup, scene, model, extended, star_fluxes)
-    return Start(setup, scene, given, extended, star_fluxes, scaling)
+    again = partial(
+        make_start,
+        setup,
+        observation,
+        initial_extended=initial_extended,
+        initial_star_fluxes=initial_star_fluxes,
+    )
+    return Start(setup, scene, given, extended, star_fluxes, scaling, again)
 
 
 # What follows loads scipy, which not every start needs.

@@ -35,6 +35,9 @@ class Engine(Protocol):
     def start(self, extended: Array, star_fluxes: Array) -> None:
         """Begin from this estimate; pixels that were not observed are set to 0."""
 
+    def take_images(self) -> None:
+        """Take the images that the scene has now, all else being as it was; forget the record."""
+
     def move_stars(self) -> None:
         """Put the stars where the scene has them now."""
 

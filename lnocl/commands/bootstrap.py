@@ -1,0 +1,193 @@
+"""The options ``--bootstrap``, ``--regions`` and ``--seed``: errors by replicas of a run."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lnocl.commands.options import option
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from lnocl.io.frames import Frames
+    from lnocl.result import Result
+    from lnocl.runs.bootstrap import Bootstrap
+    from lnocl.scene.apertures import Aperture
+
+DEFAULT = 50
+# Seconds between two writings of the replicas so far.
+WRITE_EVERY = 10.0
+# Quantities of which the run says the errors.
+MAX_SAID = 12
+
+OPTIONS = [
+    option(
+        "--bootstrap",
+        type=int,
+        metavar="N",
+        help="replicas, each about as long as the run, for the errors of stars, regions and "
+        "pixels; ten or more, such as 50",
+    ),
+    option(
+        "--regions",
+        metavar="FILE",
+        is_input=True,
+        help="regions whose light is measured: a file such as DS9 writes, in pixels or on the sky",
+    ),
+    option(
+        "--seed",
+        type=int,
+        metavar="S",
+        help="of the replicas, 0 or more (default: 0); the same seed gives the same errors",
+    ),
+]
+
+
+def check(arguments: argparse.Namespace) -> None:
+    """Refuse options that have no meaning, before any work.
+
+    Raises
+    ------
+    InputError
+        A number of replicas below ten, a negative seed; regions or a seed without replicas.
+    """
+    from lnocl.errors import InputError
+    from lnocl.runs.bootstrap import check_number
+
+    if arguments.bootstrap is None:
+        if arguments.regions is not None or arguments.seed is not None:
+            raise InputError("regions and seed are for replicas: give --bootstrap 50 with them")
+        return
+    check_number(arguments.bootstrap, arguments.seed or 0)
+
+
+def read(arguments: argparse.Namespace, frames: Frames) -> list[Aperture]:
+    """Return the regions that were given."""
+    if arguments.regions is None:
+        return []
+    from lnocl.io.regions import read_apertures
+
+    return read_apertures(arguments.regions, frames.header, frames.observation.shape)
+
+
+def add_errors(
+    arguments: argparse.Namespace,
+    result: Result,
+    frames: Frames,
+    apertures: Sequence[Aperture],
+    path: str,
+    continues: bool,
+) -> list[str]:
+    """Add the errors of a result to its file, as replicas are done; return what to say of them.
+
+    Parameters
+    ----------
+    arguments : Namespace
+        With the options of this module.
+    result : Result
+        What the file holds.
+    frames : Frames
+        What it was made of.
+    apertures : list of Aperture
+        The regions.
+    path : str
+        The file.
+    continues : bool
+        Whether replicas that it has already are counted.
+    """
+    from lnocl.runs.bootstrap import bootstrap, without_replicas
+
+    outcome, seed = result._outcome, arguments.seed or 0
+    latest: list[Bootstrap] = []
+    written = time.monotonic()
+
+    def look(found: Bootstrap) -> None:
+        nonlocal written
+        latest[:] = [found]
+        if found.n > 1 and time.monotonic() - written > WRITE_EVERY:
+            _write(path, found, apertures, frames)
+            written = time.monotonic()
+
+    expected = without_replicas(outcome, apertures, seed)
+    earlier = _earlier(path, expected, frames) if continues else None
+    try:
+        found = bootstrap(
+            outcome, arguments.bootstrap, apertures, seed, not arguments.quiet, earlier, look
+        )
+    finally:
+        if latest and latest[0].n > 1:
+            _write(path, latest[0], apertures, frames)
+    return _said(found, frames)
+
+
+def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None:
+    """Return the replicas that a file has; refuse those of something else."""
+    from lnocl.errors import InputError
+    from lnocl.io.fitserrors import read_replicas
+
+    held = read_replicas(path)
+    if held is None:
+        return None
+    is_same = (
+        held.names == [each.name for each in expected.quantities]
+        and np.array_equal(held.values, expected.values / expected.units(frames.electrons))
+        and held.sums.shape == expected.sums.shape
+        and held.seed == expected.seed
+    )
+    if not is_same:
+        raise InputError(
+            f"{path} has replicas of other regions or another seed: give those, or take overwrite "
+            "to begin anew"
+        )
+    return dataclasses.replace(expected, errors=held.errors, sums=held.sums)
+
+
+def _write(path: str, found: Bootstrap, apertures: Sequence[Aperture], frames: Frames) -> None:
+    from lnocl.io.fitserrors import write_errors
+
+    write_errors(
+        path,
+        found.to_table(frames.electrons, frames.unit),
+        _table_of(apertures),
+        (found.error_map / frames.electrons, found.bias_map / frames.electrons),
+        found.errors,
+        found.sums,
+        found.seed,
+        found.resolution,
+        frames.unit,
+    )
+
+
+def _table_of(apertures: Sequence[Aperture]) -> QTable:
+    """Return the regions as a table: name, area and centre."""
+    from astropy.table import QTable
+
+    columns: dict[str, list[Any]] = {name: [] for name in ("name", "pixels", "x", "y")}
+    for each in apertures:
+        y, x = np.indices(each.weights.shape)
+        columns["name"].append(each.name)
+        columns["pixels"].append(each.n_pixels)
+        columns["x"].append((each.weights * (x + each.x)).sum() / each.n_pixels)
+        columns["y"].append((each.weights * (y + each.y)).sum() / each.n_pixels)
+    return QTable(columns, dtype=(str, float, float, float))
+
+
+def _said(found: Bootstrap, frames: Frames) -> list[str]:
+    """Return a line a quantity."""
+    table = found.to_table(frames.electrons, frames.unit)
+    lines = [f"errors by {found.n} replicas, less their bias; in brackets 95 %:"]
+    for row in table[:MAX_SAID]:
+        note = f"; {row['note']}: do not trust its error" if row["note"] else ""
+        lines.append(
+            f"  {row['name']}: {row['value'] - row['bias']:.6g} +- {row['error']:.2g} "
+            f"{row['unit']} ({row['low95']:.6g} to {row['high95']:.6g}{note})"
+        )
+    if len(table) > MAX_SAID:
+        lines.append(f"  and {len(table) - MAX_SAID} more in the table ERRORS")
+    return lines

@@ -1,0 +1,89 @@
+"""The command ``errors``: errors of a result that is there, by replicas of its run."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lnocl.commands import bootstrap, checkpoints, deconvolve, messages, options
+from lnocl.commands.options import option
+from lnocl.commands.parser import Command, Parser
+from lnocl.errors import FileError, InputError
+
+if TYPE_CHECKING:
+    from lnocl.io.saved_results import SavedResult
+
+# The run is taken for the same where its extended source is to this share of its brightest pixel.
+SAME = 1e-3
+
+OPTIONS = [
+    option(
+        "result",
+        metavar="RESULT.fits",
+        is_input=True,
+        help="file that lnocl deconvolve has written; its errors are added to it, after those of "
+        "replicas that it has",
+    ),
+    *bootstrap.OPTIONS,
+    options.OVERWRITE.but(help="begin anew, without the replicas that RESULT.fits has"),
+    options.QUIET,
+]
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from lnocl.io.saved_results import read_result
+
+    saved = read_result(arguments.result)
+    folder, run = _run_of(saved)
+    given = {name: getattr(arguments, name) for name in ("bootstrap", "seed")}
+    for name, value in given.items():
+        setattr(run, name, getattr(run, name) if value is None else value)
+    if arguments.regions is not None:
+        run.regions = os.path.abspath(arguments.regions)
+    run.bootstrap = bootstrap.DEFAULT if run.bootstrap is None else run.bootstrap
+    run.quiet, path = arguments.quiet, os.path.abspath(arguments.result)
+    bootstrap.check(run)
+    try:
+        there = contextlib.chdir(folder)
+        with there, messages.shown_log(True), checkpoints.Interrupts() as interrupts:
+            solved = deconvolve.solve(run, interrupts)
+    except FileNotFoundError as error:
+        raise FileError(f"{folder}, where {arguments.result} was made, is not there") from error
+    found, frames = solved.result, solved.frames
+    expected = saved.extended * frames.electrons
+    if found.extended.shape != expected.shape or not np.allclose(
+        found.extended, expected, rtol=0.0, atol=SAME * abs(expected).max()
+    ):
+        raise InputError(
+            f"the run of {arguments.result} gives another result now: its images, PSFs or options "
+            "have changed; deconvolve again"
+        )
+    said = bootstrap.add_errors(run, found, frames, solved.apertures, path, not arguments.overwrite)
+    if not arguments.quiet:
+        messages.say([*said, f"added to {arguments.result}"])
+
+
+def _run_of(saved: SavedResult) -> tuple[str, argparse.Namespace]:
+    """Return the folder that a result was made in, and the arguments of its run."""
+    parser = Parser(prog="lnocl")
+    deconvolve.COMMAND.add_arguments(parser)
+    lines = saved.command_words()
+    folder = next((words[1] for words in lines if words[:1] == ["cd"]), os.curdir)
+    words = next((words for words in lines if words[:2] == ["lnocl", "deconvolve"]), None)
+    if words is None:
+        raise InputError(
+            f"{saved.path} has no command of lnocl deconvolve in its header; in Python, "
+            "Result.bootstrap gives errors"
+        )
+    return folder, parser.parse_args(words[2:])
+
+
+COMMAND = Command(
+    "add errors of stars, regions and pixels to a result, by replicas of its run",
+    {"": OPTIONS},
+    _run,
+)

@@ -1,0 +1,129 @@
+"""FITS out and in: the errors of a result, added to its file."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from lnocl.errors import FileError
+from lnocl.io.atomic import whole_file
+from lnocl.io.fitsfile import open_fits
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+# The extensions: what was measured, the regions, the standard error and bias of each pixel, and
+# what it takes to continue.
+ERRORS, REGIONS, ERROR, BIAS = "ERRORS", "REGIONS", "ERROR", "BIAS"
+REPLICAS, SUMS = "REPLICAS", "REPLSUMS"
+NAMES = ERRORS, REGIONS, ERROR, BIAS, REPLICAS, SUMS
+
+
+def write_errors(
+    path: str,
+    quantities: QTable,
+    regions: QTable,
+    maps: tuple[NDArray[np.float64], NDArray[np.float64]],
+    replicas: NDArray[np.float64],
+    sums: NDArray[np.float64],
+    seed: int,
+    resolution: float,
+    unit: str,
+) -> None:
+    """Add the errors of a result to its file, or replace those that it has.
+
+    Parameters
+    ----------
+    path : str
+        The file; it is replaced once the new one is complete.
+    quantities, regions : QTable
+        What was measured, and the regions.
+    maps : two ndarray of float64, shape (ny, nx)
+        Standard error and bias of each pixel at the resolution, in this unit.
+    replicas, sums : ndarray of float64, shapes (n, k) and (2, ny, nx)
+        The errors of each replica, and the sums of its pixels, electrons.
+    seed : int
+        Of the replicas.
+    resolution : float
+        Full width at half maximum of the smoothing of the maps, pixels.
+    unit : str
+        Of the maps.
+
+    Raises
+    ------
+    FileError
+        The file cannot be read or written.
+    """
+    cards = [
+        ("NREPL", len(replicas), "replicas"),
+        ("SEED", seed, "of the replicas"),
+        ("RESOLUT", resolution, "FWHM that maps are smoothed to, pixels"),
+    ]
+    try:
+        with fits.open(path, memmap=False) as hdus:
+            rest = [hdu.copy() for hdu in hdus if hdu.name not in NAMES]
+    except OSError as error:
+        raise FileError(f"{path} cannot be read again: {error}") from error
+    column = fits.Column("errors", f"{replicas.shape[1]}D", array=replicas)
+    added = [
+        fits.table_to_hdu(quantities),
+        fits.table_to_hdu(regions),
+        *(fits.ImageHDU(np.asarray(each, np.float64)) for each in maps),
+        fits.BinTableHDU.from_columns([column]),
+        fits.ImageHDU(sums),
+    ]
+    for hdu, name in zip(added, NAMES, strict=True):
+        hdu.name = name
+        hdu.header.extend(cards)
+        if name in (ERROR, BIAS):
+            hdu.header["BUNIT"] = (unit, "per pixel")
+    with whole_file(path, overwrite=True) as stream:
+        fits.HDUList([*rest, *added]).writeto(stream, checksum=True)
+
+
+class Held(NamedTuple):
+    """Replicas that a file has.
+
+    Attributes
+    ----------
+    names : list of str
+        What was measured.
+    values : ndarray of float64, shape (k,)
+        In the result.
+    errors, sums : ndarray of float64, shapes (n, k) and (2, ny, nx)
+        The errors of each replica, and the sums of its pixels, electrons.
+    seed : int
+        Of the replicas.
+    """
+
+    names: list[str]
+    values: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    sums: NDArray[np.float64]
+    seed: int
+
+
+def read_replicas(path: str) -> Held | None:
+    """Return the replicas that a file has; None without them.
+
+    Raises
+    ------
+    FileError
+        The file is missing or damaged.
+    """
+    with open_fits(path) as file:
+        held = {hdu.name: hdu for hdu in file.hdus() if hdu.name in (ERRORS, REPLICAS, SUMS)}
+        if len(held) < 3:
+            return None
+        try:
+            quantities, replicas = held[ERRORS].data, held[REPLICAS].data
+            errors = np.array(replicas["errors"], np.float64).reshape(len(replicas), -1)
+            values = np.array(quantities["value"], np.float64)
+            names = [str(name) for name in quantities["name"]]
+            seed = int(held[REPLICAS].header["SEED"])
+        except (KeyError, ValueError) as error:
+            raise FileError(f"{path} has damaged replicas: {error}; begin anew") from error
+        return Held(names, values, errors, file.pixels(held[SUMS]), seed)

@@ -1,0 +1,109 @@
+"""Regions in, by astropy-regions: the shares of pixels that lie within each."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lnocl.errors import FileError, InputError, LnoclError
+from lnocl.io.sky import celestial_wcs
+from lnocl.scene.apertures import Aperture
+
+if TYPE_CHECKING:
+    from astropy.io import fits
+
+# The share of a region that rounding may leave outside an image.
+ROUNDING = 1e-9
+
+
+def read_apertures(
+    given: str | os.PathLike[str] | Iterable[Any],
+    header: fits.Header | None,
+    shape: tuple[int, int],
+) -> list[Aperture]:
+    """Return the shares of pixels that lie within regions.
+
+    Parameters
+    ----------
+    given : str, path or iterable of regions.Region
+        A file of regions, such as DS9 writes, or these. Pixels are those of an array, 0-based.
+    header : astropy.io.fits.Header or None
+        Header of the image, for regions on the sky.
+    shape : tuple of int
+        Shape (ny, nx) of the image.
+
+    Raises
+    ------
+    LnoclError
+        The package regions is missing.
+    FileError
+        A file that is missing, or holds no regions.
+    InputError
+        A region that encloses nothing, lies outside the image, or on the sky without coordinates.
+    """
+    if isinstance(given, (str, os.PathLike)):
+        path = os.fspath(given)
+        found = _read(path)
+    else:
+        path, found = "regions", list(given)
+    if not found:
+        raise FileError(f"{path} holds no regions: draw circles, ellipses, boxes or polygons")
+    return [_aperture(region, k, path, header, shape) for k, region in enumerate(found, 1)]
+
+
+def _regions() -> Any:
+    try:
+        import regions
+    except ImportError as error:
+        raise LnoclError("regions are read by the package regions: pip install regions") from error
+    return regions
+
+
+def _read(path: str) -> list[Any]:
+    regions = _regions()
+    if not os.path.isfile(path):
+        raise FileError(f"{path} is not there: give a file of regions, such as DS9 writes")
+    try:
+        return list(regions.Regions.read(path))
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # its parsers raise many
+        words = " ".join(str(error).split()) or type(error).__name__
+        raise FileError(f"{path} holds no regions as DS9 writes them: {words}") from error
+
+
+def _aperture(
+    region: Any, number: int, path: str, header: fits.Header | None, shape: tuple[int, int]
+) -> Aperture:
+    regions = _regions()
+    if not isinstance(region, regions.Region):
+        raise InputError(f"regions must be those of the package regions; {region!r} was given")
+    name = region.meta.get("text") or f"region {number}"
+    kind = type(region).__name__.replace("PixelRegion", "").replace("SkyRegion", "").lower()
+    where = f"{name} of {path} ({kind})" if name != f"region {number}" else f"{name} ({kind})"
+    if isinstance(region, regions.SkyRegion):
+        if header is None:
+            raise InputError(f"{where} is on the sky, and the image has no header: give pixels")
+        region = region.to_pixel(celestial_wcs(header, path, "give regions in image coordinates"))
+    try:
+        mask = region.to_mask(mode="exact")
+    except NotImplementedError as error:
+        raise InputError(
+            f"{where} cannot be summed over: give circles, ellipses, boxes or polygons"
+        ) from error
+    weights = np.asarray(mask.data, np.float64)
+    inside = mask.cutout(np.ones(shape), fill_value=0.0)
+    total = weights.sum()
+    if inside is None or (weights * (inside == 0)).sum() > ROUNDING * total:
+        raise InputError(
+            f"{where} lies outside the image of {shape[1]} x {shape[0]} pixels, or partly"
+        )
+    if total == 0:
+        raise InputError(f"{where} encloses no part of a pixel")
+    rows, columns = np.flatnonzero(weights.any(axis=1)), np.flatnonzero(weights.any(axis=0))
+    trimmed = weights[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    y, x = mask.bbox.iymin + int(rows[0]), mask.bbox.ixmin + int(columns[0])
+    return Aperture(name, y, x, trimmed)

@@ -1,0 +1,307 @@
+"""Errors of what is measured in a reconstruction, by replicas of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lnocl.errors import InputError
+from lnocl.runs.outcome import Outcome
+from lnocl.runs.progress import make_bar
+from lnocl.runs.replicas import Replicas, Sky
+from lnocl.scene.apertures import Aperture
+from lnocl.scene.observation import Array
+from lnocl.scene.texture import CORE, resolution
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+MIN_REPLICAS = 10
+# A full width at half maximum in standard deviations.
+FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
+# Levels of the intervals.
+LEVELS = 0.68, 0.95
+
+FLUX, POSITION = "flux", "position"
+BELOW, UNDER = "below the resolution", "under a star"
+
+
+class Quantity(NamedTuple):
+    """Something that is measured.
+
+    Attributes
+    ----------
+    name : str
+        What it is.
+    kind : str
+        ``FLUX``, in electrons, or ``POSITION``, in pixels.
+    value : float
+        What it is in the reconstruction.
+    note : str
+        Why its error may not hold; else empty.
+    """
+
+    name: str
+    kind: str
+    value: float
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Bootstrap:
+    """Errors of what is measured in a reconstruction, by replicas of it.
+
+    A replica is a sky that the reconstruction may stand for (`lnocl.scene.texture`), observed and
+    reconstructed alike; its error is what was found less what was drawn. The mean of the errors is
+    the bias b, their standard deviation the standard error s. With the n replicas the interval of a
+    level round the value v is ``v - b +- t s sqrt(1 + 1 / n)``, t the quantile of Student's
+    distribution of n - 1 degrees of freedom.
+
+    Attributes
+    ----------
+    quantities : tuple of k Quantity
+        What was measured: fluxes of stars, their positions where these were refined, the light of
+        the extended source in regions.
+    errors : ndarray of float64, shape (n, k)
+        The errors of each replica, in electrons or pixels.
+    sums : ndarray of float64, shape (2, ny, nx)
+        The sums over replicas of the errors of the extended source and of their squares, electrons
+        per pixel, smoothed to the resolution.
+    resolution : float
+        Full width at half maximum of that smoothing, pixels: that of the narrowest PSF.
+    seed : int
+        Of the replicas.
+
+    References
+    ----------
+    B. Efron, R. J. Tibshirani, "An Introduction to the Bootstrap" (1993), chapter 6.5.
+    """
+
+    quantities: tuple[Quantity, ...]
+    errors: Array
+    sums: Array
+    resolution: float
+    seed: int
+
+    @property
+    def n(self) -> int:
+        """Number of replicas."""
+        return len(self.errors)
+
+    @property
+    def values(self) -> Array:
+        """The values in the reconstruction, shape (k,)."""
+        return np.array([quantity.value for quantity in self.quantities])
+
+    @property
+    def bias(self) -> Array:
+        """The mean errors, shape (k,)."""
+        return self.errors.mean(axis=0)
+
+    @property
+    def standard_errors(self) -> Array:
+        """The standard deviations of the errors, shape (k,)."""
+        return self.errors.std(axis=0, ddof=1)
+
+    def units(self, electrons: float) -> Array:
+        """Return electrons in the unit of each quantity, 1 for positions, shape (k,)."""
+        return np.array([electrons if each.kind == FLUX else 1.0 for each in self.quantities])
+
+    def interval(self, level: float) -> Array:
+        """Return the bounds that hold the truth with this probability, shape (2, k).
+
+        Parameters
+        ----------
+        level : float
+            In (0, 1).
+        """
+        from scipy.stats import t
+
+        half = t.ppf((1.0 + level) / 2.0, self.n - 1) * np.sqrt(1.0 + 1.0 / self.n)
+        middle, width = self.values - self.bias, half * self.standard_errors
+        return np.array([middle - width, middle + width])
+
+    @property
+    def bias_map(self) -> Array:
+        """The mean error of the extended source at the resolution, electrons per pixel."""
+        return np.asarray(self.sums[0] / self.n)
+
+    @property
+    def error_map(self) -> Array:
+        """Its standard error at the resolution, electrons per pixel, shape (ny, nx)."""
+        squares = self.sums[1] - self.sums[0] ** 2 / self.n
+        return np.sqrt(np.maximum(squares, 0.0) / (self.n - 1))
+
+    def to_table(self, electrons: float = 1.0, unit: str = "electron") -> QTable:
+        """Return a table: a row a quantity, with value, bias, standard error and intervals.
+
+        Parameters
+        ----------
+        electrons : float, optional
+            Electrons in the unit of fluxes.
+        unit : str, optional
+            That unit.
+        """
+        from astropy.table import QTable  # which takes its time to load
+
+        columns = {"value": self.values, "bias": self.bias, "error": self.standard_errors}
+        for level in LEVELS:
+            low, high = self.interval(level)
+            columns |= {f"low{level * 100:.0f}": low, f"high{level * 100:.0f}": high}
+        return QTable(
+            {
+                "name": [each.name for each in self.quantities],
+                "unit": [unit if each.kind == FLUX else "pix" for each in self.quantities],
+                **{name: values / self.units(electrons) for name, values in columns.items()},
+                "note": [each.note for each in self.quantities],
+            }
+        )
+
+
+def bootstrap(
+    outcome: Outcome,
+    n: int,
+    apertures: Sequence[Aperture],
+    seed: int,
+    progress: bool = False,
+    earlier: Bootstrap | None = None,
+    look: Callable[[Bootstrap], None] | None = None,
+) -> Bootstrap:
+    """Return the errors of a reconstruction by n replicas, of which some may be there already.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        The reconstruction.
+    n : int
+        Replicas, `MIN_REPLICAS` or more.
+    apertures : sequence of Aperture
+        Regions whose light is measured.
+    seed : int
+        Zero or more.
+    progress : bool, optional
+        Show a progress bar.
+    earlier : Bootstrap, optional
+        Replicas of the same reconstruction, measured alike; n of them and the others in all.
+    look : callable, optional
+        Is given the errors so far after each replica.
+
+    Raises
+    ------
+    InputError
+        n is less than ten, the seed is negative, or earlier replicas are of another reconstruction.
+    """
+    check_number(n, seed)
+    found = without_replicas(outcome, apertures, seed)
+    if earlier is not None:
+        _refuse_other(earlier, found)
+        found = earlier
+    replicas = Replicas(outcome, seed)
+    with make_bar(n, "replica", progress) as bar:
+        bar.update(found.n)
+        for k in range(found.n, n):
+            drawn, seen = replicas.reconstruct(k)
+            found = _with(found, outcome, apertures, drawn, seen)
+            bar.update()
+            if look is not None:
+                look(found)
+    return found
+
+
+def without_replicas(outcome: Outcome, apertures: Sequence[Aperture], seed: int) -> Bootstrap:
+    """Return what will be measured of a reconstruction, before its first replica."""
+    width = resolution(outcome.scene)
+    quantities = _quantities(outcome, apertures, width)
+    pixels = np.zeros((2, *outcome.scene.observation.shape))
+    return Bootstrap(quantities, np.zeros((0, len(quantities))), pixels, width, seed)
+
+
+def check_number(n: object, seed: object) -> None:
+    """Refuse a number of replicas, or a seed, that is none.
+
+    Raises
+    ------
+    InputError
+        n is no whole number of ten or more, or the seed none of zero or more.
+    """
+    if not (isinstance(n, (int, np.integer)) and n >= MIN_REPLICAS):
+        raise InputError(
+            f"bootstrap takes a whole number of replicas, {MIN_REPLICAS} or more, such as 50; "
+            f"{n} was given"
+        )
+    if not (isinstance(seed, (int, np.integer)) and seed >= 0):
+        raise InputError(f"seed must be a whole number, 0 or more; {seed} was given")
+
+
+def _with(
+    found: Bootstrap, outcome: Outcome, apertures: Sequence[Aperture], drawn: Sky, seen: Sky
+) -> Bootstrap:
+    """Return the errors with those of one replica more."""
+    from scipy.ndimage import gaussian_filter
+
+    moves = outcome.given_stars is not None
+    errors = _measure(seen, apertures, moves) - _measure(drawn, apertures, moves)
+    width = found.resolution / FWHM
+    pixels = gaussian_filter(seen.extended - drawn.extended, width, mode="nearest")
+    return Bootstrap(
+        found.quantities,
+        np.concatenate([found.errors, errors[None]]),
+        found.sums + np.array([pixels, pixels**2]),
+        found.resolution,
+        found.seed,
+    )
+
+
+def _measure(sky: Sky, apertures: Sequence[Aperture], moves: bool) -> Array:
+    positions = sky.star_positions.ravel() if moves else np.zeros(0)
+    regions = [aperture.flux(sky.extended) for aperture in apertures]
+    return np.concatenate([sky.star_fluxes, positions, regions])
+
+
+def _quantities(
+    outcome: Outcome, apertures: Sequence[Aperture], width: float
+) -> tuple[Quantity, ...]:
+    """Return what is measured, in the order of `_measure`."""
+    scene = outcome.scene
+    n, (ny, nx) = scene.n_stars, scene.observation.shape
+    moves = outcome.given_stars is not None
+    sky = Sky(outcome.sky[:ny, :nx], outcome.star_fluxes, scene.stars)
+    names = [(f"star {s} flux", FLUX, "") for s in range(1, n + 1)]
+    if moves:
+        names += [(f"star {s} {axis}", POSITION, "") for s in range(1, n + 1) for axis in "xy"]
+    names += [(each.name, FLUX, _note(each, scene.stars, width)) for each in apertures]
+    values = _measure(sky, apertures, moves).tolist()
+    return tuple(
+        Quantity(name, kind, value, note)
+        for (name, kind, note), value in zip(names, values, strict=True)
+    )
+
+
+def _note(aperture: Aperture, stars: Array, width: float) -> str:
+    """Return why the error of the light of a region may not hold."""
+    if aperture.n_pixels < np.pi / 4.0 * width**2:
+        return BELOW
+    rows, columns = np.indices(aperture.weights.shape)
+    rows, columns = rows + aperture.y, columns + aperture.x
+    for x, y in stars:
+        is_core = np.hypot(rows - y, columns - x) <= CORE * width
+        if (aperture.weights * is_core).sum() > 0.5 * aperture.n_pixels:
+            return UNDER
+    return ""
+
+
+def _refuse_other(earlier: Bootstrap, expected: Bootstrap) -> None:
+    """Refuse replicas of another reconstruction, or that were measured otherwise."""
+    is_same = (
+        earlier.quantities == expected.quantities
+        and earlier.sums.shape == expected.sums.shape
+        and (earlier.seed, earlier.resolution) == (expected.seed, expected.resolution)
+    )
+    if not is_same:
+        raise InputError(
+            "the replicas that are there are of another reconstruction, other regions or another "
+            "seed: give those, or begin anew"
+        )
