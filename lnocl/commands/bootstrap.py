@@ -185,9 +185,9 @@ def _said(found: Bootstrap, frames: Frames) -> list[str]:
     for row in table[:MAX_SAID]:
         note = f"; {row['note']}: do not trust its error" if row["note"] else ""
         lines.append(
-            f"  {row['name']}: {row['value'] - row['bias']:.6g} +- {row['error']:.2g} "
+            f"{row['name']}: {row['value'] - row['bias']:.6g} +- {row['error']:.2g} "
             f"{row['unit']} ({row['low95']:.6g} to {row['high95']:.6g}{note})"
         )
     if len(table) > MAX_SAID:
-        lines.append(f"  and {len(table) - MAX_SAID} more in the table ERRORS")
+        lines.append(f"and {len(table) - MAX_SAID} more in the table ERRORS")
     return lines

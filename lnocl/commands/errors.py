@@ -13,6 +13,7 @@ from lnocl.commands import bootstrap, checkpoints, deconvolve, messages, options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command, Parser
 from lnocl.errors import FileError, InputError
+from lnocl.process import ignored_warnings
 
 if TYPE_CHECKING:
     from lnocl.io.saved_results import SavedResult
@@ -49,7 +50,8 @@ def _run(arguments: argparse.Namespace) -> None:
     bootstrap.check(run)
     try:
         there = contextlib.chdir(folder)
-        with there, messages.shown_log(True), checkpoints.Interrupts() as interrupts:
+        # What the run has to say it has said.
+        with there, ignored_warnings(), checkpoints.Interrupts() as interrupts:
             solved = deconvolve.solve(run, interrupts)
     except FileNotFoundError as error:
         raise FileError(f"{folder}, where {arguments.result} was made, is not there") from error

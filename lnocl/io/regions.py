@@ -87,7 +87,8 @@ def _aperture(
     if isinstance(region, regions.SkyRegion):
         if header is None:
             raise InputError(f"{where} is on the sky, and the image has no header: give pixels")
-        region = region.to_pixel(celestial_wcs(header, path, "give regions in image coordinates"))
+        wcs = celestial_wcs(header, "the image", "give regions in image coordinates")
+        region = region.to_pixel(wcs)
     try:
         mask = region.to_mask(mode="exact")
     except NotImplementedError as error:

@@ -1,0 +1,184 @@
+"""``lnocl errors``, and ``--bootstrap`` of ``lnocl deconvolve``: what they write and refuse."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import lnocl
+from lnocl.commands import cli
+
+pytest.importorskip("regions", reason="regions is not installed")
+
+REGIONS = "image\ncircle(30,30,6) # text={round}\nbox(20,40,12,8,0)\ncircle(9,9,0.9) # text={dot}\n"
+NAMES = ["star 1 flux", "round", "region 2", "dot"]
+EXTENSIONS = ["ERRORS", "REGIONS", "ERROR", "BIAS", "REPLICAS", "REPLSUMS"]
+
+
+@pytest.fixture
+def words(small_command):
+    """Return the words that deconvolve and give errors, in their folder."""
+    Path("jet é.reg").write_text(REGIONS)
+    return [*small_command, "--engine", "numpy", "--n-iter", "6", "-o", "out.fits",
+            "--regions", "jet é.reg", "--bootstrap"]  # fmt: skip
+
+
+def held(path="out.fits"):
+    with fits.open(path) as hdus:
+        return {hdu.name: hdu.copy() for hdu in hdus}
+
+
+def same_errors(one, other):
+    for name in EXTENSIONS:
+        np.testing.assert_array_equal(np.array(one[name].data), np.array(other[name].data))
+
+
+def test_errors_are_added_to_the_file(words, capsys):
+    words.remove("--quiet")
+    assert cli.main([*words, "10"]) == 0
+    said = capsys.readouterr().out
+    assert "errors by 10 replicas, less their bias; in brackets 95 %:\nstar 1 flux: " in said
+    assert "below the resolution: do not trust its error)" in said
+    found = held()
+    assert list(found)[-6:] == EXTENSIONS
+    table = found["ERRORS"].data
+    assert table["name"].tolist() == NAMES
+    assert table["note"].tolist() == ["", "", "", "below the resolution"]
+    assert (table["error"] > 0).all()
+    assert (table["low95"] < table["low68"]).all()
+    assert (table["high95"] > table["high68"]).all()
+    assert table["value"][0] == found["STARS"].data["flux"][0]
+    light = found["PRIMARY"].data[35:43, 13:25].sum()
+    assert table["value"][2] == pytest.approx(light, rel=0.2)  # its edges halve pixels
+    header = found["ERROR"].header
+    assert (header["NREPL"], header["SEED"], header["BUNIT"]) == (10, 0, "electron")
+    assert found["ERROR"].data.shape == found["BIAS"].data.shape == (64, 64)
+    assert found["REGIONS"].data["pixels"][1] == pytest.approx(96)
+    assert lnocl.io.saved_results.read_result("out.fits").extended.shape == (64, 64)
+
+
+def test_errors_go_on_bit_for_bit_as_if_computed_at_once(words):
+    """The command in the header says where files are, names beyond ASCII and all."""
+    assert cli.main([*words, "12"]) == 0
+    expected = held()
+    assert cli.main([*words, "10"]) == 0
+    folder = os.getcwd()
+    os.chdir("/")
+    try:
+        assert cli.main(["errors", f"{folder}/out.fits", "--bootstrap", "12", "--quiet"]) == 0
+    finally:
+        os.chdir(folder)
+    same_errors(held(), expected)
+
+
+def test_a_result_without_errors_is_given_them(words, capsys):
+    alone = words[: words.index("--regions")]
+    assert cli.main(alone) == 0
+    before = Path("out.fits").read_bytes()
+    assert cli.main(["errors", "out.fits", "--bootstrap", "10", "--seed", "4"]) == 0
+    assert capsys.readouterr().out.endswith("added to out.fits\n")
+    found = held()
+    assert found["ERRORS"].data["name"].tolist() == NAMES[:1]
+    assert found["ERROR"].header["SEED"] == 4
+    # What was there is there.
+    with fits.open("out.fits") as now:
+        now[0].writeto("first.fits", overwrite=True, checksum=True)
+    assert len(before) < Path("out.fits").stat().st_size
+    np.testing.assert_array_equal(found["PRIMARY"].data, fits.getdata("first.fits"))
+
+
+def test_overwrite_begins_anew(words):
+    assert cli.main([*words, "10"]) == 0
+    expected = held()
+    for seed, more in (("5", []), ("5", ["--overwrite"]), ("0", ["--overwrite"])):
+        status = cli.main(["errors", "out.fits", "--quiet", "--seed", seed, *more])
+        assert status == (0 if more else 2)
+    np.testing.assert_array_equal(
+        held()["REPLICAS"].data["errors"], expected["REPLICAS"].data["errors"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "message"),
+    [
+        (["--bootstrap", "9"], 2, "--bootstrap takes a whole number of replicas, 10 or more"),
+        (["--seed", "-3"], 2, "--seed must be a whole number, 0 or more; -3 was given"),
+        (["--regions", "nix.reg"], 1, "nix.reg is not there: give a file of regions, such as DS9"),
+        (["--regions", "empty.reg"], 1, "empty.reg holds no regions"),
+        (["--regions", "beyond.reg"], 2, "region 1 (circle) lies outside the image of 64 x 64"),
+        (["--regions", "sky.reg"], 2, "the image has no sky coordinates (WCS) that can be"),
+        (["--regions", "other.reg"], 2, "has replicas of other regions or another seed: give"),
+    ],
+)  # fmt: skip
+def test_wrong_uses_are_one_line_and_leave_the_file(words, change, status, message, capsys):
+    Path("empty.reg").write_text("")
+    Path("beyond.reg").write_text("image\ncircle(300,3,2)")
+    Path("sky.reg").write_text('icrs\ncircle(10,10,1")')
+    Path("other.reg").write_text("image\ncircle(30,30,6)")
+    assert cli.main([*words, "10"]) == 0
+    before = Path("out.fits").read_bytes()
+    capsys.readouterr()
+    assert cli.main(["errors", "out.fits", *change]) == status
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert Path("out.fits").read_bytes() == before
+
+
+def test_what_has_changed_since_is_refused(words, capsys):
+    assert cli.main([*words, "10"]) == 0
+    images = fits.getdata("images.fits")
+    fits.writeto("images.fits", images[:, ::-1], overwrite=True)
+    assert cli.main(["errors", "out.fits", "--quiet"]) == 2
+    assert (
+        "the run of out.fits gives another result now: its images, PSFs or"
+        in capsys.readouterr().err
+    )
+    Path("images.fits").unlink()
+    assert cli.main(["errors", "out.fits", "--quiet"]) == 1
+    assert "images.fits" in capsys.readouterr().err
+
+
+def test_a_file_of_no_command_is_refused(words, capsys):
+    made = fits.HDUList([fits.PrimaryHDU(np.ones((8, 8)))])
+    columns = [fits.Column(name, "D", array=[1.0]) for name in ("x", "y", "flux")]
+    made.append(fits.BinTableHDU.from_columns(columns, name="STARS"))
+    made.writeto("bare.fits")
+    assert cli.main(["errors", "bare.fits"]) == 2
+    assert "bare.fits has no command of lnocl deconvolve in its header" in capsys.readouterr().err
+    alone = words[: words.index("--regions")]
+    assert cli.main([*alone, "--seed", "3"]) == 2
+    assert "--regions and --seed are for replicas: give --bootstrap" in capsys.readouterr().err
+
+
+@pytest.mark.system
+def test_killed_errors_go_on_bit_for_bit(words, monkeypatch):
+    assert cli.main([*words, "40"]) == 0
+    expected = held()
+    alone = words[: words.index("--bootstrap")]
+    assert cli.main(alone[: alone.index("--regions")]) == 0
+    program = (
+        "import sys\nfrom lnocl.commands import bootstrap, cli\nbootstrap.WRITE_EVERY = 0.0\n"
+        "sys.exit(cli.main(sys.argv[1:]))"
+    )
+    options = ["errors", "out.fits", "--regions", "jet é.reg", "--quiet", "--bootstrap", "40"]
+    killed = 0
+    for pause in (0.02, 0.3, 0.6):
+        process = subprocess.Popen([sys.executable, "-c", program, *options])
+        while process.poll() is None and "REPLICAS" not in held():
+            time.sleep(0.01)
+        time.sleep(pause)
+        killed += process.poll() is None
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert killed
+    n = len(held()["REPLICAS"].data)
+    assert n >= 2
+    assert cli.main(options) == 0
+    same_errors(held(), expected)

@@ -1,0 +1,93 @@
+"""Regions: the shares of pixels within them, and those that are refused."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import lnocl
+from lnocl.io.regions import read_apertures
+
+regions = pytest.importorskip("regions", reason="regions is not installed")
+SHAPE = (40, 50)
+WCS = fits.Header(
+    {
+        "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 30.0, "CRVAL2": 10.0,
+        "CRPIX1": 20.0, "CRPIX2": 15.0, "CDELT1": -1e-4, "CDELT2": 1e-4,
+        "CUNIT1": "deg", "CUNIT2": "deg",
+    }
+)  # fmt: skip
+
+
+def read(text, tmp_path, header=None):
+    path = tmp_path / "a.reg"
+    path.write_text(text)
+    return read_apertures(path, header, SHAPE)
+
+
+def test_shares_sum_to_the_area_and_lie_where_the_region_is(tmp_path):
+    found = read(
+        "image\ncircle(11,21,4) # text={knot}\nellipse(25,20,6,3,30)\nbox(30,10,8.5,3,0)\n"
+        "polygon(5,5,11,5,11,15)",
+        tmp_path,
+    )
+    assert [each.name for each in found] == ["knot", "region 2", "region 3", "region 4"]
+    areas = [np.pi * 16, np.pi * 18, 25.5, 30.0]
+    np.testing.assert_allclose([each.n_pixels for each in found], areas, rtol=1e-6)
+    y, x = np.indices(SHAPE, float)
+    middles = [(10, 20), (24, 19), (29, 9), (8, 22 / 3)]
+    for each, (x0, y0) in zip(found, middles, strict=True):
+        np.testing.assert_allclose([each.flux(x), each.flux(y)] / np.array(each.n_pixels), (x0, y0))
+        assert 0 <= each.weights.min() <= each.weights.max() <= 1 + 1e-12
+
+
+def test_a_region_on_the_sky_is_that_in_pixels(tmp_path):
+    (found,) = read('icrs\ncircle(30.0,10.0,1.8")', tmp_path, WCS)
+    (expected,) = read("image\ncircle(20,15,5)", tmp_path)
+    assert (found.y, found.x) == (expected.y, expected.x)
+    np.testing.assert_allclose(found.weights, expected.weights, atol=2e-4)
+
+
+def test_regions_may_be_given_themselves():
+    circle = regions.CirclePixelRegion(regions.PixCoord(12.5, 8.0), 2.5)
+    (found,) = read_apertures([circle], None, SHAPE)
+    assert found.n_pixels == pytest.approx(np.pi * 6.25)
+
+
+def test_a_region_may_touch_the_edge(tmp_path):
+    (found,) = read("image\nbox(25.5,20.5,50,40,0)", tmp_path)
+    assert found.flux(np.ones(SHAPE)) == pytest.approx(2000.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("image\ncircle(100,21,4)", r"^region 1 \(circle\) lies outside the image of 50 x 40"),
+        ("image\ncircle(2,21,4) # text={a}", r"^a of .*a.reg \(circle\) lies .*, or partly$"),
+        ("image\npoint(3,3)", r"^region 1 \(point\) cannot be summed over: give circles, ellipses"),
+        ("image\nannulus(20,20,3,6)", r"\(circleannulus\) cannot be summed over"),
+        ("icrs\ncircle(30,10,1\")", r"is on the sky, and the image has no header: give pixels$"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_measured_is_refused(text, message, tmp_path):
+    with pytest.raises(lnocl.InputError, match=message):
+        read(text, tmp_path)
+
+
+def test_a_region_on_the_sky_needs_coordinates(tmp_path):
+    with pytest.raises(lnocl.InputError, match=r"no sky coordinates .* give regions in"):
+        read('icrs\ncircle(30,10,1")', tmp_path, fits.Header())
+
+
+@pytest.mark.parametrize(
+    "text", ["", "image\n", "no regions at all\n", "image\ncircle(1,\n", "\0\1"]
+)
+def test_a_file_without_regions_is_refused(text, tmp_path):
+    with pytest.raises(lnocl.FileError, match=r"a\.reg holds no regions"):
+        read(text, tmp_path)
+
+
+def test_a_missing_file_and_what_is_no_region_are_refused(tmp_path):
+    with pytest.raises(lnocl.FileError, match=r"nix\.reg is not there: give a file of regions"):
+        read_apertures(tmp_path / "nix.reg", None, SHAPE)
+    with pytest.raises(lnocl.InputError, match=r"^regions must be those of the package regions; 3"):
+        read_apertures([3], None, SHAPE)

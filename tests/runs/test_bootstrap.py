@@ -1,0 +1,226 @@
+"""Replicas of a run, and the errors that they give."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scenes import Recipe
+from scipy.ndimage import gaussian_filter
+from scipy.stats import t
+
+import lnocl
+from lnocl.runs import bootstrap
+from lnocl.runs.bootstrap import Bootstrap, Quantity
+from lnocl.runs.replicas import Replicas
+from lnocl.runs.run import Run
+from lnocl.runs.start import Setup, make_start
+from lnocl.scene.apertures import Aperture
+from lnocl.scene.penalty import Penalty
+
+BASE = Recipe((32, 32), 2, 1, smooth=True)
+RECIPES = {
+    "plain": BASE,
+    "masked, read noise": dataclasses.replace(BASE, masked=0.1, read_noise=2.0, shape=(30, 27)),
+    "map of exposures": dataclasses.replace(BASE, exposure="map"),
+}
+pytestmark = pytest.mark.filterwarnings("ignore:psf . is sharper")
+ENGINES = [("numpy", "double"), ("opencl", "single")]
+APERTURES = [Aperture("a", 4, 6, np.ones((12, 12))), Aperture("b", 20, 3, np.ones((2, 2)))]
+
+
+def solved(recipe=BASE, **changes):
+    made = recipe.make()
+    observation = made.observation()
+    options = {"stop": None, "n_iter": 8, "smoothing": 1e-3, "pad": 0, "engine": "numpy"} | changes
+    return lnocl.deconvolve(observation, made.stars, **options)
+
+
+# --- A run that is repeated
+
+
+@pytest.mark.parametrize("refine", [False, True])
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+@pytest.mark.parametrize(("engine", "precision"), ENGINES)
+def test_a_repeated_run_is_bit_for_bit_a_new_one(engine, precision, solver, refine):
+    """After another observation, whose stars are elsewhere, and more iterations than were due."""
+    made = BASE.make()
+    observation = made.observation()
+    other = made.observation(images=made.images[:, ::-1, ::-1].copy())
+    setup = Setup(made.stars, 0, solver, precision, engine, None, refine)
+    start = make_start(setup, observation, Penalty(smoothing=1e-3))
+    expected = Run(start, 9)
+    run = Run(start, 9)
+    for each in (other, observation):
+        run.repeat(start, each)
+        assert list(run) == list(range(1, 10))
+    assert list(expected) == list(range(1, 10))
+    np.testing.assert_array_equal(run.extended(), expected.extended())
+    np.testing.assert_array_equal(run.star_fluxes(), expected.star_fluxes())
+    np.testing.assert_array_equal(run.star_positions(), expected.star_positions())
+    np.testing.assert_array_equal(run.objectives(), expected.objectives())
+
+
+# --- What is drawn
+
+
+@pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES)
+def test_counts_have_the_mean_and_variance_of_the_model(recipe):
+    result = solved(recipe)
+    replicas, observation = Replicas(result._outcome, 0), result._outcome.scene.observation
+    sky = result._outcome.sky / result._outcome.scene.unit
+    draws = np.array(
+        [replicas._observe(sky, np.random.SeedSequence(k).spawn(2)).images for k in range(400)]
+    )
+    good = ~observation.mask
+    assert not draws[:, ~good].any()
+    models = result.models()
+    # Counts of a few are rounded up where read noise makes them negative.
+    plenty = good & (models > 9 + 9 * observation.read_noise.max() ** 2)
+    assert plenty.sum() > 200
+    z = (draws.mean(axis=0) - models)[plenty] / np.sqrt(models[plenty] / 400)
+    assert abs(z).max() < 5
+    assert np.mean(z**2) == pytest.approx(1.0, abs=0.25)
+    variances = draws.var(axis=0, ddof=1)[plenty] / models[plenty]
+    assert np.mean(variances) == pytest.approx(1.0, abs=0.02)
+
+
+def test_replicas_hang_on_seed_and_number_alone():
+    outcome = solved()._outcome
+    first, second = Replicas(outcome, 5), Replicas(outcome, 5)
+    for k in (3, 0):
+        first.reconstruct(k)
+    for k in (0, 3):
+        for found, expected in zip(first.reconstruct(k), second.reconstruct(k), strict=True):
+            for a, b in zip(found, expected, strict=True):
+                np.testing.assert_array_equal(a, b)
+    different = Replicas(outcome, 6).reconstruct(0)[0].extended
+    assert (different != second.reconstruct(0)[0].extended).any()
+    assert (different != second.reconstruct(1)[0].extended).any()
+
+
+# --- What is made of it
+
+
+def run_bootstrap(outcome, n, **changes):
+    return bootstrap.bootstrap(outcome, n, APERTURES, 7, **changes)
+
+
+def test_errors_are_found_less_drawn():
+    outcome = solved(refine_positions=True)._outcome
+    found = run_bootstrap(outcome, 10)
+    assert [each.name for each in found.quantities] == [
+        "star 1 flux", "star 1 x", "star 1 y", "a", "b",
+    ]  # fmt: skip
+    replicas = Replicas(outcome, 7)
+    for k in (0, 9):
+        drawn, seen = replicas.reconstruct(k)
+        flux = seen.star_fluxes[0] - outcome.star_fluxes[0]
+        light = (seen.extended - drawn.extended)[4:16, 6:18].sum()
+        assert found.errors[k, [0, 3]] == pytest.approx([flux, light], rel=1e-9)
+        moved = seen.star_positions[0] - outcome.scene.stars[0]
+        np.testing.assert_array_equal(found.errors[k, 1:3], moved)
+    ny, nx = outcome.scene.observation.shape
+    np.testing.assert_allclose(found.values[3], outcome.sky[4:16, 6:18].sum())
+    assert found.error_map.shape == found.bias_map.shape == (ny, nx)
+    errors = []
+    for k in range(10):
+        drawn, seen = replicas.reconstruct(k)
+        # Full width at half maximum in standard deviations.
+        smoothed = gaussian_filter(seen.extended - drawn.extended, found.resolution / 2.35482)
+        errors.append(smoothed[8:-8, 8:-8])  # the edges aside
+    inner = np.s_[8:-8, 8:-8]
+    np.testing.assert_allclose(found.bias_map[inner], np.mean(errors, axis=0), rtol=1e-4)
+    np.testing.assert_allclose(found.error_map[inner], np.std(errors, axis=0, ddof=1), rtol=1e-4)
+
+
+def test_replicas_are_continued_bit_for_bit():
+    outcome = solved()._outcome
+    at_once = run_bootstrap(outcome, 13)
+    seen = []
+    first = run_bootstrap(outcome, 10, look=lambda each: seen.append(each.n))
+    assert seen == list(range(1, 11))
+    continued = run_bootstrap(outcome, 13, earlier=first)
+    np.testing.assert_array_equal(continued.errors, at_once.errors)
+    np.testing.assert_array_equal(continued.sums, at_once.sums)
+    np.testing.assert_array_equal(continued.error_map, at_once.error_map)
+
+
+def made_up(errors, value=10.0):
+    errors = np.asarray(errors, float).reshape(-1, 1)
+    pixels = np.stack([errors.sum() * np.ones((2, 2)), (errors**2).sum() * np.ones((2, 2))])
+    return Bootstrap((Quantity("a", "flux", value),), errors, pixels, 1.0, 0)
+
+
+def test_intervals_are_those_of_student():
+    errors = np.array([1.0, 2.0, 3.0, 6.0])
+    found = made_up(errors)
+    assert found.bias == errors.mean()
+    assert found.standard_errors == errors.std(ddof=1)
+    np.testing.assert_allclose(found.bias_map, errors.mean())
+    np.testing.assert_allclose(found.error_map, errors.std(ddof=1))
+    half = t(3).ppf(0.975) * errors.std(ddof=1) * np.sqrt(1.25)
+    np.testing.assert_allclose(found.interval(0.95)[:, 0], [7.0 - half, 7.0 + half])
+
+
+def test_intervals_of_normal_errors_hold_the_truth_as_often_as_they_say():
+    """With ten replicas, so that the factors of Student and of the mean are seen."""
+    rng, held = np.random.default_rng(1), []
+    for _ in range(4000):
+        low, high = made_up(rng.normal(2.0, 3.0, 10)).interval(0.68)[:, 0]
+        truth = 10.0 - rng.normal(2.0, 3.0)
+        held.append(low <= truth <= high)
+    assert np.mean(held) == pytest.approx(0.68, abs=0.025)
+
+
+def test_the_table_has_the_unit_that_is_asked_for():
+    table = made_up([1.0, 2.0, 4.0]).to_table(2.0, "adu")
+    assert table["unit"][0] == "adu"
+    assert table["value"][0] == 5.0
+    assert table["bias"][0] == pytest.approx(7 / 6)
+    assert table["low68"][0] < table["value"][0] - table["bias"][0] < table["high68"][0]
+
+
+def test_regions_whose_errors_may_not_hold_are_named():
+    outcome = solved()._outcome
+    width = bootstrap.without_replicas(outcome, [], 0).resolution
+    x, y = np.round(outcome.scene.stars[0]).astype(int)
+    side = int(np.ceil(width))
+    named = {
+        bootstrap.BELOW: Aperture("tiny", 20, 20, np.ones((1, 1))),
+        bootstrap.UNDER: Aperture("core", y - side // 2, x - side // 2, np.ones((side, side))),
+        "": Aperture("wide", 2, 2, np.ones((20, 20))),
+    }
+    found = bootstrap.without_replicas(outcome, list(named.values()), 0)
+    assert [each.note for each in found.quantities[1:]] == list(named)
+
+
+# --- What is refused
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n": 9}, r"^bootstrap takes a whole number of replicas, 10 or more, such as 50; 9 was"),
+        ({"n": 10.0}, "10.0 was given"),
+        ({"n": 10, "seed": -1}, "^seed must be a whole number, 0 or more; -1 was given"),
+    ],
+)
+def test_numbers_that_are_none_are_refused(options, message):
+    with pytest.raises(lnocl.InputError, match=message):
+        solved().bootstrap(**options)
+
+
+def test_replicas_of_something_else_are_refused():
+    result = solved()
+    first = result.bootstrap(10)
+    for other in (solved(n_iter=9).bootstrap, result.bootstrap):
+        with pytest.raises(lnocl.InputError, match="are of another reconstruction, other regions"):
+            other(12, earlier=first, seed=0 if other != result.bootstrap else 1)
+
+
+def test_a_result_gives_the_errors_of_its_regions():
+    regions = pytest.importorskip("regions", reason="regions is not installed")
+    circle = regions.CirclePixelRegion(regions.PixCoord(15, 15), 5.0)
+    found = solved().bootstrap(10, regions=[circle], seed=3)
+    assert [each.name for each in found.quantities] == ["star 1 flux", "region 1"]
+    assert (found.standard_errors > 0).all()

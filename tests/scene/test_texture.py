@@ -1,0 +1,76 @@
+"""Texture: the skies that an estimate may stand for."""
+
+import numpy as np
+import pytest
+
+import lnocl
+from lnocl.scene import texture
+from lnocl.scene.scene import Scene
+from lnocl.scene.texture import Texture, resolution
+
+N = 64
+Y, X = np.indices((N, N), float)
+SKY = 100.0 * np.exp(-0.5 * ((X - 30) / 4.0) ** 2) + 1.0
+
+
+def gaussian(fwhm):
+    return np.exp(-0.5 * ((X - 32) ** 2 + (Y - 32) ** 2) / (fwhm / 2.3548) ** 2)
+
+
+def a_texture(stars=(), sky=SKY, psfs=None):
+    psfs = np.array([gaussian(6.0), gaussian(9.0)]) if psfs is None else psfs
+    images = np.full((len(psfs), N, N), 10.0)
+    return Texture(Scene(lnocl.Observation(images, psfs), stars), sky)
+
+
+def test_the_resolution_is_that_of_the_narrowest_psf():
+    assert a_texture().resolution == pytest.approx(6.0, rel=0.01)
+
+
+def test_without_stars_the_mean_is_the_estimate_and_the_amplitude_a_share_of_it():
+    found = a_texture()
+    np.testing.assert_array_equal(found.mean, SKY)
+    inner = np.s_[:, 28:33]
+    np.testing.assert_allclose(found.amplitude[inner], texture.SHARE * SKY[inner], rtol=0.2)
+
+
+def test_drawn_skies_have_the_mean_and_amplitude_and_a_width():
+    found, rng = a_texture(), np.random.default_rng(4)
+    fields = np.array([found.draw(rng) - found.mean for _ in range(400)])[:, :, 30]
+    assert fields.mean() == pytest.approx(0.0, abs=0.5)
+    amplitude = np.sqrt(np.mean(fields**2))
+    assert amplitude == pytest.approx(found.amplitude[:, 30].mean(), rel=0.03)
+    lag = 3
+    product = np.mean(fields[:, lag:] * fields[:, :-lag]) / amplitude**2
+    assert product == pytest.approx(np.exp(-(lag**2) / (2 * found.width**2)), abs=0.03)
+
+
+def test_no_drawn_sky_is_negative():
+    found = a_texture(sky=np.where(X > 30, 50.0, 0.0))
+    assert found.draw(np.random.default_rng(5)).min() == 0.0
+
+
+@pytest.mark.parametrize("star", [(30.0, 20.0), (30.3, 0.2), (30.0, 63.4)])
+def test_under_a_star_the_sky_is_expected_to_be_as_round_it(star):
+    """Whatever the estimate has there, a hole or a heap; also where the grid wraps round."""
+    distance = np.hypot((X - star[0] + N / 2) % N - N / 2, (Y - star[1] + N / 2) % N - N / 2) / 6.0
+    core = distance <= texture.CORE
+    is_round = (distance > texture.CORE) & (distance <= texture.ROUND)
+    for held in (0.0, 1e4):
+        found = a_texture([star], np.where(core, held, SKY))
+        # A pixel on the edge may be on either side of it.
+        np.testing.assert_allclose(found.mean[core], SKY[is_round].mean(), rtol=0.02)
+        far = distance > texture.CORE + texture.EDGE
+        np.testing.assert_array_equal(found.mean[far], SKY[far])
+        near = found.amplitude[distance <= texture.NEAR]
+        assert near.min() >= 0.7 * texture.SHARE_NEAR * SKY[:, 30].max()
+
+
+def test_a_psf_wider_than_the_grid_leaves_the_estimate():
+    images = np.full((1, 8, 8), 10.0)
+    wide = np.exp(-((np.arange(41) - 20) ** 2)[:, None] / 200.0 - (np.arange(41) - 20) ** 2 / 200.0)
+    with pytest.warns(lnocl.LnoclWarning, match="larger than the grid"):
+        scene = Scene(lnocl.Observation(images, wide), [(4, 4)])
+    found = Texture(scene, np.ones((8, 8)))
+    np.testing.assert_array_equal(found.mean, 1.0)
+    assert resolution(scene) > 8
