@@ -127,8 +127,8 @@ def test_errors_are_found_less_drawn():
         drawn, seen = replicas.reconstruct(k)
         # Full width at half maximum in standard deviations.
         smoothed = gaussian_filter(seen.extended - drawn.extended, found.resolution / 2.35482)
-        errors.append(smoothed[8:-8, 8:-8])  # the edges aside
-    inner = np.s_[8:-8, 8:-8]
+        errors.append(smoothed[12:-12, 12:-12])  # the edges aside
+    inner = np.s_[12:-12, 12:-12]
     np.testing.assert_allclose(found.bias_map[inner], np.mean(errors, axis=0), rtol=1e-4)
     np.testing.assert_allclose(found.error_map[inner], np.std(errors, axis=0, ddof=1), rtol=1e-4)
 
