@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
     from matplotlib.figure import Figure
 
-    from lnocl.runs.bootstrap import Bootstrap
+    from lnocl.runs.bootstrap import Bootstrap, Part
 
 # Stars that a notebook lists.
 MAX_LISTED = 10
@@ -227,13 +227,14 @@ class Result:
         n: int = 50,
         *,
         regions: str | os.PathLike[str] | Iterable[Any] = (),
+        profiles: str | os.PathLike[str] | Iterable[Any] = (),
         header: fits.Header | None = None,
         seed: int = 0,
         progress: bool = False,
         earlier: Bootstrap | None = None,
         callback: Callable[[Bootstrap], None] | None = None,
     ) -> Bootstrap:
-        """Return the errors of stars, regions and pixels, by replicas of this reconstruction.
+        """Return the errors of stars, regions, profiles and pixels, by replicas of this result.
 
         A replica is a sky that the result may stand for, observed and reconstructed as the images
         were, by as many iterations (`lnocl.runs.replicas`, docs/errors.md). It costs as much as a
@@ -246,6 +247,8 @@ class Result:
         regions : str, path or iterable of regions.Region, optional
             Regions whose light of the extended source is measured: a file of them, as DS9 writes,
             or these, of the package regions.
+        profiles : str, path or iterable of regions.RectanglePixelRegion, optional
+            Boxes along whose longer sides light and width are measured, pixel by pixel, likewise.
         header : astropy.io.fits.Header, optional
             Header of the first image, for regions on the sky.
         seed : int, optional
@@ -270,15 +273,16 @@ class Result:
         DeviceError
             As `lnocl.deconvolve`.
         """
-        from lnocl.io.regions import read_apertures
+        from lnocl.io.regions import read_apertures, read_profiles
         from lnocl.runs.bootstrap import bootstrap, check_number
 
         check_number(n, seed)
-        if not isinstance(regions, (str, os.PathLike)):
-            regions = list(regions)
         shape = self._outcome.scene.observation.shape
-        apertures = read_apertures(regions, header, shape) if regions else []
-        return bootstrap(self._outcome, n, apertures, seed, progress, earlier, callback)
+        parts: list[Part] = []
+        for given, read in ((regions, read_apertures), (profiles, read_profiles)):
+            listed = given if isinstance(given, (str, os.PathLike)) else list(given)
+            parts += read(listed, header, shape) if listed else []
+        return bootstrap(self._outcome, n, parts, seed, progress, earlier, callback)
 
     def plot(self) -> Figure:
         """Return a picture: image, model, residuals and extended source, whole and at each star.

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lnocl.commands.options import option
+from lnocl.scene.apertures import Profile
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
     from lnocl.io.frames import Frames
     from lnocl.result import Result
-    from lnocl.runs.bootstrap import Bootstrap
-    from lnocl.scene.apertures import Aperture
+    from lnocl.runs.bootstrap import Bootstrap, Part
 
 DEFAULT = 50
 # Seconds between two writings of the replicas so far.
@@ -41,6 +41,13 @@ OPTIONS = [
         help="regions whose light is measured: a file such as DS9 writes, in pixels or on the sky",
     ),
     option(
+        "--profiles",
+        metavar="FILE",
+        is_input=True,
+        help="boxes along whose longer sides light and width are measured, pixel by pixel: such a "
+        "file; lnocl plot draws them with their errors",
+    ),
+    option(
         "--seed",
         type=int,
         metavar="S",
@@ -61,26 +68,31 @@ def check(arguments: argparse.Namespace) -> None:
     from lnocl.runs.bootstrap import check_number
 
     if arguments.bootstrap is None:
-        if arguments.regions is not None or arguments.seed is not None:
-            raise InputError("regions and seed are for replicas: give --bootstrap 50 with them")
+        if any(getattr(arguments, name) is not None for name in ("regions", "profiles", "seed")):
+            raise InputError(
+                "regions, profiles and seed are for replicas: give --bootstrap 50 with them"
+            )
         return
     check_number(arguments.bootstrap, arguments.seed or 0)
 
 
-def read(arguments: argparse.Namespace, frames: Frames) -> list[Aperture]:
-    """Return the regions that were given."""
-    if arguments.regions is None:
+def read(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
+    """Return the regions and profiles that were given."""
+    if arguments.regions is None and arguments.profiles is None:
         return []
-    from lnocl.io.regions import read_apertures
+    from lnocl.io.regions import read_apertures, read_profiles
 
-    return read_apertures(arguments.regions, frames.header, frames.observation.shape)
+    where = frames.header, frames.observation.shape
+    apertures = [] if arguments.regions is None else read_apertures(arguments.regions, *where)
+    profiles = [] if arguments.profiles is None else read_profiles(arguments.profiles, *where)
+    return [*apertures, *profiles]
 
 
 def add_errors(
     arguments: argparse.Namespace,
     result: Result,
     frames: Frames,
-    apertures: Sequence[Aperture],
+    parts: Sequence[Part],
     path: str,
     continues: bool,
 ) -> list[str]:
@@ -94,8 +106,8 @@ def add_errors(
         What the file holds.
     frames : Frames
         What it was made of.
-    apertures : list of Aperture
-        The regions.
+    parts : list of Aperture or Profile
+        What `read` returns.
     path : str
         The file.
     continues : bool
@@ -111,18 +123,18 @@ def add_errors(
         nonlocal written
         latest[:] = [found]
         if found.n > 1 and time.monotonic() - written > WRITE_EVERY:
-            _write(path, found, apertures, frames)
+            _write(path, found, parts, frames)
             written = time.monotonic()
 
-    expected = without_replicas(outcome, apertures, seed)
+    expected = without_replicas(outcome, parts, seed)
     earlier = _earlier(path, expected, frames) if continues else None
     try:
         found = bootstrap(
-            outcome, arguments.bootstrap, apertures, seed, not arguments.quiet, earlier, look
+            outcome, arguments.bootstrap, parts, seed, not arguments.quiet, earlier, look
         )
     finally:
         if latest and latest[0].n > 1:
-            _write(path, latest[0], apertures, frames)
+            _write(path, latest[0], parts, frames)
     return _said(found, frames)
 
 
@@ -148,13 +160,13 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
     return dataclasses.replace(expected, errors=held.errors, sums=held.sums)
 
 
-def _write(path: str, found: Bootstrap, apertures: Sequence[Aperture], frames: Frames) -> None:
+def _write(path: str, found: Bootstrap, parts: Sequence[Part], frames: Frames) -> None:
     from lnocl.io.fitserrors import write_errors
 
     write_errors(
         path,
         found.to_table(frames.electrons, frames.unit),
-        _table_of(apertures),
+        _table_of(parts),
         (found.error_map / frames.electrons, found.bias_map / frames.electrons),
         found.errors,
         found.sums,
@@ -164,23 +176,26 @@ def _write(path: str, found: Bootstrap, apertures: Sequence[Aperture], frames: F
     )
 
 
-def _table_of(apertures: Sequence[Aperture]) -> QTable:
+def _table_of(parts: Sequence[Part]) -> QTable:
     """Return the regions as a table: name, area and centre."""
     from astropy.table import QTable
 
     columns: dict[str, list[Any]] = {name: [] for name in ("name", "pixels", "x", "y")}
-    for each in apertures:
-        y, x = np.indices(each.weights.shape)
+    for each in parts:
+        if isinstance(each, Profile):
+            continue
+        y, x = each.places
         columns["name"].append(each.name)
         columns["pixels"].append(each.n_pixels)
-        columns["x"].append((each.weights * (x + each.x)).sum() / each.n_pixels)
-        columns["y"].append((each.weights * (y + each.y)).sum() / each.n_pixels)
+        columns["x"].append((each.weights * x).sum() / each.n_pixels)
+        columns["y"].append((each.weights * y).sum() / each.n_pixels)
     return QTable(columns, dtype=(str, float, float, float))
 
 
 def _said(found: Bootstrap, frames: Frames) -> list[str]:
     """Return a line a quantity."""
     table = found.to_table(frames.electrons, frames.unit)
+    table = table[[each.at is None for each in found.quantities]]  # profiles are to be drawn
     lines = [f"errors by {found.n} replicas, less their bias; in brackets 95 %:"]
     for row in table[:MAX_SAID]:
         note = f"; {row['note']}: do not trust its error" if row["note"] else ""

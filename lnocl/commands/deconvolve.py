@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lnocl.io.fitswrite import StarColumn
     from lnocl.io.frames import Frames
     from lnocl.plotting.result import ResultView
-    from lnocl.scene.apertures import Aperture
+    from lnocl.runs.bootstrap import Part
 
 
 class Solved(NamedTuple):
@@ -31,7 +31,7 @@ class Solved(NamedTuple):
     result: Result
     frames: Frames
     given: dict[str, Any]
-    apertures: list[Aperture]
+    parts: list[Part]
 
 
 def solve(arguments: argparse.Namespace, interrupts: checkpoints.Interrupts) -> Solved:
@@ -44,14 +44,14 @@ def solve(arguments: argparse.Namespace, interrupts: checkpoints.Interrupts) -> 
     calibration = Calibration(**_given(given, Calibration._fields))
     frames = read_frames(arguments.images, arguments.psfs, calibration)
     given["stars"] = _stars(arguments, frames.header)
-    apertures = bootstrap.read(arguments, frames)
+    parts = bootstrap.read(arguments, frames)
     result = deconvolve(
         frames.observation,
         **_parameters(given),
         progress=not arguments.quiet,
         callback=interrupts.callback,
     )
-    return Solved(result, frames, given, apertures)
+    return Solved(result, frames, given, parts)
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -67,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> None:
         messages.recorded_warnings(COMMAND.flags()) as warned,
         checkpoints.Interrupts() as interrupts,
     ):
-        result, frames, given, apertures = solve(arguments, interrupts)
+        result, frames, given, parts = solve(arguments, interrupts)
         interrupts.listen()  # a run that was resumed at its end has no iteration to start from
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
@@ -87,7 +87,7 @@ def _run(arguments: argparse.Namespace) -> None:
     interrupts.explain(arguments, result)
     if arguments.bootstrap is not None:
         said = bootstrap.add_errors(
-            arguments, result, frames, apertures, arguments.output, continues=False
+            arguments, result, frames, parts, arguments.output, continues=False
         )
         if not arguments.quiet:
             messages.say(said)

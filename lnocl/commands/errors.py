@@ -43,8 +43,9 @@ def _run(arguments: argparse.Namespace) -> None:
     given = {name: getattr(arguments, name) for name in ("bootstrap", "seed")}
     for name, value in given.items():
         setattr(run, name, getattr(run, name) if value is None else value)
-    if arguments.regions is not None:
-        run.regions = os.path.abspath(arguments.regions)
+    for name in ("regions", "profiles"):
+        if getattr(arguments, name) is not None:
+            setattr(run, name, os.path.abspath(getattr(arguments, name)))
     run.bootstrap = bootstrap.DEFAULT if run.bootstrap is None else run.bootstrap
     run.quiet, path = arguments.quiet, os.path.abspath(arguments.result)
     bootstrap.check(run)
@@ -64,7 +65,7 @@ def _run(arguments: argparse.Namespace) -> None:
             f"the run of {arguments.result} gives another result now: its images, PSFs or options "
             "have changed; deconvolve again"
         )
-    said = bootstrap.add_errors(run, found, frames, solved.apertures, path, not arguments.overwrite)
+    said = bootstrap.add_errors(run, found, frames, solved.parts, path, not arguments.overwrite)
     if not arguments.quiet:
         messages.say([*said, f"added to {arguments.result}"])
 

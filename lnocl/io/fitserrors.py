@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from astropy.io import fits
+from astropy.table import Table
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError
@@ -82,6 +83,24 @@ def write_errors(
             hdu.header["BUNIT"] = (unit, "per pixel")
     with whole_file(path, overwrite=True) as stream:
         fits.HDUList([*rest, *added]).writeto(stream, checksum=True)
+
+
+def read_errors(path: str) -> Table | None:
+    """Return the table of what was measured, with its errors; None where the file has none.
+
+    Raises
+    ------
+    FileError
+        The file is missing or damaged.
+    """
+    with open_fits(path) as file:
+        for hdu in file.hdus():
+            if hdu.name == ERRORS and isinstance(hdu, fits.BinTableHDU):
+                table = Table.read(hdu)
+                for name in ("name", "unit", "note"):
+                    table[name] = [str(each).strip() for each in table[name]]
+                return table
+    return None
 
 
 class Held(NamedTuple):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from lnocl.errors import FileError, InputError, LnoclError
 from lnocl.io.sky import celestial_wcs
-from lnocl.scene.apertures import Aperture
+from lnocl.scene.apertures import Aperture, Profile
 
 if TYPE_CHECKING:
     from astropy.io import fits
@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 ROUNDING = 1e-9
 
 
+Given = str | os.PathLike[str] | Iterable[Any]
+
+
 def read_apertures(
-    given: str | os.PathLike[str] | Iterable[Any],
-    header: fits.Header | None,
-    shape: tuple[int, int],
+    given: Given, header: fits.Header | None, shape: tuple[int, int]
 ) -> list[Aperture]:
     """Return the shares of pixels that lie within regions.
 
@@ -44,6 +45,42 @@ def read_apertures(
     InputError
         A region that encloses nothing, lies outside the image, or on the sky without coordinates.
     """
+    return [
+        _aperture(each.name, each.said, each.region, shape) for each in _in_pixels(given, header)
+    ]
+
+
+def read_profiles(
+    given: Given, header: fits.Header | None, shape: tuple[int, int]
+) -> list[Profile]:
+    """Return boxes cut into slices of about a pixel along their longer sides.
+
+    Parameters
+    ----------
+    given, header, shape
+        As for `read_apertures`; all regions are boxes.
+
+    Raises
+    ------
+    LnoclError, FileError, InputError
+        As `read_apertures`; a region that is no box.
+    """
+    found = _in_pixels(given, header)
+    for each in found:
+        if not isinstance(each.region, _regions().RectanglePixelRegion):
+            raise InputError(f"{each.said} is no box: a profile is along the longer side of a box")
+    return [_profile(each, shape) for each in found]
+
+
+class _Found(NamedTuple):
+    """A region in pixels, its name, and what messages call it."""
+
+    region: Any
+    name: str
+    said: str
+
+
+def _in_pixels(given: Given, header: fits.Header | None) -> list[_Found]:
     if isinstance(given, (str, os.PathLike)):
         path = os.fspath(given)
         found = _read(path)
@@ -51,7 +88,7 @@ def read_apertures(
         path, found = "regions", list(given)
     if not found:
         raise FileError(f"{path} holds no regions: draw circles, ellipses, boxes or polygons")
-    return [_aperture(region, k, path, header, shape) for k, region in enumerate(found, 1)]
+    return [_one_in_pixels(region, k, path, header) for k, region in enumerate(found, 1)]
 
 
 def _regions() -> Any:
@@ -75,35 +112,60 @@ def _read(path: str) -> list[Any]:
         raise FileError(f"{path} holds no regions as DS9 writes them: {words}") from error
 
 
-def _aperture(
-    region: Any, number: int, path: str, header: fits.Header | None, shape: tuple[int, int]
-) -> Aperture:
+def _one_in_pixels(region: Any, number: int, path: str, header: fits.Header | None) -> _Found:
     regions = _regions()
     if not isinstance(region, regions.Region):
         raise InputError(f"regions must be those of the package regions; {region!r} was given")
     name = region.meta.get("text") or f"region {number}"
     kind = type(region).__name__.replace("PixelRegion", "").replace("SkyRegion", "").lower()
-    where = f"{name} of {path} ({kind})" if name != f"region {number}" else f"{name} ({kind})"
+    said = f"{name} of {path} ({kind})" if name != f"region {number}" else f"{name} ({kind})"
     if isinstance(region, regions.SkyRegion):
         if header is None:
-            raise InputError(f"{where} is on the sky, and the image has no header: give pixels")
+            raise InputError(f"{said} is on the sky, and the image has no header: give pixels")
         wcs = celestial_wcs(header, "the image", "give regions in image coordinates")
         region = region.to_pixel(wcs)
+    return _Found(region, name, said)
+
+
+def _profile(found: _Found, shape: tuple[int, int]) -> Profile:
+    """Cut a box into slices."""
+    regions, box = _regions(), found.region
+    is_wide = box.width > box.height
+    length, breadth = (box.width, box.height) if is_wide else (box.height, box.width)
+    turn = float(box.angle.to_value("rad"))
+    cos, sin = np.cos(turn), np.sin(turn)
+    along, across = ((cos, sin), (-sin, cos)) if is_wide else ((-sin, cos), (cos, sin))
+    n = max(round(length), 1)
+    at = (np.arange(n) + 0.5) * length / n - length / 2.0
+    slices = []
+    for distance in at:
+        x, y = box.center.x + distance * along[0], box.center.y + distance * along[1]
+        sides = (length / n, breadth) if is_wide else (breadth, length / n)
+        part = regions.RectanglePixelRegion(regions.PixCoord(x, y), *sides, angle=box.angle)
+        slices.append(_aperture(found.name, found.said, part, shape))
+    distances = []
+    for each in slices:
+        y, x = each.places
+        distances.append((x - box.center.x) * across[0] + (y - box.center.y) * across[1])
+    return Profile(found.name, at.tolist(), slices, distances)
+
+
+def _aperture(name: str, said: str, region: Any, shape: tuple[int, int]) -> Aperture:
     try:
         mask = region.to_mask(mode="exact")
     except NotImplementedError as error:
         raise InputError(
-            f"{where} cannot be summed over: give circles, ellipses, boxes or polygons"
+            f"{said} cannot be summed over: give circles, ellipses, boxes or polygons"
         ) from error
     weights = np.asarray(mask.data, np.float64)
     inside = mask.cutout(np.ones(shape), fill_value=0.0)
     total = weights.sum()
     if inside is None or (weights * (inside == 0)).sum() > ROUNDING * total:
         raise InputError(
-            f"{where} lies outside the image of {shape[1]} x {shape[0]} pixels, or partly"
+            f"{said} lies outside the image of {shape[1]} x {shape[0]} pixels, or partly"
         )
     if total == 0:
-        raise InputError(f"{where} encloses no part of a pixel")
+        raise InputError(f"{said} encloses no part of a pixel")
     rows, columns = np.flatnonzero(weights.any(axis=1)), np.flatnonzero(weights.any(axis=0))
     trimmed = weights[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     y, x = mask.bbox.iymin + int(rows[0]), mask.bbox.ixmin + int(columns[0])

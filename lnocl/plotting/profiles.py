@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,13 +14,57 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import Array, line_style, new_figure
+from lnocl.plotting.figure import COLOURS, Array, line_style, new_figure
 from lnocl.plotting.sources import Frame, Source, whole_pixel
 
 # Share of the brightest true row below which relative errors are not shown.
 FAINT_ROW = 0.01
 # Largest relative error on an axis, percent.
 MAX_PERCENT = 100.0
+
+
+def draw_bands(name: str, flux: Mapping[str, Any], width: Mapping[str, Any], unit: str) -> Figure:
+    """Draw light and width along a profile, with the bands that hold the truth.
+
+    Parameters
+    ----------
+    name : str
+        Of the profile.
+    flux, width : mapping of str to array_like, shape (k,)
+        ``at``, pixels along the axis, ``value``, ``bias``, ``low68``, ``high68``, ``low95`` and
+        ``high95``.
+    unit : str
+        Of the light.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Light above, width below: less the bias a line, as it was found dots, 68 and 95 % bands.
+
+    Raises
+    ------
+    LnoclError
+        Where matplotlib is missing.
+    """
+    figure = new_figure(8.0, 6.0)
+    axes = figure.subplots(2, 1, sharex=True)
+    labels = f"light of a slice ({unit})", "width (pixels)"
+    for axis, rows, label in zip(axes, (flux, width), labels, strict=True):
+        at = np.asarray(rows["at"])
+        for level, share in ((95, 0.15), (68, 0.3)):
+            low, high = rows[f"low{level}"], rows[f"high{level}"]
+            axis.fill_between(
+                at, low, high, color=COLOURS[1], alpha=share, lw=0, label=f"{level} %"
+            )
+        unbiased = np.subtract(rows["value"], rows["bias"])
+        axis.plot(at, unbiased, color=COLOURS[1], label="less the bias")
+        axis.plot(at, rows["value"], ".", color="black", ms=3, label="as found")
+        axis.set_ylabel(label)
+        axis.set_ylim(min(0.0, float(np.min(unbiased))), 1.2 * float(np.max(unbiased)))
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=9, ncols=4, title=name)
+    axes[1].set_xlabel("position along the axis (pixels)")
+    return figure
 
 
 def draw_profiles(

@@ -12,7 +12,7 @@ from lnocl.errors import InputError
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.progress import make_bar
 from lnocl.runs.replicas import Replicas, Sky
-from lnocl.scene.apertures import Aperture
+from lnocl.scene.apertures import FLUX, FWHM, LENGTH, Aperture, Label, Profile
 from lnocl.scene.observation import Array
 from lnocl.scene.texture import CORE, resolution
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
 MIN_REPLICAS = 10
-# A full width at half maximum in standard deviations.
-FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 # Levels of the intervals.
 LEVELS = 0.68, 0.95
 
-FLUX, POSITION = "flux", "position"
 BELOW, UNDER = "below the resolution", "under a star"
+
+
+Part = Aperture | Profile
 
 
 class Quantity(NamedTuple):
@@ -37,17 +37,20 @@ class Quantity(NamedTuple):
     name : str
         What it is.
     kind : str
-        ``FLUX``, in electrons, or ``POSITION``, in pixels.
+        ``FLUX``, in electrons, or ``LENGTH``, in pixels.
     value : float
         What it is in the reconstruction.
     note : str
         Why its error may not hold; else empty.
+    at : float or None
+        Where it is along a profile, pixels.
     """
 
     name: str
     kind: str
     value: float
     note: str = ""
+    at: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +67,7 @@ class Bootstrap:
     ----------
     quantities : tuple of k Quantity
         What was measured: fluxes of stars, their positions where these were refined, the light of
-        the extended source in regions.
+        the extended source in regions, light and widths along profiles.
     errors : ndarray of float64, shape (n, k)
         The errors of each replica, in electrons or pixels.
     sums : ndarray of float64, shape (2, ny, nx)
@@ -154,6 +157,7 @@ class Bootstrap:
         return QTable(
             {
                 "name": [each.name for each in self.quantities],
+                "at": [np.nan if each.at is None else each.at for each in self.quantities],
                 "unit": [unit if each.kind == FLUX else "pix" for each in self.quantities],
                 **{name: values / self.units(electrons) for name, values in columns.items()},
                 "note": [each.note for each in self.quantities],
@@ -164,7 +168,7 @@ class Bootstrap:
 def bootstrap(
     outcome: Outcome,
     n: int,
-    apertures: Sequence[Aperture],
+    parts: Sequence[Part],
     seed: int,
     progress: bool = False,
     earlier: Bootstrap | None = None,
@@ -178,8 +182,8 @@ def bootstrap(
         The reconstruction.
     n : int
         Replicas, `MIN_REPLICAS` or more.
-    apertures : sequence of Aperture
-        Regions whose light is measured.
+    parts : sequence of Aperture or Profile
+        What of the extended source is measured.
     seed : int
         Zero or more.
     progress : bool, optional
@@ -195,7 +199,7 @@ def bootstrap(
         n is less than ten, the seed is negative, or earlier replicas are of another reconstruction.
     """
     check_number(n, seed)
-    found = without_replicas(outcome, apertures, seed)
+    found = without_replicas(outcome, parts, seed)
     if earlier is not None:
         _refuse_other(earlier, found)
         found = earlier
@@ -204,17 +208,17 @@ def bootstrap(
         bar.update(found.n)
         for k in range(found.n, n):
             drawn, seen = replicas.reconstruct(k)
-            found = _with(found, outcome, apertures, drawn, seen)
+            found = _with(found, outcome, parts, drawn, seen)
             bar.update()
             if look is not None:
                 look(found)
     return found
 
 
-def without_replicas(outcome: Outcome, apertures: Sequence[Aperture], seed: int) -> Bootstrap:
+def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Bootstrap:
     """Return what will be measured of a reconstruction, before its first replica."""
     width = resolution(outcome.scene)
-    quantities = _quantities(outcome, apertures, width)
+    quantities = _quantities(outcome, parts, width)
     pixels = np.zeros((2, *outcome.scene.observation.shape))
     return Bootstrap(quantities, np.zeros((0, len(quantities))), pixels, width, seed)
 
@@ -237,13 +241,13 @@ def check_number(n: object, seed: object) -> None:
 
 
 def _with(
-    found: Bootstrap, outcome: Outcome, apertures: Sequence[Aperture], drawn: Sky, seen: Sky
+    found: Bootstrap, outcome: Outcome, parts: Sequence[Part], drawn: Sky, seen: Sky
 ) -> Bootstrap:
     """Return the errors with those of one replica more."""
     from scipy.ndimage import gaussian_filter
 
     moves = outcome.given_stars is not None
-    errors = _measure(seen, apertures, moves) - _measure(drawn, apertures, moves)
+    errors = _measure(seen, parts, moves) - _measure(drawn, parts, moves)
     width = found.resolution / FWHM
     pixels = gaussian_filter(seen.extended - drawn.extended, width, mode="nearest")
     return Bootstrap(
@@ -255,42 +259,46 @@ def _with(
     )
 
 
-def _measure(sky: Sky, apertures: Sequence[Aperture], moves: bool) -> Array:
+def _measure(sky: Sky, parts: Sequence[Part], moves: bool) -> Array:
     positions = sky.star_positions.ravel() if moves else np.zeros(0)
-    regions = [aperture.flux(sky.extended) for aperture in apertures]
-    return np.concatenate([sky.star_fluxes, positions, regions])
+    return np.concatenate(
+        [sky.star_fluxes, positions, *(part.measure(sky.extended) for part in parts)]
+    )
 
 
-def _quantities(
-    outcome: Outcome, apertures: Sequence[Aperture], width: float
-) -> tuple[Quantity, ...]:
+def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[Quantity, ...]:
     """Return what is measured, in the order of `_measure`."""
     scene = outcome.scene
     n, (ny, nx) = scene.n_stars, scene.observation.shape
     moves = outcome.given_stars is not None
-    sky = Sky(outcome.sky[:ny, :nx], outcome.star_fluxes, scene.stars)
-    names = [(f"star {s} flux", FLUX, "") for s in range(1, n + 1)]
+    labels = [Label(f"star {s} flux", FLUX) for s in range(1, n + 1)]
     if moves:
-        names += [(f"star {s} {axis}", POSITION, "") for s in range(1, n + 1) for axis in "xy"]
-    names += [(each.name, FLUX, _note(each, scene.stars, width)) for each in apertures]
-    values = _measure(sky, apertures, moves).tolist()
+        labels += [Label(f"star {s} {axis}", LENGTH) for s in range(1, n + 1) for axis in "xy"]
+    labels += [label for part in parts for label in part.labels()]
+    notes = [""] * (3 * n if moves else n)
+    notes += [note for part in parts for note in _notes(part, scene.stars, width)]
+    sky = Sky(outcome.sky[:ny, :nx], outcome.star_fluxes, scene.stars)
+    values = _measure(sky, parts, moves).tolist()
     return tuple(
-        Quantity(name, kind, value, note)
-        for (name, kind, note), value in zip(names, values, strict=True)
+        Quantity(label.name, label.kind, value, note, label.at)
+        for label, value, note in zip(labels, values, notes, strict=True)
     )
 
 
-def _note(aperture: Aperture, stars: Array, width: float) -> str:
-    """Return why the error of the light of a region may not hold."""
-    if aperture.n_pixels < np.pi / 4.0 * width**2:
-        return BELOW
-    rows, columns = np.indices(aperture.weights.shape)
-    rows, columns = rows + aperture.y, columns + aperture.x
-    for x, y in stars:
-        is_core = np.hypot(rows - y, columns - x) <= CORE * width
-        if (aperture.weights * is_core).sum() > 0.5 * aperture.n_pixels:
-            return UNDER
-    return ""
+def _notes(part: Part, stars: Array, width: float) -> list[str]:
+    """Return why the errors of a part may not hold."""
+    if isinstance(part, Profile):
+        return 2 * [_under(each, stars, width) for each in part.slices]
+    is_small = part.n_pixels < np.pi / 4.0 * width**2
+    return [BELOW if is_small else _under(part, stars, width)]
+
+
+def _under(aperture: Aperture, stars: Array, width: float) -> str:
+    """Return a note where most of an aperture lies under the core of a star."""
+    rows, columns = aperture.places
+    is_core = [np.hypot(rows - y, columns - x) <= CORE * width for x, y in stars]
+    most = max(((aperture.weights * each).sum() for each in is_core), default=0.0)
+    return UNDER if most > 0.5 * aperture.n_pixels else ""
 
 
 def _refuse_other(earlier: Bootstrap, expected: Bootstrap) -> None:

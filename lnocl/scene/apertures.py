@@ -1,14 +1,30 @@
-"""Parts of the sky whose light is summed: the shares of pixels that lie within."""
+"""Parts of the sky whose light is measured: regions, and the slices of profiles."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
+
+import numpy as np
 
 from lnocl.scene.observation import Array
 
+# What is measured: light, in electrons, or lengths, in pixels.
+FLUX, LENGTH = "flux", "length"
+# A full width at half maximum in standard deviations, of a Gaussian.
+FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
+
+
+class Label(NamedTuple):
+    """The name of something that is measured, its kind, and where it is along a profile."""
+
+    name: str
+    kind: str
+    at: float | None = None
+
 
 class Aperture(NamedTuple):
-    """The shares of pixels that lie within a region.
+    """The shares of pixels that lie within a region; its light is measured.
 
     Attributes
     ----------
@@ -30,8 +46,71 @@ class Aperture(NamedTuple):
         """The area, pixels."""
         return float(self.weights.sum())
 
-    def flux(self, sky: Array) -> float:
-        """Return the light of a sky, shape (ny, nx), within the region."""
+    @property
+    def places(self) -> tuple[Array, Array]:
+        """Rows and columns of its pixels, shape (h, w)."""
+        places: Array = np.indices(self.weights.shape, np.float64)
+        return places[0] + self.y, places[1] + self.x
+
+    def light(self, sky: Array) -> Array:
+        """Return the light of each pixel of a sky, shape (ny, nx), that lies within, (h, w)."""
         height, width = self.weights.shape
-        there = sky[self.y : self.y + height, self.x : self.x + width]
-        return float((self.weights * there).sum())
+        return self.weights * sky[self.y : self.y + height, self.x : self.x + width]
+
+    def flux(self, sky: Array) -> float:
+        """Return the light of a sky within the region."""
+        return float(self.light(sky).sum())
+
+    def labels(self) -> list[Label]:
+        """Return what `measure` measures."""
+        return [Label(self.name, FLUX)]
+
+    def measure(self, sky: Array) -> Array:
+        """Return the light of a sky, shape (1,)."""
+        return np.array([self.flux(sky)])
+
+
+class Profile(NamedTuple):
+    """Slices of a box along its axis: the light of each, and how wide it is across.
+
+    Attributes
+    ----------
+    name : str
+        What the box is called.
+    at : sequence of float, length k
+        The middle of each slice along the axis, pixels from that of the box.
+    slices : sequence of Aperture, length k
+        The slices.
+    across : sequence of ndarray of float64, length k
+        Distance of each pixel of a slice from the axis, pixels.
+    """
+
+    name: str
+    at: Sequence[float]
+    slices: Sequence[Aperture]
+    across: Sequence[Array]
+
+    def labels(self) -> list[Label]:
+        """Return what `measure` measures."""
+        return [
+            *(Label(f"{self.name} flux", FLUX, at) for at in self.at),
+            *(Label(f"{self.name} width", LENGTH, at) for at in self.at),
+        ]
+
+    def measure(self, sky: Array) -> Array:
+        """Return the light of each slice, and 2.355 standard deviations of it across, (2 k,).
+
+        The width of a slice without light is 0.
+        """
+        fluxes, widths = [], []
+        for each, across in zip(self.slices, self.across, strict=True):
+            light = each.light(sky)
+            flux = float(light.sum())
+            fluxes.append(flux)
+            if flux <= 0:
+                widths.append(0.0)
+                continue
+            mean = (light * across).sum() / flux
+            variance = (light * (across - mean) ** 2).sum() / flux
+            widths.append(FWHM * float(np.sqrt(max(variance, 0.0))))
+        return np.array([*fluxes, *widths])

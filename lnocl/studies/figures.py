@@ -11,16 +11,18 @@ import numpy as np
 from lnocl import metrics
 from lnocl.errors import InputError
 from lnocl.io import atomic
+from lnocl.io.fitserrors import read_errors
 from lnocl.io.saved_results import SavedResult, read_result
 from lnocl.plotting.curves import draw_errors, draw_magnitudes
 from lnocl.plotting.figure import check_matplotlib, save_figure
-from lnocl.plotting.profiles import draw_profiles
+from lnocl.plotting.profiles import draw_bands, draw_profiles
 from lnocl.plotting.report import make_report
 from lnocl.plotting.result import OUTLINED, ResultView, draw_result
 from lnocl.plotting.sources import Frame, Source, draw_objects
 from lnocl.studies import experiment
 
 if TYPE_CHECKING:
+    from astropy.table import Table
     from matplotlib.figure import Figure
 
 # What is larger is no number of a result, and differences of such are not finite.
@@ -64,7 +66,12 @@ def draw(
     check_matplotlib()
     results = list(dict.fromkeys(results))
     pictures = ["result"] if len(results) == 1 else [f"result_{i + 1}" for i in range(len(results))]
-    outputs = [f"{name}.png" for name in (*pictures, *FIGURES)]
+    profiles = {
+        f"{picture}_profile_{k}": each
+        for picture, path in zip(pictures, results, strict=True)
+        for k, each in enumerate(read_profiles(path), 1)
+    }
+    outputs = [f"{name}.png" for name in (*pictures, *profiles, *FIGURES)]
     atomic.check_folder(folder, overwrite, outputs, make=False)
     saved = [read_result(path) for path in results]
     true = None if truth is None else read_result(truth)
@@ -80,6 +87,8 @@ def draw(
                 f"{each.path} has no models and residuals to show: repeat its run with --models "
                 "--residuals, or draw them in the run, with --plot"
             )
+    for name, profile in profiles.items():
+        yield save(folder, name, draw_bands(*profile), overwrite)
     curves = {
         name: each.tables["CURVE"]
         for name, each in zip(names, saved, strict=True)
@@ -106,6 +115,20 @@ def draw(
     for kind in ("flux", "width"):
         figure = draw_profiles(kind, original, sources, frame, experiment.NEAR_STAR, threshold)
         yield save(folder, kind, figure, overwrite)
+
+
+def read_profiles(path: str) -> list[tuple[str, Table, Table, str]]:
+    """Return name, light, width and unit of light of each profile whose errors a result has."""
+    errors = read_errors(path)
+    if errors is None:
+        return []
+    along = errors[np.isfinite(errors["at"])]
+    names = list(dict.fromkeys(along["name"].tolist()))
+    found = []
+    for flux, width in zip(names[::2], names[1::2], strict=True):
+        parts = [along[along["name"] == name] for name in (flux, width)]
+        found.append((flux.removesuffix(" flux"), *parts, parts[0]["unit"][0]))
+    return found
 
 
 def report(path: str) -> str:

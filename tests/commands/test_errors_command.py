@@ -13,6 +13,7 @@ from astropy.io import fits
 
 import lnocl
 from lnocl.commands import cli
+from lnocl.plotting.profiles import draw_bands
 
 pytest.importorskip("regions", reason="regions is not installed")
 
@@ -36,7 +37,7 @@ def held(path="out.fits"):
 
 def same_errors(one, other):
     for name in EXTENSIONS:
-        np.testing.assert_array_equal(np.array(one[name].data), np.array(other[name].data))
+        assert np.array(one[name].data).tobytes() == np.array(other[name].data).tobytes(), name
 
 
 def test_errors_are_added_to_the_file(words, capsys):
@@ -61,6 +62,32 @@ def test_errors_are_added_to_the_file(words, capsys):
     assert found["ERROR"].data.shape == found["BIAS"].data.shape == (64, 64)
     assert found["REGIONS"].data["pixels"][1] == pytest.approx(96)
     assert lnocl.io.saved_results.read_result("out.fits").extended.shape == (64, 64)
+
+
+def test_profiles_are_drawn_with_their_errors(words, capsys):
+    pytest.importorskip("matplotlib")
+    Path("p.reg").write_text("image\nbox(30,34,40,6,10) # text={jet}\nbox(30,34,6,20,0)")
+    words.remove("--quiet")
+    assert cli.main([*words, "10", "--profiles", "p.reg"]) == 0
+    assert "jet flux" not in capsys.readouterr().out  # they are many
+    table = held()["ERRORS"].data
+    along = table[np.isfinite(table["at"])]
+    assert [name for name in dict.fromkeys(along["name"])] == [
+        "jet flux", "jet width", "region 2 flux", "region 2 width",
+    ]  # fmt: skip
+    assert len(along) == 2 * (40 + 20)
+    assert set(along["unit"][along["name"] == "jet width"]) == {"pix"}
+    assert cli.main(["plot", "out.fits", "-o", "figures"]) == 0
+    said = capsys.readouterr().out
+    for k in (1, 2):
+        assert f"drew figures/result_profile_{k}.png" in said
+        assert Path(f"figures/result_profile_{k}.png").stat().st_size > 1000
+    (flux, width) = [along[along["name"] == f"jet {kind}"] for kind in ("flux", "width")]
+    figure = draw_bands("jet", flux, width, "electron")
+    bands = figure.axes[0].collections
+    assert [each.get_label() for each in bands] == ["95 %", "68 %"]
+    outer = bands[0].get_datalim(figure.axes[0].transData)
+    assert (outer.y0, outer.y1) == pytest.approx((flux["low95"].min(), flux["high95"].max()))
 
 
 def test_errors_go_on_bit_for_bit_as_if_computed_at_once(words):
@@ -154,7 +181,10 @@ def test_a_file_of_no_command_is_refused(words, capsys):
     assert "bare.fits has no command of lnocl deconvolve in its header" in capsys.readouterr().err
     alone = words[: words.index("--regions")]
     assert cli.main([*alone, "--seed", "3"]) == 2
-    assert "--regions and --seed are for replicas: give --bootstrap" in capsys.readouterr().err
+    assert (
+        "--regions, --profiles and --seed are for replicas: give --bootstrap"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.system

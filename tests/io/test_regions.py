@@ -5,7 +5,7 @@ import pytest
 from astropy.io import fits
 
 import lnocl
-from lnocl.io.regions import read_apertures
+from lnocl.io.regions import read_apertures, read_profiles
 
 regions = pytest.importorskip("regions", reason="regions is not installed")
 SHAPE = (40, 50)
@@ -91,3 +91,51 @@ def test_a_missing_file_and_what_is_no_region_are_refused(tmp_path):
         read_apertures(tmp_path / "nix.reg", None, SHAPE)
     with pytest.raises(lnocl.InputError, match=r"^regions must be those of the package regions; 3"):
         read_apertures([3], None, SHAPE)
+
+
+# --- Profiles
+
+
+def ridge(turn, x0=24.0, y0=19.0, width=2.0):
+    """Return a Gaussian ridge along a line turned by so many degrees, and light along it."""
+    y, x = np.indices(SHAPE, float)
+    cos, sin = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    along, across = (x - x0) * cos + (y - y0) * sin, (y - y0) * cos - (x - x0) * sin
+    return (2.0 + np.sin(along / 4.0)) * np.exp(-0.5 * (across / width) ** 2), along
+
+
+@pytest.mark.parametrize(
+    ("sides", "turn"), [("18,14", 0), ("14,18", 0), ("18,14", 35), ("14,18", 35)]
+)
+def test_a_profile_is_along_the_longer_side(sides, turn, tmp_path):
+    path = tmp_path / "p.reg"
+    path.write_text(f"image\nbox(25,20,{sides},{turn}) # text={{jet}}")
+    (profile,) = read_profiles(path, None, SHAPE)
+    is_tall = sides == "14,18"
+    sky, _ = ridge(turn + 90 * is_tall)
+    assert profile.name == "jet"
+    np.testing.assert_allclose(profile.at, np.arange(18) - 8.5)
+    fluxes, widths = profile.measure(sky).reshape(2, -1)
+    expected = 2.0 + np.sin(np.array(profile.at) / 4.0)
+    np.testing.assert_allclose(fluxes / expected, fluxes[0] / expected[0], rtol=0.02)
+    # A pixel is 1 / sqrt(12) wide itself.
+    np.testing.assert_allclose(widths, 2.355 * 2.0, rtol=0.03)
+    inside = read_apertures(path, None, SHAPE)[0].flux(sky)
+    assert fluxes.sum() == pytest.approx(inside, rel=1e-9)
+    labels = profile.labels()
+    assert [each.kind for each in labels] == ["flux"] * 18 + ["length"] * 18
+    assert labels[0] == ("jet flux", "flux", profile.at[0])
+
+
+def test_a_slice_without_light_has_no_width(tmp_path):
+    (tmp_path / "p.reg").write_text("image\nbox(25,20,8,6,0)")
+    (profile,) = read_profiles(tmp_path / "p.reg", None, SHAPE)
+    assert not profile.measure(np.zeros(SHAPE)).any()
+
+
+def test_a_profile_of_no_box_is_refused(tmp_path):
+    (tmp_path / "p.reg").write_text("image\ncircle(25,20,8)")
+    with pytest.raises(
+        lnocl.InputError, match=r"^region 1 \(circle\) is no box: a profile is along"
+    ):
+        read_profiles(tmp_path / "p.reg", None, SHAPE)
