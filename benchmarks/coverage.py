@@ -3,7 +3,7 @@
     python benchmarks/coverage.py [KIND...] [--seeds FIRST LAST] [--replicas 50] --output FOLDER
     python benchmarks/coverage.py --report --output FOLDER
 
-Each kind of scene has a jet, or a disc, of random knots, and stars, on 64 x 64 pixels (see `KINDS`).
+Each kind of scene has a jet, or a disc, of random knots, and stars, on 64 x 64 pixels (`KINDS`).
 Each observation is reconstructed by default, the stars' positions refined from up to 0.3 pixels
 off; its errors are of so many replicas. Measured are fluxes and positions of stars, apertures of 5
 to 20 pixels at random places of light, and the profile along y in strips of 2 pixels. Each
@@ -11,6 +11,7 @@ observation is a row of numbers in FOLDER; --report makes a table and the histog
 """
 
 import argparse
+import re
 import warnings
 from functools import cache
 from pathlib import Path
@@ -23,6 +24,8 @@ from scipy.special import expit
 
 import lnocl
 from lnocl.io.regions import read_apertures
+from lnocl.plotting.figure import new_figure, save_figure
+from lnocl.runs.bootstrap import Bootstrap, Quantity
 from lnocl.scene.shifting import place
 from lnocl.simulation.fizeau import fizeau_psf
 
@@ -43,6 +46,15 @@ KINDS = {
 }
 DIAMETERS = 5, 5, 8, 8, 12, 12, 20, 20
 STRIPS = range(14, 54, 2)
+GROUPS = {
+    "star flux": "star flux",
+    "star position": "star position",
+    "apertures 5, 8": "aperture of [58]",
+    "apertures 12, 20": "aperture of (12|20)",
+    "strips": "strip",
+}
+# The last is the error over the standard error, as a normal deviate has it 1 in the median.
+COLUMNS = "kind", "quantity", "observations", "intervals", "68", "95", "fisher68", "fisher95", "z"
 
 
 @cache
@@ -52,9 +64,11 @@ def psfs(kind, p, seed):
         y, x = np.indices((N, N)) - N // 2
         return np.exp(-0.5 * (x**2 + y**2) / (6.0 / 2.3548) ** 2)[None]
     angles = np.arange(p) * 45.0 * u.deg
-    return np.stack(
-        [fizeau_psf((N, N), a, 2.12 * u.um, 5 * u.mas, 0.7, 10 * seed + k) for k, a in enumerate(angles)]
-    )  # fmt: skip
+    kernels = [
+        fizeau_psf((N, N), angle, 2.12 * u.um, 5 * u.mas, 0.7, 10 * seed + k)
+        for k, angle in enumerate(angles)
+    ]
+    return np.array(kernels)
 
 
 def knots(rng, y, t, width, first, length):
@@ -101,11 +115,12 @@ def observe(name, seed):
             stars.append(other)
     fluxes = contrast * light * np.r_[1.0, 10 ** rng.uniform(-1.5, 0.0, n_stars - 1)]
     background = light / 1e6 * 25.0 + 10.0
-    otfs = np.fft.rfft2(np.fft.ifftshift(kernels / kernels.sum(axis=(1, 2), keepdims=True), axes=(1, 2)))
+    kernels = kernels / kernels.sum(axis=(1, 2), keepdims=True)
+    otfs = np.fft.rfft2(np.fft.ifftshift(kernels, axes=(1, 2)))
     images = np.fft.irfft2(otfs * np.fft.rfft2(sky), (N, N)).clip(0)
     for image, kernel in zip(images, kernels, strict=True):
         for flux, star in zip(fluxes, stars, strict=True):
-            image += flux * place(kernel / kernel.sum(), (N, N), *star).on_grid((N, N))
+            image += flux * place(kernel, (N, N), *star).on_grid((N, N))
     counts = rng.poisson(images.clip(0) + background) + rng.normal(0, READ_NOISE, images.shape)
     observation = lnocl.Observation(
         counts, kernels, background=background, read_noise=READ_NOISE, psf_centre="given"
@@ -154,55 +169,49 @@ def measure(name, seed, n):
 
 def score(rows):
     """Return how often the intervals of these rows hold the truth, and the ranks of the truth."""
-    n = rows["errors"].shape[1]
-    quantities = tuple(lnocl.runs.bootstrap.Quantity("", "flux", v) for v in rows["value"])
-    found = lnocl.runs.bootstrap.Bootstrap(quantities, rows["errors"].T, np.zeros((2, 1, 1)), 1.0, 0)
+    quantities = tuple(Quantity("", "flux", value) for value in rows["value"])
+    found = Bootstrap(quantities, rows["errors"].T, np.zeros((2, 1, 1)), 1.0, 0)
     holds = []
     for level in (0.68, 0.95):
         low, high = found.interval(level)
         holds.append(((low <= rows["truth"]) & (rows["truth"] <= high)).mean())
-    z = (rows["value"] - found.bias - rows["truth"]) / found.standard_errors
-    ranks = ((rows["value"][:, None] - rows["errors"]) < rows["truth"][:, None]).sum(axis=1)
-    schur = abs(rows["value"] - rows["truth"]) / rows["schur"]
-    of_schur = [(schur <= k).mean() if np.isfinite(schur).all() else np.nan for k in (0.994, 1.96)]
-    return [*holds, np.sqrt(np.median(z**2) / 0.455), *of_schur], (ranks + 0.5) / (n + 1)
+    z = (found.values - found.bias - rows["truth"]) / found.standard_errors
+    of_star = abs(rows["value"] - rows["truth"]) / rows["schur"]
+    holds += [(of_star <= width).mean() for width in (0.994, 1.96)]
+    ranks = (rows["value"][:, None] - rows["errors"] < rows["truth"][:, None]).sum(axis=1)
+    return [*holds, np.sqrt(np.median(z**2) / 0.455)], (ranks + 0.5) / (found.n + 1)
+
+
+def pick(tables, pattern):
+    """Return the rows of all tables whose quantity has such a name, as arrays."""
+    columns = {name: [] for name in ("truth", "value", "schur", "errors")}
+    for table in tables:
+        rows = table[[re.match(pattern, str(name)) is not None for name in table["quantity"]]]
+        for name, values in columns.items():
+            values.append(np.asarray(rows[name]))
+    return {name: np.concatenate(values) for name, values in columns.items()}
 
 
 def report(folder):
     """Write the table of coverage by kind and quantity, and draw the ranks."""
-    import lnocl.runs.bootstrap
-    from lnocl.plotting.figure import new_figure, save_figure
-
-    lines, all_ranks = [], {}
-    groups = {
-        "star flux": "star flux", "star position": "star position", "apertures 5, 8": "aperture of [58]",
-        "apertures 12, 20": "aperture of (12|20)", "strips": "strip",
-    }  # fmt: skip
     tables = {
         name: [Table.read(path) for path in sorted(folder.glob(f"{name.replace(' ', '_')}-*.fits"))]
         for name in KINDS
     }
     tables["all"] = [table for each in list(tables.values()) for table in each]
-    import re
-
+    lines, ranks = [], {}
     for name, found in tables.items():
-        for group, pattern in groups.items():
-            picked = [t[[bool(re.match(pattern, str(q).strip())) for q in t["quantity"]]] for t in found]
-            picked = [t for t in picked if len(t)]
-            if not picked:
-                continue
-            columns = {k: np.concatenate([np.asarray(t[k]) for t in picked]) for k in ("truth", "value", "schur", "errors")}  # fmt: skip
-            scores, ranks = score(columns)
-            lines.append((name, group, len(found), len(columns["truth"]), *np.round(scores, 3)))
-            if name == "all":
-                all_ranks[group] = ranks
-    names = ("kind", "quantity", "observations", "intervals", "holds68", "holds95", "ratio", "schur68", "schur95")  # fmt: skip
-    table = Table(rows=lines, names=names)
+        for group, pattern in GROUPS.items():
+            rows = pick(found, pattern)
+            shares, ranks[group] = score(rows)
+            lines.append((name, group, len(found), len(rows["truth"]), *np.round(shares, 3)))
+    table = Table(rows=lines, names=COLUMNS)
     table.write(folder / "coverage.ecsv", overwrite=True)
     table.pprint(max_lines=-1, max_width=-1)
     figure = new_figure(12.0, 3.0)
-    for axis, (group, ranks) in zip(figure.subplots(1, len(all_ranks), sharey=True), all_ranks.items()):
-        axis.hist(ranks, bins=np.linspace(0, 1, 11), density=True, color="0.6", edgecolor="white")
+    axes = figure.subplots(1, len(ranks), sharey=True)
+    for axis, (group, each) in zip(axes, ranks.items(), strict=True):
+        axis.hist(each, bins=np.linspace(0, 1, 11), density=True, color="0.6", edgecolor="white")
         axis.axhline(1, color="black", lw=1)
         axis.set(title=group, xlabel="rank of the truth", xlim=(0, 1))
     save_figure(figure, str(folder / "ranks.png"), True)

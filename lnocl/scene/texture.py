@@ -13,6 +13,7 @@ of the resolution. How large these are was measured on simulated skies: docs/err
 from __future__ import annotations
 
 import numpy as np
+import scipy.fft
 from scipy.ndimage import gaussian_filter
 
 from lnocl.scene.cores import fwhm
@@ -21,13 +22,13 @@ from lnocl.scene.scene import Scene
 from lnocl.scene.smooth_field import SmoothField
 
 # Amplitudes, of the extended source and of the brightest near a star.
-SHARE, SHARE_NEAR = 0.3, 0.8
+SHARE, SHARE_NEAR = 0.37, 0.8
 # All lengths are in resolutions. Widths of the correlation, of the smoothing of the amplitude, and
 # of that near stars.
-CORRELATED, SMOOTHED, SMOOTHED_NEAR = 0.25, 0.35, 0.175
+CORRELATED, SMOOTHED, SMOOTHED_NEAR = 0.4, 0.55, 0.28
 # What lies to the first distance of a star is its core, to the second it is near, to the third
 # round it; the core ends over a width.
-CORE, NEAR, ROUND, EDGE = 0.55, 0.7, 1.05, 0.25
+CORE, NEAR, ROUND, EDGE = 0.85, 1.1, 1.65, 0.4
 
 
 class Texture:
@@ -45,7 +46,7 @@ class Texture:
     mean, amplitude : ndarray of float64, shape (Ny, Nx)
         Mean and standard deviation, in the unit of `extended`.
     resolution : float
-        Full width at half maximum of the narrowest PSF, pixels.
+        Full width at half maximum of what all images resolve together, pixels.
     width : float
         Pixels over which the field is correlated (`lnocl.scene.smooth_field.SmoothField`).
     """
@@ -86,8 +87,13 @@ class Texture:
 
 
 def resolution(scene: Scene) -> float:
-    """Return the full width at half maximum of the narrowest PSF, pixels."""
-    return min(fwhm(psf) for psf in scene.observation.psfs)
+    """Return the full width at half maximum of what all images resolve together, pixels.
+
+    It is that of the PSF whose OTF is the root of the mean of ``|OTF_j|^2``.
+    """
+    psfs = scene.observation.psfs
+    power = np.mean([abs(scipy.fft.fft2(psf)) ** 2 for psf in psfs], axis=0)
+    return fwhm(scipy.fft.fftshift(scipy.fft.ifft2(np.sqrt(power)).real))
 
 
 def _smooth(sky: Array, width: float) -> Array:

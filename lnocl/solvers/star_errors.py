@@ -34,7 +34,7 @@ from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
 # Side of the window round a star, resolutions, at least.
 WINDOW = 9.0
 # Steps of conjugate gradients at most, and the share of the gradient at which they end.
-N_STEPS, FINISHED = 2000, 1e-6
+N_STEPS, FINISHED = 2000, 1e-8
 
 
 class _Window(NamedTuple):

@@ -18,13 +18,20 @@ def gaussian(fwhm):
 
 
 def a_texture(stars=(), sky=SKY, psfs=None):
-    psfs = np.array([gaussian(6.0), gaussian(9.0)]) if psfs is None else psfs
+    psfs = np.array([gaussian(5.0), gaussian(8.0)]) if psfs is None else psfs
     images = np.full((len(psfs), N, N), 10.0)
     return Texture(Scene(lnocl.Observation(images, psfs), stars), sky)
 
 
-def test_the_resolution_is_that_of_the_narrowest_psf():
-    assert a_texture().resolution == pytest.approx(6.0, rel=0.01)
+def test_the_resolution_is_that_of_all_images_together():
+    """Two PSFs that are wide across each other resolve more than either."""
+    assert a_texture(psfs=gaussian(6.0)[None]).resolution == pytest.approx(6.0, rel=0.01)
+    assert 5.0 < a_texture().resolution < 6.5
+    y, x = (Y - 32) / 2.5, X - 32
+    long = np.exp(-0.5 * (x**2 + y**2) / (4.0 / 2.3548) ** 2)
+    alone, both = (a_texture(psfs=np.array(p)).resolution for p in ([long], [long, long.T]))
+    assert alone == pytest.approx(4.0 * np.sqrt(2.5), rel=0.02)
+    assert both < 0.85 * alone
 
 
 def test_without_stars_the_mean_is_the_estimate_and_the_amplitude_a_share_of_it():
@@ -53,7 +60,8 @@ def test_no_drawn_sky_is_negative():
 @pytest.mark.parametrize("star", [(30.0, 20.0), (30.3, 0.2), (30.0, 63.4)])
 def test_under_a_star_the_sky_is_expected_to_be_as_round_it(star):
     """Whatever the estimate has there, a hole or a heap; also where the grid wraps round."""
-    distance = np.hypot((X - star[0] + N / 2) % N - N / 2, (Y - star[1] + N / 2) % N - N / 2) / 6.0
+    away = ((at - star_at + N / 2) % N - N / 2 for at, star_at in zip((X, Y), star, strict=True))
+    distance = np.hypot(*away) / a_texture().resolution
     core = distance <= texture.CORE
     is_round = (distance > texture.CORE) & (distance <= texture.ROUND)
     for held in (0.0, 1e4):
