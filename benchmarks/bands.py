@@ -46,11 +46,13 @@ def main():
 
     replicas, errors = Replicas(result._outcome, given.seed), []
     for k in range(given.replicas):
-        drawn, seen = replicas.reconstruct(k)
-        errors.append(measure(seen.extended) - measure(drawn.extended))
+        drawn, found, _ = replicas.reconstruct(k)
+        errors.append(measure(found.extended) - measure(drawn.extended))
     values, truth = measure(result.extended), measure(made.extended)
     quantities = tuple(Quantity("", "flux", value) for value in values)
-    found = Bootstrap(quantities, np.array(errors), np.zeros((2, 1, 1)), 1.0, given.seed)
+    found = Bootstrap(
+        quantities, np.array(errors), np.zeros(0), np.zeros((2, 1, 1)), 1.0, given.seed
+    )
     rows = np.arange(given.size)
     star = made.stars[0][1]
     is_jet = truth[: given.size] > FAINT * truth[: given.size].max()

@@ -170,7 +170,7 @@ def measure(name, seed, n):
 def score(rows):
     """Return how often the intervals of these rows hold the truth, and the ranks of the truth."""
     quantities = tuple(Quantity("", "flux", value) for value in rows["value"])
-    found = Bootstrap(quantities, rows["errors"].T, np.zeros((2, 1, 1)), 1.0, 0)
+    found = Bootstrap(quantities, rows["errors"].T, np.zeros(0), np.zeros((2, 1, 1)), 1.0, 0)
     holds = []
     for level in (0.68, 0.95):
         low, high = found.interval(level)

@@ -251,7 +251,7 @@ def deconvolve(
     )
     families = check_families(refine_psfs, observation, positions, refine_positions)
     setup = Setup(positions, pad, solver, precision, engine, device, refine_positions)
-    refinement = None
+    refinement, read_noise = None, observation.read_noise
     if families or len(observation.psf_scatter):
         from lnocl.runs.psf_refinement import refine_psfs as refine  # which loads scipy
 
@@ -289,7 +289,7 @@ def deconvolve(
             del start, largest  # which hold arrays of the grid
             stop_reason = _complete(run, make_rule(stop), callback, bar, checkpointer)
             outcome = run.outcome(penalties[0], stop_reason)
-        return make_result(replace(outcome, psf_refinement=refinement))
+        return make_result(replace(outcome, psf_refinement=refinement, read_noise=read_noise))
 
 
 def _choose(

@@ -157,7 +157,7 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
             f"{path} has replicas of other regions or another seed: give those, or take overwrite "
             "to begin anew"
         )
-    return dataclasses.replace(expected, errors=held.errors, sums=held.sums)
+    return dataclasses.replace(expected, errors=held.errors, of_psfs=held.of_psfs, sums=held.sums)
 
 
 def _write(path: str, found: Bootstrap, parts: Sequence[Part], frames: Frames) -> None:
@@ -169,6 +169,7 @@ def _write(path: str, found: Bootstrap, parts: Sequence[Part], frames: Frames) -
         _table_of(parts),
         (found.error_map / frames.electrons, found.bias_map / frames.electrons),
         found.errors,
+        found.of_psfs,
         found.sums,
         found.seed,
         found.resolution,
@@ -199,6 +200,8 @@ def _said(found: Bootstrap, frames: Frames) -> list[str]:
     lines = [f"errors by {found.n} replicas, less their bias; in brackets 95 %:"]
     for row in table[:MAX_SAID]:
         note = f"; {row['note']}: do not trust its error" if row["note"] else ""
+        if len(found.of_psfs):
+            note += f"; noise {row['error_noise']:.2g}, PSF {row['error_psf']:.2g}"
         lines.append(
             f"{row['name']}: {row['value'] - row['bias']:.6g} +- {row['error']:.2g} "
             f"{row['unit']} ({row['low95']:.6g} to {row['high95']:.6g}{note})"

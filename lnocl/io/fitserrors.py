@@ -29,6 +29,7 @@ def write_errors(
     regions: QTable,
     maps: tuple[NDArray[np.float64], NDArray[np.float64]],
     replicas: NDArray[np.float64],
+    of_psfs: NDArray[np.float64],
     sums: NDArray[np.float64],
     seed: int,
     resolution: float,
@@ -44,8 +45,10 @@ def write_errors(
         What was measured, and the regions.
     maps : two ndarray of float64, shape (ny, nx)
         Standard error and bias of each pixel at the resolution, in this unit.
-    replicas, sums : ndarray of float64, shapes (n, k) and (2, ny, nx)
-        The errors of each replica, and the sums of its pixels, electrons.
+    replicas, of_psfs : ndarray of float64, shapes (n, k), and (n, k) or (0, k)
+        The errors of each replica, and the part of them that comes from PSFs.
+    sums : ndarray of float64, shape (2, ny, nx)
+        The sums of the errors of pixels, and of their squares, electrons.
     seed : int
         Of the replicas.
     resolution : float
@@ -68,12 +71,16 @@ def write_errors(
             rest = [hdu.copy() for hdu in hdus if hdu.name not in NAMES]
     except OSError as error:
         raise FileError(f"{path} cannot be read again: {error}") from error
-    column = fits.Column("errors", f"{replicas.shape[1]}D", array=replicas)
+    columns = [
+        fits.Column(name, f"{values.shape[1]}D", array=values)
+        for name, values in (("errors", replicas), ("of_psfs", of_psfs))
+        if len(values)
+    ]
     added = [
         fits.table_to_hdu(quantities),
         fits.table_to_hdu(regions),
         *(fits.ImageHDU(np.asarray(each, np.float64)) for each in maps),
-        fits.BinTableHDU.from_columns([column]),
+        fits.BinTableHDU.from_columns(columns),
         fits.ImageHDU(sums),
     ]
     for hdu, name in zip(added, NAMES, strict=True):
@@ -112,8 +119,8 @@ class Held(NamedTuple):
         What was measured.
     values : ndarray of float64, shape (k,)
         In the result.
-    errors, sums : ndarray of float64, shapes (n, k) and (2, ny, nx)
-        The errors of each replica, and the sums of its pixels, electrons.
+    errors, of_psfs, sums : ndarray of float64
+        As `write_errors` takes them.
     seed : int
         Of the replicas.
     """
@@ -121,6 +128,7 @@ class Held(NamedTuple):
     names: list[str]
     values: NDArray[np.float64]
     errors: NDArray[np.float64]
+    of_psfs: NDArray[np.float64]
     sums: NDArray[np.float64]
     seed: int
 
@@ -140,9 +148,12 @@ def read_replicas(path: str) -> Held | None:
         try:
             quantities, replicas = held[ERRORS].data, held[REPLICAS].data
             errors = np.array(replicas["errors"], np.float64).reshape(len(replicas), -1)
+            of_psfs = errors[:0]
+            if "of_psfs" in held[REPLICAS].columns.names:
+                of_psfs = np.array(replicas["of_psfs"], np.float64).reshape(errors.shape)
             values = np.array(quantities["value"], np.float64)
             names = [str(name) for name in quantities["name"]]
             seed = int(held[REPLICAS].header["SEED"])
         except (KeyError, ValueError) as error:
             raise FileError(f"{path} has damaged replicas: {error}; begin anew") from error
-        return Held(names, values, errors, file.pixels(held[SUMS]), seed)
+        return Held(names, values, errors, of_psfs, file.pixels(held[SUMS]), seed)

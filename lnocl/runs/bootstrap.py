@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from lnocl.errors import InputError
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.progress import make_bar
-from lnocl.runs.replicas import Replicas, Sky
+from lnocl.runs.replicas import Replica, Replicas, Sky
 from lnocl.scene.apertures import FLUX, FWHM, LENGTH, Aperture, Label, Profile
 from lnocl.scene.observation import Array
 from lnocl.scene.texture import CORE, resolution
@@ -69,7 +69,10 @@ class Bootstrap:
         What was measured: fluxes of stars, their positions where these were refined, the light of
         the extended source in regions, light and widths along profiles.
     errors : ndarray of float64, shape (n, k)
-        The errors of each replica, in electrons or pixels.
+        The errors of each replica, in electrons or pixels; where the scatter of the PSFs is known,
+        with theirs.
+    of_psfs : ndarray of float64, shape (n, k) or (0, k)
+        The part of the errors that comes from PSFs; none where their scatter is not known.
     sums : ndarray of float64, shape (2, ny, nx)
         The sums over replicas of the errors of the extended source and of their squares, electrons
         per pixel, smoothed to the resolution.
@@ -85,6 +88,7 @@ class Bootstrap:
 
     quantities: tuple[Quantity, ...]
     errors: Array
+    of_psfs: Array
     sums: Array
     resolution: float
     seed: int
@@ -141,6 +145,8 @@ class Bootstrap:
     def to_table(self, electrons: float = 1.0, unit: str = "electron") -> QTable:
         """Return a table: a row a quantity, with value, bias, standard error and intervals.
 
+        Where the scatter of the PSFs is known, its part of the error, and the rest, are apart.
+
         Parameters
         ----------
         electrons : float, optional
@@ -151,6 +157,9 @@ class Bootstrap:
         from astropy.table import QTable  # which takes its time to load
 
         columns = {"value": self.values, "bias": self.bias, "error": self.standard_errors}
+        if len(self.of_psfs):
+            columns["error_noise"] = (self.errors - self.of_psfs).std(axis=0, ddof=1)
+            columns["error_psf"] = self.of_psfs.std(axis=0, ddof=1)
         for level in LEVELS:
             low, high = self.interval(level)
             columns |= {f"low{level * 100:.0f}": low, f"high{level * 100:.0f}": high}
@@ -207,8 +216,7 @@ def bootstrap(
     with make_bar(n, "replica", progress) as bar:
         bar.update(found.n)
         for k in range(found.n, n):
-            drawn, seen = replicas.reconstruct(k)
-            found = _with(found, outcome, parts, drawn, seen)
+            found = _with(found, outcome, parts, replicas.reconstruct(k))
             bar.update()
             if look is not None:
                 look(found)
@@ -220,7 +228,8 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     width = resolution(outcome.scene)
     quantities = _quantities(outcome, parts, width)
     pixels = np.zeros((2, *outcome.scene.observation.shape))
-    return Bootstrap(quantities, np.zeros((0, len(quantities))), pixels, width, seed)
+    none = np.zeros((0, len(quantities)))
+    return Bootstrap(quantities, none, none, pixels, width, seed)
 
 
 def check_number(n: object, seed: object) -> None:
@@ -240,22 +249,24 @@ def check_number(n: object, seed: object) -> None:
         raise InputError(f"seed must be a whole number, 0 or more; {seed} was given")
 
 
-def _with(
-    found: Bootstrap, outcome: Outcome, parts: Sequence[Part], drawn: Sky, seen: Sky
-) -> Bootstrap:
+def _with(found: Bootstrap, outcome: Outcome, parts: Sequence[Part], replica: Replica) -> Bootstrap:
     """Return the errors with those of one replica more."""
     from scipy.ndimage import gaussian_filter
 
     moves = outcome.given_stars is not None
-    errors = _measure(seen, parts, moves) - _measure(drawn, parts, moves)
+    drawn, seen = (_measure(sky, parts, moves) for sky in replica[:2])
+    last, of_psfs = replica.found, np.zeros((0, len(seen)))
+    if replica.found_with_psfs is not None:
+        last = replica.found_with_psfs
+        of_psfs = (_measure(last, parts, moves) - seen)[None]
+        seen = seen + of_psfs[0]
     width = found.resolution / FWHM
-    pixels = gaussian_filter(seen.extended - drawn.extended, width, mode="nearest")
-    return Bootstrap(
-        found.quantities,
-        np.concatenate([found.errors, errors[None]]),
-        found.sums + np.array([pixels, pixels**2]),
-        found.resolution,
-        found.seed,
+    pixels = gaussian_filter(last.extended - replica.drawn.extended, width, mode="nearest")
+    return replace(
+        found,
+        errors=np.concatenate([found.errors, (seen - drawn)[None]]),
+        of_psfs=np.concatenate([found.of_psfs, of_psfs]),
+        sums=found.sums + np.array([pixels, pixels**2]),
     )
 
 

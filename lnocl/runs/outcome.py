@@ -114,6 +114,8 @@ class Outcome:
         Returns where a run of the observation starts, given the penalty.
     psf_refinement : PsfRefinement or None
         None where the PSFs were not to be refined.
+    read_noise : ndarray of float64 or None
+        That of the counts, where `scene` has the error of the PSFs added to it.
     """
 
     scene: Scene
@@ -127,6 +129,7 @@ class Outcome:
     restart: Callable[[Penalty], Start]
     curve: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
     psf_refinement: PsfRefinement | None = None
+    read_noise: Array | None = None
 
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of star fluxes and positions, the extended source not known.

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from lnocl.runs.outcome import Outcome
 from lnocl.runs.run import Run
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array, Observation
+from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.texture import Texture
 
 
@@ -35,6 +36,14 @@ class Sky(NamedTuple):
     star_positions: Array
 
 
+class Replica(NamedTuple):
+    """A sky that was drawn, what was found of it, and what was where the PSFs were wrong too."""
+
+    drawn: Sky
+    found: Sky
+    found_with_psfs: Sky | None
+
+
 class Replicas:
     """Reconstructions of observations that are drawn from an answer.
 
@@ -42,6 +51,9 @@ class Replicas:
     Its counts are drawn from the model of that, with exposures, bad pixels, background and read
     noise as observed, and reconstructed by as many iterations, with the same penalty, from the same
     start. All replicas use the buffers and programs of one run.
+
+    Where the scatter of the PSFs is known, the same sky is also seen through PSFs that are drawn
+    from it, with the same noise, and reconstructed with those of the answer.
 
     Parameters
     ----------
@@ -55,58 +67,80 @@ class Replicas:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
         self._texture = Texture(scene, outcome.sky / scene.unit)
         self._model = Model(scene)
+        observation = scene.observation
+        self._noise = self._added = observation.read_noise**2
+        self._pixels = None
+        if len(observation.psf_scatter):
+            self._pixels = PsfPixels(observation.psfs, observation.psf_scatter)
+            if outcome.read_noise is not None:  # the scatter of PSFs is drawn instead
+                self._noise = outcome.read_noise**2
         with ignored_warnings():  # those of the reconstruction are the same
             self._start = outcome.restart(outcome.penalty)
         self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
 
-    def reconstruct(self, k: int) -> tuple[Sky, Sky]:
-        """Return the sky of replica k, and what was found of it.
+    def reconstruct(self, k: int) -> Replica:
+        """Return replica k.
 
         Raises
         ------
         NotFiniteError, DivergedError
             Its objective is not finite, or rises.
         """
-        *of_images, of_sky = np.random.SeedSequence([self._seed, k]).spawn(self._n_images + 1)
-        sky = self._texture.draw(np.random.default_rng(of_sky))
-        self._run.repeat(self._start, self._observe(sky, of_images))
-        with np.errstate(over="ignore", invalid="ignore"):
-            for _ in self._run:
-                pass
         scene = self._outcome.scene
+        of_sky, of_psfs, *of_images = np.random.SeedSequence([self._seed, k]).spawn(
+            scene.n_images + 2
+        )
+        sky = self._texture.draw(np.random.default_rng(of_sky))
         ny, nx = scene.observation.shape
         drawn = Sky(sky[:ny, :nx] * scene.unit, self._outcome.star_fluxes, scene.stars)
+        found = self._find(self._observe(self._model, sky, of_images))
+        if self._pixels is None:
+            return Replica(drawn, found, None)
+        model = Model(scene.seen_through(self._draw_psfs(of_psfs)))
+        return Replica(drawn, found, self._find(self._observe(model, sky, of_images)))
+
+    def _find(self, observation: Observation) -> Sky:
         run = self._run
-        return drawn, Sky(run.extended(), run.star_fluxes(), run.star_positions())
+        run.repeat(self._start, observation)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in run:
+                pass
+        return Sky(run.extended(), run.star_fluxes(), run.star_positions())
 
-    @property
-    def _n_images(self) -> int:
-        return self._outcome.scene.n_images
+    def _draw_psfs(self, seed: np.random.SeedSequence) -> Array:
+        psfs = self._outcome.scene.observation.psfs
+        fields = np.random.default_rng(seed).standard_normal(psfs.shape)
+        changes = [cast(PsfPixels, self._pixels).correction(j, x) for j, x in enumerate(fields)]
+        return np.asarray(psfs + np.array(changes))
 
-    def _observe(self, sky: Array, seeds: list[np.random.SeedSequence]) -> Observation:
+    def _observe(
+        self, model: Model, sky: Array, seeds: Sequence[np.random.SeedSequence]
+    ) -> Observation:
         """Return an observation of a sky on the grid, scaled."""
         observation = copy(self._outcome.scene.observation)
         with ThreadPoolExecutor() as pool:
-            observation.images = np.array(list(pool.map(self._draw, self._means(sky), seeds)))
+            counts = pool.map(_draw, self._means(model, sky), self._added, self._noise, seeds)
+            observation.images = np.array(list(counts))
         observation.images[observation.mask] = 0.0
         return observation
 
-    def _means(self, sky: Array) -> Iterator[tuple[Array, Array]]:
-        """Yield the mean of the counts of each image, and the variance of its read noise."""
+    def _means(self, model: Model, sky: Array) -> Iterator[Array]:
+        """Yield the model of each image, electrons."""
         scene = self._outcome.scene
-        images = self._model.images(sky, self._outcome.star_fluxes / scene.unit)
+        images = model.images(sky, self._outcome.star_fluxes / scene.unit)
         ny, nx = scene.observation.shape
         for j, image in enumerate(images):
             if scene.weights is not None and scene.has_exposure_map:
                 image *= scene.weights[j]
-            yield image[:ny, :nx] * scene.scale, scene.observation.read_noise[j] ** 2
+            yield image[:ny, :nx] * scene.scale
 
-    @staticmethod
-    def _draw(mean: tuple[Array, Array], seed: np.random.SeedSequence) -> Array:
-        """Return counts, with the variance of the read noise added as `Observation` has it."""
-        model, variance = mean
-        rng = np.random.default_rng(seed)
-        counts = rng.poisson(np.maximum(model - variance, 0.0)).astype(np.float64)
-        if np.any(variance):
-            counts += rng.standard_normal(counts.shape) * np.sqrt(variance) + variance
-        return np.maximum(counts, 0.0)
+
+def _draw(
+    model: Array, added: Array | float, noise: Array | float, seed: np.random.SeedSequence
+) -> Array:
+    """Return counts with read noise of this variance, and what was added to images and model."""
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(np.maximum(model - added, 0.0)).astype(np.float64)
+    if np.any(noise):
+        counts += rng.standard_normal(counts.shape) * np.sqrt(noise)
+    return np.maximum(counts + added, 0.0)

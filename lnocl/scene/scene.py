@@ -152,6 +152,15 @@ class Scene:
         half.scale, half.unit = self.scale / 2.0, self.unit / 2.0
         return half
 
+    def seen_through(self, psfs: Array) -> Scene:
+        """Return this scene with other PSFs, shape (p, ky, kx), as they are."""
+        other = copy(self)
+        other.observation = copy(self.observation)
+        other.observation.psfs = psfs
+        other._psfs = [MovablePsf(psf, self.grid) for psf in other.scaled_psfs()]
+        other._field = other._place_stars(self.stars)
+        return other
+
     def _scaled(self, name: str, weight: float, factor: float) -> float:
         """Return a weight of the penalty, scaled; refuse one that is too large for float32."""
         if weight * factor > MAX_WEIGHT:

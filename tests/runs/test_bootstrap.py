@@ -69,7 +69,10 @@ def test_counts_have_the_mean_and_variance_of_the_model(recipe):
     replicas, observation = Replicas(result._outcome, 0), result._outcome.scene.observation
     sky = result._outcome.sky / result._outcome.scene.unit
     draws = np.array(
-        [replicas._observe(sky, np.random.SeedSequence(k).spawn(2)).images for k in range(400)]
+        [
+            replicas._observe(replicas._model, sky, np.random.SeedSequence(k).spawn(2)).images
+            for k in range(400)
+        ]
     )
     good = ~observation.mask
     assert not draws[:, ~good].any()
@@ -90,7 +93,8 @@ def test_replicas_hang_on_seed_and_number_alone():
     for k in (3, 0):
         first.reconstruct(k)
     for k in (0, 3):
-        for found, expected in zip(first.reconstruct(k), second.reconstruct(k), strict=True):
+        pairs = zip(first.reconstruct(k)[:2], second.reconstruct(k)[:2], strict=True)
+        for found, expected in pairs:
             for a, b in zip(found, expected, strict=True):
                 np.testing.assert_array_equal(a, b)
     different = Replicas(outcome, 6).reconstruct(0)[0].extended
@@ -113,7 +117,7 @@ def test_errors_are_found_less_drawn():
     ]  # fmt: skip
     replicas = Replicas(outcome, 7)
     for k in (0, 9):
-        drawn, seen = replicas.reconstruct(k)
+        drawn, seen, _ = replicas.reconstruct(k)
         flux = seen.star_fluxes[0] - outcome.star_fluxes[0]
         light = (seen.extended - drawn.extended)[4:16, 6:18].sum()
         assert found.errors[k, [0, 3]] == pytest.approx([flux, light], rel=1e-9)
@@ -124,7 +128,7 @@ def test_errors_are_found_less_drawn():
     assert found.error_map.shape == found.bias_map.shape == (ny, nx)
     errors = []
     for k in range(10):
-        drawn, seen = replicas.reconstruct(k)
+        drawn, seen, _ = replicas.reconstruct(k)
         # Full width at half maximum in standard deviations.
         smoothed = gaussian_filter(seen.extended - drawn.extended, found.resolution / 2.35482)
         errors.append(smoothed[12:-12, 12:-12])  # the edges aside
@@ -148,7 +152,7 @@ def test_replicas_are_continued_bit_for_bit():
 def made_up(errors, value=10.0):
     errors = np.asarray(errors, float).reshape(-1, 1)
     pixels = np.stack([errors.sum() * np.ones((2, 2)), (errors**2).sum() * np.ones((2, 2))])
-    return Bootstrap((Quantity("a", "flux", value),), errors, pixels, 1.0, 0)
+    return Bootstrap((Quantity("a", "flux", value),), errors, errors[:0], pixels, 1.0, 0)
 
 
 def test_intervals_are_those_of_student():
@@ -192,6 +196,58 @@ def test_regions_whose_errors_may_not_hold_are_named():
     }
     found = bootstrap.without_replicas(outcome, list(named.values()), 0)
     assert [each.note for each in found.quantities[1:]] == list(named)
+
+
+# --- The scatter of PSFs
+
+
+@pytest.mark.filterwarnings("ignore:the PSFs do not fit")
+def test_errors_of_psfs_are_told_apart():
+    """Twice the scatter gives twice their part, and leaves the rest; without it there is none."""
+    made = BASE.make()
+    scatter = 1e-4 * made.psfs / made.psfs.sum(axis=(1, 2), keepdims=True)
+    found = []
+    for factor in (1.0, 2.0):
+        observation = made.observation(psf_scatter=factor * scatter)
+        result = lnocl.deconvolve(
+            observation, made.stars, stop=None, n_iter=8, smoothing=1e-3, pad=0, engine="numpy"
+        )
+        found.append(result.bootstrap(12))
+    tables = [each.to_table() for each in found]
+    assert tables[0]["error_psf"][0] > 0
+    ratio = tables[1]["error_psf"][0] / tables[0]["error_psf"][0]
+    assert ratio == pytest.approx(2.0, rel=0.01)
+    for each, table in zip(found, tables, strict=True):
+        np.testing.assert_allclose(table["error"], each.errors.std(axis=0, ddof=1))
+        without = each.errors - each.of_psfs
+        np.testing.assert_allclose(table["error_noise"], without.std(axis=0, ddof=1))
+    assert "error_psf" not in solved().bootstrap(10).to_table().colnames
+
+
+@pytest.mark.filterwarnings("ignore:the PSFs do not fit")
+def test_noise_of_counts_is_as_given_where_psfs_are_drawn():
+    """The error of PSFs was added to the read noise of the run; it must not count twice."""
+    made = dataclasses.replace(BASE, read_noise=3.0).make()
+    scatter = 0.2 * made.psfs / made.psfs.sum(axis=(1, 2), keepdims=True)
+    result = lnocl.deconvolve(
+        made.observation(psf_scatter=scatter), made.stars, stop=None, n_iter=5, smoothing=1e-3,
+        pad=0, engine="numpy",
+    )  # fmt: skip
+    replicas, scene = Replicas(result._outcome, 0), result._outcome.scene
+    assert scene.observation.read_noise.max() > 4.0
+    sky = result._outcome.sky / scene.unit
+    draws = np.array(
+        [
+            replicas._observe(replicas._model, sky, np.random.SeedSequence(k).spawn(2)).images
+            for k in range(300)
+        ]
+    )
+    models, added = result.models(), scene.observation.read_noise**2
+    expected = models - added + 3.0**2
+    plenty = models > 40
+    ratio = draws.var(axis=0, ddof=1)[plenty] / expected[plenty]
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.02)
+    np.testing.assert_allclose(draws.mean(axis=0)[plenty], models[plenty], rtol=0.1)
 
 
 # --- What is refused
