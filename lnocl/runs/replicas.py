@@ -13,7 +13,7 @@ from lnocl.process import ignored_warnings
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.run import Run
 from lnocl.scene.forward_model import Model
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.observation import Array
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.texture import Texture
 
@@ -93,14 +93,20 @@ class Replicas:
         sky = self._texture.draw(np.random.default_rng(of_sky))
         ny, nx = scene.observation.shape
         drawn = Sky(sky[:ny, :nx] * scene.unit, self._outcome.star_fluxes, scene.stars)
-        found = self._find(self._observe(self._model, sky, of_images))
+        models = list(self._means(self._model, sky))
+        counts = self._draw(models, of_images)
+        found = self._find(counts)
         if self._pixels is None:
             return Replica(drawn, found, None)
-        model = Model(scene.seen_through(self._draw_psfs(of_psfs)))
-        return Replica(drawn, found, self._find(self._observe(model, sky, of_images)))
+        others = self._means(Model(scene.seen_through(self._draw_psfs(of_psfs))), sky)
+        # The same noise: counts that are drawn of almost the same mean may be quite others.
+        changed = [n + b - a for n, a, b in zip(counts, models, others, strict=True)]
+        return Replica(drawn, found, self._find(np.maximum(changed, 0.0)))
 
-    def _find(self, observation: Observation) -> Sky:
-        run = self._run
+    def _find(self, counts: Array) -> Sky:
+        """Return what is found of an observation with these counts."""
+        observation, run = copy(self._outcome.scene.observation), self._run
+        observation.images = np.where(observation.mask, 0.0, counts)
         run.repeat(self._start, observation)
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in run:
@@ -113,16 +119,10 @@ class Replicas:
         changes = [cast(PsfPixels, self._pixels).correction(j, x) for j, x in enumerate(fields)]
         return np.asarray(psfs + np.array(changes))
 
-    def _observe(
-        self, model: Model, sky: Array, seeds: Sequence[np.random.SeedSequence]
-    ) -> Observation:
-        """Return an observation of a sky on the grid, scaled."""
-        observation = copy(self._outcome.scene.observation)
+    def _draw(self, models: Sequence[Array], seeds: Sequence[np.random.SeedSequence]) -> Array:
+        """Return counts of these models, shape (p, ny, nx)."""
         with ThreadPoolExecutor() as pool:
-            counts = pool.map(_draw, self._means(model, sky), self._added, self._noise, seeds)
-            observation.images = np.array(list(counts))
-        observation.images[observation.mask] = 0.0
-        return observation
+            return np.array(list(pool.map(_draw, models, self._added, self._noise, seeds)))
 
     def _means(self, model: Model, sky: Array) -> Iterator[Array]:
         """Yield the model of each image, electrons."""

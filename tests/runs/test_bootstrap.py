@@ -63,20 +63,19 @@ def test_a_repeated_run_is_bit_for_bit_a_new_one(engine, precision, solver, refi
 # --- What is drawn
 
 
+def drawn_by(replicas, outcome, n):
+    """Return counts of the answer itself."""
+    models = list(replicas._means(replicas._model, outcome.sky / outcome.scene.unit))
+    seeds = [np.random.SeedSequence(k).spawn(2) for k in range(n)]
+    return np.array([replicas._draw(models, each) for each in seeds])
+
+
 @pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES)
 def test_counts_have_the_mean_and_variance_of_the_model(recipe):
     result = solved(recipe)
     replicas, observation = Replicas(result._outcome, 0), result._outcome.scene.observation
-    sky = result._outcome.sky / result._outcome.scene.unit
-    draws = np.array(
-        [
-            replicas._observe(replicas._model, sky, np.random.SeedSequence(k).spawn(2)).images
-            for k in range(400)
-        ]
-    )
-    good = ~observation.mask
-    assert not draws[:, ~good].any()
-    models = result.models()
+    draws = drawn_by(replicas, result._outcome, 400)
+    good, models = ~observation.mask, result.models()
     # Counts of a few are rounded up where read noise makes them negative.
     plenty = good & (models > 9 + 9 * observation.read_noise.max() ** 2)
     assert plenty.sum() > 200
@@ -85,6 +84,17 @@ def test_counts_have_the_mean_and_variance_of_the_model(recipe):
     assert np.mean(z**2) == pytest.approx(1.0, abs=0.25)
     variances = draws.var(axis=0, ddof=1)[plenty] / models[plenty]
     assert np.mean(variances) == pytest.approx(1.0, abs=0.02)
+
+
+def test_bad_pixels_are_bad_in_replicas_too(monkeypatch):
+    result = solved(RECIPES["masked, read noise"])
+    seen, repeat = [], Run.repeat
+    monkeypatch.setattr(Run, "repeat", lambda *given: (seen.append(given[-1]), repeat(*given)))
+    Replicas(result._outcome, 0).reconstruct(0)
+    observation = result._outcome.scene.observation
+    np.testing.assert_array_equal(seen[0].mask, observation.mask)
+    assert not seen[0].images[observation.mask].any()
+    assert seen[0].images[~observation.mask].all()
 
 
 def test_replicas_hang_on_seed_and_number_alone():
@@ -235,13 +245,7 @@ def test_noise_of_counts_is_as_given_where_psfs_are_drawn():
     )  # fmt: skip
     replicas, scene = Replicas(result._outcome, 0), result._outcome.scene
     assert scene.observation.read_noise.max() > 4.0
-    sky = result._outcome.sky / scene.unit
-    draws = np.array(
-        [
-            replicas._observe(replicas._model, sky, np.random.SeedSequence(k).spawn(2)).images
-            for k in range(300)
-        ]
-    )
+    draws = drawn_by(replicas, result._outcome, 300)
     models, added = result.models(), scene.observation.read_noise**2
     expected = models - added + 3.0**2
     plenty = models > 40
