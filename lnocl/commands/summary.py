@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -39,10 +40,14 @@ def summarise(
     device, _, _ = result.device.partition(" (")  # the header has its platform and driver
     unit = re.sub(r"^(electron|photon)\b", r"\1s", frames.unit)
     stars = [
-        f"star at ({x:.7g}, {y:.7g}): {flux / frames.electrons:.6g} {unit}; residuals "
+        f"star at ({x:.7g}, {y:.7g}): {_flux(flux, error)} {unit}; residuals "
         f"{_rms(found.core)} in its core, {_rms(found.wings)} in its wings, where noise gives 1"
-        for (x, y), flux, found in zip(
-            result.star_positions, result.star_fluxes, at_stars, strict=True
+        for (x, y), flux, error, found in zip(
+            result.star_positions,
+            result.star_fluxes / frames.electrons,
+            result.star_flux_errors / frames.electrons,
+            at_stars,
+            strict=True,
         )
     ]
     return [
@@ -63,6 +68,10 @@ def _shortness(arguments: argparse.Namespace, result: Result) -> list[str]:
         f"it ended after {counted(result.n_iter, 'iteration')}: there is little but noise, or PSF, "
         "background or noise are wrong"
     ]
+
+
+def _flux(flux: float, error: float) -> str:
+    return f"{flux:.6g} +- {error:.2g}" if math.isfinite(error) else f"{flux:.6g}"
 
 
 def _rms(fit: Fit) -> str:

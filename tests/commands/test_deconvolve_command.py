@@ -80,7 +80,10 @@ class TestDeconvolve:
         parts = expected.fit(), *at_stars[0][:2], *at_stars[1][:2]
         shown = [f"{part.rms:.2f} +- {part.error:.2f}" for part in parts]
         overall, core_1, wings_1, core_2, wings_2 = shown
-        flux_1, flux_2 = (f"{flux:.6g} electrons" for flux in expected.star_fluxes)
+        flux_1, flux_2 = (
+            f"{flux:.6g} +- {error:.2g} electrons"
+            for flux, error in zip(expected.star_fluxes, expected.star_flux_errors, strict=True)
+        )
         assert captured.out.splitlines() == [
             f"7 iterations on numpy, objective {objective:.6g}",
             "all iterations were done",
