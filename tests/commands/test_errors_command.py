@@ -120,6 +120,28 @@ def test_a_result_without_errors_is_given_them(words, capsys):
     np.testing.assert_array_equal(found["PRIMARY"].data, fits.getdata("first.fits"))
 
 
+def test_errors_are_in_the_unit_of_the_result(words):
+    """Per second, of images in electrons with an exposure; and go on in it."""
+    fits.setval("images.fits", "BUNIT", value="adu")
+    assert cli.main([*words, "10", "--gain", "4", "--exposure", "2"]) == 0
+    first = held()
+    unit = first["PRIMARY"].header["BUNIT"]
+    assert unit == "adu/s"
+    assert first["ERROR"].header["BUNIT"] == unit
+    assert first["ERRORS"].data["unit"][0] == unit
+    table = first["ERRORS"].data
+    light = first["PRIMARY"].data[35:43, 13:25].sum()
+    assert table["value"][2] == pytest.approx(light, rel=0.2)
+    # The map is of replicas in electrons.
+    sums, n = first["REPLSUMS"].data, 10
+    scatter = np.sqrt((sums[1] - sums[0] ** 2 / n) / (n - 1))
+    np.testing.assert_allclose(first["ERROR"].data, scatter / 4, rtol=1e-9)
+    assert cli.main(["errors", "out.fits", "--bootstrap", "11", "--quiet"]) == 0
+    replicas = held()["REPLICAS"].data["errors"]
+    np.testing.assert_array_equal(replicas[:10], first["REPLICAS"].data["errors"])
+    assert len(replicas) == 11
+
+
 def test_overwrite_begins_anew(words):
     assert cli.main([*words, "10"]) == 0
     expected = held()

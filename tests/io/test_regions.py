@@ -113,7 +113,9 @@ def test_a_profile_is_along_the_longer_side(sides, turn, tmp_path):
     path.write_text(f"image\nbox(25,20,{sides},{turn}) # text={{jet}}")
     (profile,) = read_profiles(path, None, SHAPE)
     is_tall = sides == "14,18"
-    sky, _ = ridge(turn + 90 * is_tall)
+    # The ridge lies beside the axis of the box.
+    shift = np.radians(turn + 90 * is_tall)
+    sky, _ = ridge(turn + 90 * is_tall, 24.0 - 1.2 * np.sin(shift), 19.0 + 1.2 * np.cos(shift))
     assert profile.name == "jet"
     np.testing.assert_allclose(profile.at, np.arange(18) - 8.5)
     fluxes, widths = profile.measure(sky).reshape(2, -1)

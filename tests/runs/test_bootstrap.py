@@ -223,6 +223,11 @@ def test_errors_of_psfs_are_told_apart():
             observation, made.stars, stop=None, n_iter=8, smoothing=1e-3, pad=0, engine="numpy"
         )
         found.append(result.bootstrap(12))
+        drawn, seen, wrong = Replicas(result._outcome, 0).reconstruct(11)
+        error = wrong.star_fluxes - drawn.star_fluxes
+        assert found[-1].errors[11, 0] == pytest.approx(error[0], rel=1e-9)
+        of_psfs = wrong.star_fluxes - seen.star_fluxes
+        assert found[-1].of_psfs[11, 0] == pytest.approx(of_psfs[0], rel=1e-9)
     tables = [each.to_table() for each in found]
     assert tables[0]["error_psf"][0] > 0
     ratio = tables[1]["error_psf"][0] / tables[0]["error_psf"][0]

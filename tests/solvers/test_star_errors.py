@@ -23,7 +23,7 @@ SKY = 60.0 * np.exp(-0.5 * (((X - 15) / 1.5) ** 2 + ((Y - 20) / 6.0) ** 2)) + 0.
 STARS = np.array([(15.2, 14.1), (22.0, 18.6)])
 FLUXES = np.array([4000.0, 600.0])
 MASK = RNG.random((2, N, N)) < 0.05
-OFFSETS = np.array([(0.0, 0.0), (0.3, -0.4)])
+OFFSETS = np.array([(0.0, 0.0), (2.3, -1.4)])
 KNOWN = {
     "alike": {},
     "masked and moved": {"mask": MASK, "offsets": OFFSETS, "exposure": [1.0, 1.5]},
