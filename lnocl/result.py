@@ -259,7 +259,7 @@ class Result:
             Replicas of this result, regions and seed that are there already: the rest is added, and
             all is bit for bit as if it had been computed at once.
         callback : callable, optional
-            Is given the errors so far after each replica.
+            Is given the errors so far after each replica from the second on.
 
         Raises
         ------

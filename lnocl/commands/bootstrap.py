@@ -142,12 +142,13 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
     """Return the replicas that a file has; refuse those of something else."""
     from lnocl.errors import InputError
     from lnocl.io.fitserrors import read_replicas
+    from lnocl.io.fitswrite import ascii_of
 
     held = read_replicas(path)
     if held is None:
         return None
     is_same = (
-        held.names == [each.name for each in expected.quantities]
+        held.names == [ascii_of(each.name).strip() for each in expected.quantities]
         and np.array_equal(held.values, expected.values / expected.units(frames.electrons))
         and held.sums.shape == expected.sums.shape
         and held.seed == expected.seed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import signal
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,14 +13,16 @@ import numpy as np
 from lnocl.commands import bootstrap, checkpoints, deconvolve, messages, options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command, Parser
+from lnocl.commands.signals import Terminated
 from lnocl.errors import FileError, InputError
 from lnocl.process import ignored_warnings
 
 if TYPE_CHECKING:
     from lnocl.io.saved_results import SavedResult
 
-# The run is taken for the same where its extended source is to this share of its brightest pixel.
-SAME = 1e-3
+# The run is taken for the same where pixels and fluxes are to this share of them, and pixels to
+# this share of the brightest: another device rounds otherwise.
+SAME, ROUNDING = 1e-3, 1e-5
 
 OPTIONS = [
     option(
@@ -36,9 +39,16 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    from lnocl.io import atomic
     from lnocl.io.saved_results import read_result
 
     saved = read_result(arguments.result)
+    atomic.check_fits_output(arguments.result, overwrite=True)
+    if saved.header.get("STOPPED") == "interrupt":
+        raise InputError(
+            f"the run of {arguments.result} was interrupted, and its command gives another result: "
+            "deconvolve to the end"
+        )
     folder, run = _run_of(saved)
     given = {name: getattr(arguments, name) for name in ("bootstrap", "seed")}
     for name, value in given.items():
@@ -54,12 +64,23 @@ def _run(arguments: argparse.Namespace) -> None:
         # What the run has to say it has said.
         with there, ignored_warnings(), checkpoints.Interrupts() as interrupts:
             solved = deconvolve.solve(run, interrupts)
-    except FileNotFoundError as error:
-        raise FileError(f"{folder}, where {arguments.result} was made, is not there") from error
+    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        raise FileError(
+            f"{folder}, where {arguments.result} was made, is not there: deconvolve again"
+        ) from error
+    if interrupts.caught:
+        raise (
+            KeyboardInterrupt
+            if interrupts.caught == signal.SIGINT
+            else Terminated(interrupts.caught)
+        )
     found, frames = solved.result, solved.frames
     expected = saved.extended * frames.electrons
-    if found.extended.shape != expected.shape or not np.allclose(
-        found.extended, expected, rtol=0.0, atol=SAME * abs(expected).max()
+    fluxes = saved.star_fluxes * frames.electrons
+    if (
+        found.extended.shape != expected.shape
+        or not np.allclose(found.extended, expected, SAME, ROUNDING * abs(expected).max())
+        or not np.allclose(found.star_fluxes, fluxes, SAME)
     ):
         raise InputError(
             f"the run of {arguments.result} gives another result now: its images, PSFs or options "

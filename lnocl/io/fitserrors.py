@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from lnocl.errors import FileError
 from lnocl.io.atomic import whole_file
 from lnocl.io.fitsfile import open_fits
+from lnocl.io.fitsread import wcs_cards
+from lnocl.io.fitswrite import ascii_of
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -71,25 +73,37 @@ def write_errors(
             rest = [hdu.copy() for hdu in hdus if hdu.name not in NAMES]
     except OSError as error:
         raise FileError(f"{path} cannot be read again: {error}") from error
+    numbers = np.arange(1, len(replicas) + 1)
     columns = [
-        fits.Column(name, f"{values.shape[1]}D", array=values)
-        for name, values in (("errors", replicas), ("of_psfs", of_psfs))
-        if len(values)
+        fits.Column("replica", "K", array=numbers),
+        *(
+            fits.Column(name, f"{values.shape[1]}D", array=values)
+            for name, values in (("errors", replicas), ("of_psfs", of_psfs))
+            if values.size
+        ),
     ]
     added = [
-        fits.table_to_hdu(quantities),
-        fits.table_to_hdu(regions),
+        *(fits.table_to_hdu(_in_ascii(each)) for each in (quantities, regions)),
         *(fits.ImageHDU(np.asarray(each, np.float64)) for each in maps),
         fits.BinTableHDU.from_columns(columns),
         fits.ImageHDU(sums),
     ]
+    coordinates = wcs_cards(rest[0].header)
     for hdu, name in zip(added, NAMES, strict=True):
         hdu.name = name
         hdu.header.extend(cards)
         if name in (ERROR, BIAS):
+            hdu.header.extend(coordinates)
             hdu.header["BUNIT"] = (unit, "per pixel")
     with whole_file(path, overwrite=True) as stream:
         fits.HDUList([*rest, *added]).writeto(stream, checksum=True)
+
+
+def _in_ascii(table: QTable) -> QTable:
+    """Return a table whose names are those that FITS allows."""
+    table = table.copy()
+    table["name"] = [ascii_of(name) for name in table["name"]]
+    return table
 
 
 def read_errors(path: str) -> Table | None:
@@ -147,12 +161,16 @@ def read_replicas(path: str) -> Held | None:
             return None
         try:
             quantities, replicas = held[ERRORS].data, held[REPLICAS].data
-            errors = np.array(replicas["errors"], np.float64).reshape(len(replicas), -1)
+            shape = len(replicas), len(quantities)
+            columns = held[REPLICAS].columns.names
+            errors = np.zeros(shape)
+            if "errors" in columns:
+                errors = np.array(replicas["errors"], np.float64).reshape(shape)
             of_psfs = errors[:0]
-            if "of_psfs" in held[REPLICAS].columns.names:
-                of_psfs = np.array(replicas["of_psfs"], np.float64).reshape(errors.shape)
+            if "of_psfs" in columns:
+                of_psfs = np.array(replicas["of_psfs"], np.float64).reshape(shape)
             values = np.array(quantities["value"], np.float64)
-            names = [str(name) for name in quantities["name"]]
+            names = [str(name).strip() for name in quantities["name"]]
             seed = int(held[REPLICAS].header["SEED"])
         except (KeyError, ValueError) as error:
             raise FileError(f"{path} has damaged replicas: {error}; begin anew") from error

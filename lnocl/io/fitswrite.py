@@ -247,7 +247,7 @@ def _add_provenance(
 ) -> None:
     """Add the cards, and HISTORY lines with the notes, as comments, and the commands."""
     for keyword, value, comment in cards:
-        header[keyword] = (_ascii(value) if isinstance(value, str) else value, comment)
+        header[keyword] = (ascii_of(value) if isinstance(value, str) else value, comment)
     for note in notes:
         for line in textwrap.wrap(note, HISTORY_WIDTH - 2):
             header.add_history(f"# {line}")
@@ -298,12 +298,12 @@ def _table(name: str, rows: NDArray[np.void]) -> fits.BinTableHDU:
 
 
 def _lines(name: str, column: str, lines: Sequence[str]) -> fits.BinTableHDU:
-    texts = np.array([_ascii(line) for line in lines])
+    texts = np.array([ascii_of(line) for line in lines])
     columns = [fits.Column(column, f"{texts.dtype.itemsize // 4}A", array=texts)]
     return fits.BinTableHDU.from_columns(columns, name=name)
 
 
-def _ascii(text: str) -> str:
+def ascii_of(text: str) -> str:
     """Return text in ASCII, as FITS needs, with escapes as in Python."""
     return text.encode("unicode_escape").decode("ascii")
 

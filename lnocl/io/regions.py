@@ -88,7 +88,12 @@ def _in_pixels(given: Given, header: fits.Header | None) -> list[_Found]:
         path, found = "regions", list(given)
     if not found:
         raise FileError(f"{path} holds no regions: draw circles, ellipses, boxes or polygons")
-    return [_one_in_pixels(region, k, path, header) for k, region in enumerate(found, 1)]
+    listed = [_one_in_pixels(region, k, path, header) for k, region in enumerate(found, 1)]
+    names = [each.name for each in listed]
+    return [
+        each._replace(name=f"{each.name} {k}") if names.count(each.name) > 1 else each
+        for k, each in enumerate(listed, 1)
+    ]
 
 
 def _regions() -> Any:
@@ -116,9 +121,12 @@ def _one_in_pixels(region: Any, number: int, path: str, header: fits.Header | No
     regions = _regions()
     if not isinstance(region, regions.Region):
         raise InputError(f"regions must be those of the package regions; {region!r} was given")
-    name = region.meta.get("text") or f"region {number}"
+    named = region.meta.get("text") or region.meta.get("label") or ""
+    name = str(named).strip() or f"region {number}"
     kind = type(region).__name__.replace("PixelRegion", "").replace("SkyRegion", "").lower()
     said = f"{name} of {path} ({kind})" if name != f"region {number}" else f"{name} ({kind})"
+    if not region.meta.get("include", True):
+        raise InputError(f"{said} is to be left out of others: draw what is to be summed instead")
     if isinstance(region, regions.SkyRegion):
         if header is None:
             raise InputError(f"{said} is on the sky, and the image has no header: give pixels")
@@ -150,7 +158,23 @@ def _profile(found: _Found, shape: tuple[int, int]) -> Profile:
     return Profile(found.name, at.tolist(), slices, distances)
 
 
+def _refuse_outside(said: str, region: Any, shape: tuple[int, int]) -> None:
+    """Refuse a region of which a mask would be larger than the image, or none can be made."""
+    try:
+        box = region.bounding_box
+    except NotImplementedError:
+        return  # which is refused for that
+    except (ValueError, OverflowError):  # its places on the sky are none of the image
+        box = None
+    ny, nx = shape
+    if box is None or not (
+        -2 <= box.ixmin <= box.ixmax <= nx + 2 and -2 <= box.iymin <= box.iymax <= ny + 2
+    ):
+        raise InputError(f"{said} lies outside the image of {nx} x {ny} pixels, or partly")
+
+
 def _aperture(name: str, said: str, region: Any, shape: tuple[int, int]) -> Aperture:
+    _refuse_outside(said, region, shape)
     try:
         mask = region.to_mask(mode="exact")
     except NotImplementedError as error:

@@ -7,13 +7,16 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.errors import InputError
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.progress import make_bar
 from lnocl.runs.replicas import Replica, Replicas, Sky
 from lnocl.scene.apertures import FLUX, FWHM, LENGTH, Aperture, Label, Profile
+from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
+from lnocl.scene.scene import Scene
 from lnocl.scene.texture import CORE, resolution
 
 if TYPE_CHECKING:
@@ -23,7 +26,7 @@ MIN_REPLICAS = 10
 # Levels of the intervals.
 LEVELS = 0.68, 0.95
 
-BELOW, UNDER = "below the resolution", "under a star"
+BELOW, UNDER, UNSEEN = "below the resolution", "under a star", "not observed"
 
 
 Part = Aperture | Profile
@@ -77,9 +80,11 @@ class Bootstrap:
         The sums over replicas of the errors of the extended source and of their squares, electrons
         per pixel, smoothed to the resolution.
     resolution : float
-        Full width at half maximum of that smoothing, pixels: that of the narrowest PSF.
+        Full width at half maximum of that smoothing, pixels: what all images resolve together.
     seed : int
         Of the replicas.
+    unit : str
+        Of light: ``electron``, or ``electron/s`` where exposures were given.
 
     References
     ----------
@@ -92,6 +97,7 @@ class Bootstrap:
     sums: Array
     resolution: float
     seed: int
+    unit: str = "electron"
 
     @property
     def n(self) -> int:
@@ -124,8 +130,16 @@ class Bootstrap:
         ----------
         level : float
             In (0, 1).
+
+        Raises
+        ------
+        InputError
+            It is not.
         """
         from scipy.stats import t
+
+        if not 0.0 < level < 1.0:
+            raise InputError(f"the level of an interval lies between 0 and 1; {level} was given")
 
         half = t.ppf((1.0 + level) / 2.0, self.n - 1) * np.sqrt(1.0 + 1.0 / self.n)
         middle, width = self.values - self.bias, half * self.standard_errors
@@ -142,7 +156,7 @@ class Bootstrap:
         squares = self.sums[1] - self.sums[0] ** 2 / self.n
         return np.sqrt(np.maximum(squares, 0.0) / (self.n - 1))
 
-    def to_table(self, electrons: float = 1.0, unit: str = "electron") -> QTable:
+    def to_table(self, electrons: float = 1.0, unit: str | None = None) -> QTable:
         """Return a table: a row a quantity, with value, bias, standard error and intervals.
 
         Where the scatter of the PSFs is known, its part of the error, and the rest, are apart.
@@ -152,7 +166,7 @@ class Bootstrap:
         electrons : float, optional
             Electrons in the unit of fluxes.
         unit : str, optional
-            That unit.
+            That unit; by default `unit`.
         """
         from astropy.table import QTable  # which takes its time to load
 
@@ -167,7 +181,9 @@ class Bootstrap:
             {
                 "name": [each.name for each in self.quantities],
                 "at": [np.nan if each.at is None else each.at for each in self.quantities],
-                "unit": [unit if each.kind == FLUX else "pix" for each in self.quantities],
+                "unit": [
+                    (unit or self.unit) if each.kind == FLUX else "pix" for each in self.quantities
+                ],
                 **{name: values / self.units(electrons) for name, values in columns.items()},
                 "note": [each.note for each in self.quantities],
             }
@@ -200,7 +216,7 @@ def bootstrap(
     earlier : Bootstrap, optional
         Replicas of the same reconstruction, measured alike; n of them and the others in all.
     look : callable, optional
-        Is given the errors so far after each replica.
+        Is given the errors so far after each replica from the second on.
 
     Raises
     ------
@@ -218,7 +234,7 @@ def bootstrap(
         for k in range(found.n, n):
             found = _with(found, outcome, parts, replicas.reconstruct(k))
             bar.update()
-            if look is not None:
+            if look is not None and found.n > 1:
                 look(found)
     return found
 
@@ -229,7 +245,9 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     quantities = _quantities(outcome, parts, width)
     pixels = np.zeros((2, *outcome.scene.observation.shape))
     none = np.zeros((0, len(quantities)))
-    return Bootstrap(quantities, none, none, pixels, width, seed)
+    is_rate = (outcome.scene.observation.exposure != 1.0).any()
+    unit = "electron/s" if is_rate else "electron"
+    return Bootstrap(quantities, none, none, pixels, width, seed, unit)
 
 
 def check_number(n: object, seed: object) -> None:
@@ -287,7 +305,8 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
         labels += [Label(f"star {s} {axis}", LENGTH) for s in range(1, n + 1) for axis in "xy"]
     labels += [label for part in parts for label in part.labels()]
     notes = [""] * (3 * n if moves else n)
-    notes += [note for part in parts for note in _notes(part, scene.stars, width)]
+    observed = _observed(scene)[:ny, :nx]
+    notes += [note for part in parts for note in _notes(part, scene.stars, width, observed)]
     sky = Sky(outcome.sky[:ny, :nx], outcome.star_fluxes, scene.stars)
     values = _measure(sky, parts, moves).tolist()
     return tuple(
@@ -296,12 +315,24 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
     )
 
 
-def _notes(part: Part, stars: Array, width: float) -> list[str]:
+def _observed(scene: Scene) -> NDArray[np.bool_]:
+    """Return where the extended source was observed, on the grid."""
+    model = Model(scene)
+    return scene.observed(model.adjoint(model.weights))
+
+
+def _notes(part: Part, stars: Array, width: float, observed: NDArray[np.bool_]) -> list[str]:
     """Return why the errors of a part may not hold."""
     if isinstance(part, Profile):
-        return 2 * [_under(each, stars, width) for each in part.slices]
+        return 2 * [_note(each, stars, width, observed) for each in part.slices]
     is_small = part.n_pixels < np.pi / 4.0 * width**2
-    return [BELOW if is_small else _under(part, stars, width)]
+    return [BELOW if is_small else _note(part, stars, width, observed)]
+
+
+def _note(aperture: Aperture, stars: Array, width: float, observed: NDArray[np.bool_]) -> str:
+    if aperture.flux(observed.astype(np.float64)) < 0.5 * aperture.n_pixels:
+        return UNSEEN
+    return _under(aperture, stars, width)
 
 
 def _under(aperture: Aperture, stars: Array, width: float) -> str:

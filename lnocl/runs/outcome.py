@@ -142,6 +142,7 @@ class Outcome:
         LnoclWarning
             The images do not determine flux and position of a star.
         """
+        from lnocl.solvers.positions import RADIUS
         from lnocl.solvers.star_errors import standard_errors
 
         scene, moves = self.scene, self.given_stars is not None
@@ -154,4 +155,6 @@ class Outcome:
                 f"the images do not determine flux and position of each star at {named}, so that "
                 "these errors are NaN; leave out stars that lie on others"
             )
-        return errors[:, 0] * scene.unit, errors[:, 1:]
+        positions = errors[:, 1:]
+        positions[positions > RADIUS] = np.nan  # no star is moved farther
+        return errors[:, 0] * scene.unit, positions

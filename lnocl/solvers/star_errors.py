@@ -31,8 +31,9 @@ from lnocl.scene.texture import Texture
 from lnocl.solvers.fluxes import variances
 from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
 
-# Side of the window round a star, resolutions, at least.
-WINDOW = 9.0
+# Side of the window round a star, and how far off other stars may be that are not taken as known,
+# resolutions.
+WINDOW, NEIGHBOURS = 9.0, 4.0
 # Steps of conjugate gradients at most, and the share of the gradient at which they end.
 N_STEPS, FINISHED = 2000, 1e-8
 
@@ -83,7 +84,7 @@ def standard_errors(scene: Scene, extended: Array, fluxes: Array, moves: bool) -
     data = _cut_data(scene, extended, fluxes, windows)
     errors = np.full((scene.n_stars, 3), np.nan)
     for star, (row, window) in enumerate(zip(errors, windows, strict=True)):
-        held = np.append(star, _others_in(window, scene, star))
+        held = np.append(star, _neighbours(scene, star, texture.resolution))
         images = [
             _linearise(scene, psfs[j], j, fluxes, held, window, moves, *data[j][star])
             for j in range(scene.n_images)
@@ -108,8 +109,9 @@ def _cut_data(
         weights = 1.0 if scene.weights is None else scene.weights[j]
         total = np.maximum(model, MIN_MODEL)
         precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
+        left = counts - total
         there = [_in_image(scene, j, window).of(scene.grid) for window in windows]
-        data.append([((counts - total)[each], precision[each]) for each in there])
+        data.append([(left[each], precision[each]) for each in there])
     return data
 
 
@@ -142,12 +144,12 @@ def _window_round(scene: Scene, star: Array, resolution: float) -> _Window:
     return _Window(y - height // 2, x - width // 2, (height, width))
 
 
-def _others_in(window: _Window, scene: Scene, star: int) -> NDArray[np.int_]:
-    """Return which other stars lie in a window; those beyond are taken as known."""
-    first = np.array([window.x, window.y]) - 0.5
-    offset = (scene.stars - first) % scene.grid[::-1]
-    inside = np.flatnonzero((offset < window.shape[::-1]).all(axis=1))
-    return inside[inside != star]
+def _neighbours(scene: Scene, star: int, resolution: float) -> NDArray[np.int_]:
+    """Return which other stars are near one; those beyond are taken as known."""
+    size = np.array(scene.grid[::-1])
+    away = (scene.stars - scene.stars[star] + size / 2) % size - size / 2
+    near = np.flatnonzero(np.hypot(*away.T) <= NEIGHBOURS * resolution)
+    return near[near != star]
 
 
 def _source_error(

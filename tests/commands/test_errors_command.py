@@ -142,6 +142,46 @@ def test_errors_are_in_the_unit_of_the_result(words):
     assert len(replicas) == 11
 
 
+def test_names_beyond_ascii_are_escaped(words):
+    Path("jet é.reg").write_text("image\ncircle(30,30,6) # text={knöt ★}\n")
+    assert cli.main([*words, "10"]) == 0
+    assert held()["ERRORS"].data["name"][1] == r"kn\xf6t \u2605"
+    assert cli.main(["errors", "out.fits", "--bootstrap", "11", "--quiet"]) == 0
+    assert len(held()["REPLICAS"].data) == 11
+
+
+def test_without_stars_and_regions_pixels_have_errors(words):
+    alone = words[: words.index("--regions")]
+    alone[alone.index("--star") : alone.index("--star") + 2] = []
+    assert cli.main([*alone, "--bootstrap", "10"]) == 0
+    assert cli.main(["errors", "out.fits", "--bootstrap", "12", "--quiet"]) == 0
+    found = held()
+    assert len(found["ERRORS"].data) == 0
+    assert len(found["REPLICAS"].data) == 12
+    assert (found["ERROR"].data > 0).all()
+
+
+def test_maps_have_the_coordinates_of_the_result(words):
+    cards = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 30.0, "CDELT1": -1e-4,
+             "CDELT2": 1e-4}  # fmt: skip
+    for name, value in cards.items():
+        fits.setval("images.fits", name, value=value)
+    assert cli.main([*words, "10"]) == 0
+    found = held()
+    for name in ("ERROR", "BIAS"):
+        for card in cards:
+            assert found[name].header[card] == found["PRIMARY"].header[card]
+
+
+def test_a_run_that_was_interrupted_has_no_errors(words, capsys):
+    assert cli.main(words[: words.index("--regions")]) == 0
+    fits.setval("out.fits", "STOPPED", value="interrupt")
+    assert cli.main(["errors", "out.fits"]) == 2
+    assert "the run of out.fits was interrupted, and its command" in capsys.readouterr().err
+    Path("out.fits").rename("out.fits.gz")
+    assert cli.main(["errors", "out.fits.gz"]) != 0
+
+
 def test_overwrite_begins_anew(words):
     assert cli.main([*words, "10"]) == 0
     expected = held()

@@ -67,6 +67,8 @@ def test_a_region_may_touch_the_edge(tmp_path):
         ("image\npoint(3,3)", r"^region 1 \(point\) cannot be summed over: give circles, ellipses"),
         ("image\nannulus(20,20,3,6)", r"\(circleannulus\) cannot be summed over"),
         ("icrs\ncircle(30,10,1\")", r"is on the sky, and the image has no header: give pixels$"),
+        ("image\n-circle(20,20,4)", r"^region 1 \(circle\) is to be left out of others: draw what"),
+        ("image\ncircle(20,20,1e7)", r"^region 1 \(circle\) lies outside the image of 50 x 40"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_measured_is_refused(text, message, tmp_path):
@@ -92,6 +94,23 @@ def test_a_missing_file_and_what_is_no_region_are_refused(tmp_path):
         read_apertures(tmp_path / "nix.reg", None, SHAPE)
     with pytest.raises(lnocl.InputError, match=r"^regions must be those of the package regions; 3"):
         read_apertures([3], None, SHAPE)
+
+
+@pytest.mark.parametrize("at", ['210,-10,1"', "30.0,10.0,20d"])
+def test_a_region_of_another_field_is_refused(at, tmp_path):
+    with pytest.raises(lnocl.InputError, match=r"\(circle\) lies outside the image of 50 x 40"):
+        read(f"icrs\ncircle({at})", tmp_path, WCS)
+
+
+def test_regions_of_one_name_are_numbered(tmp_path):
+    found = read("image\n" + "circle(20,20,4) # text={ a }\n" * 2 + "circle(9,9,3)", tmp_path)
+    assert [each.name for each in found] == ["a 1", "a 2", "region 3"]
+
+
+def test_labels_of_casa_are_names(tmp_path):
+    path = tmp_path / "a.crtf"
+    path.write_text('#CRTFv0\ncircle[[20pix, 20pix], 4pix], coord=image, label="knot"\n')
+    assert [each.name for each in read_apertures(path, None, SHAPE)] == ["knot"]
 
 
 # --- Profiles

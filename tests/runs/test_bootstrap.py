@@ -152,7 +152,7 @@ def test_replicas_are_continued_bit_for_bit():
     at_once = run_bootstrap(outcome, 13)
     seen = []
     first = run_bootstrap(outcome, 10, look=lambda each: seen.append(each.n))
-    assert seen == list(range(1, 11))
+    assert seen == list(range(2, 11))
     continued = run_bootstrap(outcome, 13, earlier=first)
     np.testing.assert_array_equal(continued.errors, at_once.errors)
     np.testing.assert_array_equal(continued.sums, at_once.sums)
@@ -259,6 +259,27 @@ def test_noise_of_counts_is_as_given_where_psfs_are_drawn():
     np.testing.assert_allclose(draws.mean(axis=0)[plenty], models[plenty], rtol=0.1)
 
 
+def test_regions_that_no_image_has_seen_are_named():
+    made = dataclasses.replace(BASE, shape=(64, 64)).make()
+    mask = np.zeros((64, 64), bool)
+    mask[:, :25] = True
+    outcome = lnocl.deconvolve(
+        made.observation(mask=mask), [], stop=None, n_iter=3, smoothing=0, pad=0, engine="numpy"
+    )._outcome
+    parts = [Aperture("dark", 30, 4, np.ones((9, 9))), Aperture("lit", 30, 40, np.ones((9, 9)))]
+    found = bootstrap.without_replicas(outcome, parts, 0)
+    assert [each.note for each in found.quantities] == [bootstrap.UNSEEN, ""]
+
+
+def test_rates_are_called_rates():
+    made = BASE.make()
+    observation = made.observation(exposure=[2.0, 2.0])
+    result = lnocl.deconvolve(
+        observation, made.stars, stop=None, n_iter=3, smoothing=0, pad=0, engine="numpy"
+    )
+    assert result.bootstrap(10).to_table()["unit"].tolist() == ["electron/s"]
+
+
 # --- What is refused
 
 
@@ -273,6 +294,12 @@ def test_noise_of_counts_is_as_given_where_psfs_are_drawn():
 def test_numbers_that_are_none_are_refused(options, message):
     with pytest.raises(lnocl.InputError, match=message):
         solved().bootstrap(**options)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0, 95])
+def test_a_level_that_is_none_is_refused(level):
+    with pytest.raises(lnocl.InputError, match=r"^the level of an interval lies between 0"):
+        made_up([1.0, 2.0, 4.0]).interval(level)
 
 
 def test_replicas_of_something_else_are_refused():

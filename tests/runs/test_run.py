@@ -34,7 +34,7 @@ def test_errors_of_stars_that_have_come_to_one_place_are_nan_and_said():
     ):
         fluxes, positions = errors_of(run)
     np.testing.assert_array_equal(np.isnan(fluxes), [True, True, False])
-    np.testing.assert_array_equal(np.isnan(positions[2]), [False, False])
+    assert np.isnan(positions[2]).all()  # there is no star: it may be more than 3 pixels off
     assert np.isnan(positions[:2]).any(axis=1).all()
 
 
