@@ -30,7 +30,11 @@ def test_results_are_compared_by_identity():
 
 @pytest.mark.parametrize("refine_positions", [False, True])
 def test_positions_have_errors_where_they_were_refined_and_fluxes_always(refine_positions):
-    result = deconvolve(stars=[(3, 4)], refine_positions=refine_positions)
+    y, x = np.indices((16, 16))
+    psf = np.exp(-((x - 8) ** 2 + (y - 8) ** 2) / 4.0)
+    observation = lnocl.Observation(5.0 + 100.0 * psf, psf, background=5.0)
+    options = {"n_iter": 2, "engine": "numpy", "refine_positions": refine_positions}
+    result = paper(observation, stars=[(8, 8)], **options)
     assert result.star_flux_errors.shape == (1,)
     assert result.star_flux_errors[0] > 0
     assert result.star_position_errors.shape == (1, 2)
