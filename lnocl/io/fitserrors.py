@@ -68,11 +68,6 @@ def write_errors(
         ("SEED", seed, "of the replicas"),
         ("RESOLUT", resolution, "FWHM that maps are smoothed to, pixels"),
     ]
-    try:
-        with fits.open(path, memmap=False) as hdus:
-            rest = [hdu.copy() for hdu in hdus if hdu.name not in NAMES]
-    except OSError as error:
-        raise FileError(f"{path} cannot be read again: {error}") from error
     numbers = np.arange(1, len(replicas) + 1)
     columns = [
         fits.Column("replica", "K", array=numbers),
@@ -88,15 +83,21 @@ def write_errors(
         fits.BinTableHDU.from_columns(columns),
         fits.ImageHDU(sums),
     ]
-    coordinates = wcs_cards(rest[0].header)
     for hdu, name in zip(added, NAMES, strict=True):
         hdu.name = name
         hdu.header.extend(cards)
-        if name in (ERROR, BIAS):
-            hdu.header.extend(coordinates)
-            hdu.header["BUNIT"] = (unit, "per pixel")
-    with whole_file(path, overwrite=True) as stream:
-        fits.HDUList([*rest, *added]).writeto(stream, checksum=True)
+    try:
+        with fits.open(path, memmap=False) as hdus:
+            for hdu in added:
+                if hdu.name in (ERROR, BIAS):
+                    hdu.header.extend(wcs_cards(hdus[0].header))
+                    hdu.header["BUNIT"] = (unit, "per pixel")
+            # As they are: a copy of a table loses the comments of its columns.
+            rest = [hdu for hdu in hdus if hdu.name not in NAMES]
+            with whole_file(path, overwrite=True) as stream:
+                fits.HDUList([*rest, *added]).writeto(stream, checksum=True)
+    except OSError as error:
+        raise FileError(f"{path} cannot be read again: {error}") from error
 
 
 def _in_ascii(table: QTable) -> QTable:

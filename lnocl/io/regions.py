@@ -86,6 +86,8 @@ def _in_pixels(given: Given, header: fits.Header | None) -> list[_Found]:
         found = _read(path)
     else:
         path, found = "regions", list(given)
+    words = _regions().TextPixelRegion, _regions().TextSkyRegion
+    found = [region for region in found if not isinstance(region, words)]
     if not found:
         raise FileError(f"{path} holds no regions: draw circles, ellipses, boxes or polygons")
     listed = [_one_in_pixels(region, k, path, header) for k, region in enumerate(found, 1)]

@@ -115,7 +115,11 @@ class Replicas:
 
     def _draw_psfs(self, seed: np.random.SeedSequence) -> Array:
         psfs = self._outcome.scene.observation.psfs
-        fields = np.random.default_rng(seed).standard_normal(psfs.shape)
+        rng = np.random.default_rng(seed)
+        # One PSF for all images has one error.
+        is_shared = psfs.strides[0] == 0
+        fields = rng.standard_normal(psfs[:1].shape if is_shared else psfs.shape)
+        fields = np.broadcast_to(fields, psfs.shape)
         changes = [cast(PsfPixels, self._pixels).correction(j, x) for j, x in enumerate(fields)]
         return np.asarray(psfs + np.array(changes))
 

@@ -107,13 +107,17 @@ def test_errors_go_on_bit_for_bit_as_if_computed_at_once(words):
 def test_a_result_without_errors_is_given_them(words, capsys):
     alone = words[: words.index("--regions")]
     assert cli.main(alone) == 0
-    before = Path("out.fits").read_bytes()
+    before, headers = Path("out.fits").read_bytes(), held()
     assert cli.main(["errors", "out.fits", "--bootstrap", "10", "--seed", "4"]) == 0
     assert capsys.readouterr().out.endswith("added to out.fits\n")
     found = held()
     assert found["ERRORS"].data["name"].tolist() == NAMES[:1]
     assert found["ERROR"].header["SEED"] == 4
-    # What was there is there.
+    # What was there is there, comments of columns too.
+    for name, hdu in headers.items():
+        assert [
+            card.comment for card in found[name].header.cards if card.keyword[:5] == "TTYPE"
+        ] == [card.comment for card in hdu.header.cards if card.keyword[:5] == "TTYPE"]
     with fits.open("out.fits") as now:
         now[0].writeto("first.fits", overwrite=True, checksum=True)
     assert len(before) < Path("out.fits").stat().st_size

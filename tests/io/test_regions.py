@@ -107,6 +107,11 @@ def test_regions_of_one_name_are_numbered(tmp_path):
     assert [each.name for each in found] == ["a 1", "a 2", "region 3"]
 
 
+def test_labels_beside_regions_are_no_regions(tmp_path):
+    found = read("image\ncircle(20,20,4)\n# text(9,9) text={a label}\n", tmp_path)
+    assert [each.name for each in found] == ["region 1"]
+
+
 def test_labels_of_casa_are_names(tmp_path):
     path = tmp_path / "a.crtf"
     path.write_text('#CRTFv0\ncircle[[20pix, 20pix], 4pix], coord=image, label="knot"\n')

@@ -239,6 +239,18 @@ def test_errors_of_psfs_are_told_apart():
     assert "error_psf" not in solved().bootstrap(10).to_table().colnames
 
 
+def test_one_psf_for_all_images_has_one_error():
+    made = dataclasses.replace(BASE, n_images=3).make()
+    one = made.psfs[0] / made.psfs[0].sum()
+    result = lnocl.deconvolve(
+        made.observation(psfs=one, psf_scatter=1e-4 * one), made.stars, stop=None, n_iter=2,
+        smoothing=0, pad=0, engine="numpy",
+    )  # fmt: skip
+    drawn = Replicas(result._outcome, 0)._draw_psfs(np.random.SeedSequence(1))
+    assert (drawn[0] != one).any()
+    np.testing.assert_array_equal(drawn[1:], drawn[:1].repeat(2, axis=0))
+
+
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit")
 def test_noise_of_counts_is_as_given_where_psfs_are_drawn():
     """The error of PSFs was added to the read noise of the run; it must not count twice."""
