@@ -1,6 +1,6 @@
 """Two halves of real counts: whether their reconstructions differ by what the errors say.
 
-    python benchmarks/halves.py quasar|chandra DATA [--splits 4] [--replicas 30]
+    python benchmarks/halves.py quasar|chandra DATA [--splits 4] [--replicas 30] [--n-iter N]
 
 The counts of real frames are split binomially into two independent halves, each reconstructed by
 default. The light of apertures and the fluxes of stars differ by d; chi squared is the sum of
@@ -93,6 +93,7 @@ def main():
     parser.add_argument("data", type=Path)
     parser.add_argument("--splits", type=int, default=4)
     parser.add_argument("--replicas", type=int, default=30)
+    parser.add_argument("--n-iter", type=int, help="of both halves; by default each chooses")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     counts, observe = {"quasar": quasar, "chandra": chandra}[given.frames](given.data)
@@ -103,7 +104,8 @@ def main():
         for images in (half, counts - half):
             observation, stars = observe(images)
             moves = len(stars) > 0
-            runs.append(lnocl.deconvolve(observation, stars, n_iter=4000, refine_positions=moves))
+            length = {"n_iter": given.n_iter, "stop": None} if given.n_iter else {"n_iter": 4000}
+            runs.append(lnocl.deconvolve(observation, stars, refine_positions=moves, **length))
         n_stars = len(runs[0].star_fluxes)
         line = [f"split {split}: {[run.n_iter for run in runs]} iterations"]
         for name, texture in (("texture", Texture), ("noise", Smooth)):
