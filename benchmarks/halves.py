@@ -26,8 +26,8 @@ from lnocl.scene.texture import Texture
 class Smooth(Texture):
     """No texture: the estimate itself."""
 
-    def __init__(self, scene, extended):
-        super().__init__(scene, extended)
+    def __init__(self, extended, stars, resolution):
+        super().__init__(extended, stars, resolution)
         self.estimate = extended
 
     def draw(self, rng):

@@ -27,8 +27,8 @@ ITERATIONS_AHEAD = 4
 # And looks at the objectives once in so many, at those of as many before: a transfer costs the host
 # as much as launching an iteration.
 FETCH_EVERY = 64
-# Bytes that Python takes with NumPy, Astropy and PoCL.
-LIBRARIES = 200 * 2**20
+# Bytes that Python takes with NumPy, SciPy, Astropy and PoCL.
+LIBRARIES = 280 * 2**20
 # Estimates of both halves of the counts that are held (`lnocl.runs.halves`).
 SNAPSHOTS = 22
 

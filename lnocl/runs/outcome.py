@@ -146,9 +146,8 @@ class Outcome:
         from lnocl.solvers.star_errors import standard_errors
 
         scene, moves = self.scene, self.given_stars is not None
-        sky, fluxes = self.sky / scene.unit, self.star_fluxes / scene.unit
-        errors = standard_errors(scene, sky, fluxes, moves)
-        is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (fluxes > 0)
+        errors = standard_errors(scene, self.sky, self.star_fluxes, moves)
+        is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (self.star_fluxes > 0)
         if is_lost.any():
             named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in scene.stars[is_lost])
             warn(
@@ -157,4 +156,4 @@ class Outcome:
             )
         positions = errors[:, 1:]
         positions[positions > RADIUS] = np.nan  # no star is moved farther
-        return errors[:, 0] * scene.unit, positions
+        return errors[:, 0], positions

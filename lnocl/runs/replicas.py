@@ -15,7 +15,7 @@ from lnocl.runs.run import Run
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
 from lnocl.scene.psf_pixels import PsfPixels
-from lnocl.scene.texture import Texture
+from lnocl.scene.texture import Texture, resolution
 
 
 class Sky(NamedTuple):
@@ -65,7 +65,7 @@ class Replicas:
 
     def __init__(self, outcome: Outcome, seed: int) -> None:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
-        self._texture = Texture(scene, outcome.sky / scene.unit)
+        self._texture = Texture(outcome.sky / scene.unit, scene.stars, resolution(scene))
         self._model = Model(scene)
         observation = scene.observation
         self._noise = self._added = observation.read_noise**2

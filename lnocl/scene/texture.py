@@ -36,37 +36,36 @@ class Texture:
 
     Parameters
     ----------
-    scene : Scene
-        Its PSFs and stars.
     extended : ndarray of float64, shape (Ny, Nx)
-        The estimate of the extended source, on the grid, zero or more.
+        The estimate of the extended source, on the grid or periodic as that, zero or more.
+    stars : ndarray of float64, shape (n, 2)
+        Positions of stars there.
+    resolution : float
+        Full width at half maximum of what all images resolve together, pixels.
 
     Attributes
     ----------
     mean, amplitude : ndarray of float64, shape (Ny, Nx)
         Mean and standard deviation, in the unit of `extended`.
-    resolution : float
-        Full width at half maximum of what all images resolve together, pixels.
     width : float
         Pixels over which the field is correlated (`lnocl.scene.smooth_field.SmoothField`).
     """
 
-    def __init__(self, scene: Scene, extended: Array) -> None:
-        self.resolution = resolution(scene)
-        self.width = CORRELATED * self.resolution
+    def __init__(self, extended: Array, stars: Array, resolution: float) -> None:
+        self._resolution, self.width = resolution, CORRELATED * resolution
         self.mean = extended.copy()
-        self.amplitude = SHARE * _smooth(extended, SMOOTHED * self.resolution)
+        self.amplitude = SHARE * _smooth(extended, SMOOTHED * resolution)
         self._correlate = SmoothField(extended.shape, self.width).apply
-        bright = _smooth(extended, SMOOTHED_NEAR * self.resolution)
-        for star in scene.stars:
+        bright = _smooth(extended, SMOOTHED_NEAR * resolution)
+        for star in stars:
             self._fill(star, extended, bright)
 
     def _fill(self, star: Array, extended: Array, bright: Array) -> None:
         """Expect under a star's core what lies round it, and near it as much as the brightest."""
         grid = extended.shape
-        half = min(int(np.ceil(ROUND * self.resolution)), (min(grid) - 1) // 2)
+        half = min(int(np.ceil(ROUND * self._resolution)), (min(grid) - 1) // 2)
         columns, rows = (round(at) + np.arange(-half, half + 1) for at in star)
-        distance = np.hypot((rows - star[1])[:, None], columns - star[0]) / self.resolution
+        distance = np.hypot((rows - star[1])[:, None], columns - star[0]) / self._resolution
         window = np.ix_(rows % grid[0], columns % grid[1])
         is_round = (distance > CORE) & (distance <= ROUND)
         if not is_round.any():  # the grid is smaller than this

@@ -23,17 +23,19 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from lnocl.scene.forward_model import model_images
+from lnocl.scene.forward_model import add_to_window
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import MovablePsf, Stamp
-from lnocl.scene.texture import Texture
+from lnocl.scene.texture import Texture, resolution
 from lnocl.solvers.fluxes import variances
 from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
 
 # Side of the window round a star, and how far off other stars may be that are not taken as known,
 # resolutions.
 WINDOW, NEIGHBOURS = 9.0, 4.0
+# What lies farther from a window has no part in the texture there, resolutions.
+MARGIN = 3.0
 # Steps of conjugate gradients at most, and the share of the gradient at which they end.
 N_STEPS, FINISHED = 2000, 1e-8
 
@@ -58,61 +60,87 @@ class _Window(NamedTuple):
         return self._replace(y=self.y + dy, x=self.x + dx)
 
 
-def standard_errors(scene: Scene, extended: Array, fluxes: Array, moves: bool) -> Array:
+def standard_errors(scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -> Array:
     """Return the standard errors of stars, with the extended source marginalised.
 
     Parameters
     ----------
     scene : Scene
         What is modelled, with the stars where they are.
-    extended : ndarray of float64, shape (Ny, Nx)
-        Extended source, on the grid and scaled.
-    fluxes : ndarray of float64, shape (n,)
-        Star fluxes, scaled.
+    sky : ndarray of float64, shape (Ny, Nx)
+        Extended source on the grid, electrons per pixel.
+    star_fluxes : ndarray of float64, shape (n,)
+        Electrons.
     moves : bool
         Whether positions were fitted too; else they are taken as known.
 
     Returns
     -------
     ndarray of float64, shape (n, 3)
-        Of flux, scaled, x and y, pixels; NaN for positions that were not fitted, and where the
+        Of flux, electrons, x and y, pixels; NaN for positions that were not fitted, and where the
         images do not determine a star.
+
+    Notes
+    -----
+    All is computed in windows: arrays on the grid would take more memory than the run.
     """
-    texture = Texture(scene, extended)
+    width = resolution(scene)
     psfs = [MovablePsf(psf, scene.grid) for psf in scene.scaled_psfs()]
-    windows = [_window_round(scene, star, texture.resolution) for star in scene.stars]
-    data = _cut_data(scene, extended, fluxes, windows)
     errors = np.full((scene.n_stars, 3), np.nan)
-    for star, (row, window) in enumerate(zip(errors, windows, strict=True)):
-        held = np.append(star, _neighbours(scene, star, texture.resolution))
+    for star, row in enumerate(errors):
+        window = _window_round(scene, scene.stars[star], width)
+        held = np.append(star, _neighbours(scene, star, width))
+        there, texture = _texture_in(window, scene, sky, width)
+        source = _source_error(scene, psfs, texture.amplitude[there], texture.width, window)
+        beyond = source.images_of(texture.mean[there] - sky[window.of(scene.grid)] / scene.unit)
         images = [
-            _linearise(scene, psfs[j], j, fluxes, held, window, moves, *data[j][star])
+            _linearise(scene, psfs[j], j, sky, star_fluxes, held, window, moves, beyond[j])
             for j in range(scene.n_images)
         ]
-        source = _source_error(scene, psfs, texture, window)
-        excess = source.images_of((texture.mean - extended)[window.of(scene.grid)])
-        images = [
-            image._replace(left=image.left - each)
-            for image, each in zip(images, excess, strict=True)
-        ]
         row[: 3 if moves else 1] = _errors_of_first(images, source, len(held))
+    errors[:, 0] *= scene.unit
     return errors
 
 
-def _cut_data(
-    scene: Scene, extended: Array, fluxes: Array, windows: Sequence[_Window]
-) -> list[list[tuple[Array, Array]]]:
-    """Return ``g_j - m_j`` and one over its variance, scaled, for each image and window."""
-    data = []
-    models = model_images(scene, extended, fluxes)
-    for j, (counts, model) in enumerate(zip(scene.images(), models, strict=True)):
-        weights = 1.0 if scene.weights is None else scene.weights[j]
-        total = np.maximum(model, MIN_MODEL)
-        precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
-        left = counts - total
-        there = [_in_image(scene, j, window).of(scene.grid) for window in windows]
-        data.append([(left[each], precision[each]) for each in there])
-    return data
+def _texture_in(
+    window: _Window, scene: Scene, sky: Array, width: float
+) -> tuple[tuple[slice, slice], Texture]:
+    """Return the texture round a window, and where the window lies in it."""
+    margin = int(np.ceil(MARGIN * width))
+    (y, height), (x, breadth) = (
+        (first - margin, k + 2 * margin) if k + 2 * margin < n else (first, n)
+        for first, k, n in zip((window.y, window.x), window.shape, scene.grid, strict=True)
+    )
+    around = _Window(y, x, (height, breadth))
+    stars = (scene.stars - (x, y)) % scene.grid[::-1]
+    inside = (stars < (breadth, height)).all(axis=1)
+    there = tuple(
+        slice(first - start, first - start + k)
+        for first, start, k in zip((window.y, window.x), (y, x), window.shape, strict=True)
+    )
+    extended = sky[around.of(scene.grid)] / scene.unit
+    return (there[0], there[1]), Texture(extended, stars[inside], width)
+
+
+def _observed(scene: Scene, j: int, there: _Window) -> tuple[Array, Array, Array]:
+    """Return counts, background and weights of image j in a window, as `Scene` has them."""
+    observation, (ny, nx) = scene.observation, scene.observation.shape
+    rows, columns = there.of(scene.grid)
+    inside = (rows < ny) & (columns < nx)
+    pixels = np.minimum(rows, ny - 1), np.minimum(columns, nx - 1)
+    counts = np.where(inside, observation.images[j][pixels] / scene.scale, 0.0)
+    background = np.broadcast_to(observation.background[j] / scene.scale, counts.shape)
+    if observation.background.ndim == 3:
+        known = observation.background[j][pixels] / scene.scale
+        background = np.where(inside, known, 1.0)
+    if scene.weights is None:
+        return counts, background, np.ones(there.shape)
+    weights = scene.weights[j][rows, columns].astype(np.float64)
+    if scene.has_exposure_map:
+        seen = weights > 0
+        counts = np.divide(counts, weights, out=np.zeros(there.shape), where=seen)
+        background = np.divide(background, weights, out=np.ones(there.shape), where=seen)
+    return counts, background, weights
 
 
 def _in_image(scene: Scene, j: int, window: _Window) -> _Window:
@@ -153,13 +181,13 @@ def _neighbours(scene: Scene, star: int, resolution: float) -> NDArray[np.int_]:
 
 
 def _source_error(
-    scene: Scene, psfs: Sequence[MovablePsf], texture: Texture, window: _Window
+    scene: Scene, psfs: Sequence[MovablePsf], amplitude: Array, width: float, window: _Window
 ) -> SourceError:
     """Return the error of the extended source in a window, and what it changes there."""
     # Twice the window, in which nothing wraps round; or the grid, on which it does.
-    height, width = (min(2 * k, n) for k, n in zip(window.shape, scene.grid, strict=True))
-    shape = height, width
-    around = _Window(-(height // 2), -(width // 2), shape)
+    height, breadth = (min(2 * k, n) for k, n in zip(window.shape, scene.grid, strict=True))
+    shape = height, breadth
+    around = _Window(-(height // 2), -(breadth // 2), shape)
     otfs = []
     for psf, offset in zip(psfs, scene.observation.offsets, strict=True):
         cut = _cut(psf.at(*(offset - np.round(offset))), around, scene.grid)
@@ -174,32 +202,42 @@ def _source_error(
         spectra = np.conj(otfs) * scipy.fft.rfft2(np.array(images), shape)
         return np.asarray(scipy.fft.irfft2(spectra.sum(axis=0), shape)[inside])
 
-    amplitude = texture.amplitude[window.of(scene.grid)]
-    return SourceError(forward, adjoint, amplitude, texture.width)
+    return SourceError(forward, adjoint, amplitude, width)
 
 
 def _linearise(
     scene: Scene,
     psf: MovablePsf,
     j: int,
-    fluxes: Array,
+    sky: Array,
+    star_fluxes: Array,
     held: NDArray[np.int_],
     window: _Window,
     moves: bool,
-    left: Array,
-    precision: Array,
+    beyond: Array,
 ) -> LinearImage:
-    """Return image j near the estimate: its slopes in all fluxes, perhaps all x, and all y."""
+    """Return image j near the estimate: its slopes in all fluxes, perhaps all x, and all y.
+
+    `beyond` is the light of the sky that is expected, less that of the estimate.
+    """
     there = _in_image(scene, j, window)
+    counts, background, weights = _observed(scene, j, there)
+    model = background.copy()
+    first = there.y % scene.grid[0], there.x % scene.grid[1]
+    add_to_window(model, scene, sky, np.zeros_like(star_fluxes), j, first)
+    for stamp, flux in zip(scene.star_field.stamps[j], star_fluxes, strict=True):
+        model += flux / scene.unit * _cut(stamp, there, scene.grid)
+    total = np.maximum(model, MIN_MODEL)
+    precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
     slopes = [_cut(scene.star_stamp(j, s), there, scene.grid) for s in held]
     if moves:
         offset = scene.observation.offsets[j]
         moved = [psf.with_slopes(*(scene.stars[s] + offset)) for s in held]
         for axis in (1, 2):
             for s, (stamp, values) in zip(held, moved, strict=True):
-                slope = stamp._replace(values=fluxes[s] * values[axis])
+                slope = stamp._replace(values=star_fluxes[s] / scene.unit * values[axis])
                 slopes.append(_cut(slope, there, scene.grid))
-    k = len(slopes)
+    k, left = len(slopes), counts - total - beyond
     return LinearImage(np.array(slopes).reshape(k, -1), np.arange(k), left, precision)
 
 

@@ -20,7 +20,10 @@ def gaussian(fwhm):
 def a_texture(stars=(), sky=SKY, psfs=None):
     psfs = np.array([gaussian(5.0), gaussian(8.0)]) if psfs is None else psfs
     images = np.full((len(psfs), N, N), 10.0)
-    return Texture(Scene(lnocl.Observation(images, psfs), stars), sky)
+    scene = Scene(lnocl.Observation(images, psfs), stars)
+    found = Texture(sky, scene.stars, resolution(scene))
+    found.resolution = resolution(scene)
+    return found
 
 
 def test_the_resolution_is_that_of_all_images_together():
@@ -79,6 +82,6 @@ def test_a_psf_wider_than_the_grid_leaves_the_estimate():
     wide = np.exp(-((np.arange(41) - 20) ** 2)[:, None] / 200.0 - (np.arange(41) - 20) ** 2 / 200.0)
     with pytest.warns(lnocl.LnoclWarning, match="larger than the grid"):
         scene = Scene(lnocl.Observation(images, wide), [(4, 4)])
-    found = Texture(scene, np.ones((8, 8)))
+    found = Texture(np.ones((8, 8)), scene.stars, resolution(scene))
     np.testing.assert_array_equal(found.mean, 1.0)
     assert resolution(scene) > 8
