@@ -129,8 +129,9 @@ def _observed(scene: Scene, j: int, there: _Window) -> tuple[Array, Array, Array
     inside = (rows < ny) & (columns < nx)
     pixels = np.minimum(rows, ny - 1), np.minimum(columns, nx - 1)
     counts = np.where(inside, observation.images[j][pixels] / scene.scale, 0.0)
-    background = np.broadcast_to(observation.background[j] / scene.scale, counts.shape)
-    if observation.background.ndim == 3:
+    if observation.background.ndim == 1:
+        background = np.full(there.shape, observation.background[j] / scene.scale)
+    else:
         known = observation.background[j][pixels] / scene.scale
         background = np.where(inside, known, 1.0)
     if scene.weights is None:

@@ -27,6 +27,7 @@ OFFSETS = np.array([(0.0, 0.0), (2.3, -1.4)])
 KNOWN = {
     "alike": {},
     "masked and moved": {"mask": MASK, "offsets": OFFSETS, "exposure": [1.0, 1.5]},
+    "map of read noise": {"read_noise": RNG.uniform(0.5, 3.0, (2, N, N)), "mask": MASK},
     "map of exposures": {"exposure": RNG.uniform(0.5, 1.5, (2, N, N)), "read_noise": 2.0},
 }
 
@@ -150,3 +151,22 @@ def test_fluxes_scatter_as_their_errors_say(light, expected):
         result = lnocl.deconvolve(scene.observation, STARS[:1], n_iter=4000, pad=0, engine="numpy")
         ratios.append((result.star_fluxes - FLUXES[:1]) / result.star_flux_errors)
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(expected, abs=0.15)
+
+
+@pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
+@pytest.mark.filterwarnings("ignore:the images are shifted")
+def test_windows_hold_what_the_grid_does(known):
+    """Beyond padded images too, and where the window wraps round."""
+    counts = RNG.poisson(20.0, (2, N, N))
+    scene = Scene(lnocl.Observation(counts, PSFS, background=3.0, **known), STARS, pad=4)
+    window = star_errors._Window(-5, 40, (32, 40))
+    there = window.of(scene.grid)
+    background = scene.background()
+    for j, image in enumerate(scene.images()):
+        found = star_errors._observed(scene, j, window)
+        weights = np.ones(scene.grid) if scene.weights is None else scene.weights[j]
+        level = np.broadcast_to(background[j], scene.grid)
+        for values, expected in zip(found, (image, level, weights), strict=True):
+            lit = weights[there] > 0  # elsewhere nothing is weighed
+            np.testing.assert_array_equal(values[lit], expected[there][lit])
+        np.testing.assert_array_equal(found[2] > 0, weights[there] > 0)
