@@ -177,7 +177,8 @@ def score(rows):
         holds.append(((low <= rows["truth"]) & (rows["truth"] <= high)).mean())
     z = (found.values - found.bias - rows["truth"]) / found.standard_errors
     of_star = abs(rows["value"] - rows["truth"]) / rows["schur"]
-    holds += [(of_star <= width).mean() for width in (0.994, 1.96)]
+    is_star = np.isfinite(of_star).all()
+    holds += [(of_star <= width).mean() if is_star else np.nan for width in (0.994, 1.96)]
     ranks = (rows["value"][:, None] - rows["errors"] < rows["truth"][:, None]).sum(axis=1)
     return [*holds, np.sqrt(np.median(z**2) / 0.455)], (ranks + 0.5) / (found.n + 1)
 

@@ -1,4 +1,4 @@
-"""The options ``--bootstrap``, ``--regions`` and ``--seed``: errors by replicas of a run."""
+"""The options ``--bootstrap``, ``--regions``, ``--profiles`` and ``--seed``: errors by replicas."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def add_errors(
     def look(found: Bootstrap) -> None:
         nonlocal written
         latest[:] = [found]
-        if found.n > 1 and time.monotonic() - written > WRITE_EVERY:
+        if time.monotonic() - written > WRITE_EVERY:
             _write(path, found, parts, frames)
             written = time.monotonic()
 
@@ -133,7 +133,7 @@ def add_errors(
             outcome, arguments.bootstrap, parts, seed, not arguments.quiet, earlier, look
         )
     finally:
-        if latest and latest[0].n > 1:
+        if latest:
             _write(path, latest[0], parts, frames)
     return _said(found, frames)
 

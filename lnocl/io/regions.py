@@ -63,12 +63,14 @@ def read_profiles(
     Raises
     ------
     LnoclError, FileError, InputError
-        As `read_apertures`; a region that is no box.
+        As `read_apertures`; a region that is not a box.
     """
     found = _in_pixels(given, header)
     for each in found:
         if not isinstance(each.region, _regions().RectanglePixelRegion):
-            raise InputError(f"{each.said} is no box: a profile is along the longer side of a box")
+            raise InputError(
+                f"{each.said} is not a box: a profile is along the longer side of a box"
+            )
     return [_profile(each, shape) for each in found]
 
 
@@ -166,7 +168,7 @@ def _refuse_outside(said: str, region: Any, shape: tuple[int, int]) -> None:
         box = region.bounding_box
     except NotImplementedError:
         return  # which is refused for that
-    except (ValueError, OverflowError):  # its places on the sky are none of the image
+    except (ValueError, OverflowError):  # it is on another part of the sky
         box = None
     ny, nx = shape
     if box is None or not (

@@ -28,7 +28,6 @@ LEVELS = 0.68, 0.95
 
 BELOW, UNDER, UNSEEN = "below the resolution", "under a star", "not observed"
 
-
 Part = Aperture | Profile
 
 
@@ -140,7 +139,6 @@ class Bootstrap:
 
         if not 0.0 < level < 1.0:
             raise InputError(f"the level of an interval lies between 0 and 1; {level} was given")
-
         half = t.ppf((1.0 + level) / 2.0, self.n - 1) * np.sqrt(1.0 + 1.0 / self.n)
         middle, width = self.values - self.bias, half * self.standard_errors
         return np.array([middle - width, middle + width])
@@ -251,12 +249,12 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
 
 
 def check_number(n: object, seed: object) -> None:
-    """Refuse a number of replicas, or a seed, that is none.
+    """Refuse a number of replicas, or a seed, that is out of range.
 
     Raises
     ------
     InputError
-        n is no whole number of ten or more, or the seed none of zero or more.
+        n is not a whole number of ten or more, or the seed is not one of zero or more.
     """
     if not (isinstance(n, (int, np.integer)) and n >= MIN_REPLICAS):
         raise InputError(
@@ -305,7 +303,7 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
         labels += [Label(f"star {s} {axis}", LENGTH) for s in range(1, n + 1) for axis in "xy"]
     labels += [label for part in parts for label in part.labels()]
     notes = [""] * (3 * n if moves else n)
-    observed = _observed(scene)[:ny, :nx]
+    observed = _observed(scene)[:ny, :nx] if parts else np.ones((0, 0), bool)
     notes += [note for part in parts for note in _notes(part, scene.stars, width, observed)]
     sky = Sky(outcome.sky[:ny, :nx], outcome.star_fluxes, scene.stars)
     values = _measure(sky, parts, moves).tolist()
@@ -317,6 +315,8 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
 
 def _observed(scene: Scene) -> NDArray[np.bool_]:
     """Return where the extended source was observed, on the grid."""
+    if scene.weights is None:
+        return np.ones(scene.grid, bool)
     model = Model(scene)
     return scene.observed(model.adjoint(model.weights))
 

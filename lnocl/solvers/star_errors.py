@@ -243,7 +243,7 @@ def _linearise(
 
 
 def _cut(stamp: Stamp, window: _Window, grid: tuple[int, int]) -> Array:
-    """Return what a stamp has in a window."""
+    """Return the values of a stamp that lie in a window, and 0 elsewhere."""
     light = np.zeros(window.shape)
     y, x = (stamp.rows(grid) - window.y) % grid[0], (stamp.columns(grid) - window.x) % grid[1]
     y_in, x_in = y < window.shape[0], x < window.shape[1]

@@ -163,6 +163,6 @@ def test_a_slice_without_light_has_no_width(tmp_path):
 def test_a_profile_of_no_box_is_refused(tmp_path):
     (tmp_path / "p.reg").write_text("image\ncircle(25,20,8)")
     with pytest.raises(
-        lnocl.InputError, match=r"^region 1 \(circle\) is no box: a profile is along"
+        lnocl.InputError, match=r"^region 1 \(circle\) is not a box: a profile is along"
     ):
         read_profiles(tmp_path / "p.reg", None, SHAPE)
