@@ -7,7 +7,7 @@ Parts, each a table, written to STEM-PART.ecsv with --output:
 edges    a source that runs over three edges of the frame, on frames of 256 x 256 and 200 x 150
          pixels, one image through a Moffat PSF or four through Fizeau PSFs, with and without a
          star near an edge: errors in the 10 pixels along those edges and in the middle, for pad 0
-         to 64; with --figure the picture of it
+         to 64 and that of the rule; with --figure the picture of it
 gaps     the same on square frames of 256 - 2 N pixels, whose grid leaves just N pixels on each side
 pixels   the paper's experiment with 5 % dead pixels and ten dead columns: the smallest rho'
 holes    the same with one image and square holes of 3 to 15 pixels in the jet
@@ -34,6 +34,8 @@ from scipy.ndimage import gaussian_filter
 
 import lnocl
 from lnocl.metrics import restoration_error
+from lnocl.scene.grid import length_for
+from lnocl.scene.padding import recommend_pad
 from lnocl.simulation import Experiment, fizeau_psf, hh34, simulate
 
 SKY = 768
@@ -162,7 +164,7 @@ class Sky:
 
 def grid_of(shape, pad):
     """Return the grid that lnocl takes."""
-    return tuple(1 << (n + 2 * pad - 1).bit_length() for n in shape)
+    return tuple(length_for(n + 2 * pad) for n in shape)
 
 
 def measure(kind, shape, has_star, pad, solver, device):
@@ -198,6 +200,11 @@ def sky(kind, shape, has_star, seed):
     return Sky(kind, shape, has_star, seed)
 
 
+def pads(kind, shape):
+    """Return the pads that are compared, one of them that of the rule."""
+    return sorted({*PADS, recommend_pad(sky(kind, shape, False, 0).observation())})
+
+
 def edges(given):
     """Yield rows of the part "edges"."""
     for kind in ("moffat", "fizeau"):
@@ -205,7 +212,7 @@ def edges(given):
             for has_star in (False, True):
                 for solver in ("sgm", "sgp"):
                     known = {}
-                    for pad in PADS:
+                    for pad in pads(kind, shape):
                         grid = grid_of(shape, pad)
                         if grid not in known:
                             known[grid] = measure(kind, shape, has_star, pad, solver, given.device)
@@ -363,7 +370,8 @@ def draw(path, device):
     seen = sky("fizeau", (256, 256), False, 0)
     truth = seen.cut(seen.truth)
     images = {"one image": seen.cut(seen.counts)[0] - BACKGROUND, "truth": truth}
-    for name, pad in (("periodic model (pad 0)", 0), ("padded model (pad 8)", 8)):
+    rule = recommend_pad(seen.observation())
+    for name, pad in (("periodic model (pad 0)", 0), (f"padded model (pad {rule})", rule)):
         _, errors, images[name] = seen.reconstruct("sgp", pad, device)
         images[name] = images[name], errors
     figure = Figure(figsize=(13, 6.9), layout="constrained")

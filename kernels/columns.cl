@@ -6,7 +6,7 @@ INLINE void forward_columns(
 {
     FOR_EACH(piece, INNER(NY) * SIDE) {
         const int y = piece / SIDE, lane = piece % SIDE;
-        cvec a[8];
+        cvec a[OUTER(NY)];
         UNROLL
         for (int q = 0; q < OUTER(NY); ++q)
             a[q] = LOAD(from + lane, q * INNER(NY) + y);
@@ -22,7 +22,7 @@ INLINE void finish_columns(
 {
     FOR_EACH(piece, INNER(NY) * SIDE) {
         const int y = piece / SIDE, lane = piece % SIDE;
-        cvec a[8];
+        cvec a[OUTER(NY)];
         load_inverse(a, z + lane, y, NY, column_roots);
         UNROLL
         for (int q = 0; q < OUTER(NY); ++q)
@@ -31,7 +31,7 @@ INLINE void finish_columns(
     BARRIER;
 }
 
-/* spectra <- sum_y spectra(y) exp(-2 pi i k y / NY), k in bit-reversed order.
+/* spectra <- sum_y spectra(y) exp(-2 pi i k y / NY), k in reversed order.
  * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: NY points. Twin: reference.fft_columns.
  */
 KERNEL void fft_columns(
@@ -48,7 +48,7 @@ KERNEL void fft_columns(
     }
 }
 
-/* spectra <- sum_k spectra(k) exp(+2 pi i k y / NY), k in bit-reversed order.
+/* spectra <- sum_k spectra(k) exp(+2 pi i k y / NY), k in reversed order.
  * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: NY points. Twin: reference.ifft_columns.
  */
 KERNEL void ifft_columns(

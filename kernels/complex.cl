@@ -22,6 +22,11 @@ INLINE cvec subtract(const cvec a, const cvec b)
     return (cvec){a.re - b.re, a.im - b.im};
 }
 
+INLINE cvec times(const cvec a, const real factor)
+{
+    return (cvec){a.re * factor, a.im * factor};
+}
+
 INLINE cvec multiply(const cvec a, const cvec b)
 {
     return (cvec){a.re * b.re - a.im * b.im, a.re * b.im + a.im * b.re};

@@ -4,15 +4,13 @@
  * product with the two OTFs K_A and K_B needs the opposite point too:
  *     K_A A + i K_B B = (K_A + K_B) / 2 P(k) + (K_A - K_B) / 2 conj(P(-k)).
  * The first factor is kept in column 0 of the OTF, the second in `otf_edges`, [NY][2] reals an
- * image. Position t of the bit-reversed order has its opposite at MIRROR(t).
+ * image.
  */
 
-#define MIRROR(t) ((t) < 2 ? (t) : (t) ^ (HIGH_BIT(t) - 1))
-
-/* a plus what column 0 gets from its opposite point: (re + i im) conj(p(MIRROR(t))). */
+/* a plus what column 0 gets from its opposite point: (re + i im) conj(p(opposite place)). */
 INLINE cvec add_edge(const cvec a, const real re, const real im, SCRATCH const vec *p, const int t)
 {
-    SCRATCH const real *opposite = (SCRATCH const real *)p + 2 * MIRROR(t) * BLOCK;
+    SCRATCH const real *opposite = (SCRATCH const real *)p + 2 * opposite_place(t, NY) * BLOCK;
     const real x = opposite[0], y = opposite[BLOCK];
     return (cvec){a.re + FIRST_LANE * (re * x + im * y), a.im + FIRST_LANE * (im * x - re * y)};
 }
@@ -41,7 +39,7 @@ KERNEL void otf_columns(
         if (block == 0) {
             FOR_EACH(t, NY) {
                 SCRATCH const real *p = (SCRATCH const real *)z + 2 * t * BLOCK;
-                SCRATCH const real *q = (SCRATCH const real *)z + 2 * MIRROR(t) * BLOCK;
+                SCRATCH const real *q = (SCRATCH const real *)z + 2 * opposite_place(t, NY) * BLOCK;
                 const real a_re = p[0] + q[0], a_im = p[BLOCK] - q[BLOCK];
                 const real b_re = p[BLOCK] + q[BLOCK], b_im = q[0] - p[0];
                 __global real *column_0 = (__global real *)k + 2 * t * BLOCK;

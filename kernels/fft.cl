@@ -1,20 +1,25 @@
-/* A power-of-two FFT from radix-2 butterflies, up to three deep in registers.
+/* An FFT of n = ODD(n) EVEN(n) points, ODD(n) 1, 3, 5, 7 or 9 and EVEN(n) a power of two: one odd
+ * pass (odd.cl), and radix-2 butterflies, up to three deep in registers.
  *
- * Forward: decimation in frequency, natural order in, bit-reversed order out, exp(-2 pi i ...).
- * Inverse: decimation in time, bit-reversed order in, natural order out, exp(+2 pi i ...), not
- * divided by the length. So no bit reversal is ever done; spectra stay in reversed order.
+ * Forward: decimation in frequency, natural order in, reversed order out, exp(-2 pi i ...).
+ * Inverse: decimation in time, reversed order in, natural order out, exp(+2 pi i ...), not
+ * divided by the length. So no reversal is ever done; spectra stay in reversed order: with r the
+ * bit-reversed order of EVEN(n) points, place q EVEN(n) + t has k = ODD(n) r(t) + q.
  *
- * A transform of n points has an outer pass of radix OUTER(n) <= 8, which the kernels write
- * themselves because it is where data come and go; then, over subtransforms of INNER(n) points,
- * passes of radix 8; and a last pass of radix LAST(n) <= 8. All are in place. Where INNER(n) is
- * more than CHUNK points, one middle pass goes over everything; what is left is done span by
- * span, so that each SPAN(n) points stay in the nearest cache until they are done.
+ * A transform of n points has an outer pass of radix OUTER(n), ODD(n) times at most 8, which the
+ * kernels write themselves because it is where data come and go; then, over subtransforms of
+ * INNER(n) points, passes of radix 8; and a last pass of radix LAST(n) <= 8. All are in place.
+ * Where INNER(n) is more than CHUNK points, one middle pass goes over everything; what is left is
+ * done span by span, so that each SPAN(n) points stay in the nearest cache until they are done.
  *
- * Twiddles, for each pass over subtransforms of `length` points with radix R, in the order in
- * which the forward transform needs them: [length / R][R - 1][2] reals, the root
- * exp(-2 pi i j reversed(q) / length) for j and q = 1 .. R - 1. The last pass needs none.
+ * Roots of unity: first exp(2 pi i k / ODD(n)), [ODD(n)][2] reals, where ODD(n) is more than 1. Then
+ * twiddles, for each pass over subtransforms of `length` points with radix R, in the order in which
+ * the forward transform needs them: [length / R][R - 1][2] reals, exp(-2 pi i j reversed(q) / length)
+ * for j and q = 1 .. R - 1. The last pass needs none.
  */
 
+#define ODD(n) ((n) == NX ? ROW_ODD : COLUMN_ODD)
+#define EVEN(n) ((n) / ODD(n))
 #define OUTER(n) ((n) == NX ? ROW_OUTER : COLUMN_OUTER)
 #define LAST(n) ((n) == NX ? ROW_LAST : COLUMN_LAST)
 #define INNER(n) ((n) / OUTER(n))
@@ -23,6 +28,16 @@
 #define SPAN(n) (GROUP > 1 ? (n) : SPAN_LENGTH(n))
 
 #define HIGH_BIT(i) (1 << (31 - clz(i)))
+
+/* The place of -k, where `place` has k: places EVEN(n) to n, and 2^b to 2^(b + 1) below, have the
+ * opposites of each other in reversed order.
+ */
+INLINE int opposite_place(const int place, const int n)
+{
+    if (place < 2)
+        return place;
+    return place < EVEN(n) ? place ^ (HIGH_BIT(place) - 1) : n + EVEN(n) - 1 - place;
+}
 
 #define SQRT_HALF ((real)0.70710678118654752440)
 
@@ -33,6 +48,7 @@ INLINE void butterfly(cvec *a, cvec *b)
     *b = difference;
 }
 
+/* Radix 1, 2, 4 or 8. */
 INLINE void dif(cvec *a, const int radix)
 {
     if (radix == 8) {
@@ -84,6 +100,23 @@ INLINE void dit(cvec *a, const int radix)
     }
 }
 
+/* The butterflies of the outer pass. */
+INLINE void dif_outer(cvec *a, const int n, __global const real *roots)
+{
+    if (ODD(n) > 1)
+        dft_odd(a, ODD(n), -1, roots);
+    else
+        dif(a, OUTER(n));
+}
+
+INLINE void dit_outer(cvec *a, const int n, __global const real *roots)
+{
+    if (ODD(n) > 1)
+        dft_odd(a, ODD(n), 1, roots);
+    else
+        dit(a, OUTER(n));
+}
+
 INLINE void twiddle_forward(cvec *a, const int radix, __global const real *roots)
 {
     UNROLL
@@ -101,6 +134,8 @@ INLINE void twiddle_inverse(cvec *a, const int radix, __global const real *roots
 /* The roots of the pass over subtransforms of `length` points; `roots` is the table for n. */
 INLINE __global const real *roots_of(__global const real *roots, const int n, const int length)
 {
+    if (ODD(n) > 1)
+        roots += 2 * ODD(n);
     if (length < n)
         roots += 2 * INNER(n) * (OUTER(n) - 1);
     UNROLL

@@ -5,10 +5,12 @@
  *   LANES           reals in a vector: 16, 8, 4, 2 or 1
  *   BLOCK           columns, or pairs of rows, transformed together; a multiple of LANES
  *   GROUP           work-items that share a block, a power of two
- *   ROW_OUTER, ROW_LAST, COLUMN_OUTER, COLUMN_LAST    radices of a transform, see fft.cl
+ *   ROW_ODD, ROW_OUTER, ROW_LAST, COLUMN_ODD, COLUMN_OUTER, COLUMN_LAST
+ *                   odd factor of an axis, and radices of its transform, see fft.cl
  *   CHUNK           points of a transform that are finished before the next are begun
  *   SCRATCH_IS_GLOBAL   0 or 1: where a block lies while it is transformed
- *   NX, NY          the grid, powers of two from 2 to 8192; BLOCK divides NX / 2 and NY / 2
+ *   NX, NY          the grid, each 1, 3, 5, 7 or 9 times a power of two, up to 8192; 2 BLOCK
+ *                   divides that power
  *   ROWS            rows that a block of spectra takes in memory: NY and some padding
  *   MAX_STARS       room for stars: the scene has no more than these
  *   HAS_MU, HAS_SMOOTHING, HAS_WEIGHTS, HAS_BACKGROUND_MAP, HAS_EXPOSURE_MAP    0 or 1: what the

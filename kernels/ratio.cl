@@ -114,7 +114,7 @@ KERNEL void ratio_rows(
             products[s] = (vec_sum){0, 0};
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
-            cvec a[8];
+            cvec a[OUTER(NX)];
             load_inverse(a, z + lane, x, NX, row_roots);
             vec terms = 0, part[NEAR_ROOM];
             for (int s = 0; s < near.count; ++s)

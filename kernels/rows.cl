@@ -2,23 +2,28 @@
  *
  * Row pair (a, b) is transformed as the complex row z = a + i b. Its spectrum Z holds both: with
  * X, Y the half spectra of a and b, Z(k) = X(k) + i Y(k) and Z(-k) = conj(X(k)) + i conj(Y(k)).
- * Half spectra keep one of each pair (k, -k), column h of them that at position(h) of the
- * bit-reversed order; its opposite lies at opposite(h). X(0) and X(Nx / 2) are real and share
- * column 0 as its real and imaginary part; they lie at positions 0 and 1.
+ * Half spectra keep one of each pair (k, -k), column h of them that at place(h) of the reversed
+ * order; its opposite lies at opposite(h). X(0) and X(Nx / 2) are real and share column 0 as its
+ * real and imaginary part; they lie at places 0 and 1.
  */
 
-/* The highest bit of h + i, i < LANES, where `high_bit` is that of h, a multiple of LANES. */
+/* How far column h + i, i < LANES, lies before its place, where `shift` is that of h, a multiple of
+ * LANES: its highest bit, or half of EVEN(NX) if that is less.
+ */
 #define BIT(i) ((i) < 2 ? 1 : (i) < 4 ? 2 : (i) < 8 ? 4 : 8)
-#define COLUMN_BIT(h, i, high_bit) ((h) == 0 ? BIT(i) : (high_bit))
+#define COLUMN_SHIFT(h, i, shift) ((h) == 0 ? BIT(i) : (shift))
+#define SHIFT(h) (ODD(NX) > 1 ? min(HIGH_BIT(h), EVEN(NX) / 2) : HIGH_BIT(h))
 
-INLINE int position(const int h, const int i, const int high_bit)
+INLINE int place(const int h, const int i, const int shift)
 {
-    return h + i + COLUMN_BIT(h, i, high_bit);
+    return h + i + COLUMN_SHIFT(h, i, shift);
 }
 
-INLINE int opposite(const int h, const int i, const int high_bit)
+INLINE int opposite(const int h, const int i, const int shift)
 {
-    return position(h, i, high_bit) ^ (2 * COLUMN_BIT(h, i, high_bit) - 1);
+    if (ODD(NX) > 1 && shift == EVEN(NX) / 2)
+        return NX + EVEN(NX) - 1 - place(h, i, shift);
+    return place(h, i, shift) ^ (2 * COLUMN_SHIFT(h, i, shift) - 1);
 }
 
 INLINE vec zip_low(const vec a, const vec b)
@@ -87,13 +92,13 @@ INLINE void prefetch_tile(__global const vec *tile)
         PREFETCH(tile + i * SIDE);
 }
 
-/* Half spectra of one block of row pairs -> Z in the scratch, in bit-reversed order. */
+/* Half spectra of one block of row pairs -> Z in the scratch, in reversed order. */
 INLINE void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int block)
 {
     FOR_EACH(piece, COLUMN_BLOCKS * SIDE * SIDE) {
         const int column = piece % SIDE, pair = piece / SIDE % SIDE, tile = piece / SIDE / SIDE;
         const int h = tile * BLOCK + column * LANES;
-        const int bit = HIGH_BIT(h);
+        const int shift = SHIFT(h);
         const int offset = 4 * LANES * pair * SIDE + column;
         __global const vec *x = spectra + tile_start(block, tile) + offset;
         if (tile + TILES_AHEAD < COLUMN_BLOCKS)
@@ -109,7 +114,7 @@ INLINE void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int bl
             SCRATCH vec *to = z + part % 2 * SIDE + pair;
             UNROLL
             for (int i = 0; i < LANES; ++i) {
-                const int at = part < 2 ? position(h, i, bit) : opposite(h, i, bit);
+                const int at = part < 2 ? place(h, i, shift) : opposite(h, i, shift);
                 to[2 * at * SIDE] = a[i];
             }
         }
@@ -127,13 +132,13 @@ INLINE void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int bl
     BARRIER;
 }
 
-/* Z in the scratch, in bit-reversed order -> twice the half spectra of its row pairs. */
+/* Z in the scratch, in reversed order -> twice the half spectra of its row pairs. */
 INLINE void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int block)
 {
     FOR_EACH(piece, COLUMN_BLOCKS * SIDE * SIDE) {
         const int column = piece % SIDE, pair = piece / SIDE % SIDE, tile = piece / SIDE / SIDE;
         const int h = tile * BLOCK + column * LANES;
-        const int bit = HIGH_BIT(h);
+        const int shift = SHIFT(h);
         __global vec *x = spectra + tile_start(block, tile) + 4 * LANES * pair * SIDE + column;
         for (int part = 0; part < 4; ++part) {
             const int first = WRITE_FIRST[part], second = WRITE_SECOND[part];
@@ -142,8 +147,8 @@ INLINE void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int b
             vec a[LANES];
             UNROLL
             for (int i = 0; i < LANES; ++i) {
-                const int k = 2 * position(h, i, bit) * SIDE;
-                const int minus_k = 2 * opposite(h, i, bit) * SIDE;
+                const int k = 2 * place(h, i, shift) * SIDE;
+                const int minus_k = 2 * opposite(h, i, shift) * SIDE;
                 a[i] = from_first[first < 2 ? k : minus_k]
                     + WRITE_SIGN[part] * from_second[second < 2 ? k : minus_k];
             }
@@ -173,15 +178,15 @@ INLINE void load_inverse(
     UNROLL
     for (int q = 0; q < OUTER(n); ++q)
         a[q] = LOAD(z, q * INNER(n) + x);
-    twiddle_inverse(a, OUTER(n), roots + 2 * (OUTER(n) - 1) * x);
-    dit(a, OUTER(n));
+    twiddle_inverse(a, OUTER(n), roots_of(roots, n, n) + 2 * (OUTER(n) - 1) * x);
+    dit_outer(a, n, roots);
 }
 
 INLINE void store_forward(
     SCRATCH vec *z, cvec *a, const int x, const int n, __global const real *roots)
 {
-    dif(a, OUTER(n));
-    twiddle_forward(a, OUTER(n), roots + 2 * (OUTER(n) - 1) * x);
+    dif_outer(a, n, roots);
+    twiddle_forward(a, OUTER(n), roots_of(roots, n, n) + 2 * (OUTER(n) - 1) * x);
     UNROLL
     for (int q = 0; q < OUTER(n); ++q)
         STORE(z, q * INNER(n) + x, a[q]);
@@ -200,7 +205,7 @@ KERNEL void rfft_rows(
         __global const vec *from = pixels + (size_t)block * NX * 2 * SIDE;
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
-            cvec a[8];
+            cvec a[OUTER(NX)];
             UNROLL
             for (int q = 0; q < OUTER(NX); ++q)
                 a[q] = LOAD(from + lane, q * INNER(NX) + x);
@@ -227,7 +232,7 @@ KERNEL void irfft_rows(
         dit_inner(z, NX, row_roots);
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
-            cvec a[8];
+            cvec a[OUTER(NX)];
             load_inverse(a, z + lane, x, NX, row_roots);
             UNROLL
             for (int q = 0; q < OUTER(NX); ++q)

@@ -44,7 +44,7 @@ KERNEL void scale_rows(
         vec_sum total = {0, 0};
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
-            cvec a[8];
+            cvec a[OUTER(NX)];
             load_inverse(a, z + lane, x, NX, row_roots);
             vec part = 0;
             /* Left rolled: unrolled, the pixelwise work runs out of registers and is slower. */

@@ -23,7 +23,7 @@ INLINE near_stars stars_near(
     near.count = 0;
     /* The second bound lets compilers know that none or one star is all there is. */
     for (int s = 0; s < n_stars && s < MAX_STARS; ++s) {
-        const int k = (block - first_blocks[s]) & (ROW_BLOCKS - 1);
+        const int ahead = block - first_blocks[s], k = ahead < 0 ? ahead + ROW_BLOCKS : ahead;
         if (k < n_blocks) {
             near.star[near.count] = s;
             near.block[near.count] = (s * n_arrays + array) * n_blocks + k;

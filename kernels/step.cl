@@ -66,7 +66,7 @@ KERNEL void gradient_rows(
         vec_sum change_step = {0, 0}, change_change = {0, 0};
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
-            cvec a[8];
+            cvec a[OUTER(NX)];
             load_inverse(a, z + lane, x, NX, row_roots);
             vec step_part = 0, change_part = 0;
             /* Left rolled: unrolled, the pixelwise work runs out of registers and is slower. */
@@ -152,7 +152,7 @@ KERNEL void step_rows(
         BARRIER;
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
-            cvec a[8];
+            cvec a[OUTER(NX)];
             for (int q = 0; q < OUTER(NX); ++q)
                 a[q] = LOAD(extended + at + lane, q * INNER(NX) + x);
             store_forward(z + lane, a, x, NX, row_roots);

@@ -115,10 +115,11 @@ def deconvolve(
         `lnocl.opencl.device.choose`). By default that of the environment variable PYOPENCL_CTX,
         else the first GPU, else the first CPU.
     pad : int or "auto", optional
-        Unobserved pixels kept round the images, at least; the grid is then the next power of
-        two on each axis. With ``pad=0`` and a power-of-two image the model is periodic. "auto":
-        where light runs over the edge of an image, the radius with nine tenths of the PSFs' light,
-        at most half the shorter side (docs/frames.md); else 0.
+        Unobserved pixels kept round the images, at least. Each axis of the grid is then the next
+        length that is 1, 3, 5, 7 or 9 times a power of two (`lnocl.scene.grid.LENGTHS`). Where
+        images have such lengths and ``pad=0``, the model is periodic. "auto": where light runs over
+        the edge of an image, the radius with nine tenths of the PSFs' light, at most half the
+        shorter side (docs/frames.md); else 0.
     initial_extended : array_like, shape (ny, nx), optional
         Extended source to start from, not 0 everywhere; by default flat. Pixels that start at 0
         stay 0 with "sgm".

@@ -9,28 +9,33 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from lnocl.opencl.layout import bit_reversed
+from lnocl.opencl.layout import reversed_order
 from lnocl.opencl.program import Program
 
 READ_WRITE = cl.mem_flags.READ_WRITE
 
 
-def roots(n: int, outer: int, last: int) -> NDArray[np.float64]:
-    """Return the twiddles of all passes of a transform of n points, as kernels/fft.cl has them.
+def roots(n: int, odd: int, outer: int, last: int) -> NDArray[np.float64]:
+    """Return the roots of unity of a transform of n points, as kernels/fft.cl has them.
 
-    A pass over subtransforms of length L with radix R has, for j < L / R and 0 < q < R, the root
-    ``exp(-2 pi i j reversed(q) / L)``, real and imaginary part. The passes have radix `outer`,
-    then 8; that of radix `last` has none.
+    First ``exp(2 pi i k / odd)`` for all k, where `odd` is more than 1. Then the twiddles: a pass
+    over subtransforms of length L with radix R has, for j < L / R and 0 < q < R, the root
+    ``exp(-2 pi i j reversed(q) / L)``. The passes have radix `outer`, then 8; that of radix `last`
+    has none. Each root is a real and an imaginary part.
     """
     length, radix = n, outer
-    tables = []
+    tables = [_roots(-np.arange(odd), odd)] if odd > 1 else []
     while length == n or length > last:
-        j, q = np.arange(length // radix)[:, None], bit_reversed(radix)[None, 1:]
-        # In long double, where there is one: a rounded angle would cost a digit in double.
-        angle = -8.0 * np.arctan(np.longdouble(1.0)) * (j * q) / length
-        tables.append(np.stack([np.cos(angle), np.sin(angle)], axis=-1).ravel())
+        j, q = np.arange(length // radix)[:, None], reversed_order(radix)[None, 1:]
+        tables.append(_roots(j * q, length))
         length, radix = length // radix, 8
     return np.concatenate(tables).astype(np.float64)
+
+
+def _roots(k: NDArray[np.int64], n: int) -> NDArray[np.longdouble]:
+    # In long double, where there is one: a rounded angle would cost a digit in double.
+    angle = -8.0 * np.arctan(np.longdouble(1.0)) * k / n
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1).ravel()
 
 
 class Launch:

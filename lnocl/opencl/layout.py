@@ -7,15 +7,20 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.opencl.program import Program
+from lnocl.opencl.program import Program, odd_part
 
 
-def bit_reversed(n: int) -> NDArray[np.int64]:
-    """Return the bit-reversed order of n points, n a power of two: [0, n/2, n/4, 3n/4, ...]."""
+def reversed_order(n: int) -> NDArray[np.int64]:
+    """Return the order in which a transform of n points leaves its spectrum (kernels/fft.cl).
+
+    Bit-reversed, [0, n/2, n/4, 3n/4, ...], for a power of two; for M times that first the multiples
+    of M, so ordered, then those with remainder 1, and so on.
+    """
+    odd = odd_part(n)
     order = np.zeros(1, np.int64)
-    while len(order) < n:
+    while len(order) < n // odd:
         order = np.concatenate([2 * order, 2 * order + 1])
-    return order
+    return np.concatenate([odd * order + remainder for remainder in range(odd)])
 
 
 class Layout:
@@ -40,10 +45,10 @@ class Layout:
         self.spectra_shape = (nx // 2 // block, program.rows, 2, block)
         column = np.arange(1, nx // 2)
         high_bit = 1 << np.frexp(column)[1] - 1
-        position = bit_reversed(nx)[column + high_bit]
-        opposite = position > nx // 2
-        self._kept = np.where(opposite, nx - position, position)
-        self._conjugated = opposite
+        shift = np.minimum(high_bit, nx // odd_part(nx) // 2)
+        wavenumber = reversed_order(nx)[column + shift]
+        self._conjugated = wavenumber > nx // 2
+        self._kept = np.where(self._conjugated, nx - wavenumber, wavenumber)
 
     @property
     def block_bytes(self) -> int:

@@ -25,6 +25,7 @@ from lnocl.process import LOCK, ignored_warnings
 SOURCES = (
     "precision.cl",
     "complex.cl",
+    "odd.cl",
     "fft.cl",
     "rows.cl",
     "columns.cl",
@@ -69,13 +70,22 @@ class Tuning:
     scratch_is_global: bool = False
 
 
-def radices(n: int) -> tuple[int, int]:
-    """Return the radices of the outer and the last pass of n points; those between are 8."""
-    outer = 4 if n > 2 and n.bit_length() % 3 == 2 else min(8, n)
+def odd_part(n: int) -> int:
+    """Return the largest odd factor of a length."""
+    return n // (n & -n)
+
+
+def radices(n: int) -> tuple[int, int, int]:
+    """Return the odd factor of n points, and the radices of the outer and the last pass.
+
+    Those between are 8.
+    """
+    odd = odd_part(n)
+    outer = odd if odd > 1 else 4 if n > 2 and n.bit_length() % 3 == 2 else min(8, n)
     last = n // outer
     while last > 8:
         last //= 8
-    return outer, last
+    return odd, outer, last
 
 
 def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
@@ -84,13 +94,13 @@ def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
     A CPU takes a block as one vector in one work-item; other devices take scalars in a group of
     work-items. Small grids have smaller blocks, so that no block is ever filled in part.
     """
-    most = min(grid) // 2
+    most = min(n // odd_part(n) for n in grid) // 2
     if device.type & cl.device_type.CPU:
         lanes = min(32 // dtype.itemsize, most)  # 256 bits, benchmarks/tune.py
         block, group = lanes, 1
     else:
         lanes, block = 1, min(8, most)
-        group = max(1, min(128, min(grid) // 8, _power_of_2_up_to(device.max_work_group_size)))
+        group = _power_of_2_up_to(max(1, min(128, min(grid) // 8, device.max_work_group_size)))
     needed = local_bytes(grid, dtype, block, group)
     return Tuning(lanes, block, group, scratch_is_global=needed > device.local_mem_size)
 
@@ -121,7 +131,7 @@ class Program:
     context : pyopencl.Context
         Of one device.
     grid : tuple of int
-        Shape (Ny, Nx), powers of two from 2 to 8192.
+        Shape (Ny, Nx), of `lnocl.scene.grid.LENGTHS`.
     dtype : numpy.dtype
         float32 or float64.
     tuning : Tuning, optional
@@ -140,7 +150,7 @@ class Program:
     arguments : dict of str to tuple of str
         The names of each kernel's arguments, in the order of its declaration.
     row_radices, column_radices : tuple of int
-        Radices of the outer and the last pass.
+        As `radices`.
     rows : int
         Rows that a block of spectra takes in memory.
     max_groups : int
@@ -186,10 +196,12 @@ class Program:
             "LANES": self.tuning.lanes,
             "BLOCK": self.tuning.block,
             "GROUP": self.tuning.group,
-            "ROW_OUTER": self.row_radices[0],
-            "ROW_LAST": self.row_radices[1],
-            "COLUMN_OUTER": self.column_radices[0],
-            "COLUMN_LAST": self.column_radices[1],
+            "ROW_ODD": self.row_radices[0],
+            "ROW_OUTER": self.row_radices[1],
+            "ROW_LAST": self.row_radices[2],
+            "COLUMN_ODD": self.column_radices[0],
+            "COLUMN_OUTER": self.column_radices[1],
+            "COLUMN_LAST": self.column_radices[2],
             "CHUNK": self.tuning.chunk,
             "SCRATCH_IS_GLOBAL": int(self.tuning.scratch_is_global),
             "NX": grid[1],

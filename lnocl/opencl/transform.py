@@ -7,7 +7,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from lnocl.opencl.launch import READ_WRITE, Launch, Launcher
-from lnocl.opencl.layout import Layout, bit_reversed
+from lnocl.opencl.layout import Layout, reversed_order
 from lnocl.opencl.program import Program, Tuning
 
 
@@ -19,7 +19,7 @@ class Transform:
     context : pyopencl.Context
         Of one device.
     grid : tuple of int
-        Shape (Ny, Nx), powers of two from 2 to 8192.
+        Shape (Ny, Nx), of `lnocl.scene.grid.LENGTHS`.
     dtype : numpy.dtype
         float32 or float64.
     tuning : Tuning, optional
@@ -43,12 +43,12 @@ class Transform:
         """Return ``sum_y F(y) exp(-2 pi i k y / Ny)`` of each of (Ny, Nx / 2) complex columns."""
         self._upload(self._spectra, self.layout.pack_columns(columns))
         self._fft_columns()
-        return self._download_columns()[np.argsort(bit_reversed(self.program.grid[0]))]
+        return self._download_columns()[np.argsort(reversed_order(self.program.grid[0]))]
 
     def ifft(self, columns: NDArray) -> NDArray[np.complex128]:
         """Return ``1 / Ny sum_k F(k) exp(+2 pi i k y / Ny)`` of each of (Ny, Nx / 2) columns."""
         ny = self.program.grid[0]
-        self._upload(self._spectra, self.layout.pack_columns(columns[bit_reversed(ny)]))
+        self._upload(self._spectra, self.layout.pack_columns(columns[reversed_order(ny)]))
         self._ifft_columns()
         return self._download_columns() / ny
 
@@ -58,13 +58,13 @@ class Transform:
         self._bind("rfft_rows")()
         self._fft_columns()
         ny = self.program.grid[0]
-        columns = self._download_columns()[np.argsort(bit_reversed(ny))] / 2.0
+        columns = self._download_columns()[np.argsort(reversed_order(ny))] / 2.0
         return self.layout.half_spectrum(columns)
 
     def irfft2(self, spectrum: NDArray) -> NDArray[np.float64]:
         """Return the real pixels (Ny, Nx) of a half spectrum, divided by Ny Nx."""
         ny, nx = self.program.grid
-        columns = self.layout.columns_of(spectrum)[bit_reversed(ny)]
+        columns = self.layout.columns_of(spectrum)[reversed_order(ny)]
         self._upload(self._spectra, self.layout.pack_columns(columns))
         self._ifft_columns()
         self._bind("irfft_rows")()

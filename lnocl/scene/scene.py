@@ -13,15 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, warn
+from lnocl.scene.grid import grid_of
 from lnocl.scene.observation import Array, Observation, numbers
-from lnocl.scene.padding import choose_pad
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
 from lnocl.scene.shifting import MovablePsf, Stamp
 from lnocl.scene.stars import StarField, check_positions, rows_within
 
 log = logging.getLogger("lnocl")
-
-MAX_AXIS = 8192
 
 # Below this share of its maximum the total weight of a pixel of the extended source is taken as
 # "not observed" (the threshold of Bertero & Boccacci 2005, A&A 437, 369, for boundary effects).
@@ -42,7 +40,7 @@ EDGE = 3.0
 
 
 class Scene:
-    """What is modelled, on a grid of powers of two, scaled to images of about unit mean.
+    """What is modelled, on a grid that the transform takes, scaled to images of about unit mean.
 
     The scale of images and background is a power of two, so that it changes no digit. Exposures
     are taken relative to their mean: as ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j`` is linear,
@@ -67,7 +65,7 @@ class Scene:
     Attributes
     ----------
     grid : tuple of int
-        Shape (Ny, Nx) of the grid, powers of two; the images lie at its origin.
+        Shape (Ny, Nx), `lnocl.scene.grid.LENGTHS`; the images lie at its origin.
     stars : ndarray of float64, shape (n, 2)
         Positions.
     scale : float
@@ -410,30 +408,6 @@ def _mean(name: str, values: Array, n: int) -> float:
     if not math.isfinite(2.0 * mean):  # the power of two above it
         raise InputError(f"the {name} are too large to be summed: divide them by a constant")
     return mean
-
-
-def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
-    """Return the shape (Ny, Nx) of the grid of a scene.
-
-    Raises
-    ------
-    InputError
-        `pad` is out of range, or the images are too large for the transform.
-    """
-    if isinstance(pad, str) and pad == "auto":
-        pad = choose_pad(observation)
-        reason = "light runs" if pad else "no light runs"
-        log.info("pad chosen: %d pixels, as %s over the edge of the images", pad, reason)
-    shape = observation.shape
-    if not (isinstance(pad, (int, np.integer)) and pad >= 0):
-        raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
-    ny, nx = (max(2, 1 << (n + 2 * int(pad) - 1).bit_length()) for n in shape)
-    if max(ny, nx) > MAX_AXIS:
-        raise InputError(
-            f"images of {shape} with pad={pad} need a grid of {(ny, nx)}; "
-            f"the largest axis is {MAX_AXIS}: cut the images or pad less"
-        )
-    return ny, nx
 
 
 def _check_start(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

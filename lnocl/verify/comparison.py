@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lnocl import reference
 from lnocl.errors import DeviceError
-from lnocl.opencl.layout import bit_reversed
+from lnocl.opencl.layout import reversed_order
 from lnocl.verify.harness import KernelHarness, rounded
 
 # What a kernel made, and what its twin made of the same.
@@ -80,11 +80,11 @@ def _run_fft_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     out = harness.put(harness.layout.pack_columns(given.columns))
     harness.launch("fft_columns", spectra=out)
     found = harness.layout.unpack_columns(harness.take(out, harness.layout.spectra_shape))
-    yield found, reference.fft_columns(given.columns)[bit_reversed(harness.grid[0])]
+    yield found, reference.fft_columns(given.columns)[reversed_order(harness.grid[0])]
 
 
 def _run_ifft_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    order = bit_reversed(harness.grid[0])
+    order = reversed_order(harness.grid[0])
     out = harness.put(harness.layout.pack_columns(given.columns[order]))
     harness.launch("ifft_columns", spectra=out)
     found = harness.layout.unpack_columns(harness.take(out, harness.layout.spectra_shape))

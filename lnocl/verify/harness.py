@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from lnocl.errors import DeviceError
 from lnocl.opencl.launch import READ_WRITE, Launcher
-from lnocl.opencl.layout import Layout, bit_reversed
+from lnocl.opencl.layout import Layout, reversed_order
 from lnocl.opencl.program import Program, Tuning
 from lnocl.scene.scene import MIN_MODEL
 
@@ -159,7 +159,7 @@ class KernelHarness:
     def otf_parts(self, otf: NDArray) -> tuple[NDArray, NDArray]:
         """Return an OTF (Ny, Nx // 2 + 1) as the kernels keep it: columns and edge."""
         ny = self.grid[0]
-        order = bit_reversed(ny)
+        order = reversed_order(ny)
         columns = self.layout.columns_of(otf)
         columns[:, 0] = (otf[:, 0] + otf[:, -1]) / 2
         edge = ((otf[:, 0] - otf[:, -1]) / 2)[order]

@@ -84,7 +84,7 @@ COMPLAINTS = {
     "--n-iter at most": (["--n-iter", "3000000000"], "--n-iter must be 2147483646 at most; 3000"),
     "--stop": (["--stop", "2"], "--stop 2.0 is not known; give held-out, discrepancy, none"),
     "--pad": (["--pad", "-1"], "--pad must be a whole number, 0 or more, or auto; -1 was given"),
-    "--pad grid": (["--pad", "5000"], "with --pad 5000 need a grid of (16384, 16384)"),
+    "--pad grid": (["--pad", "5000"], "with --pad 5000 need a grid of (10016, 10012)"),
     "--engine": (["--device", "0"], "--engine numpy uses no device; leave --device '0' out"),
     "--smoothing word": (["--smoothing", "much"], "--smoothing 'much' is not known; give a number"),
     "--checkpoint-every": (

@@ -9,14 +9,20 @@ import scipy.fft
 
 from lnocl.opencl.device import choose
 from lnocl.opencl.launch import roots
-from lnocl.opencl.layout import bit_reversed
+from lnocl.opencl.layout import reversed_order
 from lnocl.opencl.program import radices
 from lnocl.opencl.transform import Transform
 
-SQUARES = [(n, n) for n in (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)]
+POWERS = [(n, n) for n in (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)]
+# Each odd factor with one, two and three passes within.
+ODD = [(n, n) for n in (48, 80, 112, 144, 192, 320, 448, 576, 1536, 1280, 1792, 1152)]
+SQUARES = POWERS + ODD
 OBLONGS = [
     (4096, 2),
     (8192, 4),
+    (6144, 2),
+    (5120, 2),
+    (4608, 4),
     (2, 4096),
     (4, 8192),
     (16, 2),
@@ -25,13 +31,20 @@ OBLONGS = [
     (512, 32),
     (32, 256),
     (1024, 128),
+    (7168, 2),
+    (2, 7168),
+    (16, 4608),
+    (48, 256),
+    (256, 1792),
+    (2560, 144),
+    (80, 144),
 ]
 GRIDS = SQUARES + OBLONGS
-# Columns are the transform in one dimension; these grids have every length from 2 to 8192.
-LENGTHS = sorted({ny: (ny, nx) for ny, nx in SQUARES + OBLONGS[:2]}.values())
+# Columns are the transform in one dimension; these grids have every power of two from 2 to 8192.
+COLUMNS = sorted({ny: (ny, nx) for ny, nx in SQUARES + OBLONGS[:5]}.values())
 DTYPES = (np.float32, np.float64)
 # One, two and three passes; a square in double, too. CI runs all.
-FEW = [(64, 8), (128, 128)]
+FEW = [(64, 8), (128, 128), (80, 144)]
 FEW_DOUBLE = [(128, 128)]
 ACCURATE_L2 = {np.float32: 5e-7, np.float64: 1e-15}
 
@@ -85,7 +98,7 @@ def columns_of(grid, dtype):
     return rounded(rng.normal(size=shape) + 1j * rng.normal(size=shape), dtype)
 
 
-@pytest.mark.parametrize(("grid", "dtype"), runs(LENGTHS))
+@pytest.mark.parametrize(("grid", "dtype"), runs(COLUMNS))
 def test_one_dimension(grid, dtype):
     t, columns, n = transform(grid, dtype), columns_of(grid, dtype), grid[0]
     before = columns.copy()
@@ -146,7 +159,7 @@ class TestIdentities:
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_error_grows_as_the_root_of_the_logarithm(dtype, record_property):
     """RMS error = c (log2 N)^power against long double; the power is reported, about 1/2."""
-    grids = [grid for grid in LENGTHS if grid[0] >= 32]
+    grids = [grid for grid in COLUMNS if grid[0] >= 32]
     exact = [scipy.fft.fft(columns_of(g, dtype).astype(np.clongdouble), axis=0) for g in grids]
     errors = [
         float(l2(transform(g, dtype).fft(columns_of(g, dtype)), e))
@@ -173,19 +186,38 @@ def test_window_is_the_shortest_run_of_blocks_round_the_edge(rows, count):
     assert held[layout.rows_of(first, count)].sum() == held.sum()
 
 
-def test_bit_reversed_order():
-    assert bit_reversed(8).tolist() == [0, 4, 2, 6, 1, 5, 3, 7]
+@pytest.mark.parametrize(
+    ("n", "order"),
+    [
+        (8, [0, 4, 2, 6, 1, 5, 3, 7]),
+        (12, [0, 6, 3, 9, 1, 7, 4, 10, 2, 8, 5, 11]),
+        (5, [0, 1, 2, 3, 4]),
+    ],
+)
+def test_reversed_order(n, order):
+    assert reversed_order(n).tolist() == order
 
 
 @pytest.mark.parametrize(
     ("n", "passes"),
-    [(2, (2, 1)), (4, (4, 1)), (16, (4, 4)), (32, (8, 4)), (512, (8, 8)), (1024, (4, 4))],
+    [
+        (2, (1, 2, 1)),
+        (4, (1, 4, 1)),
+        (16, (1, 4, 4)),
+        (32, (1, 8, 4)),
+        (512, (1, 8, 8)),
+        (1024, (1, 4, 4)),
+        (48, (3, 3, 2)),
+        (160, (5, 5, 4)),
+        (1152, (9, 9, 2)),
+        (7168, (7, 7, 2)),
+    ],
 )
 def test_radices_and_their_roots(n, passes):
     assert radices(n) == passes
-    outer, last = passes
-    table = roots(n, outer, last).reshape(-1, 2)
-    count, length = n // outer * (outer - 1), n // outer
+    odd, outer, last = passes
+    table = roots(n, *passes).reshape(-1, 2)
+    count, length = n // outer * (outer - 1) + (odd if odd > 1 else 0), n // outer
     while length > last:
         count, length = count + length // 8 * 7, length // 8
     assert len(table) == count

@@ -48,7 +48,7 @@ def test_auto_is_that_pad_and_is_announced(engine, caplog):
     assert words in caplog.messages
     expected = paper(observation, pad=7, n_iter=2, engine=engine)
     np.testing.assert_array_equal(found.extended, expected.extended)
-    assert Scene(observation, pad="auto").grid == (128, 128)
+    assert Scene(observation, pad="auto").grid == (80, 80)
 
 
 def test_auto_is_no_pad_where_no_light_runs_over_the_edge(caplog):

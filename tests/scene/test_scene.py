@@ -8,8 +8,9 @@ from astropy.nddata import CCDData
 from scenes import Recipe, make_psfs, paper
 
 import lnocl
+from lnocl.scene.grid import MAX_AXIS
 from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import MAX_AXIS, Scene
+from lnocl.scene.scene import Scene
 
 SHAPE = (8, 16)
 OBSERVATION = lnocl.Observation(np.full((2, *SHAPE), 5.0), make_psfs(2, (3, 4)))
@@ -24,14 +25,18 @@ OBSERVATION = lnocl.Observation(np.full((2, *SHAPE), 5.0), make_psfs(2, (3, 4)))
         ((1, 1), 0, (2, 2)),
         ((2, 3), 0, (2, 4)),
         ((64, 32), 0, (64, 32)),
-        ((64, 32), 1, (128, 64)),
+        ((64, 32), 1, (80, 48)),
         ((60, 30), 1, (64, 32)),
-        ((60, 30), 2, (64, 64)),
+        ((60, 30), 2, (64, 48)),
         ((120, 120), 0, (128, 128)),
+        ((33, 65), 0, (48, 80)),
+        ((129, 225), 0, (144, 256)),
+        ((100, 100), 60, (224, 224)),
+        ((513, 1025), 0, (576, 1152)),
         ((1, MAX_AXIS), 0, (2, MAX_AXIS)),
     ],
 )
-def test_grid_is_the_next_power_of_two(shape, pad, grid):
+def test_grid_is_the_least_that_the_transform_takes(shape, pad, grid):
     scene = Scene(lnocl.Observation(np.ones(shape), np.ones((1, 1))), pad=pad)
     assert scene.grid == grid
     assert (scene.weights is None) == (shape == grid)
@@ -254,7 +259,7 @@ REFUSED = {
     ),
     "text for pad": ({"pad": "1"}, "pad must be a whole number, 0 or more, or auto; 1 was given"),
     "several pads": ({"pad": np.ones((2, 2), int)}, "pad"),
-    "pad too large": ({"pad": MAX_AXIS // 2}, "with pad=4096 need a grid of (16384, 16384)"),
+    "pad too large": ({"pad": MAX_AXIS // 2}, "with pad=4096 need a grid of (8200, 8208)"),
     "start of another shape": (
         {"initial_extended": np.ones((8, 15))},
         "initial_extended has shape",

@@ -1,0 +1,63 @@
+"""The grid of the transform: the lengths that its axes may have, and which of them a scene has."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from lnocl.errors import InputError
+from lnocl.scene.observation import Observation
+from lnocl.scene.padding import choose_pad
+
+log = logging.getLogger("lnocl")
+
+MAX_AXIS = 8192
+# Odd factors of an axis, and the least power of two beside them: a transform takes blocks of 8
+# columns, and one of each pair (k, -k). With 11, 13 and 15 an iteration takes about as long as on
+# the next of these lengths (docs/speed.md).
+ODD_FACTORS = 1, 3, 5, 7, 9
+MIN_EVEN = 16
+
+LENGTHS = sorted(
+    odd << k
+    for odd in ODD_FACTORS
+    for k in range(1, MAX_AXIS.bit_length())
+    if odd << k <= MAX_AXIS and (odd == 1 or 1 << k >= MIN_EVEN)
+)
+
+
+def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
+    """Return the shape (Ny, Nx) of the grid of a scene.
+
+    Raises
+    ------
+    InputError
+        `pad` is out of range, or the images are too large for the transform.
+    """
+    if isinstance(pad, str) and pad == "auto":
+        pad = choose_pad(observation)
+        reason = "light runs" if pad else "no light runs"
+        log.info("pad chosen: %d pixels, as %s over the edge of the images", pad, reason)
+    shape = observation.shape
+    if not (isinstance(pad, (int, np.integer)) and pad >= 0):
+        raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
+    ny, nx = (n + 2 * int(pad) for n in shape)
+    if max(ny, nx) > MAX_AXIS:
+        raise InputError(
+            f"images of {shape} with pad={pad} need a grid of {(ny, nx)}; "
+            f"the largest axis is {MAX_AXIS}: cut the images or pad less"
+        )
+    return length_for(ny), length_for(nx)
+
+
+def length_for(n: int) -> int:
+    """Return the least length of an axis that holds n points.
+
+    Examples
+    --------
+    >>> from lnocl.scene.grid import length_for
+    >>> [length_for(n) for n in (5, 70, 100, 513, 1100)]
+    [8, 80, 112, 576, 1152]
+    """
+    return next(length for length in LENGTHS if length >= n)
