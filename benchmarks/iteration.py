@@ -29,7 +29,7 @@ import sides
 from astropy.table import Table, vstack
 from machine import bytes_moved, measure, operations
 
-import lnocl.opencl.program
+from lnocl.opencl import program
 from lnocl.opencl.device import choose, describe
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
@@ -126,16 +126,16 @@ def compare_scenes(device, turns, size=1024, n_images=4):
 
 def without_objective(scene, device):
     """Return lnocl's iterations with kernels that leave the objective out."""
-    source = lnocl.program.source
+    source = program.source
     text = source()
     line = "*term = divergence(modelled, quotient);"
     assert text.count(line) == 1
     text = text.replace(line, "*term = 0;")
-    lnocl.program.source = lambda names: text
+    program.source = lambda: text
     try:
         return sides.Lnocl(scene, np.float32, device)
     finally:
-        lnocl.program.source = source
+        program.source = source
 
 
 def compare_steps(device, turns, n_images, size=1024):

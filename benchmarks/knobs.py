@@ -27,9 +27,9 @@ from iteration import facts, rows, take_turns
 from parts import paper
 from precision import scene
 
-import lnocl
 from lnocl.errors import DeviceError
 from lnocl.metrics import star_rows
+from lnocl.opencl import program
 from lnocl.opencl.device import choose, describe
 from lnocl.scene.scene import MIN_MODEL, Scene
 
@@ -126,26 +126,26 @@ class Knob:
 
     def turned(self):
         """Return a context in which lnocl builds its kernels so."""
-        text, build = lnocl.program.source(), lnocl.program._build
+        text, build = program.source(), program._build
         for old, new in self.text:
             assert old in text, old
             text = text.replace(old, new)
         changes = {
-            "source": lambda names: text,
+            "source": lambda: text,
             "_build": lambda context, text, options: build(
-                context, text, [*options, *self.options]
+                context, text, (*options, *self.options)
             ),
         }
         if self.last:
             changes["radices"] = self.radices
-        return patch.multiple(lnocl.program, **changes)
+        return patch.multiple(program, **changes)
 
     def radices(self, n):
-        """Return the radices of the outer and the last pass, as lnocl.program.radices does."""
+        """Return odd factor and radices, as lnocl.opencl.program.radices does; n a power of two."""
         outer = n // self.last
         while outer > 8:
             outer //= 8
-        return outer, self.last
+        return 1, outer, self.last
 
 
 KNOBS = {

@@ -15,7 +15,7 @@ from scenes import Recipe, worst
 
 from lnocl.opencl import launch, layout, program
 from lnocl.opencl.device import choose
-from lnocl.opencl.program import Tuning
+from lnocl.opencl.tuning import Tuning
 from lnocl.verify import comparison, harness
 
 DTYPES = {"s": np.float32, "d": np.float64}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lnocl.opencl.device import choose, context_of
-from lnocl.opencl.program import Tuning
+from lnocl.opencl.tuning import Tuning
 from lnocl.verify.comparison import ALLOWED, deviation, kernels_of
 from lnocl.verify.harness import SCENES, THREE_IMAGES, KernelHarness, inputs
 

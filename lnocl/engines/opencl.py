@@ -14,7 +14,8 @@ from lnocl.opencl.faults import guarded
 from lnocl.opencl.launch import Launch, Launcher
 from lnocl.opencl.layout import Layout
 from lnocl.opencl.memory import Memory, Transfer, announce, refuse_if_too_large
-from lnocl.opencl.program import Program, Tuning
+from lnocl.opencl.program import Program
+from lnocl.opencl.tuning import Tuning, describe_tuning
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Stamp
@@ -50,7 +51,7 @@ class OpenCLEngine:
     n_iter : int
         Most iterations that will be done: objectives are recorded for one more.
     tuning : Tuning, optional
-        By default that of `lnocl.opencl.program.tune`.
+        By default that of `lnocl.opencl.tuning.tune`.
     scaling : Scaling, optional
         For the scaled gradient projection method, whose verbs need it.
     half : {0, 1}, optional
@@ -102,10 +103,12 @@ class OpenCLEngine:
             {**sizes, "scratch and roots": Launcher.bytes_needed(self.program)},
             1 if half is None else 2,
         )
+        tuned = describe_tuning(chosen, self.program.dtype)
         if half is None:
-            announce(chosen, self.bytes_needed, self._host_bytes())
+            announce(chosen, self.bytes_needed, self._host_bytes(), tuned)
         elif half == 0:
-            announce(chosen, 2 * self.bytes_needed, self._host_bytes() + self._bytes_of_halves())
+            host_bytes = self._host_bytes() + self._bytes_of_halves()
+            announce(chosen, 2 * self.bytes_needed, host_bytes, tuned)
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
         self._memory = Memory(self._queue, self.layout, scene.scale)

@@ -238,17 +238,23 @@ def discard(file: Path) -> None:
 
 
 def write(file: Path, content: bytes) -> None:
-    """Write content to its file, whole or not at all; a full disk leaves the file as it was."""
+    """Write kernels to their file, behind their checksum; remove the least used if all is much."""
+    replace(file, DIGEST(content).digest() + content)
+    with contextlib.suppress(OSError):
+        _trim(file.parent)
+
+
+def replace(file: Path, content: bytes) -> None:
+    """Write content to a file, whole or not at all; a full disk leaves the file as it was."""
     with contextlib.suppress(OSError):
         handle, part = tempfile.mkstemp(dir=file.parent, prefix=file.stem, suffix=".part")
         try:
             with os.fdopen(handle, "wb") as out:
-                out.write(DIGEST(content).digest() + content)
+                out.write(content)
             os.replace(part, file)
         except BaseException:
             os.unlink(part)
             raise
-        _trim(file.parent)
 
 
 def _trim(folder: Path) -> None:

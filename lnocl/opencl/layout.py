@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.opencl.program import Program, odd_part
+from lnocl.opencl.program import Program
+from lnocl.opencl.tuning import odd_part
 
 
 def reversed_order(n: int) -> NDArray[np.int64]:

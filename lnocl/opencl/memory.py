@@ -188,11 +188,12 @@ def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int], count: int)
     return total
 
 
-def announce(device: cl.Device, device_bytes: int, host_bytes: int) -> None:
-    """Log what a scene takes on a device and on the host."""
+def announce(device: cl.Device, device_bytes: int, host_bytes: int, tuned: str) -> None:
+    """Log what a scene takes on a device and on the host, and the tuning of the device."""
     log.info(
-        "%s: the scene takes %.1f MiB there, and up to %.0f MiB of the host's memory",
+        "%s: the scene takes %.1f MiB there, and up to %.0f MiB of the host's memory; %s",
         describe(device),
         device_bytes / 2**20,
         host_bytes / 2**20,
+        tuned,
     )

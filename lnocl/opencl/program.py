@@ -7,7 +7,6 @@ import re
 import weakref
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import cast
@@ -19,6 +18,7 @@ from lnocl.errors import DeviceError
 from lnocl.opencl import kernel_cache, linking, unknown_cpu
 from lnocl.opencl.device import describe, has_double
 from lnocl.opencl.faults import after_fault, build_failure
+from lnocl.opencl.tuning import Tuning, odd_part, scratch_points, tune
 from lnocl.process import LOCK, ignored_warnings
 
 # In the order in which they build on each other.
@@ -46,35 +46,6 @@ STAR_ROOMS = (0, 1, 8, 64, 512, 4096)
 MAX_PROGRAMS = 16
 
 
-@dataclass(frozen=True)
-class Tuning:
-    """The cut of the kernels to a device; kernels/precision.cl explains each constant.
-
-    Attributes
-    ----------
-    lanes, block, group, chunk : int
-        Reals in a vector; columns transformed together; work-items that share a block; points
-        of a transform that are finished before the next ones.
-    padding : int
-        Rows of padding behind a block of spectra. They keep neighbouring blocks from falling on
-        the same cache sets.
-    scratch_is_global : bool
-        Whether a block lies in global memory while it is transformed, not in local memory.
-    """
-
-    lanes: int
-    block: int
-    group: int = 1
-    chunk: int = 128
-    padding: int = 16
-    scratch_is_global: bool = False
-
-
-def odd_part(n: int) -> int:
-    """Return the largest odd factor of a length."""
-    return n // (n & -n)
-
-
 def radices(n: int) -> tuple[int, int, int]:
     """Return the odd factor of n points, and the radices of the outer and the last pass.
 
@@ -86,38 +57,6 @@ def radices(n: int) -> tuple[int, int, int]:
     while last > 8:
         last //= 8
     return odd, outer, last
-
-
-def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
-    """Return the tuning for this kind of device.
-
-    A CPU takes a block as one vector in one work-item; other devices take scalars in a group of
-    work-items. Small grids have smaller blocks, so that no block is ever filled in part.
-    """
-    most = min(n // odd_part(n) for n in grid) // 2
-    if device.type & cl.device_type.CPU:
-        lanes = min(32 // dtype.itemsize, most)  # 256 bits, benchmarks/tune.py
-        block, group = lanes, 1
-    else:
-        lanes, block = 1, min(8, most)
-        group = _power_of_2_up_to(max(1, min(128, min(grid) // 8, device.max_work_group_size)))
-    needed = local_bytes(grid, dtype, block, group)
-    return Tuning(lanes, block, group, scratch_is_global=needed > device.local_mem_size)
-
-
-def local_bytes(grid: tuple[int, int], dtype: np.dtype, block: int, group: int) -> int:
-    """Return the bytes of local memory of a work-group: its block, and a sum for each item."""
-    sums = 2 * group if group > 1 else 0
-    return (scratch_points(grid) * 2 * block + sums) * dtype.itemsize
-
-
-def scratch_points(grid: tuple[int, int]) -> int:
-    """Return the points of a block that a work-group holds while it transforms."""
-    return max(grid[1], 2 * grid[0])
-
-
-def _power_of_2_up_to(n: int) -> int:
-    return 1 << (n.bit_length() - 1)
 
 
 class Program:
@@ -135,7 +74,7 @@ class Program:
     dtype : numpy.dtype
         float32 or float64.
     tuning : Tuning, optional
-        By default that of `tune`.
+        By default that of `lnocl.opencl.tuning.tune`.
     n_stars : int, optional
         Stars of the scene, at most 4096; the program has room for more.
     has_mu, has_smoothing, has_weights, has_background_map, has_exposure_map : bool, optional

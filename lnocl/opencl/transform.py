@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from lnocl.opencl.launch import READ_WRITE, Launch, Launcher
 from lnocl.opencl.layout import Layout, reversed_order
-from lnocl.opencl.program import Program, Tuning
+from lnocl.opencl.program import Program
+from lnocl.opencl.tuning import Tuning
 
 
 class Transform:
@@ -23,7 +24,7 @@ class Transform:
     dtype : numpy.dtype
         float32 or float64.
     tuning : Tuning, optional
-        By default that of `lnocl.opencl.program.tune`.
+        By default that of `lnocl.opencl.tuning.tune`.
     """
 
     def __init__(

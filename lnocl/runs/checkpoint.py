@@ -17,7 +17,7 @@ import numpy as np
 from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.atomic import check_output, whole_file
 from lnocl.runs.held_out import HeldOutCounts
-from lnocl.runs.run import Run, Setup, engine_name
+from lnocl.runs.run import Run, Setup, engine_name, tuning_name
 from lnocl.runs.saved import Saved
 from lnocl.runs.stopping import Rule
 from lnocl.scene.arrays import numbers
@@ -79,7 +79,7 @@ def describe(observation: Observation, setup: Setup, **parameters: Any) -> dict[
         **vars(setup),
         **parameters,
     }
-    bound["device"] = engine_name(setup)
+    bound |= {"device": engine_name(setup), "tuning": tuning_name(setup)}
     return {name: _describe(name, value) for name, value in bound.items()}
 
 

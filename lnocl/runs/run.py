@@ -350,6 +350,17 @@ def engine_name(setup: Setup) -> str:
     return device.describe(device.choose(setup.device).device)
 
 
+def tuning_name(setup: Setup) -> str:
+    """Return the name of the tuning of a run, on which its last digits hang; "" with NumPy."""
+    if setup.engine == "numpy":
+        return ""
+    from lnocl.opencl import device, tuning
+
+    dtype = np.dtype(np.float64 if setup.precision == "double" else np.float32)
+    chosen = device.choose(setup.device).device
+    return tuning.in_words(tuning.chosen(chosen, dtype), dtype)
+
+
 def _make_engine(
     setup: Setup, scene: Scene, n_iter: int, scaling: Scaling | None, half: int | None
 ) -> Engine:

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from lnocl.errors import DeviceError
 from lnocl.opencl.launch import READ_WRITE, Launcher
 from lnocl.opencl.layout import Layout, reversed_order
-from lnocl.opencl.program import Program, Tuning
+from lnocl.opencl.program import Program
+from lnocl.opencl.tuning import Tuning
 from lnocl.scene.scene import MIN_MODEL
 
 # Scenes with all parts, together, that a program can have.

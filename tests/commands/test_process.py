@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 from astropy.io import fits
 from commandline import GIVEN, NUMPY, PAPER, SHAPE, outside, run
@@ -15,7 +16,9 @@ from commandline import GIVEN, NUMPY, PAPER, SHAPE, outside, run
 import lnocl
 from lnocl.commands import cli
 from lnocl.opencl import device
+from lnocl.opencl.tuning import candidates, chosen, describe_tuning
 from lnocl.runs.progress import Bar
+from lnocl.studies import tuning
 
 pytestmark = pytest.mark.usefixtures("command_folder")
 
@@ -159,8 +162,34 @@ class TestDevices:
         assert cli.main(["devices"]) == 0
         *listed, used = capsys.readouterr().out.splitlines()
         found = device.find_devices()
-        assert listed == [f"{device.spec_of(each)} {device.describe(each)}" for each in found]
+        dtype = np.dtype(np.float32)
+        assert listed == [
+            f"{device.spec_of(each)} {device.describe(each)}; {describe_tuning(each, dtype)}"
+            for each in found
+        ]
         choice = device.choose(None)
         assert used == (
             f"lnocl uses {device.spec_of(choice.device)} unless told otherwise: {choice.reason}"
         )
+
+    def test_what_is_fastest_is_measured_once_and_taken_from_then_on(
+        self, capsys, monkeypatch, tmp_path
+    ):
+        """The times are made up: the second tuning is the faster one in single precision alone."""
+        monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+        tried = {np.dtype(t): candidates(device.choose().device, np.dtype(t)) for t in "fd"}
+
+        def measure(spec):
+            for dtype, ratio in zip(tried, (0.8, 0.98), strict=True):
+                first, second, *_ = tried[dtype]
+                yield dtype, [tuning.Timed(first, 5.0, 1.0), tuning.Timed(second, 4.0, ratio)]
+
+        monkeypatch.setattr(tuning, "measure", measure)
+        assert cli.main(["devices", "--tune"]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.endswith("<- taken from now on") for line in lines[1:5]] == [0, 1, 1, 0]
+        assert lines[-1] == f"stored in {tmp_path / 'tunings.json'}"
+        assert cli.main(["devices"]) == 0
+        assert ", as measured" in capsys.readouterr().out
+        for dtype, index in zip(tried, (1, 0), strict=True):
+            assert chosen(device.choose().device, dtype) == tried[dtype][index]

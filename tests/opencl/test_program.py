@@ -1,50 +1,13 @@
 """Which programs are built, with which tuning, and which of them a process holds."""
 
-from types import SimpleNamespace
-
 import numpy as np
-import pyopencl as cl
 import pytest
 
 import lnocl
 from lnocl.opencl import program
 from lnocl.opencl.device import choose, context_of
-from lnocl.opencl.program import Program, Tuning, tune
-
-KIB = 1024
-
-
-def device(kind, local_kib):
-    return SimpleNamespace(type=kind, local_mem_size=local_kib * KIB, max_work_group_size=256)
-
-
-@pytest.mark.parametrize("local_kib", [256, 1024, 2048, 65536])
-@pytest.mark.parametrize(
-    ("grid", "dtype", "needed_kib"),
-    [
-        ((64, 64), np.float32, 8),
-        ((1024, 1024), np.float32, 128),
-        ((2048, 4096), np.float32, 256),
-        ((8192, 64), np.float64, 1024),
-        ((8192, 8192), np.float64, 1024),
-    ],
-)
-def test_scratch_is_global_where_a_block_does_not_fit_in_local_memory(
-    grid, dtype, needed_kib, local_kib
-):
-    tuning = tune(device(cl.device_type.CPU, local_kib), np.dtype(dtype), grid)
-    assert tuning.block * np.dtype(dtype).itemsize == 32
-    assert tuning.scratch_is_global == (needed_kib > local_kib)
-
-
-def test_a_group_needs_room_for_its_sums_beside_the_block():
-    """A block of 64 KiB, and 128 sums: no more than the block would fit."""
-    gpu = device(cl.device_type.GPU, 64)
-    tuning = tune(gpu, np.dtype(np.float32), (512, 1024))
-    assert (tuning.block, tuning.group) == (8, 64)
-    assert tuning.scratch_is_global
-    gpu.local_mem_size += 2 * 64 * 4
-    assert not tune(gpu, np.dtype(np.float32), (512, 1024)).scratch_is_global
+from lnocl.opencl.program import Program
+from lnocl.opencl.tuning import Tuning
 
 
 @pytest.fixture

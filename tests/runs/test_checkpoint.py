@@ -220,9 +220,9 @@ def test_a_checkpoint_of_another_run_is_refused(name, saved):
         made.deconvolve(**changed)
 
 
-def test_another_device_or_version_is_refused(saved, tmp_path):
+def test_another_device_version_or_tuning_is_refused(saved, tmp_path):
     found = checkpoint.read(saved)
-    for name in ("device", "version"):
+    for name in ("device", "version", "tuning"):
         path = str(tmp_path / f"{name}.fits")
         checkpoint.write(path, found.described | {name: "'other'"}, found.ended, found.arrays)
         with pytest.raises(lnocl.InputError, match=f"of another run: {name} differs; repeat"):

@@ -1,0 +1,158 @@
+"""The cut of the kernels to a device: what was measured there, else what is safe anywhere."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import stat
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+
+from lnocl.errors import warn
+from lnocl.opencl import kernel_cache
+from lnocl.opencl.device import describe
+
+FILE = "tunings.json"
+MAX_BYTES = 2**16
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """The cut of the kernels to a device; kernels/precision.cl explains each constant.
+
+    Attributes
+    ----------
+    lanes, block, group, chunk : int
+        Reals in a vector; columns transformed together; work-items that share a block; points
+        of a transform that are finished before the next ones.
+    padding : int
+        Rows of padding behind a block of spectra. They keep neighbouring blocks from falling on
+        the same cache sets.
+    scratch_is_global : bool
+        Whether a block lies in global memory while it is transformed, not in local memory.
+    """
+
+    lanes: int
+    block: int
+    group: int = 1
+    chunk: int = 128
+    padding: int = 16
+    scratch_is_global: bool = False
+
+    def fit(self, device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
+        """Return the tuning for a grid: small grids have smaller blocks, none filled in part."""
+        most = min(n // odd_part(n) for n in grid) // 2
+        block = min(self.block, most)
+        group = min(self.group, _power_of_2_up_to(max(1, min(grid) // 8)))
+        needed = local_bytes(grid, dtype, block, group)
+        is_global = self.scratch_is_global or needed > device.local_mem_size
+        lanes = min(self.lanes, most)
+        return replace(self, lanes=lanes, block=block, group=group, scratch_is_global=is_global)
+
+
+def odd_part(n: int) -> int:
+    """Return the largest odd factor of a length."""
+    return n // (n & -n)
+
+
+def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
+    """Return the tuning of a device for a grid: what was measured there, else the default."""
+    return chosen(device, dtype).fit(device, dtype, grid)
+
+
+def chosen(device: cl.Device, dtype: np.dtype) -> Tuning:
+    """Return the tuning of a device for large grids."""
+    return measured(device, dtype) or candidates(device, dtype)[0]
+
+
+def candidates(device: cl.Device, dtype: np.dtype) -> list[Tuning]:
+    """Return the tunings that may be fastest on a device, first the one that is safe anywhere.
+
+    A CPU takes a block as one vector in one work-item, of 256 or 512 bits; other devices take
+    scalars in a group of work-items.
+    """
+    if device.type & cl.device_type.CPU:
+        lanes = (n_bytes // dtype.itemsize for n_bytes in (32, 64))
+        return [Tuning(n, n) for n in lanes]
+    most = _power_of_2_up_to(device.max_work_group_size)
+    groups = dict.fromkeys(min(n, most) for n in (128, 32, 64, 256))
+    return [Tuning(1, 8, group) for group in groups]
+
+
+def measured(device: cl.Device, dtype: np.dtype) -> Tuning | None:
+    """Return the fastest of `candidates` as it was measured, or None where it was not.
+
+    Warns
+    -----
+    LnoclWarning
+        The file of what was measured is damaged.
+    """
+    known = _read().get(describe(device), {})
+    words = known.get(dtype.name) if isinstance(known, dict) else None
+    return next((each for each in candidates(device, dtype) if asdict(each) == words), None)
+
+
+def store(device: cl.Device, fastest: Mapping[np.dtype, Tuning]) -> Path:
+    """Store the fastest tunings of a device, by precision; return the file.
+
+    Warns
+    -----
+    LnoclWarning
+        Its folder cannot be written to.
+    """
+    file = kernel_cache.store() / FILE
+    known = _read() | {describe(device): {dtype.name: asdict(t) for dtype, t in fastest.items()}}
+    if kernel_cache.can_write(file.parent):
+        kernel_cache.replace(file, json.dumps(known, indent=1).encode("ascii"))
+    return file
+
+
+def in_words(tuning: Tuning, dtype: np.dtype) -> str:
+    """Return the width of the vectors, or the size of the work-groups, of a tuning."""
+    if tuning.group > 1 or tuning.lanes == 1:
+        return f"work-groups of {tuning.group}"
+    return f"vectors of {8 * dtype.itemsize * tuning.lanes} bits"
+
+
+def describe_tuning(device: cl.Device, dtype: np.dtype) -> str:
+    """Return the tuning of a device in words, and whether it was measured."""
+    words = in_words(chosen(device, dtype), dtype)
+    if measured(device, dtype):
+        return f"{words}, as measured"
+    return f"{words}; lnocl devices --tune measures whether others are faster"
+
+
+def _read() -> dict[str, object]:
+    """Return what was measured, by device and precision."""
+    file = kernel_cache.store() / FILE
+    with contextlib.suppress(OSError):
+        state = file.stat()
+        if not stat.S_ISREG(state.st_mode) or state.st_size > MAX_BYTES:
+            return {}
+        try:
+            known = json.loads(file.read_bytes())
+        except ValueError:
+            known = None
+        if isinstance(known, dict):
+            return known
+        warn(f"the tunings in {file} are damaged, and not used; run lnocl devices --tune again")
+    return {}
+
+
+def local_bytes(grid: tuple[int, int], dtype: np.dtype, block: int, group: int) -> int:
+    """Return the bytes of local memory of a work-group: its block, and a sum for each item."""
+    sums = 2 * group if group > 1 else 0
+    return (scratch_points(grid) * 2 * block + sums) * dtype.itemsize
+
+
+def scratch_points(grid: tuple[int, int]) -> int:
+    """Return the points of a block that a work-group holds while it transforms."""
+    return max(grid[1], 2 * grid[0])
+
+
+def _power_of_2_up_to(n: int) -> int:
+    return 1 << (n.bit_length() - 1)

@@ -1,0 +1,78 @@
+"""The work of ``lnocl devices --tune``: iterations timed with each tuning of a device."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lnocl.engines.opencl import OpenCLEngine
+from lnocl.opencl.device import choose, has_double
+from lnocl.opencl.tuning import Tuning, candidates
+from lnocl.scene.observation import Observation
+from lnocl.scene.scene import Scene
+
+SIZE, N_IMAGES, TURNS, SECONDS_A_TURN = 1024, 4, 7, 0.1
+MOST_A_TURN = 1000
+MOST = (TURNS + 2) * MOST_A_TURN
+PRECISIONS: dict[str, np.dtype[Any]] = {
+    "single": np.dtype(np.float32),
+    "double": np.dtype(np.float64),
+}
+# A tuning is taken in the place of the safe one if it takes less than this share of its time.
+WORTH = 0.97
+
+
+class Timed(NamedTuple):
+    """A tuning, its milliseconds an iteration, and their ratio to those of the safe one."""
+
+    tuning: Tuning
+    ms: float
+    ratio: float
+
+
+def fastest(timed: list[Timed]) -> Tuning:
+    """Return the tuning to take: the fastest, or the first where that is no faster to speak of."""
+    best = min(timed, key=lambda each: each.ratio)
+    return best.tuning if best.ratio < WORTH else timed[0].tuning
+
+
+def measure(spec: str | None) -> Iterator[tuple[np.dtype, list[Timed]]]:
+    """Yield each precision that a device has, and its tunings timed on 4 images of 1024 x 1024.
+
+    All take turns; the ratio is the median of each turn's.
+    """
+    device, rng = choose(spec).device, np.random.default_rng(0)
+    axis = np.arange(-32, 32) ** 2
+    psf = np.exp(-(axis[:, None] + axis) / 20.0)
+    observation = Observation(rng.poisson(100.0, (N_IMAGES, SIZE, SIZE)), psf, background=10.0)
+    scene = Scene(observation, pad=0)
+    for precision, dtype in PRECISIONS.items():
+        if precision == "double" and not has_double(device):
+            continue
+        tried = candidates(device, dtype)
+        runs = [_Run(scene, precision, spec, each.fit(device, dtype, scene.grid)) for each in tried]
+        times = np.array([[run.time() for run in runs] for _ in range(TURNS)])
+        ratios = np.median(times / times[:, :1], axis=0)
+        yield dtype, list(map(Timed, tried, 1e3 * np.median(times, axis=0), ratios))
+
+
+class _Run:
+    def __init__(self, scene: Scene, precision: str, spec: str | None, tuning: Tuning) -> None:
+        self._engine = OpenCLEngine(scene, precision, spec, MOST, tuning)
+        self._engine.start(*scene.start(None, None))
+        self._count = 1
+        self.time()  # which compiles
+        self._count = max(1, min(MOST_A_TURN, round(SECONDS_A_TURN / self.time())))
+
+    def time(self) -> float:
+        """Return the seconds of an iteration."""
+        start = time.perf_counter()
+        for _ in range(self._count):
+            self._engine.ratio()
+            self._engine.correct()
+            self._engine.scale()
+        self._engine.objectives()  # which waits for them
+        return (time.perf_counter() - start) / self._count

@@ -1,0 +1,123 @@
+"""Which tuning a device has: the default, or the one that was measured and stored."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import lnocl
+from lnocl.opencl import tuning as module
+from lnocl.opencl.tuning import candidates, in_words, measured, store, tune
+
+KIB = 1024
+SINGLE, DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
+
+
+def device(kind, local_kib, name="a device"):
+    return SimpleNamespace(
+        type=kind,
+        local_mem_size=local_kib * KIB,
+        max_work_group_size=256,
+        name=name,
+        platform=SimpleNamespace(name="a platform"),
+        driver_version="1.0",
+    )
+
+
+CPU, GPU = (device(kind, 1024) for kind in (cl.device_type.CPU, cl.device_type.GPU))
+
+
+@pytest.fixture(autouse=True)
+def folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+    return tmp_path
+
+
+@pytest.mark.parametrize("local_kib", [256, 1024, 2048, 65536])
+@pytest.mark.parametrize(
+    ("grid", "dtype", "needed_kib"),
+    [
+        ((64, 64), np.float32, 8),
+        ((1024, 1024), np.float32, 128),
+        ((2048, 4096), np.float32, 256),
+        ((8192, 64), np.float64, 1024),
+        ((8192, 8192), np.float64, 1024),
+    ],
+)
+def test_scratch_is_global_where_a_block_does_not_fit_in_local_memory(
+    grid, dtype, needed_kib, local_kib
+):
+    tuning = tune(device(cl.device_type.CPU, local_kib), np.dtype(dtype), grid)
+    assert tuning.block * np.dtype(dtype).itemsize == 32
+    assert tuning.scratch_is_global == (needed_kib > local_kib)
+
+
+def test_a_group_needs_room_for_its_sums_beside_the_block():
+    """A block of 64 KiB, and 128 sums: no more than the block would fit."""
+    gpu = device(cl.device_type.GPU, 64)
+    tuning = tune(gpu, np.dtype(np.float32), (512, 1024))
+    assert (tuning.block, tuning.group) == (8, 64)
+    assert tuning.scratch_is_global
+    gpu.local_mem_size += 2 * 64 * 4
+    assert not tune(gpu, np.dtype(np.float32), (512, 1024)).scratch_is_global
+
+
+def test_the_default_is_the_first_candidate():
+    assert tune(CPU, SINGLE, (512, 512)) == candidates(CPU, SINGLE)[0]
+    assert [in_words(each, SINGLE) for each in candidates(CPU, SINGLE)] == [
+        "vectors of 256 bits",
+        "vectors of 512 bits",
+    ]
+    assert in_words(candidates(CPU, DOUBLE)[0], DOUBLE) == "vectors of 256 bits"
+    assert [in_words(each, SINGLE) for each in candidates(GPU, SINGLE)] == [
+        f"work-groups of {n}" for n in (128, 32, 64, 256)
+    ]
+
+
+@pytest.mark.parametrize("given", [CPU, GPU], ids=["CPU", "GPU"])
+def test_what_was_measured_is_taken_for_this_device_and_precision_alone(given):
+    fastest = candidates(given, SINGLE)[1]
+    assert measured(given, SINGLE) is None
+    assert store(given, {SINGLE: fastest}).is_file()
+    assert measured(given, SINGLE) == fastest == tune(given, SINGLE, (512, 512))
+    assert measured(given, DOUBLE) is None
+    assert measured(device(given.type, 1024, "another"), SINGLE) is None
+    other = device(given.type, 1024, "another")
+    store(other, {SINGLE: candidates(other, SINGLE)[0]})
+    assert measured(given, SINGLE) == fastest
+
+
+@pytest.mark.parametrize("grid", [(2, 8192), (48, 80), (112, 64), (1024, 1024)])
+def test_blocks_fit_the_grid(grid):
+    store(CPU, {SINGLE: candidates(CPU, SINGLE)[1]})
+    tuning = tune(CPU, SINGLE, grid)
+    for n in grid:
+        assert n // module.odd_part(n) % (2 * tuning.block) == 0
+    assert tuning.lanes == tuning.block <= 16
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[", "[]", "3", '{"x": 1}', "\xff", '{"a device (a platform, 1.0)": [1]}']
+)
+def test_a_damaged_file_is_not_used(folder, content, recwarn):
+    (folder / module.FILE).write_text(content, encoding="latin1")
+    assert measured(CPU, SINGLE) is None
+    words = "; run lnocl devices --tune again"
+    assert all(words in str(each.message) for each in recwarn)
+    assert len(recwarn) == (not content.startswith("{"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lnocl.errors.warnings, "warn", lambda *_, **__: None)
+        store(CPU, {SINGLE: candidates(CPU, SINGLE)[1]})
+    assert measured(CPU, SINGLE) == candidates(CPU, SINGLE)[1]
+
+
+def test_a_tuning_that_is_no_candidate_is_not_used(folder):
+    store(CPU, {SINGLE: candidates(CPU, SINGLE)[1]})
+    file = folder / module.FILE
+    known = json.loads(file.read_text())
+    ((_, words),) = known["a device (a platform, 1.0)"].items()
+    words["lanes"] = 3
+    file.write_text(json.dumps(known))
+    assert measured(CPU, SINGLE) is None
