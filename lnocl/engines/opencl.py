@@ -325,8 +325,8 @@ class OpenCLEngine:
         squares[0] = np.einsum("yx,yx->", extended, extended)
         memory.upload("square_sums", squares)
         if self.scaling is not None:
-            memory.upload_pixels("previous", [extended])
-            memory.upload_pixels("gradient", [np.zeros_like(extended)])
+            memory.copy("extended", "previous")
+            memory.clear("gradient")
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""

@@ -77,6 +77,15 @@ class Memory:
             self.buffers.pop(name, None)  # first, lest the memory of both is taken
             self.buffers[name] = cl.Buffer(self._queue.context, READ_WRITE, size)
 
+    def copy(self, one: str, other: str) -> None:
+        """Copy a buffer to another of the same size."""
+        cl.enqueue_copy(self._queue, self.buffers[other], self.buffers[one])
+
+    def clear(self, name: str) -> None:
+        """Set all of a buffer to 0."""
+        buffer = self.buffers[name]
+        cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, self._layout.dtype), 0, buffer.size)
+
     def exchange(self, one: str, other: str) -> None:
         """Exchange the names of two buffers."""
         buffers = self.buffers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -13,6 +14,11 @@ from numpy.typing import NDArray
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Stamp
+
+# Rows and columns of the grid.
+Box = tuple[slice, slice]
+# A box is convolved by itself where what its PSF reaches is less than this share of the grid.
+SHARE_OF_GRID = 0.25
 
 # Rounding of an FFT, as a share of the largest value.
 ROUNDING = 1e-16
@@ -41,6 +47,8 @@ class Model:
         self.shape = (scene.n_images, *scene.grid)
         self._window_otfs: dict[Any, NDArray[np.complex128]] = {}
         self._psfs = [scene.psf_stamp(j) for j in range(scene.n_images)]
+        # What a flat array is multiplied by: it stays flat.
+        self._sums = np.array([psf.values.sum() for psf in self._psfs])
         self._otfs = [scipy.fft.rfft2(psf.on_grid(scene.grid), workers=-1) for psf in self._psfs]
         self.weights = np.broadcast_to(
             np.float64(1.0) if scene.weights is None else scene.weights.astype(np.float64),
@@ -51,18 +59,42 @@ class Model:
 
     def forward(self, extended: Array) -> Array:
         """Return the ``A_j f``, shape (p, Ny, Nx)."""
-        spectrum = scipy.fft.rfft2(extended, workers=-1)
         images = np.empty(self.shape)
+        if is_flat(extended):
+            images[:] = extended[0, 0] * self._sums[:, None, None]
+            return images
+        spectrum = scipy.fft.rfft2(extended, workers=-1)
         for image, otf in zip(images, self._otfs, strict=True):
             image[:] = scipy.fft.irfft2(otf * spectrum, image.shape, workers=-1, overwrite_x=True)
         return images
 
     def adjoint(self, arrays: Iterable[Array]) -> Array:
         """Return ``sum_j A_j^T x_j``, shape (Ny, Nx)."""
-        spectrum = np.zeros_like(self._otfs[0])
-        for array, otf in zip(arrays, self._otfs, strict=True):
-            spectrum += otf.conj() * scipy.fft.rfft2(array, workers=-1)
-        return scipy.fft.irfft2(spectrum, self.shape[1:], workers=-1, overwrite_x=True)
+        (total,) = self.adjoints(arrays, np.ones((1, self.shape[0])))
+        return total
+
+    def adjoints(self, arrays: Iterable[Array], factors: Array) -> Array:
+        """Return ``sum_j q_kj A_j^T x_j`` for each k, shape (k, Ny, Nx); q has shape (k, p).
+
+        It may be read-only: of arrays of one value each it is a view of one value, too.
+        """
+        flat, spectra = np.zeros(len(factors)), list[NDArray[np.complex128]]()
+        for j, (array, otf) in enumerate(zip(arrays, self._otfs, strict=True)):
+            if not any(array.strides):  # of one value, as weights are where all is observed
+                flat += factors[:, j] * self._sums[j] * array[0, 0]
+                continue
+            spectrum = scipy.fft.rfft2(array, workers=-1).conj()
+            spectrum *= otf
+            spectra = spectra or [np.zeros_like(otf) for _ in factors]
+            for total, factor in zip(spectra, factors[:, j], strict=True):
+                total += factor * spectrum
+        if not spectra:
+            return np.broadcast_to(flat[:, None, None], (len(flat), *self.shape[1:]))
+        back = [
+            scipy.fft.irfft2(each.conj(), self.shape[1:], workers=-1, overwrite_x=True)
+            for each in spectra
+        ]
+        return np.array(back) + flat[:, None, None]
 
     def adjoint_of_stamps(self, stamps: Sequence[Stamp]) -> Stamp:
         """Return ``sum_j A_j^T x_j`` of arrays x_j that are 0 beyond a stamp, one an image.
@@ -103,6 +135,41 @@ class Model:
             _illuminate(image, background, light)
         return images
 
+    def images_at(self, boxes: Sequence[Box], extended: Array) -> Array:
+        """Return the m_j without stars in a box of each; beyond it they may be 0."""
+        flat = is_flat(extended)
+        if not flat and any(map(self._is_large, boxes, self._psfs)):
+            return self.images(extended, np.zeros(self._scene.n_stars))
+        images = np.zeros(self.shape)
+        for j, (image, box) in enumerate(zip(images, boxes, strict=True)):
+            rows, columns = (range(side.start, side.stop) for side in box)
+            image[box] = np.broadcast_to(self.background[j], image.shape)[box]
+            if flat:
+                image[box] += self._sums[j] * extended[0, 0]
+            else:
+                image[box] += convolve_at(extended, self._psfs[j], rows, columns)
+            np.maximum(image[box], 0.0, out=image[box])
+        return images
+
+    def _is_large(self, box: Box, psf: Stamp) -> bool:
+        """Return whether the pixels that a box sees are a large share of the grid."""
+        sides = np.add([side.stop - side.start for side in box], psf.values.shape)
+        return math.prod(map(int, sides)) > SHARE_OF_GRID * math.prod(self.shape[1:])
+
+
+def is_flat(array: Array) -> bool:
+    """Return whether an array has one value alone; convolved, it stays flat."""
+    return not any(array.strides) or bool((array == array[0, 0]).all())
+
+
+def convolve_at(extended: Array, psf: Stamp, rows: range, columns: range) -> Array:
+    """Return ``K_j * f`` in some rows and columns of the grid."""
+    height, width = psf.values.shape
+    around = extended.take(
+        range(rows.start - psf.y - height + 1, rows.stop - psf.y), axis=0, mode="wrap"
+    ).take(range(columns.start - psf.x - width + 1, columns.stop - psf.x), axis=1, mode="wrap")
+    return np.asarray(scipy.signal.fftconvolve(around, psf.values, mode="valid"))
+
 
 def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[Array]:
     """Yield the m_j, as `Model.images` returns them; nothing but one of them is held."""
@@ -135,12 +202,7 @@ def add_to_window(
         Row and column of the first pixel of the window.
     """
     rows, columns = (range(at, at + n) for at, n in zip(first, image.shape, strict=True))
-    psf = scene.psf_stamp(j)
-    height, width = psf.values.shape
-    around = sky.take(
-        range(rows.start - psf.y - height + 1, rows.stop - psf.y), axis=0, mode="wrap"
-    ).take(range(columns.start - psf.x - width + 1, columns.stop - psf.x), axis=1, mode="wrap")
-    image += scipy.signal.fftconvolve(around / scene.unit, psf.values, mode="valid")
+    image += convolve_at(sky, scene.psf_stamp(j), rows, columns) / scene.unit
     for stamp, flux in zip(scene.star_field.stamps[j], star_fluxes, strict=True):
         stamp.add_to(image, rows, columns, scene.grid, flux / scene.unit)
 

@@ -13,6 +13,8 @@ from lnocl.scene.observation import Array, Observation
 # Noise is measured in square blocks, of these the darker half, where there are so many.
 BLOCK = 8
 MIN_BLOCKS = 24
+# Rows of blocks that are measured; of images with twice as many every second one, and so on.
+MAX_ROWS = 128
 # Second differences of neighbours, and of pixels so far apart.
 FAR = 3
 # What is said of: the variance over the mean beyond this factor of 1, and that of neighbours below
@@ -60,17 +62,28 @@ def measure_noise(observation: Observation) -> Iterator[Noise | None]:
     ny, nx = (n - n % BLOCK for n in observation.shape)
     counts = zip(observation.images, observation.mask, observation.background, strict=True)
     for image, mask, background in counts:
-        means = _block_means(image[:ny, :nx])
-        good = ~_block_means(mask[:ny, :nx]).astype(bool)
+        image, mask, background = (
+            _some_rows(np.broadcast_to(each, observation.shape)[:ny, :nx])
+            for each in (image, mask, background)
+        )
+        means = _block_means(image)
+        good = ~_block_means(mask).astype(bool)
         if good.sum() < 2 * MIN_BLOCKS:
             yield None
             continue
         dark = good & (means <= np.median(means[good]))
-        excess = (image - background)[:ny, :nx]  # the background may have structure that is known
+        excess = image - background  # the background may have structure that is known
         near, apart = (_block_means(_squares(excess, lag))[dark] for lag in (1, FAR))
         level = means - _block_means(excess)
         values = means[dark], level[dark], near, apart
         yield Noise(*map(float, map(np.median, values)))  # many blocks may hold next to nothing
+
+
+def _some_rows(pixels: Array) -> Array:
+    """Return all rows of blocks, or every so many-th of more than `MAX_ROWS`."""
+    ny, nx = pixels.shape
+    some = pixels.reshape(ny // BLOCK, BLOCK, nx)[:: ny // (BLOCK * MAX_ROWS) or 1]
+    return some.reshape(len(some) * BLOCK, nx)
 
 
 def _squares(image: Array, lag: int) -> Array:

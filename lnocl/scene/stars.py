@@ -133,7 +133,7 @@ class StarField:
 
     def images(self, j: int, lit: NDArray[np.bool_]) -> StarImages:
         """Return the P_js over these pixels, to which all that any star lights must belong."""
-        place, size = places(lit), int(lit.sum())
+        place, size = places(lit), int(np.count_nonzero(lit))
         pieces: list[list[Piece]] = []
         for stamp in self.stamps[j]:
             window = stamp.window(self._grid)
@@ -153,7 +153,9 @@ def light_up(stamps: Sequence[Stamp], grid: tuple[int, int]) -> NDArray[np.bool_
 
 def places(lit: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Return the place of each pixel that is lit among all that are, -1 where it is dark."""
-    return np.where(lit, np.cumsum(lit).reshape(lit.shape) - 1, -1)
+    place = np.full(lit.shape, -1)
+    place[lit] = np.arange(np.count_nonzero(lit))
+    return place
 
 
 def overlap(stamps: Sequence[Stamp], grid: tuple[int, int]) -> NDArray[np.bool_]:

@@ -55,8 +55,7 @@ class StarLikelihood:
         """
         images = []
         for where, *arrays in zip(lit, scene.images(), diffuse, model.weights, strict=True):
-            pixels = slice(None) if where.all() else where.ravel()
-            g, known, w = (array.ravel()[pixels] for array in arrays)
+            g, known, w = (array.ravel() if where.all() else array[where] for array in arrays)
             images.append((g, known, w))
         return cls(images)
 

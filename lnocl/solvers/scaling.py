@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.scene.forward_model import Model
+from lnocl.scene.forward_model import Box, Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Stamp
@@ -118,36 +118,71 @@ def prepare(
     star_fluxes : ndarray of float64, shape (n,)
         Where the fluxes are sought from, scaled.
     """
-    total_weight = model.adjoint(model.weights)
-    observed = np.where(scene.observed(total_weight), extended, 0.0)
-    diffuse = model.images(observed, np.zeros_like(star_fluxes))
-    fluxes = fit_fluxes(scene, model, diffuse, star_fluxes)
-    return fluxes, _make_scaling(scene, model, total_weight, diffuse, fluxes)
-
-
-def _make_scaling(
-    scene: Scene, model: Model, total_weight: Array, diffuse: Array, fluxes: Array
-) -> Scaling:
-    def bright() -> Iterator[Array]:
-        for light, background in zip(model.starlight(fluxes), model.background, strict=True):
-            light += background
-            yield np.maximum(light, MIN_BACKGROUND, out=light)
-
-    inverse = model.adjoint(w / light for w, light in zip(model.weights, bright(), strict=True))
+    total_weight, inverse = _back_projections(model)
+    information, cross = np.zeros((scene.n_stars, scene.n_stars)), list[Stamp]()
+    if scene.n_stars:
+        lit = [scene.star_field.lit(j) for j in range(scene.n_images)]
+        boxes = [_box(each) for each in lit]
+        observed = np.where(scene.observed(total_weight), extended, 0.0)
+        diffuse = model.images_at(boxes, observed)
+        star_fluxes = fit_fluxes(scene, model, diffuse, star_fluxes)
+        lights = list(model.starlight(star_fluxes))
+        change = _change_by_stars(model, lights, boxes)
+        inverse[change.window(scene.grid)] += change.values
+        information, cross = _star_information(scene, model, diffuse, lights, lit)
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     np.maximum(shift, 0.0, out=shift)
     shift *= SHIFT
+    return star_fluxes, Scaling.of_stamps(shift, information, cross)
+
+
+def _back_projections(model: Model) -> tuple[Array, Array]:
+    """Return ``sum_j A_j^T w_j`` and ``sum_j A_j^T (w_j / b_j)``."""
+    dark = np.maximum(model.background, MIN_BACKGROUND)
+    if dark.shape[1:] == (1, 1):  # numbers: one transform of each w_j
+        both = model.adjoints(model.weights, np.array([np.ones(len(dark)), 1.0 / dark[:, 0, 0]]))
+        return both[0], both[1].copy()
+    per_background = (w / b for w, b in zip(model.weights, dark, strict=True))
+    return model.adjoint(model.weights), model.adjoint(per_background)
+
+
+def _change_by_stars(model: Model, lights: Sequence[Array], boxes: Sequence[Box]) -> Stamp:
+    """Return what light of stars changes ``sum_j A_j^T (w_j / b_j)`` by, where it is seen."""
+    changes = []
+    for j, (light, box) in enumerate(zip(lights, boxes, strict=True)):
+        background = np.broadcast_to(model.background[j], light.shape)[box]
+        bright, dark = (
+            np.maximum(each, MIN_BACKGROUND) for each in (light[box] + background, background)
+        )
+        values = model.weights[j][box] * (1.0 / bright - 1.0 / dark)
+        changes.append(Stamp(values, box[0].start, box[1].start))
+    return model.adjoint_of_stamps(changes)
+
+
+def _star_information(
+    scene: Scene,
+    model: Model,
+    diffuse: Array,
+    lights: Sequence[Array],
+    lit: Sequence[NDArray[np.bool_]],
+) -> tuple[Array, list[Stamp]]:
+    """Return the Fisher information of the star fluxes, and that with the extended source."""
     information = np.zeros((scene.n_stars, scene.n_stars))
     stamps: list[list[Stamp]] = [[] for _ in range(scene.n_stars)]  # w_j P_js / m_j of each star
-    for j, light in enumerate(model.starlight(fluxes) if stamps else ()):
-        light += diffuse[j]
-        total = np.maximum(light, MIN_MODEL, out=light)
-        ratio = movable_weights(model.weights[j], total) / total
-        lit = scene.star_field.lit(j)
-        information += scene.star_field.images(j, lit).information(ratio[lit])
+    for j, (light, where) in enumerate(zip(lights, lit, strict=True)):
+        total = np.maximum(light[where] + diffuse[j][where], MIN_MODEL)
+        ratio = np.zeros(scene.grid)
+        ratio[where] = movable_weights(model.weights[j][where], total) / total
+        information += scene.star_field.images(j, where).information(ratio[where])
         for s, of_star in enumerate(stamps):
             of_star.append(_times(scene.star_stamp(j, s), ratio))
-    return Scaling.of_stamps(shift, information, [model.adjoint_of_stamps(x) for x in stamps])
+    return information, [model.adjoint_of_stamps(each) for each in stamps]
+
+
+def _box(lit: NDArray[np.bool_]) -> Box:
+    """Return rows and columns from the first to the last pixel that is lit."""
+    rows, columns = (np.flatnonzero(lit.any(axis=axis)) for axis in (1, 0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def _times(stamp: Stamp, x: Array) -> Stamp:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.scene.noise_check import measure_noise, warn_of_noise
+from lnocl.scene.noise_check import _some_rows, measure_noise, warn_of_noise
 
 SHAPE, LEVEL = (128, 130), 60.0
 Y, X = np.indices(SHAPE) - 64.0
@@ -44,6 +44,17 @@ def test_nothing_is_said_of_few_counts(level):
         image = np.random.default_rng(seed).poisson(level, SHAPE).astype(float)
         image[60, 60] += 50.0
         assert said(image, background=level) == []
+
+
+@pytest.mark.parametrize("rows", [1024, 2048, 2100, 5000])
+def test_of_large_images_some_rows_of_blocks_say_the_same(rows):
+    image = np.random.default_rng(rows).poisson(LEVEL, (rows, 32)).astype(float)
+    observation = lnocl.Observation(image, np.ones((1, 1)), background=LEVEL)
+    (noise,) = measure_noise(observation)
+    assert noise.variance == pytest.approx(LEVEL, rel=0.1)
+    assert noise.variance_apart == pytest.approx(LEVEL, rel=0.1)
+    assert 0.0 < noise.level - noise.mean < 0.2 * np.sqrt(LEVEL)
+    assert len(_some_rows(image[: rows - rows % 8])) // 8 in range(128, 256)
 
 
 def test_nothing_is_said_of_counts_with_read_noise():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from explicit_matrix import problem_of
-from scenes import Recipe, make_psfs, worst
+from scenes import Recipe, make_psfs, make_smooth_psfs, worst
 
 import lnocl
 from lnocl.engines.numpy import ReferenceEngine
@@ -11,6 +11,7 @@ from lnocl.scene.forward_model import Model
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.solvers import scaling
+from lnocl.solvers.fluxes import fit_fluxes
 
 TINY = Recipe((8, 8), 2, 2, mu=1e-3, masked=0.1, background="map", psf_shape=(3, 4))
 
@@ -97,6 +98,39 @@ def test_cross_information_lies_in_a_window(psf_shape, offsets):
         found = stamp.on_grid(scene.grid)
         assert worst(found, expected) <= 1.5e-15
         assert psf_shape != (9, 11) or stamp.values.size < found.size / 2
+
+
+FAR, CLOSE, ROUND_THE_EDGE = [(40, 50)], [(40, 50), (47.3, 52.6)], [(0.2, 1.0), (94.0, 3.0)]
+
+
+@pytest.mark.parametrize("stars", [[], FAR, CLOSE, ROUND_THE_EDGE])
+@pytest.mark.parametrize("masked", [0.0, 0.1])
+@pytest.mark.parametrize("background", ["numbers", "maps"])
+@pytest.mark.parametrize("start", ["flat", "given"])
+@pytest.mark.filterwarnings("ignore:psf . is sharper")
+def test_shift_is_that_of_the_whole_grid(stars, masked, background, start):
+    """Where stars light a small part of it, and where nothing tells one pixel from another."""
+    rng, shape = np.random.default_rng(7), (2, 80, 96)
+    images, psfs = rng.poisson(30.0, shape).astype(float), make_smooth_psfs(2, (15, 17))
+    for x, y in np.round(stars).astype(int):
+        images[:, y, x] += 3e4
+    levels = np.array([2.0, 5.0]) if background == "numbers" else rng.uniform(2.0, 5.0, shape)
+    mask = rng.random(shape) < masked
+    scene = Scene(lnocl.Observation(images, psfs, background=levels, mask=mask), stars)
+    model = Model(scene)
+    given = None if start == "flat" else rng.uniform(0.0, 9.0, shape[1:])
+    extended, sought_from = scene.start(given, np.full(len(stars), 3e4))
+    fluxes, steps = scaling.prepare(scene, model, extended, sought_from)
+    total = model.adjoint(model.weights)
+    light = np.array(list(model.starlight(fluxes))) + model.background
+    light = np.maximum(light, scaling.MIN_BACKGROUND)
+    shift = scaling.SHIFT * total / model.adjoint(model.weights / light)
+    # Measured 2.6e-11: under a star 1 / light is less by 5 digits, in both.
+    assert worst(steps.shift, shift) <= 8e-11
+    observed = np.where(scene.observed(total), extended, 0.0)
+    images = model.images(observed, np.zeros(len(stars)))
+    expected = fit_fluxes(scene, model, images, sought_from)
+    np.testing.assert_allclose(fluxes, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("n_stars", [0, 2])
