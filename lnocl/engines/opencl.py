@@ -302,8 +302,9 @@ class OpenCLEngine:
         spectra, size = self._memory.buffers["spectra"], self.layout.spectra_bytes
         transform = self._bind("rfft_rows", pixels=self._memory.buffers["extended"])
         for j in reversed(range(len(weights))):
-            self._memory.upload_pixels("extended", [weights[j]])
-            transform()
+            if j == len(weights) - 1 or weights.strides[0]:  # else all images share them
+                self._memory.upload_pixels("extended", [weights[j]])
+                transform()
             if j > 0:  # the first array is where transforms come out
                 cl.enqueue_copy(self._queue, spectra, spectra, byte_count=size, dst_offset=j * size)
         self._bind("correlate_columns")()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -49,13 +50,17 @@ class Model:
         self._psfs = [scene.psf_stamp(j) for j in range(scene.n_images)]
         # What a flat array is multiplied by: it stays flat.
         self._sums = np.array([psf.values.sum() for psf in self._psfs])
-        self._otfs = [scipy.fft.rfft2(psf.on_grid(scene.grid), workers=-1) for psf in self._psfs]
-        self.weights = np.broadcast_to(
-            np.float64(1.0) if scene.weights is None else scene.weights.astype(np.float64),
-            self.shape,
-        )
+        weights = np.ones((1, 1, 1)) if scene.weights is None else scene.weights
+        if not weights.strides[0]:  # all images share them
+            weights = weights[:1]
+        self.weights = np.broadcast_to(weights.astype(np.float64), self.shape)
         background = scene.background()
         self.background = background if background.ndim == 3 else background[:, None, None]
+
+    @cached_property
+    def _otfs(self) -> list[NDArray[np.complex128]]:
+        grid = self.shape[1:]
+        return [scipy.fft.rfft2(psf.on_grid(grid), workers=-1) for psf in self._psfs]
 
     def forward(self, extended: Array) -> Array:
         """Return the ``A_j f``, shape (p, Ny, Nx)."""
@@ -79,15 +84,15 @@ class Model:
         It may be read-only: of arrays of one value each it is a view of one value, too.
         """
         flat, spectra = np.zeros(len(factors)), list[NDArray[np.complex128]]()
-        for j, (array, otf) in enumerate(zip(arrays, self._otfs, strict=True)):
+        for array, members in _runs(arrays):
+            shares = factors[:, members]
             if not any(array.strides):  # of one value, as weights are where all is observed
-                flat += factors[:, j] * self._sums[j] * array[0, 0]
+                flat += shares @ self._sums[members] * array[0, 0]
                 continue
             spectrum = scipy.fft.rfft2(array, workers=-1).conj()
-            spectrum *= otf
-            spectra = spectra or [np.zeros_like(otf) for _ in factors]
-            for total, factor in zip(spectra, factors[:, j], strict=True):
-                total += factor * spectrum
+            spectra = spectra or [np.zeros_like(spectrum) for _ in factors]
+            for total, share in zip(spectra, shares, strict=True):
+                total += self._mixed_otf(members, share) * spectrum
         if not spectra:
             return np.broadcast_to(flat[:, None, None], (len(flat), *self.shape[1:]))
         back = [
@@ -95,6 +100,17 @@ class Model:
             for each in spectra
         ]
         return np.array(back) + flat[:, None, None]
+
+    def _mixed_otf(self, members: Sequence[int], shares: Array) -> NDArray[np.complex128]:
+        """Return ``sum_j q_j K^_j`` over some images."""
+        if len(members) == 1:
+            otf = self._otfs[members[0]]
+            return otf if shares[0] == 1.0 else shares[0] * otf
+        mixed = np.zeros(self.shape[1:])
+        for j, share in zip(members, shares, strict=True):
+            psf = self._psfs[j]
+            mixed[psf.window(mixed.shape)] += share * psf.values
+        return np.asarray(scipy.fft.rfft2(mixed, workers=-1))
 
     def adjoint_of_stamps(self, stamps: Sequence[Stamp]) -> Stamp:
         """Return ``sum_j A_j^T x_j`` of arrays x_j that are 0 beyond a stamp, one an image.
@@ -155,6 +171,20 @@ class Model:
         """Return whether the pixels that a box sees are a large share of the grid."""
         sides = np.add([side.stop - side.start for side in box], psf.values.shape)
         return math.prod(map(int, sides)) > SHARE_OF_GRID * math.prod(self.shape[1:])
+
+
+def _runs(arrays: Iterable[Array]) -> Iterator[tuple[Array, list[int]]]:
+    """Yield arrays with the places of all in a row that are the same memory, as shared weights."""
+    first, members = np.zeros(0), list[int]()
+    for j, array in enumerate(arrays):  # first is held: no other lies in its memory
+        is_same = array.ctypes.data == first.ctypes.data and array.strides == first.strides
+        if members and not is_same:
+            yield first, members
+            members = []
+        if not members:
+            first = array
+        members.append(j)
+    yield first, members
 
 
 def is_flat(array: Array) -> bool:

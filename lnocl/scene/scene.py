@@ -217,8 +217,11 @@ class Scene:
 
     def images(self) -> Iterator[Array]:
         """Yield each image on the grid, scaled, shape (Ny, Nx); 0 where not observed."""
+        ny, nx = self.observation.shape
         for j, image in enumerate(self.observation.images):
-            yield self._per_exposure(self._on_grid(image / self.scale), 0.0, j)
+            laid = np.zeros(self.grid)
+            np.divide(image, self.scale, out=laid[:ny, :nx])
+            yield self._per_exposure(laid, 0.0, j)
 
     def background(self) -> Array:
         """Return the background, scaled, shape (p,) or (p, Ny, Nx); 1 where not observed."""
@@ -359,13 +362,17 @@ class Scene:
             return self._on_grid(np.where(observed, relative, 0.0))
         if observed.all() and self.grid == self.observation.shape:
             return None
+        if (observed == observed[0]).all():
+            return np.broadcast_to(self._on_grid(observed[0]), (self.n_images, *self.grid))
         return self._on_grid(observed)
 
     def _on_grid(self, array: NDArray, fill: float = 0.0) -> NDArray:
         ny, nx = self.observation.shape
         if self.grid == (ny, nx):
             return array
-        laid = np.full((*array.shape[:-2], *self.grid), fill, dtype=array.dtype)
+        laid = np.zeros((*array.shape[:-2], *self.grid), array.dtype)
+        if fill:
+            laid.fill(fill)
         laid[..., :ny, :nx] = array
         return laid
 

@@ -139,6 +139,9 @@ def prepare(
 def _back_projections(model: Model) -> tuple[Array, Array]:
     """Return ``sum_j A_j^T w_j`` and ``sum_j A_j^T (w_j / b_j)``."""
     dark = np.maximum(model.background, MIN_BACKGROUND)
+    if dark.shape[1:] == (1, 1) and np.ptp(dark) == 0.0:
+        total = model.adjoint(model.weights)
+        return total, total / dark[0, 0, 0]
     if dark.shape[1:] == (1, 1):  # numbers: one transform of each w_j
         both = model.adjoints(model.weights, np.array([np.ones(len(dark)), 1.0 / dark[:, 0, 0]]))
         return both[0], both[1].copy()

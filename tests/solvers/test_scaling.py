@@ -104,8 +104,8 @@ FAR, CLOSE, ROUND_THE_EDGE = [(40, 50)], [(40, 50), (47.3, 52.6)], [(0.2, 1.0), 
 
 
 @pytest.mark.parametrize("stars", [[], FAR, CLOSE, ROUND_THE_EDGE])
-@pytest.mark.parametrize("masked", [0.0, 0.1])
-@pytest.mark.parametrize("background", ["numbers", "maps"])
+@pytest.mark.parametrize("masked", ["nothing", "each", "all"])
+@pytest.mark.parametrize("background", ["number", "numbers", "maps"])
 @pytest.mark.parametrize("start", ["flat", "given"])
 @pytest.mark.filterwarnings("ignore:psf . is sharper")
 def test_shift_is_that_of_the_whole_grid(stars, masked, background, start):
@@ -114,9 +114,9 @@ def test_shift_is_that_of_the_whole_grid(stars, masked, background, start):
     images, psfs = rng.poisson(30.0, shape).astype(float), make_smooth_psfs(2, (15, 17))
     for x, y in np.round(stars).astype(int):
         images[:, y, x] += 3e4
-    levels = np.array([2.0, 5.0]) if background == "numbers" else rng.uniform(2.0, 5.0, shape)
-    mask = rng.random(shape) < masked
-    scene = Scene(lnocl.Observation(images, psfs, background=levels, mask=mask), stars)
+    levels = {"number": 3.0, "numbers": np.array([2.0, 5.0]), "maps": rng.uniform(2.0, 5.0, shape)}
+    mask = rng.random(shape if masked == "each" else shape[1:]) < 0.1 * (masked != "nothing")
+    scene = Scene(lnocl.Observation(images, psfs, background=levels[background], mask=mask), stars)
     model = Model(scene)
     given = None if start == "flat" else rng.uniform(0.0, 9.0, shape[1:])
     extended, sought_from = scene.start(given, np.full(len(stars), 3e4))
