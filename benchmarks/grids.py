@@ -7,7 +7,7 @@ without. An iteration is timed on each grid that they need, and on the grids of 
 they needed once, all taking turns. `over` is the time over that of n^2 log2 n points, n the padded
 size, at the pace of powers of two, interpolated between the two beside n; `before` the same for the
 next power of two. With --output the table of frames goes to STEM-frames.ecsv, that of grids to
-STEM-grids.ecsv.
+STEM-lengths.ecsv.
 """
 
 import argparse
@@ -87,7 +87,7 @@ def main():
     print(f"time over before: mean {np.mean(frames['over'] / frames['before']):.2f}")
     if given.output:
         known = facts(choose(given.device).device)
-        for name, each in (("frames", frames), ("grids", table)):
+        for name, each in (("frames", frames), ("lengths", table)):
             each.meta |= known | {"turns": given.turns, "images": given.images}
             each.write(f"{given.output}-{name}.ecsv", overwrite=True)
 

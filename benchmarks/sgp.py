@@ -353,6 +353,7 @@ def answer(data, device):
             *(repr(float(b)) for b in simulation.background),
             *("--read-noise", str(float(np.ravel(simulation.read_noise)[0]))),
             *("--star", f"{star[0]},{star[1]}", "--solver", "sgp", "--n-iter", str(n_sgp)),
+            *("--stop", "none", "--smoothing", "0", "--pad", "0"),
             *(() if device is None else ("--device", device)),
             *("-o", f"{folder}/found.fits", "--overwrite", "--quiet"),
         ]

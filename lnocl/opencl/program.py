@@ -7,6 +7,7 @@ import re
 import weakref
 from collections import OrderedDict
 from collections.abc import Mapping
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import cast
@@ -195,6 +196,7 @@ def _room_for(n_stars: int) -> int:
     )
 
 
+@cache
 def source() -> str:
     """Return the OpenCL source of all kernels."""
     folder = resources.files("lnocl.kernels")

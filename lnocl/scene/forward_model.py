@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import scipy.fft
-import scipy.signal
 from numpy.typing import NDArray
 
 from lnocl.scene.observation import Array
@@ -193,12 +192,25 @@ def is_flat(array: Array) -> bool:
 
 
 def convolve_at(extended: Array, psf: Stamp, rows: range, columns: range) -> Array:
-    """Return ``K_j * f`` in some rows and columns of the grid."""
+    """Return ``K_j * f`` in some rows and columns of the grid, round its edges."""
     height, width = psf.values.shape
-    around = extended.take(
-        range(rows.start - psf.y - height + 1, rows.stop - psf.y), axis=0, mode="wrap"
-    ).take(range(columns.start - psf.x - width + 1, columns.stop - psf.x), axis=1, mode="wrap")
-    return np.asarray(scipy.signal.fftconvolve(around, psf.values, mode="valid"))
+    reach = len(rows) + height - 1, len(columns) + width - 1
+    if math.prod(reach) >= extended.size:  # a transform of the grid is the smaller one
+        spectrum = scipy.fft.rfft2(extended, workers=-1)
+        spectrum *= scipy.fft.rfft2(psf.on_grid(extended.shape), workers=-1)
+        image = scipy.fft.irfft2(spectrum, extended.shape, workers=-1, overwrite_x=True)
+        return np.asarray(_around(image, rows, columns))
+    first = rows.start - psf.y - height + 1, columns.start - psf.x - width + 1
+    ranges = (range(at, at + n) for at, n in zip(first, reach, strict=True))
+    shape = tuple(scipy.fft.next_fast_len(n, real=True) for n in reach)
+    spectrum = scipy.fft.rfft2(_around(extended, *ranges), shape)
+    spectrum *= scipy.fft.rfft2(psf.values, shape)
+    image = scipy.fft.irfft2(spectrum, shape)
+    return np.asarray(image[height - 1 : reach[0], width - 1 : reach[1]])
+
+
+def _around(pixels: Array, rows: range, columns: range) -> Array:
+    return pixels.take(rows, axis=0, mode="wrap").take(columns, axis=1, mode="wrap")
 
 
 def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[Array]:
