@@ -6,11 +6,12 @@
  * divided by the length. So no reversal is ever done; spectra stay in reversed order: with r the
  * bit-reversed order of EVEN(n) points, place q EVEN(n) + t has k = ODD(n) r(t) + q.
  *
- * A transform of n points has an outer pass of radix OUTER(n), ODD(n) times at most 8, which the
- * kernels write themselves because it is where data come and go; then, over subtransforms of
- * INNER(n) points, passes of radix 8; and a last pass of radix LAST(n) <= 8. All are in place.
- * Where INNER(n) is more than CHUNK points, one middle pass goes over everything; what is left is
- * done span by span, so that each SPAN(n) points stay in the nearest cache until they are done.
+ * A transform of n points has an outer pass of radix OUTER(n), which the kernels write themselves
+ * because it is where data come and go: the odd one, or else one of radix 8 at most. Then follow,
+ * over subtransforms of INNER(n) points, passes of radix 8, and a last pass of radix LAST(n) <= 8.
+ * All are in place. Where INNER(n) is more than CHUNK points, one middle pass goes over everything;
+ * what is left is done span by span, so that each SPAN(n) points stay in the nearest cache until
+ * they are done.
  *
  * Roots of unity: first exp(2 pi i k / ODD(n)), [ODD(n)][2] reals, where ODD(n) is more than 1. Then
  * twiddles, for each pass over subtransforms of `length` points with radix R, in the order in which

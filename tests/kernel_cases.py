@@ -36,6 +36,7 @@ CASES = {
     "odd factor 3, radices 8 and 8, 4 within": ((192, 768), None, "plain", "SD"),
     "odd factor 5, middle pass": ((2560, 16), None, "plain", "S"),
     "odd factors 3 and 9, group": ((48, 144), Tuning(1, 8, group=4), THREE_IMAGES, "S"),
+    "odd factors 3 and 5, vectors of 16": ((96, 160), Tuning(16, 16), THREE_IMAGES, "SD"),
     "odd factor 5, several vectors a block": ((80, 96), Tuning(4, 8), "plain", "S"),
     "global scratch": ((64, 32), Tuning(4, 16, scratch_is_global=True), "plain", "s"),
     "several vectors a block": ((64, 32), Tuning(4, 8), "mask, mu, smoothing", "S"),
