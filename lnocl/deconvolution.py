@@ -115,8 +115,8 @@ def deconvolve(
         `lnocl.opencl.device.choose`). By default that of the environment variable PYOPENCL_CTX,
         else the first GPU, else the first CPU.
     pad : int or "auto", optional
-        Unobserved pixels kept round the images, at least. Each axis of the grid is then the next
-        length that is 1, 3, 5, 7 or 9 times a power of two (`lnocl.scene.grid.LENGTHS`). Where
+        Unobserved pixels kept round the images, at least. Each axis of the grid is then the next of
+        `lnocl.scene.grid.LENGTHS`: powers of two, and 3, 5, 7 or 9 times one from 16 up. Where
         images have such lengths and ``pad=0``, the model is periodic. "auto": where light runs over
         the edge of an image, the radius with nine tenths of the PSFs' light, at most half the
         shorter side (docs/frames.md); else 0.

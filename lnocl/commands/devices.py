@@ -18,7 +18,7 @@ def _run(arguments: argparse.Namespace) -> None:
         _tune(arguments.device)
         return
     found, single = device.find_devices(), np.dtype(np.float32)
-    choice = device.choose(arguments.device)
+    choice = device.choose(None)
     messages.say(
         [
             *(
@@ -59,7 +59,7 @@ COMMAND = Command(
                 help="time iterations with vectors of several widths (CPU) or groups of several "
                 "sizes (GPU), and use the fastest on this device from now on",
             ),
-            options.DEVICE,
+            options.DEVICE.but(help="with --tune: the device, as PLATFORM[:DEVICE]"),
         ]
     },
     _run,

@@ -103,7 +103,7 @@ class OpenCLEngine:
             {**sizes, "scratch and roots": Launcher.bytes_needed(self.program)},
             1 if half is None else 2,
         )
-        tuned = describe_tuning(chosen, self.program.dtype)
+        tuned = describe_tuning(chosen, self.program.dtype, self.program.tuning)
         if half is None:
             announce(chosen, self.bytes_needed, self._host_bytes(), tuned)
         elif half == 0:

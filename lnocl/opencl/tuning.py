@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyopencl as cl
 
-from lnocl.errors import warn
+from lnocl.errors import FileError, warn
 from lnocl.opencl import kernel_cache
 from lnocl.opencl.device import describe
 
@@ -79,7 +79,7 @@ def candidates(device: cl.Device, dtype: np.dtype) -> list[Tuning]:
         lanes = (n_bytes // dtype.itemsize for n_bytes in (32, 64))
         return [Tuning(n, n) for n in lanes]
     most = _power_of_2_up_to(device.max_work_group_size)
-    groups = dict.fromkeys(min(n, most) for n in (128, 32, 64, 256))
+    groups = dict.fromkeys(min(n, most) for n in (128, 32, 64))
     return [Tuning(1, 8, group) for group in groups]
 
 
@@ -99,15 +99,21 @@ def measured(device: cl.Device, dtype: np.dtype) -> Tuning | None:
 def store(device: cl.Device, fastest: Mapping[np.dtype, Tuning]) -> Path:
     """Store the fastest tunings of a device, by precision; return the file.
 
-    Warns
-    -----
-    LnoclWarning
-        Its folder cannot be written to.
+    Raises
+    ------
+    FileError
+        It cannot be written.
     """
     file = kernel_cache.store() / FILE
     known = _read() | {describe(device): {dtype.name: asdict(t) for dtype, t in fastest.items()}}
-    if kernel_cache.can_write(file.parent):
-        kernel_cache.replace(file, json.dumps(known, indent=1).encode("ascii"))
+    with contextlib.suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    kernel_cache.replace(file, json.dumps(known, indent=1).encode("ascii"))
+    if _read() != known:
+        raise FileError(
+            f"the tunings cannot be written to {file}; set {kernel_cache.VARIABLE} to a folder "
+            "that can be written to, for this command and later ones"
+        )
     return file
 
 
@@ -118,12 +124,15 @@ def in_words(tuning: Tuning, dtype: np.dtype) -> str:
     return f"vectors of {8 * dtype.itemsize * tuning.lanes} bits"
 
 
-def describe_tuning(device: cl.Device, dtype: np.dtype) -> str:
-    """Return the tuning of a device in words, and whether it was measured."""
-    words = in_words(chosen(device, dtype), dtype)
+def describe_tuning(device: cl.Device, dtype: np.dtype, used: Tuning | None = None) -> str:
+    """Return the tuning that is used, or that of a device, and whether the latter was measured."""
+    words = in_words(used or chosen(device, dtype), dtype)
     if measured(device, dtype):
         return f"{words}, as measured"
     return f"{words}; lnocl devices --tune measures whether others are faster"
+
+
+_damaged: set[Path] = set()  # of which it was said once
 
 
 def _read() -> dict[str, object]:
@@ -135,10 +144,13 @@ def _read() -> dict[str, object]:
             return {}
         try:
             known = json.loads(file.read_bytes())
-        except ValueError:
+        except (ValueError, RecursionError):
             known = None
         if isinstance(known, dict):
             return known
+        if file in _damaged:
+            return {}
+        _damaged.add(file)
         warn(f"the tunings in {file} are damaged, and not used; run lnocl devices --tune again")
     return {}
 

@@ -153,7 +153,7 @@ class Model:
     def images_at(self, boxes: Sequence[Box], extended: Array) -> Array:
         """Return the m_j without stars in a box of each; beyond it they may be 0."""
         flat = is_flat(extended)
-        if not flat and any(map(self._is_large, boxes, self._psfs)):
+        if not flat and self.are_large(boxes):
             return self.images(extended, np.zeros(self._scene.n_stars))
         images = np.zeros(self.shape)
         for j, (image, box) in enumerate(zip(images, boxes, strict=True)):
@@ -166,10 +166,14 @@ class Model:
             np.maximum(image[box], 0.0, out=image[box])
         return images
 
-    def _is_large(self, box: Box, psf: Stamp) -> bool:
-        """Return whether the pixels that a box sees are a large share of the grid."""
-        sides = np.add([side.stop - side.start for side in box], psf.values.shape)
-        return math.prod(map(int, sides)) > SHARE_OF_GRID * math.prod(self.shape[1:])
+    def are_large(self, boxes: Sequence[Box]) -> bool:
+        """Return whether the pixels that a box of an image sees are a large share of the grid."""
+        sides = [
+            np.add([side.stop - side.start for side in box], psf.values.shape)
+            for box, psf in zip(boxes, self._psfs, strict=True)
+        ]
+        largest = max(math.prod(map(int, each)) for each in sides)
+        return largest > SHARE_OF_GRID * math.prod(self.shape[1:])
 
 
 def _runs(arrays: Iterable[Array]) -> Iterator[tuple[Array, list[int]]]:

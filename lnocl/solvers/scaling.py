@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -126,10 +126,9 @@ def prepare(
         observed = np.where(scene.observed(total_weight), extended, 0.0)
         diffuse = model.images_at(boxes, observed)
         star_fluxes = fit_fluxes(scene, model, diffuse, star_fluxes)
-        lights = list(model.starlight(star_fluxes))
-        change = _change_by_stars(model, lights, boxes)
+        change = _change_by_stars(model, star_fluxes, boxes)
         inverse[change.window(scene.grid)] += change.values
-        information, cross = _star_information(scene, model, diffuse, lights, lit)
+        information, cross = _star_information(scene, model, diffuse, star_fluxes, lit)
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     np.maximum(shift, 0.0, out=shift)
     shift *= SHIFT
@@ -149,30 +148,35 @@ def _back_projections(model: Model) -> tuple[Array, Array]:
     return model.adjoint(model.weights), model.adjoint(per_background)
 
 
-def _change_by_stars(model: Model, lights: Sequence[Array], boxes: Sequence[Box]) -> Stamp:
+def _change_by_stars(model: Model, star_fluxes: Array, boxes: Sequence[Box]) -> Stamp:
     """Return what light of stars changes ``sum_j A_j^T (w_j / b_j)`` by, where it is seen."""
-    changes = []
-    for j, (light, box) in enumerate(zip(lights, boxes, strict=True)):
+    changes = _changes(model, star_fluxes, boxes)
+    if model.are_large(boxes):  # one after the other, lest all are held
+        return Stamp(model.adjoint(each.on_grid(model.shape[1:]) for each in changes), 0, 0)
+    return model.adjoint_of_stamps(list(changes))
+
+
+def _changes(model: Model, star_fluxes: Array, boxes: Sequence[Box]) -> Iterator[Stamp]:
+    for j, (light, box) in enumerate(zip(model.starlight(star_fluxes), boxes, strict=True)):
         background = np.broadcast_to(model.background[j], light.shape)[box]
         bright, dark = (
             np.maximum(each, MIN_BACKGROUND) for each in (light[box] + background, background)
         )
         values = model.weights[j][box] * (1.0 / bright - 1.0 / dark)
-        changes.append(Stamp(values, box[0].start, box[1].start))
-    return model.adjoint_of_stamps(changes)
+        yield Stamp(values, box[0].start, box[1].start)
 
 
 def _star_information(
     scene: Scene,
     model: Model,
     diffuse: Array,
-    lights: Sequence[Array],
+    star_fluxes: Array,
     lit: Sequence[NDArray[np.bool_]],
 ) -> tuple[Array, list[Stamp]]:
     """Return the Fisher information of the star fluxes, and that with the extended source."""
     information = np.zeros((scene.n_stars, scene.n_stars))
     stamps: list[list[Stamp]] = [[] for _ in range(scene.n_stars)]  # w_j P_js / m_j of each star
-    for j, (light, where) in enumerate(zip(lights, lit, strict=True)):
+    for j, (light, where) in enumerate(zip(model.starlight(star_fluxes), lit, strict=True)):
         total = np.maximum(light[where] + diffuse[j][where], MIN_MODEL)
         ratio = np.zeros(scene.grid)
         ratio[where] = movable_weights(model.weights[j][where], total) / total

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lnocl.engines.opencl import OpenCLEngine
+from lnocl.errors import DeviceError
 from lnocl.opencl.device import choose, has_double
 from lnocl.opencl.tuning import Tuning, candidates
 from lnocl.scene.observation import Observation
@@ -52,8 +53,15 @@ def measure(spec: str | None) -> Iterator[tuple[np.dtype, list[Timed]]]:
     for precision, dtype in PRECISIONS.items():
         if precision == "double" and not has_double(device):
             continue
-        tried = candidates(device, dtype)
-        runs = [_Run(scene, precision, spec, each.fit(device, dtype, scene.grid)) for each in tried]
+        runs, tried = [], []
+        for each in candidates(device, dtype):
+            fitted = each.fit(device, dtype, scene.grid)
+            try:
+                runs.append(_Run(scene, precision, spec, fitted))
+                tried.append(each)
+            except DeviceError:  # such as too few registers for so large a group
+                if not tried:
+                    raise
         times = np.array([[run.time() for run in runs] for _ in range(TURNS)])
         ratios = np.median(times / times[:, :1], axis=0)
         yield dtype, list(map(Timed, tried, 1e3 * np.median(times, axis=0), ratios))

@@ -72,7 +72,7 @@ def test_the_default_is_the_first_candidate():
     ]
     assert in_words(candidates(CPU, DOUBLE)[0], DOUBLE) == "vectors of 256 bits"
     assert [in_words(each, SINGLE) for each in candidates(GPU, SINGLE)] == [
-        f"work-groups of {n}" for n in (128, 32, 64, 256)
+        f"work-groups of {n}" for n in (128, 32, 64)
     ]
 
 
@@ -99,11 +99,13 @@ def test_blocks_fit_the_grid(grid):
 
 
 @pytest.mark.parametrize(
-    "content", ["", "[", "[]", "3", '{"x": 1}', "\xff", '{"a device (a platform, 1.0)": [1]}']
+    "content",
+    ["", "[", "[" * 60_000, "[]", "3", '{"x": 1}', "\xff", '{"a device (a platform, 1.0)": [1]}'],
 )
 def test_a_damaged_file_is_not_used(folder, content, recwarn):
     (folder / module.FILE).write_text(content, encoding="latin1")
-    assert measured(CPU, SINGLE) is None
+    for _ in range(3):
+        assert measured(CPU, SINGLE) is None
     words = "; run lnocl devices --tune again"
     assert all(words in str(each.message) for each in recwarn)
     assert len(recwarn) == (not content.startswith("{"))
@@ -111,6 +113,17 @@ def test_a_damaged_file_is_not_used(folder, content, recwarn):
         patch.setattr(lnocl.errors.warnings, "warn", lambda *_, **__: None)
         store(CPU, {SINGLE: candidates(CPU, SINGLE)[1]})
     assert measured(CPU, SINGLE) == candidates(CPU, SINGLE)[1]
+
+
+@pytest.mark.parametrize("place", ["folder", "file"])
+def test_what_cannot_be_stored_is_said(folder, monkeypatch, place):
+    if place == "file":
+        (folder / module.FILE).mkdir()
+    else:
+        (folder / "file").touch()
+        monkeypatch.setenv("POCL_CACHE_DIR", str(folder / "file" / "folder"))
+    with pytest.raises(lnocl.FileError, match=r"cannot be written to .*set POCL_CACHE_DIR"):
+        store(CPU, {SINGLE: candidates(CPU, SINGLE)[1]})
 
 
 def test_a_tuning_that_is_no_candidate_is_not_used(folder):
