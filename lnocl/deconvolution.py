@@ -116,10 +116,11 @@ def deconvolve(
         else the first GPU, else the first CPU.
     pad : int or "auto", optional
         Unobserved pixels kept round the images, at least. Each axis of the grid is then the next of
-        `lnocl.scene.grid.LENGTHS`: powers of two, and 3, 5, 7 or 9 times one from 16 up. Where
-        images have such lengths and ``pad=0``, the model is periodic. "auto": where light runs over
-        the edge of an image, the radius with nine tenths of the PSFs' light, at most half the
-        shorter side (docs/frames.md); else 0.
+        `lnocl.scene.grid.LENGTHS`: powers of two, and 3, 5, 7 or 9 times one from 16 up, at least
+        as long as the PSFs or twice the images. Where images have such lengths, PSFs are no larger
+        and ``pad=0``, the model is periodic. "auto": where light runs over the edge of an image,
+        the radius with nine tenths of the PSFs' light, at most half the shorter side
+        (docs/frames.md); else 0.
     initial_extended : array_like, shape (ny, nx), optional
         Extended source to start from, not 0 everywhere; by default flat. Pixels that start at 0
         stay 0 with "sgm".

@@ -172,6 +172,9 @@ def tune_as_on_gpu():
             type=cl.device_type.GPU,
             max_work_group_size=device.max_work_group_size,
             local_mem_size=device.local_mem_size,
+            name=device.name,
+            platform=device.platform,
+            driver_version=device.driver_version,
         )
         return tune(gpu, dtype, grid)
 

@@ -79,7 +79,8 @@ class Memory:
 
     def copy(self, one: str, other: str) -> None:
         """Copy a buffer to another of the same size."""
-        cl.enqueue_copy(self._queue, self.buffers[other], self.buffers[one])
+        size = int(self.buffers[one].size)
+        cl.enqueue_copy(self._queue, self.buffers[other], self.buffers[one], byte_count=size)
 
     def clear(self, name: str) -> None:
         """Set all of a buffer to 0."""

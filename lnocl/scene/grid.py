@@ -30,6 +30,9 @@ LENGTHS = sorted(
 def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
     """Return the shape (Ny, Nx) of the grid of a scene.
 
+    It holds the images with their pad, and the PSFs, or as much of them as reaches from one end of
+    the images to the other.
+
     Raises
     ------
     InputError
@@ -42,7 +45,9 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
     shape = observation.shape
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
         raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
-    ny, nx = (n + 2 * int(pad) for n in shape)
+    # Light that is farther from its source than the images are wide reaches none of them.
+    psf_shape = observation.psfs.shape[1:]
+    ny, nx = (max(n + 2 * int(pad), min(k, 2 * n)) for n, k in zip(shape, psf_shape, strict=True))
     if max(ny, nx) > MAX_AXIS:
         raise InputError(
             f"images of {shape} with pad={pad} need a grid of {(ny, nx)}; "

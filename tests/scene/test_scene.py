@@ -42,6 +42,15 @@ def test_grid_is_the_least_that_the_transform_takes(shape, pad, grid):
     assert (scene.weights is None) == (shape == grid)
 
 
+@pytest.mark.parametrize(
+    ("psf_shape", "grid"), [((8, 16), (8, 16)), ((9, 31), (16, 32)), ((33, 99), (16, 32))]
+)
+@pytest.mark.filterwarnings("ignore:the psf")
+def test_grid_holds_psfs_as_far_as_they_reach(psf_shape, grid):
+    scene = Scene(lnocl.Observation(np.ones(SHAPE), np.ones(psf_shape)))
+    assert scene.grid == grid
+
+
 def test_images_lie_at_the_origin():
     mask = np.zeros((2, 5, 11), bool)
     mask[1, 2, 3] = True
@@ -73,11 +82,12 @@ def test_psf_is_folded_with_its_peak_at_the_origin(psf_shape):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lnocl.LnoclWarning)  # the largest wraps round
         scene = Scene(lnocl.Observation(np.ones(SHAPE), make_psfs(1, psf_shape)), [(14, 1)])
-    at_origin, at_star = np.zeros((2, *SHAPE))
+    ny, nx = scene.grid
+    at_origin, at_star = np.zeros((2, ny, nx))
     for (y, x), value in np.ndenumerate(scene.observation.psfs[0]):
         dy, dx = y - psf_shape[0] // 2, x - psf_shape[1] // 2
-        at_origin[dy % 8, dx % 16] += value
-        at_star[(1 + dy) % 8, (14 + dx) % 16] += value
+        at_origin[dy % ny, dx % nx] += value
+        at_star[(1 + dy) % ny, (14 + dx) % nx] += value
     # Wings that wrap round are summed in another order.
     np.testing.assert_allclose(scene.psf(0), at_origin, rtol=5e-16)
     np.testing.assert_allclose(scene.star_image(0, 0), at_star, rtol=5e-16)
@@ -96,11 +106,11 @@ def test_star_weights_are_the_observed_shares():
 
 
 def test_psf_larger_than_the_grid_is_announced():
-    observation = lnocl.Observation(np.ones(SHAPE), make_psfs(1, (9, 5)))
-    with pytest.warns(lnocl.LnoclWarning, match=r"psf \(9, 5\) is larger than the grid") as caught:
+    observation = lnocl.Observation(np.ones(SHAPE), make_psfs(1, (33, 5)))
+    with pytest.warns(lnocl.LnoclWarning, match=r"psf \(33, 5\) is larger than the grid") as caught:
         paper(observation, n_iter=1, engine="numpy")
     assert [warning.filename for warning in caught] == [__file__]
-    paper(observation, n_iter=1, engine="numpy", pad=1)  # fits: nothing announced
+    paper(observation, n_iter=1, engine="numpy", pad=13)  # fits: nothing announced
 
 
 # --- The start

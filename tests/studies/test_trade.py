@@ -148,7 +148,7 @@ class TestNumbers:
 
     @pytest.mark.usefixtures("numpy_only")
     def test_a_warning_comes_once(self):
-        narrow = np.ones((1, 33))
+        narrow = np.ones((1, 65))
         with pytest.warns(lnocl.LnoclWarning, match="larger than the grid") as caught:
             list(trade.compare(MADE.observation(psfs=narrow), n_iter=N_ITER))
         assert len(caught) == 1
