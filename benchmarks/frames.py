@@ -33,8 +33,8 @@ from parts import paper
 from scipy.ndimage import gaussian_filter
 
 import lnocl
+import lnocl.scene.grid
 from lnocl.metrics import restoration_error
-from lnocl.scene.grid import length_for
 from lnocl.scene.padding import recommend_pad
 from lnocl.simulation import Experiment, fizeau_psf, hh34, simulate
 
@@ -162,9 +162,9 @@ class Sky:
         return best
 
 
-def grid_of(shape, pad):
+def grid_of(kind, shape, pad):
     """Return the grid that lnocl takes."""
-    return tuple(length_for(n + 2 * pad) for n in shape)
+    return lnocl.scene.grid.grid_of(sky(kind, shape, False, 0).observation(), pad)
 
 
 def measure(kind, shape, has_star, pad, solver, device):
@@ -183,7 +183,7 @@ def measure(kind, shape, has_star, pad, solver, device):
         "star": has_star,
         "solver": solver,
         "pad": pad,
-        "grid": "{1} x {0}".format(*grid_of(shape, pad)),
+        "grid": "{1} x {0}".format(*grid_of(kind, shape, pad)),
         "at": float(np.mean(iterations)),
         "edges": edge,
         "middle": middle,
@@ -213,7 +213,7 @@ def edges(given):
                 for solver in ("sgm", "sgp"):
                     known = {}
                     for pad in pads(kind, shape):
-                        grid = grid_of(shape, pad)
+                        grid = grid_of(kind, shape, pad)
                         if grid not in known:
                             known[grid] = measure(kind, shape, has_star, pad, solver, given.device)
                         yield known[grid] | {"pad": pad}
