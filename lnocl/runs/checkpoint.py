@@ -64,6 +64,11 @@ class Checkpoint:
             An input or a parameter differs; the message names it.
         """
         differing = [name for name in described if self.described.get(name) != described[name]]
+        if differing == ["tuning"]:
+            raise InputError(
+                f"the checkpoint {self.path} is of a run before lnocl devices --tune, which has "
+                "changed the tuning since: start anew, or remove the file that it named"
+            )
         if differing:
             raise InputError(
                 f"the checkpoint {self.path} is of another run: {', '.join(differing)} "
