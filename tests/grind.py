@@ -132,7 +132,12 @@ def keep_track():
         event.wait()
         return event
 
-    cl.enqueue_copy = copied
+    def filled(queue, buffer, pattern, offset, size):
+        return copied(
+            queue, buffer, np.full(size // pattern.itemsize, pattern[0]), dst_offset=offset
+        )
+
+    cl.enqueue_copy, cl.enqueue_fill_buffer = copied, filled
 
 
 def nbytes_of(given):
