@@ -46,8 +46,10 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
         raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
     # Light that is farther from its source than the images are wide reaches none of them.
-    psf_shape = observation.psfs.shape[1:]
-    ny, nx = (max(n + 2 * int(pad), min(k, 2 * n)) for n, k in zip(shape, psf_shape, strict=True))
+    reach = (
+        min(k, 2 * n, MAX_AXIS) for n, k in zip(shape, observation.psfs.shape[1:], strict=True)
+    )
+    ny, nx = (max(n + 2 * int(pad), k) for n, k in zip(shape, reach, strict=True))
     if max(ny, nx) > MAX_AXIS:
         raise InputError(
             f"images of {shape} with pad={pad} need a grid of {(ny, nx)}; "

@@ -35,7 +35,7 @@ class Timed(NamedTuple):
 
 
 def fastest(timed: list[Timed]) -> Tuning:
-    """Return the tuning to take: the fastest, or the first where that is no faster to speak of."""
+    """Return the fastest tuning, or the first where that gains less than 3 %."""
     best = min(timed, key=lambda each: each.ratio)
     return best.tuning if best.ratio < WORTH else timed[0].tuning
 

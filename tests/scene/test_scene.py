@@ -51,6 +51,12 @@ def test_grid_holds_psfs_as_far_as_they_reach(psf_shape, grid):
     assert scene.grid == grid
 
 
+@pytest.mark.filterwarnings("ignore:the psf")
+def test_a_psf_that_no_grid_holds_refuses_no_image():
+    image, psf = np.ones((1, MAX_AXIS - 192)), np.ones((1, MAX_AXIS + 1))
+    assert Scene(lnocl.Observation(image, psf)).grid == (2, MAX_AXIS)
+
+
 def test_images_lie_at_the_origin():
     mask = np.zeros((2, 5, 11), bool)
     mask[1, 2, 3] = True
