@@ -2,11 +2,12 @@
 
     python benchmarks/crowded.py [--stars 200] [--size 1000] [--images 1] [--psf 33] [--refine]
         [--solver sgp] [--engine opencl] [--precision single] [--n-iter 3] [--output FILE.npz]
-        [held-out]
+        [held-out | price]
 
 Stars lie at random, a tenth of the side from the edges and farther; they are given up to a third of
 a pixel off. Memory is the peak of the process above that before the run, when it holds the images.
-With held-out, held-out counts choose the smoothing and the iteration as well.
+With held-out, held-out counts choose the smoothing and the iteration as well. With price, an
+iteration with the stars is timed beside one without any, in turn.
 """
 
 import argparse
@@ -40,10 +41,25 @@ def peak():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
+def price(observation, stars, turns=7, count=50, **settings):
+    """Return milliseconds of an iteration with stars and without, medians of several turns."""
+
+    def seconds(positions, n_iter):
+        begin = time.perf_counter()
+        paper(observation, stars=positions, n_iter=n_iter, **settings)
+        return time.perf_counter() - begin
+
+    both = stars, stars[:0]
+    for each in both:
+        seconds(each, 3)  # compiles
+    turns = [[seconds(each, 5 + count) - seconds(each, 5) for each in both] for _ in range(turns)]
+    return 1e3 / count * np.median(turns, axis=0)
+
+
 def main():
     """Measure what the arguments ask for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("rule", nargs="?", choices=["held-out"])
+    parser.add_argument("rule", nargs="?", choices=["held-out", "price"])
     parser.add_argument("--stars", type=int, default=200)
     parser.add_argument("--size", type=int, default=1000)
     parser.add_argument("--images", type=int, default=1)
@@ -56,6 +72,11 @@ def main():
     parser.add_argument("--output")
     given = parser.parse_args()
     observation, stars = field(given.stars, given.size, given.images, given.psf)
+    if given.rule == "price":
+        settings = {name: getattr(given, name) for name in ("solver", "engine", "precision")}
+        with_stars, without = price(observation, stars, **settings)
+        print(f"{with_stars:.2f} ms an iteration, {without:.2f} without stars")
+        return
     before, begin, first = peak(), time.perf_counter(), []
     result = paper(
         observation,

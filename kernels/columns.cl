@@ -1,32 +1,32 @@
 /* Transforms along the columns of half spectra, a block of columns at a time. */
 
-/* Outer and all inner passes of the forward transform of a block of columns. */
+/* Outer and all inner passes of the forward transform of a block of columns of n points. */
 INLINE void forward_columns(
-    SCRATCH vec *z, __global const vec *from, __global const real *column_roots)
+    SCRATCH vec *z, __global const vec *from, const int n, __global const real *roots)
 {
-    FOR_EACH(piece, INNER(NY) * SIDE) {
+    FOR_EACH(piece, INNER(n) * SIDE) {
         const int y = piece / SIDE, lane = piece % SIDE;
-        cvec a[OUTER(NY)];
+        cvec a[MAX_OUTER];
         UNROLL
-        for (int q = 0; q < OUTER(NY); ++q)
-            a[q] = LOAD(from + lane, q * INNER(NY) + y);
-        store_forward(z + lane, a, y, NY, column_roots);
+        for (int q = 0; q < OUTER(n); ++q)
+            a[q] = LOAD(from + lane, q * INNER(n) + y);
+        store_forward(z + lane, a, y, n, roots);
     }
     BARRIER;
-    dif_inner(z, NY, column_roots);
+    dif_inner(z, n, roots);
 }
 
-/* The outer pass of the inverse transform of a block of columns. */
+/* The outer pass of the inverse transform of a block of columns of n points. */
 INLINE void finish_columns(
-    __global vec *to, SCRATCH const vec *z, __global const real *column_roots)
+    __global vec *to, SCRATCH const vec *z, const int n, __global const real *roots)
 {
-    FOR_EACH(piece, INNER(NY) * SIDE) {
+    FOR_EACH(piece, INNER(n) * SIDE) {
         const int y = piece / SIDE, lane = piece % SIDE;
-        cvec a[OUTER(NY)];
-        load_inverse(a, z + lane, y, NY, column_roots);
+        cvec a[MAX_OUTER];
+        load_inverse(a, z + lane, y, n, roots);
         UNROLL
-        for (int q = 0; q < OUTER(NY); ++q)
-            STORE(to + lane, q * INNER(NY) + y, a[q]);
+        for (int q = 0; q < OUTER(n); ++q)
+            STORE(to + lane, q * INNER(n) + y, a[q]);
     }
     BARRIER;
 }
@@ -41,7 +41,7 @@ KERNEL void fft_columns(
     SCRATCH vec *z = OWN_SCRATCH(scratch, NY);
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
-        forward_columns(z, columns, column_roots);
+        forward_columns(z, columns, NY, column_roots);
         FOR_EACH(i, NY * 2 * SIDE)
             columns[i] = z[i];
         BARRIER;
@@ -62,6 +62,6 @@ KERNEL void ifft_columns(
             z[i] = columns[i];
         BARRIER;
         dit_inner(z, NY, column_roots);
-        finish_columns(columns, z, column_roots);
+        finish_columns(columns, z, NY, column_roots);
     }
 }

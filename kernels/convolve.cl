@@ -5,12 +5,20 @@
  *     K_A A + i K_B B = (K_A + K_B) / 2 P(k) + (K_A - K_B) / 2 conj(P(-k)).
  * The first factor is kept in column 0 of the OTF, the second in `otf_edges`, [NY][2] reals an
  * image.
+ *
+ * Where the sky is finer than the images, an image has every OVERSAMPLE-th point of the convolved
+ * sky. Its spectrum is periodic: frequency k holds the sum of k, k + IMAGE_NY, k + 2 IMAGE_NY ...,
+ * which are neighbours in reversed order. Here columns are folded so; ratio.cl folds the rows.
  */
 
-/* a plus what column 0 gets from its opposite point: (re + i im) conj(p(opposite place)). */
-INLINE cvec add_edge(const cvec a, const real re, const real im, SCRATCH const vec *p, const int t)
+/* a plus what column 0 gets from its opposite point, (re + i im) conj(p(opposite place)); one point
+ * of p stands for `share` points of the column.
+ */
+INLINE cvec add_edge(
+    const cvec a, const real re, const real im, SCRATCH const vec *p, const int t, const int share)
 {
-    SCRATCH const real *opposite = (SCRATCH const real *)p + 2 * opposite_place(t, NY) * BLOCK;
+    SCRATCH const real *opposite =
+        (SCRATCH const real *)p + 2 * (opposite_place(t, NY) / share) * BLOCK;
     const real x = opposite[0], y = opposite[BLOCK];
     return (cvec){a.re + FIRST_LANE * (re * x + im * y), a.im + FIRST_LANE * (im * x - re * y)};
 }
@@ -32,7 +40,7 @@ KERNEL void otf_columns(
     SCRATCH vec *z = OWN_SCRATCH(scratch, NY);
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *k = otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
-        forward_columns(z, spectra + (size_t)block * ROWS * 2 * SIDE, column_roots);
+        forward_columns(z, spectra + (size_t)block * ROWS * 2 * SIDE, NY, column_roots);
         FOR_EACH(i, NY * 2 * SIDE)
             k[i] = z[i] * norm;
         BARRIER;
@@ -53,48 +61,64 @@ KERNEL void otf_columns(
     }
 }
 
-/* spectra_j <- IFFT(otfs_j FFT(spectra_0)) along the columns: the row spectra of A_j f from f's.
+/* Point t of a column of an image, in reversed order: the sum of OVERSAMPLE points of otfs_j FFT(f).
+ * `k` and `edge` are those of image and block; `edges` tells whether this is column 0.
+ */
+INLINE cvec convolved(
+    SCRATCH const vec *source, __global const vec *k, __global const real *edge, const int t,
+    const int lane, const bool edges)
+{
+    cvec total;
+    UNROLL
+    for (int q = 0; q < OVERSAMPLE; ++q) {
+        const int point = t * OVERSAMPLE + q;
+        cvec a = multiply(LOAD(source + lane, point), LOAD(k + lane, point));
+        if (edges)
+            a = add_edge(a, edge[2 * point], edge[2 * point + 1], source, point, 1);
+        total = q > 0 ? add(total, a) : a;
+    }
+    return total;
+}
+
+/* spectra_j <- IFFT(otfs_j FFT(spectra_0)) along the columns: the row spectra of A_j f from f's, in
+ * every OVERSAMPLE-th row.
  * spectra: n_images arrays, written but for their padding. otfs: n_images arrays, const;
  * otf_edges: [n_images][NY][2].
- * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: 2 NY points.
+ * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: NY + IMAGE_NY points.
  * Twin: reference.convolve_columns.
  */
 KERNEL void convolve_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
     __global const real *restrict otf_edges, const int n_images,
-    __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
+    __global const real *restrict column_roots, __global const real *restrict image_column_roots,
+    SCRATCH vec *restrict scratch)
 {
-    SCRATCH vec *source = OWN_SCRATCH(scratch, 2 * NY);
+    SCRATCH vec *source = OWN_SCRATCH(scratch, NY + IMAGE_NY);
     SCRATCH vec *z = source + 2 * NY * SIDE;
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
-        forward_columns(source, columns, column_roots);
+        forward_columns(source, columns, NY, column_roots);
         for (int image = 0; image < n_images; ++image) {
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
-            for (int start = 0; start < NY; start += SPAN(NY)) {
-                FOR_EACH(piece, SPAN(NY) / LAST(NY) * SIDE) {
-                    const int t = start + piece / SIDE * LAST(NY), lane = piece % SIDE;
+            __global const real *edge = otf_edges + 2 * image * NY;
+            for (int start = 0; start < IMAGE_NY; start += SPAN(IMAGE_NY)) {
+                FOR_EACH(piece, SPAN(IMAGE_NY) / LAST(IMAGE_NY) * SIDE) {
+                    const int t = start + piece / SIDE * LAST(IMAGE_NY), lane = piece % SIDE;
                     cvec a[8];
                     UNROLL
-                    for (int q = 0; q < LAST(NY); ++q)
-                        a[q] = multiply(LOAD(source + lane, t + q), LOAD(k + lane, t + q));
-                    if (block == 0 && lane == 0) {
-                        __global const real *edge = otf_edges + 2 * (image * NY + t);
-                        UNROLL
-                        for (int q = 0; q < LAST(NY); ++q)
-                            a[q] = add_edge(a[q], edge[2 * q], edge[2 * q + 1], source, t + q);
-                    }
-                    dit(a, LAST(NY));
+                    for (int q = 0; q < LAST(IMAGE_NY); ++q)
+                        a[q] = convolved(source, k, edge, t + q, lane, block == 0 && lane == 0);
+                    dit(a, LAST(IMAGE_NY));
                     UNROLL
-                    for (int q = 0; q < LAST(NY); ++q)
+                    for (int q = 0; q < LAST(IMAGE_NY); ++q)
                         STORE(z + lane, t + q, a[q]);
                 }
                 BARRIER;
-                dit_span(z + 2 * SIDE * start, NY, column_roots);
+                dit_span(z + 2 * SIDE * start, IMAGE_NY, image_column_roots);
             }
-            dit_middle(z, NY, column_roots);
-            finish_columns(columns + (size_t)image * SPECTRA_SIZE, z, column_roots);
+            dit_middle(z, IMAGE_NY, image_column_roots);
+            finish_columns(columns + (size_t)image * SPECTRA_SIZE, z, IMAGE_NY, image_column_roots);
         }
     }
 }
@@ -102,28 +126,31 @@ KERNEL void convolve_columns(
 /* spectra_0 <- IFFT(sum_j conj(otfs_j) FFT(spectra_j)) along the columns: the row spectrum of
  * sum_j A_j^T (r_j - w_j) from those of the r_j - w_j. Shapes as in convolve_columns; array 0 alone
  * is written.
- * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: 2 NY points.
+ * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: NY + IMAGE_NY points.
  * Twin: reference.correlate_columns.
  */
 KERNEL void correlate_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
     __global const real *restrict otf_edges, const int n_images,
-    __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
+    __global const real *restrict column_roots, __global const real *restrict image_column_roots,
+    SCRATCH vec *restrict scratch)
 {
-    SCRATCH vec *total = OWN_SCRATCH(scratch, 2 * NY);
+    SCRATCH vec *total = OWN_SCRATCH(scratch, NY + IMAGE_NY);
     SCRATCH vec *z = total + 2 * NY * SIDE;
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
         for (int image = 0; image < n_images; ++image) {
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
-            forward_columns(z, columns + (size_t)image * SPECTRA_SIZE, column_roots);
+            forward_columns(
+                z, columns + (size_t)image * SPECTRA_SIZE, IMAGE_NY, image_column_roots);
             FOR_EACH(piece, NY * SIDE) {
                 const int t = piece / SIDE, lane = piece % SIDE;
-                cvec product = multiply_conjugate(LOAD(z + lane, t), LOAD(k + lane, t));
+                const cvec a = LOAD(z + lane, t / OVERSAMPLE);
+                cvec product = multiply_conjugate(a, LOAD(k + lane, t));
                 if (block == 0 && lane == 0) {
                     __global const real *edge = otf_edges + 2 * (image * NY + t);
-                    product = add_edge(product, edge[0], -edge[1], z, t);
+                    product = add_edge(product, edge[0], -edge[1], z, t, OVERSAMPLE);
                 }
                 if (image > 0)
                     product = add(product, LOAD(total + lane, t));
@@ -132,6 +159,6 @@ KERNEL void correlate_columns(
             BARRIER;
         }
         dit_inner(total, NY, column_roots);
-        finish_columns(columns, total, column_roots);
+        finish_columns(columns, total, NY, column_roots);
     }
 }

@@ -19,10 +19,20 @@
  * for j and q = 1 .. R - 1. The last pass needs none.
  */
 
-#define ODD(n) ((n) == NX ? ROW_ODD : COLUMN_ODD)
+#define IS_ROW(n) ((n) == NX || (n) == IMAGE_NX)
+#define ODD(n) (IS_ROW(n) ? ROW_ODD : COLUMN_ODD)
 #define EVEN(n) ((n) / ODD(n))
-#define OUTER(n) ((n) == NX ? ROW_OUTER : COLUMN_OUTER)
-#define LAST(n) ((n) == NX ? ROW_LAST : COLUMN_LAST)
+#define OUTER(n)                                \
+    ((n) == NX                ? ROW_OUTER       \
+            : (n) == IMAGE_NX ? IMAGE_ROW_OUTER \
+            : (n) == NY       ? COLUMN_OUTER    \
+                              : IMAGE_COLUMN_OUTER)
+#define LAST(n)                                \
+    ((n) == NX                ? ROW_LAST       \
+            : (n) == IMAGE_NX ? IMAGE_ROW_LAST \
+            : (n) == NY       ? COLUMN_LAST    \
+                              : IMAGE_COLUMN_LAST)
+#define MAX_OUTER 9
 #define INNER(n) ((n) / OUTER(n))
 #define HAS_MIDDLE(n) (INNER(n) > LAST(n) && INNER(n) > CHUNK)
 #define SPAN_LENGTH(n) (HAS_MIDDLE(n) ? INNER(n) / 8 : INNER(n))

@@ -7,10 +7,13 @@
  *   GROUP           work-items that share a block, a power of two
  *   ROW_ODD, ROW_OUTER, ROW_LAST, COLUMN_ODD, COLUMN_OUTER, COLUMN_LAST
  *                   odd factor of an axis, and radices of its transform, see fft.cl
+ *   IMAGE_ROW_OUTER, IMAGE_ROW_LAST, IMAGE_COLUMN_OUTER, IMAGE_COLUMN_LAST
+ *                   the same of the images' axes, whose odd factors are those of the sky's
  *   CHUNK           points of a transform that are finished before the next are begun
  *   SCRATCH_IS_GLOBAL   0 or 1: where a block lies while it is transformed
- *   NX, NY          the grid, each 1, 3, 5, 7 or 9 times a power of two, up to 8192; 2 BLOCK
- *                   divides that power
+ *   NX, NY          the grid of the sky, each 1, 3, 5, 7 or 9 times a power of two, up to 8192
+ *   OVERSAMPLE      pixels of the sky to one of the images, along each axis: 1, 2 or 4; 2 BLOCK
+ *                   OVERSAMPLE divides that power of two
  *   ROWS            rows that a block of spectra takes in memory: NY and some padding
  *   MAX_STARS       room for stars: the scene has no more than these
  *   HAS_MU, HAS_SMOOTHING, HAS_WEIGHTS, HAS_BACKGROUND_MAP, HAS_EXPOSURE_MAP    0 or 1: what the
@@ -19,7 +22,9 @@
  *
  * Layouts, in reals, the last index fastest:
  *   pixels    [NY / 2 / BLOCK][NX][2][BLOCK]     lanes are pairs of rows: 2 y and 2 y + 1
- *   spectra   [NX / 2 / BLOCK][ROWS][2][BLOCK]   lanes are columns; real part, imaginary part
+ *             of the sky; those of an image have IMAGE_NY and IMAGE_NX
+ *   spectra   [NX / 2 / BLOCK][ROWS][2][BLOCK]   lanes are columns; real part, imaginary part;
+ *             of an image IMAGE_NY of the rows are used
  *   otf       [NX / 2 / BLOCK][NY][2][BLOCK]     as spectra
  * A block of BLOCK reals is SIDE vectors of LANES reals.
  */
@@ -50,9 +55,13 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define as_ivec PASTE(as_, PASTE(BITS, WIDTH))
 
 #define SIDE (BLOCK / LANES)
+#define IMAGE_NX (NX / OVERSAMPLE)
+#define IMAGE_NY (NY / OVERSAMPLE)
 #define ROW_BLOCKS (NY / 2 / BLOCK)
+#define IMAGE_ROW_BLOCKS (IMAGE_NY / 2 / BLOCK)
 #define COLUMN_BLOCKS (NX / 2 / BLOCK)
 #define PIXELS_SIZE (NX * NY / LANES)                  /* vectors */
+#define IMAGE_SIZE (IMAGE_NX * IMAGE_NY / LANES)       /* vectors */
 #define SPECTRA_SIZE (COLUMN_BLOCKS * ROWS * 2 * SIDE) /* vectors */
 
 /* Without it PoCL leaves calls behind, and registers go through memory. */

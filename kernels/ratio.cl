@@ -79,49 +79,70 @@ INLINE vec ratio(vec g, const vec m, vec *term)
 #endif
 }
 
+/* Sums of the OVERSAMPLE frequencies that are one in an image, neighbours in reversed order. */
+INLINE SCRATCH vec *fold_rows(SCRATCH vec *z)
+{
+#if OVERSAMPLE == 1
+    return z;
+#else
+    SCRATCH vec *folded = z + 2 * SIDE * NX;
+    FOR_EACH(piece, IMAGE_NX * SIDE) {
+        const int t = piece / SIDE, lane = piece % SIDE;
+        cvec a = LOAD(z + lane, t * OVERSAMPLE);
+        UNROLL
+        for (int q = 1; q < OVERSAMPLE; ++q)
+            a = add(a, LOAD(z + lane, t * OVERSAMPLE + q));
+        STORE(folded + lane, t, a);
+    }
+    BARRIER;
+    return folded;
+#endif
+}
+
 /* m_j = A_j f + sum_s c_s P_js + b_j;  r_j = w_j g_j / m_j;  spectra <- row spectra of r_j - w_j;
  * ratio_sums: J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j); star_sums: <P_js, r_j - w_j>.
  * spectra: n_images arrays, in: row spectra of A_j f, out: twice the row spectra of r_j - w_j.
  * images: n_images arrays of pixels, negative where not observed (HAS_WEIGHTS).
  * background: [n_images], or n_images arrays of pixels (HAS_BACKGROUND_MAP).
  * exposure: n_images arrays of pixels, w (HAS_EXPOSURE_MAP; then no image is negative).
- * star_images: [n_stars][n_images], a window of star_blocks blocks of pixels each, see stars.cl.
- * first_blocks, star_fluxes: [n_stars].
- * ratio_sums: [ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
- * Launch: up to ROW_BLOCKS n_images groups. In place. Scratch: NX points.
+ * star_images: [n_stars][n_images], a window of star_blocks blocks and star_columns columns each, see
+ * stars.cl; star_corners: [n_stars][2]. star_fluxes: [n_stars].
+ * ratio_sums: [IMAGE_ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
+ * Launch: up to IMAGE_ROW_BLOCKS n_images groups. In place. Scratch: NX points, and where
+ * OVERSAMPLE > 1 IMAGE_NX more.
  * Twin: reference.ratio_rows.
  */
 KERNEL void ratio_rows(
     __global vec *restrict spectra, __global real *restrict ratio_sums,
     __global real *restrict star_sums, __global const vec *restrict images,
     __global const real *restrict background, __global const vec *restrict exposure,
-    __global const vec *restrict star_images, __global const int *restrict first_blocks,
+    __global const vec *restrict star_images, __global const int *restrict star_corners,
     __global const real *restrict star_fluxes, const int n_images, const int n_stars,
-    const int star_blocks, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const int star_blocks, const int star_columns, __global const real *restrict image_row_roots,
+    SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
-    SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
-    FOR_EACH_BLOCK(unit, ROW_BLOCKS * n_images) {
+    SCRATCH vec *wide = OWN_SCRATCH(scratch, NX + (OVERSAMPLE > 1 ? IMAGE_NX : 0));
+    FOR_EACH_BLOCK(unit, IMAGE_ROW_BLOCKS * n_images) {
         const int block = unit / n_images, image = unit % n_images;
         __global vec *row_spectra = spectra + (size_t)image * SPECTRA_SIZE;
-        const size_t at = (size_t)image * PIXELS_SIZE + (size_t)block * NX * 2 * SIDE;
-        read_tiles(z, row_spectra, block);
-        dit_inner(z, NX, row_roots);
-        const near_stars near =
-            stars_near(first_blocks, n_stars, n_images, star_blocks, image, block);
+        const size_t at = (size_t)image * IMAGE_SIZE + (size_t)block * IMAGE_NX * 2 * SIDE;
+        read_tiles(wide, row_spectra, block);
+        SCRATCH vec *z = fold_rows(wide);
+        dit_inner(z, IMAGE_NX, image_row_roots);
+        const near_stars near = stars_near(
+            star_corners, n_stars, n_images, star_blocks, image, block, IMAGE_ROW_BLOCKS);
         vec_sum objective = {0, 0}, products[NEAR_ROOM];
         for (int s = 0; s < near.count; ++s)
             products[s] = (vec_sum){0, 0};
-        FOR_EACH(piece, INNER(NX) * SIDE) {
+        FOR_EACH(piece, INNER(IMAGE_NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
-            cvec a[OUTER(NX)];
-            load_inverse(a, z + lane, x, NX, row_roots);
-            vec terms = 0, part[NEAR_ROOM];
-            for (int s = 0; s < near.count; ++s)
-                part[s] = 0;
+            cvec a[OUTER(IMAGE_NX)];
+            load_inverse(a, z + lane, x, IMAGE_NX, image_row_roots);
+            vec terms = 0;
             /* Left rolled: unrolled, the pixelwise work runs out of registers and is slower. */
-            for (int q = 0; q < OUTER(NX); ++q) {
-                const int pixel = q * INNER(NX) + x;
+            for (int q = 0; q < OUTER(IMAGE_NX); ++q) {
+                const int pixel = q * INNER(IMAGE_NX) + x;
                 const cvec g = LOAD(images + at + lane, pixel);
 #if HAS_BACKGROUND_MAP
                 a[q] = add(a[q], LOAD((__global const vec *)background + at + lane, pixel));
@@ -130,7 +151,11 @@ KERNEL void ratio_rows(
                 a[q].im += background[image];
 #endif
                 for (int s = 0; s < near.count; ++s) {
-                    const cvec p = LOAD(WINDOW_BLOCK(star_images, near.block[s]) + lane, pixel);
+                    const int column = window_column(pixel, near.column[s], IMAGE_NX);
+                    if (column >= star_columns)
+                        continue;
+                    const cvec p =
+                        LOAD(WINDOW_BLOCK(star_images, near.block[s], star_columns) + lane, column);
                     a[q].re += star_fluxes[near.star[s]] * p.re;
                     a[q].im += star_fluxes[near.star[s]] * p.im;
                 }
@@ -146,20 +171,22 @@ KERNEL void ratio_rows(
 #endif
                 terms += term.re + term.im;
                 for (int s = 0; s < near.count; ++s) {
-                    const cvec p = LOAD(WINDOW_BLOCK(star_images, near.block[s]) + lane, pixel);
-                    part[s] += p.re * a[q].re + p.im * a[q].im;
+                    const int column = window_column(pixel, near.column[s], IMAGE_NX);
+                    if (column >= star_columns)
+                        continue;
+                    const cvec p =
+                        LOAD(WINDOW_BLOCK(star_images, near.block[s], star_columns) + lane, column);
+                    ACCUMULATE(products[s], p.re * a[q].re + p.im * a[q].im);
                 }
             }
             ACCUMULATE(objective, terms);
-            for (int s = 0; s < near.count; ++s)
-                ACCUMULATE(products[s], part[s]);
-            store_forward(z + lane, a, x, NX, row_roots);
+            store_forward(z + lane, a, x, IMAGE_NX, image_row_roots);
         }
         store_pair(ratio_sums + 2 * unit, sum_group(sum_lanes(objective), shared));
         for (int s = 0; s < near.count; ++s)
             store_pair(star_sums + 2 * near.block[s], sum_group(sum_lanes(products[s]), shared));
         BARRIER;
-        dif_inner(z, NX, row_roots);
-        write_tiles(row_spectra, z, block);
+        dif_inner(z, IMAGE_NX, image_row_roots);
+        write_tiles(row_spectra, z, block, OVERSAMPLE);
     }
 }

@@ -132,8 +132,11 @@ INLINE void read_tiles(SCRATCH vec *z, __global const vec *spectra, const int bl
     BARRIER;
 }
 
-/* Z in the scratch, in reversed order -> twice the half spectra of its row pairs. */
-INLINE void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int block)
+/* Z in the scratch, in reversed order -> twice the half spectra of its row pairs; one point of Z
+ * stands for `share` points of them.
+ */
+INLINE void write_tiles(
+    __global vec *spectra, SCRATCH const vec *z, const int block, const int share)
 {
     FOR_EACH(piece, COLUMN_BLOCKS * SIDE * SIDE) {
         const int column = piece % SIDE, pair = piece / SIDE % SIDE, tile = piece / SIDE / SIDE;
@@ -147,8 +150,8 @@ INLINE void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int b
             vec a[LANES];
             UNROLL
             for (int i = 0; i < LANES; ++i) {
-                const int k = 2 * place(h, i, shift) * SIDE;
-                const int minus_k = 2 * opposite(h, i, shift) * SIDE;
+                const int k = 2 * (place(h, i, shift) / share) * SIDE;
+                const int minus_k = 2 * (opposite(h, i, shift) / share) * SIDE;
                 a[i] = from_first[first < 2 ? k : minus_k]
                     + WRITE_SIGN[part] * from_second[second < 2 ? k : minus_k];
             }
@@ -162,10 +165,11 @@ INLINE void write_tiles(__global vec *spectra, SCRATCH const vec *z, const int b
     FOR_EACH(pair, BLOCK) {
         __global real *x = (__global real *)(spectra + tile_start(block, 0)) + 4 * pair * BLOCK;
         SCRATCH const real *first = (SCRATCH const real *)z + pair;
+        SCRATCH const real *second = first + 2 * BLOCK * (1 / share);
         x[0] = 2 * first[0];
         x[2 * BLOCK] = 2 * first[BLOCK];
-        x[BLOCK] = 2 * first[2 * BLOCK];
-        x[3 * BLOCK] = 2 * first[3 * BLOCK];
+        x[BLOCK] = 2 * second[0];
+        x[3 * BLOCK] = 2 * second[BLOCK];
     }
     BARRIER;
 }
@@ -213,7 +217,7 @@ KERNEL void rfft_rows(
         }
         BARRIER;
         dif_inner(z, NX, row_roots);
-        write_tiles(spectra, z, block);
+        write_tiles(spectra, z, block, 1);
     }
 }
 

@@ -79,7 +79,7 @@ KERNEL void scale_rows(
 #endif
         BARRIER;
         dif_inner(z, NX, row_roots);
-        write_tiles(spectra, z, block);
+        write_tiles(spectra, z, block, 1);
     }
     if (get_group_id(0) == 0) {
         FOR_EACH(s, n_stars)

@@ -101,8 +101,8 @@ KERNEL void gradient_rows(
  * coupling_sums: <cross_information_s, d>; square_sums: sum extended^2.
  * spectra: one array, out: twice the row spectrum. extended: one array of pixels, written.
  * previous (f), gradient, shift: one each, const; inverse_weight, curvature: as for gradient_rows,
- * which has D. cross_information: [n_stars], a window of cross_blocks blocks of pixels each, see
- * stars.cl; cross_first_blocks: [n_stars]; coupling_sums: [n_stars][cross_blocks][2].
+ * which has D. cross_information: [n_stars], a window of cross_blocks blocks and cross_columns
+ * columns each, see stars.cl; cross_corners: [n_stars][2]; coupling_sums: [n_stars][cross_blocks][2].
  * step_sums, square_sums (HAS_MU): [ROW_BLOCKS][2].
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.step_rows.
  */
@@ -112,18 +112,18 @@ KERNEL void step_rows(
     __global real *restrict square_sums, __global const vec *restrict previous,
     __global const vec *restrict gradient, __global const vec *restrict shift,
     __global const vec *restrict inverse_weight, __global const vec *restrict curvature,
-    __global const vec *restrict cross_information, __global const int *restrict cross_first_blocks,
+    __global const vec *restrict cross_information, __global const int *restrict cross_corners,
     const real mu, const real alpha, const real share, const int n_images, const int n_stars,
-    const int cross_blocks, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const int cross_blocks, const int cross_columns, __global const real *restrict row_roots,
+    SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
     FOR_EACH_BLOCK(block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
-        const near_stars near = stars_near(cross_first_blocks, n_stars, 1, cross_blocks, 0, block);
-        vec_sum slope_total = {0, 0}, square_total = {0, 0}, couplings[NEAR_ROOM];
-        for (int s = 0; s < near.count; ++s)
-            couplings[s] = (vec_sum){0, 0};
+        const near_stars near =
+            stars_near(cross_corners, n_stars, 1, cross_blocks, 0, block, ROW_BLOCKS);
+        vec_sum slope_total = {0, 0}, square_total = {0, 0};
         /* A pass of its own over the pixels in their order, which prefetching follows: inside the
          * transform they come from too many places at once.
          */
@@ -141,13 +141,23 @@ KERNEL void step_rows(
             const cvec trial = {not_below_0(f.re + share * d.re), not_below_0(f.im + share * d.im)};
             STORE(extended + at + lane, pixel, trial);
             ACCUMULATE(slope_total, g.re * d.re + g.im * d.im);
-            for (int s = 0; s < near.count; ++s) {
-                const cvec r = LOAD(WINDOW_BLOCK(cross_information, near.block[s]) + lane, pixel);
-                ACCUMULATE(couplings[s], r.re * d.re + r.im * d.im);
-            }
+            if (near.count > 0)
+                STORE(z + lane, pixel, d);
 #if HAS_MU
             ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
 #endif
+        }
+        BARRIER;
+        for (int s = 0; s < near.count; ++s) {
+            __global const vec *r = WINDOW_BLOCK(cross_information, near.block[s], cross_columns);
+            vec_sum coupling = {0, 0};
+            FOR_EACH(piece, cross_columns * SIDE) {
+                const int column = piece / SIDE, lane = piece % SIDE;
+                const int pixel = (near.column[s] + column) % NX;
+                const cvec d = LOAD(z + lane, pixel), there = LOAD(r + lane, column);
+                ACCUMULATE(coupling, there.re * d.re + there.im * d.im);
+            }
+            store_pair(coupling_sums + 2 * near.block[s], sum_group(sum_lanes(coupling), shared));
         }
         BARRIER;
         FOR_EACH(piece, INNER(NX) * SIDE) {
@@ -158,14 +168,11 @@ KERNEL void step_rows(
             store_forward(z + lane, a, x, NX, row_roots);
         }
         store_pair(step_sums + 2 * block, sum_group(sum_lanes(slope_total), shared));
-        for (int s = 0; s < near.count; ++s)
-            store_pair(
-                coupling_sums + 2 * near.block[s], sum_group(sum_lanes(couplings[s]), shared));
 #if HAS_MU
         store_pair(square_sums + 2 * block, sum_group(sum_lanes(square_total), shared));
 #endif
         BARRIER;
         dif_inner(z, NX, row_roots);
-        write_tiles(spectra, z, block);
+        write_tiles(spectra, z, block, 1);
     }
 }

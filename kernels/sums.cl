@@ -92,7 +92,7 @@ INLINE real_sum sum_pairs(__global const real *pairs, const int n)
  * not below 0 (negative PSF pixels).
  * objectives: [iterations][2], a compensated pair each; entry `iteration` is written.
  * data_term: [2], J_0. star_totals: [n_stars][2]. star_corrections, star_weights: [n_stars].
- * ratio_sums: [ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
+ * ratio_sums: [IMAGE_ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
  * square_sums (HAS_MU), smooth_sums (HAS_SMOOTHING): [ROW_BLOCKS][2].
  * Launch: one group. Out of place. Twin: reference.collect_sums.
  */
@@ -105,7 +105,7 @@ KERNEL void collect_sums(
     const int n_stars, const int star_blocks, const int iteration)
 {
     SHARED_SUMS(shared);
-    real_sum objective = sum_group(sum_pairs(ratio_sums, ROW_BLOCKS * n_images), shared);
+    real_sum objective = sum_group(sum_pairs(ratio_sums, IMAGE_ROW_BLOCKS * n_images), shared);
     store_pair(data_term, objective);
 #if HAS_MU
     real_sum squares = sum_group(sum_pairs(square_sums, ROW_BLOCKS), shared);

@@ -33,6 +33,13 @@ CASES = {
     "odd factors 3 and 5": ((12, 40), Tuning(2, 2, chunk=2), harness.THREE_IMAGES, "sD"),
     "odd factors 7 and 9": ((28, 36), Tuning(2, 2), "exposure map, mu", "Sd"),
     "group": ((16, 32), ON_GPU, harness.THREE_IMAGES, "Sd"),
+    "sky twice as fine": ((16, 24), Tuning(2, 2), harness.TWICE_AS_FINE, "s"),
+    "group, sky four times as fine": (
+        (16, 32),
+        Tuning(1, 2, group=4),
+        harness.FOUR_TIMES_AS_FINE,
+        "sd",
+    ),
     "group, exposure map": ((32, 16), Tuning(1, 8, group=4), "exposure map, mu", "s"),
     "group, mu": ((16, 16), ON_GPU, "two images, star, mu", "D"),
     "group, odd factors": ((36, 40), Tuning(1, 2, group=4), "mask, mu, smoothing", "sD"),
@@ -172,7 +179,7 @@ def plant(old, new):
 def tune_as_on_gpu():
     tune = program.tune
 
-    def tuned(device, dtype, grid):
+    def tuned(device, dtype, grid, oversample):
         gpu = SimpleNamespace(
             type=cl.device_type.GPU,
             max_work_group_size=device.max_work_group_size,
@@ -181,7 +188,7 @@ def tune_as_on_gpu():
             platform=device.platform,
             driver_version=device.driver_version,
         )
-        return tune(gpu, dtype, grid)
+        return tune(gpu, dtype, grid, oversample)
 
     program.tune = tuned
 

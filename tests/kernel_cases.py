@@ -11,7 +11,14 @@ import pytest
 from lnocl.opencl.device import choose, context_of
 from lnocl.opencl.tuning import Tuning
 from lnocl.verify.comparison import ALLOWED, deviation, kernels_of
-from lnocl.verify.harness import SCENES, THREE_IMAGES, KernelHarness, inputs
+from lnocl.verify.harness import (
+    FOUR_TIMES_AS_FINE,
+    SCENES,
+    THREE_IMAGES,
+    TWICE_AS_FINE,
+    KernelHarness,
+    inputs,
+)
 
 # Name: (grid, tuning, scene, precisions), a capital letter for one that only CI tests. Each grid
 # is the smallest that takes some path of kernels/fft.cl; tunings other than the default share a
@@ -38,6 +45,14 @@ CASES = {
     "odd factors 3 and 9, group": ((48, 144), Tuning(1, 8, group=4), THREE_IMAGES, "S"),
     "odd factors 3 and 5, vectors of 16": ((96, 160), Tuning(16, 16), THREE_IMAGES, "SD"),
     "odd factor 5, several vectors a block": ((80, 96), Tuning(4, 8), "plain", "S"),
+    "sky twice as fine": ((32, 64), None, TWICE_AS_FINE, "sD"),
+    "sky twice as fine, smallest": ((64, 4), None, TWICE_AS_FINE, "S"),
+    "sky twice as fine, odd factors 3 and 5": ((96, 80), None, TWICE_AS_FINE, "SD"),
+    "sky twice as fine, group": ((64, 96), Tuning(1, 8, group=4), TWICE_AS_FINE, "S"),
+    "sky twice as fine, middle pass": ((2048, 32), None, TWICE_AS_FINE, "D"),
+    "sky four times as fine": ((64, 32), None, FOUR_TIMES_AS_FINE, "sD"),
+    "sky four times as fine, radices 8, 8, 4": ((64, 1024), None, FOUR_TIMES_AS_FINE, "SD"),
+    "sky four times as fine, group": ((128, 64), Tuning(1, 8, group=4), FOUR_TIMES_AS_FINE, "S"),
     "global scratch": ((64, 32), Tuning(4, 16, scratch_is_global=True), "plain", "s"),
     "several vectors a block": ((64, 32), Tuning(4, 8), "mask, mu, smoothing", "S"),
     "group": ((64, 32), Tuning(1, 8, group=4), THREE_IMAGES, "sD"),

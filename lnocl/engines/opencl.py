@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from lnocl.opencl.device import choose, context_of, describe
 from lnocl.opencl.faults import guarded
 from lnocl.opencl.launch import Launch, Launcher
-from lnocl.opencl.layout import Layout
+from lnocl.opencl.layout import Layout, PixelLayout, shortest_arc
 from lnocl.opencl.memory import Memory, Transfer, announce, refuse_if_too_large
 from lnocl.opencl.program import Program
 from lnocl.opencl.tuning import Tuning, describe_tuning
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Stamp
+from lnocl.scene.stars import Lit, lit_box
 from lnocl.solvers.engine import State
 from lnocl.solvers.scaling import Scaling
 
@@ -95,7 +96,9 @@ class OpenCLEngine:
             min_model=MIN_MODEL,
         )
         self.layout = Layout(self.program)
-        self._stars = _Windows(self.layout, [scene.star_rows(s) for s in range(scene.n_stars)])
+        self._stars = _Windows(
+            self.layout.images, [scene.star_box(s) for s in range(scene.n_stars)]
+        )
         self._cross = self._cross_windows()
         sizes = self._sizes(n_iter)
         self.bytes_needed = refuse_if_too_large(
@@ -146,7 +149,7 @@ class OpenCLEngine:
 
     def _cross_windows(self) -> _Windows:
         stamps = self.scaling.cross_information if self.scaling is not None else []
-        return _Windows(self.layout, [_rows(stamp, self.scene.grid) for stamp in stamps])
+        return _Windows(self.layout, [lit_box([stamp], self.scene.grid) for stamp in stamps])
 
     def _sizes(self, n_iter: int) -> dict[str, int]:
         """Return the bytes of each buffer, by the name that the kernels have for it."""
@@ -163,7 +166,7 @@ class OpenCLEngine:
             "background": p * (pixels if self._has_background_map else item),
             "exposure": p * pixels if scene.has_exposure_map else item,
             "star_images": max(p * self._stars.bytes, item),
-            "first_blocks": max(n, 1) * 4,
+            "star_corners": max(n, 1) * 8,
             "star_fluxes": max(n, 1) * item,
             "star_weights": max(n, 1) * item,
             "star_corrections": max(n, 1) * item,
@@ -193,7 +196,7 @@ class OpenCLEngine:
         item = self.program.dtype.itemsize
         return {
             "cross_information": max(self._cross.bytes, item),
-            "cross_first_blocks": max(self.scene.n_stars, 1) * 4,
+            "cross_corners": max(self.scene.n_stars, 1) * 8,
             "coupling_sums": max(self._cross.n_blocks_of_all, 1) * 2 * item,
         }
 
@@ -203,7 +206,9 @@ class OpenCLEngine:
             "n_images": scene.n_images,
             "n_stars": scene.n_stars,
             "star_blocks": self._stars.n_blocks,
+            "star_columns": self._stars.n_columns,
             "cross_blocks": self._cross.n_blocks,
+            "cross_columns": self._cross.n_columns,
             "mu": scene.mu,
             "smoothing": scene.smoothing,
             "edge": scene.edge,
@@ -235,7 +240,7 @@ class OpenCLEngine:
         else:
             memory.upload("background", background)
         self._make_otfs()
-        memory.upload_integers("first_blocks", self._stars.first_blocks)
+        memory.upload_integers("star_corners", self._stars.corners)
         self.move_stars()
         if scene.weights is not None:
             self._invert_weights(scene.weights)
@@ -271,7 +276,7 @@ class OpenCLEngine:
             "cross_information",
             map(self._cross.cut, range(len(scaling.cross_information)), scaling.cross_information),
         )
-        self._memory.upload_integers("cross_first_blocks", self._cross.first_blocks)
+        self._memory.upload_integers("cross_corners", self._cross.corners)
         self._gradient = self._bind("gradient_rows")
         self._step = self._bind("step_rows")
 
@@ -477,46 +482,45 @@ class OpenCLEngine:
 
 
 class _Windows:
-    """The blocks of row pairs in which arrays of stars are not 0: see kernels/stars.cl.
+    """The blocks of row pairs, and columns, in which arrays of stars are not 0: kernels/stars.cl.
 
     Parameters
     ----------
-    layout : Layout
-        Of arrays of pixels.
-    rows : sequence of ndarray of bool, shape (Ny,)
-        For each star the rows that its arrays may reach into.
+    layout : PixelLayout
+        Of the arrays.
+    boxes : sequence of Lit
+        For each star the rows and columns that its arrays may reach into.
     """
 
-    def __init__(self, layout: Layout, rows: Sequence[NDArray[np.bool_]]) -> None:
-        windows = [layout.window(each) for each in rows]
+    def __init__(self, layout: PixelLayout, boxes: Sequence[Lit]) -> None:
+        blocks = [layout.window(box.rows) for box in boxes]
+        columns = [shortest_arc(box.columns) for box in boxes]
         self._layout = layout
-        self.first_blocks = np.array([first for first, _ in windows], np.int32)
-        self.n_blocks = max((count for _, count in windows), default=1)
+        self.corners = np.array(
+            [(block, x) for (block, _), (x, _) in zip(blocks, columns, strict=True)], np.int32
+        ).reshape(-1, 2)
+        self.n_blocks = max((count for _, count in blocks), default=1)
+        self.n_columns = max((count for _, count in columns), default=1)
 
     @property
     def n_blocks_of_all(self) -> int:
         """Blocks of the windows of all stars."""
-        return len(self.first_blocks) * self.n_blocks
+        return len(self.corners) * self.n_blocks
 
     @property
     def bytes(self) -> int:
         """Bytes of one array for each star."""
-        return self.n_blocks_of_all * self._layout.block_bytes
+        width = self._layout.grid[1]
+        return self.n_blocks_of_all * self._layout.block_bytes // width * self.n_columns
 
     def cut(self, s: int, stamp: Stamp) -> Array:
-        """Return the rows of a star's window, with a stamp in them."""
+        """Return the pixels of a star's window, with a stamp in them."""
         grid = self._layout.grid
-        n_rows = self._layout.rows_of(0, self.n_blocks).size
-        first = self._layout.rows_of(int(self.first_blocks[s]), 1)[0]
-        window = np.zeros((n_rows, grid[1]))
+        block, column = self.corners[s]
+        first = self._layout.rows_of(int(block), 1)[0]
+        window = np.zeros((self._layout.rows_of(0, self.n_blocks).size, self.n_columns))
         rows = (stamp.rows(grid) - first) % grid[0]
-        held = rows < n_rows
-        window[np.ix_(rows[held], stamp.columns(grid))] = stamp.values[held]
+        columns = (stamp.columns(grid) - column) % grid[1]
+        row_in, column_in = rows < window.shape[0], columns < window.shape[1]
+        window[np.ix_(rows[row_in], columns[column_in])] = stamp.values[np.ix_(row_in, column_in)]
         return window
-
-
-def _rows(stamp: Stamp, grid: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return the rows of the grid, shape (Ny,), that a stamp lies in."""
-    rows = np.zeros(grid[0], bool)
-    rows[stamp.rows(grid)] = True
-    return rows

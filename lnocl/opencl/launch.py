@@ -38,6 +38,22 @@ def _roots(k: NDArray[np.int64], n: int) -> NDArray[np.longdouble]:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1).ravel()
 
 
+def _all_roots(program: Program) -> dict[str, NDArray[np.float64]]:
+    """Return the roots of unity that kernels take, by their names as arguments.
+
+    Those of images are left out where their grid is the sky's.
+    """
+    (ny, nx), (image_ny, image_nx) = program.grid, program.image_grid
+    tables = {
+        "row_roots": roots(nx, *program.row_radices),
+        "column_roots": roots(ny, *program.column_radices),
+    }
+    if program.oversample > 1:
+        tables["image_row_roots"] = roots(image_nx, *program.image_row_radices)
+        tables["image_column_roots"] = roots(image_ny, *program.image_column_radices)
+    return tables
+
+
 class Launch:
     """A kernel bound to its arguments, which each call launches; it costs the host little.
 
@@ -110,15 +126,14 @@ class Launcher:
         context = program.context
         self.program = program
         self.queue = cl.CommandQueue(context)
-        ny, nx = program.grid
         constant = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-        row_roots, column_roots = (
-            roots(n, *split).astype(program.dtype)
-            for n, split in ((nx, program.row_radices), (ny, program.column_radices))
-        )
-        self.own = {
-            "row_roots": cl.Buffer(context, constant, hostbuf=row_roots),
-            "column_roots": cl.Buffer(context, constant, hostbuf=column_roots),
+        self.own: dict[str, Any] = {
+            name: cl.Buffer(context, constant, hostbuf=table.astype(program.dtype))
+            for name, table in _all_roots(program).items()
+        }
+        for axis in ("row_roots", "column_roots"):
+            self.own.setdefault(f"image_{axis}", self.own[axis])
+        self.own |= {
             "scratch": (
                 cl.Buffer(context, READ_WRITE, program.max_groups * program.scratch_bytes)
                 if program.tuning.scratch_is_global
@@ -129,8 +144,7 @@ class Launcher:
     @staticmethod
     def bytes_needed(program: Program) -> int:
         """Return the bytes that a launcher takes on the device."""
-        ny, nx = program.grid
-        n_roots = len(roots(nx, *program.row_radices)) + len(roots(ny, *program.column_radices))
+        n_roots = sum(map(len, _all_roots(program).values()))
         return n_roots * program.dtype.itemsize + program.max_groups * program.scratch_bytes
 
     def bind(self, name: str, arguments: Mapping[str, Any] | None = None, **others: Any) -> Launch:
@@ -145,5 +159,5 @@ class Launcher:
         if name == "collect_sums":
             return 1
         if name == "ratio_rows":
-            return self.program.row_blocks * int(arguments["n_images"])
+            return self.program.image_row_blocks * int(arguments["n_images"])
         return self.program.column_blocks if name.endswith("_columns") else self.program.row_blocks

@@ -24,32 +24,33 @@ def reversed_order(n: int) -> NDArray[np.int64]:
     return np.concatenate([odd * order + remainder for remainder in range(odd)])
 
 
-class Layout:
-    """Converts arrays between their natural order and that of the kernels.
+def shortest_arc(held: NDArray[np.bool_]) -> tuple[int, int]:
+    """Return first and number of the shortest run of places, round the end, with all held ones."""
+    at, n = np.flatnonzero(held), len(held)
+    gaps = np.diff(at, append=at[0] + n)
+    widest = int(np.argmax(gaps))
+    return int(at[(widest + 1) % len(at)]), n - int(gaps[widest]) + 1
+
+
+class PixelLayout:
+    """Converts arrays of pixels between their natural order and that of the kernels.
 
     Parameters
     ----------
     program : Program
-        Whose grid, tuning and precision are meant.
+        Whose tuning and precision are meant.
+    grid : tuple of int
+        Shape of the arrays: that of its sky or of its images.
 
     Notes
     -----
-    kernels/precision.cl says what the layouts are, kernels/rows.cl how half spectra are packed.
+    kernels/precision.cl says what the layouts are.
     """
 
-    def __init__(self, program: Program) -> None:
-        self.dtype = program.dtype
-        self.grid = program.grid
-        ny, nx = program.grid
+    def __init__(self, program: Program, grid: tuple[int, int]) -> None:
+        self.dtype, self.grid = program.dtype, grid
         block = program.tuning.block
-        self.pixels_shape = (ny // 2 // block, nx, 2, block)
-        self.spectra_shape = (nx // 2 // block, program.rows, 2, block)
-        column = np.arange(1, nx // 2)
-        high_bit = 1 << np.frexp(column)[1] - 1
-        shift = np.minimum(high_bit, nx // odd_part(nx) // 2)
-        wavenumber = reversed_order(nx)[column + shift]
-        self._conjugated = wavenumber > nx // 2
-        self._kept = np.where(self._conjugated, nx - wavenumber, wavenumber)
+        self.pixels_shape = (grid[0] // 2 // block, grid[1], 2, block)
 
     @property
     def block_bytes(self) -> int:
@@ -61,24 +62,18 @@ class Layout:
         """Bytes of one array of pixels."""
         return int(np.prod(self.pixels_shape)) * self.dtype.itemsize
 
-    @property
-    def spectra_bytes(self) -> int:
-        """Bytes of one array of spectra."""
-        return int(np.prod(self.spectra_shape)) * self.dtype.itemsize
-
     def pack_pixels(self, pixels: NDArray) -> NDArray:
-        """Return pixels (..., Ny, Nx), or some blocks' rows of them, in the kernels' order."""
-        _, nx, _, block = self.pixels_shape
+        """Return pixels (..., Ny, Nx), or some blocks' rows of them, in the kernels' order.
+
+        They may be of the sky or of images.
+        """
+        nx, block = pixels.shape[-1], self.pixels_shape[-1]
         pairs = pixels.reshape(*pixels.shape[:-2], -1, block, 2, nx)
         return np.ascontiguousarray(np.swapaxes(pairs, -3, -1), dtype=self.dtype)
 
     def window(self, rows: NDArray[np.bool_]) -> tuple[int, int]:
         """Return first and number of the blocks, round the edge, that hold some rows (Ny,)."""
-        row_blocks = self.pixels_shape[0]
-        held = np.flatnonzero(rows.reshape(row_blocks, -1).any(axis=1))
-        gaps = np.diff(held, append=held[0] + row_blocks)
-        widest = int(np.argmax(gaps))
-        return int(held[(widest + 1) % len(held)]), row_blocks - int(gaps[widest]) + 1
+        return shortest_arc(np.any(rows.reshape(self.pixels_shape[0], -1), axis=1))
 
     def rows_of(self, first: int, count: int) -> NDArray[np.int64]:
         """Return the rows that some blocks hold, round the edge."""
@@ -96,23 +91,60 @@ class Layout:
         pairs = np.swapaxes(packed.reshape(-1, nx, 2, block), -3, -1)
         return pairs.astype(np.float64).reshape(-1, nx)
 
+
+class Layout(PixelLayout):
+    """Converts spectra too, and pixels of the sky.
+
+    Parameters
+    ----------
+    program : Program
+        Whose grid, tuning and precision are meant.
+
+    Attributes
+    ----------
+    images : PixelLayout
+        Of the images.
+
+    Notes
+    -----
+    kernels/rows.cl says how half spectra are packed. Spectra of an image have fewer rows than those
+    of a finer sky: they are the first of as many.
+    """
+
+    def __init__(self, program: Program) -> None:
+        super().__init__(program, program.grid)
+        self.images = PixelLayout(program, program.image_grid)
+        nx, block = program.grid[1], program.tuning.block
+        self.spectra_shape = (nx // 2 // block, program.rows, 2, block)
+        column = np.arange(1, nx // 2)
+        high_bit = 1 << np.frexp(column)[1] - 1
+        shift = np.minimum(high_bit, nx // odd_part(nx) // 2)
+        wavenumber = reversed_order(nx)[column + shift]
+        self._conjugated = wavenumber > nx // 2
+        self._kept = np.where(self._conjugated, nx - wavenumber, wavenumber)
+
+    @property
+    def spectra_bytes(self) -> int:
+        """Bytes of one array of spectra."""
+        return int(np.prod(self.spectra_shape)) * self.dtype.itemsize
+
     def pack_spectra(self, row_spectra: NDArray) -> NDArray:
-        """Return row spectra (Ny, Nx // 2 + 1) in the kernels' order and precision.
+        """Return row spectra (rows, Nx // 2 + 1) in the kernels' order and precision.
 
         Column 0 gets the real parts of columns 0 and Nx / 2, as row spectra of real pixels have
         no others.
         """
-        ny, nx = self.grid
+        ny, nx = len(row_spectra), self.grid[1]
         kept = np.empty((ny, nx // 2), np.complex128)
         kept[:, 0] = row_spectra[:, 0].real + 1j * row_spectra[:, -1].real
         kept[:, 1:] = row_spectra[:, self._kept]
         kept[:, 1:][:, self._conjugated] = kept[:, 1:][:, self._conjugated].conj()
         return self.pack_columns(kept)
 
-    def unpack_spectra(self, packed: NDArray) -> NDArray[np.complex128]:
-        """Return the row spectra (Ny, Nx // 2 + 1) of an array in the kernels' order."""
-        ny, nx = self.grid
-        kept = self.unpack_columns(packed)
+    def unpack_spectra(self, packed: NDArray, ny: int | None = None) -> NDArray[np.complex128]:
+        """Return the row spectra (ny, Nx // 2 + 1) of an array in the kernels' order."""
+        ny, nx = ny or self.grid[0], self.grid[1]
+        kept = self.unpack_columns(packed, ny)
         row_spectra = np.empty((ny, nx // 2 + 1), np.complex128)
         row_spectra[:, 0], row_spectra[:, -1] = kept[:, 0].real, kept[:, 0].imag
         columns = kept[:, 1:]
@@ -143,16 +175,16 @@ class Layout:
         return columns
 
     def pack_columns(self, columns: NDArray) -> NDArray:
-        """Return complex columns (Ny, Nx / 2) in the kernels' order, as they are."""
+        """Return complex columns (rows, Nx / 2) in the kernels' order, as they are."""
         column_blocks, _, _, block = self.spectra_shape
-        ny = self.grid[0]
+        ny = len(columns)
         packed = np.zeros(self.spectra_shape, self.dtype)
         blocks = columns.reshape(ny, column_blocks, block).transpose(1, 0, 2)
         packed[:, :ny, 0], packed[:, :ny, 1] = blocks.real, blocks.imag
         return packed
 
-    def unpack_columns(self, packed: NDArray) -> NDArray[np.complex128]:
-        """Return the complex columns (Ny, Nx / 2) of an array in the kernels' order."""
-        ny, nx = self.grid
+    def unpack_columns(self, packed: NDArray, ny: int | None = None) -> NDArray[np.complex128]:
+        """Return the complex columns (ny, Nx / 2) of an array in the kernels' order."""
+        ny, nx = ny or self.grid[0], self.grid[1]
         parts = packed[:, :ny].astype(np.float64)
         return (parts[:, :, 0] + 1j * parts[:, :, 1]).transpose(1, 0, 2).reshape(ny, nx // 2)

@@ -71,11 +71,13 @@ class Program:
     context : pyopencl.Context
         Of one device.
     grid : tuple of int
-        Shape (Ny, Nx), of `lnocl.scene.grid.LENGTHS`.
+        Shape (Ny, Nx) of the sky, of `lnocl.scene.grid.LENGTHS`.
     dtype : numpy.dtype
         float32 or float64.
     tuning : Tuning, optional
         By default that of `lnocl.opencl.tuning.tune`.
+    oversample : int, optional
+        Pixels of the sky to one of the images, along each axis: 1, 2 or 4.
     n_stars : int, optional
         Stars of the scene, at most 4096; the program has room for more.
     has_mu, has_smoothing, has_weights, has_background_map, has_exposure_map : bool, optional
@@ -89,7 +91,9 @@ class Program:
         The build options.
     arguments : dict of str to tuple of str
         The names of each kernel's arguments, in the order of its declaration.
-    row_radices, column_radices : tuple of int
+    image_grid : tuple of int
+        Shape of the images' grid.
+    row_radices, column_radices, image_row_radices, image_column_radices : tuple of int
         As `radices`.
     rows : int
         Rows that a block of spectra takes in memory.
@@ -110,6 +114,7 @@ class Program:
         dtype: np.dtype,
         tuning: Tuning | None = None,
         *,
+        oversample: int = 1,
         n_stars: int = 0,
         has_mu: bool = False,
         has_smoothing: bool = False,
@@ -125,11 +130,15 @@ class Program:
                 f"{describe(device)} has no double precision; take precision single, or another "
                 "device"
             )
-        self.tuning = tuning or tune(device, dtype, grid)
+        self.tuning = tuning or tune(device, dtype, grid, oversample)
+        self.oversample = oversample
+        self.image_grid = grid[0] // oversample, grid[1] // oversample
         self.rows = grid[0] + self.tuning.padding
         self.max_groups = device.max_compute_units if self.tuning.scratch_is_global else 0
         self.row_radices = radices(grid[1])
         self.column_radices = radices(grid[0])
+        self.image_row_radices = radices(self.image_grid[1])
+        self.image_column_radices = radices(self.image_grid[0])
         constants = {
             "REAL": "double" if dtype == np.float64 else "float",
             "BITS": "long" if dtype == np.float64 else "int",
@@ -142,10 +151,15 @@ class Program:
             "COLUMN_ODD": self.column_radices[0],
             "COLUMN_OUTER": self.column_radices[1],
             "COLUMN_LAST": self.column_radices[2],
+            "IMAGE_ROW_OUTER": self.image_row_radices[1],
+            "IMAGE_ROW_LAST": self.image_row_radices[2],
+            "IMAGE_COLUMN_OUTER": self.image_column_radices[1],
+            "IMAGE_COLUMN_LAST": self.image_column_radices[2],
             "CHUNK": self.tuning.chunk,
             "SCRATCH_IS_GLOBAL": int(self.tuning.scratch_is_global),
             "NX": grid[1],
             "NY": grid[0],
+            "OVERSAMPLE": oversample,
             "ROWS": self.rows,
             "MAX_STARS": _room_for(n_stars),
             "HAS_MU": int(has_mu),
@@ -172,8 +186,13 @@ class Program:
 
     @property
     def row_blocks(self) -> int:
-        """Blocks of row pairs in an array of pixels."""
+        """Blocks of row pairs in an array of pixels of the sky."""
         return self.grid[0] // 2 // self.tuning.block
+
+    @property
+    def image_row_blocks(self) -> int:
+        """Blocks of row pairs in an image."""
+        return self.image_grid[0] // 2 // self.tuning.block
 
     @property
     def column_blocks(self) -> int:
@@ -183,7 +202,8 @@ class Program:
     @property
     def scratch_bytes(self) -> int:
         """Bytes that a work-group needs for its block."""
-        return scratch_points(self.grid) * 2 * self.tuning.block * self.dtype.itemsize
+        points = scratch_points(self.grid, self.oversample)
+        return points * 2 * self.tuning.block * self.dtype.itemsize
 
 
 def _room_for(n_stars: int) -> int:

@@ -43,12 +43,14 @@ class Tuning:
     padding: int = 16
     scratch_is_global: bool = False
 
-    def fit(self, device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
+    def fit(
+        self, device: cl.Device, dtype: np.dtype, grid: tuple[int, int], oversample: int = 1
+    ) -> Tuning:
         """Return the tuning for a grid: small grids have smaller blocks, none filled in part."""
-        most = min(n // odd_part(n) for n in grid) // 2
+        most = min(n // odd_part(n) for n in grid) // (2 * oversample)
         block = min(self.block, most)
-        group = min(self.group, _power_of_2_up_to(max(1, min(grid) // 8)))
-        needed = local_bytes(grid, dtype, block, group)
+        group = min(self.group, _power_of_2_up_to(max(1, min(grid) // (8 * oversample))))
+        needed = local_bytes(grid, oversample, dtype, block, group)
         is_global = self.scratch_is_global or needed > device.local_mem_size
         lanes = min(self.lanes, most)
         return replace(self, lanes=lanes, block=block, group=group, scratch_is_global=is_global)
@@ -59,9 +61,9 @@ def odd_part(n: int) -> int:
     return n // (n & -n)
 
 
-def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int]) -> Tuning:
+def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int], oversample: int = 1) -> Tuning:
     """Return the tuning of a device for a grid: what was measured there, else the default."""
-    return chosen(device, dtype).fit(device, dtype, grid)
+    return chosen(device, dtype).fit(device, dtype, grid, oversample)
 
 
 def chosen(device: cl.Device, dtype: np.dtype) -> Tuning:
@@ -155,15 +157,18 @@ def _read() -> dict[str, object]:
     return {}
 
 
-def local_bytes(grid: tuple[int, int], dtype: np.dtype, block: int, group: int) -> int:
+def local_bytes(
+    grid: tuple[int, int], oversample: int, dtype: np.dtype, block: int, group: int
+) -> int:
     """Return the bytes of local memory of a work-group: its block, and a sum for each item."""
     sums = 2 * group if group > 1 else 0
-    return (scratch_points(grid) * 2 * block + sums) * dtype.itemsize
+    return (scratch_points(grid, oversample) * 2 * block + sums) * dtype.itemsize
 
 
-def scratch_points(grid: tuple[int, int]) -> int:
+def scratch_points(grid: tuple[int, int], oversample: int) -> int:
     """Return the points of a block that a work-group holds while it transforms."""
-    return max(grid[1], 2 * grid[0])
+    ny, nx = grid
+    return max(nx + (nx // oversample if oversample > 1 else 0), ny + ny // oversample)
 
 
 def _power_of_2_up_to(n: int) -> int:

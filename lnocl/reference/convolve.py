@@ -18,11 +18,21 @@ def otf_columns(row_spectra: ComplexArray) -> ComplexArray:
     return fft_columns(row_spectra) / (4.0 * ny * nx)
 
 
-def convolve_columns(row_spectrum: ComplexArray, otfs: ComplexArray) -> ComplexArray:
-    """Return the row spectra of ``A_j f``, shape (p, Ny, Nx // 2 + 1), from that of f."""
-    return ifft_columns(otfs * fft_columns(row_spectrum))
+def convolve_columns(
+    row_spectrum: ComplexArray, otfs: ComplexArray, oversample: int = 1
+) -> ComplexArray:
+    """Return the row spectra of ``A_j f``, shape (p, Ny / oversample, Nx // 2 + 1), from that of f.
+
+    Of the rows, each in `oversample` of them is an image's.
+    """
+    return ifft_columns(otfs * fft_columns(row_spectrum))[..., ::oversample, :]
 
 
 def correlate_columns(row_spectra: ComplexArray, otfs: ComplexArray) -> ComplexArray:
-    """Return the row spectrum of ``sum_j A_j^T (r_j - w_j)`` from those of the r_j - w_j."""
-    return ifft_columns((np.conj(otfs) * fft_columns(row_spectra)).sum(axis=0))
+    """Return the row spectrum of ``sum_j A_j^T (r_j - w_j)`` from those of the r_j - w_j.
+
+    The rows of an image are some of the sky's, each in `oversample` of them; 0 is in the others.
+    """
+    rows = np.zeros((*row_spectra.shape[:-2], *otfs.shape[-2:]), np.complex128)
+    rows[..., :: otfs.shape[-2] // row_spectra.shape[-2], :] = row_spectra
+    return ifft_columns((np.conj(otfs) * fft_columns(rows)).sum(axis=0))

@@ -25,9 +25,13 @@ def ratio_rows(
 
     ``m_j = A_j f + sum_s c_s P_js + b_j``, ``r_j = w_j g_j / m_j``, ``sum_j <P_js, r_j - w_j>`` and
     ``J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j)``; La Camera et al. (2012), Eq. 7 and 9.
-    Where ``m_j`` is not above `MIN_MODEL`, ``r_j = 0`` and ``m_j = MIN_MODEL`` in J_0.
+    Of the columns of ``A_j f``, each in `oversample` of them is an image's; the ratios lie there,
+    and 0 in the others. Where ``m_j`` is not above `MIN_MODEL`, ``r_j = 0`` and ``m_j = MIN_MODEL``
+    in J_0.
     """
-    model = irfft_rows(row_spectra) + background
+    convolved = irfft_rows(row_spectra)
+    oversample = convolved.shape[-1] // images.shape[-1]
+    model = convolved[..., ::oversample] + background
     model += np.einsum("s,sjyx->jyx", star_fluxes, star_images)
     dark = model <= MIN_MODEL  # which NaN is not: it reaches the objective
     model = np.where(dark, MIN_MODEL, model)
@@ -38,4 +42,6 @@ def ratio_rows(
     if weights is not None:
         excess, divergence = weights * excess, weights * divergence
     star_sums = np.einsum("sjyx,jyx->s", star_images, excess)
-    return rfft_rows(excess), float(divergence.sum()), star_sums
+    spread = np.zeros_like(convolved)
+    spread[..., ::oversample] = excess
+    return rfft_rows(spread), float(divergence.sum()), star_sums

@@ -17,7 +17,7 @@ from lnocl.scene.grid import grid_of
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
 from lnocl.scene.shifting import MovablePsf, Stamp
-from lnocl.scene.stars import StarField, check_positions, rows_within
+from lnocl.scene.stars import Lit, StarField, check_positions, lit_box
 
 log = logging.getLogger("lnocl")
 
@@ -264,10 +264,10 @@ class Scene:
         psfs = zip(self.gains, self.observation.psfs, strict=True)
         return [psf if gain == 1.0 else gain * psf for gain, psf in psfs]
 
-    def star_rows(self, s: int) -> NDArray[np.bool_]:
-        """Return the rows of the grid, shape (Ny,), that the images of star s may light."""
+    def star_box(self, s: int) -> Lit:
+        """Return the rows and columns of the grid that the images of star s may light."""
         stamps = [self.star_stamp(j, s) for j in range(self.n_images)]
-        return rows_within(stamps, self.grid, self._leeway)
+        return lit_box(stamps, self.grid, self._leeway)
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
         """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -169,17 +169,25 @@ def overlap(stamps: Sequence[Stamp], grid: tuple[int, int]) -> NDArray[np.bool_]
     return overlap
 
 
-def rows_within(stamps: Sequence[Stamp], grid: tuple[int, int], leeway: float) -> NDArray[np.bool_]:
-    """Return the rows of the grid, shape (Ny,), that stamps light, moved by up to the leeway."""
-    rows = np.zeros(grid[0], bool)
+class Lit(NamedTuple):
+    """Rows of the grid, shape (Ny,), and columns, shape (Nx,), that hold light."""
+
+    rows: NDArray[np.bool_]
+    columns: NDArray[np.bool_]
+
+
+def lit_box(stamps: Sequence[Stamp], grid: tuple[int, int], leeway: float = 0.0) -> Lit:
+    """Return the rows and columns that stamps light, moved by up to the leeway."""
+    box = Lit(*(np.zeros(n, bool) for n in grid))
     for stamp in stamps:
-        may_be_lit = (stamp.values != 0).any(axis=1) | (leeway > 0)
-        rows[stamp.rows(grid)[may_be_lit]] = True
-    if leeway:
-        distance = int(np.ceil(leeway)) + MARGIN + 1
-        steps = range(-distance, distance + 1)
-        rows = np.any([np.roll(rows, step) for step in steps], axis=0)
-    return rows
+        for axis, at in enumerate((stamp.rows(grid), stamp.columns(grid))):
+            may_be_lit = (stamp.values != 0).any(axis=1 - axis) | (leeway > 0)
+            box[axis][at[may_be_lit]] = True
+    if not leeway:
+        return box
+    distance = int(np.ceil(leeway)) + MARGIN + 1
+    steps = range(-distance, distance + 1)
+    return Lit(*(np.any([np.roll(each, step) for step in steps], axis=0) for each in box))
 
 
 # Stars that are nearer to each other, in pixels, are one: nothing tells their fluxes apart.

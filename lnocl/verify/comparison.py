@@ -120,16 +120,18 @@ def _run_convolve_columns(harness: KernelHarness, given: SimpleNamespace) -> Pai
     others = np.full((given.p - 1, *given.spectrum.shape[1:]), np.nan)
     out = harness.put_spectra([*given.spectrum, *others])
     harness.launch("convolve_columns", spectra=out, **_put_otfs(harness, given))
-    expected = _real_edges(reference.convolve_columns(given.spectrum[0], given.otfs))
-    yield harness.take_spectra(out, given.p), expected
+    oversample = harness.program.oversample
+    expected = reference.convolve_columns(given.spectrum[0], given.otfs, oversample)
+    yield harness.take_image_spectra(out, given.p), _real_edges(expected)
 
 
 def _run_correlate_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    out = harness.put_spectra(given.spectra)
+    out = harness.put_spectra(given.image_spectra)
     harness.launch("correlate_columns", spectra=out, **_put_otfs(harness, given))
-    found = harness.take_spectra(out, given.p)
-    yield found[0], _real_edges(reference.correlate_columns(given.spectra, given.otfs))
-    if not np.array_equal(found[1:], _real_edges(given.spectra[1:])):
+    expected = _real_edges(reference.correlate_columns(given.image_spectra, given.otfs))
+    yield harness.take_spectra(out)[0], expected
+    others = harness.take_image_spectra(out, given.p)[1:]
+    if not np.array_equal(others, _real_edges(given.image_spectra[1:])):
         raise DeviceError("others than array 0 are written")
 
 
@@ -155,8 +157,9 @@ def _run_ratio_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         images = np.where(given.weights, given.images, -1.0)
     put = harness.put_pixels if given.background.size > given.p else harness.put
     out = harness.put_spectra(given.model_spectra)
-    sums = harness.put(np.full((harness.program.row_blocks * given.p, 2), np.nan))
-    sums_of_stars = harness.put(np.full((given.n, given.p * given.star_blocks, 2), np.nan))
+    sums = harness.put(np.full((harness.program.image_row_blocks * given.p, 2), np.nan))
+    windows = given.star_windows
+    sums_of_stars = harness.put(np.full((given.n, given.p * windows.n_blocks, 2), np.nan))
     harness.launch(
         "ratio_rows",
         spectra=out,
@@ -164,13 +167,14 @@ def _run_ratio_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         star_sums=sums_of_stars,
         images=harness.put_pixels(images),
         background=put(given.background),
-        star_images=harness.put_windows(given.star_images, given),
-        first_blocks=harness.put(given.first_blocks, np.int32),
-        star_blocks=given.star_blocks,
+        star_images=harness.put_windows(given.star_images, windows),
+        star_corners=harness.put(windows.corners, np.int32),
+        star_blocks=windows.n_blocks,
+        star_columns=windows.n_columns,
         star_fluxes=harness.put(given.star_fluxes),
         **exposure,
     )
-    yield harness.take_spectra(out, given.p), _real_edges(spectra)
+    yield harness.take_image_spectra(out, given.p), _real_edges(spectra)
     yield harness.take_sums(sums, 1), np.array([objective])
     yield _take_star_sums(harness, given, sums_of_stars), star_sums
 
@@ -232,9 +236,10 @@ def _run_smooth(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 
 def _run_collect_sums(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     rng = np.random.default_rng(7)
-    blocks = harness.program.row_blocks
-    ratio_sums = rounded(rng.normal(size=(blocks * given.p, 2)) + 1, harness.dtype)
-    star_sums = rng.normal(size=(given.n, given.p * given.star_blocks, 2)) + 1
+    blocks, ratio_blocks = harness.program.row_blocks, harness.program.image_row_blocks
+    ratio_sums = rounded(rng.normal(size=(ratio_blocks * given.p, 2)) + 1, harness.dtype)
+    star_blocks = given.star_windows.n_blocks
+    star_sums = rng.normal(size=(given.n, given.p * star_blocks, 2)) + 1
     star_sums[1:] *= -1.0  # the correction of a second star counts as 0
     star_sums = rounded(star_sums, harness.dtype)
     square_sums = rounded(rng.random((blocks, 2)), harness.dtype)
@@ -262,7 +267,7 @@ def _run_collect_sums(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         smooth_sums=harness.put(smooth_sums),
         star_weights=harness.put(given.star_weights),
         mu=given.mu,
-        star_blocks=given.star_blocks,
+        star_blocks=star_blocks,
         iteration=1,
     )
     found = harness.take(objectives, (3, 2)).astype(float)
@@ -316,7 +321,8 @@ def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         )
         out, trial = harness.empty_spectra(), harness.empty_pixels()
         sums, square_sums = harness.empty_sums(), harness.empty_sums()
-        coupling_sums = harness.put(np.full((given.n, given.star_blocks, 2), np.nan))
+        windows = given.cross_windows
+        coupling_sums = harness.put(np.full((given.n, windows.n_blocks, 2), np.nan))
         harness.launch(
             "step_rows",
             spectra=out,
@@ -327,9 +333,10 @@ def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
             previous=harness.put_pixels(given.extended),
             gradient=harness.put_pixels(given.gradient),
             shift=harness.put_pixels(given.shift),
-            cross_information=harness.put_windows(given.cross_information, given),
-            cross_first_blocks=harness.put(given.first_blocks, np.int32),
-            cross_blocks=given.star_blocks,
+            cross_information=harness.put_windows(given.cross_information, windows),
+            cross_corners=harness.put(windows.corners, np.int32),
+            cross_blocks=windows.n_blocks,
+            cross_columns=windows.n_columns,
             mu=given.mu,
             alpha=alpha,
             share=share,

@@ -13,13 +13,15 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from lnocl.errors import DeviceError
 from lnocl.opencl.launch import READ_WRITE, Launcher
-from lnocl.opencl.layout import Layout, reversed_order
+from lnocl.opencl.layout import Layout, PixelLayout, reversed_order
 from lnocl.opencl.program import Program
 from lnocl.opencl.tuning import Tuning
 from lnocl.scene.scene import MIN_MODEL
 
 # Scenes with all parts, together, that a program can have.
 THREE_IMAGES = "three images, two stars, mask, background map, smoothing"
+TWICE_AS_FINE = "sky twice as fine, three images, two stars, mask, background map"
+FOUR_TIMES_AS_FINE = "sky four times as fine, exposure map, mu"
 SCENES: dict[str, dict[str, Any]] = {
     "plain": {"n_images": 1},
     "two images, star, mu": {"n_images": 2, "n_stars": 1, "has_mu": True},
@@ -44,9 +46,56 @@ SCENES: dict[str, dict[str, Any]] = {
         "has_exposure_map": True,
         "has_background_map": True,
     },
+    TWICE_AS_FINE: {
+        "n_images": 3,
+        "n_stars": 2,
+        "has_weights": True,
+        "has_background_map": True,
+        "oversample": 2,
+    },
+    FOUR_TIMES_AS_FINE: {
+        "n_images": 2,
+        "n_stars": 1,
+        "has_mu": True,
+        "has_weights": True,
+        "has_exposure_map": True,
+        "has_background_map": True,
+        "oversample": 4,
+    },
 }
 
 CANARY = np.frombuffer(b"\xa5" * 64, np.uint8)
+
+
+class Windows:
+    """The windows of stars: see kernels/stars.cl.
+
+    That of one star is the whole grid; of several, each is half of its blocks and three quarters
+    of its columns, the first star's round the edges.
+
+    Parameters
+    ----------
+    layout : PixelLayout
+        Of the arrays.
+    n_stars : int
+        Their number, at most 2.
+    """
+
+    def __init__(self, layout: PixelLayout, n_stars: int) -> None:
+        self.layout = layout
+        row_blocks, nx = layout.pixels_shape[:2]
+        self.n_blocks = row_blocks if n_stars < 2 else max(1, row_blocks // 2)
+        self.n_columns = nx if n_stars < 2 else max(1, 3 * nx // 4)
+        self.corners = np.array([(row_blocks - 1, nx - 1), (0, 1 % nx)])[:n_stars]
+
+    def rows(self, s: int) -> NDArray[np.int64]:
+        """Return the rows of a star's window."""
+        return self.layout.rows_of(self.corners[s, 0], self.n_blocks)
+
+    def columns(self, s: int) -> NDArray[np.int64]:
+        """Return the columns of a star's window."""
+        nx = self.layout.grid[1]
+        return np.arange(self.corners[s, 1], self.corners[s, 1] + self.n_columns) % nx
 
 
 class KernelHarness:
@@ -59,7 +108,7 @@ class KernelHarness:
     context : pyopencl.Context
         Of one device.
     grid, dtype, tuning
-        As for `lnocl.opencl.program.Program`.
+        Grid of the sky; as for `lnocl.opencl.program.Program`.
     **scene
         Parts of the scene, as for `lnocl.opencl.program.Program`, and n_images: one of `SCENES`.
     """
@@ -77,6 +126,7 @@ class KernelHarness:
         self.program = Program(context, grid, np.dtype(dtype), tuning, min_model=MIN_MODEL, **parts)
         self.layout, self.launcher = Layout(self.program), Launcher(self.program)
         self.dtype, self.grid, self.scene = self.program.dtype, grid, scene
+        self.image_grid = self.program.image_grid
         self._buffers: list[cl.Buffer] = []
 
     def put(self, values: ArrayLike, dtype: DTypeLike | None = None) -> cl.Buffer:
@@ -123,12 +173,12 @@ class KernelHarness:
         """Return a buffer of row spectra, in the kernels' order."""
         return self.put([self.layout.pack_spectra(a) for a in row_spectra])
 
-    def put_windows(self, arrays: Iterable[NDArray], given: SimpleNamespace) -> cl.Buffer:
+    def put_windows(self, arrays: NDArray, windows: Windows) -> cl.Buffer:
         """Return a buffer of windows of arrays, [n_stars] or [n_stars][n_images]."""
         return self.put_pixels(
-            each[self.layout.rows_of(first, given.star_blocks)]
-            for stack, first in zip(arrays, given.first_blocks, strict=True)
-            for each in np.reshape(stack, (-1, *self.grid))
+            each[np.ix_(windows.rows(s), windows.columns(s))]
+            for s, stack in enumerate(arrays)
+            for each in np.reshape(stack, (-1, *windows.layout.grid))
         )
 
     def take_pixels(self, buffer: cl.Buffer) -> NDArray:
@@ -138,8 +188,15 @@ class KernelHarness:
 
     def take_spectra(self, buffer: cl.Buffer, count: int = 1) -> NDArray:
         """Return the row spectra (count, Ny, Nx // 2 + 1) that a buffer holds."""
-        packed = self.take(buffer, (count, *self.layout.spectra_shape))
-        return np.array([self.layout.unpack_spectra(a) for a in packed])
+        return self._take_spectra(buffer, count, self.grid[0])
+
+    def take_image_spectra(self, buffer: cl.Buffer, count: int) -> NDArray:
+        """Return the row spectra (count, ny, Nx // 2 + 1) of images that a buffer holds."""
+        return self._take_spectra(buffer, count, self.image_grid[0])
+
+    def _take_spectra(self, buffer: cl.Buffer, count: int, ny: int) -> NDArray:
+        packed = self.take(buffer, (-1, *self.layout.spectra_shape))[:count]
+        return np.array([self.layout.unpack_spectra(a, ny) for a in packed])
 
     def take_sums(self, buffer: cl.Buffer, n_sums: int) -> NDArray:
         """Return sums over pixels, of the pairs that each block left in a buffer."""
@@ -180,6 +237,7 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
     """Return random inputs for every kernel, in natural order."""
     rng = np.random.default_rng(harness.grid[0] * 31 + harness.grid[1])
     ny, nx = harness.grid
+    image = harness.image_grid
     p, n = harness.n_images, harness.n_stars
     has_map, has_weights, has_exposure_map, has_mu, has_smoothing = (
         harness.scene.get(f"has_{what}", False)
@@ -190,39 +248,35 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
     def half_spectra(count: int) -> NDArray:
         return own(np.fft.rfft(rng.normal(size=(count, ny, nx)), axis=-1))
 
-    model = rng.uniform(0.5, 3.0, (p, ny, nx))
-    model[:, 0, :2] = -1.0  # the division guard
-    images = rng.poisson(3.0, (p, ny, nx)) / 3.0
+    # Where the sky is finer, each row of A_j f has what lies between the image's pixels too.
+    oversample = harness.program.oversample
+    model = rng.uniform(0.5, 3.0, (p, image[0], nx))
+    model[:, 0, : 2 * oversample] = -1.0  # the division guard
+    images = rng.poisson(3.0, (p, *image)) / 3.0
     images[:, 0, :2] = 0.0, 1.0
-    weights = rng.random((p, ny, nx)) > 0.2
+    weights = rng.random((p, *image)) > 0.2
     if has_exposure_map:
         weights = own(weights * rng.uniform(0.5, 2.0, weights.shape))
-    # One star is seen in all blocks; of two, each in half of them, the first round the edge.
-    row_blocks = harness.program.row_blocks
-    star_blocks = row_blocks if n < 2 else max(1, row_blocks // 2)
-    first_blocks = np.array([row_blocks - 1, 0])[:n]
-    star_images = own(rng.random((n, p, ny, nx)))
+    star_images = own(rng.random((n, p, *image)))
     cross_information = own(rng.uniform(-0.1, 1.0, (n, ny, nx)))
-    for s, first in enumerate(first_blocks):
-        dark = np.setdiff1d(np.arange(ny), harness.layout.rows_of(first, star_blocks))
-        star_images[s, :, dark] = 0.0
-        cross_information[s, dark] = 0.0
+    star_windows = _cut_to_windows(star_images, harness.layout.images)
+    cross_windows = _cut_to_windows(cross_information, harness.layout)
     return SimpleNamespace(
         p=p,
         n=n,
         pixels=own(rng.normal(size=(1, ny, nx))),
         columns=own(rng.normal(size=(ny, nx // 2)) + 1j * rng.normal(size=(ny, nx // 2))),
         spectrum=half_spectra(1),
-        spectra=half_spectra(p),
         otfs=own(np.fft.rfft2(rng.normal(size=(p, ny, nx))) / (ny * nx)),
         model_spectra=own(np.fft.rfft(model, axis=-1) / nx),
+        image_spectra=half_spectra(p)[:, : image[0]],
         images=own(images),
         weights=weights if has_weights else None,
         has_exposure_map=has_exposure_map,
-        background=own(rng.uniform(0.1, 0.2, (p, ny, nx) if has_map else (p, 1, 1))),
+        background=own(rng.uniform(0.1, 0.2, (p, *image) if has_map else (p, 1, 1))),
         star_images=star_images,
-        star_blocks=star_blocks,
-        first_blocks=first_blocks,
+        star_windows=star_windows,
+        cross_windows=cross_windows,
         star_fluxes=own(rng.uniform(0.1, 1.0, n)),
         star_weights=own(rng.uniform(1.0, 2.0, n)),
         star_corrections=own(rng.uniform(0.9, 1.1, n)),
@@ -245,3 +299,12 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         cross_information=cross_information,
         mu=float(np.float32(0.25)) if has_mu else 0.0,
     )
+
+
+def _cut_to_windows(arrays: NDArray, layout: PixelLayout) -> Windows:
+    """Set the arrays of each star to 0 beyond a window, and return the windows."""
+    windows = Windows(layout, len(arrays))
+    for s, each in enumerate(arrays):
+        each[..., np.setdiff1d(np.arange(layout.grid[0]), windows.rows(s)), :] = 0.0
+        each[..., np.setdiff1d(np.arange(layout.grid[1]), windows.columns(s))] = 0.0
+    return windows

@@ -24,11 +24,12 @@ def launch_ratio_rows(harness, model, images, star_image):
         images=harness.put_pixels(images[None]),
         background=harness.put([1.0]),
         star_images=harness.put_pixels(star_image[None]),
-        first_blocks=harness.put([0], np.int32),
+        star_corners=harness.put([0, 0], np.int32),
         star_fluxes=harness.put([0.0]),
         n_images=1,
         n_stars=1,
         star_blocks=blocks,
+        star_columns=harness.grid[1],
     )
     pairs = (harness.take(each, (-1, 2)).astype(float) for each in (sums, star_sums))
     return harness.take_spectra(spectra)[0], *pairs

@@ -328,20 +328,22 @@ def test_a_star_may_leave_the_images_but_not_go_where_all_is_masked():
 
 
 @pytest.mark.parametrize("shape", [(128, 64), (16, 128)])
-def test_rows_that_a_star_may_light_hold_it_wherever_it_goes(shape):
-    """The engine keeps those rows alone; an undersampled PSF rings to the end of its margins."""
+def test_box_that_a_star_may_light_holds_it_wherever_it_goes(shape):
+    """The engine has room for that alone; an undersampled PSF rings to the end of its margins."""
     psf = np.zeros((9, 5))
     psf[4, 2] = 1.0  # the rest of it is empty
     observation = lnocl.Observation(np.ones((2, *shape)), psf, offsets=[(0, 0), (1.5, -3.25)])
     for given in ((30.0, 10.0), (30.5, 10.5), (30.2, 0.0)):
         scene = Scene(observation, [given], leeway=RADIUS)
-        rows = scene.star_rows(0)
+        rows, columns = scene.star_box(0)
         fit = StarFit(scene, Model(scene), np.ones(scene.grid), scene.stars)
         for angle in np.linspace(0, 2 * np.pi, 17):
             position = np.array(given) + RADIUS * np.array([np.cos(angle), np.sin(angle)])
             scene.move_stars([position])
             for j in range(2):
-                assert rows[scene.star_stamp(j, 0).rows(scene.grid)].all()
+                stamp = scene.star_stamp(j, 0)
+                assert rows[stamp.rows(scene.grid)].all()
+                assert columns[stamp.columns(scene.grid)].all()
             for movable, offset in zip(fit._stars, observation.offsets, strict=True):
                 pixels, values = movable._moving(position + offset)
                 assert (pixels >= 0).all()  # else the fit has no place for them

@@ -161,8 +161,8 @@ FAULTS = {
     "padding read": (
         "an item a block",
         "fft_columns",
-        "a[q] = LOAD(from + lane, q * INNER(NY) + y)",
-        "a[q] = LOAD(from + lane, q * INNER(NY) + y + 1)",
+        "a[q] = LOAD(from + lane, q * INNER(n) + y)",
+        "a[q] = LOAD(from + lane, q * INNER(n) + y + 1)",
         "Uninitialized value written to local memory",
     ),
 }

@@ -24,9 +24,9 @@ TRIED = comparison.kernels_of(harness.SCENES[SCENE])
 FAULTS = {
     "correlate_columns": ("edge[0], -edge[1], z, t", "edge[0], edge[1], z, t"),
     "elsewhere": (
-        "finish_columns(columns, total, column_roots);",
-        "finish_columns(columns, total, column_roots);"
-        "finish_columns(columns + SPECTRA_SIZE, total, column_roots);",
+        "finish_columns(columns, total, NY, column_roots);",
+        "finish_columns(columns, total, NY, column_roots);"
+        "finish_columns(columns + SPECTRA_SIZE, total, NY, column_roots);",
     ),
     "step_rows": (
         "KERNEL void step_rows",
