@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.scene.cores import fwhm
+from lnocl.scene.detector import on_sky, seen_psfs
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.scene import Scene
 
@@ -137,30 +138,37 @@ def judge_stars(scene: Scene, sky: Array, star_fluxes: Array) -> list[StarResidu
         Electrons.
     """
     found = []
-    ny, nx = scene.observation.shape
-    background = [np.broadcast_to(each, scene.grid) for each in scene.background()]
+    ny, nx = scene.observation.sky_shape
+    background = [np.broadcast_to(each, scene.image_grid) for each in scene.background()]
     width = min(fwhm(psf) for psf in scene.observation.psfs) if scene.n_stars else 0.0
-    for position, flux in zip(scene.stars, star_fluxes, strict=True):
+    psfs = seen_psfs(scene.observation) if scene.n_stars else np.zeros((0, 0, 0))
+    on_pixels = on_sky(scene.stars, scene.oversample)
+    for position, on_pixel, flux in zip(scene.stars, on_pixels, star_fluxes, strict=True):
         core, wings = Fit(), Fit()
-        for j in range(scene.n_images):
-            fits = _fits_at(scene, background[j], sky, star_fluxes, j, position)
+        for j, psf in enumerate(psfs):
+            fits = _fits_at(scene, background[j], sky, star_fluxes, j, psf, position)
             core, wings = core.plus(fits[0]), wings.plus(fits[1])
-        halo, light = _halo(sky[:ny, :nx], position, width)
+        halo, light = _halo(sky[:ny, :nx], on_pixel, width)
         shares = (halo / max(each, np.finfo(float).tiny) for each in (float(flux), light))
         found.append(StarResiduals(core, wings, *shares))
     return found
 
 
 def _fits_at(
-    scene: Scene, background: Array, sky: Array, star_fluxes: Array, j: int, position: Array
+    scene: Scene,
+    background: Array,
+    sky: Array,
+    star_fluxes: Array,
+    j: int,
+    psf: Array,
+    position: Array,
 ) -> tuple[Fit, Fit]:
-    """Return the fit in the core and in the wings of a star in one image."""
+    """Return the fit in the core and in the wings of a star in one image, whose PSF is given."""
     from astropy.nddata import NoOverlapError, overlap_slices
 
     from lnocl.scene.forward_model import add_to_window  # which loads scipy
 
     observation = scene.observation
-    psf = observation.psfs[j]
     y, x = np.nonzero(psf > WINGS * psf.max())
     lit = psf[y.min() : y.max() + 1, x.min() : x.max() + 1]
     # The middle of what is lit, where the PSF's is at the star.

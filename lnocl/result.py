@@ -273,11 +273,14 @@ class Result:
         DeviceError
             As `lnocl.deconvolve`.
         """
+        from lnocl.io.fitsread import sky_header
         from lnocl.io.regions import read_apertures, read_profiles
         from lnocl.runs.bootstrap import bootstrap, check_number
 
         check_number(n, seed)
-        shape = self._outcome.scene.observation.shape
+        shape = self._outcome.scene.observation.sky_shape
+        if header is not None:
+            header = sky_header(header, self._outcome.scene.oversample)
         parts: list[Part] = []
         for given, read in ((regions, read_apertures), (profiles, read_profiles)):
             listed = given if isinstance(given, (str, os.PathLike)) else list(given)
@@ -393,7 +396,7 @@ def make_result(outcome: Outcome) -> Result:
     history = np.zeros(len(outcome.objectives), HISTORY_DTYPE)
     history["iteration"] = np.arange(len(history))
     history["objective"] = outcome.objectives
-    ny, nx = scene.observation.shape
+    ny, nx = scene.observation.sky_shape
     return Result(
         extended=outcome.sky[:ny, :nx],
         star_fluxes=outcome.star_fluxes,
@@ -417,6 +420,7 @@ def saved_parts(result: Result) -> dict[str, Any]:
         "history": result.history,
         "held_out": result.held_out if result.held_out.size else None,
         "offsets": result._outcome.scene.observation.offsets,
+        "oversample": result._outcome.scene.oversample,
         "cards": [],
     }
     if refinement is not None:
@@ -447,6 +451,7 @@ def view_of(result: Result) -> ResultView:
         offsets=observation.offsets,
         doubtful=None if result.psf_refinement is None else result.doubtful,
         unit="electron/s" if result._is_rate else "electron",
+        oversample=observation.oversample,
     )
 
 

@@ -80,9 +80,10 @@ def read(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
     """Return the regions and profiles that were given."""
     if arguments.regions is None and arguments.profiles is None:
         return []
+    from lnocl.io.fitsread import sky_header
     from lnocl.io.regions import read_apertures, read_profiles
 
-    where = frames.header, frames.observation.shape
+    where = sky_header(frames.header, frames.observation.oversample), frames.observation.sky_shape
     apertures = [] if arguments.regions is None else read_apertures(arguments.regions, *where)
     profiles = [] if arguments.profiles is None else read_profiles(arguments.profiles, *where)
     return [*apertures, *profiles]

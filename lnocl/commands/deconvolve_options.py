@@ -9,6 +9,7 @@ from lnocl.commands import bootstrap, checkpoints, options
 from lnocl.commands.options import SEVERAL, finite, number_or_word, option, whole_or_word
 from lnocl.deconvolution import deconvolve
 from lnocl.runs.options import ENGINES, PRECISIONS
+from lnocl.scene.observation import OVERSAMPLES
 from lnocl.scene.psf_families import FAMILIES
 from lnocl.solvers import SOLVERS
 
@@ -27,6 +28,23 @@ OPTIONS = {
     "input": [
         options.IMAGES,
         options.PSFS.but(required=True),
+        option(
+            "--oversample",
+            type=int,
+            choices=OVERSAMPLES,
+            help="pixels of the extended source, and of the PSFs, to one of the images along each "
+            "axis, for detectors with fewer than two pixels to the PSF's width; offsets of "
+            "fractions of a pixel then add resolution (default: 1)",
+        ),
+        option(
+            "--effective-psfs",
+            action="store_true",
+            default=None,  # for no card where it is not given
+            card=("EPSF", "the PSFs hold the response of a pixel"),
+            help="with --oversample: each sample of the PSFs holds what a pixel of the images "
+            "sees, as in effective PSFs of photutils or STDPSF files; else what a pixel of the "
+            "PSF sees, as in STPSF's",
+        ),
         option(
             "--psf-centre",
             choices=("check", "fit", "given"),

@@ -11,6 +11,7 @@ from lnocl.reference.scale import scale_rows
 from lnocl.reference.smooth import smooth
 from lnocl.reference.step import gradient_rows, step_rows
 from lnocl.reference.sums import collect_sums
+from lnocl.scene.forward_model import spread
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.solvers.engine import State
@@ -64,7 +65,8 @@ class ReferenceEngine:
     def _invert_weight(self) -> Array | float:
         if self.scene.weights is None:
             return 1.0 / self.scene.n_images
-        row_spectra = rfft_rows(self.scene.weights.astype(np.float64))
+        weights = self.scene.weights.astype(np.float64)
+        row_spectra = rfft_rows(spread(weights, self.scene.oversample))
         total = irfft_rows(correlate_columns(row_spectra, self._otfs))
         observed = self.scene.observed(total)
         return np.divide(1.0, total, out=np.zeros_like(total), where=observed)
@@ -81,7 +83,7 @@ class ReferenceEngine:
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
         self._ratio_row_spectra, self._data_term, self._star_sums = ratio_rows(
-            convolve_columns(self._row_spectrum, self._otfs),
+            convolve_columns(self._row_spectrum, self._otfs, self.scene.oversample),
             self._images,
             self.scene.weights,
             self._background,

@@ -87,6 +87,7 @@ class OpenCLEngine:
             scene.grid,
             np.dtype(np.float64 if precision == "double" else np.float32),
             tuning,
+            oversample=scene.oversample,
             n_stars=scene.n_stars,
             has_mu=scene.mu > 0,
             has_smoothing=scene.smoothing > 0,
@@ -155,16 +156,16 @@ class OpenCLEngine:
         """Return the bytes of each buffer, by the name that the kernels have for it."""
         scene, program, layout = self.scene, self.program, self.layout
         p, n, item = scene.n_images, scene.n_stars, program.dtype.itemsize
-        pixels, pair = layout.pixels_bytes, 2 * item
+        pixels, image, pair = layout.pixels_bytes, layout.images.pixels_bytes, 2 * item
         sizes = {
-            "images": p * pixels,
+            "images": p * image,
             "otfs": p * pixels,
             "otf_edges": p * program.grid[0] * pair,
             "spectra": p * layout.spectra_bytes,
             "extended": pixels,
             "inverse_weight": pixels if scene.weights is not None else item,
-            "background": p * (pixels if self._has_background_map else item),
-            "exposure": p * pixels if scene.has_exposure_map else item,
+            "background": p * (image if self._has_background_map else item),
+            "exposure": p * image if scene.has_exposure_map else item,
             "star_images": max(p * self._stars.bytes, item),
             "star_corners": max(n, 1) * 8,
             "star_fluxes": max(n, 1) * item,
@@ -172,7 +173,7 @@ class OpenCLEngine:
             "star_corrections": max(n, 1) * item,
             "star_totals": max(n, 1) * pair,
             "star_sums": max(p * self._stars.n_blocks_of_all, 1) * pair,
-            "ratio_sums": program.row_blocks * p * pair,
+            "ratio_sums": program.image_row_blocks * p * pair,
             "data_term": pair,
             "square_sums": program.row_blocks * pair,
             "slope": pixels if scene.smoothing else item,
@@ -243,7 +244,7 @@ class OpenCLEngine:
         memory.upload_integers("star_corners", self._stars.corners)
         self.move_stars()
         if scene.weights is not None:
-            self._invert_weights(scene.weights)
+            self._invert(self._total_weight(scene.weights))
 
     def take_images(self) -> None:
         """Take the images that the scene has now, all else being as it was; forget the record."""
@@ -302,8 +303,13 @@ class OpenCLEngine:
             otf.set(image=j)
             otf()
 
-    def _invert_weights(self, weights: NDArray) -> None:
-        """Make 1 / sum_j A_j^T w_j, 0 where nothing was observed."""
+    def _total_weight(self, weights: NDArray) -> Array:
+        """Return sum_j A_j^T w_j."""
+        if self.scene.oversample > 1:  # rfft_rows takes no images that are coarser than the sky
+            from lnocl.scene.forward_model import Model  # which loads scipy
+
+            model = Model(self.scene)
+            return model.adjoint(model.weights)
         spectra, size = self._memory.buffers["spectra"], self.layout.spectra_bytes
         transform = self._bind("rfft_rows", pixels=self._memory.buffers["extended"])
         for j in reversed(range(len(weights))):
@@ -314,7 +320,10 @@ class OpenCLEngine:
                 cl.enqueue_copy(self._queue, spectra, spectra, byte_count=size, dst_offset=j * size)
         self._bind("correlate_columns")()
         self._bind("irfft_rows", pixels=self._memory.buffers["extended"])()
-        total = self.extended()
+        return self.extended()
+
+    def _invert(self, total: Array) -> None:
+        """Make 1 / sum_j A_j^T w_j, 0 where nothing was observed."""
         self._observed = self.scene.observed(total)
         inverse = np.divide(1.0, total, out=np.zeros_like(total), where=self._observed)
         self._memory.upload_pixels("inverse_weight", [inverse])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.fitsfile import open_fits
-from lnocl.io.headers import make_wcs, quiet_log, readable
+from lnocl.io.headers import finer_cards, make_wcs, quiet_log, readable
 from lnocl.io.names import parse_name
 from lnocl.io.selection import choose, describe, find, has_pixels, name_of, only
 from lnocl.process import ignored_warnings
@@ -226,6 +226,11 @@ def wcs_cards(header: fits.Header) -> fits.Header:
                 f"copied and are left out: {error}"
             )
     return cards
+
+
+def sky_header(header: fits.Header, oversample: int) -> fits.Header:
+    """Return a header with the coordinates of a sky so many times as fine as the image of this."""
+    return header if oversample == 1 else finer_cards(wcs_cards(header), oversample)
 
 
 class _NoImageError(FileError):

@@ -15,6 +15,7 @@ from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.io.atomic import whole_file
+from lnocl.io.headers import finer_cards
 
 # A HISTORY card holds 72 characters; the last one may be needed for a backslash and a space.
 HISTORY_WIDTH = 70
@@ -47,6 +48,7 @@ def write_result(
     star_columns: Sequence[StarColumn] = (),
     cubes: Mapping[str, tuple[ArrayLike, str]] = MappingProxyType({}),
     offsets: ArrayLike = (),
+    oversample: int = 1,
     psf_fit: NDArray[np.void] | None = None,
     psfs: ArrayLike | None = None,
     psf_errors: NDArray[np.void] | None = None,
@@ -65,15 +67,15 @@ def write_result(
     path : str
         File to write.
     extended : array_like, shape (ny, nx)
-        Extended source, in this unit per pixel.
+        Extended source, in this unit per pixel of it.
     stars : array_like, shape (n, 2)
-        Positions (x, y) in pixels, 0-based.
+        Positions (x, y) in pixels of the images, 0-based.
     star_fluxes : array_like, shape (n,)
         In this unit.
     history : ndarray with fields ``iteration`` and ``objective``, optional
         The objective after each iteration; a truth has no history.
     wcs : astropy.io.fits.Header, optional
-        Cards of the coordinate systems, from `fitsread.wcs_cards`.
+        Cards of the coordinate systems of the images, from `fitsread.wcs_cards`.
     cards : iterable of (keyword, value, comment), optional
         Further cards of the primary header.
     commands : iterable of sequence of str, optional
@@ -93,6 +95,8 @@ def write_result(
     offsets : array_like, shape (p, 2), optional
         Offsets of these images, pixels. Where one is not 0, no coordinate system holds for all of a
         cube: it has the cards of `offset_cards` instead.
+    oversample : int, optional
+        Pixels of the extended source to one of the images, along each axis.
     psf_fit : ndarray with fields ``image`` and those of the parameters, optional
         The parameters of the PSFs that were refined.
     psfs : array_like, shape (p, ky, kx), optional
@@ -111,8 +115,10 @@ def write_result(
     """
     coordinates = fits.Header() if wcs is None else wcs
     shared = coordinates if not np.any(offsets) else fits.Header(offset_cards(offsets))
-    header = coordinates.copy()
+    header = coordinates.copy() if oversample == 1 else finer_cards(coordinates, oversample)
     header["BUNIT"] = (unit, "per pixel")
+    if oversample > 1:
+        header["OVERSAMP"] = (oversample, "pixels of this image to one of the frames")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
     _add_provenance(header, cards, (), commands)
     hdus = fits.HDUList(

@@ -20,7 +20,7 @@ from lnocl.io.levels import sky_level, sky_noise
 from lnocl.io.maps import Maps, Word
 from lnocl.io.noise import VARIANCES, NoiseMap, electrons_by_variance, read_noise_map
 from lnocl.scene import units
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.observation import OVERSAMPLES, Array, Observation
 
 log = logging.getLogger("lnocl")
 
@@ -70,6 +70,8 @@ class Calibration(NamedTuple):
         Offsets from the headers' coordinates.
     psf_centre : {"check", "fit", "given"}
         As for `Observation`.
+    oversample, effective_psfs : int, bool
+        As for `Observation`.
     ideal_psfs : sequence of str
         Files of the PSFs without aberrations, as for `Observation`.
     pupils, psf_scatter : sequence of str
@@ -92,6 +94,8 @@ class Calibration(NamedTuple):
     saturation: float | None = None
     gain: Word | None = None
     align: str | None = None
+    oversample: int = 1
+    effective_psfs: bool = False
     psf_centre: str = "check"
     ideal_psfs: Sequence[str] = ()
     pupils: Sequence[str] = ()
@@ -193,6 +197,8 @@ class _Reader:
             mask=mask if mask.any() else None,
             exposure=1.0 if exposure is None else exposure,
             offsets=self._offsets(),
+            oversample=self._calibration.oversample,
+            effective_psfs=self._calibration.effective_psfs,
             psf_centre=self._calibration.psf_centre,
             **self._psf_errors(),
         )
@@ -217,7 +223,7 @@ class _Reader:
             self._gain,
         )
 
-    def _psf_errors(self) -> dict[str, Array]:
+    def _psf_errors(self) -> dict[str, Any]:
         """Return what is known of the ways in which PSFs may be wrong."""
         given = self._calibration
         files = {
@@ -240,21 +246,31 @@ class _Reader:
     def _warn_of_pixel_scales(self) -> None:
         """Warn of the first PSF whose pixels are of another size than those of its image."""
         scales = [sky.pixel_scale(header) for header in self._psfs.headers]
+        oversample = self._calibration.oversample
         for j, header in enumerate(self._psfs.headers):
-            if scales[j] is None and (finer := sky.oversampling(header)):
+            finer = sky.oversampling(header) if scales[j] is None else None
+            if finer is not None and finer != oversample:
                 warn(
                     f"psf {j} is sampled {finer:g} times finer than the detector, by OVERSAMP in "
-                    "its header: bin it to the image's pixels"
+                    f"its header: give oversample {finer:g}, or bin it to "
+                    + ("the image's pixels" if oversample == 1 else f"{oversample} times finer")
                 )
                 return
         if not any(scales):
             return  # nor need the images' coordinates be read
         for j, of_psf in enumerate(scales):
             of_image = sky.pixel_scale(self._images.headers[min(j, len(self._paths) - 1)])
-            if of_psf and of_image and abs(np.log(of_image / of_psf)) > MAX_SCALE_ERROR:
+            if not (of_psf and of_image):
+                continue
+            wanted = of_image / oversample
+            if abs(np.log(wanted / of_psf)) > MAX_SCALE_ERROR:
+                finer_by = round(of_image / of_psf)
+                exact = finer_by in OVERSAMPLES and abs(of_image / of_psf / finer_by - 1) < 0.01
+                words = f"give oversample {finer_by}, or " if exact else ""
+                pixels = "the image's pixels" if oversample == 1 else f"{wanted:.4g} arcsec"
                 warn(
                     f"the pixels of psf {j} are of {of_psf:.4g} arcsec, those of its image of "
-                    f"{of_image:.4g}: rebin it to the image's pixels, by {of_image / of_psf:.3g}"
+                    f"{of_image:.4g}: {words}rebin it to {pixels}, by {wanted / of_psf:.3g}"
                 )
                 return
 

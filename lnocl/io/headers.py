@@ -71,6 +71,31 @@ def observed_cards(
     ]
 
 
+def finer_cards(cards: fits.Header, oversample: int) -> fits.Header:
+    """Return the cards of `fitsread.wcs_cards` for pixels that are so many times finer.
+
+    With q of them to a pixel, pixel x begins at q x: ``CRPIX <- q (CRPIX - 1/2) + 1/2``,
+    ``CDELT <- CDELT / q``, and a coefficient of SIP of powers i and j ``A <- A q^(1 - i - j)``.
+
+    Examples
+    --------
+    >>> from astropy.io import fits
+    >>> from lnocl.io.headers import finer_cards
+    >>> finer_cards(fits.Header({"CRPIX1": 1.0, "CDELT1": 0.5}), 2)
+    CRPIX1  =                  1.5
+    CDELT1  =                 0.25
+    """
+    finer, q = cards.copy(), oversample
+    for keyword, value in cards.items():
+        if re.fullmatch("CRPIX[12][A-Z]?", keyword):
+            finer[keyword] = q * (value - 0.5) + 0.5
+        elif re.fullmatch("CDELT[12][A-Z]?", keyword):
+            finer[keyword] = value / q
+        elif powers := re.fullmatch("[AB]P?_([0-9])_([0-9])", keyword):
+            finer[keyword] = value * float(q) ** (1 - int(powers[1]) - int(powers[2]))
+    return finer
+
+
 def number(path: str, header: fits.Header, keyword: str) -> float | None:
     """Return the number that a keyword holds; None where it is missing.
 

@@ -68,9 +68,20 @@ class SavedResult:
 
     @property
     def stars(self) -> list[tuple[float, float]]:
-        """Positions (x, y) of the stars, pixels, 0-based."""
+        """Positions (x, y) of the stars, pixels of the images, 0-based."""
         stars = self.tables["STARS"]
         return list(zip(stars["x"].tolist(), stars["y"].tolist(), strict=True))
+
+    @property
+    def sky_stars(self) -> list[tuple[float, float]]:
+        """Positions (x, y) of the stars, pixels of the extended source."""
+        q = self.oversample
+        return [(q * x + (q - 1) / 2.0, q * y + (q - 1) / 2.0) for x, y in self.stars]
+
+    @property
+    def oversample(self) -> int:
+        """Pixels of the extended source to one of the images, along each axis."""
+        return int(self.number("OVERSAMP") or 1)
 
     @property
     def star_fluxes(self) -> NDArray[np.float64]:
@@ -144,7 +155,8 @@ def read_result(path: str) -> SavedResult:
     extended, header = image
     if len(cubes) < len(CUBES):
         cubes = {}
-    if fault := _fault(extended, tables, cubes, doubtful):
+    oversample = int(number(path, header, "OVERSAMP") or 1)
+    if fault := _fault(extended, tables, cubes, doubtful, oversample):
         raise FileError(
             f"{path} is not a result or truth written by lnocl, such as OUT.fits of lnocl "
             f"deconvolve: {fault}"
@@ -182,6 +194,7 @@ def _fault(
     tables: dict[str, Columns],
     cubes: dict[str, NDArray[np.float64]],
     doubtful: NDArray[np.bool_] | None,
+    oversample: int,
 ) -> str:
     """Return why these are not the parts of a result; nothing where they are."""
     for table, names in TABLES.items():
@@ -193,7 +206,7 @@ def _fault(
     for name, cube in cubes.items():
         if (
             cube.ndim != 3
-            or cube.shape[1:] != extended.shape
+            or (oversample * cube.shape[1], oversample * cube.shape[2]) != extended.shape
             or cube.shape != cubes[CUBES[0]].shape
         ):
             return f"{name} has the shape {cube.shape}"

@@ -23,6 +23,7 @@ from lnocl.plotting.result import (
     ResultView,
     brightest,
     draw_choice,
+    finer_slices,
     image_limits,
     worst_image,
 )
@@ -77,6 +78,10 @@ def make_report(
         "palettes": {"source": _palette(COLOUR_MAP), "residuals": _palette("RdBu_r")},
     }
     notes = [f"The whole frame is shown in blocks of {step} x {step} pixels."] if step > 1 else []
+    if view.oversample > 1:
+        notes.append(
+            "The extended source is finer: shown is its light in each pixel of the images."
+        )
     if not len(view.images):
         notes.append("The file has no models and residuals: repeat the run with both.")
     template = Template((files("lnocl.plotting") / "report.html").read_text("utf-8"))
@@ -94,16 +99,17 @@ def make_report(
 
 def frame_step(view: ResultView) -> int:
     """Return the side of the blocks in which the whole frame fits the page, pixels."""
-    each = BYTES_OF_IMAGE * len(view.images) + BYTES_OF_SOURCE
-    return max(1, int(np.ceil(np.sqrt(view.extended.size * each / FRAME_BYTES))))
+    n_bytes = BYTES_OF_IMAGE * view.shape[0] * view.shape[1] * len(view.images)
+    n_bytes += BYTES_OF_SOURCE * view.extended.size
+    return max(1, int(np.ceil(np.sqrt(n_bytes / FRAME_BYTES))))
 
 
 def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
     """Return the pictures of a region: image, model and residuals of each image, and the source."""
     images: list[list[dict[str, Any]]] = []
     for j, offset in enumerate(view.offsets):
-        there = region.slices(view.extended.shape, offset)
-        corner = _corner(there, view.extended.shape, offset)
+        there = region.slices(view.shape, offset)
+        corner = _corner(there, view.shape, offset)
         if not view.images[j][there].size:  # not in this image
             images.append([])
             continue
@@ -118,13 +124,15 @@ def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
                 _layer("residuals", residuals, (-MAX_SIGMA, MAX_SIGMA, 0.0), corner, "sigma"),
             ]
         )
-    there = region.slices(view.extended.shape)
-    top = brightest(view.extended[there])
+    there, q = region.slices(view.shape), view.oversample
+    # Of a finer sky the light in each pixel of the images.
+    extended = q**2 * block_means(view.extended[finer_slices(there, q)], q)
+    top = brightest(extended)
     source = _layer(
         "extended source",
-        block_means(view.extended[there], step),
+        block_means(extended, step),
         (0.0, top, FAINT_SHARE * top),
-        _corner(there, view.extended.shape, (0.0, 0.0)),
+        _corner(there, view.shape, (0.0, 0.0)),
         view.unit,
     )
     return {"name": region.name, "step": step, "images": images, "source": source}

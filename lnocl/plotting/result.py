@@ -36,10 +36,10 @@ class ResultView:
 
     Attributes
     ----------
-    extended : ndarray of float64, shape (ny, nx)
-        Extended source.
+    extended : ndarray of float64
+        Extended source: pixels of the images, or finer ones.
     stars : sequence of (x, y)
-        Positions, pixels.
+        Positions, pixels of the images.
     star_fluxes : ndarray of float64, shape (n,)
         In any unit.
     n_iter : int
@@ -56,7 +56,9 @@ class ResultView:
     doubtful : ndarray of bool, shape (ny, nx), or None
         Pixels to outline, where errors of the PSFs may have faked what is there.
     unit : str
-        Unit of the extended source, per pixel.
+        Unit of the extended source, per pixel of it.
+    oversample : int
+        Pixels of the extended source to one of the images, along each axis.
     """
 
     extended: Array
@@ -71,6 +73,13 @@ class ResultView:
     offsets: Array
     doubtful: NDArray[np.bool_] | None = None
     unit: str = "electron"
+    oversample: int = 1
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (ny, nx) of the images."""
+        ny, nx = self.extended.shape
+        return ny // self.oversample, nx // self.oversample
 
     def zooms(self) -> list[int]:
         """Return the stars to enlarge: the brightest, in the order that they have."""
@@ -79,7 +88,7 @@ class ResultView:
 
     def half(self) -> int:
         """Return half the side of an enlarged region, pixels."""
-        return max(ZOOM, round(ZOOM_SHARE * max(self.extended.shape)))
+        return max(ZOOM, round(ZOOM_SHARE * max(self.shape)))
 
 
 @dataclass(frozen=True)
@@ -197,7 +206,7 @@ def _draw_images(axes: Sequence[Axes], view: ResultView, region: Region) -> None
 
     j = worst_image(view, region)
     offset = view.offsets[j]
-    there = region.slices(view.extended.shape, offset)
+    there = region.slices(view.shape, offset)
     _, _, noise = image_limits(view.images[j])
     low, high, _ = image_limits(view.images[j][there])
     name = "image" if len(view.images) == 1 else f"image {j + 1} of {len(view.images)}"
@@ -222,11 +231,10 @@ def _draw_images(axes: Sequence[Axes], view: ResultView, region: Region) -> None
 def _draw_extended(axis: Axes, view: ResultView, region: Region, title: str) -> None:
     from matplotlib.colors import AsinhNorm
 
-    there = region.slices(view.extended.shape)
+    there = finer_slices(region.slices(view.shape), view.oversample)
     top = brightest(view.extended[there])
-    shown = _draw_region(
-        axis, view.extended, there, AsinhNorm(FAINT_SHARE * top, 0.0, top), COLOUR_MAP
-    )
+    norm = AsinhNorm(FAINT_SHARE * top, 0.0, top)
+    shown = _draw_region(axis, view.extended, there, norm, COLOUR_MAP, view.oversample)
     if view.doubtful is not None and view.doubtful[there].any():
         outline(axis, view.doubtful, there)
         title += f"\n{OUTLINED}"
@@ -244,13 +252,26 @@ def outline(axis: Axes, flags: NDArray[np.bool_], there: Any = np.s_[:, :]) -> N
     axis.set(xlim=limits[0], ylim=limits[1])
 
 
-def _draw_region(axis: Axes, image: NDArray[Any], there: Any, norm: Any, colours: str) -> Any:
-    """Draw a part of an image; bad pixels are grey."""
+def finer_slices(there: Any, oversample: int) -> Any:
+    """Return the rows and columns of a sky so many times as fine."""
+    if oversample == 1:
+        return there
+    return tuple(
+        slice(*(None if at is None else oversample * at for at in (part.start, part.stop)))
+        for part in there
+    )
+
+
+def _draw_region(
+    axis: Axes, image: NDArray[Any], there: Any, norm: Any, colours: str, oversample: int = 1
+) -> Any:
+    """Draw a part of an image, on axes of pixels so many times as coarse; bad pixels are grey."""
     from matplotlib import colormaps
 
     # A part alone is drawn, since matplotlib scales all that it is given.
     rows, columns = (part.indices(n) for part, n in zip(there, image.shape, strict=True))
-    extent = (columns[0] - 0.5, columns[1] - 0.5, rows[0] - 0.5, rows[1] - 0.5)
+    edges = columns[0], columns[1], rows[0], rows[1]
+    extent = tuple(edge / oversample - 0.5 for edge in edges)
     part = image[there]
     if not part.size:
         axis.text(0.5, 0.5, "not in this image", transform=axis.transAxes, ha="center")

@@ -14,6 +14,7 @@ from lnocl.runs.outcome import Outcome
 from lnocl.runs.progress import make_bar
 from lnocl.runs.replicas import Replica, Replicas, Sky
 from lnocl.scene.apertures import FLUX, FWHM, LENGTH, Aperture, Label, Profile
+from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
@@ -241,7 +242,7 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     """Return what will be measured of a reconstruction, before its first replica."""
     width = resolution(outcome.scene)
     quantities = _quantities(outcome, parts, width)
-    pixels = np.zeros((2, *outcome.scene.observation.shape))
+    pixels = np.zeros((2, *outcome.scene.observation.sky_shape))
     none = np.zeros((0, len(quantities)))
     is_rate = (outcome.scene.observation.exposure != 1.0).any()
     unit = "electron/s" if is_rate else "electron"
@@ -296,7 +297,7 @@ def _measure(sky: Sky, parts: Sequence[Part], moves: bool) -> Array:
 def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[Quantity, ...]:
     """Return what is measured, in the order of `_measure`."""
     scene = outcome.scene
-    n, (ny, nx) = scene.n_stars, scene.observation.shape
+    n, (ny, nx) = scene.n_stars, scene.observation.sky_shape
     moves = outcome.given_stars is not None
     labels = [Label(f"star {s} flux", FLUX) for s in range(1, n + 1)]
     if moves:
@@ -304,7 +305,8 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
     labels += [label for part in parts for label in part.labels()]
     notes = [""] * (3 * n if moves else n)
     observed = _observed(scene)[:ny, :nx] if parts else np.ones((0, 0), bool)
-    notes += [note for part in parts for note in _notes(part, scene.stars, width, observed)]
+    stars = on_sky(scene.stars, scene.oversample)
+    notes += [note for part in parts for note in _notes(part, stars, width, observed)]
     sky = Sky(outcome.sky[:ny, :nx], outcome.star_fluxes, scene.stars)
     values = _measure(sky, parts, moves).tolist()
     return tuple(

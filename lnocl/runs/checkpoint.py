@@ -24,7 +24,10 @@ from lnocl.scene.arrays import numbers
 from lnocl.scene.observation import Observation
 from lnocl.solvers.engine import State
 
-OBSERVED = ("images", "psfs", "background", "mask", "exposure", "offsets")
+OBSERVED = (
+    *("images", "psfs", "background", "mask", "exposure", "offsets"),
+    *("oversample", "effective_psfs"),
+)
 # The widest value: a SHA-256 in hexadecimal, or the repr of a parameter or name of a device.
 WIDTH = 256
 # More than there are parameters, and than the state of held-out counts has arrays: a hostile file

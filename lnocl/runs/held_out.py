@@ -161,7 +161,7 @@ class HeldOutCounts:
 
     @property
     def _shape(self) -> tuple[int, int]:
-        return self._start.scene.observation.shape
+        return self._start.scene.observation.sky_shape
 
     def _judge(self, halves: Halves) -> bool:
         """Record the errors of one penalty; return whether they are the least so far."""

@@ -12,6 +12,7 @@ import numpy as np
 from lnocl.process import ignored_warnings
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.run import Run
+from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
 from lnocl.scene.psf_pixels import PsfPixels
@@ -65,7 +66,9 @@ class Replicas:
 
     def __init__(self, outcome: Outcome, seed: int) -> None:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
-        self._texture = Texture(outcome.sky / scene.unit, scene.stars, resolution(scene))
+        self._texture = Texture(
+            outcome.sky / scene.unit, on_sky(scene.stars, scene.oversample), resolution(scene)
+        )
         self._model = Model(scene)
         observation = scene.observation
         self._noise = self._added = observation.read_noise**2
@@ -91,7 +94,7 @@ class Replicas:
             scene.n_images + 2
         )
         sky = self._texture.draw(np.random.default_rng(of_sky))
-        ny, nx = scene.observation.shape
+        ny, nx = scene.observation.sky_shape
         drawn = Sky(sky[:ny, :nx] * scene.unit, self._outcome.star_fluxes, scene.stars)
         models = list(self._means(self._model, sky))
         counts = self._draw(models, of_images)

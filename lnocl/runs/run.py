@@ -202,7 +202,7 @@ class Run:
         if self._refines:
             from lnocl.scene.forward_model import largest_window
 
-            size = largest_window(self.scene.observation.psfs.shape[1:], self.scene.grid)
+            size = largest_window(self.scene)
             low, high = [-LARGEST, -LARGEST, 1, 1], [LARGEST, LARGEST, *size]
         return saved.take("cross_windows", own.dtype, own.shape, low, high)
 
@@ -270,8 +270,8 @@ class Run:
         return self.scene.stars
 
     def extended(self) -> Array:
-        """Return the extended source, electrons per pixel, shape (ny, nx)."""
-        ny, nx = self.scene.observation.shape
+        """Return the extended source, electrons per pixel of it."""
+        ny, nx = self.scene.observation.sky_shape
         return self.engine.extended()[:ny, :nx] * self.scene.unit
 
     def star_fluxes(self) -> Array:
@@ -379,7 +379,7 @@ def most_bytes(start: Start, n_iter: int) -> int:
     from lnocl.scene.forward_model import largest_window
 
     scene = start.scene
-    window = largest_window(scene.observation.psfs.shape[1:], scene.grid)
+    window = largest_window(scene)
     n, pixels = scene.n_stars, math.prod(scene.grid)
     numbers = 4 * pixels + 2 * scene.grid[0] + n * (math.prod(window) + n + 8) + 2 * n_iter + 64
     return np.dtype(np.float64).itemsize * numbers

@@ -27,13 +27,19 @@ ROUNDING = 1e-16
 class Model:
     """The linear maps of a scene: ``m_j = A_j f + sum_s c_s P_js + b_j``, on the grid and scaled.
 
+    A_j convolves with the response of image j and takes each `oversample`-th point.
+
     Attributes
     ----------
     shape : tuple of int
-        (p, Ny, Nx).
-    weights : ndarray of float64, shape (p, Ny, Nx)
+        (p, ny, nx), of the images on their grid.
+    grid : tuple of int
+        (Ny, Nx), of the sky.
+    oversample : int
+        Ny / ny.
+    weights : ndarray of float64, shape (p, ny, nx)
         Its relative exposure where a pixel was observed, else 0.
-    background : ndarray of float64, shape (p, 1, 1) or (p, Ny, Nx)
+    background : ndarray of float64, shape (p, 1, 1) or (p, ny, nx)
         b_j.
 
     Notes
@@ -44,11 +50,13 @@ class Model:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self.shape = (scene.n_images, *scene.grid)
+        self.shape = (scene.n_images, *scene.image_grid)
+        self.grid, self.oversample = scene.grid, scene.oversample
         self._window_otfs: dict[Any, NDArray[np.complex128]] = {}
         self._psfs = [scene.psf_stamp(j) for j in range(scene.n_images)]
-        # What a flat array is multiplied by: it stays flat.
+        # What a flat sky is multiplied by: it stays flat. So does what comes back of a flat image.
         self._sums = np.array([psf.values.sum() for psf in self._psfs])
+        self._back_sums = self._sums / scene.oversample**2
         weights = np.ones((1, 1, 1)) if scene.weights is None else scene.weights
         if not weights.strides[0]:  # all images share them
             weights = weights[:1]
@@ -58,18 +66,18 @@ class Model:
 
     @cached_property
     def _otfs(self) -> list[NDArray[np.complex128]]:
-        grid = self.shape[1:]
-        return [scipy.fft.rfft2(psf.on_grid(grid), workers=-1) for psf in self._psfs]
+        return [scipy.fft.rfft2(psf.on_grid(self.grid), workers=-1) for psf in self._psfs]
 
     def forward(self, extended: Array) -> Array:
-        """Return the ``A_j f``, shape (p, Ny, Nx)."""
+        """Return the ``A_j f``, shape (p, ny, nx)."""
         images = np.empty(self.shape)
         if is_flat(extended):
             images[:] = extended[0, 0] * self._sums[:, None, None]
             return images
         spectrum = scipy.fft.rfft2(extended, workers=-1)
         for image, otf in zip(images, self._otfs, strict=True):
-            image[:] = scipy.fft.irfft2(otf * spectrum, image.shape, workers=-1, overwrite_x=True)
+            fine = scipy.fft.irfft2(otf * spectrum, self.grid, workers=-1, overwrite_x=True)
+            image[:] = sampled(fine, self.oversample)
         return images
 
     def adjoint(self, arrays: Iterable[Array]) -> Array:
@@ -86,16 +94,16 @@ class Model:
         for array, members in _runs(arrays):
             shares = factors[:, members]
             if not any(array.strides):  # of one value, as weights are where all is observed
-                flat += shares @ self._sums[members] * array[0, 0]
+                flat += shares @ self._back_sums[members] * array[0, 0]
                 continue
-            spectrum = scipy.fft.rfft2(array, workers=-1).conj()
+            spectrum = scipy.fft.rfft2(spread(array, self.oversample), workers=-1).conj()
             spectra = spectra or [np.zeros_like(spectrum) for _ in factors]
             for total, share in zip(spectra, shares, strict=True):
                 total += self._mixed_otf(members, share) * spectrum
         if not spectra:
-            return np.broadcast_to(flat[:, None, None], (len(flat), *self.shape[1:]))
+            return np.broadcast_to(flat[:, None, None], (len(flat), *self.grid))
         back = [
-            scipy.fft.irfft2(each.conj(), self.shape[1:], workers=-1, overwrite_x=True)
+            scipy.fft.irfft2(each.conj(), self.grid, workers=-1, overwrite_x=True)
             for each in spectra
         ]
         return np.array(back) + flat[:, None, None]
@@ -105,21 +113,23 @@ class Model:
         if len(members) == 1:
             otf = self._otfs[members[0]]
             return otf if shares[0] == 1.0 else shares[0] * otf
-        mixed = np.zeros(self.shape[1:])
+        mixed = np.zeros(self.grid)
         for j, share in zip(members, shares, strict=True):
             psf = self._psfs[j]
             mixed[psf.window(mixed.shape)] += share * psf.values
         return np.asarray(scipy.fft.rfft2(mixed, workers=-1))
 
     def adjoint_of_stamps(self, stamps: Sequence[Stamp]) -> Stamp:
-        """Return ``sum_j A_j^T x_j`` of arrays x_j that are 0 beyond a stamp, one an image.
+        """Return ``sum_j A_j^T x_j`` of images x_j that are 0 beyond a stamp, one an image.
 
         It is computed in the window that it lies in, where that is smaller than the grid. Outer
         rows and columns below the rounding of its largest value are cut off.
         """
+        given, q = stamps, self.oversample
+        stamps = [Stamp(spread(each.values, q), q * each.y, q * each.x) for each in given]
         first, size = _window_of_correlations(stamps, self._psfs)
-        if (size >= self.shape[1:]).any():
-            total = self.adjoint(stamp.on_grid(self.shape[1:]) for stamp in stamps)
+        if (size >= self.grid).any():
+            total = self.adjoint(stamp.on_grid(self.shape[1:]) for stamp in given)
             return _without_rounding(Stamp(total, 0, 0))
         shape = tuple(scipy.fft.next_fast_len(int(n), real=True) for n in size)
         spectrum: Any = 0.0
@@ -137,7 +147,7 @@ class Model:
         return self._window_otfs[j, shape]
 
     def starlight(self, star_fluxes: Array) -> Iterator[Array]:
-        """Yield ``sum_s c_s P_js`` of each image, shape (Ny, Nx), the stars where they are now."""
+        """Yield ``sum_s c_s P_js`` of each image, shape (ny, nx), the stars where they are now."""
         for j in range(self.shape[0]):
             yield self._scene.star_field.light(j, star_fluxes)
 
@@ -162,18 +172,21 @@ class Model:
             if flat:
                 image[box] += self._sums[j] * extended[0, 0]
             else:
-                image[box] += convolve_at(extended, self._psfs[j], rows, columns)
+                image[box] += self._convolve_at(extended, j, rows, columns)
             np.maximum(image[box], 0.0, out=image[box])
         return images
+
+    def _convolve_at(self, extended: Array, j: int, rows: range, columns: range) -> Array:
+        return convolve_at(extended, self._psfs[j], rows, columns, self.oversample)
 
     def are_large(self, boxes: Sequence[Box]) -> bool:
         """Return whether the pixels that a box of an image sees are a large share of the grid."""
         sides = [
-            np.add([side.stop - side.start for side in box], psf.values.shape)
+            np.add([self.oversample * (side.stop - side.start) for side in box], psf.values.shape)
             for box, psf in zip(boxes, self._psfs, strict=True)
         ]
         largest = max(math.prod(map(int, each)) for each in sides)
-        return largest > SHARE_OF_GRID * math.prod(self.shape[1:])
+        return largest > SHARE_OF_GRID * math.prod(self.grid)
 
 
 def _runs(arrays: Iterable[Array]) -> Iterator[tuple[Array, list[int]]]:
@@ -195,8 +208,30 @@ def is_flat(array: Array) -> bool:
     return not any(array.strides) or bool((array == array[0, 0]).all())
 
 
-def convolve_at(extended: Array, psf: Stamp, rows: range, columns: range) -> Array:
-    """Return ``K_j * f`` in some rows and columns of the grid, round its edges."""
+def sampled(sky: Array, oversample: int) -> Array:
+    """Return each `oversample`-th row and column: what an image has of a convolved sky."""
+    return sky[..., ::oversample, ::oversample]
+
+
+def spread(image: Array, oversample: int) -> Array:
+    """Return the adjoint of `sampled`: the pixels of an image on the sky's, 0 between them."""
+    if oversample == 1:
+        return image
+    *others, ny, nx = image.shape
+    sky = np.zeros((*others, oversample * ny, oversample * nx))
+    sky[..., ::oversample, ::oversample] = image
+    return sky
+
+
+def convolve_at(
+    extended: Array, psf: Stamp, rows: range, columns: range, oversample: int = 1
+) -> Array:
+    """Return ``A_j f`` in some rows and columns of the images' grid, round its edges."""
+    if oversample > 1:
+        fine_rows, fine_columns = (
+            range(oversample * at.start, oversample * at.stop) for at in (rows, columns)
+        )
+        return sampled(convolve_at(extended, psf, fine_rows, fine_columns), oversample)
     height, width = psf.values.shape
     reach = len(rows) + height - 1, len(columns) + width - 1
     if math.prod(reach) >= extended.size:  # a transform of the grid is the smaller one
@@ -224,7 +259,8 @@ def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[
     for j in range(scene.n_images):
         otf = scipy.fft.rfft2(scene.psf(j), workers=-1)
         otf *= spectrum
-        image = scipy.fft.irfft2(otf, scene.grid, workers=-1, overwrite_x=True)
+        sky = scipy.fft.irfft2(otf, scene.grid, workers=-1, overwrite_x=True)
+        image = np.ascontiguousarray(sampled(sky, scene.oversample))
         _illuminate(image, background[j], scene.star_field.light(j, star_fluxes))
         yield image
 
@@ -232,7 +268,7 @@ def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[
 def add_to_window(
     image: Array, scene: Scene, sky: Array, star_fluxes: Array, j: int, first: tuple[int, int]
 ) -> None:
-    """Add ``A_j f + sum_s c_s P_js``, scaled, to an image of a window of the grid.
+    """Add ``A_j f + sum_s c_s P_js``, scaled, to an image of a window of the images' grid.
 
     Parameters
     ----------
@@ -248,9 +284,10 @@ def add_to_window(
         Row and column of the first pixel of the window.
     """
     rows, columns = (range(at, at + n) for at, n in zip(first, image.shape, strict=True))
-    image += convolve_at(sky, scene.psf_stamp(j), rows, columns) / scene.unit
+    seen = convolve_at(sky, scene.psf_stamp(j), rows, columns, scene.oversample)
+    image += seen / scene.unit
     for stamp, flux in zip(scene.star_field.stamps[j], star_fluxes, strict=True):
-        stamp.add_to(image, rows, columns, scene.grid, flux / scene.unit)
+        stamp.add_to(image, rows, columns, scene.image_grid, flux / scene.unit)
 
 
 def _illuminate(image: Array, background: Array | float, starlight: Array) -> None:
@@ -273,9 +310,10 @@ def _window_of_correlations(
     return start, np.max(last, axis=0) - start
 
 
-def largest_window(psf_shape: tuple[int, ...], grid: tuple[int, int]) -> tuple[int, int]:
+def largest_window(scene: Scene) -> tuple[int, int]:
     """Return the largest shape of `Model.adjoint_of_stamps` of star images, wherever these lie."""
-    height, width = (2 * (k + 2 * MARGIN) for k in psf_shape)
+    grid, psf_shape = scene.grid, scene.observation.psfs.shape[1:]
+    height, width = (2 * (k + 2 * MARGIN + 2 * (scene.oversample - 1)) for k in psf_shape)
     return grid if height >= grid[0] or width >= grid[1] else (height, width)
 
 

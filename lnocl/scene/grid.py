@@ -28,7 +28,7 @@ LENGTHS = sorted(
 
 
 def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
-    """Return the shape (Ny, Nx) of the grid of a scene.
+    """Return the shape (Ny, Nx) of the grid of a scene's images; its sky may be finer.
 
     It holds the images with their pad, and the PSFs, or as much of them as reaches from one end of
     the images to the other.
@@ -46,14 +46,15 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
         raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
     # Light that is farther from its source than the images are wide reaches none of them.
-    reach = (
-        min(k, 2 * n, MAX_AXIS) for n, k in zip(shape, observation.psfs.shape[1:], strict=True)
-    )
+    most = MAX_AXIS // observation.oversample
+    sizes = (-(-k // observation.oversample) for k in observation.psfs.shape[1:])
+    reach = (min(k, 2 * n, most) for n, k in zip(shape, sizes, strict=True))
     ny, nx = (max(n + 2 * int(pad), k) for n, k in zip(shape, reach, strict=True))
-    if max(ny, nx) > MAX_AXIS:
+    if max(ny, nx) > most:
+        finer = f" and oversample={observation.oversample}" if observation.oversample > 1 else ""
         raise InputError(
-            f"images of {shape} with pad={pad} need a grid of {(ny, nx)}; "
-            f"the largest axis is {MAX_AXIS}: cut the images or pad less"
+            f"images of {shape} with pad={pad}{finer} need a grid of {(ny, nx)}; "
+            f"the largest axis is {most}: cut the images or pad less"
         )
     return length_for(ny), length_for(nx)
 

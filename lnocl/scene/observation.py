@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -18,6 +20,10 @@ Array = NDArray[np.float64]
 MAX_CHANNELS = 4
 MIN_SIDE = 8
 
+# Pixels of the sky to one of an image, along each axis. The frequencies that an image cannot tell
+# apart are neighbours in the transform's order where this is a power of two (kernels/convolve.cl).
+OVERSAMPLES = 1, 2, 4
+
 # Pixels that the core of a PSF may lie off its centre: from the first on a warning is due, from the
 # second on it is refused.
 LITTLE_OFF_CENTRE, FAR_OFF_CENTRE = 0.25, 0.8
@@ -25,6 +31,8 @@ LITTLE_OFF_CENTRE, FAR_OFF_CENTRE = 0.25, 0.8
 
 class Observation:
     """Images of one sky, each with its point spread function, background and bad pixels.
+
+    The sky may be finer than their pixels.
 
     All input is checked and copied once, and held in read-only arrays. The data follow
     ``images[j] ~ Poisson(exposure[j] (psfs[j] * sky) + background[j]) + Normal(0, read_noise[j])``,
@@ -57,6 +65,14 @@ class Observation:
     offsets : array_like, shape (p, 2), optional
         ``(dx, dy)`` of each image, pixels: a source at (x, y) in the sky is at
         ``(x + dx, y + dy)`` in the image. They are taken into the PSFs; no counts are resampled.
+    oversample : {1, 2, 4}, optional
+        Pixels of the sky, and of the PSFs, to one of the images along each axis. The model of a
+        pixel is the sum over its pixels of the sky. For detectors with fewer than two pixels to the
+        PSF's width. Positions and offsets stay in pixels of the images.
+    effective_psfs : bool, optional
+        Whether the PSFs are effective PSFs: each sample holds what a pixel of the images sees, as
+        those of photutils and STDPSF files do. Else it holds what a pixel of the sky sees, as
+        STPSF's OVERSAMP and OVERDIST do. Without oversampling both are one.
     psf_centre : {"check", "fit", "given"}, optional
         What becomes of a PSF whose core lies off its centre, by which it would move the sky.
         "check": it is refused where it is off by 0.8 pixels or more, with a warning from 0.25 on.
@@ -86,6 +102,9 @@ class Observation:
         As given.
     psfs : ndarray of float64, shape (p, ky, kx)
         Of unit sum.
+    oversample : int
+    effective_psfs : bool
+        As given.
     ideal_psfs, pupils, psf_scatter : ndarray of float64
         Shape (p, ky, kx), or (0, ky, kx) where they were not given.
     psf_modes : ndarray of float64, shape (p, n, ky, kx)
@@ -96,7 +115,8 @@ class Observation:
     Raises
     ------
     InputError
-        An array has the wrong shape, type or unit, is empty, or holds values out of range; an array
+        `oversample` is not 1, 2 or 4; an array has the wrong shape, type or unit, is empty, or
+        holds values out of range; an array
         other than `images` holds masked values; a PSF has no positive sum, or it or its sum is not
         finite, or its core is off its centre; images or background become infinite by exposure or
         read noise; no good pixel is left; an offset leaves nothing of an image.
@@ -131,12 +151,15 @@ class Observation:
         mask: ArrayLike | None = None,
         exposure: ArrayLike | None = None,
         offsets: ArrayLike | None = None,
+        oversample: int = 1,
+        effective_psfs: bool = False,
         psf_centre: str = "check",
         ideal_psfs: ArrayLike | None = None,
         pupils: ArrayLike | None = None,
         psf_modes: ArrayLike | None = None,
         psf_scatter: ArrayLike | None = None,
     ) -> None:
+        self.oversample, self.effective_psfs = _check_oversample(oversample), bool(effective_psfs)
         has_exposure = exposure is not None
         counts, are_rates = containers.counts("images", images, has_exposure)
         given, masked = values_and_mask("images", counts)
@@ -159,7 +182,7 @@ class Observation:
             self._add_read_noise()
         self._refuse_overflow()
         self._clip_negative()
-        for values in vars(self).values():
+        for values in self._arrays().values():
             values.flags.writeable = False
 
     @property
@@ -173,9 +196,17 @@ class Observation:
         return self.images.shape[1], self.images.shape[2]
 
     @property
+    def sky_shape(self) -> tuple[int, int]:
+        """Shape of the extended source: that of an image, finer by `oversample`."""
+        return self.oversample * self.shape[0], self.oversample * self.shape[1]
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {name: each for name, each in vars(self).items() if isinstance(each, np.ndarray)}
+
+    @property
     def nbytes(self) -> int:
         """Bytes that its arrays take."""
-        arrays = dict(vars(self))
+        arrays = self._arrays()
         if self.psfs.strides[0] == 0:  # one for all images
             arrays["psfs"] = self.psfs[:1]
         return sum(array.nbytes for array in arrays.values())
@@ -320,6 +351,12 @@ class Observation:
                 "subtracted, give the noise that it left as read_noise, or add the sky to the "
                 "images and give it as background"
             )
+
+
+def _check_oversample(oversample: object) -> int:
+    if isinstance(oversample, (int, np.integer)) and oversample in OVERSAMPLES:
+        return int(oversample)
+    raise InputError(f"oversample must be 1, 2 or 4; {oversample} was given")
 
 
 def _range(values: Array) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lnocl.scene.detector import seen_psfs
 from lnocl.scene.observation import Array, Observation
 
 # Share of a PSF's light within the radius that is enough for a pad, and the share of the shorter
@@ -50,7 +51,7 @@ def recommend_pad(observation: Observation) -> int:
     7
     """
     most = max(1, int(SHARE_OF_SIDE * min(observation.shape)))
-    return min(max(1, *(_radius(psf, LIGHT) for psf in observation.psfs)), most)
+    return min(max(1, *(_radius(psf, LIGHT) for psf in seen_psfs(observation))), most)
 
 
 def runs_over_the_edge(observation: Observation) -> bool:

@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from lnocl.errors import InputError
+from lnocl.scene.detector import seen_psfs
 from lnocl.scene.observation import Observation
 
 # A larger weight leaves nothing of the data term of images at unit mean.
@@ -61,7 +62,8 @@ def recommend_smoothing(observation: Observation) -> float:
     """Return the weight of the edge-preserving term that suits the noise of an observation.
 
     It is `SMOOTHING` times the standard deviation of the gradient of the data term by the noise of
-    the counts, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, < > the mean over the observed pixels.
+    the counts, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, < > the mean over the observed pixels,
+    K_j as these see it.
     """
     relative = observation.exposure
     if relative.ndim == 1:
@@ -69,7 +71,7 @@ def recommend_smoothing(observation: Observation) -> float:
     variance = np.ma.masked_array(
         relative**2 / np.maximum(observation.images, 1.0), observation.mask
     ).mean(axis=(1, 2))
-    squares = (observation.psfs**2).sum(axis=(1, 2))
+    squares = (seen_psfs(observation) ** 2).sum(axis=(1, 2))
     return SMOOTHING * float(np.sqrt((variance * squares).sum()))
 
 

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, warn
+from lnocl.scene.detector import movable_psfs
 from lnocl.scene.grid import grid_of
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
-from lnocl.scene.shifting import MovablePsf, Stamp
+from lnocl.scene.shifting import Stamp
 from lnocl.scene.stars import Lit, StarField, check_positions, lit_box
 
 log = logging.getLogger("lnocl")
@@ -64,8 +65,12 @@ class Scene:
 
     Attributes
     ----------
+    image_grid : tuple of int
+        Shape (ny, nx), `lnocl.scene.grid.LENGTHS`; the images lie at its origin.
     grid : tuple of int
-        Shape (Ny, Nx), `lnocl.scene.grid.LENGTHS`; the images lie at its origin.
+        Shape (Ny, Nx) of the sky's grid: that of the images, finer by `oversample`.
+    oversample : int
+        Pixels of the sky to one of the images, along each axis.
     stars : ndarray of float64, shape (n, 2)
         Positions.
     scale : float
@@ -76,7 +81,7 @@ class Scene:
         Weights of the penalty, scaled.
     edge : float
         delta of the edge-preserving term, scaled; 0 where there is no such term.
-    weights : ndarray of bool or float64, shape (p, Ny, Nx), or None
+    weights : ndarray of bool or float64, shape (p, ny, nx) of the images' grid, or None
         True where a pixel was observed, or its relative exposure where exposures are maps; None
         where all were observed alike.
     gains : ndarray of float64, shape (p,)
@@ -110,7 +115,10 @@ class Scene:
         self.observation = observation
         positions = check_positions(stars, observation)
         self._leeway = leeway
-        self.grid = grid_of(observation, pad)
+        self.oversample = observation.oversample
+        self.image_grid = grid_of(observation, pad)
+        ny, nx = self.image_grid
+        self.grid = self.oversample * ny, self.oversample * nx
         self._warn_of_large_psf()
         self._warn_of_wrapped_offsets()
         # A power of two just above the mean; 1 where that is 0.
@@ -124,7 +132,7 @@ class Scene:
         self.unit = self._sky_unit(self._mean_exposure)
         relative = exposure / self._mean_exposure
         self.gains = np.ones(self.n_images) if has_map else relative
-        self._psfs = [MovablePsf(psf, self.grid) for psf in self.scaled_psfs()]
+        self._psfs = movable_psfs(self.scaled_psfs(), observation, self.image_grid)
         self.weights = self._weigh(relative if has_map else None)
         self._field = self._place_stars(positions)
         self.star_weights, is_observed = self._weigh_stars(self._field)
@@ -155,7 +163,7 @@ class Scene:
         other = copy(self)
         other.observation = copy(self.observation)
         other.observation.psfs = psfs
-        other._psfs = [MovablePsf(psf, self.grid) for psf in other.scaled_psfs()]
+        other._psfs = movable_psfs(other.scaled_psfs(), other.observation, self.image_grid)
         other._field = other._place_stars(self.stars)
         return other
 
@@ -193,7 +201,7 @@ class Scene:
             self.star_weights = np.where(is_observed, self.star_weights, weights)
 
     def _place_stars(self, positions: Array) -> StarField:
-        return StarField(self._psfs, self.observation.offsets, self.grid, positions)
+        return StarField(self._psfs, self.observation.offsets, self.image_grid, positions)
 
     @property
     def stars(self) -> Array:
@@ -216,15 +224,15 @@ class Scene:
         return len(self.stars)
 
     def images(self) -> Iterator[Array]:
-        """Yield each image on the grid, scaled, shape (Ny, Nx); 0 where not observed."""
+        """Yield each image on its grid, scaled, shape (ny, nx); 0 where not observed."""
         ny, nx = self.observation.shape
         for j, image in enumerate(self.observation.images):
-            laid = np.zeros(self.grid)
+            laid = np.zeros(self.image_grid)
             np.divide(image, self.scale, out=laid[:ny, :nx])
             yield self._per_exposure(laid, 0.0, j)
 
     def background(self) -> Array:
-        """Return the background, scaled, shape (p,) or (p, Ny, Nx); 1 where not observed."""
+        """Return the background, scaled, shape (p,) or (p, ny, nx); 1 where not observed."""
         background = self.observation.background / self.scale
         if self.has_exposure_map and background.ndim == 1:
             background = np.broadcast_to(background[:, None, None], self.observation.images.shape)
@@ -239,16 +247,20 @@ class Scene:
         return np.divide(values, weights, out=np.full_like(values, fill), where=weights > 0)
 
     def psf(self, j: int) -> Array:
-        """Return the PSF of image j on the grid, shape (Ny, Nx), its peak at the offset."""
+        """Return the response of image j on the grid, shape (Ny, Nx): see `psf_stamp`."""
         return self.psf_stamp(j).on_grid(self.grid)
 
     def psf_stamp(self, j: int) -> Stamp:
-        """Return the PSF of image j, its peak at the offset, where it is not 0."""
-        return self._psfs[j].at(*self.observation.offsets[j])
+        """Return the response of image j where it is not 0, the sky moved by the offset.
+
+        It is what the pixels of the image see of a source at the origin of the grid, each beginning
+        at one pixel of the sky: the PSF, its peak at the offset, where the sky is no finer.
+        """
+        return self._psfs[j].response(*self.observation.offsets[j])
 
     def star_image(self, j: int, s: int) -> Array:
-        """Return P_js, the PSF of image j centred on star s, shape (Ny, Nx)."""
-        return self.star_stamp(j, s).on_grid(self.grid)
+        """Return P_js, the PSF of image j centred on star s, shape (ny, nx)."""
+        return self.star_stamp(j, s).on_grid(self.image_grid)
 
     def star_stamp(self, j: int, s: int) -> Stamp:
         """Return P_js, where it is not 0."""
@@ -265,9 +277,9 @@ class Scene:
         return [psf if gain == 1.0 else gain * psf for gain, psf in psfs]
 
     def star_box(self, s: int) -> Lit:
-        """Return the rows and columns of the grid that the images of star s may light."""
+        """Return the rows and columns of the images' grid that star s may light."""
         stamps = [self.star_stamp(j, s) for j in range(self.n_images)]
-        return lit_box(stamps, self.grid, self._leeway)
+        return lit_box(stamps, self.image_grid, self._leeway)
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
         """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""
@@ -280,7 +292,7 @@ class Scene:
 
         Parameters
         ----------
-        extended : array_like, shape (ny, nx), optional
+        extended : array_like, of shape `lnocl.Observation.sky_shape`, optional
             Extended source, electrons per pixel, finite and not negative. Beyond the images the
             grid is filled with its mean. By default flat, with the flux that the stars leave.
         star_fluxes : array_like, shape (n,), optional
@@ -298,8 +310,8 @@ class Scene:
             fluxes = _check_start("initial_star_fluxes", star_fluxes, (self.n_stars,)) / self.unit
         if extended is None:
             return np.full(self.grid, self._rough_fit[1]), fluxes
-        given = _check_start("initial_extended", extended, self.observation.shape) / self.unit
-        return self._on_grid(given, fill=given.mean()), fluxes
+        given = _check_start("initial_extended", extended, self.observation.sky_shape) / self.unit
+        return _lay(given, self.grid, fill=given.mean()), fluxes
 
     @cached_property
     def _rough_fit(self) -> tuple[Array, float]:
@@ -310,7 +322,7 @@ class Scene:
         background = self.background()
         for j, excess in enumerate(self.images()):
             excess -= background[j]
-            observed = np.ones(self.grid, bool) if self.weights is None else self.weights[j] > 0
+            observed = np.ones(excess.shape, bool) if self.weights is None else self.weights[j] > 0
             excess[~observed] = 0.0
             light, n_there = float(excess.sum()), int(np.count_nonzero(observed))
             total, n_observed = total + light, n_observed + n_there
@@ -325,10 +337,11 @@ class Scene:
         # A star or a sky that starts at zero stays there, so each keeps a small share.
         least = max(1e-3 * mean, float(np.finfo(np.float32).eps))
         fluxes = np.maximum(
-            np.linalg.lstsq(normal, moment, rcond=None)[0], least * math.prod(self.grid) / 100
+            np.linalg.lstsq(normal, moment, rcond=None)[0],
+            least * math.prod(self.image_grid) / 100,
         )
         level = mean - float(fluxes @ self.star_weights) / n_observed
-        return fluxes, max(level, least)
+        return fluxes, max(level, least) / self.oversample**2
 
     def _weigh_stars(self, field: StarField) -> tuple[Array, NDArray[np.bool_]]:
         """Return ``sum_j <P_js, w_j>`` for each star, and whether any image observed it.
@@ -341,7 +354,7 @@ class Scene:
             return np.full(len(field), float(self.n_images)), np.ones(len(field), bool)
         total, is_observed = np.zeros(len(field)), np.zeros(len(field), bool)
         for j, weights in enumerate(self.weights):
-            windows = [(stamp, weights[stamp.window(self.grid)]) for stamp in field.stamps[j]]
+            windows = [(stamp, weights[stamp.window(self.image_grid)]) for stamp in field.stamps[j]]
             light = np.array([float((stamp.values * w).sum()) for stamp, w in windows])
             on_good = np.array([float((stamp.values * (w > 0)).sum()) for stamp, w in windows])
             total += np.maximum(light, 0.0)
@@ -360,25 +373,18 @@ class Scene:
         observed = ~self.observation.mask
         if relative is not None:
             return self._on_grid(np.where(observed, relative, 0.0))
-        if observed.all() and self.grid == self.observation.shape:
+        if observed.all() and self.image_grid == self.observation.shape:
             return None
         if (observed == observed[0]).all():
-            return np.broadcast_to(self._on_grid(observed[0]), (self.n_images, *self.grid))
+            return np.broadcast_to(self._on_grid(observed[0]), (self.n_images, *self.image_grid))
         return self._on_grid(observed)
 
     def _on_grid(self, array: NDArray, fill: float = 0.0) -> NDArray:
-        ny, nx = self.observation.shape
-        if self.grid == (ny, nx):
-            return array
-        laid = np.zeros((*array.shape[:-2], *self.grid), array.dtype)
-        if fill:
-            laid.fill(fill)
-        laid[..., :ny, :nx] = array
-        return laid
+        return _lay(array, self.image_grid, fill)
 
     def _warn_of_wrapped_offsets(self) -> None:
         offsets = np.ceil(abs(self.observation.offsets).max(axis=0)).astype(int)[::-1]
-        room = np.subtract(self.grid, self.observation.shape)
+        room = np.subtract(self.image_grid, self.observation.shape)
         if (offsets > room).any():
             warn(
                 f"the images are shifted by up to {offsets.max()} pixels, and what leaves one edge "
@@ -389,10 +395,11 @@ class Scene:
         """Warn of PSFs that are moved between pixels and are sharper than pixels can hold."""
         for j, offset in enumerate(self.observation.offsets):
             moved = np.concatenate([[offset], self.stars + offset])
-            may_move = self._leeway > 0 and self.n_stars > 0
+            # In the middle of an image's pixel a star is between pixels of a finer sky.
+            may_move = self.oversample > 1 or (self._leeway > 0 and self.n_stars > 0)
             if not may_move and (moved == np.round(moved)).all():
                 continue
-            psf, moved_psf = self.observation.psfs[j], self._psfs[j].at(0.5, 0.5).values
+            psf, moved_psf = self.observation.psfs[j], self._psfs[j].fine.at(0.5, 0.5).values
             dark = min(psf.min(), 0.0) - moved_psf.min() / self.gains[j]
             if dark > MAX_RINGING * psf.max():
                 warn(
@@ -407,6 +414,18 @@ class Scene:
                 f"the psf {psf_shape} is larger than the grid {self.grid}: its wings wrap "
                 "round; crop it, or give pad to enlarge the grid"
             )
+
+
+def _lay(array: NDArray, grid: tuple[int, int], fill: float = 0.0) -> NDArray:
+    """Return an array at the origin of a grid."""
+    ny, nx = array.shape[-2:]
+    if grid == (ny, nx):
+        return array
+    laid = np.zeros((*array.shape[:-2], *grid), array.dtype)
+    if fill:
+        laid.fill(fill)
+    laid[..., :ny, :nx] = array
+    return laid
 
 
 def _mean(name: str, values: Array, n: int) -> float:

@@ -111,6 +111,15 @@ class MovablePsf:
         values = self._spectrum.moved(fraction, axis) if is_moved else self._folded
         return Stamp(values, *(i - n // 2 for i, n in zip(whole, values.shape, strict=True)))
 
+    @property
+    def fine(self) -> MovablePsf:
+        """The PSF on the pixels of the sky."""
+        return self
+
+    def response(self, x: float, y: float) -> Stamp:
+        """Return what the image shows of a source at its origin, the sky moved so far."""
+        return self.at(x, y)
+
     def with_slopes(self, x: float, y: float) -> tuple[Stamp, Array]:
         """Return the PSF at a position, and it and its derivatives along x and y, (3, h, w)."""
         whole = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))

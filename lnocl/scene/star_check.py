@@ -9,6 +9,7 @@ import numpy as np
 
 from lnocl.errors import counted, warn
 from lnocl.scene.cores import Array, centroid, fwhm
+from lnocl.scene.detector import seen_psfs
 from lnocl.scene.scene import Scene
 
 # The square in which a star is looked at reaches so many widths of its PSF from it, at least and at
@@ -54,7 +55,7 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
     observation = scene.observation
     if not scene.n_stars:
         return
-    for j, psf in enumerate(observation.psfs):
+    for j, psf in enumerate(seen_psfs(observation)):
         reach = int(np.clip(np.ceil(REACH * fwhm(psf)), LEAST_REACH, MOST_REACH))
         light = observation.images[j] - observation.background[j]
         positions = scene.stars + observation.offsets[j]
@@ -70,7 +71,7 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
                 continue
             model = np.zeros((side, side))
             window = range(rows.start, rows.stop), range(columns.start, columns.stop)
-            scene.star_stamp(j, s).add_to(model, *window, scene.grid, 1.0)
+            scene.star_stamp(j, s).add_to(model, *window, scene.image_grid, 1.0)
             found = _compare(star, model, observation.images[j][rows, columns])
             if found is not None:
                 yield StarCheck(j, s, *found)
@@ -131,7 +132,11 @@ def warn_of_stars(scene: Scene) -> None:
     star, psf = worst.widths
     if abs(np.log(psf / star)) > np.log1p(MAX_WIDTH_ERROR):
         finer = round(psf / star)
-        hint = f", as one sampled {finer} times too fine is: rebin it" if finer >= 2 else ""
+        hint = (
+            f", as one sampled {finer} times too fine is: rebin it, or give oversample"
+            if finer >= 2
+            else ""
+        )
         x, y = scene.stars[worst.star]
         warn(
             f"psf {worst.image} does not fit: it is {psf / star:.2f} times as wide as the star at "

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError
 from lnocl.scene import containers, star_tables
+from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
 
@@ -88,19 +89,19 @@ class StarField:
 
     Parameters
     ----------
-    psfs : sequence of MovablePsf, length p
+    psfs : sequence of MovablePsf or DetectorPsf, length p
         One an image.
     offsets : ndarray of float64, shape (p, 2)
         Of the images, pixels.
     grid : tuple of int
-        Shape (Ny, Nx).
+        Shape (ny, nx) of the images' grid.
     positions : ndarray of float64, shape (n, 2)
         Pixels of an image without offset.
     """
 
     def __init__(
         self,
-        psfs: Sequence[MovablePsf],
+        psfs: Sequence[MovablePsf | DetectorPsf],
         offsets: Array,
         grid: tuple[int, int],
         positions: Array,

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.detector import DetectorPsf, movable_psfs
 from lnocl.scene.forward_model import ROUNDING, Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
@@ -76,16 +77,21 @@ class StarFit:
         self._given, self._offsets = given, scene.observation.offsets
         psfs = _cut(scene.scaled_psfs())
         squares = [
-            [_square(psf.shape, position + offset, scene.grid) for position in given]
+            [_square(psf.shape, position + offset, scene) for position in given]
             for psf, offset in zip(psfs, self._offsets, strict=True)
         ]
-        lit = [light_up(each, scene.grid) for each in squares]
+        lit = [light_up(each, scene.image_grid) for each in squares]
         diffuse = model.forward(extended) + model.background
         self._likelihood = StarLikelihood.of_scene(scene, model, diffuse, lit)
         self._stars = [
-            _MovableStars(MovablePsf(psf, scene.grid), where, scene.stars + offset, whole, around)
+            _MovableStars(psf, where, scene.stars + offset, whole, around)
             for psf, offset, where, whole, around in zip(
-                psfs, self._offsets, lit, scene.star_field.stamps, squares, strict=True
+                movable_psfs(psfs, scene.observation, scene.image_grid),
+                self._offsets,
+                lit,
+                scene.star_field.stamps,
+                squares,
+                strict=True,
             )
         ]
 
@@ -178,7 +184,7 @@ class _MovableStars:
 
     Parameters
     ----------
-    psf : MovablePsf
+    psf : MovablePsf or DetectorPsf
         The part of the PSF that moves with a star.
     lit : ndarray of bool, shape (Ny, Nx)
         The pixels.
@@ -197,7 +203,7 @@ class _MovableStars:
 
     def __init__(
         self,
-        psf: MovablePsf,
+        psf: MovablePsf | DetectorPsf,
         lit: NDArray[np.bool_],
         positions: Array,
         whole: Sequence[Stamp],
@@ -256,10 +262,11 @@ class _MovableStars:
         return image
 
 
-def _square(shape: tuple[int, ...], position: Array, grid: tuple[int, int]) -> Stamp:
-    """Return the part of the grid that a star may light, wherever it goes from a position."""
+def _square(shape: tuple[int, ...], position: Array, scene: Scene) -> Stamp:
+    """Return the part of an image that a star may light, wherever it goes from a position."""
     margin = int(np.ceil(RADIUS)) + MARGIN + 1
-    height, width = (min(k + 2 * margin, n) for k, n in zip(shape, grid, strict=True))
+    sizes = (-(-k // scene.oversample) + 2 * margin for k in shape)
+    height, width = map(min, sizes, scene.image_grid)
     x, y = np.floor(position + 0.5).astype(int).tolist()
     return Stamp(np.broadcast_to(1.0, (height, width)), y - height // 2, x - width // 2)
 

@@ -178,7 +178,7 @@ def _star_information(
     stamps: list[list[Stamp]] = [[] for _ in range(scene.n_stars)]  # w_j P_js / m_j of each star
     for j, (light, where) in enumerate(zip(model.starlight(star_fluxes), lit, strict=True)):
         total = np.maximum(light[where] + diffuse[j][where], MIN_MODEL)
-        ratio = np.zeros(scene.grid)
+        ratio = np.zeros(scene.image_grid)
         ratio[where] = movable_weights(model.weights[j][where], total) / total
         information += scene.star_field.images(j, where).information(ratio[where])
         for s, of_star in enumerate(stamps):

@@ -23,7 +23,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from lnocl.scene.forward_model import add_to_window
+from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
+from lnocl.scene.forward_model import add_to_window, sampled, spread
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import MovablePsf, Stamp
@@ -59,6 +60,10 @@ class _Window(NamedTuple):
         """Return it moved by whole pixels."""
         return self._replace(y=self.y + dy, x=self.x + dx)
 
+    def finer(self, q: int) -> _Window:
+        """Return the pixels of a sky q times as fine that it holds."""
+        return _Window(q * self.y, q * self.x, (q * self.shape[0], q * self.shape[1]))
+
 
 def standard_errors(scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -> Array:
     """Return the standard errors of stars, with the extended source marginalised.
@@ -85,14 +90,15 @@ def standard_errors(scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -
     All is computed in windows: arrays on the grid would take more memory than the run.
     """
     width = resolution(scene)
-    psfs = [MovablePsf(psf, scene.grid) for psf in scene.scaled_psfs()]
+    psfs = movable_psfs(scene.scaled_psfs(), scene.observation, scene.image_grid)
     errors = np.full((scene.n_stars, 3), np.nan)
     for star, row in enumerate(errors):
         window = _window_round(scene, scene.stars[star], width)
         held = np.append(star, _neighbours(scene, star, width))
         there, texture = _texture_in(window, scene, sky, width)
         source = _source_error(scene, psfs, texture.amplitude[there], texture.width, window)
-        beyond = source.images_of(texture.mean[there] - sky[window.of(scene.grid)] / scene.unit)
+        on_sky_window = window.finer(scene.oversample).of(scene.grid)
+        beyond = source.images_of(texture.mean[there] - sky[on_sky_window] / scene.unit)
         images = [
             _linearise(scene, psfs[j], j, sky, star_fluxes, held, window, moves, beyond[j])
             for j in range(scene.n_images)
@@ -105,14 +111,15 @@ def standard_errors(scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -
 def _texture_in(
     window: _Window, scene: Scene, sky: Array, width: float
 ) -> tuple[tuple[slice, slice], Texture]:
-    """Return the texture round a window, and where the window lies in it."""
+    """Return the texture round a window of the images, and where the window lies in it."""
+    window = window.finer(scene.oversample)
     margin = int(np.ceil(MARGIN * width))
     (y, height), (x, breadth) = (
         (first - margin, k + 2 * margin) if k + 2 * margin < n else (first, n)
         for first, k, n in zip((window.y, window.x), window.shape, scene.grid, strict=True)
     )
     around = _Window(y, x, (height, breadth))
-    stars = (scene.stars - (x, y)) % scene.grid[::-1]
+    stars = (on_sky(scene.stars, scene.oversample) - (x, y)) % scene.grid[::-1]
     inside = (stars < (breadth, height)).all(axis=1)
     there = tuple(
         slice(first - start, first - start + k)
@@ -125,7 +132,7 @@ def _texture_in(
 def _observed(scene: Scene, j: int, there: _Window) -> tuple[Array, Array, Array]:
     """Return counts, background and weights of image j in a window, as `Scene` has them."""
     observation, (ny, nx) = scene.observation, scene.observation.shape
-    rows, columns = there.of(scene.grid)
+    rows, columns = there.of(scene.image_grid)
     inside = (rows < ny) & (columns < nx)
     pixels = np.minimum(rows, ny - 1), np.minimum(columns, nx - 1)
     counts = np.where(inside, observation.images[j][pixels] / scene.scale, 0.0)
@@ -145,7 +152,7 @@ def _observed(scene: Scene, j: int, there: _Window) -> tuple[Array, Array, Array
 
 
 def _in_image(scene: Scene, j: int, window: _Window) -> _Window:
-    """Return where a window of the sky lies in image j, to the nearest pixel."""
+    """Return where a window of an image without offset lies in image j, to the nearest pixel."""
     dx, dy = np.round(scene.observation.offsets[j]).astype(int).tolist()
     return window.moved(dx, dy)
 
@@ -167,8 +174,9 @@ def _errors_of_first(images: list[LinearImage], source: SourceError, n: int) -> 
 
 def _window_round(scene: Scene, star: Array, resolution: float) -> _Window:
     """Return a window round a star: the whole axis of the grid where it is not twice as long."""
-    size = scipy.fft.next_fast_len(int(np.ceil(WINDOW * resolution)), real=True)
-    height, width = (size if 2 * size <= n else n for n in scene.grid)
+    length = int(np.ceil(WINDOW * resolution / scene.oversample))
+    size = scipy.fft.next_fast_len(length, real=True)
+    height, width = (size if 2 * size <= n else n for n in scene.image_grid)
     x, y = np.round(star).astype(int).tolist()
     return _Window(y - height // 2, x - width // 2, (height, width))
 
@@ -176,31 +184,37 @@ def _window_round(scene: Scene, star: Array, resolution: float) -> _Window:
 def _neighbours(scene: Scene, star: int, resolution: float) -> NDArray[np.int_]:
     """Return which other stars are near one; those beyond are taken as known."""
     size = np.array(scene.grid[::-1])
-    away = (scene.stars - scene.stars[star] + size / 2) % size - size / 2
+    away = scene.oversample * (scene.stars - scene.stars[star])
+    away = (away + size / 2) % size - size / 2
     near = np.flatnonzero(np.hypot(*away.T) <= NEIGHBOURS * resolution)
     return near[near != star]
 
 
 def _source_error(
-    scene: Scene, psfs: Sequence[MovablePsf], amplitude: Array, width: float, window: _Window
+    scene: Scene,
+    psfs: Sequence[MovablePsf | DetectorPsf],
+    amplitude: Array,
+    width: float,
+    window: _Window,
 ) -> SourceError:
-    """Return the error of the extended source in a window, and what it changes there."""
+    """Return the error of the extended source in a window of the images, and its change there."""
+    q, window = scene.oversample, window.finer(scene.oversample)
     # Twice the window, in which nothing wraps round; or the grid, on which it does.
     height, breadth = (min(2 * k, n) for k, n in zip(window.shape, scene.grid, strict=True))
     shape = height, breadth
     around = _Window(-(height // 2), -(breadth // 2), shape)
     otfs = []
     for psf, offset in zip(psfs, scene.observation.offsets, strict=True):
-        cut = _cut(psf.at(*(offset - np.round(offset))), around, scene.grid)
+        cut = _cut(psf.response(*(offset - np.round(offset))), around, scene.grid)
         otfs.append(scipy.fft.rfft2(np.roll(cut, (around.y, around.x), axis=(0, 1))))
     inside = (..., *map(slice, window.shape))
 
     def forward(sky: Array) -> Array:
         images = scipy.fft.irfft2(otfs * scipy.fft.rfft2(sky, shape), shape)
-        return np.asarray(images[inside])
+        return np.asarray(sampled(images[inside], q))
 
     def adjoint(images: Iterable[Array]) -> Array:
-        spectra = np.conj(otfs) * scipy.fft.rfft2(np.array(images), shape)
+        spectra = np.conj(otfs) * scipy.fft.rfft2(spread(np.array(images), q), shape)
         return np.asarray(scipy.fft.irfft2(spectra.sum(axis=0), shape)[inside])
 
     return SourceError(forward, adjoint, amplitude, width)
@@ -208,7 +222,7 @@ def _source_error(
 
 def _linearise(
     scene: Scene,
-    psf: MovablePsf,
+    psf: MovablePsf | DetectorPsf,
     j: int,
     sky: Array,
     star_fluxes: Array,
@@ -224,20 +238,20 @@ def _linearise(
     there = _in_image(scene, j, window)
     counts, background, weights = _observed(scene, j, there)
     model = background.copy()
-    first = there.y % scene.grid[0], there.x % scene.grid[1]
+    first = there.y % scene.image_grid[0], there.x % scene.image_grid[1]
     add_to_window(model, scene, sky, np.zeros_like(star_fluxes), j, first)
     for stamp, flux in zip(scene.star_field.stamps[j], star_fluxes, strict=True):
-        model += flux / scene.unit * _cut(stamp, there, scene.grid)
+        model += flux / scene.unit * _cut(stamp, there, scene.image_grid)
     total = np.maximum(model, MIN_MODEL)
     precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
-    slopes = [_cut(scene.star_stamp(j, s), there, scene.grid) for s in held]
+    slopes = [_cut(scene.star_stamp(j, s), there, scene.image_grid) for s in held]
     if moves:
         offset = scene.observation.offsets[j]
         moved = [psf.with_slopes(*(scene.stars[s] + offset)) for s in held]
         for axis in (1, 2):
             for s, (stamp, values) in zip(held, moved, strict=True):
                 slope = stamp._replace(values=star_fluxes[s] / scene.unit * values[axis])
-                slopes.append(_cut(slope, there, scene.grid))
+                slopes.append(_cut(slope, there, scene.image_grid))
     k, left = len(slopes), counts - total - beyond
     return LinearImage(np.array(slopes).reshape(k, -1), np.arange(k), left, precision)
 

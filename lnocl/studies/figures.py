@@ -159,7 +159,8 @@ def report(path: str) -> str:
 
 def view_of(saved: SavedResult) -> ResultView:
     """Return what the picture of a saved result shows."""
-    nothing = np.zeros((0, *saved.extended.shape))
+    q = saved.oversample
+    nothing = np.zeros((0, *(n // q for n in saved.extended.shape)))
     models, residuals = (
         np.where(abs(cube) < LARGEST, cube, np.nan)
         for cube in (saved.cubes.get(name, nothing) for name in ("MODELS", "RESIDUALS"))
@@ -177,6 +178,7 @@ def view_of(saved: SavedResult) -> ResultView:
         offsets=saved.offsets,
         doubtful=saved.doubtful,
         unit=str(saved.header.get("BUNIT", "")),
+        oversample=q,
     )
 
 
@@ -198,7 +200,7 @@ def _check_saved(saved: Sequence[SavedResult], room: float) -> None:
             )
         if not (abs(each.extended) < LARGEST).all():
             raise InputError(f"{each.path} holds values that are not finite; draw another")
-        for x, y in each.stars:
+        for x, y in each.sky_stars:
             if not (-room <= x + 0.5 < nx + room and -room <= y + 0.5 < ny + room):
                 raise InputError(f"{each.path} has a star at ({x:g}, {y:g}), outside its image")
 
@@ -225,7 +227,7 @@ def _names(paths: Sequence[str], saved: Sequence[SavedResult]) -> list[str]:
 def _frame(saved: Sequence[SavedResult]) -> Frame:
     """Return the axes: from the star, where there is one alone."""
     several = any(len(each.stars) > 1 for each in saved)
-    star = next((each.stars[0] for each in saved if each.stars), None)
+    star = next((each.sky_stars[0] for each in saved if each.stars), None)
     scale = next((each.number("PIXSCALE") for each in saved if "PIXSCALE" in each.header), None)
     return Frame(None if several else star, scale)
 

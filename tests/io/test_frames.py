@@ -575,13 +575,13 @@ SCALE = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 10.0, "CRVAL2": 7
 
 
 class TestPixelScales:
-    def said(self, psf_cards, image_cards=None):
+    def said(self, psf_cards, image_cards=None, **calibration):
         for path, image in zip(("1.fits", "2.fits"), IMAGES, strict=True):
             save(path, image, **(SCALE if image_cards is None else image_cards))
         save("psf.fits", np.ones((3, 3)), **psf_cards)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            observe()
+            observe(**calibration)
         return [str(each.message) for each in caught]
 
     @pytest.mark.parametrize(
@@ -592,8 +592,8 @@ class TestPixelScales:
     def test_a_psf_of_other_pixels_is_said(self, cards):
         (message,) = self.said(cards)
         assert message == (
-            "the pixels of psf 0 are of 0.0125 arcsec, those of its image of 0.05: rebin it to the "
-            "image's pixels, by 4"
+            "the pixels of psf 0 are of 0.0125 arcsec, those of its image of 0.05: give "
+            "oversample 4, or rebin it to the image's pixels, by 4"
         )
 
     @pytest.mark.parametrize(
@@ -607,10 +607,13 @@ class TestPixelScales:
     def test_a_psf_finer_than_the_detector_is_said(self):
         (message,) = self.said({"OVERSAMP": 4})
         assert message == (
-            "psf 0 is sampled 4 times finer than the detector, by OVERSAMP in its header: bin it "
-            "to the image's pixels"
+            "psf 0 is sampled 4 times finer than the detector, by OVERSAMP in its header: give "
+            "oversample 4, or bin it to the image's pixels"
         )
         assert self.said({"OVERSAMP": 1}) == []
+        assert self.said({"OVERSAMP": 4}, oversample=4) == []
+        (message,) = self.said({"OVERSAMP": 4}, oversample=2)
+        assert message.endswith("give oversample 4, or bin it to 2 times finer")
         (message,) = self.said({"OVERSAMP": 4, "PIXELSCL": 0.0125})
         assert "rebin it to the image's pixels, by 4" in message
 

@@ -23,7 +23,7 @@ def observe(**changes):
 def assert_same(observation, other):
     for name, values in vars(other).items():
         np.testing.assert_array_equal(getattr(observation, name), values)
-        assert type(getattr(observation, name)) is np.ndarray
+        assert type(getattr(observation, name)) is type(values)
 
 
 # --- Units of counts

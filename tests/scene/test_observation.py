@@ -88,6 +88,10 @@ def test_read_noise_may_be_a_map(read_noise, background):
     np.testing.assert_array_equal(observation.background[~mask], expected[~mask])
 
 
+def arrays_of(observation):
+    return {name: each for name, each in vars(observation).items() if isinstance(each, np.ndarray)}
+
+
 @pytest.mark.parametrize("name", ["background", "read_noise", "exposure"])
 def test_one_map_serves_all_images(name):
     for mask in (None, IMAGES % 5 == 0):
@@ -193,11 +197,13 @@ def test_input_is_copied_and_never_modified():
     with pytest.warns(lnocl.LnoclWarning):
         observation = lnocl.Observation(**given)
     start = {"initial_extended": np.ones((4, 4)), "initial_star_fluxes": np.array([2.0])}
-    held = {name: array.copy() for name, array in vars(observation).items()}
+    held = {name: array.copy() for name, array in arrays_of(observation).items()}
     paper(observation, stars=[(1, 2)], n_iter=3, engine="numpy", **start)
     for name, array in before.items():
         np.testing.assert_array_equal(given[name], array)
-        assert not any(np.shares_memory(given[name], own) for own in vars(observation).values())
+        assert not any(
+            np.shares_memory(given[name], own) for own in arrays_of(observation).values()
+        )
     for name, array in held.items():
         np.testing.assert_array_equal(getattr(observation, name), array)
     np.testing.assert_array_equal(start["initial_extended"], np.ones((4, 4)))
@@ -235,7 +241,7 @@ def test_masked_arrays_with_nothing_masked_are_plain_arrays(name):
     for given in (np.ma.array(GIVEN[name]), masked(GIVEN[name], 0)):
         for attribute, values in vars(observe(**{name: given})).items():
             np.testing.assert_array_equal(values, expected[attribute])
-            assert type(values) is np.ndarray
+            assert type(values) is type(expected[attribute])
 
 
 @pytest.mark.parametrize("scale", [1e-300, 5e-324, 1e300])
@@ -592,7 +598,7 @@ def test_the_arrays_of_an_observation_are_read_only(maps):
         "pupils",
         "psf_scatter",
     )
-    assert set(vars(observation)) == set(names)
+    assert set(arrays_of(observation)) == set(names)
     for name in names:
         with pytest.raises(ValueError, match="read-only"):
             getattr(observation, name)[...] = 0

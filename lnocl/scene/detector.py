@@ -1,0 +1,137 @@
+"""PSFs that are finer than the pixels of the images: what these see of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from lnocl.scene.observation import Array, Observation
+from lnocl.scene.shifting import MovablePsf, Stamp
+
+
+def movable_psfs(
+    psfs: Iterable[Array], observation: Observation, grid: tuple[int, int]
+) -> list[MovablePsf | DetectorPsf]:
+    """Return PSFs to be placed on the images' grid, as its pixels see them."""
+    if observation.oversample == 1:
+        return [MovablePsf(psf, grid) for psf in psfs]
+    oversample, are_effective = observation.oversample, observation.effective_psfs
+    return [DetectorPsf(psf, grid, oversample, are_effective) for psf in psfs]
+
+
+def seen_psfs(observation: Observation) -> Array:
+    """Return the PSFs as the pixels of the images see a star in the middle of one.
+
+    Shape (p, n, n), the star at ``n // 2``; without oversampling they are those given.
+    """
+    q, psfs = observation.oversample, observation.psfs
+    if q == 1:
+        return psfs
+    half = -(-max(psfs.shape[1:]) // (2 * q)) + 1
+    n = 2 * half + 1
+    movable = movable_psfs(psfs, observation, (n, n))
+    return np.array([psf.at(half, half).on_grid((n, n)) for psf in movable])
+
+
+def on_sky(positions: Array, oversample: int) -> Array:
+    """Return positions in pixels of the images in those of the sky."""
+    return oversample * positions + (oversample - 1) / 2.0
+
+
+class DetectorPsf:
+    """A PSF finer than the pixels of an image, which sees it at any position.
+
+    Pixel n of an image sees the fine pixels q n to q n + q - 1 along each axis, q being
+    `oversample`. For a source of one count in fine pixel u, ``h(q n - u)`` are in pixel n. The
+    response h is ``sum_b K(v + b)``, 0 <= b < q along each axis, of a PSF that holds what fine
+    pixels see; of an effective PSF, which holds what a pixel of the image sees, it is
+    ``q^2 K(v + (q - 1) / 2)``.
+
+    Parameters
+    ----------
+    psf : ndarray of float64, shape (ky, kx)
+        K, of unit sum but for the gain of its image, on fine pixels.
+    grid : tuple of int
+        Shape (ny, nx) of the images' grid.
+    oversample : int
+        q.
+    is_effective : bool
+        Whether it is an effective PSF.
+
+    Attributes
+    ----------
+    fine : MovablePsf
+        The PSF on the pixels of the sky.
+
+    References
+    ----------
+    J. Anderson, I. R. King, PASP 112, 1360 (2000), for the effective PSF.
+    """
+
+    def __init__(
+        self, psf: Array, grid: tuple[int, int], oversample: int, is_effective: bool
+    ) -> None:
+        self._q, self._grid = oversample, (oversample * grid[0], oversample * grid[1])
+        self.fine, self._is_effective = MovablePsf(psf, self._grid), is_effective
+        # From the middle of a pixel to the first of its fine pixels, in these.
+        self._half = (oversample - 1) / 2.0
+        self._lag = self._half if is_effective else 0.0
+
+    def response(self, x: float, y: float) -> Stamp:
+        """Return h on the fine grid, the sky moved by so many pixels of the image."""
+        stamp = self.fine.at(self._q * x - self._lag, self._q * y - self._lag)
+        return self._seen(stamp, stamp.values)[0]
+
+    def at(self, x: float, y: float, axis: int | None = None) -> Stamp:
+        """Return the image of a star at a position, pixels, or a derivative, as `place` does."""
+        stamp = self.fine.at(*self._on_fine_pixels(x, y), axis)
+        per_pixel = 1.0 if axis is None else float(self._q)
+        return self._sampled(*self._seen(stamp, per_pixel * stamp.values))[0]
+
+    def with_slopes(self, x: float, y: float) -> tuple[Stamp, Array]:
+        """Return the image of a star, and it and its derivatives along x and y, (3, h, w)."""
+        stamp, values = self.fine.with_slopes(*self._on_fine_pixels(x, y))
+        per_pixel = np.array([1.0, self._q, self._q])[:, None, None]
+        return self._sampled(*self._seen(stamp, per_pixel * values))
+
+    def _on_fine_pixels(self, x: float, y: float) -> tuple[float, float]:
+        shift = self._half - self._lag
+        return self._q * x + shift, self._q * y + shift
+
+    def _seen(self, stamp: Stamp, values: Array) -> tuple[Stamp, Array]:
+        """Return what pixels that begin at each fine pixel see, for values (..., h, w) there."""
+        if self._is_effective:
+            values = self._q**2 * values
+            return Stamp(_first(values), stamp.y, stamp.x), values
+        y, values = _sum_ahead(values, stamp.y, self._q, self._grid[0], -2)
+        x, values = _sum_ahead(values, stamp.x, self._q, self._grid[1], -1)
+        return Stamp(_first(values), y, x), values
+
+    def _sampled(self, stamp: Stamp, values: Array) -> tuple[Stamp, Array]:
+        """Return what the pixels of the image see."""
+        y, x = -(-stamp.y // self._q), -(-stamp.x // self._q)
+        values = values[..., self._q * y - stamp.y :: self._q, self._q * x - stamp.x :: self._q]
+        return Stamp(_first(values), y, x), values
+
+
+def _first(values: Array) -> Array:
+    return values if values.ndim == 2 else values[0]
+
+
+def _sum_ahead(values: Array, first: int, q: int, n: int, axis: int) -> tuple[int, Array]:
+    """Return the sums over each point and the q - 1 behind it of n round the edge, and the first.
+
+    Beyond the values, whose first point is given, there is 0.
+    """
+    size = values.shape[axis]
+    padding = [(0, 0)] * values.ndim
+    if size + q - 1 > n:  # it goes round
+        padding[axis] = 0, n - size
+        values = np.pad(values, padding)
+        return first, np.sum([np.roll(values, -b, axis) for b in range(q)], axis=0)
+    padding[axis] = q - 1, q - 1
+    padded = np.pad(values, padding)
+    length = size + q - 1
+    places = (np.arange(b, b + length) for b in range(q))
+    return first - (q - 1), np.sum([padded.take(at, axis) for at in places], axis=0)
