@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, warn
-from lnocl.scene.detector import movable_psfs
+from lnocl.scene.detector import movable_psfs, on_sky
 from lnocl.scene.grid import grid_of
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
@@ -394,9 +394,11 @@ class Scene:
     def _warn_of_ringing(self) -> None:
         """Warn of PSFs that are moved between pixels and are sharper than pixels can hold."""
         for j, offset in enumerate(self.observation.offsets):
-            moved = np.concatenate([[offset], self.stars + offset])
-            # In the middle of an image's pixel a star is between pixels of a finer sky.
-            may_move = self.oversample > 1 or (self._leeway > 0 and self.n_stars > 0)
+            q = self.oversample
+            moved = np.concatenate([[q * offset], on_sky(self.stars + offset, q)])
+            if self.observation.effective_psfs:
+                moved -= (q - 1) / 2.0
+            may_move = self._leeway > 0 and self.n_stars > 0
             if not may_move and (moved == np.round(moved)).all():
                 continue
             psf, moved_psf = self.observation.psfs[j], self._psfs[j].fine.at(0.5, 0.5).values
