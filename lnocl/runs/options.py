@@ -94,11 +94,6 @@ def check_families(
     for name in found:
         if not (isinstance(name, str) and name in FAMILIES):
             raise InputError(f"refine_psfs {name!r} is not known; give {', '.join(FAMILIES)}")
-    if observation.oversample > 1 and (found or len(observation.psf_scatter)):
-        raise InputError(
-            "PSFs finer than the images are taken as they are: leave refine_psfs and psf_scatter "
-            "out, or oversample"
-        )
     if found and not len(positions):
         raise InputError("refine_psfs needs a star, whose image shows the PSF; give stars")
     if len(observation.psf_scatter) and not len(positions):

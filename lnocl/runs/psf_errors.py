@@ -8,7 +8,15 @@ from copy import copy
 import numpy as np
 
 from lnocl.process import ignored_warnings
-from lnocl.runs.short_runs import Estimate, at_rings, estimate_scatter, rings_of, with_psfs
+from lnocl.runs.short_runs import (
+    DARK,
+    Estimate,
+    at_rings,
+    estimate_scatter,
+    rings_of,
+    with_psfs,
+)
+from lnocl.scene.detector import on_sky
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.psf_families import PsfFamilies
 from lnocl.scene.rings import Rings
@@ -68,14 +76,17 @@ class PsfErrors:
             psfs, errors = observation.psfs, scatter
         else:
             errors = np.zeros_like(psfs) if misfit.is_noise else _corrections(estimate)
-        rings = rings_of(psfs)
+        rings = rings_of(psfs, observation.oversample)
         squares, lights = (
             np.bincount(rings.number.ravel(), (each**2).sum(axis=0).ravel())
             for each in (errors, psfs)
         )
         self.overall = float(np.sqrt(squares.sum() / lights.sum()))
         self.edges = rings.edges[: len(squares) + 1]
-        self.at_radius = np.sqrt(squares / np.maximum(lights, np.finfo(float).tiny))
+        # Where PSFs give next to nothing, a share of them means nothing.
+        least = np.bincount(rings.number.ravel()) * len(psfs) * (DARK * psfs.max()) ** 2
+        shares = np.divide(squares, lights, out=np.zeros_like(squares), where=lights > least)
+        self.at_radius = np.sqrt(shares)
         self.over_noise = self._compare_with_noise()
 
     def as_noise(self) -> Observation:
@@ -99,12 +110,15 @@ class PsfErrors:
     def in_sky(self) -> Array:
         """Return what they may fake in the sky, ``kappa(r) sum_s c_s K_s / sqrt(p)``.
 
-        Electrons per pixel, shape (ny, nx): K is the mean over the PSFs, at the stars.
+        Electrons per pixel of the sky: K is the mean over the PSFs, at the stars.
         """
-        sky = copy(self._observation)
+        sky, oversample = copy(self._observation), self._observation.oversample
         sky.offsets = np.zeros_like(sky.offsets)
         sky.exposure = np.ones(sky.n_images)
-        errors = [error for error, _ in self._in_images(sky)]
+        if oversample > 1:  # images of all its pixels
+            shape = sky.n_images, *sky.sky_shape
+            sky.oversample, sky.images, sky.mask = 1, np.ones(shape), np.zeros(shape, bool)
+        errors = [error for error, _ in self._in_images(sky, oversample)]
         return np.asarray(np.mean(errors, axis=0) / np.sqrt(sky.n_images))
 
     def _compare_with_noise(self) -> float:
@@ -115,16 +129,20 @@ class PsfErrors:
             weights += float(light.sum())
         return ratios / weights
 
-    def _in_images(self, observation: Observation) -> Iterator[tuple[Array, Array]]:
-        """Yield the errors in each image of the stars, and these, electrons."""
+    def _in_images(self, observation: Observation, finer: int = 1) -> Iterator[tuple[Array, Array]]:
+        """Yield the errors in each image of the stars, and these, electrons.
+
+        The images may be `finer` than those that the stars' positions are for.
+        """
         seen = with_psfs(observation, self._scatter) if len(self._scatter) else observation
+        positions = on_sky(self._stars, finer)
         with ignored_warnings():
-            scene = Scene(seen, self._stars)
-            stars = Scene(observation, self._stars)
+            scene = Scene(seen, positions)
+            stars = Scene(observation, positions)
         for j, offset in enumerate(observation.offsets):
             error, light = (_starlight(each, j, self._fluxes) for each in (scene, stars))
             if not len(self._scatter):
-                rings = Rings(observation.shape, stars.stars + offset)
+                rings = Rings(observation.shape, stars.stars + offset, finer)
                 error = light * at_rings(self.at_radius, rings)
             yield error, light
 
@@ -132,7 +150,7 @@ class PsfErrors:
 def _corrections(estimate: Estimate) -> Array:
     """Return the corrections of the PSFs' pixels that fit best, shape (p, ky, kx)."""
     observation = estimate.scene.observation
-    scatter = LOOSE * estimate_scatter(observation.psfs, estimate.kappa)
+    scatter = LOOSE * estimate_scatter(observation.psfs, estimate.kappa, observation.oversample)
     families = PsfFamilies(("pixels",), observation, scatter)
     fit = step(
         estimate.scene, families, families.first(), estimate.extended, estimate.fluxes, False

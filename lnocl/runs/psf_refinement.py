@@ -102,7 +102,7 @@ def _pixels(observation: Observation, psfs: Array, estimate: Estimate) -> PsfFam
     """Return PSFs whose pixels are free, as far as their scatter is given, or residuals show it."""
     scatter = observation.psf_scatter
     if not len(scatter):
-        scatter = LOOSE * estimate_scatter(psfs, estimate.kappa)
+        scatter = LOOSE * estimate_scatter(psfs, estimate.kappa, observation.oversample)
     return PsfFamilies(("pixels",), with_psfs(observation, psfs), scatter)
 
 

@@ -74,7 +74,9 @@ class Replicas:
         self._noise = self._added = observation.read_noise**2
         self._pixels = None
         if len(observation.psf_scatter):
-            self._pixels = PsfPixels(observation.psfs, observation.psf_scatter)
+            self._pixels = PsfPixels(
+                observation.psfs, observation.psf_scatter, observation.oversample
+            )
             if outcome.read_noise is not None:  # the scatter of PSFs is drawn instead
                 self._noise = outcome.read_noise**2
         with ignored_warnings():  # those of the reconstruction are the same

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from lnocl.process import ignored_warnings
 from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_model, make_start
+from lnocl.scene.detector import on_sky
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.padding import choose_pad
 from lnocl.scene.penalty import Penalty
@@ -23,7 +24,7 @@ from lnocl.solvers.psf_fit import Misfit, PsfStep, misfit
 ROUND = 0.4
 # So many times what the PSFs' error may fake is not the extended source's.
 FAKED = 2.0
-# Short runs look at a window of this side, pixels.
+# Short runs look at a window of this side, pixels of the images.
 WINDOW = 256
 # The median of the square of a normal deviate of unit variance.
 MEDIAN = 0.455
@@ -32,7 +33,7 @@ MEDIAN = 0.455
 DARK, MOST_WRONG = 1e-9, 1.0
 # PSFs are judged after so many iterations.
 JUDGED = 15
-# The error of a PSF's pixel is a share of the PSF, smoothed over so many pixels.
+# The error of a PSF's pixel is a share of the PSF, smoothed over so many pixels of the images.
 SPREAD = 2.0
 
 
@@ -93,8 +94,9 @@ class ShortRuns:
 
     def _seen_through(self, psfs: Array) -> Observation:
         """Return the observation with these PSFs, as far as the window may show them."""
+        most = WINDOW * self._observation.oversample
         cut = [
-            slice(n // 2 - min(n, WINDOW) // 2, n // 2 - min(n, WINDOW) // 2 + min(n, WINDOW))
+            slice(n // 2 - min(n, most) // 2, n // 2 - min(n, most) // 2 + min(n, most))
             for n in psfs.shape[1:]
         ]
         return with_psfs(self._observation, psfs[:, *cut])
@@ -121,21 +123,25 @@ def _clean(scene: Scene, extended: Array, fluxes: Array, share: float) -> Estima
     Where `share` is not 0, that is this quantile of each ring round a star.
     """
     model = make_model(scene)
-    shape = scene.observation.shape
+    shape, q = scene.observation.shape, scene.oversample
     inside = tuple(map(slice, shape))
-    rings = Rings(shape, scene.stars)
+    sky_shape = scene.observation.sky_shape
+    on_images = tuple(map(slice, sky_shape))  # the part of the sky's grid that they show
+    rings = Rings(sky_shape, on_sky(scene.stars, q), q)
     kept = extended.copy()
     if share:
-        kept[inside] = np.maximum(kept[inside] - rings.round_stars(kept[inside], share), 0.0)
+        round_stars = rings.round_stars(kept[on_images], share)
+        kept[on_images] = np.maximum(kept[on_images] - round_stars, 0.0)
     diffuse = model.forward(kept)
     diffuse += model.background
     fluxes = fit_fluxes(scene, model, diffuse, fluxes)
     excess, number = [], []
-    mean_light = np.zeros(shape)
+    mean_light = np.zeros(sky_shape)
     for j, (counts, light) in enumerate(zip(scene.images(), model.starlight(fluxes), strict=True)):
         total = np.maximum(diffuse[j] + light, MIN_MODEL)[inside]
         counts, light, weights = (
-            each[inside] for each in (counts, light, np.broadcast_to(model.weights[j], scene.grid))
+            each[inside]
+            for each in (counts, light, np.broadcast_to(model.weights[j], scene.image_grid))
         )
         good = weights > 0
         variance = np.divide(total, weights * scene.scale, out=np.ones(shape), where=good)
@@ -143,16 +149,28 @@ def _clean(scene: Scene, extended: Array, fluxes: Array, share: float) -> Estima
         lit = good & (light > DARK * light.max())
         excess.append((squares - variance)[lit] / light[lit] ** 2)
         number.append(Rings(shape, scene.stars + scene.observation.offsets[j]).number[lit])
-        mean_light += light / scene.n_images
+        mean_light += starlight_on_sky(scene, j, fluxes) / scene.n_images
     kappa = np.zeros(rings.number.max() + 1)
     found = medians(np.concatenate(number), np.concatenate(excess)).clip(0.0, MOST_WRONG**2) ** 0.5
     kappa[: len(found)] = found[: len(kappa)]
     faked = FAKED / np.sqrt(scene.n_images) * kappa[rings.number] * mean_light
-    kept[inside] = np.maximum(kept[inside] - faked, 0.0)
+    kept[on_images] = np.maximum(kept[on_images] - faked, 0.0)
     return Estimate(scene, kept, fluxes, kappa)
 
 
-def estimate_scatter(psfs: Array, kappa: Array) -> Array:
+def starlight_on_sky(scene: Scene, j: int, fluxes: Array) -> Array:
+    """Return ``sum_s c_s P_js`` for each pixel of the sky, within the images."""
+    ny, nx = scene.observation.sky_shape
+    if scene.oversample == 1:
+        return scene.star_field.light(j, fluxes)[:ny, :nx]
+    total = np.zeros(scene.grid)
+    for s, flux in enumerate(fluxes):
+        stamp = scene.star_on_sky(j, s).aligned(scene.grid)
+        total[stamp.window(scene.grid)] += flux * stamp.values
+    return total[:ny, :nx] / scene.oversample**2
+
+
+def estimate_scatter(psfs: Array, kappa: Array, oversample: int) -> Array:
     """Return the scatter of the pixels of PSFs, a share of the PSF round each pixel.
 
     Parameters
@@ -161,15 +179,18 @@ def estimate_scatter(psfs: Array, kappa: Array) -> Array:
         The PSFs.
     kappa : ndarray of float64
         The error that residuals show in each ring, as `Estimate.kappa`.
+    oversample : int
+        Pixels of the PSFs to one of the images, along each axis.
     """
-    share = at_rings(kappa, rings_of(psfs))
-    return np.array([share * gaussian_filter(psf, SPREAD).clip(0.0) for psf in psfs])
+    share = at_rings(kappa, rings_of(psfs, oversample))
+    width = SPREAD * oversample
+    return np.array([share * gaussian_filter(psf, width).clip(0.0) for psf in psfs])
 
 
-def rings_of(psfs: Array) -> Rings:
+def rings_of(psfs: Array, oversample: int) -> Rings:
     """Return the rings round the middle of PSFs."""
     ky, kx = psfs.shape[1:]
-    return Rings((ky, kx), np.array([(kx // 2, ky // 2)]))
+    return Rings((ky, kx), np.array([(kx // 2, ky // 2)]), oversample)
 
 
 def at_rings(values: Array, rings: Rings) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.shifting import MovablePsf, Stamp
@@ -72,8 +73,8 @@ class DetectorPsf:
     def __init__(
         self, psf: Array, grid: tuple[int, int], oversample: int, is_effective: bool
     ) -> None:
-        self._q, self._grid = oversample, (oversample * grid[0], oversample * grid[1])
-        self.fine, self._is_effective = MovablePsf(psf, self._grid), is_effective
+        self._q, self._fine_grid = oversample, (oversample * grid[0], oversample * grid[1])
+        self.fine, self._is_effective = MovablePsf(psf, self._fine_grid), is_effective
         # From the middle of a pixel to the first of its fine pixels, in these.
         self._half = (oversample - 1) / 2.0
         self._lag = self._half if is_effective else 0.0
@@ -82,6 +83,22 @@ class DetectorPsf:
         """Return h on the fine grid, the sky moved by so many pixels of the image."""
         stamp = self.fine.at(self._q * x - self._lag, self._q * y - self._lag)
         return self._seen(stamp, stamp.values)[0]
+
+    def on_sky(self, x: float, y: float) -> Stamp:
+        """Return what pixels that begin at each fine pixel see of a star at a position, pixels."""
+        stamp = self.fine.at(*self._on_fine_pixels(x, y))
+        return self._seen(stamp, stamp.values)[0]
+
+    def spectrum(self) -> NDArray[np.complex128]:
+        """Return the factors by which pixels change the spectrum of the PSF, on the fine grid."""
+        v, u = np.fft.fftfreq(self._fine_grid[0])[:, None], np.fft.rfftfreq(self._fine_grid[1])
+        if self._is_effective:
+            return self._q**2 * np.exp(2j * np.pi * self._half * (u + v))
+        behind = np.arange(self._q)
+        along, across = (
+            np.exp(2j * np.pi * each[..., None] * behind).sum(axis=-1) for each in (v, u)
+        )
+        return along * across
 
     def at(self, x: float, y: float, axis: int | None = None) -> Stamp:
         """Return the image of a star at a position, pixels, or a derivative, as `place` does."""
@@ -104,8 +121,8 @@ class DetectorPsf:
         if self._is_effective:
             values = self._q**2 * values
             return Stamp(_first(values), stamp.y, stamp.x), values
-        y, values = _sum_ahead(values, stamp.y, self._q, self._grid[0], -2)
-        x, values = _sum_ahead(values, stamp.x, self._q, self._grid[1], -1)
+        y, values = _sum_ahead(values, stamp.y, self._q, self._fine_grid[0], -2)
+        x, values = _sum_ahead(values, stamp.x, self._q, self._fine_grid[1], -1)
         return Stamp(_first(values), y, x), values
 
     def _sampled(self, stamp: Stamp, values: Array) -> tuple[Stamp, Array]:

@@ -74,11 +74,15 @@ class Model:
         if is_flat(extended):
             images[:] = extended[0, 0] * self._sums[:, None, None]
             return images
-        spectrum = scipy.fft.rfft2(extended, workers=-1)
-        for image, otf in zip(images, self._otfs, strict=True):
-            fine = scipy.fft.irfft2(otf * spectrum, self.grid, workers=-1, overwrite_x=True)
-            image[:] = sampled(fine, self.oversample)
+        for image, sky in zip(images, self.convolved(extended), strict=True):
+            image[:] = sampled(sky, self.oversample)
         return images
+
+    def convolved(self, extended: Array) -> Iterator[Array]:
+        """Yield the ``A_j f`` before pixels sample them, each of shape (Ny, Nx)."""
+        spectrum = scipy.fft.rfft2(extended, workers=-1)
+        for otf in self._otfs:
+            yield scipy.fft.irfft2(otf * spectrum, self.grid, workers=-1, overwrite_x=True)
 
     def adjoint(self, arrays: Iterable[Array]) -> Array:
         """Return ``sum_j A_j^T x_j``, shape (Ny, Nx)."""

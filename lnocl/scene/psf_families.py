@@ -110,9 +110,12 @@ class PsfFamilies:
         if "modes" not in names:
             modes = np.zeros((len(self._psfs), 0, *self._psfs.shape[1:]))
         self._modes = modes - modes.sum(axis=(2, 3), keepdims=True) * self._psfs[:, None]
-        self.pixels = PsfPixels(self._psfs, scatter) if "pixels" in names else None
+        self.pixels = None
+        if "pixels" in names:
+            self.pixels = PsfPixels(self._psfs, scatter, observation.oversample)
         numbered = {"pupil": self._n_phases, "modes": modes.shape[1]}
-        scales = {"shift": SHIFT, "jitter": JITTER, "strehl": STREHL, "pupil": PUPIL}
+        q = observation.oversample  # priors are for pixels of the images
+        scales = {"shift": q * SHIFT, "jitter": q**2 * JITTER, "strehl": STREHL, "pupil": PUPIL}
         self.parameters, prior = [], []
         for name, own in FAMILIES.items():
             if name in names:

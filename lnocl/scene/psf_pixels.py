@@ -9,7 +9,7 @@ from lnocl.scene.smooth_field import SmoothField
 
 Array = NDArray[np.float64]
 
-# Errors of PSFs are correlated over this, pixels.
+# Errors of PSFs are correlated over this, pixels of the images.
 CORRELATED = 0.6
 
 
@@ -26,12 +26,14 @@ class PsfPixels:
         The given PSFs.
     scatter : ndarray of float64, shape (p, ky, kx)
         The standard deviations of their pixels.
+    oversample : int
+        Pixels of the PSFs to one of the images, along each axis.
     """
 
-    def __init__(self, psfs: Array, scatter: Array) -> None:
+    def __init__(self, psfs: Array, scatter: Array, oversample: int) -> None:
         self._psfs, self._scatter = psfs, scatter
         self.shape = psfs.shape[1:]
-        self._smooth = SmoothField(self.shape, CORRELATED)
+        self._smooth = SmoothField(self.shape, CORRELATED * oversample)
 
     def correction(self, j: int, field: Array) -> Array:
         """Return the correction of PSF j, shape (ky, kx)."""

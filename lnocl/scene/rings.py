@@ -21,6 +21,8 @@ class Rings:
         Of the images, (ny, nx).
     positions : ndarray of float64, shape (n, 2)
         Of the stars, (x, y), pixels; one or more.
+    oversample : int, optional
+        Pixels of the array to one of the images along each axis: radii are in those of the images.
 
     Attributes
     ----------
@@ -30,9 +32,10 @@ class Rings:
         The ring that each pixel is in, counted from the star outwards.
     """
 
-    def __init__(self, shape: tuple[int, int], positions: Array) -> None:
+    def __init__(self, shape: tuple[int, int], positions: Array, oversample: int = 1) -> None:
         y, x = np.indices(shape)
         distance, nearest = KDTree(positions).query(np.stack([x, y], axis=-1))
+        distance = distance / oversample
         edges = [0.0]
         while edges[-1] <= distance.max():
             edges.append(edges[-1] + max(1.0, WIDTH * edges[-1]))

@@ -266,6 +266,14 @@ class Scene:
         """Return P_js, where it is not 0."""
         return self._field.stamps[j][s]
 
+    def star_on_sky(self, j: int, s: int) -> Stamp:
+        """Return P_js before the pixels of image j sample it, on the sky's grid."""
+        return self._psfs[j].on_sky(*(self.stars[s] + self.observation.offsets[j]))
+
+    def pixel_spectrum(self, j: int) -> Any:
+        """Return the factors by which pixels change the spectrum of PSF j, on the sky's grid."""
+        return self._psfs[j].spectrum()
+
     @property
     def star_field(self) -> StarField:
         """The stars where they are now."""

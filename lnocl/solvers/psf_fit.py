@@ -21,7 +21,8 @@ import numpy as np
 import scipy.fft
 from scipy.ndimage import gaussian_filter
 
-from lnocl.scene.forward_model import Model
+from lnocl.scene.detector import on_sky
+from lnocl.scene.forward_model import Model, sampled, spread
 from lnocl.scene.observation import Array
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
 from lnocl.scene.psf_pixels import PsfPixels
@@ -29,8 +30,8 @@ from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.solvers.fluxes import MAX_FADING
 from lnocl.solvers.least_squares import Field, LeastSquares, LinearImage, SourceError
 
-# The error of the extended source is correlated over this, pixels, and as large as it is smoothed
-# over that.
+# The error of the extended source is correlated over this, pixels of the images, and as large as it
+# is smoothed over that.
 CORRELATED, SMOOTHED = 1.5, 4.0
 # Steps of conjugate gradients, and the share of the gradient at which they end.
 N_STEPS, FINISHED = 40, 1e-4
@@ -148,8 +149,8 @@ def _fit(images: list[LinearImage], fields: Sequence[Field], prior: Array) -> Le
 
 
 def _source_error(model: Model, extended: Array) -> SourceError:
-    amplitude = gaussian_filter(extended, SMOOTHED, mode="wrap")
-    return SourceError(model.forward, model.adjoint, amplitude, CORRELATED)
+    amplitude = gaussian_filter(extended, SMOOTHED * model.oversample, mode="wrap")
+    return SourceError(model.forward, model.adjoint, amplitude, CORRELATED * model.oversample)
 
 
 def _linearise(
@@ -163,15 +164,19 @@ def _linearise(
 ) -> list[LinearImage]:
     p, k, n = scene.n_images, len(families.prior), len(fluxes)
     shared = p * k + np.arange(n * (3 if moves else 1))
-    diffuse, images = model.forward(extended), []
-    for j, (counts, weights) in enumerate(zip(scene.images(), model.weights, strict=True)):
-        stars = [scene.star_image(j, s) for s in range(n)]
-        light = diffuse[j] + sum(c * star for c, star in zip(fluxes, stars, strict=True))
-        total = np.maximum(light + model.background[j], MIN_MODEL)
+    images = []
+    for j, (counts, weights, diffuse) in enumerate(
+        zip(scene.images(), model.weights, model.convolved(extended), strict=True)
+    ):
+        stars = [scene.star_on_sky(j, s).on_grid(scene.grid) for s in range(n)]
+        light = diffuse + sum(c * star for c, star in zip(fluxes, stars, strict=True))
+        seen = sampled(light, scene.oversample)
+        total = np.maximum(seen + model.background[j], MIN_MODEL)
         factors, modes = families.slopes(j, scene.grid, values[j])
         slopes = [*_scaled(light, factors), *_convolved(scene, j, extended, fluxes, modes), *stars]
         if moves:
-            slopes += _star_slopes(stars, fluxes)
+            slopes += _star_slopes(stars, scene.oversample * fluxes)
+        slopes = [sampled(slope, scene.oversample) for slope in slopes]
         images.append(
             LinearImage(
                 np.array(slopes).reshape(len(slopes), -1),
@@ -202,13 +207,14 @@ def _convolved(
 
 
 def _sky(scene: Scene, j: int, extended: Array, fluxes: Array) -> Spectrum:
-    """Return the spectrum of all that PSF j is convolved with, stars and extended source."""
+    """Return the spectrum of all that PSF j is convolved with: stars, extended source, pixels."""
     u, v = _frequencies(scene.grid)
-    dx, dy = scene.observation.offsets[j]
+    dx, dy = scene.oversample * scene.observation.offsets[j]
     sky = scipy.fft.rfft2(extended)
-    for c, (x, y) in zip(fluxes, scene.stars, strict=True):
+    for c, (x, y) in zip(fluxes, on_sky(scene.stars, scene.oversample), strict=True):
         sky = sky + c * np.exp(-2j * np.pi * (u * x + v * y))
-    return np.asarray(sky * (scene.gains[j] * np.exp(-2j * np.pi * (u * dx + v * dy))))
+    seen = scene.gains[j] * scene.pixel_spectrum(j)
+    return np.asarray(sky * (seen * np.exp(-2j * np.pi * (u * dx + v * dy))))
 
 
 def _star_slopes(stars: Sequence[Array], fluxes: Array) -> list[Array]:
@@ -233,6 +239,7 @@ class _PixelErrors:
         self, scene: Scene, pixels: PsfPixels, extended: Array, fluxes: Array, at: Array
     ) -> None:
         self._pixels, self._grid, self.at = pixels, scene.grid, at
+        self._oversample = scene.oversample
         self._skies = [_sky(scene, j, extended, fluxes) for j in range(scene.n_images)]
         places = [np.arange(k) - k // 2 for k in at.shape[1:]]
         self._places = np.ix_(*(at % n for at, n in zip(places, self._grid, strict=True)))
@@ -240,12 +247,13 @@ class _PixelErrors:
     def forward(self, x: Array) -> Iterator[Array]:
         for j, (field, sky) in enumerate(zip(x, self._skies, strict=True)):
             change = spectrum(self._pixels.correction(j, field), self._grid)
-            yield scipy.fft.irfft2(change * sky, self._grid, workers=-1)
+            seen = scipy.fft.irfft2(change * sky, self._grid, workers=-1)
+            yield sampled(seen, self._oversample)
 
     def adjoint(self, images: Sequence[Array]) -> Array:
         fields = np.empty_like(self.at)
         for j, (image, sky) in enumerate(zip(images, self._skies, strict=True)):
-            back = sky.conj() * scipy.fft.rfft2(image, workers=-1)
+            back = sky.conj() * scipy.fft.rfft2(spread(image, self._oversample), workers=-1)
             of_psf = scipy.fft.irfft2(back, self._grid, workers=-1)[self._places]
             fields[j] = self._pixels.adjoint(j, of_psf)
         return fields

@@ -154,9 +154,3 @@ def test_held_out_counts_choose_and_errors_are_there():
     expected = np.where(made.mask, 0.0, light.reshape(2, N, N) + made.background)
     models = np.where(made.mask, 0.0, result.models())
     np.testing.assert_allclose(models, expected, rtol=1e-11)
-
-
-def test_psfs_are_not_refined_yet():
-    made = MADE[2]
-    with pytest.raises(lnocl.InputError, match="PSFs finer than the images are taken as they are"):
-        made.deconvolve(n_iter=1, refine_psfs=["jitter"])

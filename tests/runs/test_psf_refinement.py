@@ -503,3 +503,68 @@ def test_the_grid_stays_though_wider_psfs_would_take_a_larger_one():
 def test_what_is_accepted(before, after, are_free, expected):
     misfits = (Misfit(np.array([square]), 0.0, 10000) for square in (before, after))
     assert psf_refinement._mends(*misfits, are_free) is expected
+
+
+def gaussian_star(n, x, y, width, step=1.0):
+    """Return a Gaussian of this FWHM and unit light integrated over n x n pixels of a side."""
+    from scipy.special import erf
+
+    edges, sigma = (np.arange(n + 1) - 0.5) * step, width / 2.3548
+    along = [np.diff(erf((edges - at) / (sigma * 2**0.5))) / 2 for at in (y, x)]
+    return np.outer(*along)
+
+
+def undersampled(oversample, width, true=1.7):
+    """Return an observation of two stars of this FWHM, and a cloud, with PSFs of another."""
+    rng, n = np.random.default_rng(3), 40
+    y, x = np.indices((n, n))
+    offsets, images = [(0, 0), (0.5, 0.25), (-0.3, 0.75)], []
+    for dx, dy in offsets:
+        mean = 20.0 + 40.0 * np.exp(-((x - dx - 15) ** 2 + (y - dy - 28) ** 2) / 32.0)
+        mean += 2e5 * gaussian_star(n, 16.2 + dx, 19.4 + dy, true)
+        mean += 1e5 * gaussian_star(n, 28.6 + dx, 11.9 + dy, true)
+        images.append(rng.poisson(mean))
+    return lnocl.Observation(
+        images,
+        gaussian_star(16 * oversample + 1, 8, 8, width, 1 / oversample),
+        background=20.0,
+        offsets=offsets,
+        oversample=oversample,
+    )
+
+
+TWO = [(16.2, 19.4), (28.6, 11.9)]
+
+
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+@pytest.mark.parametrize(
+    ("oversample", "names"),
+    [
+        (2, ("jitter",)),
+        pytest.param(4, ("jitter",), marks=pytest.mark.exhaustive),
+        pytest.param(2, ("pixels",), marks=pytest.mark.exhaustive),
+    ],
+)
+def test_psfs_finer_than_the_images_are_refined(oversample, names):
+    observation = undersampled(oversample, width=1.4)
+    result = lnocl.deconvolve(
+        observation, TWO, refine_psfs=names, **PAPER | {"solver": "sgp", "n_iter": 30}
+    )
+    assert result.psf_refinement.is_accepted
+    assert result.psf_refinement.misfit[1] < 1.1
+    true = undersampled(oversample, width=1.7).psfs[0]
+    wrong, left = (abs(each - true).sum() for each in (observation.psfs[0], result.psfs[0]))
+    assert left < (0.03 if names == ("jitter",) else 0.4) * wrong
+    np.testing.assert_allclose(result.star_fluxes, [2e5, 1e5], rtol=0.01)
+    assert result.doubtful.shape == result.extended.shape == (40 * oversample, 40 * oversample)
+
+
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+def test_where_psfs_give_nothing_their_error_is_no_noise():
+    """A share of the rounding in a Gaussian's wings made noise of 1e100 electrons."""
+    observation = undersampled(1, width=1.4)
+    given = {"solver": "sgp", "n_iter": 10, "engine": "numpy"}
+    result = lnocl.deconvolve(observation, TWO, refine_psfs=["pixels"], **PAPER | given)
+    assert result.psf_refinement.is_noise
+    assert (result.psf_refinement.errors_in_rings[6:] == 0).all()
+    assert (result.star_fluxes < 4e5).all()

@@ -12,7 +12,7 @@ from lnocl.scene.psf_pixels import CORRELATED, PsfPixels
 def pixels(shape=(16, 20)):
     rng = np.random.default_rng(0)
     psfs, scatter = rng.uniform(0.1, 1.0, (2, 2, *shape))
-    return PsfPixels(psfs / psfs.sum(axis=(1, 2), keepdims=True), scatter)
+    return PsfPixels(psfs / psfs.sum(axis=(1, 2), keepdims=True), scatter, 1)
 
 
 @given(st.integers(0, 2**32), st.integers(5, 21), st.integers(5, 21), st.integers(0, 1))
@@ -34,7 +34,7 @@ def test_corrections_have_the_scatter_and_are_correlated():
     shape = (64, 64)
     psf = np.zeros((1, *shape))  # with which nothing is taken back
     scatter = np.linspace(0.5, 2.0, 64)[:, None] * np.ones((1, *shape))
-    found = PsfPixels(psf, scatter)
+    found = PsfPixels(psf, scatter, 1)
     rng = np.random.default_rng(2)
     draws = np.array([found.correction(0, rng.standard_normal(shape)) for _ in range(300)])
     np.testing.assert_allclose(draws.std(axis=0).mean(axis=1), scatter[0, :, 0], rtol=0.05)
