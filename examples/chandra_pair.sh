@@ -19,6 +19,14 @@ common="--pad 24 --n-iter 20 --models --residuals --quiet --overwrite"
 lnocl deconvolve $paper "$first" "$second" --psf $psfs $common --align wcs -o "$out/aligned.fits"
 lnocl deconvolve $paper "$first" "$second" --psf $psfs $common -o "$out/not_aligned.fits"
 python "$here/real.py" figures "$out/aligned.fits" "$out/not_aligned.fits"
+# The same on a sky twice as fine, whose pixels need not lie as those of either do.
+for id in 4683 4684; do
+    python "$here/real.py" finer-psf "$out/psf_$id.fits" "$out/finer_psf_$id.fits" 2
+done
+finer="--psf $out/finer_psf_4683.fits $out/finer_psf_4684.fits --oversample 2 --effective-psfs"
+lnocl deconvolve $paper "$first" "$second" $finer $common --align wcs -o "$out/finer_aligned.fits"
+lnocl deconvolve $paper "$first" "$second" $finer $common -o "$out/finer.fits"
+python "$here/real.py" figures "$out/finer_aligned.fits" "$out/finer.fits"
 # These two are not sampled alike; so the same again with half the offset on each image.
 python "$here/real.py" offsets "$out/aligned.fits" "$first" "$second" $psfs 20
 python "$here/real.py" draw "$out/chandra_pair.png" "4683, counts=$first:127,117,16:0:90" \

@@ -2,6 +2,8 @@
 
 python examples/real.py star-psf FRAME OUT X,Y SIZE   PSF of a star in a frame
 python examples/real.py centred-psf FRAME OUT SIZE    PSF image without background, centred
+python examples/real.py finer-psf PSF OUT Q           the same PSF at Q times as many samples
+python examples/real.py airy-psf OUT FWHM HALF Q      Airy pattern in pixels, Q times as fine
 python examples/real.py pixel-psf PSF OUT             PSF spread over Chandra's pixels
 python examples/real.py offsets ALIGNED IMAGE IMAGE PSF PSF N   two images with their offset and not
 python examples/real.py stars-psf SCI EXPTIME OUT     one PSF of the lensed quasar's four images
@@ -13,7 +15,8 @@ import sys
 
 import numpy as np
 from astropy.io import fits
-from scipy.ndimage import convolve1d, shift
+from scipy.ndimage import convolve1d, map_coordinates, shift
+from scipy.special import j1
 
 import lnocl
 from lnocl.psf.make import make_psf
@@ -44,6 +47,30 @@ def centred_psf(frame, out, size):
     star = make_psf(fits.getdata(frame), size=int(size), background=0.0, clip_negative=True)
     print(star.steps[3])
     fits.writeto(out, star.psf, overwrite=True)
+
+
+def finer_psf(psf, out, finer):
+    """Write an effective PSF between the pixels that it is known on, by cubic splines.
+
+    What lies between is a guess: pixels that undersample a PSF do not show it.
+    """
+    known, finer = fits.getdata(psf).astype(float), int(finer)
+    at = [np.arange(finer * (n // 2 - 1) * 2 + 1) / finer + 1 for n in known.shape]
+    samples = map_coordinates(known, np.meshgrid(*at, indexing="ij"), order=3)
+    fits.writeto(out, samples.clip(0.0), overwrite=True)
+
+
+def airy_psf(out, fwhm, half, finer):
+    """Write the Airy pattern of this FWHM, pixels, on so many times finer ones, to `half` pixels.
+
+    It is integrated over the finer pixels at 8 x 8 points.
+    """
+    points, n = 8, 2 * int(half) * int(finer) + 1
+    side = 1.0 / int(finer)
+    at = ((np.arange(n * points) + 0.5) / points - 0.5) * side - int(half)
+    u = np.maximum(3.2327 * np.hypot(at[:, None], at) / float(fwhm), 1e-9)
+    light = ((2 * j1(u) / u) ** 2).reshape(n, points, n, points).sum(axis=(1, 3))
+    fits.writeto(out, light / light.sum(), overwrite=True)
 
 
 def pixel_psf(psf, out):
@@ -196,6 +223,8 @@ def draw(out, *panels):
 COMMANDS = {
     "star-psf": star_psf,
     "centred-psf": centred_psf,
+    "finer-psf": finer_psf,
+    "airy-psf": airy_psf,
     "pixel-psf": pixel_psf,
     "offsets": offsets,
     "stars-psf": stars_psf,

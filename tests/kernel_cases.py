@@ -31,7 +31,7 @@ CASES = {
     "radices 4, 4 and 8, 4": ((16, 32), None, THREE_IMAGES, "sD"),
     "radices 8, 8 and 4, 8, 4": ((64, 128), None, "two images, star, mu", "sD"),
     "radices 8, 8, 4": ((256, 16), None, "plain", "S"),
-    "exposure map": ((32, 16), None, "exposure map, mu", "sD"),
+    "exposure map": ((32, 16), None, "exposure map, mu", "SD"),
     "exposure map, group": ((32, 16), Tuning(1, 8, group=4), "exposure map, mu", "S"),
     "radices 8, 8, 8": ((8, 512), None, "plain", "S"),
     "radices 4, 8, 8, 4, middle pass": ((32, 1024), None, "plain", "SD"),
