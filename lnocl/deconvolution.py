@@ -69,7 +69,8 @@ def deconvolve(
     `smoothing`, ``+ smoothing sum [sqrt((f - f')^2 + delta^2) - delta]`` over pairs of neighbours,
     over the star fluxes c and the extended source f. The model of image g_j is
     ``m_j = A_j f + sum_s c_s P_js + b_j``: A_j convolves with PSF j, P_js is the image of star s
-    for flux 1, and b_j the background.
+    for flux 1, and b_j the background. The sky may be finer than the images (``oversample`` of the
+    observation): A_j then sums over the pixels of the sky that a pixel of the image holds.
 
     The defaults are for real frames. The paper's iteration is ``solver="sgm", stop=None,
     smoothing=0, pad=0`` with `mu` and `n_iter` given; without stars and penalties it is
@@ -121,7 +122,7 @@ def deconvolve(
         and ``pad=0``, the model is periodic. "auto": where light runs over the edge of an image,
         the radius with nine tenths of the PSFs' light, at most half the shorter side
         (docs/frames.md); else 0.
-    initial_extended : array_like, shape (ny, nx), optional
+    initial_extended : array_like, of the shape of the result's, optional
         Extended source to start from, not 0 everywhere; by default flat. Pixels that start at 0
         stay 0 with "sgm".
     initial_star_fluxes : array_like, shape (n,), optional

@@ -49,8 +49,9 @@ class Estimate:
 
     Attributes
     ----------
-    extended : ndarray of float64, shape (ny, nx)
-        Extended source, electrons per pixel.
+    extended : ndarray of float64
+        Extended source, electrons per pixel of it; its shape is the observation's ``sky_shape``,
+        that of the images but for ``oversample``.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons.
     star_positions : ndarray of float64, shape (n, 2)
@@ -93,8 +94,9 @@ class Result:
 
     Attributes
     ----------
-    extended : ndarray of float64, shape (ny, nx)
-        Extended source, electrons per pixel.
+    extended : ndarray of float64
+        Extended source, electrons per pixel of it; its shape is the observation's ``sky_shape``,
+        that of the images but for ``oversample``.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons, in the order of the stars given.
     star_positions : ndarray of float64, shape (n, 2)

@@ -42,7 +42,7 @@ class PsfRefinement:
     is_noise : bool
         Whether this error was made a part of the noise: it was given, or exceeds the noise of the
         counts at the stars, and is at most 0.15.
-    may_be_faked : ndarray of float64, shape (ny, nx)
+    may_be_faked : ndarray of float64, of the shape of the extended source
         What this error may fake in the sky, electrons per pixel: in each ring its share of the
         stars, seen through the PSFs, over the square root of p.
     """

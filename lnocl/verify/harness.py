@@ -251,7 +251,7 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
     # Where the sky is finer, each row of A_j f has what lies between the image's pixels too.
     oversample = harness.program.oversample
     model = rng.uniform(0.5, 3.0, (p, image[0], nx))
-    model[:, 0, : 2 * oversample] = -1.0  # the division guard
+    model[:, 0, : 2 * oversample] = -3.0  # the division guard, stars or not
     images = rng.poisson(3.0, (p, *image)) / 3.0
     images[:, 0, :2] = 0.0, 1.0
     weights = rng.random((p, *image)) > 0.2
