@@ -248,7 +248,7 @@ class Result:
             Replicas, ten or more.
         regions : str, path or iterable of regions.Region, optional
             Regions whose light of the extended source is measured: a file of them, as DS9 writes,
-            or these, of the package regions.
+            or these, of the package regions; in pixels of the extended source, or on the sky.
         profiles : str, path or iterable of regions.RectanglePixelRegion, optional
             Boxes along whose longer sides light and width are measured, pixel by pixel, likewise.
         header : astropy.io.fits.Header, optional

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import logging
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from lnocl.io.frames import Frames
     from lnocl.result import Result
     from lnocl.runs.bootstrap import Bootstrap, Part
+
+log = logging.getLogger("lnocl")
 
 DEFAULT = 50
 # Seconds between two writings of the replicas so far.
@@ -38,7 +41,8 @@ OPTIONS = [
         "--regions",
         metavar="FILE",
         is_input=True,
-        help="regions whose light is measured: a file such as DS9 writes, in pixels or on the sky",
+        help="regions whose light is measured: a file such as DS9 writes, in pixels of the "
+        "extended source or on the sky",
     ),
     option(
         "--profiles",
@@ -83,7 +87,13 @@ def read(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
     from lnocl.io.fitsread import sky_header
     from lnocl.io.regions import read_apertures, read_profiles
 
-    where = sky_header(frames.header, frames.observation.oversample), frames.observation.sky_shape
+    oversample = frames.observation.oversample
+    if oversample > 1:
+        log.info(
+            "regions in pixels are in those of the extended source, %d to one of the images",
+            oversample,
+        )
+    where = sky_header(frames.header, oversample), frames.observation.sky_shape
     apertures = [] if arguments.regions is None else read_apertures(arguments.regions, *where)
     profiles = [] if arguments.profiles is None else read_profiles(arguments.profiles, *where)
     return [*apertures, *profiles]

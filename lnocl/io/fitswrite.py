@@ -115,7 +115,8 @@ def write_result(
     """
     coordinates = fits.Header() if wcs is None else wcs
     shared = coordinates if not np.any(offsets) else fits.Header(offset_cards(offsets))
-    header = coordinates.copy() if oversample == 1 else finer_cards(coordinates, oversample)
+    of_sky = coordinates if oversample == 1 else finer_cards(coordinates, oversample)
+    header = of_sky.copy()
     header["BUNIT"] = (unit, "per pixel")
     if oversample > 1:
         header["OVERSAMP"] = (oversample, "pixels of this image to one of the frames")
@@ -132,7 +133,7 @@ def write_result(
             *([] if psf_fit is None else [_table("PSFFIT", psf_fit)]),
             *([] if psfs is None else [fits.ImageHDU(np.asarray(psfs, np.float64), name="PSFS")]),
             *([] if psf_errors is None else [_table("PSFERRORS", psf_errors)]),
-            *([] if doubtful is None else [_flags("DOUBTFUL", doubtful, shared)]),
+            *([] if doubtful is None else [_flags("DOUBTFUL", doubtful, of_sky)]),
             *([_lines("MESSAGES", "message", said)] if said else []),
         ]
     )

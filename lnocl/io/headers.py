@@ -75,7 +75,8 @@ def finer_cards(cards: fits.Header, oversample: int) -> fits.Header:
     """Return the cards of `fitsread.wcs_cards` for pixels that are so many times finer.
 
     With q of them to a pixel, pixel x begins at q x: ``CRPIX <- q (CRPIX - 1/2) + 1/2``,
-    ``CDELT <- CDELT / q``, and a coefficient of SIP of powers i and j ``A <- A q^(1 - i - j)``.
+    ``PC <- PC / q``, and a coefficient of SIP of powers i and j ``A <- A q^(1 - i - j)``. CDELT
+    stays, as distortions by TPV come before it.
 
     Examples
     --------
@@ -83,14 +84,18 @@ def finer_cards(cards: fits.Header, oversample: int) -> fits.Header:
     >>> from lnocl.io.headers import finer_cards
     >>> finer_cards(fits.Header({"CRPIX1": 1.0, "CDELT1": 0.5}), 2)
     CRPIX1  =                  1.5
-    CDELT1  =                 0.25
+    CDELT1  =                  0.5
+    PC1_1   =                  0.5
+    PC2_2   =                  0.5
     """
     finer, q = cards.copy(), oversample
     for keyword, value in cards.items():
-        if re.fullmatch("CRPIX[12][A-Z]?", keyword):
+        if origin := re.fullmatch("CRPIX[12]([A-Z]?)", keyword):
             finer[keyword] = q * (value - 0.5) + 0.5
-        elif re.fullmatch("CDELT[12][A-Z]?", keyword):
-            finer[keyword] = value / q
+            for i, j in ((1, 1), (1, 2), (2, 1), (2, 2)):
+                name = f"PC{i}_{j}{origin[1]}"
+                if i == j or name in cards:
+                    finer[name] = cards.get(name, 1.0) / q
         elif powers := re.fullmatch("[AB]P?_([0-9])_([0-9])", keyword):
             finer[keyword] = value * float(q) ** (1 - int(powers[1]) - int(powers[2]))
     return finer

@@ -16,6 +16,7 @@ from lnocl.errors import FileError
 from lnocl.io.fitsfile import FitsFile, open_fits
 from lnocl.io.headers import number, readable
 from lnocl.io.selection import has_pixels
+from lnocl.scene.observation import OVERSAMPLES
 
 Columns = dict[str, NDArray[np.float64]]
 
@@ -155,7 +156,7 @@ def read_result(path: str) -> SavedResult:
     extended, header = image
     if len(cubes) < len(CUBES):
         cubes = {}
-    oversample = int(number(path, header, "OVERSAMP") or 1)
+    oversample = number(path, header, "OVERSAMP") or 1.0
     if fault := _fault(extended, tables, cubes, doubtful, oversample):
         raise FileError(
             f"{path} is not a result or truth written by lnocl, such as OUT.fits of lnocl "
@@ -194,7 +195,7 @@ def _fault(
     tables: dict[str, Columns],
     cubes: dict[str, NDArray[np.float64]],
     doubtful: NDArray[np.bool_] | None,
-    oversample: int,
+    oversample: float,
 ) -> str:
     """Return why these are not the parts of a result; nothing where they are."""
     for table, names in TABLES.items():
@@ -203,6 +204,8 @@ def _fault(
                 return f"there is no column {table} {name}"
     if extended.ndim != 2:
         return "the image is a cube"
+    if oversample not in OVERSAMPLES or any(n % oversample for n in extended.shape):
+        return f"OVERSAMP is {oversample:g}"
     for name, cube in cubes.items():
         if (
             cube.ndim != 3

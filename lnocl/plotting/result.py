@@ -236,17 +236,25 @@ def _draw_extended(axis: Axes, view: ResultView, region: Region, title: str) -> 
     norm = AsinhNorm(FAINT_SHARE * top, 0.0, top)
     shown = _draw_region(axis, view.extended, there, norm, COLOUR_MAP, view.oversample)
     if view.doubtful is not None and view.doubtful[there].any():
-        outline(axis, view.doubtful, there)
+        outline(axis, view.doubtful, there, view.oversample)
         title += f"\n{OUTLINED}"
     axis.set_title(title, fontsize=10)
     _add_bar(axis, shown, view.unit)
     _mark_stars(axis, view)
 
 
-def outline(axis: Axes, flags: NDArray[np.bool_], there: Any = np.s_[:, :]) -> None:
-    """Outline flagged pixels of a part of an image, and leave the limits of the axes."""
+def outline(
+    axis: Axes, flags: NDArray[np.bool_], there: Any = np.s_[:, :], oversample: int = 1
+) -> None:
+    """Outline flagged pixels of a part of an image, and leave the limits of the axes.
+
+    The axes may be those of pixels that are `oversample` times as coarse.
+    """
     limits = axis.get_xlim(), axis.get_ylim()
-    y, x = (np.arange(n)[part] for part, n in zip(there, flags.shape, strict=True))
+    y, x = (
+        (np.arange(n)[part] + 0.5) / oversample - 0.5
+        for part, n in zip(there, flags.shape, strict=True)
+    )
     if min(len(x), len(y)) > 1:  # else there is nothing to draw a line between
         axis.contour(x, y, flags[there], [0.5], colors="red", linewidths=0.8)
     axis.set(xlim=limits[0], ylim=limits[1])

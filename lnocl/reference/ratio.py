@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import xlog1py
+from scipy.special import xlog1py, xlogy
 
 from lnocl.reference.rows import ComplexArray, irfft_rows, rfft_rows
 from lnocl.scene.observation import Array
@@ -36,8 +36,10 @@ def ratio_rows(
     dark = model <= MIN_MODEL  # which NaN is not: it reaches the objective
     model = np.where(dark, MIN_MODEL, model)
     ratio = images / model
-    # Its terms of first order cancel, those of scipy.special.kl_div only the terms themselves.
-    divergence = model * (xlog1py(ratio, ratio - 1.0) - (ratio - 1.0))
+    # Near 1 its terms of first order cancel, those of scipy.special.kl_div only the terms themselves;
+    # near 0 a ratio may be lost in that less 1.
+    log = np.where(ratio < 0.5, xlogy(ratio, ratio), xlog1py(ratio, np.maximum(ratio, 0.5) - 1.0))
+    divergence = model * (log - (ratio - 1.0))
     excess = np.where(dark, 0.0, ratio) - 1.0
     if weights is not None:
         excess, divergence = weights * excess, weights * divergence

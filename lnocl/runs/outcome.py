@@ -26,7 +26,7 @@ class PsfRefinement:
     parameters : tuple of str
         Names of the n parameters of each PSF (`lnocl.scene.psf_families.PsfFamilies`).
     values : ndarray of float64, shape (p, n)
-        What was found for them, whether it was accepted or not.
+        What was found for them, whether it was accepted or not; lengths in pixels of the images.
     misfit : tuple of float
         Of the given PSFs and of the refined ones: the reduced chi squared of the images, with the
         extended source marginalised, 1 where there is noise alone.

@@ -84,7 +84,7 @@ def refine_psfs(
     is_noise = len(known) > 0 or (errors.over_noise > RUINOUS and errors.overall <= HOPELESS)
     refinement = PsfRefinement(
         tuple(families.parameters),
-        values,
+        values / families.units,
         (before.reduced, after.reduced),
         is_accepted,
         errors.overall,
@@ -172,7 +172,8 @@ def _search(
             parameters = _follow(families, parameters, change.parameters)
             if moves:  # which a common shift is not told from
                 parameters, common = families.without_common_shift(parameters)
-                change = change._replace(positions=change.positions + common)
+                moved = change.positions + common / found.scene.oversample
+                change = change._replace(positions=moved)
             found = runs.moved(found, families.psfs(parameters), change)
     return parameters
 

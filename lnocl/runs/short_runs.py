@@ -159,15 +159,13 @@ def _clean(scene: Scene, extended: Array, fluxes: Array, share: float) -> Estima
 
 
 def starlight_on_sky(scene: Scene, j: int, fluxes: Array) -> Array:
-    """Return ``sum_s c_s P_js`` for each pixel of the sky, within the images."""
+    """Return the PSF of image j times its flux at each star, within the images' part of the sky."""
     ny, nx = scene.observation.sky_shape
-    if scene.oversample == 1:
-        return scene.star_field.light(j, fluxes)[:ny, :nx]
     total = np.zeros(scene.grid)
     for s, flux in enumerate(fluxes):
-        stamp = scene.star_on_sky(j, s).aligned(scene.grid)
+        stamp = scene.psf_on_sky(j, s)
         total[stamp.window(scene.grid)] += flux * stamp.values
-    return total[:ny, :nx] / scene.oversample**2
+    return total[:ny, :nx]
 
 
 def estimate_scatter(psfs: Array, kappa: Array, oversample: int) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,22 @@ def movable_psfs(
         return [MovablePsf(psf, grid) for psf in psfs]
     oversample, are_effective = observation.oversample, observation.effective_psfs
     return [DetectorPsf(psf, grid, oversample, are_effective) for psf in psfs]
+
+
+def pixel_spectrum(
+    v: NDArray[Any], u: NDArray[Any], observation: Observation
+) -> NDArray[np.complex128]:
+    """Return the factors by which pixels change the spectra of PSFs, at frequencies 1 / pixel.
+
+    Those of the response h over those of K (`DetectorPsf`); 1 without oversampling.
+    """
+    q = observation.oversample
+    if observation.effective_psfs:
+        return np.asarray(q**2 * np.exp(1j * np.pi * (q - 1) * (u + v)))
+    along, across = (
+        np.exp(2j * np.pi * np.multiply.outer(each, np.arange(q))).sum(axis=-1) for each in (v, u)
+    )
+    return np.asarray(along * across)
 
 
 def seen_psfs(observation: Observation) -> Array:
@@ -88,17 +105,6 @@ class DetectorPsf:
         """Return what pixels that begin at each fine pixel see of a star at a position, pixels."""
         stamp = self.fine.at(*self._on_fine_pixels(x, y))
         return self._seen(stamp, stamp.values)[0]
-
-    def spectrum(self) -> NDArray[np.complex128]:
-        """Return the factors by which pixels change the spectrum of the PSF, on the fine grid."""
-        v, u = np.fft.fftfreq(self._fine_grid[0])[:, None], np.fft.rfftfreq(self._fine_grid[1])
-        if self._is_effective:
-            return self._q**2 * np.exp(2j * np.pi * self._half * (u + v))
-        behind = np.arange(self._q)
-        along, across = (
-            np.exp(2j * np.pi * each[..., None] * behind).sum(axis=-1) for each in (v, u)
-        )
-        return along * across
 
     def at(self, x: float, y: float, axis: int | None = None) -> Stamp:
         """Return the image of a star at a position, pixels, or a derivative, as `place` does."""

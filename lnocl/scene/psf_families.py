@@ -95,6 +95,8 @@ class PsfFamilies:
         Names of the n parameters of each PSF, such as "jitter xy".
     prior : ndarray of float64, shape (n,)
         Standard deviations of their priors.
+    units : ndarray of float64, shape (n,)
+        The parameters, in pixels of the PSFs, over what they are in pixels of the images.
     pixels : PsfPixels or None
         None where they are not asked for.
     n_searches : int
@@ -114,15 +116,17 @@ class PsfFamilies:
         if "pixels" in names:
             self.pixels = PsfPixels(self._psfs, scatter, observation.oversample)
         numbered = {"pupil": self._n_phases, "modes": modes.shape[1]}
-        q = observation.oversample  # priors are for pixels of the images
-        scales = {"shift": q * SHIFT, "jitter": q**2 * JITTER, "strehl": STREHL, "pupil": PUPIL}
-        self.parameters, prior = [], []
+        scales = {"shift": SHIFT, "jitter": JITTER, "strehl": STREHL, "pupil": PUPIL}
+        pixels = {"shift": observation.oversample, "jitter": observation.oversample**2}
+        self.parameters, prior, units = [], [], []
         for name, own in FAMILIES.items():
             if name in names:
                 own = own or tuple(str(i + 1) for i in range(numbered.get(name, 0)))
                 self.parameters += [f"{name} {each}" for each in own]
                 prior += [scales.get(name, MODE)] * len(own)
-        self.prior = np.array(prior)
+                units += [pixels.get(name, 1)] * len(own)
+        self.units = np.array(units, np.float64)
+        self.prior = np.array(prior) * self.units
         self.n_searches = SEARCHES if self._pupils else 1
 
     def first(self, search: int = 0) -> PsfParameters:

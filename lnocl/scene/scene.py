@@ -270,9 +270,9 @@ class Scene:
         """Return P_js before the pixels of image j sample it, on the sky's grid."""
         return self._psfs[j].on_sky(*(self.stars[s] + self.observation.offsets[j]))
 
-    def pixel_spectrum(self, j: int) -> Any:
-        """Return the factors by which pixels change the spectrum of PSF j, on the sky's grid."""
-        return self._psfs[j].spectrum()
+    def psf_on_sky(self, j: int, s: int) -> Stamp:
+        """Return PSF j on the sky's grid, at star s."""
+        return self._psfs[j].fine.at(*on_sky(self.stars[s], self.oversample))
 
     @property
     def star_field(self) -> StarField:
@@ -359,7 +359,11 @@ class Scene:
         of a PSF make negative counts as 0.
         """
         if self.weights is None:
-            return np.full(len(field), float(self.n_images)), np.ones(len(field), bool)
+            light = np.ones((self.n_images, len(field)))
+            # Samples of an effective PSF a pixel apart may sum to another number.
+            if self.oversample > 1 and self.observation.effective_psfs:
+                light[:] = [[stamp.values.sum() for stamp in each] for each in field.stamps]
+            return light.sum(axis=0), np.ones(len(field), bool)
         total, is_observed = np.zeros(len(field)), np.zeros(len(field), bool)
         for j, weights in enumerate(self.weights):
             windows = [(stamp, weights[stamp.window(self.image_grid)]) for stamp in field.stamps[j]]

@@ -120,10 +120,6 @@ class MovablePsf:
         """Return the PSF at a position."""
         return self.at(x, y)
 
-    def spectrum(self) -> float:
-        """Return the factor by which pixels change the spectrum of the PSF: 1, they hold it."""
-        return 1.0
-
     def response(self, x: float, y: float) -> Stamp:
         """Return what the image shows of a source at its origin, the sky moved so far."""
         return self.at(x, y)

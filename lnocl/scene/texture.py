@@ -17,6 +17,7 @@ import scipy.fft
 from scipy.ndimage import gaussian_filter
 
 from lnocl.scene.cores import fwhm
+from lnocl.scene.detector import pixel_spectrum
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.smooth_field import SmoothField
@@ -88,10 +89,13 @@ class Texture:
 def resolution(scene: Scene) -> float:
     """Return the full width at half maximum of what all images resolve together, pixels.
 
-    It is that of the PSF whose OTF is the root of the mean of ``|OTF_j|^2``.
+    It is that of the PSF whose OTF is the root of the mean of ``|OTF_j|^2``, each with the
+    response of the images' pixels, in pixels of the sky.
     """
-    psfs = scene.observation.psfs
-    power = np.mean([abs(scipy.fft.fft2(psf)) ** 2 for psf in psfs], axis=0)
+    psfs, observation = scene.observation.psfs, scene.observation
+    v, u = (np.fft.fftfreq(n) for n in psfs.shape[1:])
+    pixel = abs(pixel_spectrum(v[:, None], u, observation)) / observation.oversample**2
+    power = np.mean([abs(scipy.fft.fft2(psf) * pixel) ** 2 for psf in psfs], axis=0)
     return fwhm(scipy.fft.fftshift(scipy.fft.ifft2(np.sqrt(power)).real))
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.fft
 from scipy.ndimage import gaussian_filter
 
-from lnocl.scene.detector import on_sky
+from lnocl.scene.detector import on_sky, pixel_spectrum
 from lnocl.scene.forward_model import Model, sampled, spread
 from lnocl.scene.observation import Array
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
@@ -213,7 +213,7 @@ def _sky(scene: Scene, j: int, extended: Array, fluxes: Array) -> Spectrum:
     sky = scipy.fft.rfft2(extended)
     for c, (x, y) in zip(fluxes, on_sky(scene.stars, scene.oversample), strict=True):
         sky = sky + c * np.exp(-2j * np.pi * (u * x + v * y))
-    seen = scene.gains[j] * scene.pixel_spectrum(j)
+    seen = scene.gains[j] * pixel_spectrum(v, u, scene.observation)
     return np.asarray(sky * (seen * np.exp(-2j * np.pi * (u * dx + v * dy))))
 
 

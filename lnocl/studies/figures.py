@@ -200,8 +200,9 @@ def _check_saved(saved: Sequence[SavedResult], room: float) -> None:
             )
         if not (abs(each.extended) < LARGEST).all():
             raise InputError(f"{each.path} holds values that are not finite; draw another")
-        for x, y in each.sky_stars:
-            if not (-room <= x + 0.5 < nx + room and -room <= y + 0.5 < ny + room):
+        width, height = nx / each.oversample, ny / each.oversample
+        for x, y in each.stars:
+            if not (-room <= x + 0.5 < width + room and -room <= y + 0.5 < height + room):
                 raise InputError(f"{each.path} has a star at ({x:g}, {y:g}), outside its image")
 
 

@@ -5,11 +5,15 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
+from matplotlib.figure import Figure
 from scipy.special import erf
 
+import lnocl
 from lnocl.commands import cli
+from lnocl.io.fitsread import wcs_cards
 from lnocl.io.headers import finer_cards
 from lnocl.io.saved_results import read_result
+from lnocl.plotting.result import outline
 from lnocl.studies.figures import view_of
 
 N, Q = 24, 2
@@ -68,13 +72,74 @@ def test_pixels_of_both_lie_at_one_place_of_the_sky(result):
         assert there.separation(coarse.pixel_to_world(x, y)).arcsec < 1e-7
 
 
-@pytest.mark.parametrize("key", ["", "B"])
-def test_cards_of_other_systems_are_scaled(key):
-    cards = {f"CRPIX1{key}": 3.0, f"CRPIX2{key}": -1.5, f"CDELT1{key}": -0.4, f"CDELT2{key}": 0.2}
-    found = finer_cards(fits.Header(cards | {f"CRVAL1{key}": 5.0, f"PC1_2{key}": 0.1}), 4)
-    assert [found[f"CRPIX{axis}{key}"] for axis in "12"] == [10.5, -7.5]
-    assert [found[f"CDELT{axis}{key}"] for axis in "12"] == [-0.1, 0.05]
-    assert (found[f"CRVAL1{key}"], found[f"PC1_2{key}"]) == (5.0, 0.1)
+PLAIN = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 65.0, "CRVAL2": 19.5,
+         "CRPIX1": 12.0, "CRPIX2": -3.5}  # fmt: skip
+SYSTEMS = {
+    "CDELT": PLAIN | {"CDELT1": -2e-5, "CDELT2": 3e-5},
+    "CDELT and CROTA": PLAIN | {"CDELT1": -2e-5, "CDELT2": 2e-5, "CROTA2": 31.0},
+    "PC": PLAIN | {"CDELT1": -2e-5, "CDELT2": 2e-5, "PC1_2": 0.1, "PC2_1": -0.1},
+    "SIP both ways": COORDINATES | {"CRPIX1": 12.0, "CRPIX2": 11.0, "AP_ORDER": 2, "BP_ORDER": 2, "AP_2_0": -1e-4},
+    "TPV": PLAIN | {
+        "CTYPE1": "RA---TPV", "CTYPE2": "DEC--TPV", "CD1_1": -1e-4, "CD2_2": 1e-4,
+        "PV1_0": 0.0, "PV1_1": 1.0, "PV1_4": 0.01, "PV2_0": 0.0, "PV2_1": 1.0, "PV2_4": -0.01,
+    },
+    "an alternate one": {f"{key}B": value for key, value in PLAIN.items()}
+    | {"CDELT1B": -2e-5, "CDELT2B": 2e-5, "PC1_2B": 0.2},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("q", [2, 4])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_finer_cards_name_the_same_places(name, q):
+    header, key = fits.Header(SYSTEMS[name]), "B" if name == "an alternate one" else " "
+    finer = finer_cards(wcs_cards(header), q)
+    coarse, fine = (WCS(each, key=key, naxis=2) for each in (wcs_cards(header), finer))
+    for x, y in ((0.0, 0.0), (1500.0, 127.0), (22.0, 1003.5)):
+        there = fine.all_pix2world(q * x + (q - 1) / 2, q * y + (q - 1) / 2, 0)
+        np.testing.assert_allclose(there, coarse.all_pix2world(x, y, 0), rtol=0, atol=1e-11)
+
+
+@pytest.mark.filterwarnings("ignore:the PSFs do not fit the stars")
+def test_flags_lie_where_the_extended_source_does(tmp_path):
+    rng, path = np.random.default_rng(2), tmp_path / "out.fits"
+    psf = gaussian(8 * Q + 1, 4, 4, 0.6, 1 / Q)
+    mean = 5.0 + FLUX * gaussian(N, *STAR, 0.6)
+    observation = lnocl.Observation(
+        rng.poisson(mean), psf, background=5.0, oversample=Q, psf_scatter=0.05 * psf / psf.sum()
+    )
+    result = lnocl.deconvolve(observation, [STAR], engine="numpy", n_iter=3, stop=None)
+    result.write(path, header=fits.Header(PLAIN | {"CDELT1": -2e-5, "CDELT2": 2e-5}))
+    with fits.open(path) as hdus:
+        assert hdus["DOUBTFUL"].data.shape == hdus[0].data.shape
+        for card in ("CRPIX1", "CRPIX2", "CDELT1", "PC1_1"):
+            assert hdus["DOUBTFUL"].header[card] == hdus[0].header[card]
+    axis = Figure().subplots()
+    axis.imshow(np.zeros((N, N)))
+    outline(axis, result.doubtful, oversample=Q)
+    lines = np.concatenate([each.vertices for each in axis.collections[0].get_paths()])
+    assert result.doubtful.any()
+    flagged = np.argwhere(result.doubtful)
+    assert (lines.max(axis=0) <= (flagged.max(axis=0)[::-1] + 1.5) / Q).all()
+    assert np.hypot(*(lines - STAR).T).min() < 3
+
+
+def test_stars_just_outside_are_drawn(result, tmp_path):
+    moved = str(tmp_path / "moved.fits")
+    with fits.open(result) as hdus:
+        hdus["STARS"].data["x"] = -2.9
+        hdus.writeto(moved)
+        assert cli.main(["report", moved, "-o", str(tmp_path / "page.html")]) == 0
+
+
+@pytest.mark.parametrize("value", [0.5, 3, -2, 1e9])
+def test_a_damaged_oversamp_is_one_line(result, tmp_path, value, capsys):
+    damaged = str(tmp_path / "damaged.fits")
+    with fits.open(result) as hdus:
+        hdus[0].header["OVERSAMP"] = value
+        hdus.writeto(damaged)
+    assert cli.main(["plot", damaged, "-o", str(tmp_path / "plots")]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"OVERSAMP is {value:g}" in line
 
 
 def test_the_file_is_drawn_on_the_images_pixels(result, tmp_path):

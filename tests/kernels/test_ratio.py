@@ -63,3 +63,22 @@ def test_sums_over_pixels_are_compensated():
     expected = (images - 1.0).sum()
     assert star_sums.sum() == pytest.approx(expected, rel=3e-9)
     assert star_sums[:, 0].sum() != pytest.approx(expected, rel=3e-9)
+
+
+@in_each_precision
+def test_images_of_next_to_nothing(dtype):
+    """Counts of 0 with a variance of 1e-20: their ratio is lost in that less 1."""
+    harness = harness_of("radices 8, 8 and 4, 8, 4", dtype)
+    images, ones = np.full(harness.grid, 1e-20), np.ones(harness.grid)
+    _, sums, _ = launch_ratio_rows(harness, ones, images, np.zeros(harness.grid))
+    zero = np.zeros((1, 1, *harness.grid))
+    _, expected, _ = reference.ratio_rows(
+        np.fft.rfft(ones)[None] / harness.grid[1],
+        images[None],
+        None,
+        np.zeros((1, 1, 1)),
+        zero,
+        np.zeros(1),
+    )
+    assert expected == pytest.approx(images.size, rel=1e-12)
+    assert sums.sum() == pytest.approx(expected, rel=4 * float(np.finfo(dtype).eps))

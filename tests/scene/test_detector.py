@@ -10,6 +10,7 @@ import lnocl
 from lnocl.scene.detector import DetectorPsf, on_sky, seen_psfs
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
+from lnocl.scene.texture import resolution
 
 RNG = np.random.default_rng(24)
 
@@ -191,3 +192,27 @@ def test_images_whose_sky_is_too_large_are_refused():
     observation = lnocl.Observation(np.ones((8, 2049)), np.ones((1, 1)), oversample=4)
     with pytest.raises(lnocl.InputError, match=r"oversample=4 need .* the largest axis is 2048"):
         Scene(observation)
+
+
+@pytest.mark.parametrize("q", [2, 4])
+@pytest.mark.parametrize("sigma", [0.4, 1.0])
+def test_the_resolution_is_that_of_what_pixels_see(q, sigma):
+    """One instrument, its PSF given either way."""
+    places = (np.arange(2 * 8 * q + 1) / q) - 8
+    along = (erf((places + 0.5) / sigma / 2**0.5) - erf((places - 0.5) / sigma / 2**0.5)) / 2
+    widths = []
+    for psf, effective in ((np.outer(along, along), True), (fine_gaussian(q, sigma, 8), False)):
+        observation = lnocl.Observation(
+            np.ones((32, 32)), psf, oversample=q, effective_psfs=effective
+        )
+        widths.append(resolution(Scene(observation)) / q)
+    assert widths[0] == pytest.approx(widths[1], rel=1e-3)
+
+
+def test_the_weight_of_a_star_is_what_its_samples_sum_to():
+    psf = fine_gaussian(2, 0.5, 3)  # which is no effective PSF
+    observation = lnocl.Observation(np.ones((16, 16)), psf, oversample=2, effective_psfs=True)
+    scene = Scene(observation, [(7.2, 8.4)])
+    light = scene.star_image(0, 0).sum()
+    assert abs(light - 1.0) > 1e-4
+    assert scene.star_weights[0] == pytest.approx(light, rel=1e-12)
