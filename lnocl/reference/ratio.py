@@ -36,8 +36,8 @@ def ratio_rows(
     dark = model <= MIN_MODEL  # which NaN is not: it reaches the objective
     model = np.where(dark, MIN_MODEL, model)
     ratio = images / model
-    # Near 1 its terms of first order cancel, those of scipy.special.kl_div only the terms themselves;
-    # near 0 a ratio may be lost in that less 1.
+    # Near 1 its terms of first order cancel, those of scipy.special.kl_div only the terms
+    # themselves; near 0 a ratio is lost in that less 1.
     log = np.where(ratio < 0.5, xlogy(ratio, ratio), xlog1py(ratio, np.maximum(ratio, 0.5) - 1.0))
     divergence = model * (log - (ratio - 1.0))
     excess = np.where(dark, 0.0, ratio) - 1.0

@@ -78,7 +78,9 @@ SYSTEMS = {
     "CDELT": PLAIN | {"CDELT1": -2e-5, "CDELT2": 3e-5},
     "CDELT and CROTA": PLAIN | {"CDELT1": -2e-5, "CDELT2": 2e-5, "CROTA2": 31.0},
     "PC": PLAIN | {"CDELT1": -2e-5, "CDELT2": 2e-5, "PC1_2": 0.1, "PC2_1": -0.1},
-    "SIP both ways": COORDINATES | {"CRPIX1": 12.0, "CRPIX2": 11.0, "AP_ORDER": 2, "BP_ORDER": 2, "AP_2_0": -1e-4},
+    "SIP both ways": COORDINATES | {
+        "CRPIX1": 12.0, "CRPIX2": 11.0, "AP_ORDER": 2, "BP_ORDER": 2, "AP_2_0": -1e-4,
+    },
     "TPV": PLAIN | {
         "CTYPE1": "RA---TPV", "CTYPE2": "DEC--TPV", "CD1_1": -1e-4, "CD2_2": 1e-4,
         "PV1_0": 0.0, "PV1_1": 1.0, "PV1_4": 0.01, "PV2_0": 0.0, "PV2_1": 1.0, "PV2_4": -0.01,
