@@ -310,16 +310,29 @@ class Scene:
         Raises
         ------
         InputError
-            Either has the wrong shape, a negative, masked or non-finite value.
+            Either has the wrong shape, a negative, masked or non-finite value; counts of the start
+            that are no number.
         """
         if star_fluxes is None:
             fluxes = self._rough_fit[0].copy()
         else:
             fluxes = _check_start("initial_star_fluxes", star_fluxes, (self.n_stars,)) / self.unit
         if extended is None:
-            return np.full(self.grid, self._rough_fit[1]), fluxes
+            level = self._rough_fit[1]
+            self._refuse_if_too_bright(level * math.prod(self.grid) + float(fluxes.sum()))
+            return np.full(self.grid, level), fluxes
         given = _check_start("initial_extended", extended, self.observation.sky_shape) / self.unit
+        self._refuse_if_too_bright(float(given.sum() + fluxes.sum()))
         return _lay(given, self.grid, fill=given.mean()), fluxes
+
+    def _refuse_if_too_bright(self, light: float) -> None:
+        """Refuse a start whose counts, in electrons, no number holds."""
+        most = self.weights.max() if self.weights is not None else 1.0
+        if not math.isfinite(light * float(most) * float(self.gains.max()) * self.scale):
+            raise InputError(
+                "what the images show in their shortest exposure is more, in the longest, than a "
+                "number holds: divide images and background by a constant"
+            )
 
     @cached_property
     def _rough_fit(self) -> tuple[Array, float]:

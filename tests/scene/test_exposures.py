@@ -368,3 +368,12 @@ def test_mu_too_large_is_refused_in_terms_of_what_was_given():
     made.deconvolve(observation, mu=0.99 * most, n_iter=1, **numpy_alone)
     with pytest.raises(lnocl.InputError):
         made.deconvolve(observation, mu=1.01 * most, n_iter=1, **numpy_alone)
+
+
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+def test_skies_that_no_number_holds_in_the_longest_exposure_are_refused(engine):
+    """Scaled to about 1 the start has 1e38; in electrons its objective is infinite."""
+    exposure = np.array([[[7.5, 1e40]]])
+    observation = lnocl.Observation([[[1e300, 7.0]]], [[[2.1]]], exposure=exposure)
+    with pytest.raises(lnocl.InputError, match="than a number holds: divide images"):
+        paper(observation, n_iter=1, engine=engine)
