@@ -15,8 +15,8 @@ pairs     two points 1 and 1.5 pixels apart, FWHM 1.5: their positions are sough
 extended  relative error of a spiral galaxy seen through a PSF of FWHM 1.3 pixels in 1, 4 and 9
           dithers, at four times the images' sampling: oversample 1, 2, 4, and drizzle with
           Richardson-Lucy, each at its best iteration and at that of held-out counts
-made      error of a fine PSF that --refine-psfs pixels makes of 4, 12 and 36 stars of one frame,
-          begun with a Gaussian: its images at 12 random places over the peak, the largest
+made      error of a fine PSF that --refine-psfs pixels makes of a Gaussian and 4, 12 or 36 stars
+          of one frame: the largest of its images at 12 random places, over the peak
 
 The images are made here, of profiles integrated over pixels at 16 x 16 points; those of the
 galaxy of a sky eight times as fine. No seed was tuned on.

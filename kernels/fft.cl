@@ -32,7 +32,7 @@
             : (n) == IMAGE_NX ? IMAGE_ROW_LAST \
             : (n) == NY       ? COLUMN_LAST    \
                               : IMAGE_COLUMN_LAST)
-#define MAX_OUTER 9
+#define MAX_OUTER MAX_ODD /* more than 8, the most where there is no odd pass */
 #define INNER(n) ((n) / OUTER(n))
 #define HAS_MIDDLE(n) (INNER(n) > LAST(n) && INNER(n) > CHUNK)
 #define SPAN_LENGTH(n) (HAS_MIDDLE(n) ? INNER(n) / 8 : INNER(n))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 import pyopencl as cl
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from lnocl.opencl.device import choose, context_of, describe
 from lnocl.opencl.faults import guarded
 from lnocl.opencl.launch import Launch, Launcher
-from lnocl.opencl.layout import Layout, PixelLayout, shortest_arc
+from lnocl.opencl.layout import Layout
 from lnocl.opencl.memory import Memory, Transfer, announce, refuse_if_too_large
 from lnocl.opencl.program import Program
 from lnocl.opencl.tuning import Tuning, describe_tuning
+from lnocl.opencl.windows import StarWindows
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
-from lnocl.scene.shifting import Stamp
-from lnocl.scene.stars import Lit, lit_box
+from lnocl.scene.stars import lit_box
 from lnocl.solvers.engine import State
 from lnocl.solvers.scaling import Scaling
 
@@ -97,7 +97,7 @@ class OpenCLEngine:
             min_model=MIN_MODEL,
         )
         self.layout = Layout(self.program)
-        self._stars = _Windows(
+        self._stars = StarWindows(
             self.layout.images, [scene.star_box(s) for s in range(scene.n_stars)]
         )
         self._cross = self._cross_windows()
@@ -148,9 +148,9 @@ class OpenCLEngine:
         counts = 2 * self.scene.observation.images.nbytes
         return counts + 2 * SNAPSHOTS * math.prod(self.scene.grid) * self.program.dtype.itemsize
 
-    def _cross_windows(self) -> _Windows:
+    def _cross_windows(self) -> StarWindows:
         stamps = self.scaling.cross_information if self.scaling is not None else []
-        return _Windows(self.layout, [lit_box([stamp], self.scene.grid) for stamp in stamps])
+        return StarWindows(self.layout, [lit_box([stamp], self.scene.grid) for stamp in stamps])
 
     def _sizes(self, n_iter: int) -> dict[str, int]:
         """Return the bytes of each buffer, by the name that the kernels have for it."""
@@ -488,48 +488,3 @@ class OpenCLEngine:
         self._bind("rfft_rows", pixels=self._memory.buffers["extended"])()
         self._bind("convolve_columns")()
         self._pending_objective = None
-
-
-class _Windows:
-    """The blocks of row pairs, and columns, in which arrays of stars are not 0: kernels/stars.cl.
-
-    Parameters
-    ----------
-    layout : PixelLayout
-        Of the arrays.
-    boxes : sequence of Lit
-        For each star the rows and columns that its arrays may reach into.
-    """
-
-    def __init__(self, layout: PixelLayout, boxes: Sequence[Lit]) -> None:
-        blocks = [layout.window(box.rows) for box in boxes]
-        columns = [shortest_arc(box.columns) for box in boxes]
-        self._layout = layout
-        self.corners = np.array(
-            [(block, x) for (block, _), (x, _) in zip(blocks, columns, strict=True)], np.int32
-        ).reshape(-1, 2)
-        self.n_blocks = max((count for _, count in blocks), default=1)
-        self.n_columns = max((count for _, count in columns), default=1)
-
-    @property
-    def n_blocks_of_all(self) -> int:
-        """Blocks of the windows of all stars."""
-        return len(self.corners) * self.n_blocks
-
-    @property
-    def bytes(self) -> int:
-        """Bytes of one array for each star."""
-        width = self._layout.grid[1]
-        return self.n_blocks_of_all * self._layout.block_bytes // width * self.n_columns
-
-    def cut(self, s: int, stamp: Stamp) -> Array:
-        """Return the pixels of a star's window, with a stamp in them."""
-        grid = self._layout.grid
-        block, column = self.corners[s]
-        first = self._layout.rows_of(int(block), 1)[0]
-        window = np.zeros((self._layout.rows_of(0, self.n_blocks).size, self.n_columns))
-        rows = (stamp.rows(grid) - first) % grid[0]
-        columns = (stamp.columns(grid) - column) % grid[1]
-        row_in, column_in = rows < window.shape[0], columns < window.shape[1]
-        window[np.ix_(rows[row_in], columns[column_in])] = stamp.values[np.ix_(row_in, column_in)]
-        return window

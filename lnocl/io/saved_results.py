@@ -16,6 +16,7 @@ from lnocl.errors import FileError
 from lnocl.io.fitsfile import FitsFile, open_fits
 from lnocl.io.headers import number, readable
 from lnocl.io.selection import has_pixels
+from lnocl.scene.detector import on_sky
 from lnocl.scene.observation import OVERSAMPLES
 
 Columns = dict[str, NDArray[np.float64]]
@@ -76,8 +77,8 @@ class SavedResult:
     @property
     def sky_stars(self) -> list[tuple[float, float]]:
         """Positions (x, y) of the stars, pixels of the extended source."""
-        q = self.oversample
-        return [(q * x + (q - 1) / 2.0, q * y + (q - 1) / 2.0) for x, y in self.stars]
+        places = on_sky(np.reshape(self.stars, (-1, 2)), self.oversample)
+        return [(x, y) for x, y in places.tolist()]
 
     @property
     def oversample(self) -> int:

@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import math
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from string import Template
@@ -99,9 +100,8 @@ def make_report(
 
 def frame_step(view: ResultView) -> int:
     """Return the side of the blocks in which the whole frame fits the page, pixels."""
-    n_bytes = BYTES_OF_IMAGE * view.shape[0] * view.shape[1] * len(view.images)
-    n_bytes += BYTES_OF_SOURCE * view.extended.size
-    return max(1, int(np.ceil(np.sqrt(n_bytes / FRAME_BYTES))))
+    each = BYTES_OF_IMAGE * len(view.images) + BYTES_OF_SOURCE
+    return max(1, int(np.ceil(np.sqrt(math.prod(view.shape) * each / FRAME_BYTES))))
 
 
 def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:

@@ -115,8 +115,8 @@ class Observation:
     Raises
     ------
     InputError
-        `oversample` is not 1, 2 or 4; an array has the wrong shape, type or unit, is empty, or
-        holds values out of range; an array
+        `oversample` is not 1, 2 or 4, or `effective_psfs` not True or False; an array has the
+        wrong shape, type or unit, is empty, or holds values out of range; an array
         other than `images` holds masked values; a PSF has no positive sum, or it or its sum is not
         finite, or its core is off its centre; images or background become infinite by exposure or
         read noise; no good pixel is left; an offset leaves nothing of an image.
@@ -159,7 +159,10 @@ class Observation:
         psf_modes: ArrayLike | None = None,
         psf_scatter: ArrayLike | None = None,
     ) -> None:
-        self.oversample, self.effective_psfs = _check_oversample(oversample), bool(effective_psfs)
+        self.oversample = _check_oversample(oversample)
+        if not isinstance(effective_psfs, (bool, np.bool_)):
+            raise InputError(f"effective_psfs must be True or False; {effective_psfs!r} was given")
+        self.effective_psfs = bool(effective_psfs)
         has_exposure = exposure is not None
         counts, are_rates = containers.counts("images", images, has_exposure)
         given, masked = values_and_mask("images", counts)

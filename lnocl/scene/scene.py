@@ -253,8 +253,8 @@ class Scene:
     def psf_stamp(self, j: int) -> Stamp:
         """Return the response of image j where it is not 0, the sky moved by the offset.
 
-        It is what the pixels of the image see of a source at the origin of the grid, each beginning
-        at one pixel of the sky: the PSF, its peak at the offset, where the sky is no finer.
+        Its value at a pixel of the sky is what a pixel of the image that begins there sees of a
+        source at the origin. Without oversampling it is the PSF with its peak at the offset.
         """
         return self._psfs[j].response(*self.observation.offsets[j])
 

@@ -14,7 +14,7 @@ import lnocl
 SHAPE = NY, NX = 16, 32
 FLUXES = np.array([1500.0, 900.0])
 # About three times what was measured after 30 iterations, extended source and star fluxes.
-TOLERANCES = {"double": (1.5e-14, 4e-15), "single": (4e-6, 6e-7)}
+TOLERANCES = {"double": (2.1e-14, 1.4e-15), "single": (1.5e-6, 1.1e-7)}
 
 
 class Made:
@@ -99,14 +99,15 @@ def test_steps_lower_the_objective_to_one_minimum(engine):
     """Both methods end where the gradient in every pixel of the sky is 0 or holds it at 0."""
     made = MADE[2]
     result = made.deconvolve(n_iter=300, solver="sgp", **engine)
-    assert (np.diff(result.history["objective"]) <= 1e-5).all()
+    assert (np.diff(result.history["objective"]) <= 0).all()
     x = np.append(result.extended.ravel(), result.star_fluxes)
     background = np.concatenate([made.background.ravel()] * 2)
     weights = (~made.mask).ravel()
     ratio = np.where(weights, made.images.ravel() / (made.matrix @ x + background) - 1.0, 0.0)
     gradient = -made.matrix.T @ ratio
+    # Measured 4.7e-4 and -0.002 at most, of ratios that scatter by 0.3.
     assert abs(gradient @ x) / x.sum() < 1e-3
-    assert gradient.min() > -0.02
+    assert gradient.min() > -0.006
 
 
 @pytest.mark.parametrize("engine", FEWER_ENGINES)

@@ -1,0 +1,57 @@
+"""The windows in which arrays of stars lie on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lnocl.opencl.layout import PixelLayout, shortest_arc
+from lnocl.scene.observation import Array
+from lnocl.scene.shifting import Stamp
+from lnocl.scene.stars import Lit
+
+
+class StarWindows:
+    """The blocks of row pairs, and columns, in which arrays of stars are not 0: kernels/stars.cl.
+
+    Parameters
+    ----------
+    layout : PixelLayout
+        Of the arrays.
+    boxes : sequence of Lit
+        For each star the rows and columns that its arrays may reach into.
+    """
+
+    def __init__(self, layout: PixelLayout, boxes: Sequence[Lit]) -> None:
+        blocks = [layout.window(box.rows) for box in boxes]
+        columns = [shortest_arc(box.columns) for box in boxes]
+        self._layout = layout
+        self.corners = np.array(
+            [(block, x) for (block, _), (x, _) in zip(blocks, columns, strict=True)], np.int32
+        ).reshape(-1, 2)
+        self.n_blocks = max((count for _, count in blocks), default=1)
+        self.n_columns = max((count for _, count in columns), default=1)
+
+    @property
+    def n_blocks_of_all(self) -> int:
+        """Blocks of the windows of all stars."""
+        return len(self.corners) * self.n_blocks
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of one array for each star."""
+        width = self._layout.grid[1]
+        return self.n_blocks_of_all * self._layout.block_bytes // width * self.n_columns
+
+    def cut(self, s: int, stamp: Stamp) -> Array:
+        """Return the pixels of a star's window, with a stamp in them."""
+        grid = self._layout.grid
+        block, column = self.corners[s]
+        first = self._layout.rows_of(int(block), 1)[0]
+        window = np.zeros((self._layout.rows_of(0, self.n_blocks).size, self.n_columns))
+        rows = (stamp.rows(grid) - first) % grid[0]
+        columns = (stamp.columns(grid) - column) % grid[1]
+        row_in, column_in = rows < window.shape[0], columns < window.shape[1]
+        window[np.ix_(rows[row_in], columns[column_in])] = stamp.values[np.ix_(row_in, column_in)]
+        return window
