@@ -8,6 +8,9 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+# Whether other processes like this one may share the devices of this machine.
+is_worker = False
+
 # One lock for all of it: threads that took one of several could wait for each other.
 LOCK = threading.RLock()
 # A process forked while another thread has it would wait for that thread forever.

@@ -235,6 +235,7 @@ class Result:
         progress: bool = False,
         earlier: Bootstrap | None = None,
         callback: Callable[[Bootstrap], None] | None = None,
+        parallel: bool | int | str = False,
     ) -> Bootstrap:
         """Return the errors of stars, regions, profiles and pixels, by replicas of this result.
 
@@ -262,6 +263,10 @@ class Result:
             all is bit for bit as if it had been computed at once.
         callback : callable, optional
             Is given the errors so far after each replica from the second on.
+        parallel : bool, int or "current-scheduler", optional
+            Where the replicas are computed (`lnocl.parallel.check_parallel`): one after the other
+            in this process; in as many processes as cores or so many; or by the workers of a
+            cluster of Dask. All give the same errors on the same kind of device.
 
         Raises
         ------
@@ -271,15 +276,17 @@ class Result:
         FileError
             The file of regions is missing, or holds none.
         LnoclError
-            The package regions is missing.
+            The package regions is missing, or Dask; the workers are lost.
         DeviceError
             As `lnocl.deconvolve`.
         """
         from lnocl.io.fitsread import sky_header
         from lnocl.io.regions import read_apertures, read_profiles
+        from lnocl.parallel import check_parallel
         from lnocl.runs.bootstrap import bootstrap, check_number
 
         check_number(n, seed)
+        check_parallel(parallel)
         shape = self._outcome.scene.observation.sky_shape
         if header is not None:
             header = sky_header(header, self._outcome.scene.oversample)
@@ -287,7 +294,7 @@ class Result:
         for given, read in ((regions, read_apertures), (profiles, read_profiles)):
             listed = given if isinstance(given, (str, os.PathLike)) else list(given)
             parts += read(listed, header, shape) if listed else []
-        return bootstrap(self._outcome, n, parts, seed, progress, earlier, callback)
+        return bootstrap(self._outcome, n, parts, seed, progress, earlier, callback, parallel)
 
     def plot(self) -> Figure:
         """Return a picture: image, model, residuals and extended source, whole and at each star.

@@ -10,6 +10,7 @@ import lnocl
 # Each room may import those above it in this list, never one of its own line or below.
 FLOORS = [
     {"errors", "process", "notebook", "kernels"},
+    {"parallel"},
     {"scene"},
     {"metrics", "residuals", "detection", "psf", "io", "reference", "solvers", "opencl"},
     {"simulation", "plotting"},

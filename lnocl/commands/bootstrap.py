@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lnocl.commands.options import option
+from lnocl.commands.options import PARALLEL, option
 from lnocl.scene.apertures import Profile
 
 if TYPE_CHECKING:
@@ -57,6 +57,10 @@ OPTIONS = [
         metavar="S",
         help="of the replicas, 0 or more (default: 0); the same seed gives the same errors",
     ),
+    PARALLEL.but(
+        help="replicas at once: a number of processes, or current-scheduler, the workers of the "
+        "scheduler of Dask that DASK_SCHEDULER_ADDRESS names (default: one after the other)"
+    ),
 ]
 
 
@@ -66,15 +70,22 @@ def check(arguments: argparse.Namespace) -> None:
     Raises
     ------
     InputError
-        A number of replicas below ten, a negative seed; regions or a seed without replicas.
+        A number of replicas below ten, a negative seed; regions, a seed or processes without
+        replicas.
+    LnoclError
+        Dask is missing.
     """
     from lnocl.errors import InputError
+    from lnocl.parallel import check_parallel
     from lnocl.runs.bootstrap import check_number
 
+    check_parallel(arguments.parallel)
     if arguments.bootstrap is None:
-        if any(getattr(arguments, name) is not None for name in ("regions", "profiles", "seed")):
+        given = [getattr(arguments, name) for name in ("regions", "profiles", "seed")]
+        if any(each is not None for each in given) or arguments.parallel:
             raise InputError(
-                "regions, profiles and seed are for replicas: give --bootstrap 50 with them"
+                "regions, profiles, seed and parallel are for replicas: give --bootstrap 50 with "
+                "them"
             )
         return
     check_number(arguments.bootstrap, arguments.seed or 0)
@@ -141,7 +152,14 @@ def add_errors(
     earlier = _earlier(path, expected, frames) if continues else None
     try:
         found = bootstrap(
-            outcome, arguments.bootstrap, parts, seed, not arguments.quiet, earlier, look
+            outcome,
+            arguments.bootstrap,
+            parts,
+            seed,
+            not arguments.quiet,
+            earlier,
+            look,
+            arguments.parallel,
         )
     finally:
         if latest:

@@ -47,7 +47,8 @@ def solve(arguments: argparse.Namespace, interrupts: checkpoints.Interrupts) -> 
     parts = bootstrap.read(arguments, frames)
     result = deconvolve(
         frames.observation,
-        **_parameters(given),
+        # Each process that makes replicas takes a device of its own, unless one was named.
+        **_parameters(given | {"device": arguments.device}),
         progress=not arguments.quiet,
         callback=interrupts.callback,
     )

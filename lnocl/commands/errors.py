@@ -57,6 +57,7 @@ def _run(arguments: argparse.Namespace) -> None:
         if getattr(arguments, name) is not None:
             setattr(run, name, os.path.abspath(getattr(arguments, name)))
     run.bootstrap = bootstrap.DEFAULT if run.bootstrap is None else run.bootstrap
+    run.parallel = arguments.parallel
     run.quiet, path = arguments.quiet, os.path.abspath(arguments.result)
     bootstrap.check(run)
     try:

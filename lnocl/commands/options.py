@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lnocl.io.names import file_of
+from lnocl.parallel import CURRENT
 
 # The values for which a switch is on the command line.
 SWITCHES = {"store_true": True, "store_false": False}
@@ -173,6 +174,23 @@ def position(text: str) -> tuple[float, float]:
     return x, y
 
 
+def processes(text: str) -> int | str:
+    """Return a number of processes, or the name of what `lnocl.parallel` knows.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        A text that is neither.
+    """
+    if text == CURRENT:
+        return text
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is neither a number of processes, 1 or more, nor {CURRENT}"
+        )
+    return int(text)
+
+
 IMAGES = option(
     "images",
     nargs="+",
@@ -243,6 +261,13 @@ QUIET = option(
 )
 
 
+PARALLEL = option(
+    "--parallel",
+    type=processes,
+    default=False,
+    metavar="N",
+    is_repeated=False,
+)
 PICTURE = option(
     "--plot",
     metavar="FILE.png",

@@ -9,8 +9,9 @@ from typing import NamedTuple, TypeVar
 
 import pyopencl as cl
 
+from lnocl import process
 from lnocl.errors import DeviceError, InputError
-from lnocl.opencl import kernel_cache
+from lnocl.opencl import kernel_cache, sharing
 from lnocl.opencl.faults import after_fault, claim_process
 
 T = TypeVar("T")
@@ -44,6 +45,8 @@ def find_devices() -> list[cl.Device]:
 def choose(spec: str | None = None) -> Choice:
     """Choose a device: that of `spec`, else of PYOPENCL_CTX, else the first GPU, else CPU.
 
+    Worker processes of one machine take its GPUs in turn.
+
     Parameters
     ----------
     spec : str, optional
@@ -62,10 +65,17 @@ def choose(spec: str | None = None) -> Choice:
         return Choice(_by_spec(spec, "device"), f"asked for as {spec!r}")
     if environment := os.environ.get("PYOPENCL_CTX"):
         return Choice(_by_spec(environment, "PYOPENCL_CTX"), f"PYOPENCL_CTX is {environment!r}")
-    for kind, name in ((cl.device_type.GPU, "GPU"), (cl.device_type.CPU, "CPU")):
-        for device in devices:
-            if device.type & kind:
-                return Choice(device, f"the first {name}")
+    gpus = [device for device in devices if device.type & cl.device_type.GPU]
+    # Another platform may have the same ones under other names.
+    like = [device for device in gpus if device.platform == gpus[0].platform]
+    if process.is_worker and len(like) > 1:
+        number = sharing.claim(len(like))
+        return Choice(like[number], f"GPU {number + 1} of {len(like)}, shared among processes")
+    if gpus:
+        return Choice(gpus[0], "the first GPU")
+    for device in devices:
+        if device.type & cl.device_type.CPU:
+            return Choice(device, "the first CPU")
     return Choice(devices[0], "the first device, neither GPU nor CPU")
 
 

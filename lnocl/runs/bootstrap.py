@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError
+from lnocl.parallel import work
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.progress import make_bar
-from lnocl.runs.replicas import Replica, Replicas, Sky
+from lnocl.runs.replicas import Replicas, Sky
 from lnocl.scene.apertures import FLUX, FWHM, LENGTH, Aperture, Label, Profile
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
@@ -197,6 +200,7 @@ def bootstrap(
     progress: bool = False,
     earlier: Bootstrap | None = None,
     look: Callable[[Bootstrap], None] | None = None,
+    parallel: bool | int | str = False,
 ) -> Bootstrap:
     """Return the errors of a reconstruction by n replicas, of which some may be there already.
 
@@ -216,6 +220,8 @@ def bootstrap(
         Replicas of the same reconstruction, measured alike; n of them and the others in all.
     look : callable, optional
         Is given the errors so far after each replica from the second on.
+    parallel : bool, int or "current-scheduler", optional
+        As for `lnocl.parallel.check_parallel`.
 
     Raises
     ------
@@ -227,11 +233,14 @@ def bootstrap(
     if earlier is not None:
         _refuse_other(earlier, found)
         found = earlier
-    replicas = Replicas(outcome, seed)
-    with make_bar(n, "replica", progress) as bar:
+    make = partial(_Measuring, outcome, parts, seed, found.resolution)
+    with (
+        make_bar(n, "replica", progress) as bar,
+        closing(work(make, range(found.n, n), parallel)) as measured,
+    ):
         bar.update(found.n)
-        for k in range(found.n, n):
-            found = _with(found, outcome, parts, replicas.reconstruct(k))
+        for each in measured:
+            found = _with(found, each)
             bar.update()
             if look is not None and found.n > 1:
                 look(found)
@@ -266,24 +275,43 @@ def check_number(n: object, seed: object) -> None:
         raise InputError(f"seed must be a whole number, 0 or more; {seed} was given")
 
 
-def _with(found: Bootstrap, outcome: Outcome, parts: Sequence[Part], replica: Replica) -> Bootstrap:
-    """Return the errors with those of one replica more."""
-    from scipy.ndimage import gaussian_filter
+class _Measured(NamedTuple):
+    """Errors in a replica: of the quantities, those that PSFs add, and of the smoothed pixels."""
 
-    moves = outcome.given_stars is not None
-    drawn, seen = (_measure(sky, parts, moves) for sky in replica[:2])
-    last, of_psfs = replica.found, np.zeros((0, len(seen)))
-    if replica.found_with_psfs is not None:
-        last = replica.found_with_psfs
-        of_psfs = (_measure(last, parts, moves) - seen)[None]
-        seen = seen + of_psfs[0]
-    width = found.resolution / FWHM
-    pixels = gaussian_filter(last.extended - replica.drawn.extended, width, mode="nearest")
+    errors: Array
+    of_psfs: Array
+    pixels: Array
+
+
+class _Measuring:
+    """Makes a replica by its number, and measures it."""
+
+    def __init__(self, outcome: Outcome, parts: Sequence[Part], seed: int, width: float) -> None:
+        self._moves, self._parts, self._width = outcome.given_stars is not None, parts, width
+        self._replicas = Replicas(outcome, seed)
+
+    def __call__(self, k: int) -> _Measured:
+        from scipy.ndimage import gaussian_filter
+
+        replica = self._replicas.reconstruct(k)
+        drawn, seen = (_measure(sky, self._parts, self._moves) for sky in replica[:2])
+        last, of_psfs = replica.found, np.zeros((0, len(seen)))
+        if replica.found_with_psfs is not None:
+            last = replica.found_with_psfs
+            of_psfs = (_measure(last, self._parts, self._moves) - seen)[None]
+            seen = seen + of_psfs[0]
+        pixels = last.extended - replica.drawn.extended
+        smooth = gaussian_filter(pixels, self._width / FWHM, mode="nearest")
+        return _Measured((seen - drawn)[None], of_psfs, smooth)
+
+
+def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
+    """Return the errors with those of one replica more."""
     return replace(
         found,
-        errors=np.concatenate([found.errors, (seen - drawn)[None]]),
-        of_psfs=np.concatenate([found.of_psfs, of_psfs]),
-        sums=found.sums + np.array([pixels, pixels**2]),
+        errors=np.concatenate([found.errors, measured.errors]),
+        of_psfs=np.concatenate([found.of_psfs, measured.of_psfs]),
+        sums=found.sums + np.array([measured.pixels, measured.pixels**2]),
     )
 
 

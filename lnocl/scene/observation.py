@@ -188,6 +188,15 @@ class Observation:
         for values in self._arrays().values():
             values.flags.writeable = False
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes; one PSF for all images stays one where pickle would copy it."""
+        is_shared = self.psfs.strides[0] == 0
+        return {**vars(self), "psfs": self.psfs[:1] if is_shared else self.psfs}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.psfs = np.broadcast_to(self.psfs, (self.n_images, *self.psfs.shape[1:]))
+
     @property
     def n_images(self) -> int:
         """Number of images, p."""

@@ -1,5 +1,6 @@
 """Choosing a device, and what is said where there is none or it cannot do what is asked."""
 
+import os
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -11,8 +12,9 @@ from scenes import blur, paper
 from scipy.special import kl_div
 
 import lnocl
+from lnocl import process
 from lnocl.engines import opencl
-from lnocl.opencl import device, program
+from lnocl.opencl import device, program, sharing
 from lnocl.scene.scene import MIN_MODEL
 
 GPU = SimpleNamespace(name="Fast GPU", type=cl.device_type.GPU)
@@ -78,6 +80,60 @@ def test_specification_finds_the_device_again(machine):
     machine.insert(0, SimpleNamespace(name="Empty", get_devices=list))
     for each in (CPU, SECOND_CPU, GPU):
         assert device.choose(device.spec_of(each)).device is each
+
+
+def test_workers_take_the_gpus_of_a_platform_in_turn(machine, monkeypatch):
+    second = SimpleNamespace(name="Fast GPU", type=GPU.type, platform=machine[1])
+    machine[1].get_devices = lambda: [GPU, second]
+    again = SimpleNamespace(name="Same GPU", get_devices=lambda: [other])
+    other = SimpleNamespace(name="Fast GPU", type=GPU.type, platform=again)
+    machine.append(again)
+    claimed = []
+    monkeypatch.setattr(sharing, "claim", lambda n: claimed.append(n) or 1)
+    assert device.choose().device is GPU
+    assert not claimed
+    monkeypatch.setattr(process, "is_worker", True)
+    assert device.choose().device is second
+    assert device.choose().reason == "GPU 2 of 2, shared among processes"
+    assert claimed == [2, 2]
+    assert device.choose("1:0").device is GPU
+    machine[1].get_devices = lambda: [GPU]
+    assert device.choose().device is GPU
+
+
+CLAIM = """
+import sys
+from lnocl.opencl import sharing
+print(sharing.claim(2), sharing.claim(2), flush=True)
+sys.stdin.read()
+"""
+
+
+def test_processes_claim_devices_that_the_fewest_others_have(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    started = []
+
+    def claimed():
+        pipe = subprocess.PIPE
+        started.append(subprocess.Popen([sys.executable, "-c", CLAIM], stdin=pipe, stdout=pipe))
+        return started[-1].stdout.readline().split()
+
+    try:
+        assert [claimed() for _ in range(3)] == [[b"0"] * 2, [b"1"] * 2, [b"0"] * 2]
+        started[1].kill()
+        started[1].wait()
+        assert claimed() == [b"1"] * 2
+    finally:
+        for each in started:
+            each.kill()
+            each.communicate()
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path, monkeypatch):
+    (tmp_path / f"lnocl-devices-{os.getuid()}").write_text("")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(lnocl.DeviceError, match=r"devices cannot be shared .*; give device"):
+        sharing.claim.__wrapped__(2)
 
 
 def test_no_platform(monkeypatch):

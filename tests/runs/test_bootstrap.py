@@ -159,6 +159,20 @@ def test_replicas_are_continued_bit_for_bit():
     np.testing.assert_array_equal(continued.error_map, at_once.error_map)
 
 
+def test_processes_give_the_replicas_bit_for_bit():
+    """With one PSF for all images, whose error they share in the workers too."""
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    made = dataclasses.replace(BASE, n_images=3).make()
+    one = made.psfs[0] / made.psfs[0].sum()
+    result = lnocl.deconvolve(
+        made.observation(psfs=one, psf_scatter=1e-4 * one), made.stars, stop=None, n_iter=4,
+        smoothing=1e-3, pad=0,
+    )  # fmt: skip
+    here, there = (result.bootstrap(10, parallel=parallel) for parallel in (False, 2))
+    for name in ("errors", "of_psfs", "sums"):
+        np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
+
+
 def made_up(errors, value=10.0):
     errors = np.asarray(errors, float).reshape(-1, 1)
     pixels = np.stack([errors.sum() * np.ones((2, 2)), (errors**2).sum() * np.ones((2, 2))])

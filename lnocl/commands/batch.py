@@ -1,0 +1,320 @@
+"""The command ``batch``: deconvolve each row of a table, and sum up what became of them."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from lnocl.commands import deconvolve, environment, messages, options, pictures, running
+from lnocl.commands.options import option
+from lnocl.commands.parser import Command
+from lnocl.commands.targets import Target, read_targets
+from lnocl.errors import FileError, LnoclError, counted
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+SUMMARY = "summary.ecsv"
+# Seconds between two writings of the summary.
+WRITE_EVERY = 10.0
+
+WAITING, STARTED, DONE, FAILED = "waiting", "started", "done", "failed"
+
+
+def _part(text: str) -> tuple[int, int]:
+    """Return the numbers of ``I/N``.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        A text that is not two whole numbers, 1 <= I <= N.
+    """
+    try:
+        i, n = map(int, text.split("/"))
+    except ValueError:
+        i, n = 0, 0
+    if not 1 <= i <= n:
+        raise argparse.ArgumentTypeError(f"{text!r} is not I/N with 1 <= I <= N")
+    return i, n
+
+
+OPTIONS = [
+    option(
+        "targets",
+        metavar="TARGETS",
+        is_input=True,
+        help="table, .ecsv, .csv or .fits, with a row a target; its columns are named as the "
+        "options of lnocl deconvolve (images, psf, star, background, ...), and name, that of the "
+        "outputs; several values are separated by blanks",
+    ),
+    option(
+        "-o",
+        "--output",
+        required=True,
+        metavar="DIR",
+        help=f"folder for NAME.fits, NAME.log and NAME.json of each target, and {SUMMARY}; "
+        "targets that are done there with the same row are not done again",
+    ),
+    options.OVERWRITE.but(help="do all targets anew, and replace files in DIR"),
+    options.PARALLEL.but(
+        help="targets at once: a number of processes, or current-scheduler, the workers of the "
+        "scheduler of Dask that DASK_SCHEDULER_ADDRESS names (default: one after the other)"
+    ),
+    option(
+        "--array",
+        type=_part,
+        metavar="I/N",
+        help="do each N-th target from the I-th, counted from 1: for job arrays",
+    ),
+    options.PICTURE.but(help="picture of the extended source of each target that is done"),
+    options.QUIET,
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """What became of a target: a row of the summary, and its file NAME.json."""
+
+    name: str
+    status: str
+    message: str = ""
+    n_iter: int = 0
+    stopped: str = ""
+    warnings: int = 0
+    seconds: float = 0.0
+    device: str = ""
+    process: str = ""
+    command: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Folder:
+    """The folder of the outputs."""
+
+    path: str
+
+    def file(self, name: str, ending: str) -> str:
+        """Return the path of an output of a target."""
+        return os.path.join(self.path, name + ending)
+
+    def read(self, name: str) -> Record | None:
+        """Return the record of a target, where it has one."""
+        try:
+            with open(self.file(name, ".json"), encoding="utf-8") as file:
+                return Record(**json.load(file))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError) as error:
+            raise FileError(
+                f"{self.file(name, '.json')} is no record of a target: {error}; remove it"
+            ) from error
+
+    def write(self, record: Record) -> None:
+        """Write the record of a target."""
+        from lnocl.io.atomic import write_text
+
+        text = json.dumps(dataclasses.asdict(record), indent=1)
+        write_text(self.file(record.name, ".json"), text + "\n", overwrite=True)
+
+    def fault(self, target: Target, overwrite: bool) -> str:
+        """Return why a target must not be done; empty where it may."""
+        record = self.read(target.name)
+        if target.fault or overwrite or (record is not None and record.command == target.command):
+            return target.fault
+        output = self.file(target.name, ".fits")
+        if record is not None:
+            return f"{output} is of another command than its row gives; take --overwrite"
+        return f"{output} exists; take --overwrite" if os.path.exists(output) else ""
+
+    def is_done(self, target: Target) -> bool:
+        """Return whether a target is done, by the command of its row."""
+        record = self.read(target.name)
+        return (
+            record is not None
+            and (record.status, record.command) == (DONE, target.command)
+            and os.path.exists(self.file(target.name, ".fits"))
+        )
+
+
+def _make_worker(folder: Folder, start: str) -> Callable[[Target], Record]:
+    """Return what does a target; `start` is the folder in which its command is run."""
+    environment.prepare()
+    return partial(_do, folder, start)
+
+
+def _do(folder: Folder, start: str, target: Target) -> Record:
+    """Deconvolve a target, with its log and its record; return that."""
+    command = target.command
+    process = f"{socket.gethostname()}:{os.getpid()}"
+    folder.write(Record(target.name, STARTED, process=process, command=command))
+    output, said = folder.file(target.name, ".fits"), io.StringIO()
+    words = ["deconvolve", *target.words, "-o", output, "--overwrite"]
+    begun = time.perf_counter()
+    with (
+        contextlib.chdir(start),
+        contextlib.redirect_stdout(said),
+        contextlib.redirect_stderr(said),
+    ):
+        status = running.run({"deconvolve": deconvolve.COMMAND}, words)
+    if status >= 128:  # Ctrl-C, or the end of the process
+        raise KeyboardInterrupt
+    record = Record(
+        target.name,
+        FAILED if status else DONE,
+        seconds=round(time.perf_counter() - begun, 3),
+        process=process,
+        command=command,
+    )
+    record = dataclasses.replace(record, **_found(said.getvalue(), output, status))
+    _write_log(folder, record, said.getvalue())
+    folder.write(record)
+    return record
+
+
+def _found(said: str, output: str, status: int) -> dict[str, Any]:
+    """Return what the record has of the outcome."""
+    lines = said.splitlines()
+    errors = [line.partition("error: ")[2] for line in lines if line.startswith("lnocl: error: ")]
+    warnings = sum(line.startswith("lnocl: warning: ") for line in lines)
+    if status:
+        return {"message": errors[-1] if errors else f"exit status {status}", "warnings": warnings}
+    from astropy.io import fits
+
+    header = fits.getheader(output)
+    return {
+        "n_iter": header["NITER"],
+        "stopped": header["STOPPED"],
+        "device": header["DEVICE"],
+        "warnings": warnings,
+    }
+
+
+def _write_log(folder: Folder, record: Record, said: str) -> None:
+    from lnocl.io.atomic import write_text
+
+    write_text(folder.file(record.name, ".log"), f"$ {record.command}\n{said}", overwrite=True)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from lnocl.io import atomic
+    from lnocl.parallel import check_parallel
+    from lnocl.runs.progress import make_bar
+
+    check_parallel(arguments.parallel)
+    targets = read_targets(arguments.targets)
+    atomic.check_folder(arguments.output, overwrite=True)
+    pictures.check(arguments, [arguments.targets])
+    folder = Folder(os.path.abspath(arguments.output))
+    i, n = arguments.array or (1, 1)
+    own = targets[i - 1 :: n]
+    faults = {each.name: folder.fault(each, arguments.overwrite) for each in own}
+    is_old = {each.name: not arguments.overwrite and folder.is_done(each) for each in own}
+    due = [each for each in own if not (faults[each.name] or is_old[each.name])]
+    refused = {
+        each.name: Record(each.name, FAILED, faults[each.name], command=each.command)
+        for each in own
+        if faults[each.name]
+    }
+    written = time.monotonic()
+    with make_bar(len(due), "target", not arguments.quiet) as bar:
+        for record in _records(folder, due, arguments.parallel):
+            bar.update()
+            bar.set_postfix_str(f"{record.name} {record.status}")
+            if time.monotonic() - written > WRITE_EVERY:
+                _write_summary(folder, targets, refused)
+                written = time.monotonic()
+    summary = _write_summary(folder, targets, refused)
+    if not arguments.quiet:
+        messages.say(_said(summary, sum(is_old.values()), folder))
+    if arguments.plot is not None:
+        from lnocl.plotting.batch import draw_batch
+
+        done = [each.name for each in targets if folder.is_done(each)]
+        line = pictures.draw(
+            arguments, draw_batch({name: folder.file(name, ".fits") for name in done})
+        )
+        if not arguments.quiet:
+            messages.say([line])
+    _explain_failures(summary, own, folder)
+
+
+def _records(
+    folder: Folder, targets: Sequence[Target], parallel: bool | int | str
+) -> Iterator[Record]:
+    """Yield the record of each target as it is done."""
+    from lnocl.parallel import work
+
+    if not targets:
+        return
+    make = partial(_make_worker, folder, os.getcwd())
+
+    def give_up(target: Target, why: str) -> Record:
+        record = Record(target.name, FAILED, why, command=target.command)
+        folder.write(record)
+        return record
+
+    with closing(work(make, targets, parallel, give_up)) as records:
+        yield from records
+
+
+def _write_summary(folder: Folder, targets: Sequence[Target], refused: dict[str, Record]) -> Table:
+    """Write what became of all targets, those of other processes too, and return it."""
+    from astropy.table import Table
+
+    from lnocl.io.atomic import write_text
+
+    records = [
+        refused.get(each.name)
+        or folder.read(each.name)
+        or Record(each.name, WAITING, command=each.command)
+        for each in targets
+    ]
+    summary = Table([dataclasses.asdict(each) for each in records])
+    summary["seconds"].unit = "s"
+    text = io.StringIO()
+    summary.write(text, format="ascii.ecsv")
+    write_text(os.path.join(folder.path, SUMMARY), text.getvalue(), overwrite=True)
+    return summary
+
+
+def _said(summary: Table, n_old: int, folder: Folder) -> list[str]:
+    """Return what to say of the targets."""
+    statuses = summary["status"].tolist()
+    counts = ", ".join(
+        f"{statuses.count(each)} {each}"
+        for each in (DONE, FAILED, STARTED, WAITING)
+        if each in statuses
+    )
+    before = f" ({n_old} of them before)" if n_old else ""
+    return [
+        f"{counted(len(summary), 'target')}: {counts}{before}",
+        f"written to {os.path.join(folder.path, SUMMARY)}",
+    ]
+
+
+def _explain_failures(summary: Table, own: Sequence[Target], folder: Folder) -> None:
+    """Raise an error where targets of this process have failed."""
+    names = {each.name for each in own}
+    failed = [row for row in summary if row["status"] == FAILED and row["name"] in names]
+    if failed:
+        raise LnoclError(
+            f"{counted(len(failed), 'target')} of {len(own)} failed, the first, "
+            f"{failed[0]['name']}: {failed[0]['message']}"
+        )
+
+
+COMMAND = Command(
+    "deconvolve many targets, each a row of a table, and sum up what became of them",
+    {"": OPTIONS},
+    _run,
+)

@@ -1,0 +1,65 @@
+"""Running a command line: its parser, and what becomes of errors, warnings and signals."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+from lnocl import __version__
+from lnocl.commands import messages
+from lnocl.commands.parser import Command, Parser
+from lnocl.commands.signals import ENDING, Terminated, first_handled, terminate
+from lnocl.errors import InputError, LnoclError, LnoclWarning
+
+FAILED = 1
+INTERRUPTED = 130
+
+
+def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
+    """Run a command line, and return its exit status: that of `lnocl.commands.cli.main`.
+
+    Parameters
+    ----------
+    commands : mapping of str to Command
+        The subcommands, in the order of the help.
+    words : sequence of str
+        The command line without the program's name.
+    """
+    flags: dict[str, str] = {}
+    try:
+        with first_handled(ENDING, terminate), warnings.catch_warnings():
+            warnings.simplefilter("always", LnoclWarning)
+            warnings.showwarning = partial(messages.show_warning, flags)
+            parsed = _make_parser(commands).parse_args(words)
+            flags |= parsed.command.flags(words)
+            parsed.command.run(parsed)
+    except InputError as error:
+        return messages.fail(messages.in_shell(str(error), flags), error.exit_status)
+    except LnoclError as error:
+        return messages.fail(str(error), error.exit_status)
+    except MemoryError:
+        return messages.fail("not enough memory; cut the images, or give fewer at a time", FAILED)
+    except Terminated as error:
+        return messages.fail("terminated", 128 + error.args[0])
+    except KeyboardInterrupt:
+        return messages.fail("interrupted", INTERRUPTED)
+    except OSError as error:
+        return messages.fail(str(error), FAILED)
+    return 0
+
+
+def _make_parser(commands: Mapping[str, Command]) -> Parser:
+    parser = Parser(
+        prog="lnocl",
+        description="Multi-component Richardson-Lucy deconvolution of astronomical images.",
+        epilog="Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 129 or 143 "
+        "terminated.",
+    )
+    parser.add_argument("--version", action="version", version=f"lnocl {__version__}")
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for name, command in commands.items():
+        subparser = subparsers.add_parser(name, help=command.summary, description=command.summary)
+        command.add_arguments(subparser)
+        subparser.set_defaults(command=command)
+    return parser

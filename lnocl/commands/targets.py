@@ -1,0 +1,167 @@
+"""Tables of targets: a row is a command line of ``lnocl deconvolve``."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections import Counter
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from lnocl.commands import deconvolve
+from lnocl.commands.options import SWITCHES, Option
+from lnocl.errors import FileError, InputError
+from lnocl.io.names import file_of
+
+if TYPE_CHECKING:
+    from astropy.table import Row, Table
+
+# The formats of tables, by their endings, as astropy names them.
+FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
+NAME = "name"
+# What the batch gives itself.
+OWN = ("output", "overwrite", "quiet", "resume", "checkpoint", "parallel")
+YES, NO = ("true", "yes", "1"), ("false", "no", "0", "")
+
+
+class Target(NamedTuple):
+    """A row of a table of targets.
+
+    Attributes
+    ----------
+    name : str
+        Its outputs are called so.
+    words : tuple of str
+        The command line but for its output.
+    fault : str
+        Why there is no command line; else empty.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    fault: str = ""
+
+    @property
+    def command(self) -> str:
+        """What would be typed for it, but for the output."""
+        return shlex.join(["lnocl", "deconvolve", *self.words])
+
+
+def read_targets(path: str) -> list[Target]:
+    """Return the targets of a table, in its order.
+
+    Parameters
+    ----------
+    path : str
+        ECSV, CSV or FITS, by its ending. Columns are named as the options of ``lnocl deconvolve``,
+        with images for its images, and name for that of the outputs, by default that of the first
+        image. Several values of an option are separated by blanks, as in a shell; an empty cell
+        gives none. An option that takes no value is true or false.
+
+    Raises
+    ------
+    FileError
+        The file cannot be read.
+    InputError
+        Its ending is another; it has no row, or no column of images; a column is no option; two
+        targets have one name.
+    """
+    table = _read(path)
+    options = _options_of(path, table)
+    targets = [_target(row, options) for row in table]
+    if not targets:
+        raise InputError(f"{path} has no row; give one a target")
+    [(name, count)] = Counter(target.name for target in targets).most_common(1)
+    if count > 1:
+        raise InputError(
+            f"{path} has {count} targets called {name!r}, whose outputs would replace each other: "
+            "give a column name that differs"
+        )
+    return targets
+
+
+def _read(path: str) -> Table:
+    from astropy.table import Table
+
+    ending = next((end for end in FORMATS if path.lower().endswith(end)), None)
+    if ending is None:
+        raise InputError(f"{path} is no table of targets; its name ends in {', '.join(FORMATS)}")
+    try:
+        return Table.read(path, format=FORMATS[ending])
+    except FileNotFoundError as error:
+        raise FileError(f"{path} does not exist") from error
+    except Exception as error:  # of its readers, which raise any
+        raise FileError(f"{path} cannot be read as a table: {error}") from error
+
+
+def _options_of(path: str, table: Table) -> dict[str, Option]:
+    """Return the option of each column but that of names."""
+    known = {
+        _plain(each.flags[-1]): each for each in deconvolve.ALL_OPTIONS if each.name not in OWN
+    }
+    options = {}
+    for column in table.colnames:
+        if column == NAME:
+            continue
+        if _plain(column) not in known:
+            raise InputError(
+                f"column {column!r} of {path} is no option that a target may have; columns are "
+                "called name or as options of lnocl deconvolve: images, psf, star, background, ..."
+            )
+        options[column] = known[_plain(column)]
+    if not any(each.name == "images" for each in options.values()):
+        raise InputError(f"{path} has no column images; give the files of each target there")
+    return options
+
+
+def _plain(flag: str) -> str:
+    return flag.lstrip("-").replace("_", "-").lower()
+
+
+def _target(row: Row, options: dict[str, Option]) -> Target:
+    name, words, fault = "", [], ""
+    try:
+        for column, option in options.items():
+            values = _values(row[column], option)
+            words += option.words(values)
+            if option.name == "images" and isinstance(values, list) and values:
+                name = os.path.basename(file_of(values[0])).partition(".")[0]
+    except ValueError as error:
+        fault = str(error)
+    if NAME in row.colnames and (given := _text(row[NAME])):
+        name = given
+    if not name or name != os.path.basename(name) or name.startswith("."):
+        fault = fault or f"its name {name!r} cannot be that of a file; give another in column name"
+        name = f"row{row.index + 1}"
+    return Target(name, tuple(words), fault)
+
+
+def _values(cell: Any, option: Option) -> bool | list[str] | None:
+    """Return the value of an option, as `Option.words` takes it."""
+    text = _text(cell)
+    action = option.keywords.get("action")
+    if action in SWITCHES:
+        if text.lower() not in (*YES, *NO):
+            raise ValueError(f"{option.flags[-1]} is true or false; {text!r} was given")
+        is_set: bool = SWITCHES[action]
+        return is_set if text.lower() in YES else not is_set
+    if not text:
+        return None
+    takes_several = action == "append" or option.keywords.get("nargs") in ("+", "*")
+    return shlex.split(text) if takes_several else [text]
+
+
+def _text(cell: Any) -> str:
+    """Return a cell as it is typed; arrays are several values."""
+    if cell is np.ma.masked:
+        return ""
+    if isinstance(cell, bytes):
+        cell = cell.decode(errors="replace")
+    if isinstance(cell, np.ndarray):
+        return " ".join(map(_text, cell))
+    if isinstance(cell, np.generic):
+        cell = cell.item()
+    if isinstance(cell, float) and not np.isfinite(cell):
+        return ""
+    return str(cell).strip()

@@ -1,0 +1,247 @@
+"""Independent tasks, in this process one after the other or in processes of Dask."""
+
+from __future__ import annotations
+
+import os
+import threading
+import uuid
+import warnings
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+from lnocl import process
+from lnocl.errors import InputError, LnoclError, counted
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+Task = TypeVar("Task")
+Answer = TypeVar("Answer")
+# Returns the function that does a task; each process calls it once, and holds what it returns.
+Maker = Callable[[], Callable[[Task], Answer]]
+Said = list[tuple[type[Warning], str]]
+
+CURRENT = "current-scheduler"
+# Times in a row that tasks are sent anew although none was done since the last time.
+MAX_FRUITLESS = 5
+# Seconds to wait for a scheduler that is gone, and for its workers.
+PATIENCE = 60.0
+
+
+def check_parallel(parallel: object) -> None:
+    """Refuse what says nothing of processes, and processes without Dask.
+
+    Parameters
+    ----------
+    parallel : bool, int or "current-scheduler"
+        False: this process. True: as many processes of this machine as it has cores, or so many;
+        they end with the work. "current-scheduler": the workers of the client of Dask that is
+        current, or else of the scheduler that its setting ``scheduler-address`` names.
+
+    Raises
+    ------
+    InputError
+        It is something else.
+    LnoclError
+        Dask is not installed.
+    """
+    is_number = isinstance(parallel, int) and (isinstance(parallel, bool) or parallel >= 1)
+    if not (is_number or (isinstance(parallel, str) and parallel == CURRENT)):
+        raise InputError(
+            f"parallel must be True, False, a number of processes or {CURRENT!r}; {parallel!r} "
+            "was given"
+        )
+    if parallel is False:
+        return
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise LnoclError(
+            "parallel needs Dask; install it with: pip install 'lnocl[dask]'"
+        ) from None
+
+
+def work(
+    make: Maker[Task, Answer],
+    tasks: Iterable[Task],
+    parallel: bool | int | str = False,
+    instead: Callable[[Task, str], Answer] | None = None,
+) -> Generator[Answer]:
+    """Yield the answer to each task, in the order of the tasks.
+
+    Tasks whose worker or connection is lost are done again. Warnings of a worker are given here,
+    each once. Where the iteration is ended early, the tasks that are left are cancelled.
+
+    Parameters
+    ----------
+    make : callable
+        Returns the function that does a task. Each process calls it once, so that programs and
+        buffers last from task to task. It can be pickled, like the tasks and the answers.
+    tasks : iterable
+        What to do.
+    parallel : bool, int or "current-scheduler", optional
+        As for `check_parallel`. This process does one after the other.
+    instead : callable, optional
+        Returns the answer to a task that has ended one worker after the other, given why.
+
+    Raises
+    ------
+    InputError, LnoclError
+        As `check_parallel`; there is no current client; there is no worker, or they are lost again
+        and again; a task ends them, and there is no other answer.
+    """
+    check_parallel(parallel)
+    if parallel is False:
+        do = make()
+        yield from map(do, tasks)
+        return
+    early: dict[int, Answer] = {}
+    n_given = 0
+    with _client_of(parallel) as client, closing(_answers(client, make, tasks, instead)) as answers:
+        for k, answer in answers:
+            early[k] = answer
+            while n_given in early:
+                yield early.pop(n_given)
+                n_given += 1
+
+
+@contextmanager
+def _client_of(parallel: bool | int | str) -> Iterator[Client]:
+    import distributed
+
+    if parallel == CURRENT:
+        try:
+            client = distributed.get_client()
+        except (ValueError, OSError) as error:
+            raise LnoclError(
+                f"parallel {CURRENT!r} finds no scheduler ({error}): make a client first, as by "
+                "dask.distributed.Client(ADDRESS), or set DASK_SCHEDULER_ADDRESS"
+            ) from None
+        yield client
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    n = int(parallel) if parallel is not True else int(cores or 1)
+    # PoCL starts a thread a core in each process, where they would share the cores.
+    threads = {"POCL_MAX_PTHREAD_COUNT": str(max(int(cores or 1) // n, 1))}
+    with (
+        distributed.LocalCluster(
+            n_workers=n,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            memory_limit=None,
+            env={**threads, **os.environ},
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+class _Ended(NamedTuple):
+    """Why a task has no answer: its workers ended."""
+
+    why: str
+
+
+def _answers(
+    client: Client,
+    make: Maker[Task, Answer],
+    tasks: Iterable[Task],
+    instead: Callable[[Task, str], Answer] | None,
+) -> Generator[tuple[int, Answer]]:
+    """Yield the place of each task and its answer, as they are done; send what was lost anew."""
+    waiting = dict(enumerate(tasks))
+    said: set[tuple[type[Warning], str]] = set()
+    n_fruitless = 0
+    while waiting:
+        n_before, suspects = len(waiting), []
+        for k, found in _round(client, make, waiting):
+            if isinstance(found, _Ended):
+                suspects.append(k)
+                continue
+            del waiting[k]
+            yield k, _heard(found, said)
+        # Another task may have ended the workers that these waited for.
+        for suspect in suspects:
+            for k, found in _round(client, make, {suspect: waiting[suspect]}):
+                task = waiting.pop(k)
+                if not isinstance(found, _Ended):
+                    yield k, _heard(found, said)
+                elif instead is None:
+                    raise LnoclError(f"{found.why}; see what their logs say")
+                else:
+                    yield k, instead(task, found.why)
+        n_fruitless = n_fruitless + 1 if len(waiting) == n_before else 0
+        if n_fruitless > MAX_FRUITLESS:
+            raise LnoclError(
+                f"the workers were lost {n_fruitless} times in a row before any of "
+                f"{counted(len(waiting), 'task')} was done; see what their logs say"
+            )
+
+
+def _heard(found: tuple[Answer, Said], said: set[tuple[type[Warning], str]]) -> Answer:
+    """Return the answer of a worker; give its warnings but for those that were said."""
+    answer, warned = found
+    for category, message in warned:
+        if (category, message) not in said:
+            said.add((category, message))
+            warnings.warn(message, category, stacklevel=5)
+    return answer
+
+
+def _round(
+    client: Client, make: Maker[Task, Answer], waiting: Mapping[int, Task]
+) -> Iterator[tuple[int, tuple[Answer, Said] | _Ended]]:
+    """Yield what workers found for tasks that are waiting, but for those that are lost."""
+    import dask
+    from distributed import as_completed
+    from distributed.client import FutureCancelledError
+    from distributed.scheduler import KilledWorker
+
+    token = uuid.uuid4().hex
+    futures: dict[Future, int] = {}
+    try:
+        client.wait_for_workers(1, timeout=PATIENCE)
+        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):
+            # Unlike what is scattered, this is made again where all its copies are lost.
+            made = client.submit(_same, make, key=f"lnocl-{token}")
+            client.replicate([made])
+            for k, task in waiting.items():
+                futures[client.submit(_do, token, made, task, key=f"lnocl-{token}-{k}")] = k
+        # One that is done is dropped, lest it is done again where its worker is lost.
+        for future in as_completed(list(futures), loop=client.loop):
+            k = futures.pop(future)
+            try:
+                yield k, future.result()
+            except FutureCancelledError:
+                continue  # lost with a worker or a connection
+            except KilledWorker as error:
+                n_ended = counted(error.allowed_failures + 1, "worker")
+                yield k, _Ended(f"{n_ended} ended at the same task, perhaps for lack of memory")
+    except TimeoutError:
+        raise LnoclError(f"the scheduler has had no worker for {PATIENCE:g} s") from None
+    finally:
+        if client.status == "running":
+            client.cancel(list(futures))
+
+
+# A worker with several threads does one task at a time: buffers are not to be shared.
+_LOCK = threading.Lock()
+# By the token of the work.
+_held: dict[str, Callable[[Any], Any]] = {}
+
+
+def _same(make: Maker[Task, Answer]) -> Maker[Task, Answer]:
+    return make
+
+
+def _do(token: str, make: Maker[Task, Answer], task: Task) -> tuple[Answer, Said]:
+    """Do a task in a worker, which holds what `make` returned until other work comes."""
+    with _LOCK, process.recorded_warnings() as recorded:
+        process.is_worker = True
+        if token not in _held:
+            _held.clear()
+            _held[token] = make()
+        answer: Answer = _held[token](task)
+    return answer, [(each.category, str(each.message)) for each in recorded]

@@ -1,0 +1,243 @@
+"""``lnocl batch``: tables of targets, what becomes of each, and what is done again."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from commandline import GIVEN, PAPER, one_complaint, outcome
+
+from lnocl.commands import cli
+from lnocl.commands.targets import read_targets
+
+pytestmark = pytest.mark.usefixtures("command_folder")
+
+HEADER = "name,images,psf,star,n_iter,engine,psf_centre,solver,stop,smoothing,pad,models"
+COMMON = "numpy,given,sgm,none,0,0,"
+
+
+def write_targets(*rows, path="targets.csv"):
+    Path(path).write_text("\n".join([HEADER, *(f"{row},{COMMON}" for row in rows)]) + "\n")
+
+
+def batch(*arguments):
+    return cli.main(["batch", "targets.csv", "-o", "out", *arguments])
+
+
+def summary():
+    table = Table.read("out/summary.ecsv")
+    return {name: dict(zip(table.colnames, row, strict=True)) for name, *row in
+            zip(table["name"], *table.columns.values(), strict=True)}  # fmt: skip
+
+
+GOOD = ('one,a.fits,k1.fits,"7,5 3.5,2",3', 'two,a.fits b.fits,k1.fits k2.fits,"7,5",2')
+
+
+def test_each_target_is_what_its_command_gives(capsys):
+    write_targets(*GOOD)
+    assert batch() == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert said.out == "2 targets: 2 done\nwritten to {}\n".format(
+        os.path.abspath("out/summary.ecsv")
+    )
+    assert sorted(os.listdir("out")) == [
+        "one.fits", "one.json", "one.log", "summary.ecsv", "two.fits", "two.json", "two.log",
+    ]  # fmt: skip
+    engine = "--engine", "numpy"
+    alone = ["deconvolve", "a.fits", "b.fits", "--psf", "k1.fits", "k2.fits", "--star", "7,5",
+             "--n-iter", "2", "-o", "alone.fits", *engine, *PAPER, *GIVEN]  # fmt: skip
+    assert cli.main(alone) == 0
+    np.testing.assert_equal(outcome("out/two.fits"), outcome("alone.fits"))
+    assert len(fits.getdata("out/one.fits", "STARS")) == 2
+    found = summary()
+    assert [each["status"] for each in found.values()] == ["done", "done"]
+    assert [each["n_iter"] for each in found.values()] == [3, 2]
+    log = Path("out/one.log").read_text()
+    assert log.startswith(f"$ {found['one']['command']}\n")
+    assert "3 iterations on numpy" in log
+
+
+def test_a_bad_target_is_a_row_and_stops_no_other(capsys):
+    write_targets(
+        "lost,gone.fits,k1.fits,,2", GOOD[0], "bad,a.fits,k1.fits,,two", "flagged,a.fits,k1.fits,,2"
+    )
+    text = Path("targets.csv").read_text()
+    Path("targets.csv").write_text(text.removesuffix(",\n") + ",maybe\n")
+    assert batch() == 1
+    said = capsys.readouterr()
+    assert "4 targets: 1 done, 3 failed" in said.out
+    assert said.err == (
+        "lnocl: error: 3 targets of 4 failed, the first, lost: gone.fits cannot be opened: No such "
+        "file or directory\n"
+    )
+    found = summary()
+    assert found["one"]["status"] == "done"
+    assert "argument --n-iter: invalid int value: 'two'" in found["bad"]["message"]
+    assert found["flagged"]["message"] == "--models is true or false; 'maybe' was given"
+    assert "lnocl: error: gone.fits cannot be opened" in Path("out/lost.log").read_text()
+
+
+def test_what_is_done_is_not_done_again(capsys):
+    write_targets("late,c.fits,k1.fits,,2", *GOOD)
+    assert batch("--quiet") == 1
+    before = {name: os.stat(f"out/{name}").st_mtime_ns for name in ("one.fits", "one.json")}
+    os.link("a.fits", "c.fits")
+    capsys.readouterr()
+    assert batch() == 0
+    assert "3 targets: 3 done (2 of them before)" in capsys.readouterr().out
+    assert before == {name: os.stat(f"out/{name}").st_mtime_ns for name in before}
+    assert summary()["late"]["status"] == "done"
+    assert batch("--overwrite", "--quiet") == 0
+    assert os.stat("out/one.fits").st_mtime_ns != before["one.fits"]
+
+
+def test_what_another_command_has_made_stays(capsys):
+    write_targets(*GOOD)
+    assert batch("--quiet") == 0
+    made = Path("out/one.fits").read_bytes()
+    Path("out/three.fits").write_bytes(b"mine")
+    write_targets(GOOD[0].removesuffix("3") + "4", GOOD[1], "three,a.fits,k1.fits,,1")
+    assert batch() == 1
+    said = capsys.readouterr()
+    assert "3 targets: 1 done, 2 failed (1 of them before)" in said.out
+    messages = {name: each["message"] for name, each in summary().items()}
+    assert messages["one"].endswith("one.fits is of another command than its row gives; take "
+                                    "--overwrite")  # fmt: skip
+    assert messages["three"].endswith("three.fits exists; take --overwrite")
+    assert Path("out/one.fits").read_bytes() == made
+    assert Path("out/three.fits").read_bytes() == b"mine"
+    assert batch("--overwrite", "--quiet") == 0
+    assert summary()["one"]["n_iter"] == 4
+
+
+def test_job_arrays_share_the_targets():
+    rows = [f"t{k},a.fits,k1.fits,,1" for k in range(5)]
+    write_targets(*rows)
+    assert batch("--array", "2/3", "--quiet") == 0
+    assert [each["status"] for each in summary().values()] == [
+        "waiting", "done", "waiting", "waiting", "done"
+    ]  # fmt: skip
+    assert batch("--array", "1/3", "--quiet") == 0
+    assert batch("--array", "3/3", "--quiet") == 0
+    assert {each["status"] for each in summary().values()} == {"done"}
+
+
+@pytest.mark.parametrize("part", ["0/3", "4/3", "1", "a/b", "1/0"])
+def test_parts_that_are_none_are_refused(part, capsys):
+    write_targets(*GOOD)
+    assert batch("--array", part) == 2
+    assert f"'{part}' is not I/N with 1 <= I <= N" in one_complaint(capsys.readouterr())
+
+
+@pytest.mark.parametrize("ending", ["ecsv", "csv", "fits"])
+def test_tables_give_the_same_commands_in_every_format(ending):
+    table = Table(
+        {
+            "images": ["a.fits", "'with blank.fits' b.fits[SCI]", "c.fits"],
+            "psf": ["k.fits", "k.fits", "k.fits"],
+            "star": ["", "1,2 3.5,-4", ""],
+            "n-iter": np.ma.array([1, 2, 3], mask=[False, True, False]),
+            "mu": [0.0, np.nan, 1e-7],
+            "residuals": [True, False, True],
+            "saturation": [60000.0, 60000.5, 1e5],
+        }
+    )
+    table.write(f"t.{ending}", overwrite=True)
+    targets = read_targets(f"t.{ending}")
+    assert [each.name for each in targets] == ["a", "with blank", "c"]
+    assert [each.words for each in targets] == [
+        ("a.fits", "--psf", "k.fits", "--n-iter", "1", "--mu", "0.0", "--residuals",
+         "--saturation", "60000.0"),
+        ("with blank.fits", "b.fits[SCI]", "--psf", "k.fits", "--star", "1,2", "--star", "3.5,-4",
+         "--saturation", "60000.5"),
+        ("c.fits", "--psf", "k.fits", "--n-iter", "3", "--mu", "1e-07", "--residuals",
+         "--saturation", "100000.0"),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "t.csv does not exist"),
+        ("images,psf\n", "t.csv has no row; give one a target"),
+        ("psf\nk1.fits\n", "t.csv has no column images; give the files of each target there"),
+        ("images,n_itre\na.fits,3\n", "column 'n_itre' of t.csv is no option that a target may"),
+        ("images,output\na.fits,b.fits\n", "column 'output' of t.csv is no option that a target"),
+        ("images\na.fits\n./a.fits\n", "t.csv has 2 targets called 'a', whose outputs would repl"),
+        ("images,psf\na.fits,k\nb,c,d\n", "t.csv cannot be read as a table"),
+    ],
+)
+def test_tables_that_are_no_use_are_refused(text, message, capsys):
+    if text is not None:
+        Path("t.csv").write_text(text)
+    assert cli.main(["batch", "t.csv", "-o", "out"]) in (1, 2)
+    assert message in one_complaint(capsys.readouterr())
+    assert not os.path.exists("out")
+
+
+def test_names_that_leave_the_folder_are_rows_that_fail():
+    write_targets("../up,a.fits,k1.fits,,1", ".hidden,a.fits,k1.fits,,1", GOOD[0])
+    assert batch("--quiet") == 1
+    assert list(summary()) == ["row1", "row2", "one"]
+    assert "its name '../up' cannot be that of a file" in summary()["row1"]["message"]
+
+
+def test_the_picture_shows_what_is_done(capsys):
+    pytest.importorskip("matplotlib")
+    from matplotlib.image import imread
+
+    write_targets(*GOOD, "lost,gone.fits,k1.fits,,2")
+    assert batch("--plot", "page.png") == 1
+    assert "drew page.png" in capsys.readouterr().out
+    assert imread("page.png").std() > 0.1
+    assert batch("--plot", "page.png") == 1
+    assert "page.png exists" in capsys.readouterr().err
+
+
+def test_an_interrupt_ends_it_and_the_next_call_goes_on():
+    write_targets(GOOD[0], 'long,cube.fits,psfs.fits,"7,5",1000000', GOOD[1])
+    words = [sys.executable, "-m", "lnocl", "batch", "targets.csv", "-o", "out"]
+    # Whoever runs the tests in the background may ignore it.
+    heeded = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(
+        words, stderr=subprocess.PIPE, text=True, preexec_fn=heeded
+    ) as process:
+        while not os.path.exists("out/long.json"):
+            time.sleep(0.01)
+        time.sleep(0.5)  # it listens from the first iteration on
+        process.send_signal(signal.SIGINT)
+        assert process.stderr.read().splitlines()[-1] == "lnocl: error: interrupted"
+    assert process.returncode == 130
+    assert json.loads(Path("out/long.json").read_text())["status"] == "started"
+    Path("out/long.json").write_text(
+        Path("out/long.json").read_text().replace("--n-iter 1000000", "--n-iter 2")
+    )
+    write_targets(GOOD[0], 'long,cube.fits,psfs.fits,"7,5",2', GOOD[1])
+    assert batch("--quiet") == 0
+    assert [each["n_iter"] for each in summary().values()] == [3, 2, 2]
+
+
+def test_without_dask_it_works_but_in_parallel(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    write_targets(*GOOD)
+    assert batch("--parallel", "2") == 1
+    assert one_complaint(capsys.readouterr()) == (
+        "parallel needs Dask; install it with: pip install 'lnocl[dask]'"
+    )
+    assert batch("--quiet") == 0
+
+
+@pytest.mark.parametrize("wrong", ["0", "-2", "many", "1.5"])
+def test_processes_that_are_none_are_refused(wrong, capsys):
+    write_targets(*GOOD)
+    assert batch("--parallel", wrong) == 2
+    assert f"'{wrong}' is neither a number of processes" in one_complaint(capsys.readouterr())

@@ -1,0 +1,185 @@
+"""Independent tasks: in this process, in processes of their own, and on a cluster of Dask."""
+
+import os
+import signal
+import sys
+import time
+import warnings
+from contextlib import closing
+from functools import partial
+
+import pytest
+
+from lnocl import parallel
+from lnocl.errors import InputError, LnoclError, LnoclWarning
+from lnocl.parallel import CURRENT, check_parallel, work
+
+distributed = pytest.importorskip("distributed", reason="Dask is not installed")
+
+# Its sockets are closed by its own threads, when they come to it.
+pytestmark = pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
+
+
+class Squares:
+    """Squares numbers, and counts how many it has squared."""
+
+    def __init__(self, seconds=0.0):
+        self.seconds, self.n_done = seconds, 0
+
+    def __call__(self, number):
+        time.sleep(self.seconds)
+        self.n_done += 1
+        return number**2, os.getpid(), self.n_done
+
+
+def warn_of(number):
+    warnings.warn("numbers are odd" if number % 2 else "numbers are even", LnoclWarning, 2)
+    return number
+
+
+def make_warner():
+    return warn_of
+
+
+def refuse(number):
+    raise InputError(f"{number} is no number of mine")
+
+
+def make_refuser():
+    return refuse
+
+
+def end(number):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def make_ender():
+    return end
+
+
+def make_half_ender():
+    return end_if_odd
+
+
+def end_if_odd(number):
+    if number % 2:
+        end(number)
+    return number
+
+
+@pytest.fixture(scope="module")
+def client():
+    """Two workers, as a user would start them; the client is current."""
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        yield client
+
+
+def test_this_process_does_one_after_the_other():
+    n_asked = []
+    answers = work(Squares, (n_asked.append(k) or k for k in range(3)))
+    assert next(answers) == (0, os.getpid(), 1)
+    assert len(n_asked) == 1
+    assert list(answers) == [(1, os.getpid(), 2), (4, os.getpid(), 3)]
+
+
+@pytest.mark.parametrize("wrong", [0, -1, 2.0, "two", None, "current scheduler"])
+def test_what_says_nothing_of_processes_is_refused(wrong):
+    with pytest.raises(InputError, match="parallel must be True, False, a number of processes or"):
+        check_parallel(wrong)
+
+
+@pytest.mark.parametrize("given", [True, 1, CURRENT])
+def test_without_dask_one_line_says_what_to_install(monkeypatch, given):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    check_parallel(False)
+    with pytest.raises(LnoclError, match=r"parallel needs Dask; install it with: pip install 'lno"):
+        check_parallel(given)
+    assert next(work(Squares, [3]))[0] == 9
+
+
+def test_without_a_client_there_is_no_current_scheduler():
+    with pytest.raises(LnoclError, match=r"finds no scheduler .*DASK_SCHEDULER_ADDRESS"):
+        next(work(Squares, [1], CURRENT))
+
+
+def test_processes_of_its_own_end_with_the_work():
+    answers = list(work(Squares, range(6), 2))
+    assert [each[0] for each in answers] == [0, 1, 4, 9, 16, 25]
+    pids = {each[1] for each in answers}
+    assert os.getpid() not in pids
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+def test_workers_hold_what_does_the_tasks(client):
+    answers = list(work(partial(Squares, 0.02), range(20), CURRENT))
+    assert [each[0] for each in answers] == [k**2 for k in range(20)]
+    pids = [each[1] for each in answers]
+    assert len(set(pids)) == 2
+    for pid in set(pids):
+        counts = sorted(n for _, each, n in answers if each == pid)
+        assert counts == list(range(1, pids.count(pid) + 1))
+
+
+def test_a_worker_that_is_killed_and_a_connection_that_is_cut_cost_no_task(client):
+    found = []
+    for square, pid, _ in work(partial(Squares, 0.02), range(60), CURRENT):
+        found.append(square)
+        if len(found) == 10:
+            os.kill(pid, signal.SIGKILL)
+        if len(found) == 30:
+            client.loop.add_callback(client.scheduler_comm.comm.abort)
+    assert found == [k**2 for k in range(60)]
+
+
+def test_warnings_of_workers_are_given_once(client):
+    with pytest.warns(LnoclWarning) as given:
+        assert list(work(make_warner, range(8), CURRENT)) == list(range(8))
+    said = [str(each.message) for each in given if each.category is LnoclWarning]
+    assert sorted(said) == ["numbers are even", "numbers are odd"]
+
+
+def test_an_error_of_a_task_is_raised(client):
+    with pytest.raises(InputError, match="0 is no number of mine"):
+        list(work(make_refuser, range(4), CURRENT))
+    assert len(list(work(Squares, range(4), CURRENT))) == 4  # the workers are none the worse
+
+
+def count_tasks(dask_scheduler):
+    return len(dask_scheduler.tasks)
+
+
+def test_tasks_that_are_left_are_cancelled(client):
+    with closing(work(partial(Squares, 0.3), range(1000), CURRENT)) as answers:
+        next(answers)
+        while client.run_on_scheduler(count_tasks) < 900:
+            time.sleep(0.01)
+    while client.run_on_scheduler(count_tasks) > 5:  # they would take minutes
+        time.sleep(0.01)
+
+
+def test_a_task_that_ends_its_workers_ends_the_work_or_has_another_answer(client):
+    with pytest.raises(LnoclError, match="4 workers ended at the same task"):
+        list(work(make_ender, [1], CURRENT))
+    answers = work(make_half_ender, range(4), CURRENT, lambda number, why: (number, why))
+    why = "4 workers ended at the same task, perhaps for lack of memory"
+    assert list(answers) == [0, (1, why), 2, (3, why)]
+
+
+def test_tasks_whose_workers_are_lost_again_and_again_are_given_up(client, monkeypatch):
+    rounds = []
+
+    def lose_all(client, make, waiting):
+        rounds.append(len(waiting))
+        return iter(())
+
+    monkeypatch.setattr(parallel, "_round", lose_all)
+    with pytest.raises(LnoclError, match="lost 6 times in a row before any of 3 tasks"):
+        list(work(Squares, range(3), CURRENT))
+    assert rounds == [3] * 6
