@@ -153,6 +153,11 @@ def make_sleeper():
     return time.sleep
 
 
+def _sleep(token, make, seconds):
+    make()(seconds)
+    return seconds, []
+
+
 def scheduler(n):
     """Time tasks that sleep on many workers: threads of processes, which need no core."""
     import dask
@@ -164,19 +169,19 @@ def scheduler(n):
     dask.config.set({"distributed.scheduler.work-stealing-interval": "100ms"})
     for seconds in (0.1, 1.0):
         for count in (1, 4, 16, 64, 256):
-            parallel._LOCK = threading.Semaphore(1000)  # these workers share one process
+            parallel._do = _sleep  # these workers share one process, which has one lock
             with (
                 distributed.LocalCluster(
                     n_workers=count, threads_per_worker=1, processes=False, dashboard_address=None
-                ),
-                distributed.get_client() as client,
+                ) as cluster,
+                distributed.Client(cluster) as client,
             ):
                 list(parallel.work(make_sleeper, [0.0] * count, parallel.CURRENT))
                 n_tasks = 10 * count
                 begun = time.perf_counter()
                 list(parallel.work(make_sleeper, [seconds] * n_tasks, parallel.CURRENT))
                 took = time.perf_counter() - begun
-                del client
+                assert client.status == "running"
             print(f"tasks of {seconds:g} s on {count:3d} workers: efficiency "
                   f"{n_tasks * seconds / count / took:.2f}, "
                   f"{1e3 * (took - 10 * seconds) / n_tasks:.2f} ms of the scheduler a task",

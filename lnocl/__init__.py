@@ -18,6 +18,16 @@ from lnocl.errors import InputError as InputError
 from lnocl.errors import LnoclError, LnoclWarning
 from lnocl.result import Result
 from lnocl.scene.observation import Observation
+from lnocl.scene.psf_field import PsfField
+from lnocl.tiles import deconvolve_tiles
 
-__all__ = ["LnoclError", "LnoclWarning", "Observation", "Result", "deconvolve"]
+__all__ = [
+    "LnoclError",
+    "LnoclWarning",
+    "Observation",
+    "PsfField",
+    "Result",
+    "deconvolve",
+    "deconvolve_tiles",
+]
 __version__ = version("lnocl")

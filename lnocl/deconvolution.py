@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Set
+from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import replace
 from functools import partial
 from os import PathLike
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -246,9 +245,7 @@ def deconvolve(
         callback, progress=progress, refine_positions=refine_positions, round_source=round_source
     )
     fits_stars = solver == "sgp" or bool(refine_positions)
-    # What can be read once, or has no order that NumPy knows, is no array_like.
-    listed: Any = list(stars) if isinstance(stars, (Iterator, Set)) else stars
-    positions = check_positions(listed, observation)
+    positions = check_positions(stars, observation)
     initial_extended, initial_star_fluxes = read_start(
         observation, fits_stars, initial_extended, initial_star_fluxes
     )

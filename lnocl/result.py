@@ -16,7 +16,7 @@ from lnocl.notebook import html_card
 from lnocl.plotting.result import ResultView, draw_result
 from lnocl.residuals import Fit, StarResiduals, judge, judge_stars, residuals
 from lnocl.runs.outcome import Outcome, PsfRefinement
-from lnocl.scene.observation import Array
+from lnocl.scene.observation import Array, Observation
 
 if TYPE_CHECKING:
     from astropy.io import fits
@@ -172,9 +172,13 @@ class Result:
         return errors
 
     @property
+    def _observation(self) -> Observation:
+        return self._outcome.scene.observation
+
+    @property
     def psfs(self) -> Array:
         """The PSFs of the model, shape (p, ky, kx), of unit sum: as given or refined."""
-        return self._outcome.scene.observation.psfs
+        return self._observation.psfs
 
     @property
     def doubtful(self) -> NDArray[np.bool_]:
@@ -192,17 +196,20 @@ class Result:
         ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j``, in double precision. As in the observation,
         the square of the read noise is included.
         """
-        return np.array(list(models_of(self._outcome)))
+        return np.array(list(self._models()))
+
+    def _models(self) -> Iterator[Array]:
+        return models_of(self._outcome)
 
     def residuals(self) -> Array:
         """Return ``(g_j - m_j) / sqrt(m_j)``, shape (p, ny, nx): about 1 where only noise is left.
 
         NaN where a pixel is bad, or the model is 0.
         """
-        return self._residuals(models_of(self._outcome))
+        return self._residuals(self._models())
 
     def _residuals(self, models: Iterable[Array]) -> Array:
-        observation = self._outcome.scene.observation
+        observation = self._observation
         images = zip(observation.images, observation.mask, models, strict=True)
         return np.array([residuals(*each) for each in images])
 
@@ -384,14 +391,14 @@ class Result:
 
     @property
     def _is_rate(self) -> bool:
-        return not (self._outcome.scene.observation.exposure == 1.0).all()
+        return not (self._observation.exposure == 1.0).all()
 
     def fit(self) -> Fit:
         """Return how well the model fits all good pixels.
 
         It takes a convolution of each image in double precision on the host.
         """
-        return judge(self._outcome.scene.observation, models_of(self._outcome))
+        return judge(self._observation, self._models())
 
     def star_residuals(self) -> list[StarResiduals]:
         """Return how well the model fits at each star: in its core, its wings and round it."""
@@ -428,8 +435,8 @@ def saved_parts(result: Result) -> dict[str, Any]:
     parts: dict[str, Any] = {
         "history": result.history,
         "held_out": result.held_out if result.held_out.size else None,
-        "offsets": result._outcome.scene.observation.offsets,
-        "oversample": result._outcome.scene.oversample,
+        "offsets": result._observation.offsets,
+        "oversample": result._observation.oversample,
         "cards": [],
     }
     if refinement is not None:
@@ -445,7 +452,7 @@ def saved_parts(result: Result) -> dict[str, Any]:
 
 def view_of(result: Result) -> ResultView:
     """Return what the picture of a result shows."""
-    observation = result._outcome.scene.observation
+    observation = result._observation
     models = result.models()
     return ResultView(
         extended=result.extended,

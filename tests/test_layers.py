@@ -18,6 +18,7 @@ FLOORS = [
     {"runs"},
     {"result"},
     {"deconvolution"},
+    {"tiles"},
     {"__init__"},
     {"verify", "studies"},
     {"commands"},

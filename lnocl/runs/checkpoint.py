@@ -88,6 +88,8 @@ def describe(observation: Observation, setup: Setup, **parameters: Any) -> dict[
         **parameters,
     }
     bound |= {"device": engine_name(setup), "tuning": tuning_name(setup)}
+    if observation.psf_fields:
+        bound["psf_fields"] = np.concatenate([each.numbers() for each in observation.psf_fields])
     return {name: _describe(name, value) for name, value in bound.items()}
 
 

@@ -84,7 +84,8 @@ def check_families(
     Raises
     ------
     InputError
-        A name is unknown, or one text is given instead of several; there is no star; ideal PSFs,
+        A name is unknown, or one text is given instead of several; there is no star; the PSFs vary
+        over the field; ideal PSFs,
         pupils or modes are lacking; pupils differ in their apertures; pixels are asked of one star,
         or a shift of one image beside free positions.
     """
@@ -94,6 +95,11 @@ def check_families(
     for name in found:
         if not (isinstance(name, str) and name in FAMILIES):
             raise InputError(f"refine_psfs {name!r} is not known; give {', '.join(FAMILIES)}")
+    if observation.psf_fields and (found or len(observation.psf_scatter)):
+        raise InputError(
+            "refine_psfs and psf_scatter are for PSFs that are the same all over the images; leave "
+            "them out where PSFs vary over the field"
+        )
     if found and not len(positions):
         raise InputError("refine_psfs needs a star, whose image shows the PSF; give stars")
     if len(observation.psf_scatter) and not len(positions):
@@ -202,6 +208,8 @@ def read_penalties(
     InputError
         A weight is not a number, finite and not negative; smoothing is another word than "auto".
     """
+    if isinstance(smoothing, list):  # those of tiles, with the edge of the whole
+        return smoothing
     if not isinstance(smoothing, str):
         return [Penalty(mu, smoothing)]
     if smoothing != "auto":

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from lnocl.scene import containers
 from lnocl.scene.arrays import numbers, refuse_masked, unmasked, values_and_mask
 from lnocl.scene.cores import centre, off_centre, peak
 from lnocl.scene.psf_errors import check_modes, check_pixels
+from lnocl.scene.psf_field import PsfField, read_fields
 
 Array = NDArray[np.float64]
 
@@ -47,9 +50,12 @@ class Observation:
         `astropy.nddata.NDData` such as a CCDData, or a sequence of these, is taken with its unit
         and mask; counts per time are multiplied by the exposure. Uncertainties are not used.
         Maps may be masked where the images are; nothing else may hold masked values.
-    psfs : array_like, shape (p, ky, kx) or (ky, kx)
+    psfs : array_like, shape (p, ky, kx) or (ky, kx), or PsfField
         Point spread functions, centre at ``(ky // 2, kx // 2)``, of any positive sum: they are
-        normalised here. One serves all images. Negative pixels are kept, with a warning.
+        normalised here. One serves all images. Negative pixels are kept, with a warning. A
+        `PsfField` or a `photutils.psf.GriddedPSFModel`, or one for each image, holds PSFs that vary
+        over the image: stars then have those of their own places, the extended source that of the
+        middle (`lnocl.deconvolve_tiles` has one for each tile).
     background : float or array_like, shape (p,) or (p, ny, nx), optional
         Calibration background, electrons per pixel, zero or more. A Quantity may be per time.
     read_noise : float or array_like, shape (p,) or (p, ny, nx), optional
@@ -101,7 +107,9 @@ class Observation:
     offsets : ndarray of float64, shape (p, 2)
         As given.
     psfs : ndarray of float64, shape (p, ky, kx)
-        Of unit sum.
+        Of unit sum; where they vary over the field, those of the middle of the images.
+    psf_fields : tuple of PsfField
+        One for each image where PSFs vary over the field, else empty.
     oversample : int
     effective_psfs : bool
         As given.
@@ -144,7 +152,7 @@ class Observation:
     def __init__(
         self,
         images: ArrayLike,
-        psfs: ArrayLike,
+        psfs: ArrayLike | PsfField | Sequence[PsfField],
         *,
         background: ArrayLike = 0.0,
         read_noise: ArrayLike = 0.0,
@@ -168,7 +176,15 @@ class Observation:
         given, masked = values_and_mask("images", counts)
         self.images = _stack("images", given)
         self.mask = masked.copy().reshape(self.images.shape)
-        self.psfs = _check_psfs(containers.bare("psfs", psfs), self.n_images, psf_centre)
+        fields = read_fields(psfs, self.n_images, self.oversample, self.effective_psfs)
+        self.psf_fields = tuple(
+            field.mapped(lambda stack: np.array(_check_psfs(stack, len(stack), psf_centre)))
+            for field in fields
+        )
+        if fields:
+            self._take_psfs_of_the_middle()
+        else:
+            self.psfs = _check_psfs(containers.bare("psfs", psfs), self.n_images, psf_centre)
         self.pupils = check_pixels("pupils", pupils, self.psfs)
         self.ideal_psfs = self._check_ideals(ideal_psfs, psf_centre)
         self.psf_modes = check_modes(psf_modes, self.psfs)
@@ -211,6 +227,25 @@ class Observation:
     def sky_shape(self) -> tuple[int, int]:
         """Shape of the extended source: that of an image, finer by `oversample`."""
         return self.oversample * self.shape[0], self.oversample * self.shape[1]
+
+    def window(self, rows: range, columns: range) -> Observation:
+        """Return what is in some rows and columns of the images; positions begin at its corner."""
+        part = copy(self)
+        inside = np.s_[:, rows.start : rows.stop, columns.start : columns.stop]
+        for name in ("images", "mask", "background", "read_noise", "exposure"):
+            values = getattr(self, name)
+            if values.ndim == 3:
+                setattr(part, name, values[inside])
+        part.psf_fields = tuple(
+            field.moved(-columns.start, -rows.start) for field in self.psf_fields
+        )
+        if part.psf_fields:
+            part._take_psfs_of_the_middle()
+        return part
+
+    def _take_psfs_of_the_middle(self) -> None:
+        y, x = (np.array(self.shape) - 1) / 2.0
+        self.psfs = np.array([field.at(x, y) for field in self.psf_fields])
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {name: each for name, each in vars(self).items() if isinstance(each, np.ndarray)}

@@ -39,6 +39,8 @@ class Penalty:
     smoothing : float
         Weight of the edge-preserving term, zero or more. It has no unit (with exposures that of an
         exposure).
+    edge : float or None
+        delta, in the unit of the extended source; None: three times its mean, roughly.
 
     Raises
     ------
@@ -48,6 +50,7 @@ class Penalty:
 
     mu: float = 0.0
     smoothing: float = 0.0
+    edge: float | None = None
 
     def __post_init__(self) -> None:
         weights: dict[str, Any] = {"mu": self.mu, "smoothing": self.smoothing}

@@ -6,18 +6,18 @@ import logging
 import math
 from collections.abc import Iterator
 from copy import copy
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, warn
-from lnocl.scene.detector import movable_psfs, on_sky
+from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
 from lnocl.scene.grid import grid_of
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
-from lnocl.scene.shifting import Stamp
+from lnocl.scene.shifting import MovablePsf, Stamp
 from lnocl.scene.stars import Lit, StarField, check_positions, lit_box
 
 log = logging.getLogger("lnocl")
@@ -143,7 +143,11 @@ class Scene:
     def _penalise(self, penalty: Penalty) -> None:
         self.mu = self._scaled("mu", penalty.mu, self.unit / self._mean_exposure)
         self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / self._mean_exposure)
-        self.edge = EDGE * self._rough_fit[1] if self.smoothing else 0.0
+        self.edge = self._edge(penalty) if self.smoothing else 0.0
+
+    def _edge(self, penalty: Penalty) -> float:
+        """Return delta of the edge-preserving term, scaled."""
+        return EDGE * self._rough_fit[1] if penalty.edge is None else penalty.edge / self.unit
 
     def penalised(self, penalty: Penalty) -> Scene:
         """Return this scene with another penalty."""
@@ -162,7 +166,7 @@ class Scene:
         """Return this scene with other PSFs, shape (p, ky, kx), as they are."""
         other = copy(self)
         other.observation = copy(self.observation)
-        other.observation.psfs = psfs
+        other.observation.psfs, other.observation.psf_fields = psfs, ()
         other._psfs = movable_psfs(other.scaled_psfs(), other.observation, self.image_grid)
         other._field = other._place_stars(self.stars)
         return other
@@ -201,7 +205,24 @@ class Scene:
             self.star_weights = np.where(is_observed, self.star_weights, weights)
 
     def _place_stars(self, positions: Array) -> StarField:
-        return StarField(self._psfs, self.observation.offsets, self.image_grid, positions)
+        psfs = self.star_psfs(positions)
+        return StarField(psfs, self.observation.offsets, self.image_grid, positions)
+
+    def star_psfs(
+        self, positions: Array, part: tuple[slice, slice] | None = None
+    ) -> list[list[MovablePsf | DetectorPsf]]:
+        """Return the PSF of each image at each of some positions, or a part of it, to be placed."""
+        observation, fields = self.observation, self.observation.psf_fields
+        if not fields and part is None:
+            return [[psf] * len(positions) for psf in self._psfs]
+        movable = partial(movable_psfs, observation=observation, grid=self.image_grid)
+        if not fields:
+            parts = movable([psf[part] for psf in self.scaled_psfs()])
+            return [[psf] * len(positions) for psf in parts]
+        return [
+            movable([gain * field.at(*place)[part or ...] for place in positions + offset])
+            for field, gain, offset in zip(fields, self.gains, observation.offsets, strict=True)
+        ]
 
     @property
     def stars(self) -> Array:
@@ -268,7 +289,7 @@ class Scene:
 
     def star_on_sky(self, j: int, s: int) -> Stamp:
         """Return P_js before the pixels of image j sample it, on the sky's grid."""
-        return self._psfs[j].on_sky(*(self.stars[s] + self.observation.offsets[j]))
+        return self._field.psfs[j][s].on_sky(*(self.stars[s] + self.observation.offsets[j]))
 
     def psf_on_sky(self, j: int, s: int) -> Stamp:
         """Return PSF j on the sky's grid, at star s."""
@@ -333,6 +354,11 @@ class Scene:
                 "what the images show in their shortest exposure is more, in the longest, than a "
                 "number holds: divide images and background by a constant"
             )
+
+    @property
+    def level(self) -> float:
+        """The mean of the extended source, electrons per pixel of it, by linear least squares."""
+        return self._rough_fit[1] * self.unit
 
     @cached_property
     def _rough_fit(self) -> tuple[Array, float]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence, Set
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from lnocl.errors import InputError
 from lnocl.scene import containers, star_tables
@@ -89,8 +89,8 @@ class StarField:
 
     Parameters
     ----------
-    psfs : sequence of MovablePsf or DetectorPsf, length p
-        One an image.
+    psfs : sequence of p sequences of n MovablePsf or DetectorPsf
+        That of each image at each star.
     offsets : ndarray of float64, shape (p, 2)
         Of the images, pixels.
     grid : tuple of int
@@ -101,13 +101,13 @@ class StarField:
 
     def __init__(
         self,
-        psfs: Sequence[MovablePsf | DetectorPsf],
+        psfs: Sequence[Sequence[MovablePsf | DetectorPsf]],
         offsets: Array,
         grid: tuple[int, int],
         positions: Array,
     ) -> None:
         self.positions = positions
-        self._psfs, self._offsets, self._grid = psfs, offsets, grid
+        self.psfs, self._offsets, self._grid = psfs, offsets, grid
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -116,8 +116,11 @@ class StarField:
     def stamps(self) -> list[list[Stamp]]:
         """P_js for each image j and star s."""
         return [
-            [psf.at(*(position + offset)).aligned(self._grid) for position in self.positions]
-            for psf, offset in zip(self._psfs, self._offsets, strict=True)
+            [
+                psf.at(*(position + offset)).aligned(self._grid)
+                for psf, position in zip(psfs, self.positions, strict=True)
+            ]
+            for psfs, offset in zip(self.psfs, self._offsets, strict=True)
         ]
 
     def light(self, j: int, fluxes: Array) -> Array:
@@ -195,7 +198,7 @@ def lit_box(stamps: Sequence[Stamp], grid: tuple[int, int], leeway: float = 0.0)
 CLOSEST = 1e-3
 
 
-def check_positions(stars: ArrayLike, observation: Observation) -> Array:
+def check_positions(stars: Any, observation: Observation) -> Array:
     """Return the positions of stars, shape (n, 2).
 
     Raises
@@ -204,6 +207,8 @@ def check_positions(stars: ArrayLike, observation: Observation) -> Array:
         They are not pairs of numbers, or not in pixels; a table that `star_tables.positions`
         refuses; one lies outside all images; two are at one position.
     """
+    if isinstance(stars, (Iterator, Set)):  # which can be read once, or have no order
+        stars = list(stars)
     if hasattr(stars, "colnames"):  # a table of astropy
         positions = star_tables.positions(stars)
     else:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.scene.detector import DetectorPsf, movable_psfs
+from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.forward_model import ROUNDING, Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
@@ -75,18 +75,19 @@ class StarFit:
 
     def __init__(self, scene: Scene, model: Model, extended: Array, given: Array) -> None:
         self._given, self._offsets = given, scene.observation.offsets
-        psfs = _cut(scene.scaled_psfs())
+        part = _part(scene.scaled_psfs())
+        shape = scene.observation.psfs[0][part].shape
         squares = [
-            [_square(psf.shape, position + offset, scene) for position in given]
-            for psf, offset in zip(psfs, self._offsets, strict=True)
+            [_square(shape, position + offset, scene) for position in given]
+            for offset in self._offsets
         ]
         lit = [light_up(each, scene.image_grid) for each in squares]
         diffuse = model.forward(extended) + model.background
         self._likelihood = StarLikelihood.of_scene(scene, model, diffuse, lit)
         self._stars = [
-            _MovableStars(psf, where, scene.stars + offset, whole, around)
-            for psf, offset, where, whole, around in zip(
-                movable_psfs(psfs, scene.observation, scene.image_grid),
+            _MovableStars(psfs, where, scene.stars + offset, whole, around)
+            for psfs, offset, where, whole, around in zip(
+                scene.star_psfs(scene.stars, part),
                 self._offsets,
                 lit,
                 scene.star_field.stamps,
@@ -184,8 +185,8 @@ class _MovableStars:
 
     Parameters
     ----------
-    psf : MovablePsf or DetectorPsf
-        The part of the PSF that moves with a star.
+    psfs : sequence of MovablePsf or DetectorPsf
+        The part of the PSF that moves with each star.
     lit : ndarray of bool, shape (Ny, Nx)
         The pixels.
     positions : ndarray of float64, shape (n, 2)
@@ -203,14 +204,14 @@ class _MovableStars:
 
     def __init__(
         self,
-        psf: MovablePsf | DetectorPsf,
+        psfs: Sequence[MovablePsf | DetectorPsf],
         lit: NDArray[np.bool_],
         positions: Array,
         whole: Sequence[Stamp],
         squares: Sequence[Stamp],
     ) -> None:
         n, self._grid = len(positions), (lit.shape[0], lit.shape[1])
-        self._psf, self._places = psf, places(lit)
+        self._psfs, self._places = psfs, places(lit)
         both = overlap([*squares, *whole], self._grid).reshape(2, n, 2, n)
         self._overlap: NDArray[np.bool_] = np.any(both, axis=(0, 2))
         self._size = int(lit.sum())
@@ -218,18 +219,18 @@ class _MovableStars:
         self._image = np.zeros(self._size + 1)
         self.around: list[NDArray[np.intp]] = []
         self._beyond: list[Piece] = []
-        for position, stamp, square in zip(positions, whole, squares, strict=True):
+        for s, (position, stamp, square) in enumerate(zip(positions, whole, squares, strict=True)):
             reached = np.zeros(self._size + 1, bool)
             for each in (stamp, square):
                 reached[self._places[each.window(self._grid)]] = True
             self.around.append(np.flatnonzero(reached[:-1]))
-            self._beyond.append(self._find_beyond(position, stamp))
+            self._beyond.append(self._find_beyond(s, position, stamp))
 
-    def _find_beyond(self, position: Array, whole: Stamp) -> Piece:
-        """Return the whole PSF of a star less the part that moves."""
+    def _find_beyond(self, s: int, position: Array, whole: Stamp) -> Piece:
+        """Return the whole PSF of star s less the part that moves."""
         at = self._places[whole.window(self._grid)]
         self._image[at] = whole.values
-        pixels, values = self._moving(position)
+        pixels, values = self._moving(s, position)
         self._image[pixels] -= values[0]
         beyond = self._image[at].ravel()
         self._image[at] = self._image[pixels] = 0.0
@@ -238,22 +239,22 @@ class _MovableStars:
         values[0] = beyond[is_left]
         return at.ravel()[is_left], values
 
-    def _moving(self, position: Array) -> Piece:
-        """Return the part of the PSF that moves, and its derivatives along x and y."""
-        stamp, values = self._psf.with_slopes(*position)
+    def _moving(self, s: int, position: Array) -> Piece:
+        """Return the part of star s's PSF that moves, and its derivatives along x and y."""
+        stamp, values = self._psfs[s].with_slopes(*position)
         return self._places[stamp.window(self._grid)].ravel(), values.reshape(3, -1)
 
     def at(self, positions: Array) -> StarImages:
         """Return the images of the stars and their derivatives along x and y."""
         pieces = [
-            [self._moving(position), beyond]
-            for position, beyond in zip(positions, self._beyond, strict=True)
+            [self._moving(s, position), beyond]
+            for s, (position, beyond) in enumerate(zip(positions, self._beyond, strict=True))
         ]
         return StarImages(self._size, pieces, self._overlap)
 
     def image_around(self, s: int, position: Array) -> Array:
         """Return the image of star s, there, over the pixels that it may light."""
-        pieces = [self._moving(position), self._beyond[s]]
+        pieces = [self._moving(s, position), self._beyond[s]]
         for pixels, values in pieces:
             self._image[pixels] += values[0]
         image = self._image[self.around[s]]
@@ -271,8 +272,8 @@ def _square(shape: tuple[int, ...], position: Array, scene: Scene) -> Stamp:
     return Stamp(np.broadcast_to(1.0, (height, width)), y - height // 2, x - width // 2)
 
 
-def _cut(psfs: list[Array]) -> list[Array]:
-    """Return PSFs cut to the square round their middle that holds enough of the information."""
+def _part(psfs: list[Array]) -> tuple[slice, slice]:
+    """Return the square round the middle of PSFs that holds enough of the information."""
     # Where the star's own light is the noise, a pixel says |grad P|^2 / P of a position.
     information = sum(
         (np.square(np.gradient(np.pad(psf, 1))).sum(axis=0)[1:-1, 1:-1])
@@ -285,8 +286,7 @@ def _cut(psfs: list[Array]) -> list[Array]:
     within = np.cumsum(np.bincount(distance.ravel(), np.ravel(information)))
     half = int(np.argmax(within >= INFORMATION_SHARE * within[-1]))
     first = np.maximum(middle - half, 0)
-    cut = np.s_[first[0] : middle[0] + half + 1, first[1] : middle[1] + half + 1]
-    return [psf[cut] for psf in psfs]
+    return np.s_[first[0] : middle[0] + half + 1, first[1] : middle[1] + half + 1]
 
 
 def _shorten(vectors: Array, longest: float) -> Array:

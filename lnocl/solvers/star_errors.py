@@ -100,7 +100,7 @@ def standard_errors(scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -
         on_sky_window = window.finer(scene.oversample).of(scene.grid)
         beyond = source.images_of(texture.mean[there] - sky[on_sky_window] / scene.unit)
         images = [
-            _linearise(scene, psfs[j], j, sky, star_fluxes, held, window, moves, beyond[j])
+            _linearise(scene, j, sky, star_fluxes, held, window, moves, beyond[j])
             for j in range(scene.n_images)
         ]
         row[: 3 if moves else 1] = _errors_of_first(images, source, len(held))
@@ -222,7 +222,6 @@ def _source_error(
 
 def _linearise(
     scene: Scene,
-    psf: MovablePsf | DetectorPsf,
     j: int,
     sky: Array,
     star_fluxes: Array,
@@ -246,8 +245,8 @@ def _linearise(
     precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
     slopes = [_cut(scene.star_stamp(j, s), there, scene.image_grid) for s in held]
     if moves:
-        offset = scene.observation.offsets[j]
-        moved = [psf.with_slopes(*(scene.stars[s] + offset)) for s in held]
+        offset, psfs = scene.observation.offsets[j], scene.star_field.psfs[j]
+        moved = [psfs[s].with_slopes(*(scene.stars[s] + offset)) for s in held]
         for axis in (1, 2):
             for s, (stamp, values) in zip(held, moved, strict=True):
                 slope = stamp._replace(values=star_fluxes[s] / scene.unit * values[axis])

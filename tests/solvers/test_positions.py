@@ -345,7 +345,7 @@ def test_box_that_a_star_may_light_holds_it_wherever_it_goes(shape):
                 assert rows[stamp.rows(scene.grid)].all()
                 assert columns[stamp.columns(scene.grid)].all()
             for movable, offset in zip(fit._stars, observation.offsets, strict=True):
-                pixels, values = movable._moving(position + offset)
+                pixels, values = movable._moving(0, position + offset)
                 assert (pixels >= 0).all()  # else the fit has no place for them
                 assert len(np.unique(pixels)) == len(pixels) == values.shape[1]
     if shape[0] == 128:

@@ -1,0 +1,483 @@
+"""Large images, and PSFs that vary over the field: overlapping tiles, each a run of its own."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple, NoReturn, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.deconvolution import deconvolve
+from lnocl.errors import InputError, LnoclWarning, counted, warn
+from lnocl.parallel import check_parallel, work
+from lnocl.process import ignored_warnings, recorded_warnings
+from lnocl.residuals import StarResiduals
+from lnocl.result import Result
+from lnocl.runs.options import check_length, check_observation, read_penalties
+from lnocl.runs.outcome import CURVE_DTYPE, Outcome
+from lnocl.runs.progress import make_bar
+from lnocl.scene.grid import length_for
+from lnocl.scene.observation import Array, Observation
+from lnocl.scene.padding import recommend_pad
+from lnocl.scene.penalty import Penalty
+from lnocl.scene.scene import EDGE, Scene
+from lnocl.scene.stars import check_positions
+
+# The side of a tile in those of the PSFs, where these vary: docs/tiles.md.
+SIDES = 5
+# Where they do not.
+LARGE_TILE = 2048
+# Warnings of tiles that are given in full.
+MAX_WARNINGS = 3
+
+TILE_DTYPE = np.dtype(
+    [
+        *((name, np.int64) for name in ("x", "y", "width", "height", "n_iter")),
+        ("objective", np.float64),
+    ]
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TiledResult(Result):
+    """The result of `deconvolve_tiles`: that of `deconvolve`, put together from those of tiles.
+
+    `bootstrap` is not there, `psfs` are those of the middle of the images, and `history` is the sum
+    of those of all tiles.
+
+    Attributes
+    ----------
+    tiles : ndarray, fields ``x``, ``y``, ``width``, ``height``, ``n_iter``, ``objective``
+        The pixels of the images that each tile stands for, without its margins; its iterations, and
+        its last objective, margins included.
+    """
+
+    tiles: NDArray[np.void]
+    _images: Observation
+    _all_models: Array
+    _errors: tuple[Array, Array]
+    _at_stars: list[StarResiduals]
+
+    @property
+    def _observation(self) -> Observation:
+        return self._images
+
+    def _models(self) -> Iterator[Array]:
+        return iter(self._all_models)
+
+    @property
+    def _star_errors(self) -> tuple[Array, Array]:
+        return self._errors
+
+    def star_residuals(self) -> list[StarResiduals]:
+        """Return how well the model fits at each star: in its core, its wings and round it."""
+        return self._at_stars
+
+    def bootstrap(self, *_: Any, **__: Any) -> NoReturn:
+        """Refuse: replicas are made of one run.
+
+        Raises
+        ------
+        InputError
+            Always.
+        """
+        raise InputError("replicas are of one run, not of tiles; leave tile out, or bootstrap")
+
+
+class _Span(NamedTuple):
+    """A tile along one axis, in pixels of the images.
+
+    Attributes
+    ----------
+    core : range
+        What it stands for.
+    window : range
+        What it sees: the core and its margins.
+    size : int
+        Of the images.
+    margin : int
+        Pixels round the core that are seen, at least.
+    """
+
+    core: range
+    window: range
+    size: int
+    margin: int
+
+    def weights(self, oversample: int) -> Array:
+        """Return the weights of the window's pixels, which fall across half of each margin.
+
+        Those of neighbours sum to 1.
+        """
+        at = (np.arange(oversample * len(self.window)) + 0.5) / oversample + self.window.start
+        weights = np.ones_like(at)
+        if self.core.start > 0:
+            weights *= np.clip(0.5 + (at - self.core.start) / self.margin, 0.0, 1.0)
+        if self.core.stop < self.size:
+            weights *= np.clip(0.5 + (self.core.stop - at) / self.margin, 0.0, 1.0)
+        return weights
+
+
+class _Tile(NamedTuple):
+    """What a tile sees, and which stars are its own.
+
+    Attributes
+    ----------
+    spans : tuple of _Span
+        Along y and x.
+    observation : Observation
+        What is in its window.
+    stars : ndarray of float64, shape (k, 2)
+        Positions in the window.
+    own, numbers : ndarray of int
+        Which of them lie in its core, and which those are of all stars.
+    """
+
+    spans: tuple[_Span, _Span]
+    observation: Observation
+    stars: Array
+    own: NDArray[np.intp]
+    numbers: NDArray[np.intp]
+
+
+class _Found(NamedTuple):
+    """What a tile has found: its extended source, in electrons, and what it stands for alone."""
+
+    extended: Array
+    models: Array
+    stars: tuple[Array, Array, Array, Array]
+    at_stars: list[StarResiduals]
+    history: NDArray[np.void]
+    stop_reason: str
+    device: str
+    said: list[str]
+
+
+def deconvolve_tiles(
+    observation: Observation,
+    stars: Iterable[tuple[float, float]] = (),
+    *,
+    tile: int | None = None,
+    parallel: bool | int | str = False,
+    mu: float = 0.0,
+    smoothing: float | str = "auto",
+    n_iter: int = 1000,
+    stop: str | float | None = "held-out",
+    progress: bool = False,
+    **options: Any,
+) -> TiledResult:
+    """Reconstruct the sky tile by tile: large images, or PSFs that vary over the field.
+
+    Each tile is a run of its own, of what is in its window: its part of the images, and margins of
+    half a PSF and more, so that nothing that lights its part is left out. Its PSFs are those of the
+    middle of its part, ``sum_i w_i K_i`` of a `PsfField`; each star has that of its own place. The
+    extended sources are blended across half of the margins.
+
+    All tiles have the same iterations, weights and delta of the edge-preserving term. Those that
+    held-out counts, or the discrepancy, choose are chosen on the brightest tile.
+
+    Parameters
+    ----------
+    observation : Observation
+        As for `deconvolve`.
+    stars : iterable of (x, y) or astropy.table.Table, optional
+        As for `deconvolve`.
+    tile : int, optional
+        Side of the grid that a tile is computed on, with its margins and pad, pixels of the images;
+        by default about five times that of the PSFs where these vary, else 2048.
+    parallel : bool, int or "current-scheduler", optional
+        Where the tiles are computed (`lnocl.parallel.check_parallel`).
+    mu, smoothing, n_iter, stop, progress : optional
+        As for `deconvolve`.
+    **options
+        Others of `deconvolve`: solver, precision, engine, device, pad, refine_positions.
+
+    Returns
+    -------
+    TiledResult
+
+    Raises
+    ------
+    InputError
+        As `deconvolve`; a tile has no room for its margins; an option is not for tiles.
+    LnoclError
+        Dask is missing; the workers are lost.
+    DeviceError
+        As `deconvolve`.
+
+    Warns
+    -----
+    LnoclWarning
+        As `deconvolve`, for the first tiles of which there is something to say.
+
+    Notes
+    -----
+    Tiles of one iteration agree with the whole where a pixel hangs on its neighbours alone: with
+    "sgm", and with "sgp" when it has converged. Before that the steps of "sgp" differ from tile to
+    tile, by less than the noise (docs/tiles.md).
+
+    References
+    ----------
+    L. Denis, E. Thiebaut, F. Soulez, J.-M. Becker, R. Mourya, Int. J. Comput. Vis. 115, 253 (2015),
+    section 2, compares models of PSFs that vary.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> narrow, wide = np.eye(3)[[1]].T * np.eye(3)[1], np.full((3, 3), 1 / 9)
+    >>> field = lnocl.PsfField([narrow, wide], [(0, 0), (63, 0)])
+    >>> obs = lnocl.Observation(np.full((64, 64), 9.0), field)
+    >>> result = lnocl.deconvolve_tiles(obs, tile=40, stop=None, n_iter=9, engine="numpy")
+    >>> len(result.tiles), result.extended[8:-8, 8:-8].mean().round(2)
+    (4, np.float64(9.0))
+    """
+    check_parallel(parallel)
+    check_observation(observation)
+    check_length(n_iter, stop)
+    _check_options(options)
+    positions = check_positions(stars, observation)
+    penalties = read_penalties(mu, smoothing, stop, observation)
+    if any(each.smoothing for each in penalties):
+        with ignored_warnings():  # of which the tiles know more
+            edge = EDGE * Scene(observation, positions).level
+        penalties = [replace(each, edge=edge) for each in penalties]
+    pad = _pad(observation, options.pop("pad", "auto"))
+    tiles = _lay(observation, positions, tile, pad)
+    options["pad"] = pad if len(tiles) > 1 else "auto"
+    curve, reason, penalty, last = np.zeros(0, CURVE_DTYPE), "", penalties[0], stop
+    if isinstance(stop, str):
+        chosen = _choose(tiles, penalties, n_iter, stop, options)
+        curve, reason, n_iter, last = chosen.held_out, chosen.stop_reason, chosen.n_iter, None
+        penalty = next(each for each in penalties if each.smoothing == chosen.smoothing)
+    make = partial(_Solving, smoothing=[penalty], n_iter=max(n_iter, 1), stop=last, **options)
+    mosaic = _Mosaic(observation, len(positions))
+    observed = [each for each in tiles if not each.observation.mask.all()]
+    with (
+        make_bar(len(observed), "tile", progress) as bar,
+        closing(work(make, observed, parallel)) as answers,
+    ):
+        for each, found in zip(observed, answers, strict=True):
+            mosaic.add(each, found)
+            bar.update()
+    _warn_of_tiles(mosaic.said)
+    return mosaic.result(penalty, curve, reason, n_iter if reason else None)
+
+
+ALLOWED = {"solver", "precision", "engine", "device", "pad", "refine_positions"}
+
+
+def _check_options(options: dict[str, Any]) -> None:
+    if unknown := sorted(set(options) - ALLOWED):
+        raise InputError(
+            f"{unknown[0]} is no option of tiles; leave it out, or take deconvolve for the whole"
+        )
+
+
+def _pad(observation: Observation, pad: Any) -> int:
+    """Return the pad of all tiles: light runs over the edges of some, wherever they are cut."""
+    if isinstance(pad, str) and pad == "auto":
+        return recommend_pad(observation)
+    if not (isinstance(pad, (int, np.integer)) and pad >= 0):
+        raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
+    return int(pad)
+
+
+def _lay(observation: Observation, positions: Array, tile: int | None, pad: int) -> list[_Tile]:
+    """Return the tiles of the images, row by row."""
+    sides = [-(-k // observation.oversample) for k in observation.psfs.shape[1:]]
+    margins = [k // 2 for k in sides]
+    if tile is None:
+        tile = length_for(SIDES * max(sides)) if observation.psf_fields else LARGE_TILE
+    least = 2 * (max(margins) + pad) + 16
+    if not (isinstance(tile, (int, np.integer)) and tile >= least):
+        raise InputError(
+            f"tile must be a whole number of {least} pixels or more, for margins of half a PSF, "
+            f"{max(margins)} pixels, on each side, and a pad of {pad}; {tile} was given"
+        )
+    rows, columns = (
+        _divide(size, int(tile) - 2 * pad, margin)
+        for size, margin in zip(observation.shape, margins, strict=True)
+    )
+    return [_cut(observation, positions, (y, x)) for y in rows for x in columns]
+
+
+def _divide(size: int, window: int, margin: int) -> list[_Span]:
+    """Return tiles along an axis; their windows are of one size, so that programs serve all."""
+    n = 1 if size <= window else math.ceil(size / (window - 2 * margin))
+    window = min(window, size)
+    edges = np.round(np.linspace(0, size, n + 1)).astype(int).tolist()
+    first = [
+        min(max((a + b - window) // 2, 0), size - window) for a, b in itertools.pairwise(edges)
+    ]
+    return [
+        _Span(range(a, b), range(at, at + window), size, margin)
+        for (a, b), at in zip(itertools.pairwise(edges), first, strict=True)
+    ]
+
+
+def _cut(observation: Observation, positions: Array, spans: tuple[_Span, _Span]) -> _Tile:
+    rows, columns = (span.window for span in spans)
+    moved = positions - (columns.start, rows.start)
+    part = observation.window(rows, columns)
+    if part.psf_fields:  # those of the middle of the core, not of the window
+        y, x = ((each.core.start + each.core.stop - 1) / 2.0 - each.window.start for each in spans)
+        part.psfs = np.array([field.at(x, y) for field in part.psf_fields])
+    ny, nx = part.shape
+    x, y = (moved[:, None] + part.offsets).transpose(2, 0, 1)
+    is_seen = ((x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)).any(axis=1)
+    is_own = _are_own(positions, spans) & is_seen
+    own = np.flatnonzero(is_own[is_seen])
+    return _Tile(spans, part, moved[is_seen], own, np.flatnonzero(is_own))
+
+
+def _are_own(positions: Array, spans: tuple[_Span, _Span]) -> NDArray[np.bool_]:
+    """Return which positions lie in the core of a tile, or outside the images next to it."""
+    are_own = np.ones(len(positions), bool)
+    for at, span in zip(positions.T[::-1], spans, strict=True):
+        nearest = np.clip(np.floor(at + 0.5), 0, span.size - 1)
+        are_own &= (nearest >= span.core.start) & (nearest < span.core.stop)
+    return are_own
+
+
+def _choose(
+    tiles: Sequence[_Tile],
+    penalties: list[Penalty],
+    n_iter: int,
+    stop: str,
+    options: dict[str, Any],
+) -> Result:
+    """Return the result of the brightest tile, which chooses for all."""
+    brightest = max(tiles, key=lambda each: _light(each.observation))
+    return deconvolve(
+        brightest.observation,
+        brightest.stars,
+        smoothing=cast(Any, penalties),
+        n_iter=n_iter,
+        stop=stop,
+        **options,
+    )
+
+
+def _light(observation: Observation) -> float:
+    """Return the counts above the background."""
+    level = observation.background
+    level = level if level.ndim == 3 else level[:, None, None]
+    return float(np.where(observation.mask, 0.0, observation.images - level).sum())
+
+
+class _Solving:
+    """Reconstructs tiles with the same options."""
+
+    def __init__(self, **options: Any) -> None:
+        self._options = options
+
+    def __call__(self, tile: _Tile) -> _Found:
+        with recorded_warnings() as recorded:
+            result = deconvolve(tile.observation, tile.stars, **self._options)
+            stars = (
+                result.star_positions,
+                result.star_fluxes,
+                result.star_flux_errors,
+                result.star_position_errors,
+            )
+        rows, columns = (
+            slice(span.core.start - span.window.start, span.core.stop - span.window.start)
+            for span in tile.spans
+        )
+        at_stars = result.star_residuals()
+        return _Found(
+            result.extended,
+            result.models()[:, rows, columns],
+            cast(Any, tuple(each[tile.own] for each in stars)),
+            [at_stars[s] for s in tile.own],
+            result.history,
+            result.stop_reason,
+            result.device,
+            [str(each.message) for each in recorded if issubclass(each.category, LnoclWarning)],
+        )
+
+
+class _Mosaic:
+    """What all tiles have found, put together as they are done."""
+
+    def __init__(self, observation: Observation, n_stars: int) -> None:
+        self._observation = observation
+        self._extended = np.zeros(observation.sky_shape)
+        self._weight = np.zeros(observation.sky_shape)
+        self._models = np.zeros(observation.images.shape)
+        self._stars = np.full((n_stars, 6), np.nan)
+        self._at_stars: list[StarResiduals | None] = [None] * n_stars
+        self._tiles: list[tuple[Any, ...]] = []
+        self._found: list[_Found] = []
+        self.said: list[str] = []
+
+    def add(self, tile: _Tile, found: _Found) -> None:
+        """Add what a tile has found."""
+        q = self._observation.oversample
+        y, x = tile.spans
+        weights = np.multiply.outer(y.weights(q), x.weights(q))
+        there = tuple(slice(q * s.window.start, q * s.window.stop) for s in tile.spans)
+        self._extended[there] += weights * found.extended
+        self._weight[there] += weights
+        self._models[:, y.core.start : y.core.stop, x.core.start : x.core.stop] = found.models
+        self._tiles.append(
+            (x.core.start, y.core.start, len(x.core), len(y.core), len(found.history) - 1,
+             found.history["objective"][-1])
+        )  # fmt: skip
+        self.said += [
+            f"tile at ({x.core.start}, {y.core.start}): {message}" for message in found.said
+        ]
+        positions, fluxes, flux_errors, position_errors = found.stars
+        columns = [positions, fluxes, flux_errors, position_errors]
+        self._stars[tile.numbers] = np.column_stack(columns)
+        for s, at_star in zip(tile.numbers, found.at_stars, strict=True):
+            self._at_stars[s] = at_star
+        self._found.append(found._replace(extended=np.zeros(0), models=np.zeros(0)))
+
+    def result(
+        self, penalty: Penalty, curve: NDArray[np.void], reason: str, n_iter: int | None
+    ) -> TiledResult:
+        """Return it all."""
+        longest = max(self._found, key=lambda each: len(each.history))
+        history = longest.history.copy()
+        history["objective"] = 0.0
+        for found in self._found:
+            objective = found.history["objective"]
+            history["objective"][: len(objective)] += objective
+            history["objective"][len(objective) :] += objective[-1]
+        extended = np.divide(
+            self._extended, self._weight, out=self._extended, where=self._weight > 0
+        )
+        return TiledResult(
+            extended=extended,
+            star_fluxes=self._stars[:, 2],
+            star_positions=self._stars[:, :2],
+            n_iter=len(history) - 1 if n_iter is None else n_iter,
+            stop_reason=reason or longest.stop_reason,
+            device=longest.device,
+            history=history,
+            mu=penalty.mu,
+            smoothing=penalty.smoothing,
+            held_out=curve,
+            psf_refinement=None,
+            _outcome=cast(Outcome, None),
+            tiles=np.array(self._tiles, TILE_DTYPE),
+            _images=self._observation,
+            _all_models=self._models,
+            _errors=(self._stars[:, 3], self._stars[:, 4:]),
+            _at_stars=cast(Any, self._at_stars),
+        )
+
+
+def _warn_of_tiles(said: Sequence[str]) -> None:
+    for message in said[:MAX_WARNINGS]:
+        warn(message)
+    if len(said) > MAX_WARNINGS:
+        warn(f"{counted(len(said) - MAX_WARNINGS, 'other warning')} of tiles")
