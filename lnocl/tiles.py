@@ -244,13 +244,14 @@ def deconvolve_tiles(
     _check_options(options)
     positions = check_positions(stars, observation)
     penalties = read_penalties(mu, smoothing, stop, observation)
-    if any(each.smoothing for each in penalties):
-        with ignored_warnings():  # of which the tiles know more
-            edge = EDGE * Scene(observation, positions).level
-        penalties = [replace(each, edge=edge) for each in penalties]
-    pad = _pad(observation, options.pop("pad", "auto"))
+    pad = _pad(observation, options.get("pad", "auto"))
     tiles = _lay(observation, positions, tile, pad)
-    options["pad"] = pad if len(tiles) > 1 else "auto"
+    if len(tiles) > 1:
+        options["pad"] = pad
+        if any(each.smoothing for each in penalties):
+            with ignored_warnings():  # of which the tiles know more
+                edge = EDGE * Scene(observation, positions).level
+            penalties = [replace(each, edge=edge) for each in penalties]
     curve, reason, penalty, last = np.zeros(0, CURVE_DTYPE), "", penalties[0], stop
     if isinstance(stop, str):
         chosen = _choose(tiles, penalties, n_iter, stop, options)
@@ -435,7 +436,8 @@ class _Mosaic:
             f"tile at ({x.core.start}, {y.core.start}): {message}" for message in found.said
         ]
         positions, fluxes, flux_errors, position_errors = found.stars
-        columns = [positions, fluxes, flux_errors, position_errors]
+        placed = positions + np.array([x.window.start, y.window.start])
+        columns = [placed, fluxes, flux_errors, position_errors]
         self._stars[tile.numbers] = np.column_stack(columns)
         for s, at_star in zip(tile.numbers, found.at_stars, strict=True):
             self._at_stars[s] = at_star

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lnocl.commands.options import PARALLEL, option
+from lnocl.commands.options import option
 from lnocl.scene.apertures import Profile
 
 if TYPE_CHECKING:
@@ -57,10 +57,6 @@ OPTIONS = [
         metavar="S",
         help="of the replicas, 0 or more (default: 0); the same seed gives the same errors",
     ),
-    PARALLEL.but(
-        help="replicas at once: a number of processes, or current-scheduler, the workers of the "
-        "scheduler of Dask that DASK_SCHEDULER_ADDRESS names (default: one after the other)"
-    ),
 ]
 
 
@@ -70,8 +66,8 @@ def check(arguments: argparse.Namespace) -> None:
     Raises
     ------
     InputError
-        A number of replicas below ten, a negative seed; regions, a seed or processes without
-        replicas.
+        A number of replicas below ten, a negative seed; regions or a seed without replicas; tiles
+        with them.
     LnoclError
         Dask is missing.
     """
@@ -81,13 +77,13 @@ def check(arguments: argparse.Namespace) -> None:
 
     check_parallel(arguments.parallel)
     if arguments.bootstrap is None:
-        given = [getattr(arguments, name) for name in ("regions", "profiles", "seed")]
-        if any(each is not None for each in given) or arguments.parallel:
+        if any(getattr(arguments, name) is not None for name in ("regions", "profiles", "seed")):
             raise InputError(
-                "regions, profiles, seed and parallel are for replicas: give --bootstrap 50 with "
-                "them"
+                "regions, profiles and seed are for replicas: give --bootstrap 50 with them"
             )
         return
+    if arguments.tile is not None:
+        raise InputError("replicas are of one run, not of tiles; leave tile out, or bootstrap")
     check_number(arguments.bootstrap, arguments.seed or 0)
 
 

@@ -13,6 +13,7 @@ from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
 from lnocl.commands.summary import summarise
 from lnocl.deconvolution import deconvolve
+from lnocl.errors import InputError
 from lnocl.residuals import Fit, StarResiduals
 from lnocl.result import Result, saved_parts, view_of
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from lnocl.io.frames import Frames
     from lnocl.plotting.result import ResultView
     from lnocl.runs.bootstrap import Part
+    from lnocl.scene.observation import Observation
 
 
 class Solved(NamedTuple):
@@ -45,14 +47,30 @@ def solve(arguments: argparse.Namespace, interrupts: checkpoints.Interrupts) -> 
     frames = read_frames(arguments.images, arguments.psfs, calibration)
     given["stars"] = _stars(arguments, frames.header)
     parts = bootstrap.read(arguments, frames)
-    result = deconvolve(
-        frames.observation,
-        # Each process that makes replicas takes a device of its own, unless one was named.
-        **_parameters(given | {"device": arguments.device}),
-        progress=not arguments.quiet,
-        callback=interrupts.callback,
-    )
+    # Each process that makes replicas or tiles takes a device of its own, unless one was named.
+    parameters = _parameters(given | {"device": arguments.device})
+    parameters["progress"] = not arguments.quiet
+    if arguments.tile is None and not frames.observation.psf_fields:
+        result = deconvolve(frames.observation, **parameters, callback=interrupts.callback)
+    else:
+        result = _solve_tiles(arguments, frames.observation, parameters)
     return Solved(result, frames, given, parts)
+
+
+def _solve_tiles(
+    arguments: argparse.Namespace, observation: Observation, parameters: dict[str, Any]
+) -> Result:
+    """Run tile by tile; refuse what is for one run alone."""
+    from lnocl.tiles import deconvolve_tiles
+
+    if arguments.bootstrap is not None:
+        raise InputError("replicas are of one run, not of tiles; leave bootstrap out")
+    for name in ("checkpoint", "checkpoint_every", "resume", "refine_psfs", "round_source"):
+        if parameters.pop(name, PARAMETERS[name]) not in (PARAMETERS[name], []):
+            raise InputError(f"{name} is not for tiles; leave it out")
+    return deconvolve_tiles(
+        observation, tile=arguments.tile, parallel=arguments.parallel, **parameters
+    )
 
 
 def _run(arguments: argparse.Namespace) -> None:

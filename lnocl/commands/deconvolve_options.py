@@ -309,6 +309,21 @@ OPTIONS = {
             help="OpenCL, or the NumPy reference, which computes in double (default: %(default)s)",
         ),
     ],
+    "tiles": [
+        option(
+            "--tile",
+            type=int,
+            metavar="N",
+            help="reconstruct tile by tile on grids of N x N pixels, each with the PSF of its "
+            "middle: for large images, and PSFs that vary (default: where --psf is a grid of PSFs "
+            "five times its side, else the whole)",
+        ),
+        options.PARALLEL.but(
+            help="tiles, or replicas of --bootstrap, at once: a number of processes, or "
+            "current-scheduler, the workers of the scheduler of Dask that DASK_SCHEDULER_ADDRESS "
+            "names (default: one after the other)"
+        ),
+    ],
     "errors": bootstrap.OPTIONS,
     "long runs": checkpoints.OPTIONS,
 }

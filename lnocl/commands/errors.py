@@ -33,6 +33,10 @@ OPTIONS = [
         "replicas that it has",
     ),
     *bootstrap.OPTIONS,
+    options.PARALLEL.but(
+        help="replicas at once: a number of processes, or current-scheduler, the workers of the "
+        "scheduler of Dask that DASK_SCHEDULER_ADDRESS names (default: one after the other)"
+    ),
     options.OVERWRITE.but(help="begin anew, without the replicas that RESULT.fits has"),
     options.QUIET,
 ]

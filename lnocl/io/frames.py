@@ -19,6 +19,7 @@ from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
 from lnocl.io.levels import sky_level, sky_noise
 from lnocl.io.maps import Maps, Word
 from lnocl.io.noise import VARIANCES, NoiseMap, electrons_by_variance, read_noise_map
+from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.observation import OVERSAMPLES, Array, Observation
 
@@ -143,7 +144,8 @@ def read_frames(images: Sequence[str], psfs: Sequence[str], calibration: Calibra
     Parameters
     ----------
     images, psfs : sequence of str
-        Files, as for `fitsread.read_stack`. The unit of the images is that of their BUNIT; without
+        Files, as for `fitsread.read_stack`; PSFs may be grids (`lnocl.io.psf_grids`). The unit of
+        the images is that of their BUNIT; without
         one they are in electrons.
     calibration : Calibration
         Their calibration.
@@ -166,6 +168,9 @@ class _Reader:
         self._paths, self._calibration = images, calibration
         self._images = read_stack(images)
         self._psfs = read_stack(psfs)
+        self._grids = [read_grid(path) for path in psfs if is_grid(path)]
+        if len(self._grids) not in (0, len(psfs)):
+            raise InputError("give grids of PSFs for all images, or for none")
         self._maps = Maps(self._images.data.shape)
         self._sha256: dict[str, list[str]] = {}
 
@@ -179,7 +184,8 @@ class _Reader:
                 "map, or a keyword of the header such as EXPTIME"
             )
         # Electrons in each unit of the images.
-        self._warn_of_pixel_scales()
+        if not self._grids:  # which are sampled on the images' pixels as they need
+            self._warn_of_pixel_scales()
         each = factor * (_maps(exposure) if are_rates and exposure is not None else 1.0)
         noise = self._noise_map()
         mask = self._mask(exposure, noise)
@@ -189,7 +195,7 @@ class _Reader:
         read_noise = self._read_noise_words(counts, mask)
         observation = Observation(
             counts,
-            self._psfs.data,
+            self._grids or self._psfs.data,
             background=self._maps.combine("background", background),
             read_noise=self._maps.combine("read_noise", read_noise)
             if noise is None

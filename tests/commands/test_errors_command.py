@@ -248,7 +248,7 @@ def test_a_file_of_no_command_is_refused(words, capsys):
     alone = words[: words.index("--regions")]
     assert cli.main([*alone, "--seed", "3"]) == 2
     assert (
-        "--regions, --profiles, --seed and --parallel are for replicas: give --bootstrap"
+        "--regions, --profiles and --seed are for replicas: give --bootstrap"
         in capsys.readouterr().err
     )
 

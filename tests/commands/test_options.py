@@ -17,7 +17,8 @@ pytestmark = pytest.mark.usefixtures("command_folder")
 # Options of lnocl deconvolve that no function takes as they are.
 OF_THE_SHELL = {"images", "output", "overwrite", "plot", "quiet", "models", "residuals",
                 "star_sky", "star_table", "zero_point",
-                "bootstrap", "regions", "profiles", "seed", "parallel"}  # fmt: skip
+                "bootstrap", "regions", "profiles", "seed",
+                "parallel", "tile"}  # fmt: skip
 # Parameters of lnocl.deconvolve that the shell gives itself, or that no option gives.
 NOT_OPTIONS = {"observation", "callback", "progress", "initial_extended", "initial_star_fluxes"}
 

@@ -1,0 +1,424 @@
+"""Tiles, and PSFs that vary over the field: against the whole, and against a PSF for each pixel."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from commandline import outcome
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import RegularGridInterpolator
+from scipy.signal import fftconvolve
+
+import lnocl
+from lnocl import PsfField, tiles
+from lnocl.commands import cli
+from lnocl.errors import InputError
+from lnocl.scene.shifting import MovablePsf
+
+HALF = 10
+Y, X = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].astype(float)
+N = 128
+RUN = {"engine": "numpy", "precision": "double", "stop": None}
+
+
+def vary(x, y, size=N, growth=0.5, turn=60.0):
+    """Return a Gaussian whose width grows by half, and that turns by 60 degrees, to the corner."""
+    middle = (size - 1) / 2.0
+    r = np.hypot(x - middle, y - middle) / np.hypot(middle, middle)
+    width, angle = 1.7 * (1.0 + growth * r), np.deg2rad(turn * r)
+    along = (X * np.cos(angle) + Y * np.sin(angle)) / width
+    across = (Y * np.cos(angle) - X * np.sin(angle)) / (0.8 * width)
+    psf = np.exp(-0.5 * (along**2 + across**2))
+    return psf / psf.sum()
+
+
+def make_field(n=3, size=N, **how):
+    nodes = np.linspace(0.0, size - 1.0, n)
+    positions = [(x, y) for y in nodes for x in nodes]
+    return PsfField([vary(x, y, size, **how) for x, y in positions], positions)
+
+
+def make_sky(seed=0, size=N):
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:size, :size]
+    sky = np.full((size, size), 2.0)
+    for _ in range(size // 8):
+        (cx, cy), width, peak = rng.uniform(0, size, 2), rng.uniform(2.0, 8.0), rng.uniform(10, 60)
+        sky += peak * np.exp(-np.hypot(x - cx, y - cy) / width)
+    return sky
+
+
+def see(sky, psf_at):
+    """Return the image of a sky through a PSF for each of its pixels, by brute force."""
+    ny, nx = sky.shape
+    image = np.zeros((ny + 2 * HALF, nx + 2 * HALF))
+    for (y, x), light in np.ndenumerate(sky):
+        image[y : y + 2 * HALF + 1, x : x + 2 * HALF + 1] += light * psf_at(x, y)
+    return image[HALF:-HALF, HALF:-HALF]
+
+
+# --- Fields of PSFs
+
+
+def test_between_nodes_psfs_are_bilinear_and_beyond_them_constant():
+    rng = np.random.default_rng(1)
+    x, y = np.array([0.0, 30.0, 100.0]), np.array([5.0, 60.0])
+    psfs = rng.random((2, 3, 4, 5))
+    positions = [(a, b) for b in y for a in x]
+    mixed = rng.permutation(6)
+    field = PsfField(psfs.reshape(6, 4, 5)[mixed], np.array(positions)[mixed])
+    expected = RegularGridInterpolator((y, x), psfs)
+    for a, b in rng.uniform((-20, -20), (120, 80), (50, 2)):
+        at = np.clip((b, a), (5.0, 0.0), (60.0, 100.0))
+        np.testing.assert_allclose(field.at(a, b), expected(at)[0], rtol=1e-13)
+    moved = field.moved(-7.0, 3.0)
+    np.testing.assert_allclose(moved.at(13.0, 33.0), field.at(20.0, 30.0), rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("psfs", "positions", "message"),
+    [
+        (np.ones((2, 3, 3)), [(0, 0)], r"positions \(1, 2\)"),
+        (np.ones((3, 3)), [(0, 0)], r"psfs has shape \(3, 3\)"),
+        (np.ones((0, 3, 3)), np.zeros((0, 2)), r"psfs has shape \(0, 3, 3\)"),
+        (np.ones((3, 3, 3)), [(0, 0), (0, 1), (1, 0)], "3 PSFs do not fill a grid of 2 columns"),
+        (np.ones((2, 3, 3)), [(0, 0), (0, 0)], "do not fill a grid of 1 columns and 1 rows"),
+        (np.ones((1, 3, 3)), [(0, np.nan)], "must be finite"),
+    ],
+)
+def test_fields_that_are_none_are_refused(psfs, positions, message):
+    with pytest.raises(InputError, match=message):
+        PsfField(psfs, positions)
+
+
+@pytest.mark.parametrize("oversample", [1, 2])
+@pytest.mark.parametrize("side", [29, 28])
+def test_models_of_photutils_are_sampled_on_the_pixels_of_the_sky(side, oversample):
+    photutils = pytest.importorskip("photutils.psf", reason="photutils is not installed")
+    from astropy.nddata import NDData
+
+    middle = (side - 1) / 2.0
+    y, x = (np.mgrid[:side, :side] - middle) / 4.0
+    widths = {(0.0, 0.0): 1.0, (40.0, 0.0): 1.2, (0.0, 50.0): 1.1, (40.0, 50.0): 1.4}
+    gaussians = [np.exp(-0.5 * (x**2 + y**2) / w**2) / (2 * np.pi * w**2) for w in widths.values()]
+    meta = {"grid_xypos": list(widths), "oversampling": 4}
+    model = photutils.GriddedPSFModel(NDData(np.array(gaussians), meta=meta))
+    observation = lnocl.Observation(
+        np.ones((51, 41)), model, oversample=oversample, effective_psfs=oversample > 1
+    )
+    assert observation.psfs.shape[1] % 2 == 1
+    half = observation.psfs.shape[1] // 2
+    y, x = np.mgrid[-half : half + 1, -half : half + 1] / oversample
+    for (px, py), width in widths.items():
+        expected = np.exp(-0.5 * (x**2 + y**2) / width**2)
+        found = observation.psf_fields[0].at(px, py)
+        np.testing.assert_allclose(found, expected / expected.sum(), atol=1e-4 * found.max())
+    mean = np.mean([observation.psf_fields[0].at(*place) for place in widths], axis=0)
+    np.testing.assert_allclose(observation.psfs[0], mean, atol=1e-15)
+    if oversample > 1:
+        with pytest.raises(InputError, match="give effective_psfs=True"):
+            lnocl.Observation(np.ones((51, 41)), model, oversample=2)
+
+
+def test_fields_must_serve_all_images():
+    one, other = make_field(), PsfField(np.ones((1, 3, 3)), [(0, 0)])
+    images = np.ones((3, N, N))
+    assert lnocl.Observation(images, [one] * 3).psfs.shape == (3, 21, 21)
+    assert len(lnocl.Observation(images, one).psf_fields) == 3
+    with pytest.raises(InputError, match="2 fields of PSFs for 3 images"):
+        lnocl.Observation(images, [one, one])
+    with pytest.raises(InputError, match="differ in shape"):
+        lnocl.Observation(images, [one, other, one])
+    with pytest.raises(InputError, match="psf 0 has the sum 0"):
+        lnocl.Observation(images, PsfField(np.zeros((1, 3, 3)), [(0, 0)]))
+
+
+# --- Stars through the PSFs of their own places
+
+
+@pytest.mark.filterwarnings("ignore:the noise of image", "ignore:neighbouring pixels")
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_each_star_has_the_psf_of_its_own_place(solver):
+    """Without noise their fluxes and places are found in every corner, and nothing beside them."""
+    field = make_field()
+    stars = np.array([(20.3, 25.8), (110.6, 14.2), (64.0, 64.0), (16.1, 108.7), (104.9, 111.4)])
+    fluxes = np.array([3e5, 1e5, 2e5, 5e5, 4e5])
+    offset = (0.4, -1.3)
+    images = np.zeros((2, N, N))
+    for image, moved in zip(images, ((0.0, 0.0), offset), strict=True):
+        for place, flux in zip(stars + moved, fluxes, strict=True):
+            image += flux * MovablePsf(field.at(*place), (N, N)).at(*place).on_grid((N, N))
+    observation = lnocl.Observation(
+        np.maximum(images, 0.0) + 5.0, field, background=5.0, offsets=[(0, 0), offset]
+    )
+    given = stars + np.random.default_rng(0).uniform(-0.3, 0.3, stars.shape)
+    result = lnocl.deconvolve(
+        observation, given, solver=solver, n_iter=30, smoothing=0.0, refine_positions=True, **RUN
+    )
+    np.testing.assert_allclose(result.star_positions, stars, atol=6e-3)
+    np.testing.assert_allclose(result.star_fluxes, fluxes, rtol=2e-3)
+    middle = lnocl.Observation(
+        observation.images, observation.psfs, background=5.0, offsets=[(0, 0), offset]
+    )
+    with pytest.warns(lnocl.LnoclWarning, match="does not fit"):
+        wrong = lnocl.deconvolve(
+            middle, given, solver=solver, n_iter=30, smoothing=0.0, refine_positions=True, **RUN
+        )
+    assert abs(wrong.star_fluxes / fluxes - 1.0).max() > 0.1
+    errors = result.star_flux_errors
+    assert (errors > 0.9 * np.sqrt(fluxes / 2)).all()
+    assert (errors < 2.0 * np.sqrt(fluxes / 2)).all()
+
+
+@pytest.mark.filterwarnings("ignore:the noise of image", "ignore:neighbouring pixels")
+def test_fields_are_part_of_what_a_checkpoint_is_of(tmp_path):
+    path = tmp_path / "c.fits"
+    image = make_sky() + 5.0
+    run = {"n_iter": 2, "smoothing": 0.0, **RUN}
+    lnocl.deconvolve(lnocl.Observation(image, make_field()), checkpoint=path, **run)
+    # The PSF of the middle is the same.
+    other = lnocl.Observation(image, make_field(growth=0.4))
+    with pytest.raises(InputError, match="psf_fields differs"):
+        lnocl.deconvolve(other, resume=path, **run)
+    lnocl.deconvolve(lnocl.Observation(image, make_field()), resume=path, **run)
+
+
+@pytest.mark.parametrize(
+    "more", [{"refine_psfs": ["jitter"]}, {"psf_scatter": np.full((21, 21), 1e-4)}]
+)
+def test_psfs_that_vary_are_not_refined(more):
+    scatter = {name: more[name] for name in more if name == "psf_scatter"}
+    refine = {name: more[name] for name in more if name == "refine_psfs"}
+    observation = lnocl.Observation(make_sky(), make_field(), **scatter)
+    with pytest.raises(InputError, match="PSFs that are the same all over"):
+        lnocl.deconvolve(observation, [(5, 5)], **refine, **RUN)
+
+
+# --- Tiles
+
+
+@given(st.integers(20, 400), st.integers(24, 120), st.integers(1, 12), st.sampled_from([1, 2, 4]))
+def test_tiles_cover_an_axis_and_their_weights_sum_to_one(size, window, margin, oversample):
+    window = max(window, 2 * margin + 8)
+    spans = tiles._divide(size, window, margin)
+    assert [n for span in spans for n in span.core] == list(range(size))
+    total = np.zeros(oversample * size)
+    for span in spans:
+        assert len(span.window) == min(window, size)
+        assert span.window.start <= max(span.core.start - margin, 0)
+        assert span.window.stop >= min(span.core.stop + margin, size)
+        weights = span.weights(oversample)
+        total[oversample * span.window.start : oversample * span.window.stop] += weights
+    assert (total > 0).all()
+    if min(len(span.core) for span in spans) >= margin:  # else ramps of both sides meet
+        np.testing.assert_allclose(total, 1.0, rtol=1e-12)
+
+
+def make_frame(seed=0, n_images=1, psf=None, n_stars=9, size=N):
+    """Return noisy images of a sky with stars, through one PSF, and the stars."""
+    rng = np.random.default_rng(seed)
+    psf = vary(N / 2, N / 2) if psf is None else psf
+    sky = make_sky(seed, size)
+    stars = rng.uniform(4, size - 4, (n_stars, 2))
+    image = fftconvolve(np.pad(sky, 32, mode="reflect"), psf, "same")[32:-32, 32:-32] + 5.0
+    for place in stars:
+        image += 3e4 * MovablePsf(psf, (size, size)).at(*place).on_grid((size, size))
+    counts = rng.poisson(np.maximum(image, 0.0), (n_images, size, size))
+    return lnocl.Observation(counts, psf, background=5.0), stars
+
+
+@pytest.mark.parametrize(
+    ("run", "n_stars", "middle", "blends"),
+    [
+        # With stars the fluxes that "sgm" starts from, and hangs on, differ.
+        ({"solver": "sgm", "n_iter": 60, "smoothing": 0.0}, 0, 1e-3, 1e-2),
+        ({"solver": "sgp", "n_iter": 400, "smoothing": 0.02}, 9, 6e-4, 1e-3),
+    ],
+)
+def test_tiles_are_the_whole(run, n_stars, middle, blends):
+    observation, stars = make_frame(n_images=2, n_stars=n_stars)
+    whole = lnocl.deconvolve(observation, stars, pad=16, **run, **RUN)
+    result = lnocl.deconvolve_tiles(observation, stars, tile=96, pad=8, **run, **RUN)
+    assert len(result.tiles) == 9
+    difference = abs(result.extended - whole.extended) / np.percentile(whole.extended, 99.9)
+    for each in result.tiles:
+        x, y, width, height = (int(each[name]) for name in ("x", "y", "width", "height"))
+        inner = np.s_[y + height // 4 : y + height * 3 // 4, x + width // 4 : x + width * 3 // 4]
+        assert difference[inner].max() < middle
+    assert difference[8:-8, 8:-8].max() < blends
+    np.testing.assert_allclose(result.star_fluxes, whole.star_fluxes, rtol=3e-6)
+    np.testing.assert_array_equal(result.star_positions, stars)
+    np.testing.assert_allclose(result.star_flux_errors, whole.star_flux_errors, rtol=1e-5)
+    assert result.fit().rms == pytest.approx(whole.fit().rms, rel=3e-5)
+    assert len(result.star_residuals()) == len(stars)
+
+
+def test_one_tile_is_the_whole_bit_for_bit():
+    observation, stars = make_frame()
+    run = {"n_iter": 20, "smoothing": 0.01, **RUN}
+    whole = lnocl.deconvolve(observation, stars, **run)
+    result = lnocl.deconvolve_tiles(observation, stars, **run)
+    for name in ("extended", "star_fluxes", "star_flux_errors", "history"):
+        np.testing.assert_array_equal(getattr(result, name), getattr(whole, name), name)
+    np.testing.assert_array_equal(result.models(), whole.models())
+    assert result.n_iter == whole.n_iter
+
+
+def test_tiles_come_near_a_psf_for_each_pixel():
+    """Model against model: nine tiles leave a third of the error of one PSF for all."""
+    sky, field = make_sky(3), make_field()
+    exact = see(sky, lambda x, y: vary(x, y))
+    observation = lnocl.Observation(exact, field)
+    inner, peak = np.s_[HALF:-HALF, HALF:-HALF], exact.max()
+    one = fftconvolve(sky, vary(63.5, 63.5), "same")
+    spans = tiles._divide(N, 62, 10)
+    seen = np.zeros_like(sky)
+    for y in spans:
+        for x in spans:
+            tile = tiles._cut(observation, np.zeros((0, 2)), (y, x))
+            image = fftconvolve(sky, tile.observation.psfs[0], "same")
+            rows, columns = y.core, x.core
+            core = np.s_[rows.start : rows.stop, columns.start : columns.stop]
+            seen[core] = image[core]
+    errors = [abs(each - exact)[inner].max() / peak for each in (one, seen)]
+    assert errors[1] < errors[0] / 3.0
+    assert errors[1] < 0.03
+
+
+def test_all_tiles_take_what_the_brightest_chooses():
+    observation, stars = make_frame(n_stars=4)
+    run = {key: RUN[key] for key in ("engine", "precision")}
+    result = lnocl.deconvolve_tiles(observation, stars, tile=96, pad=4, n_iter=60, **run)
+    assert result.stop_reason == "held-out"
+    assert len(result.held_out)
+    assert set(result.tiles["n_iter"]) == {result.n_iter}
+    assert result.smoothing in set(result.held_out["smoothing"])
+
+
+def test_masked_tiles_are_dark_and_stars_keep_their_order():
+    observation, stars = make_frame()
+    images = np.array(observation.images)
+    images[:, :, :64] = np.nan
+    seen = stars[stars[:, 0] > 70]
+    with pytest.warns(lnocl.LnoclWarning, match="not finite"):
+        half = lnocl.Observation(images, observation.psfs, background=5.0)
+    run = {"tile": 64, "pad": 4, "n_iter": 20, "smoothing": 0.01, **RUN}
+    result = lnocl.deconvolve_tiles(half, seen[::-1], **run)
+    assert not result.extended[:, :40].any()
+    assert (result.star_fluxes > 1e4).all()
+    np.testing.assert_array_equal(result.star_positions, seen[::-1])
+    assert np.isnan(result.residuals()[:, :, :64]).all()
+
+
+def test_processes_give_the_same_tiles():
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    field = make_field()
+    observation, stars = make_frame()
+    observation = lnocl.Observation(observation.images, field, background=5.0)
+    run = {"n_iter": 8, "smoothing": 0.01, **RUN}
+    here = lnocl.deconvolve_tiles(observation, stars, tile=64, pad=4, **run)
+    there = lnocl.deconvolve_tiles(observation, stars, tile=64, pad=4, parallel=2, **run)
+    for name in ("extended", "star_fluxes", "star_flux_errors", "tiles", "history"):
+        np.testing.assert_array_equal(getattr(here, name), getattr(there, name), name)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tile": 30}, "tile must be a whole number of 46 pixels or more"),
+        ({"tile": 80.0}, "tile must be a whole number"),
+        ({"tile": 80, "pad": -1}, "pad must be a whole number, 0 or more"),
+        ({"tile": 80, "checkpoint": "c"}, "checkpoint is no option of tiles"),
+        ({"tile": 80, "parallel": "many"}, "parallel must be True, False"),
+        ({"tile": 80, "n_iter": 0}, "n_iter must be a whole number"),
+        ({"tile": 80, "solver": "best"}, "solver 'best' is not known"),
+    ],
+)
+def test_what_is_not_for_tiles_is_refused(options, message):
+    observation, stars = make_frame()
+    with pytest.raises(InputError, match=message):
+        lnocl.deconvolve_tiles(observation, stars, **{"stop": None, "pad": 5, **options})
+
+
+def test_tiles_have_no_replicas():
+    result = lnocl.deconvolve_tiles(make_frame()[0], n_iter=1, smoothing=0, **RUN)
+    with pytest.raises(InputError, match="replicas are of one run"):
+        result.bootstrap()
+
+
+def test_what_tiles_say_is_summed_up():
+    observation, stars = make_frame(n_stars=12)
+    bad = np.zeros((N, N), bool)
+    bad[*np.round(stars[:, ::-1]).astype(int).T] = True
+    masked = lnocl.Observation(observation.images, observation.psfs, background=5.0, mask=bad)
+    with pytest.warns(lnocl.LnoclWarning) as given:
+        lnocl.deconvolve_tiles(masked, stars, tile=80, pad=4, n_iter=2, smoothing=0, **RUN)
+    said = [str(each.message) for each in given]
+    assert len(said) == 4
+    assert all(each.startswith("tile at (") and "on bad pixels" in each for each in said[:3])
+    assert said[3].endswith("of tiles")
+
+
+# --- The command line
+
+
+def write_frame(grid_keywords, psfs):
+    observation, stars = make_frame(n_stars=3)
+    fits.writeto("image.fits", observation.images[0])
+    header = fits.Header(grid_keywords)
+    fits.writeto("grid.fits", psfs, header)
+    star = [word for x, y in stars for word in ("--star", f"{x},{y}")]
+    return ["deconvolve", "image.fits", "--psf", "grid.fits", "--background", "5", *star,
+            "--engine", "numpy", "--stop", "none", "--n-iter", "5", "-o", "out.fits"]  # fmt: skip
+
+
+def stpsf_file(oversample=1):
+    nodes = (0, N - 1)
+    places = [(x, y) for y in nodes for x in nodes]
+    keywords = {f"DET_YX{k}": f"({x}.0, {y}.0)" for k, (x, y) in enumerate(places)}
+    psfs = np.array([vary(x, y, growth=0.1, turn=5.0) for x, y in places])
+    return keywords | {"OVERSAMP": oversample}, psfs
+
+
+def test_a_grid_of_psfs_is_taken_tile_by_tile(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("photutils", reason="photutils is not installed")
+    monkeypatch.chdir(tmp_path)
+    words = write_frame(*stpsf_file())
+    assert cli.main([*words, "--tile", "80", "--pad", "4", "--models"]) == 0
+    assert "written to out.fits" in capsys.readouterr().out
+    observation, stars = make_frame(n_stars=3)
+    _, psfs = stpsf_file()
+    nodes = [(0, 0), (N - 1, 0), (0, N - 1), (N - 1, N - 1)]
+    varied = lnocl.Observation(observation.images, PsfField(psfs, nodes), background=5.0)
+    expected = lnocl.deconvolve_tiles(varied, stars, tile=80, pad=4, n_iter=5, **RUN)
+    found = outcome("out.fits")
+    np.testing.assert_allclose(found["PRIMARY"], expected.extended, rtol=1e-5)
+    np.testing.assert_allclose(found["STARS"]["flux"], expected.star_fluxes, rtol=1e-9)
+    assert cli.main([*words, "--overwrite", "--pad", "4"]) == 0  # without being told
+
+
+def test_stdpsf_files_are_read(tmp_path, monkeypatch):
+    pytest.importorskip("photutils", reason="photutils is not installed")
+    monkeypatch.chdir(tmp_path)
+    keywords = {"NXPSFS": 2, "NYPSFS": 2, "IPSFX01": 1, "IPSFX02": N, "JPSFY01": 1, "JPSFY02": N}
+    y, x = np.mgrid[-50:51, -50:51] / 4.0
+    psfs = np.array([np.exp(-0.5 * (x**2 + y**2) / w**2) for w in (1.6, 1.7, 1.8, 1.9)])
+    words = write_frame(keywords, psfs)
+    assert cli.main([*words, "--tile", "96", "--pad", "4"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--bootstrap", "10"], "replicas are of one run, not of tiles; leave --bootstrap out"),
+        (["--checkpoint", "c.fits"], "--checkpoint is not for tiles; leave it out"),
+        (["--refine-psfs", "jitter"], "--refine-psfs is not for tiles; leave it out"),
+        (["--tile", "20"], "--tile must be a whole number of"),
+        (["--oversample", "2"], "give --effective-psfs"),
+    ],
+)
+def test_the_shell_refuses_what_is_not_for_tiles(more, message, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("photutils", reason="photutils is not installed")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*write_frame(*stpsf_file()), *more]) == 2
+    assert message in capsys.readouterr().err
