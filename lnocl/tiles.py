@@ -33,6 +33,8 @@ from lnocl.scene.stars import check_positions
 SIDES = 5
 # Where they do not.
 LARGE_TILE = 2048
+# The brightest tiles, of whose choices that in the middle is taken.
+N_CHOOSING = 3
 # Warnings of tiles that are given in full.
 MAX_WARNINGS = 3
 
@@ -179,8 +181,9 @@ def deconvolve_tiles(
     middle of its part, ``sum_i w_i K_i`` of a `PsfField`; each star has that of its own place. The
     extended sources are blended across half of the margins.
 
-    All tiles have the same iterations, weights and delta of the edge-preserving term. Those that
-    held-out counts, or the discrepancy, choose are chosen on the brightest tile.
+    All tiles have the same iterations, weights and delta of the edge-preserving term. Where
+    held-out counts or the discrepancy choose them, it is the middle one of the choices of the three
+    brightest tiles.
 
     Parameters
     ----------
@@ -252,14 +255,15 @@ def deconvolve_tiles(
             with ignored_warnings():  # of which the tiles know more
                 edge = EDGE * Scene(observation, positions).level
             penalties = [replace(each, edge=edge) for each in penalties]
+    observed = [each for each in tiles if not each.observation.mask.all()]
     curve, reason, penalty, last = np.zeros(0, CURVE_DTYPE), "", penalties[0], stop
     if isinstance(stop, str):
-        chosen = _choose(tiles, penalties, n_iter, stop, options)
+        given = {**options, "smoothing": penalties, "n_iter": n_iter, "stop": stop}
+        chosen = _choose(observed, parallel, given)
         curve, reason, n_iter, last = chosen.held_out, chosen.stop_reason, chosen.n_iter, None
         penalty = next(each for each in penalties if each.smoothing == chosen.smoothing)
     make = partial(_Solving, smoothing=[penalty], n_iter=max(n_iter, 1), stop=last, **options)
     mosaic = _Mosaic(observation, len(positions))
-    observed = [each for each in tiles if not each.observation.mask.all()]
     with (
         make_bar(len(observed), "tile", progress) as bar,
         closing(work(make, observed, parallel)) as answers,
@@ -347,23 +351,37 @@ def _are_own(positions: Array, spans: tuple[_Span, _Span]) -> NDArray[np.bool_]:
     return are_own
 
 
-def _choose(
-    tiles: Sequence[_Tile],
-    penalties: list[Penalty],
-    n_iter: int,
-    stop: str,
-    options: dict[str, Any],
-) -> Result:
-    """Return the result of the brightest tile, which chooses for all."""
-    brightest = max(tiles, key=lambda each: _light(each.observation))
-    return deconvolve(
-        brightest.observation,
-        brightest.stars,
-        smoothing=cast(Any, penalties),
-        n_iter=n_iter,
-        stop=stop,
-        **options,
-    )
+def _choose(tiles: Sequence[_Tile], parallel: bool | int | str, options: dict[str, Any]) -> _Choice:
+    """Return the choice in the middle of those of the brightest tiles.
+
+    One tile alone may be misled: of 1024 x 1024 fields, single tiles chose 5 to 136 iterations
+    where 8 was best (docs/tiles.md).
+    """
+    brightest = sorted(tiles, key=lambda each: _light(each.observation))[-N_CHOOSING:]
+    with closing(work(partial(_Choosing, **options), brightest, parallel)) as answers:
+        choices = sorted(answers, key=lambda each: each.n_iter)
+    return choices[len(choices) // 2]
+
+
+class _Choice(NamedTuple):
+    """What a tile chooses."""
+
+    n_iter: int
+    smoothing: float
+    stop_reason: str
+    held_out: NDArray[np.void]
+
+
+class _Choosing:
+    """Has tiles choose iterations and smoothing."""
+
+    def __init__(self, **options: Any) -> None:
+        self._options = options
+
+    def __call__(self, tile: _Tile) -> _Choice:
+        with ignored_warnings(LnoclWarning):  # the tile is done again
+            result = deconvolve(tile.observation, tile.stars, **self._options)
+        return _Choice(result.n_iter, result.smoothing, result.stop_reason, result.held_out)
 
 
 def _light(observation: Observation) -> float:

@@ -21,6 +21,7 @@ from lnocl.commands import (
     selftest,
     simulate,
     stars,
+    study,
 )
 
 # In the order of the help.
@@ -34,6 +35,7 @@ COMMANDS = {
     "report": report.COMMAND,
     "demo": demo.COMMAND,
     "simulate": simulate.COMMAND,
+    "study": study.COMMAND,
     "bench": bench.COMMAND,
     "devices": devices.COMMAND,
     "selftest": selftest.COMMAND,
