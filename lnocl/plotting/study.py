@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lnocl.plotting.figure import MARKERS, line_style, new_figure
+from lnocl.plotting.figure import MARKERS, line_style, new_figure, plain_ticks
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -57,9 +57,10 @@ def draw_study(table: Table, axes: Sequence[str]) -> Figure:
                 words = ", ".join(f"{o} {v}" for o, v in zip(others, setting, strict=True))
                 _draw_line(panel, table[is_of_it], name, (column, factor), i, words)
             values = np.array(sorted(set(table[name])), float)
-            if (values > 0).all() and values.max() >= 30 * values.min():
+            if (values > 0).all() and values.max() >= 10 * values.min():
                 panel.set_xscale("log")
             panel.set(yscale="log", xlabel=name.replace("_", " "), ylabel=label)
+            plain_ticks(panel.yaxis)
             panel.grid(alpha=0.3)
         if others:
             row[0].legend(fontsize=7)

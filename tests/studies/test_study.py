@@ -105,8 +105,8 @@ def test_errors_are_those_of_the_experiment(method, name):
 def test_a_star_that_is_off_is_put_right_where_that_is_asked_for():
     table = measured(position_error=[0.0, 0.4], refine=[False, True], n_iter=[60])
     errors = {(row["position_error"], row["refine"]): row["rho_star"] for row in table}
-    assert errors[0.4, False] > 1.5 * errors[0.0, False]
-    assert errors[0.4, True] < 1.1 * errors[0.0, False]
+    assert errors[0.4, False] > 10.0 * errors[0.0, False]
+    assert errors[0.4, True] == pytest.approx(errors[0.0, True], rel=0.02)
 
 
 def test_rows_that_are_there_are_not_done_again(monkeypatch):
