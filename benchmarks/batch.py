@@ -173,7 +173,7 @@ def scheduler(n):
                 distributed.LocalCluster(
                     n_workers=processes,
                     threads_per_worker=count // processes,
-                    dashboard_address=None,
+                    dashboard_address="127.0.0.1:0",
                     memory_limit=None,
                 ) as cluster,
                 distributed.Client(cluster),

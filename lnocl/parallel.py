@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 import uuid
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -27,6 +28,10 @@ CURRENT = "current-scheduler"
 MAX_FRUITLESS = 5
 # Seconds to wait for a scheduler that is gone, and for its workers.
 PATIENCE = 60.0
+# Seconds between two looks for what was done; the workers need not wait for that.
+LOOK_EVERY = 0.02
+# And for workers, where nothing is done.
+LOOK_AFTER = 1.0
 
 
 def check_parallel(parallel: object) -> None:
@@ -110,6 +115,7 @@ def work(
 def _client_of(parallel: bool | int | str) -> Iterator[Client]:
     import distributed
 
+    _refuse_inside_a_task()
     if parallel == CURRENT:
         try:
             client = distributed.get_client()
@@ -124,18 +130,33 @@ def _client_of(parallel: bool | int | str) -> Iterator[Client]:
     n = int(parallel) if parallel is not True else int(cores or 1)
     # PoCL starts a thread a core in each process, where they would share the cores.
     threads = {"POCL_MAX_PTHREAD_COUNT": str(max(int(cores or 1) // n, 1))}
-    with (
-        distributed.LocalCluster(
+    try:
+        cluster = distributed.LocalCluster(
             n_workers=n,
             threads_per_worker=1,
             processes=True,
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",
             memory_limit=None,
             env={**threads, **os.environ},
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
+        )
+    except RuntimeError as error:
+        raise LnoclError(
+            f"worker processes cannot be started ({error}): a script needs 'if __name__ == "
+            '"__main__":\' round what it does, as each of them reads it first'
+        ) from error
+    with cluster, distributed.Client(cluster, set_as_default=False) as client:
         yield client
+
+
+def _refuse_inside_a_task() -> None:
+    """Refuse work inside a task of Dask, which would wait for the worker that it keeps."""
+    import distributed
+
+    try:
+        distributed.get_worker()
+    except ValueError:
+        return
+    raise InputError("parallel inside a task of Dask would wait for itself; leave it out there")
 
 
 class _Ended(NamedTuple):
@@ -195,7 +216,6 @@ def _round(
 ) -> Iterator[tuple[int, tuple[Answer, Said] | _Ended]]:
     """Yield what workers found for tasks that are waiting, but for those that are lost."""
     import dask
-    from distributed import as_completed
     from distributed.client import FutureCancelledError
     from distributed.scheduler import KilledWorker
 
@@ -210,15 +230,18 @@ def _round(
             for k, task in waiting.items():
                 futures[client.submit(_do, token, made, task, key=f"lnocl-{token}-{k}")] = k
         # One that is done is dropped, lest it is done again where its worker is lost.
-        for future in as_completed(list(futures), loop=client.loop):
+        for future in _completed(client, list(futures)):
             k = futures.pop(future)
             try:
-                yield k, future.result()
+                answer = future.result(timeout=PATIENCE)
             except FutureCancelledError:
                 continue  # lost with a worker or a connection
+            except TimeoutError:
+                return  # lost with its worker after it was done
             except KilledWorker as error:
                 n_ended = counted(error.allowed_failures + 1, "worker")
-                yield k, _Ended(f"{n_ended} ended at the same task, perhaps for lack of memory")
+                answer = _Ended(f"{n_ended} ended at the same task, perhaps for lack of memory")
+            yield k, answer
     except TimeoutError:
         raise LnoclError(f"the scheduler has had no worker for {PATIENCE:g} s") from None
     finally:
@@ -230,6 +253,41 @@ def _round(
 _LOCK = threading.Lock()
 # By the token of the work.
 _held: dict[str, Callable[[Any], Any]] = {}
+
+
+def _completed(client: Client, futures: Sequence[Future]) -> Iterator[Future]:
+    """Yield futures as they are completed, or lost.
+
+    Raises
+    ------
+    TimeoutError
+        There is no worker for `PATIENCE`.
+    """
+    from distributed import as_completed
+
+    completed = as_completed(futures, loop=client.loop)
+    alive = looked = time.monotonic()
+    while not completed.is_empty():
+        batch = completed.next_batch(block=False)
+        yield from batch
+        now = time.monotonic()
+        if batch:
+            alive = now
+            continue
+        if now - looked > LOOK_AFTER:
+            looked = now
+            if _has_workers(client):
+                alive = now
+        if now - alive > PATIENCE:
+            raise TimeoutError
+        time.sleep(LOOK_EVERY)
+
+
+def _has_workers(client: Client) -> bool:
+    try:
+        return client.status == "running" and bool(client.nthreads())
+    except OSError:  # the connection is being made again
+        return False
 
 
 def _same(make: Maker[Task, Answer]) -> Maker[Task, Answer]:

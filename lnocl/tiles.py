@@ -89,7 +89,7 @@ class TiledResult(Result):
         InputError
             Always.
         """
-        raise InputError("replicas are of one run, not of tiles; leave tile out, or bootstrap")
+        raise InputError("replicas are of one run, and this result is of tiles: they have none")
 
 
 class _Span(NamedTuple):
@@ -147,6 +147,16 @@ class _Tile(NamedTuple):
     own: NDArray[np.intp]
     numbers: NDArray[np.intp]
 
+    def without_unseen_neighbours(self) -> _Tile:
+        """Return it without stars of its neighbours that it does not observe."""
+        if not self.observation.mask.any() or len(self.own) == len(self.stars):
+            return self
+        with ignored_warnings():
+            is_kept = Scene(self.observation).observes(self.stars)
+        is_kept[self.own] = True
+        own = np.cumsum(is_kept)[self.own] - 1
+        return self._replace(stars=self.stars[is_kept], own=own)
+
 
 class _Found(NamedTuple):
     """What a tile has found: its extended source, in electrons, and what it stands for alone."""
@@ -177,13 +187,13 @@ def deconvolve_tiles(
     """Reconstruct the sky tile by tile: large images, or PSFs that vary over the field.
 
     Each tile is a run of its own, of what is in its window: its part of the images, and margins of
-    half a PSF and more, so that nothing that lights its part is left out. Its PSFs are those of the
-    middle of its part, ``sum_i w_i K_i`` of a `PsfField`; each star has that of its own place. The
-    extended sources are blended across half of the margins.
+    half a PSF and the largest offset, so that nothing that lights its part is left out. Its PSFs
+    are those of the middle of its part, ``sum_i w_i K_i`` of a `PsfField`; each star has that of
+    its own place. The extended sources are blended across half of the margins.
 
-    All tiles have the same iterations, weights and delta of the edge-preserving term. Where
-    held-out counts or the discrepancy choose them, it is the middle one of the choices of the three
-    brightest tiles.
+    All tiles have the same weights and delta of the edge-preserving term, and the same iterations
+    unless `stop` is a number. Where held-out counts or the discrepancy choose, it is the middle one
+    of the choices of the three brightest tiles.
 
     Parameters
     ----------
@@ -249,13 +259,14 @@ def deconvolve_tiles(
     penalties = read_penalties(mu, smoothing, stop, observation)
     pad = _pad(observation, options.get("pad", "auto"))
     tiles = _lay(observation, positions, tile, pad)
+    observed = [each for each in tiles if not each.observation.mask.all()]
+    _refuse_unowned(positions, observed)
     if len(tiles) > 1:
         options["pad"] = pad
         if any(each.smoothing for each in penalties):
             with ignored_warnings():  # of which the tiles know more
                 edge = EDGE * Scene(observation, positions).level
             penalties = [replace(each, edge=edge) for each in penalties]
-    observed = [each for each in tiles if not each.observation.mask.all()]
     curve, reason, penalty, last = np.zeros(0, CURVE_DTYPE), "", penalties[0], stop
     if isinstance(stop, str):
         given = {**options, "smoothing": penalties, "n_iter": n_iter, "stop": stop}
@@ -288,7 +299,7 @@ def _check_options(options: dict[str, Any]) -> None:
 def _pad(observation: Observation, pad: Any) -> int:
     """Return the pad of all tiles: light runs over the edges of some, wherever they are cut."""
     if isinstance(pad, str) and pad == "auto":
-        return recommend_pad(observation)
+        return max(recommend_pad(observation), int(np.ceil(abs(observation.offsets).max())))
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
         raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
     return int(pad)
@@ -297,14 +308,16 @@ def _pad(observation: Observation, pad: Any) -> int:
 def _lay(observation: Observation, positions: Array, tile: int | None, pad: int) -> list[_Tile]:
     """Return the tiles of the images, row by row."""
     sides = [-(-k // observation.oversample) for k in observation.psfs.shape[1:]]
-    margins = [k // 2 for k in sides]
+    # An image that is shifted shows the core of a tile beside it.
+    shifts = np.ceil(abs(observation.offsets).max(axis=0)).astype(int).tolist()[::-1]
+    margins = [max(k // 2, 1) + shift for k, shift in zip(sides, shifts, strict=True)]
     if tile is None:
         tile = length_for(SIDES * max(sides)) if observation.psf_fields else LARGE_TILE
     least = 2 * (max(margins) + pad) + 16
     if not (isinstance(tile, (int, np.integer)) and tile >= least):
         raise InputError(
-            f"tile must be a whole number of {least} pixels or more, for margins of half a PSF, "
-            f"{max(margins)} pixels, on each side, and a pad of {pad}; {tile} was given"
+            f"tile must be a whole number of {least} pixels or more, for margins of half a PSF and "
+            f"the offsets, {max(margins)} pixels, and a pad of {pad} on each side; {tile} was given"
         )
     rows, columns = (
         _divide(size, int(tile) - 2 * pad, margin)
@@ -340,6 +353,16 @@ def _cut(observation: Observation, positions: Array, spans: tuple[_Span, _Span])
     is_own = _are_own(positions, spans) & is_seen
     own = np.flatnonzero(is_own[is_seen])
     return _Tile(spans, part, moved[is_seen], own, np.flatnonzero(is_own))
+
+
+def _refuse_unowned(positions: Array, tiles: Sequence[_Tile]) -> None:
+    """Refuse a star in a tile that no image has observed."""
+    numbers = np.concatenate([each.numbers for each in tiles])
+    for x, y in np.delete(positions, numbers, axis=0):
+        raise InputError(
+            f"the star at ({x:g}, {y:g}) lies in a tile that all images mask; leave it out or mend "
+            "the mask"
+        )
 
 
 def _are_own(positions: Array, spans: tuple[_Span, _Span]) -> NDArray[np.bool_]:
@@ -379,6 +402,7 @@ class _Choosing:
         self._options = options
 
     def __call__(self, tile: _Tile) -> _Choice:
+        tile = tile.without_unseen_neighbours()
         with ignored_warnings(LnoclWarning):  # the tile is done again
             result = deconvolve(tile.observation, tile.stars, **self._options)
         return _Choice(result.n_iter, result.smoothing, result.stop_reason, result.held_out)
@@ -398,8 +422,15 @@ class _Solving:
         self._options = options
 
     def __call__(self, tile: _Tile) -> _Found:
+        tile = tile.without_unseen_neighbours()
+        begins = "tile that begins at pixel ({1}, {0}), where positions there begin".format(
+            *(span.window.start for span in tile.spans)
+        )
         with recorded_warnings() as recorded:
-            result = deconvolve(tile.observation, tile.stars, **self._options)
+            try:
+                result = deconvolve(tile.observation, tile.stars, **self._options)
+            except InputError as error:
+                raise InputError(f"{begins}: {error}") from error
             stars = (
                 result.star_positions,
                 result.star_fluxes,
@@ -419,7 +450,11 @@ class _Solving:
             result.history,
             result.stop_reason,
             result.device,
-            [str(each.message) for each in recorded if issubclass(each.category, LnoclWarning)],
+            [
+                f"{begins}: {each.message}"
+                for each in recorded
+                if issubclass(each.category, LnoclWarning)
+            ],
         )
 
 
@@ -450,9 +485,7 @@ class _Mosaic:
             (x.core.start, y.core.start, len(x.core), len(y.core), len(found.history) - 1,
              found.history["objective"][-1])
         )  # fmt: skip
-        self.said += [
-            f"tile at ({x.core.start}, {y.core.start}): {message}" for message in found.said
-        ]
+        self.said += found.said
         positions, fluxes, flux_errors, position_errors = found.stars
         placed = positions + np.array([x.window.start, y.window.start])
         columns = [placed, fluxes, flux_errors, position_errors]

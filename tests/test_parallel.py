@@ -2,10 +2,11 @@
 
 import os
 import signal
+import subprocess
 import sys
 import time
 import warnings
-from contextlib import closing
+from contextlib import closing, contextmanager
 from functools import partial
 
 import pytest
@@ -67,15 +68,21 @@ def end_if_odd(number):
     return number
 
 
-@pytest.fixture(scope="module")
-def client():
+@contextmanager
+def cluster_of_two():
     """Two workers, as a user would start them; the client is current."""
     with (
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+            n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
+        yield client
+
+
+@pytest.fixture(scope="module")
+def client():
+    with cluster_of_two() as client:
         yield client
 
 
@@ -146,7 +153,7 @@ def test_warnings_of_workers_are_given_once(client):
 
 
 def test_an_error_of_a_task_is_raised(client):
-    with pytest.raises(InputError, match="0 is no number of mine"):
+    with pytest.raises(InputError, match=r"\d is no number of mine"):
         list(work(make_refuser, range(4), CURRENT))
     assert len(list(work(Squares, range(4), CURRENT))) == 4  # the workers are none the worse
 
@@ -164,14 +171,6 @@ def test_tasks_that_are_left_are_cancelled(client):
         time.sleep(0.01)
 
 
-def test_a_task_that_ends_its_workers_ends_the_work_or_has_another_answer(client):
-    with pytest.raises(LnoclError, match="4 workers ended at the same task"):
-        list(work(make_ender, [1], CURRENT))
-    answers = work(make_half_ender, range(4), CURRENT, lambda number, why: (number, why))
-    why = "4 workers ended at the same task, perhaps for lack of memory"
-    assert list(answers) == [0, (1, why), 2, (3, why)]
-
-
 def test_tasks_whose_workers_are_lost_again_and_again_are_given_up(client, monkeypatch):
     rounds = []
 
@@ -183,3 +182,47 @@ def test_tasks_whose_workers_are_lost_again_and_again_are_given_up(client, monke
     with pytest.raises(LnoclError, match="lost 6 times in a row before any of 3 tasks"):
         list(work(Squares, range(3), CURRENT))
     assert rounds == [3] * 6
+
+
+def test_a_task_that_ends_its_workers_ends_the_work_or_has_another_answer():
+    with cluster_of_two():
+        with pytest.raises(LnoclError, match="4 workers ended at the same task"):
+            list(work(make_ender, [1], CURRENT))
+        answers = work(make_half_ender, range(3), CURRENT, lambda number, why: (number, why))
+        why = "4 workers ended at the same task, perhaps for lack of memory"
+        assert list(answers) == [0, (1, why), 2]
+
+
+def nested(parallel):
+    return list(work(Squares, [3], parallel))
+
+
+def make_nested():
+    return nested
+
+
+@pytest.mark.parametrize("inner", [CURRENT, 2])
+def test_work_inside_a_task_is_refused(client, inner):
+    with pytest.raises(InputError, match="parallel inside a task of Dask would wait for itself"):
+        list(work(make_nested, [inner], CURRENT))
+
+
+def test_a_script_that_starts_processes_without_a_guard_is_told(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from lnocl.parallel import work\nfrom builtins import abs\n"
+        "def make():\n    return abs\nprint(list(work(make, [-1], 2)))\n"
+    )
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert "a script needs 'if __name__ == \"__main__\":' round what it does" in ended.stderr
+
+
+def test_where_all_workers_have_gone_it_says_so(monkeypatch):
+    monkeypatch.setattr(parallel, "PATIENCE", 1.0)
+    with cluster_of_two() as client:
+        answers = work(partial(Squares, 0.2), range(200), CURRENT)
+        next(answers)
+        client.cluster.scale(0)
+        with pytest.raises(LnoclError, match="the scheduler has had no worker for 1 s"):
+            list(answers)

@@ -1,5 +1,7 @@
 """Tiles, and PSFs that vary over the field: against the whole, and against a PSF for each pixel."""
 
+import re
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -322,6 +324,65 @@ def test_processes_give_the_same_tiles():
         np.testing.assert_array_equal(getattr(here, name), getattr(there, name), name)
 
 
+def test_images_that_are_shifted_are_seen_whole_by_tiles():
+    """Most of the light is in the image that is shifted by more than half a PSF."""
+    psf = vary(N / 2, N / 2)
+    rng, far = np.random.default_rng(2), 26
+    sky = make_sky(4, N + far)
+    image = fftconvolve(sky, psf, "same")
+    images = np.stack([image[:N, :N], 30.0 * image[:N, far : N + far]]) + 5.0
+    observation = lnocl.Observation(
+        rng.poisson(images), psf, background=5.0, exposure=[1.0, 30.0],
+        offsets=[(0.0, 0.0), (-float(far), 0.0)],
+    )  # fmt: skip
+    run = {"n_iter": 300, "smoothing": 0.02, **RUN}
+    whole = lnocl.deconvolve(observation, pad=30, **run)
+    result = lnocl.deconvolve_tiles(observation, tile=160, **run)
+    assert len(result.tiles) > 4
+    inner = np.s_[16:-16, far + 16 : -16]
+    difference = abs(result.extended - whole.extended)[inner] / whole.extended[inner].max()
+    assert difference.max() < 0.02
+    assert result.fit().rms == pytest.approx(whole.fit().rms, rel=0.01)
+
+
+def test_a_star_in_a_masked_tile_is_refused_and_one_beside_it_is_not():
+    observation, stars = make_frame(n_stars=6)
+    bad = np.zeros((N, N), bool)
+    bad[:64, :64] = True
+    masked = lnocl.Observation(observation.images, observation.psfs, background=5.0, mask=bad)
+    run = {"tile": 64, "pad": 4, "n_iter": 5, "smoothing": 0.0, **RUN}
+    with pytest.raises(InputError, match=r"\(10, 10\) lies in a tile that all images mask"):
+        lnocl.deconvolve_tiles(masked, [(10.0, 10.0), *stars], **run)
+    bad[:] = False
+    bad[:, 40:52] = True
+    masked = lnocl.Observation(observation.images, observation.psfs, background=5.0, mask=bad)
+    beside = [(37.0, 30.0), (54.0, 60.0)]
+    result = lnocl.deconvolve_tiles(masked, beside, **run)
+    whole = lnocl.deconvolve(masked, beside, pad=8, n_iter=5, smoothing=0.0, **RUN)
+    np.testing.assert_array_equal(result.star_positions, beside)
+    assert (abs(result.star_fluxes - whole.star_fluxes) < 3 * whole.star_flux_errors).all()
+
+
+def test_errors_and_warnings_of_tiles_say_where_positions_begin():
+    observation, _ = make_frame(n_stars=0)
+    bad = np.zeros((N, N), bool)
+    bad[70:100, 70:100] = True
+    masked = lnocl.Observation(observation.images, observation.psfs, background=5.0, mask=bad)
+    with pytest.raises(InputError, match="tile that begins at pixel") as error:
+        lnocl.deconvolve_tiles(masked, [(85, 85)], tile=64, pad=4, n_iter=2, smoothing=0.0, **RUN)
+    corner, at = (list(map(int, each)) for each in
+                  re.findall(r"\((\d+), (\d+)\)", str(error.value)))  # fmt: skip
+    assert [a + b for a, b in zip(corner, at, strict=True)] == [85, 85]
+
+
+def test_a_psf_of_one_pixel_has_margins_too():
+    image = np.random.default_rng(0).poisson(9.0, (64, 64)).astype(float)
+    observation = lnocl.Observation(image, np.ones((1, 1)))
+    run = {"n_iter": 20, "smoothing": 0.0, **RUN}
+    result = lnocl.deconvolve_tiles(observation, tile=40, pad=1, **run)
+    np.testing.assert_allclose(result.extended, image, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -331,6 +392,7 @@ def test_processes_give_the_same_tiles():
         ({"tile": 80, "checkpoint": "c"}, "checkpoint is no option of tiles"),
         ({"tile": 80, "parallel": "many"}, "parallel must be True, False"),
         ({"tile": 80, "n_iter": 0}, "n_iter must be a whole number"),
+        ({"tile": 80, "smoothing": [0.1]}, "smoothing must be a number"),
         ({"tile": 80, "solver": "best"}, "solver 'best' is not known"),
     ],
 )
@@ -355,7 +417,10 @@ def test_what_tiles_say_is_summed_up():
         lnocl.deconvolve_tiles(masked, stars, tile=80, pad=4, n_iter=2, smoothing=0, **RUN)
     said = [str(each.message) for each in given]
     assert len(said) == 4
-    assert all(each.startswith("tile at (") and "on bad pixels" in each for each in said[:3])
+    assert all(
+        each.startswith("tile that begins at pixel (") and "on bad pixels" in each
+        for each in said[:3]
+    )
     assert said[3].endswith("of tiles")
 
 

@@ -8,8 +8,10 @@ import dataclasses
 import io
 import json
 import os
+import shlex
 import socket
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
@@ -18,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from lnocl.commands import deconvolve, environment, messages, options, pictures, running
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
+from lnocl.commands.signals import Terminated
 from lnocl.commands.targets import Target, read_targets
 from lnocl.errors import FileError, LnoclError, counted
 
@@ -95,6 +98,7 @@ class Record:
     device: str = ""
     process: str = ""
     command: str = ""
+    folder: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,23 +130,30 @@ class Folder:
         text = json.dumps(dataclasses.asdict(record), indent=1)
         write_text(self.file(record.name, ".json"), text + "\n", overwrite=True)
 
-    def fault(self, target: Target, overwrite: bool) -> str:
-        """Return why a target must not be done; empty where it may."""
-        record = self.read(target.name)
-        if target.fault or overwrite or (record is not None and record.command == target.command):
-            return target.fault
-        output = self.file(target.name, ".fits")
-        if record is not None:
-            return f"{output} is of another command than its row gives; take --overwrite"
-        return f"{output} exists; take --overwrite" if os.path.exists(output) else ""
+    def state(self, target: Target, start: str) -> Record:
+        """Return what became of a target by the command of its row, given in a folder.
 
-    def is_done(self, target: Target) -> bool:
-        """Return whether a target is done, by the command of its row."""
+        That is its record; that it fails, where its outputs are of something else; or that it is
+        waiting.
+        """
+        new = Record(target.name, WAITING, command=target.command, folder=start)
+        if target.fault:
+            return dataclasses.replace(new, status=FAILED, message=target.fault)
         record = self.read(target.name)
-        return (
-            record is not None
-            and (record.status, record.command) == (DONE, target.command)
-            and os.path.exists(self.file(target.name, ".fits"))
+        is_its_own = record is not None and (record.command, record.folder) == (
+            target.command,
+            start,
+        )
+        there = [e for e in (".fits", ".log") if os.path.exists(self.file(target.name, e))]
+        if record is not None and is_its_own:
+            return new if record.status == DONE and ".fits" not in there else record
+        taken = ".fits" in there or (bool(there) and record is None)
+        if not taken:
+            return new
+        output = self.file(target.name, there[0])
+        of = "is of another command" if record is not None else "exists"
+        return dataclasses.replace(
+            new, status=FAILED, message=f"{output} {of}; give another name, or --overwrite"
         )
 
 
@@ -154,9 +165,14 @@ def _make_worker(folder: Folder, start: str) -> Callable[[Target], Record]:
 
 def _do(folder: Folder, start: str, target: Target) -> Record:
     """Deconvolve a target, with its log and its record; return that."""
-    command = target.command
-    process = f"{socket.gethostname()}:{os.getpid()}"
-    folder.write(Record(target.name, STARTED, process=process, command=command))
+    new = Record(
+        target.name,
+        STARTED,
+        process=f"{socket.gethostname()}:{os.getpid()}",
+        command=target.command,
+        folder=start,
+    )
+    folder.write(new)
     output, said = folder.file(target.name, ".fits"), io.StringIO()
     words = ["deconvolve", *target.words, "-o", output, "--overwrite"]
     begun = time.perf_counter()
@@ -165,17 +181,21 @@ def _do(folder: Folder, start: str, target: Target) -> Record:
         contextlib.redirect_stdout(said),
         contextlib.redirect_stderr(said),
     ):
-        status = running.run({"deconvolve": deconvolve.COMMAND}, words)
-    if status >= 128:  # Ctrl-C, or the end of the process
+        try:
+            status = running.run({"deconvolve": deconvolve.COMMAND}, words)
+        except Exception as error:  # which stops no other target
+            status = 1
+            said.write(f"{traceback.format_exc()}lnocl: error: {type(error).__name__}: {error}\n")
+    if status == running.INTERRUPTED:
         raise KeyboardInterrupt
-    record = Record(
-        target.name,
-        FAILED if status else DONE,
+    if status > 128:
+        raise Terminated(status - 128)
+    record = dataclasses.replace(
+        new,
+        status=FAILED if status else DONE,
         seconds=round(time.perf_counter() - begun, 3),
-        process=process,
-        command=command,
+        **_found(said.getvalue(), output, status),
     )
-    record = dataclasses.replace(record, **_found(said.getvalue(), output, status))
     _write_log(folder, record, said.getvalue())
     folder.write(record)
     return record
@@ -202,7 +222,11 @@ def _found(said: str, output: str, status: int) -> dict[str, Any]:
 def _write_log(folder: Folder, record: Record, said: str) -> None:
     from lnocl.io.atomic import write_text
 
-    write_text(folder.file(record.name, ".log"), f"$ {record.command}\n{said}", overwrite=True)
+    write_text(
+        folder.file(record.name, ".log"),
+        f"$ cd {shlex.quote(record.folder)}; {record.command}\n{said}",
+        overwrite=True,
+    )
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -213,39 +237,58 @@ def _run(arguments: argparse.Namespace) -> None:
     check_parallel(arguments.parallel)
     targets = read_targets(arguments.targets)
     atomic.check_folder(arguments.output, overwrite=True)
+    folder, start = Folder(os.path.abspath(arguments.output)), os.getcwd()
+    atomic.check_output(os.path.join(folder.path, SUMMARY), True, [arguments.targets])
     pictures.check(arguments, [arguments.targets])
-    folder = Folder(os.path.abspath(arguments.output))
+    targets = _apart(targets, folder)
     i, n = arguments.array or (1, 1)
     own = targets[i - 1 :: n]
-    faults = {each.name: folder.fault(each, arguments.overwrite) for each in own}
-    is_old = {each.name: not arguments.overwrite and folder.is_done(each) for each in own}
-    due = [each for each in own if not (faults[each.name] or is_old[each.name])]
-    refused = {
-        each.name: Record(each.name, FAILED, faults[each.name], command=each.command)
-        for each in own
-        if faults[each.name]
-    }
+    before = [folder.state(each, start) for each in own]
+    n_old = sum(record.status == DONE for record in before)
+    if arguments.overwrite:
+        due, n_old = [each for each in own if not each.fault], 0
+    else:
+        # What has failed by its own command is tried again.
+        due = [
+            each
+            for each, record in zip(own, before, strict=True)
+            if record.status != DONE and (record.status != FAILED or record.process)
+        ]
     written = time.monotonic()
-    with make_bar(len(due), "target", not arguments.quiet) as bar:
-        for record in _records(folder, due, arguments.parallel):
-            bar.update()
-            bar.set_postfix_str(f"{record.name} {record.status}")
-            if time.monotonic() - written > WRITE_EVERY:
-                _write_summary(folder, targets, refused)
-                written = time.monotonic()
-    summary = _write_summary(folder, targets, refused)
+    try:
+        with make_bar(len(due), "target", not arguments.quiet) as bar:
+            for record in _records(folder, due, arguments.parallel):
+                bar.update()
+                bar.set_postfix_str(f"{record.name} {record.status}")
+                if time.monotonic() - written > WRITE_EVERY:
+                    _write_summary(folder, targets, start)
+                    written = time.monotonic()
+    finally:
+        summary = _write_summary(folder, targets, start)
     if not arguments.quiet:
-        messages.say(_said(summary, sum(is_old.values()), folder))
+        messages.say(_said(summary, n_old, folder))
     if arguments.plot is not None:
         from lnocl.plotting.batch import draw_batch
 
-        done = [each.name for each in targets if folder.is_done(each)]
+        done = [name for name, status in summary.iterrows("name", "status") if status == DONE]
         line = pictures.draw(
             arguments, draw_batch({name: folder.file(name, ".fits") for name in done})
         )
         if not arguments.quiet:
             messages.say([line])
-    _explain_failures(summary, own, folder)
+    _explain_failures(summary, own)
+
+
+def _apart(targets: Sequence[Target], folder: Folder) -> list[Target]:
+    """Return the targets; those whose result would replace an input of any fail."""
+    inputs = {os.path.realpath(path) for each in targets for path in each.inputs}
+    fault = "its result would replace an input of the targets; give another name"
+    return [
+        each._replace(fault=each.fault or fault)
+        if os.path.realpath(folder.file(each.name, ".fits")) in inputs
+        else each
+        for each in targets
+    ]
 
 
 def _records(
@@ -259,7 +302,9 @@ def _records(
     make = partial(_make_worker, folder, os.getcwd())
 
     def give_up(target: Target, why: str) -> Record:
-        record = Record(target.name, FAILED, why, command=target.command)
+        record = dataclasses.replace(
+            folder.state(target, os.getcwd()), status=FAILED, message=why, process="lost"
+        )
         folder.write(record)
         return record
 
@@ -267,18 +312,13 @@ def _records(
         yield from records
 
 
-def _write_summary(folder: Folder, targets: Sequence[Target], refused: dict[str, Record]) -> Table:
+def _write_summary(folder: Folder, targets: Sequence[Target], start: str) -> Table:
     """Write what became of all targets, those of other processes too, and return it."""
     from astropy.table import Table
 
     from lnocl.io.atomic import write_text
 
-    records = [
-        refused.get(each.name)
-        or folder.read(each.name)
-        or Record(each.name, WAITING, command=each.command)
-        for each in targets
-    ]
+    records = [folder.state(each, start) for each in targets]
     summary = Table([dataclasses.asdict(each) for each in records])
     summary["seconds"].unit = "s"
     text = io.StringIO()
@@ -302,7 +342,7 @@ def _said(summary: Table, n_old: int, folder: Folder) -> list[str]:
     ]
 
 
-def _explain_failures(summary: Table, own: Sequence[Target], folder: Folder) -> None:
+def _explain_failures(summary: Table, own: Sequence[Target]) -> None:
     """Raise an error where targets of this process have failed."""
     names = {each.name for each in own}
     failed = [row for row in summary if row["status"] == FAILED and row["name"] in names]

@@ -34,12 +34,15 @@ class Target(NamedTuple):
         Its outputs are called so.
     words : tuple of str
         The command line but for its output.
+    inputs : tuple of str
+        The files that it reads.
     fault : str
         Why there is no command line; else empty.
     """
 
     name: str
     words: tuple[str, ...]
+    inputs: tuple[str, ...] = ()
     fault: str = ""
 
     @property
@@ -64,8 +67,8 @@ def read_targets(path: str) -> list[Target]:
     FileError
         The file cannot be read.
     InputError
-        Its ending is another; it has no row, or no column of images; a column is no option; two
-        targets have one name.
+        Its ending is another; it has no row, or no column of images; a column is no option, or has
+        a unit; two targets have one name.
     """
     table = _read(path)
     options = _options_of(path, table)
@@ -109,6 +112,11 @@ def _options_of(path: str, table: Table) -> dict[str, Option]:
                 f"column {column!r} of {path} is no option that a target may have; columns are "
                 "called name or as options of lnocl deconvolve: images, psf, star, background, ..."
             )
+        if table[column].unit is not None:
+            raise InputError(
+                f"column {column!r} of {path} has a unit, {table[column].unit}; give its values in "
+                "that of the option, as lnocl deconvolve --help says, and no unit"
+            )
         options[column] = known[_plain(column)]
     if not any(each.name == "images" for each in options.values()):
         raise InputError(f"{path} has no column images; give the files of each target there")
@@ -120,11 +128,12 @@ def _plain(flag: str) -> str:
 
 
 def _target(row: Row, options: dict[str, Option]) -> Target:
-    name, words, fault = "", [], ""
+    name, words, inputs, fault = "", [], [], ""
     try:
         for column, option in options.items():
             values = _values(row[column], option)
             words += option.words(values)
+            inputs += [file_of(path) for path in option.inputs(values)]
             if option.name == "images" and isinstance(values, list) and values:
                 name = os.path.basename(file_of(values[0])).partition(".")[0]
     except ValueError as error:
@@ -134,7 +143,7 @@ def _target(row: Row, options: dict[str, Option]) -> Target:
     if not name or name != os.path.basename(name) or name.startswith("."):
         fault = fault or f"its name {name!r} cannot be that of a file; give another in column name"
         name = f"row{row.index + 1}"
-    return Target(name, tuple(words), fault)
+    return Target(name, tuple(words), tuple(inputs), fault)
 
 
 def _values(cell: Any, option: Option) -> bool | list[str] | None:
@@ -159,9 +168,11 @@ def _text(cell: Any) -> str:
     if isinstance(cell, bytes):
         cell = cell.decode(errors="replace")
     if isinstance(cell, np.ndarray):
-        return " ".join(map(_text, cell))
+        return " ".join(",".join(map(_text, np.atleast_1d(each))) for each in cell)
     if isinstance(cell, np.generic):
         cell = cell.item()
     if isinstance(cell, float) and not np.isfinite(cell):
         return ""
+    if isinstance(cell, float) and cell.is_integer() and abs(cell) < 1e15:
+        cell = int(cell)  # which options of whole numbers take too
     return str(cell).strip()

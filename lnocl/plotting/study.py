@@ -18,8 +18,6 @@ SHOWN = (
     ("rho_star", 100.0, r"error near the star, $\rho''$ (%)"),
     ("magnitude_error", 1e3, "error of the star (mmag)"),
 )
-# Lines of a panel, at most.
-MAX_LINES = 12
 
 
 def draw_study(table: Table, axes: Sequence[str]) -> Figure:
@@ -50,7 +48,7 @@ def draw_study(table: Table, axes: Sequence[str]) -> Figure:
         others = [each for each in varied if each != name]
         settings = sorted({tuple(each) for each in table[others].iterrows()} if others else {()})
         for panel, (column, factor, label) in zip(row, SHOWN, strict=True):
-            for i, setting in enumerate(settings[:MAX_LINES]):
+            for i, setting in enumerate(settings):
                 is_of_it = np.ones(len(table), bool)
                 for other, value in zip(others, setting, strict=True):
                     is_of_it &= table[other] == value
@@ -59,8 +57,10 @@ def draw_study(table: Table, axes: Sequence[str]) -> Figure:
             values = np.array(sorted(set(table[name])), float)
             if (values > 0).all() and values.max() >= 10 * values.min():
                 panel.set_xscale("log")
-            panel.set(yscale="log", xlabel=name.replace("_", " "), ylabel=label)
-            plain_ticks(panel.yaxis)
+            panel.set(xlabel=name.replace("_", " "), ylabel=label)
+            if (abs(np.array(table[column], float)) > 0).any():
+                panel.set_yscale("log")
+                plain_ticks(panel.yaxis)
             panel.grid(alpha=0.3)
         if others:
             row[0].legend(fontsize=7)

@@ -204,6 +204,10 @@ class Scene:
             self._field = self._place_stars(np.where(is_observed[:, None], self.stars, before))
             self.star_weights = np.where(is_observed, self.star_weights, weights)
 
+    def observes(self, positions: Array) -> NDArray[np.bool_]:
+        """Return which stars at these positions any image would observe."""
+        return self._weigh_stars(self._place_stars(positions))[1]
+
     def _place_stars(self, positions: Array) -> StarField:
         psfs = self.star_psfs(positions)
         return StarField(psfs, self.observation.offsets, self.image_grid, positions)

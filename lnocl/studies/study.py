@@ -19,6 +19,7 @@ from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
 from lnocl.parallel import work
 from lnocl.process import ignored_warnings
+from lnocl.runs.options import check_choices, check_length
 from lnocl.scene.observation import Array, Observation
 from lnocl.simulation import Experiment, Simulation, Star, Target, fizeau_psf, hh34, simulate
 
@@ -78,13 +79,21 @@ class Case:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        for name in ("stop", "smoothing"):
+            object.__setattr__(self, name, _word(getattr(self, name)))
+        check_choices(self.solver, "single", "opencl", None)
+        check_length(self.n_iter, _read(self.stop))
         for name, least in (("psf_error", 0.0), ("position_error", 0.0)):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= least):
                 raise InputError(f"{name} must be finite and not negative")
         if not (np.isfinite(self.contrast) and self.contrast > 0):
             raise InputError(f"contrast must be finite and more than zero; {self.contrast} given")
-        if self.n_images < 1:
-            raise InputError(f"n_images must be 1 or more; {self.n_images} was given")
+        if not (isinstance(self.n_images, (int, np.integer)) and self.n_images >= 1):
+            raise InputError(f"n_images must be a whole number, 1 or more; {self.n_images} given")
+        if not 0 < self.strehl <= 1:
+            raise InputError(f"strehl must be in (0, 1]; {self.strehl} was given")
+        if self.position_error > self.size / 8:
+            raise InputError(f"position_error must be {self.size / 8:g} pixels at most here")
         if self.method not in METHODS:
             raise InputError(f"method {self.method!r} is not known; give {', '.join(METHODS)}")
 
@@ -107,7 +116,10 @@ MEASURES = {
     "iterations": ("d", "iterations done"),
     "chosen_smoothing": (".2e", "weight of the edge-preserving term"),
     "stopped": ("", "why it stopped"),
-    "seconds": (".2f", "time of the reconstruction"),
+    "seconds": (
+        ".2f",
+        "time of the reconstruction, with the compilation of kernels where it is the first",
+    ),
 }
 
 
@@ -239,6 +251,16 @@ class _Measuring:
             "stopped": result.stop_reason,
             "seconds": seconds,
         }
+
+
+def _word(value: Any) -> str:
+    """Return a rule or a weight as tables hold it."""
+    if value is None:
+        return "none"
+    try:
+        return repr(float(value))
+    except ValueError:
+        return str(value)
 
 
 def _read(text: str) -> Any:

@@ -15,7 +15,7 @@ from astropy.io import fits
 from astropy.table import Table
 from commandline import GIVEN, PAPER, one_complaint, outcome
 
-from lnocl.commands import cli
+from lnocl.commands import cli, deconvolve
 from lnocl.commands.targets import read_targets
 
 pytestmark = pytest.mark.usefixtures("command_folder")
@@ -62,7 +62,7 @@ def test_each_target_is_what_its_command_gives(capsys):
     assert [each["status"] for each in found.values()] == ["done", "done"]
     assert [each["n_iter"] for each in found.values()] == [3, 2]
     log = Path("out/one.log").read_text()
-    assert log.startswith(f"$ {found['one']['command']}\n")
+    assert log.startswith(f"$ cd {os.getcwd()}; {found['one']['command']}\n")
     assert "3 iterations on numpy" in log
 
 
@@ -110,9 +110,9 @@ def test_what_another_command_has_made_stays(capsys):
     said = capsys.readouterr()
     assert "3 targets: 1 done, 2 failed (1 of them before)" in said.out
     messages = {name: each["message"] for name, each in summary().items()}
-    assert messages["one"].endswith("one.fits is of another command than its row gives; take "
-                                    "--overwrite")  # fmt: skip
-    assert messages["three"].endswith("three.fits exists; take --overwrite")
+    remedy = "; give another name, or --overwrite"
+    assert messages["one"].endswith(f"one.fits is of another command{remedy}")
+    assert messages["three"].endswith(f"three.fits exists{remedy}")
     assert Path("out/one.fits").read_bytes() == made
     assert Path("out/three.fits").read_bytes() == b"mine"
     assert batch("--overwrite", "--quiet") == 0
@@ -155,12 +155,12 @@ def test_tables_give_the_same_commands_in_every_format(ending):
     targets = read_targets(f"t.{ending}")
     assert [each.name for each in targets] == ["a", "with blank", "c"]
     assert [each.words for each in targets] == [
-        ("a.fits", "--psf", "k.fits", "--n-iter", "1", "--mu", "0.0", "--residuals",
-         "--saturation", "60000.0"),
+        ("a.fits", "--psf", "k.fits", "--n-iter", "1", "--mu", "0", "--residuals",
+         "--saturation", "60000"),
         ("with blank.fits", "b.fits[SCI]", "--psf", "k.fits", "--star", "1,2", "--star", "3.5,-4",
          "--saturation", "60000.5"),
         ("c.fits", "--psf", "k.fits", "--n-iter", "3", "--mu", "1e-07", "--residuals",
-         "--saturation", "100000.0"),
+         "--saturation", "100000"),
     ]  # fmt: skip
 
 
@@ -218,12 +218,104 @@ def test_an_interrupt_ends_it_and_the_next_call_goes_on():
         assert process.stderr.read().splitlines()[-1] == "lnocl: error: interrupted"
     assert process.returncode == 130
     assert json.loads(Path("out/long.json").read_text())["status"] == "started"
-    Path("out/long.json").write_text(
-        Path("out/long.json").read_text().replace("--n-iter 1000000", "--n-iter 2")
-    )
+    assert [each["status"] for each in summary().values()] == ["done", "started", "waiting"]
+    os.remove("out/long.fits")  # of the run that was interrupted
     write_targets(GOOD[0], 'long,cube.fits,psfs.fits,"7,5",2', GOOD[1])
     assert batch("--quiet") == 0
     assert [each["n_iter"] for each in summary().values()] == [3, 2, 2]
+
+
+def test_sigterm_ends_it_with_its_status():
+    write_targets('long,cube.fits,psfs.fits,"7,5",1000000')
+    words = [sys.executable, "-m", "lnocl", "batch", "targets.csv", "-o", "out"]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        while not os.path.exists("out/long.json"):
+            time.sleep(0.01)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGTERM)
+        assert process.stderr.read().splitlines()[-1] == "lnocl: error: terminated"
+    assert process.returncode == 143
+
+
+@pytest.mark.parametrize("error", [ValueError("odd"), RecursionError("deep"), KeyError("k")])
+def test_an_error_that_nobody_thought_of_is_a_row(error, monkeypatch):
+    solve = deconvolve.solve
+
+    def fail(arguments, interrupts):
+        if "a.fits" in arguments.images:
+            raise error
+        return solve(arguments, interrupts)
+
+    monkeypatch.setattr(deconvolve, "solve", fail)
+    write_targets("odd,a.fits,k1.fits,,1", "good,b.fits,k1.fits,,1")
+    assert batch("--quiet") == 1
+    found = summary()
+    assert found["good"]["status"] == "done"
+    assert found["odd"]["message"].startswith(f"{type(error).__name__}: ")
+    assert "Traceback" in Path("out/odd.log").read_text()
+
+
+def test_a_row_that_is_mended_is_done():
+    write_targets("t,a.fits,gone.fits,,1")
+    assert batch("--quiet") == 1
+    write_targets("t,a.fits,k1.fits,,1")
+    assert batch("--quiet") == 0
+
+
+def test_files_of_others_and_inputs_stay(capsys):
+    write_targets("one,a.fits,k1.fits,,1")
+    os.mkdir("out")
+    os.rename("targets.csv", "out/summary.ecsv")
+    table = Table.read("out/summary.ecsv", format="ascii.csv")
+    table.write("out/summary.ecsv", overwrite=True)
+    given = Path("out/summary.ecsv").read_bytes()
+    assert cli.main(["batch", "out/summary.ecsv", "-o", "out"]) == 2
+    assert "out/summary.ecsv is one of the inputs" in one_complaint(capsys.readouterr())
+    assert Path("out/summary.ecsv").read_bytes() == given
+    os.remove("out/summary.ecsv")
+    Path("out/one.log").write_text("mine")
+    write_targets("one,a.fits,k1.fits,,1")
+    assert batch("--quiet") == 1
+    assert Path("out/one.log").read_text() == "mine"
+    image = Path("b.fits").read_bytes()
+    write_targets("b,a.fits,k1.fits,,1", "q,b.fits,k1.fits,,1")
+    assert cli.main(["batch", "targets.csv", "-o", ".", "--overwrite", "--quiet"]) == 1
+    assert Path("b.fits").read_bytes() == image
+    assert json.loads(Path("q.json").read_text())["status"] == "done"
+
+
+def test_the_summary_says_what_became_of_the_rows_that_are_now():
+    write_targets("../up,a.fits,k1.fits,,1", "b,a.fits,k1.fits,,1", "c,a.fits,k1.fits,,1")
+    assert batch("--quiet", "--array", "1/2") == 1
+    assert batch("--quiet", "--array", "2/2") == 0
+    assert [each["status"] for each in summary().values()] == ["failed", "done", "done"]
+    os.remove("out/c.fits")
+    write_targets("b,a.fits,k1.fits,,2", "c,a.fits,k1.fits,,1", "d,a.fits,k1.fits,,1")
+    assert batch("--quiet", "--array", "3/3") == 0
+    assert [each["status"] for each in summary().values()] == ["failed", "waiting", "done"]
+
+
+def test_what_is_done_hangs_on_the_folder_that_files_are_named_from(tmp_path, monkeypatch):
+    write_targets("t,a.fits,k1.fits,,1")
+    assert batch("--quiet") == 0
+    for name in ("b.fits", "k1.fits", "targets.csv"):
+        os.makedirs("other", exist_ok=True)
+        os.link(name, f"other/{name.replace('b.', 'a.')}")
+    monkeypatch.chdir("other")
+    assert cli.main(["batch", "targets.csv", "-o", "../out", "--quiet"]) == 1
+
+
+def test_columns_with_units_are_refused(capsys):
+    table = Table({"images": ["a.fits"], "psf": ["k1.fits"], "exposure": [30.0]})
+    table["exposure"].unit = "min"
+    table.write("t.ecsv")
+    assert cli.main(["batch", "t.ecsv", "-o", "out"]) == 2
+    assert "column 'exposure' of t.ecsv has a unit, min; give its" in capsys.readouterr().err
+
+
+def test_arrays_of_positions_are_pairs():
+    Table({"images": ["a.fits"], "star": [[(1.0, 2.5), (3.0, 4.0)]]}).write("t.fits")
+    assert read_targets("t.fits")[0].words == ("a.fits", "--star", "1,2.5", "--star", "3,4")
 
 
 def test_without_dask_it_works_but_in_parallel(monkeypatch, capsys):

@@ -51,8 +51,14 @@ def test_a_case_is_made_for_each_combination():
         ({"contrast": [0.0]}, "contrast must be finite and more than zero"),
         ({"psf_error": [-0.1]}, "psf_error must be finite and not negative"),
         ({"position_error": [np.nan]}, "position_error must be finite and not negative"),
-        ({"n_images": [0]}, "n_images must be 1 or more"),
+        ({"n_images": [0]}, "n_images must be a whole number, 1 or more; 0"),
         ({"method": ["clean"]}, "method 'clean' is not known; give mc-rl, rl"),
+        ({"n_images": [2.5]}, "n_images must be a whole number"),
+        ({"strehl": [1.5]}, r"strehl must be in \(0, 1\]"),
+        ({"solver": ["best"]}, "solver 'best' is not known"),
+        ({"stop": ["soon"]}, "stop 'soon' is not known"),
+        ({"n_iter": [0]}, "n_iter must be a whole number"),
+        ({"position_error": [40.0]}, "position_error must be 32 pixels at most"),
     ],
 )
 def test_values_out_of_range_are_refused(axes, message):
@@ -120,6 +126,15 @@ def test_rows_that_are_there_are_not_done_again(monkeypatch):
     assert [case.contrast for case in done] == [9.0]
     assert table["contrast"].tolist() == [1.0, 3.0, 9.0]
     assert table["rho"].tolist()[:2] == first["rho"].tolist()
+
+
+def test_numbers_and_none_are_taken_as_deconvolve_takes_them():
+    case = Case(stop=None, smoothing=0.02)
+    assert case == Case(stop="none", smoothing="0.020")
+    assert make_cases({"smoothing": [0.02, "0.02"], "stop": [None, "none", 1e-3, "0.001"]}) == [
+        Case(stop="none", smoothing="0.02"),
+        Case(stop="0.001", smoothing="0.02"),
+    ]
 
 
 WORDS = ["study", "-o", "t.ecsv", "--size", "64", "--n-images", "2", "--stop", "none",

@@ -56,7 +56,7 @@ def test_a_lost_worker_and_connection_change_no_result(targets, capfd):
     assert cli.main(["batch", "targets.csv", "-o", "one", "--quiet"]) == 1
     with (
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+            n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
