@@ -166,7 +166,7 @@ def field():
     """Compare tiles with one PSF for all, where the PSF varies."""
     size = 2048
     exact = make_field(33, size)
-    for seed in (0, 1, 2):
+    for seed in (0, 1):
         counts, sky, stars, fluxes = observe(size, seed, 100, exact)
         varied = lnocl.Observation(counts, make_field(3, size), background=10.0)
         one = lnocl.Observation(counts, make_psf(1023.5, 1023.5, size), background=10.0)
@@ -182,7 +182,7 @@ def field():
                 return lnocl.deconvolve_tiles(observation, stars, **run)
 
             seconds = {}
-            for _ in range(2):
+            for _ in range(2 if stop is None else 1):
                 for name, solve in (("one PSF", whole), ("tiles", tiled)):
                     begun = time.perf_counter()
                     result = solve()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lnocl.plotting.figure import MARKERS, line_style, new_figure, plain_ticks
+from lnocl.plotting.figure import MARKERS, Array, line_style, new_figure
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -18,6 +18,9 @@ SHOWN = (
     ("rho_star", 100.0, r"error near the star, $\rho''$ (%)"),
     ("magnitude_error", 1e3, "error of the star (mmag)"),
 )
+
+# Lines of a panel from which on their legend is small.
+MANY = 8
 
 
 def draw_study(table: Table, axes: Sequence[str]) -> Figure:
@@ -54,17 +57,25 @@ def draw_study(table: Table, axes: Sequence[str]) -> Figure:
                     is_of_it &= table[other] == value
                 words = ", ".join(f"{o} {v}" for o, v in zip(others, setting, strict=True))
                 _draw_line(panel, table[is_of_it], name, (column, factor), i, words)
-            values = np.array(sorted(set(table[name])), float)
-            if (values > 0).all() and values.max() >= 10 * values.min():
-                panel.set_xscale("log")
+            _scale(panel.xaxis, np.array(table[name], float), 10.0)
+            _scale(panel.yaxis, abs(np.array(table[column], float)), 1.0)
             panel.set(xlabel=name.replace("_", " "), ylabel=label)
-            if (abs(np.array(table[column], float)) > 0).any():
-                panel.set_yscale("log")
-                plain_ticks(panel.yaxis)
             panel.grid(alpha=0.3)
         if others:
-            row[0].legend(fontsize=7)
+            small = len(settings) > MANY
+            row[1].legend(fontsize=5 if small else 7, ncols=2 if small else 1, framealpha=0.6)
     return figure
+
+
+def _scale(axis: Any, values: Array, least: float) -> None:
+    """Make an axis logarithmic from 0 or the smallest on, where values span a factor."""
+    above = values[values > 0]
+    if above.size and above.max() >= least * above.min():
+        kind = "log" if (values > 0).all() else "symlog"
+        more = {} if kind == "log" else {"linthresh": above.min()}
+        panel = axis.axes
+        (panel.set_xscale if axis is panel.xaxis else panel.set_yscale)(kind, **more)
+        axis.set_major_formatter("{x:g}")
 
 
 def _draw_line(
