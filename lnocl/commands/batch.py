@@ -263,8 +263,11 @@ def _run(arguments: argparse.Namespace) -> None:
                 if time.monotonic() - written > WRITE_EVERY:
                     _write_summary(folder, targets, start)
                     written = time.monotonic()
-    finally:
-        summary = _write_summary(folder, targets, start)
+    except BaseException:
+        with contextlib.suppress(Exception):  # a library may have been cut short while it loaded
+            _write_summary(folder, targets, start)
+        raise
+    summary = _write_summary(folder, targets, start)
     if not arguments.quiet:
         messages.say(_said(summary, n_old, folder))
     if arguments.plot is not None:
