@@ -33,7 +33,7 @@ from lnocl.scene.stars import check_positions
 SIDES = 5
 # Where they do not.
 LARGE_TILE = 2048
-# The brightest tiles, of whose choices that in the middle is taken.
+# The tiles with the brightest extended source, of whose choices that in the middle is taken.
 N_CHOOSING = 3
 # Warnings of tiles that are given in full.
 MAX_WARNINGS = 3
@@ -193,7 +193,7 @@ def deconvolve_tiles(
 
     All tiles have the same weights and delta of the edge-preserving term, and the same iterations
     unless `stop` is a number. Where held-out counts or the discrepancy choose, it is the middle one
-    of the choices of the three brightest tiles.
+    of the choices of the three tiles whose extended source is brightest.
 
     Parameters
     ----------
@@ -375,12 +375,12 @@ def _are_own(positions: Array, spans: tuple[_Span, _Span]) -> NDArray[np.bool_]:
 
 
 def _choose(tiles: Sequence[_Tile], parallel: bool | int | str, options: dict[str, Any]) -> _Choice:
-    """Return the choice in the middle of those of the brightest tiles.
+    """Return the choice in the middle of those of the tiles with the brightest extended source.
 
     One tile alone may be misled: of 1024 x 1024 fields, single tiles chose 5 to 136 iterations
     where 8 was best (docs/tiles.md).
     """
-    brightest = sorted(tiles, key=lambda each: _light(each.observation))[-N_CHOOSING:]
+    brightest = sorted(tiles, key=_light)[-N_CHOOSING:]
     with closing(work(partial(_Choosing, **options), brightest, parallel)) as answers:
         choices = sorted(answers, key=lambda each: each.n_iter)
     return choices[len(choices) // 2]
@@ -408,11 +408,23 @@ class _Choosing:
         return _Choice(result.n_iter, result.smoothing, result.stop_reason, result.held_out)
 
 
-def _light(observation: Observation) -> float:
-    """Return the counts above the background."""
+def _light(tile: _Tile) -> float:
+    """Return the counts above the background but for those within half a PSF of a star.
+
+    Bright stars mislead the choice, most of all where PSFs are not quite right: both halves of the
+    counts share their residuals.
+    """
+    observation, q = tile.observation, tile.observation.oversample
     level = observation.background
     level = level if level.ndim == 3 else level[:, None, None]
-    return float(np.where(observation.mask, 0.0, observation.images - level).sum())
+    light = np.where(observation.mask, 0.0, observation.images - level)
+    reach = max(observation.psfs.shape[1:]) / (2.0 * q)
+    rows, columns = (np.arange(n) for n in observation.shape)
+    for image, offset in zip(light, observation.offsets, strict=True):
+        for x, y in tile.stars + offset:
+            near = np.ix_(abs(rows - y) <= reach, abs(columns - x) <= reach)
+            image[near] = 0.0
+    return float(light.sum())
 
 
 class _Solving:

@@ -297,6 +297,18 @@ def test_all_tiles_take_what_the_brightest_chooses():
     assert result.smoothing in set(result.held_out["smoothing"])
 
 
+def test_light_of_stars_makes_no_tile_bright():
+    observation, _ = make_frame(n_stars=0)
+    images = observation.images.copy()
+    images[0, 20, 20] += 1e7
+    starry = lnocl.Observation(images, observation.psfs, background=5.0)
+    spans = tiles._divide(N, 64, 10)[0]
+    empty = tiles._cut(observation, np.zeros((0, 2)), (spans, spans))
+    tile = tiles._cut(starry, np.array([[20.0, 20.0]]), (spans, spans))
+    assert tiles._light(tile) < tiles._light(empty)
+    assert tiles._light(tile._replace(stars=np.zeros((0, 2)))) > 9e6
+
+
 def test_masked_tiles_are_dark_and_stars_keep_their_order():
     observation, stars = make_frame()
     images = np.array(observation.images)
