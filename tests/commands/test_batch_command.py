@@ -208,9 +208,7 @@ def test_an_interrupt_ends_it_and_the_next_call_goes_on():
     words = [sys.executable, "-m", "lnocl", "batch", "targets.csv", "-o", "out"]
     # Whoever runs the tests in the background may ignore it.
     heeded = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    with subprocess.Popen(
-        words, stderr=subprocess.PIPE, text=True, preexec_fn=heeded
-    ) as process:
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, preexec_fn=heeded) as process:
         while not os.path.exists("out/long.json"):
             time.sleep(0.01)
         time.sleep(0.5)  # it listens from the first iteration on

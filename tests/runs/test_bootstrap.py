@@ -1,6 +1,7 @@
 """Replicas of a run, and the errors that they give."""
 
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -160,17 +161,22 @@ def test_replicas_are_continued_bit_for_bit():
 
 
 def test_processes_give_the_replicas_bit_for_bit():
-    """With one PSF for all images, whose error they share in the workers too."""
     pytest.importorskip("distributed", reason="Dask is not installed")
-    made = dataclasses.replace(BASE, n_images=3).make()
-    one = made.psfs[0] / made.psfs[0].sum()
-    result = lnocl.deconvolve(
-        made.observation(psfs=one, psf_scatter=1e-4 * one), made.stars, stop=None, n_iter=4,
-        smoothing=1e-3, pad=0,
-    )  # fmt: skip
+    result = solved(engine="opencl")
     here, there = (result.bootstrap(10, parallel=parallel) for parallel in (False, 2))
     for name in ("errors", "of_psfs", "sums"):
         np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
+
+
+def test_one_psf_for_all_images_is_one_in_other_processes_too():
+    """On which its error hangs, and the bytes that are sent."""
+    one = lnocl.Observation(np.ones((4, 32, 32)), np.ones((31, 31)))
+    sent = pickle.dumps(one)
+    got = pickle.loads(sent)
+    assert got.psfs.strides[0] == 0
+    np.testing.assert_array_equal(got.psfs, one.psfs)
+    four = lnocl.Observation(np.ones((4, 32, 32)), np.ones((4, 31, 31)))
+    assert len(pickle.dumps(four)) - len(sent) == pytest.approx(3 * 31**2 * 8, rel=0.02)
 
 
 def made_up(errors, value=10.0):
