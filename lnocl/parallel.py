@@ -62,9 +62,7 @@ def check_parallel(parallel: object) -> None:
     try:
         import distributed  # noqa: F401
     except ImportError:
-        raise LnoclError(
-            "parallel needs Dask; install it with: pip install 'lnocl[dask]'"
-        ) from None
+        raise LnoclError("parallel needs Dask; install it with: pip install distributed") from None
 
 
 def work(
