@@ -104,9 +104,7 @@ def test_what_says_nothing_of_processes_is_refused(wrong):
 def test_without_dask_one_line_says_what_to_install(monkeypatch, given):
     monkeypatch.setitem(sys.modules, "distributed", None)
     check_parallel(False)
-    with pytest.raises(
-        LnoclError, match=r"parallel needs Dask; install it with: pip install"
-    ):
+    with pytest.raises(LnoclError, match=r"parallel needs Dask; install it with: pip install"):
         check_parallel(given)
     assert next(work(Squares, [3]))[0] == 9
 
