@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import threading
 import time
@@ -32,6 +33,10 @@ PATIENCE = 60.0
 LOOK_EVERY = 0.02
 # And for workers, where nothing is done.
 LOOK_AFTER = 1.0
+_WITHOUT_GUARD = (
+    "worker processes cannot be started: a script needs 'if __name__ == \"__main__\":' round what "
+    "it does, as each of them reads it first"
+)
 
 
 def check_parallel(parallel: object) -> None:
@@ -111,6 +116,7 @@ def work(
 
 @contextmanager
 def _client_of(parallel: bool | int | str) -> Iterator[Client]:
+    import dask
     import distributed
 
     _refuse_inside_a_task()
@@ -124,26 +130,37 @@ def _client_of(parallel: bool | int | str) -> Iterator[Client]:
             ) from None
         yield client
         return
+    _refuse_a_script_without_guard()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     n = int(parallel) if parallel is not True else int(cores or 1)
     # PoCL starts a thread a core in each process, where they would share the cores.
     threads = {"POCL_MAX_PTHREAD_COUNT": str(max(int(cores or 1) // n, 1))}
-    try:
-        cluster = distributed.LocalCluster(
+    with (
+        # A worker that ends twice within this time is given up, even where it was started again.
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "1 day"}),
+        distributed.LocalCluster(
             n_workers=n,
             threads_per_worker=1,
             processes=True,
             dashboard_address="127.0.0.1:0",
             memory_limit=None,
             env={**threads, **os.environ},
-        )
-    except RuntimeError as error:
-        raise LnoclError(
-            f"worker processes cannot be started ({error}): a script needs 'if __name__ == "
-            '"__main__":\' round what it does, as each of them reads it first'
-        ) from error
-    with cluster, distributed.Client(cluster, set_as_default=False) as client:
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
         yield client
+
+
+def _refuse_a_script_without_guard() -> None:
+    """Start a process as Dask does, which waits for ever where none can be started."""
+    trial = multiprocessing.get_context("spawn").Process(target=os.getpid)
+    try:
+        trial.start()
+    except RuntimeError as error:
+        raise LnoclError(_WITHOUT_GUARD) from error
+    trial.join()
+    if trial.exitcode != 0:
+        raise LnoclError(_WITHOUT_GUARD)
 
 
 def _refuse_inside_a_task() -> None:

@@ -185,12 +185,11 @@ def test_tasks_whose_workers_are_lost_again_and_again_are_given_up(client, monke
 
 
 def test_a_task_that_ends_its_workers_ends_the_work_or_has_another_answer():
-    with cluster_of_two():
-        with pytest.raises(LnoclError, match="4 workers ended at the same task"):
-            list(work(make_ender, [1], CURRENT))
-        answers = work(make_half_ender, range(3), CURRENT, lambda number, why: (number, why))
-        why = "4 workers ended at the same task, perhaps for lack of memory"
-        assert list(answers) == [0, (1, why), 2]
+    with pytest.raises(LnoclError, match="4 workers ended at the same task"):
+        list(work(make_ender, [1], 2))
+    answers = work(make_half_ender, range(3), 2, lambda number, why: (number, why))
+    why = "4 workers ended at the same task, perhaps for lack of memory"
+    assert list(answers) == [0, (1, why), 2]
 
 
 def nested(parallel):
