@@ -190,8 +190,9 @@ def deconvolve(
     -----
     LnoclWarning
         A PSF is larger than the grid, so that its wings wrap round, or rings where it is moved
-        between pixels; it is wider or narrower than a star, or a star is elsewhere than it was said
-        to be; PSFs that were to be refined are wrong by a quarter; there are offsets without `pad`;
+        between pixels, or varies over the images by a fifth; it is wider or narrower than a star,
+        or a star is elsewhere than it was said to be; PSFs that were to be refined are wrong by a
+        quarter; there are offsets without `pad`;
         single precision is expected to stray from double by a thousandth of the extended source;
         the noise of an image is not that of Poisson counts, or that of neighbouring pixels is
         correlated; held-out counts choose an iteration too near `n_iter`; the images do not

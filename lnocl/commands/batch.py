@@ -257,7 +257,7 @@ def _run(arguments: argparse.Namespace) -> None:
     written = time.monotonic()
     try:
         with make_bar(len(due), "target", not arguments.quiet) as bar:
-            for record in _records(folder, due, arguments.parallel):
+            for record in _records(folder, due, start, arguments.parallel):
                 bar.update()
                 bar.set_postfix_str(f"{record.name} {record.status}")
                 if time.monotonic() - written > WRITE_EVERY:
@@ -295,18 +295,18 @@ def _apart(targets: Sequence[Target], folder: Folder) -> list[Target]:
 
 
 def _records(
-    folder: Folder, targets: Sequence[Target], parallel: bool | int | str
+    folder: Folder, targets: Sequence[Target], start: str, parallel: bool | int | str
 ) -> Iterator[Record]:
     """Yield the record of each target as it is done."""
     from lnocl.parallel import work
 
     if not targets:
         return
-    make = partial(_make_worker, folder, os.getcwd())
+    make = partial(_make_worker, folder, start)
 
     def give_up(target: Target, why: str) -> Record:
         record = dataclasses.replace(
-            folder.state(target, os.getcwd()), status=FAILED, message=why, process="lost"
+            folder.state(target, start), status=FAILED, message=why, process="lost"
         )
         folder.write(record)
         return record

@@ -94,10 +94,11 @@ class PsfField:
         other._psfs = stack.reshape(*self._psfs.shape[:2], *stack.shape[1:])
         return other
 
-    def variation(self, psf: Array) -> float:
-        """Return by how much the nodes differ at most from a PSF, relative to its norm."""
-        differences = np.sqrt(((self._psfs - psf) ** 2).sum(axis=(2, 3)))
-        return float(differences.max() / np.sqrt((psf**2).sum()))
+    def variation(self, psf: Array, shape: tuple[int, int]) -> float:
+        """Return how far the corners of an image differ at most from a PSF, over its norm."""
+        ny, nx = shape
+        corners = [self.at(x, y) for x in (0, nx - 1) for y in (0, ny - 1)]
+        return float(max(np.linalg.norm(each - psf) for each in corners) / np.linalg.norm(psf))
 
     @classmethod
     def of_model(cls, model: Any, oversample: int) -> PsfField:

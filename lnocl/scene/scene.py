@@ -29,6 +29,8 @@ OBSERVED_SHARE = 0.01
 # A PSF that rings by more than this share of its peak, moved by half a pixel, is warned of.
 # Gaussians do not ring where they are centred on a pixel; sharp ones do where they are not.
 MAX_RINGING = 0.01
+# In tiles of five times the PSF's side a field that grows by half varied by 0.1 (docs/tiles.md).
+MAX_VARIATION = 0.2
 
 # The one division guard: where the model is not above this (images have unit mean) the ratio is
 # taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
@@ -120,6 +122,7 @@ class Scene:
         ny, nx = self.image_grid
         self.grid = self.oversample * ny, self.oversample * nx
         self._warn_of_large_psf()
+        self._warn_of_varying_psfs()
         self._warn_of_wrapped_offsets()
         # A power of two just above the mean; 1 where that is 0.
         n_good = int(np.count_nonzero(~observation.mask))
@@ -462,6 +465,17 @@ class Scene:
                 warn(
                     f"psf {j} is sharper than its pixels can hold: moved between pixels it rings "
                     f"by up to {dark / psf.max():.1%} of its peak, at whole pixels not"
+                )
+
+    def _warn_of_varying_psfs(self) -> None:
+        observation = self.observation
+        for j, field in enumerate(observation.psf_fields):
+            variation = field.variation(observation.psfs[j], observation.shape)
+            if variation > MAX_VARIATION:
+                warn(
+                    f"psf {j} varies over the image by {variation:.0%}, and what is not a star is "
+                    "reconstructed with that of the middle: take lnocl.deconvolve_tiles, or "
+                    "smaller tiles"
                 )
 
     def _warn_of_large_psf(self) -> None:
