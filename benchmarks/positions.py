@@ -16,7 +16,7 @@ offsets    the paper's experiment: rho'' for an error of 0 to 2 pixels in the st
            and without refinement
 between    the same with the true star between pixels
 basin      from how far away the first fit finds the star, for one image and for four
-figure     draws the smallest rho'' of STEM-offsets.ecsv to docs/positions.png; no table
+figure     draws the smallest rho'' of STEM-offsets.ecsv to docs/validation/positions.png; no table
 
 The Fisher bound here owes nothing to lnocl: derivatives by phases on the whole grid, in NumPy.
 """
@@ -442,7 +442,7 @@ def figure(stem):
     axes.set_ylabel("smallest rho'', %")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    pyplot.savefig("docs/positions.png", dpi=120)
+    pyplot.savefig("docs/validation/positions.png", dpi=120)
 
 
 PARTS = {

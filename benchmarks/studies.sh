@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# What the paper left open, as tables and pictures: docs/studies.md. Usage: studies.sh FOLDER
+# What the paper left open, as tables and pictures: docs/validation/studies.md. Usage: studies.sh FOLDER
 # Each command goes on where its table ends.
 set -euo pipefail
 folder=$1

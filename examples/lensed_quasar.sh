@@ -2,7 +2,7 @@
 # Four images of a quasar between pixels on a faint ring (HST F814W): stars refined, or not.
 # The first argument is the folder of the data, the second one for the output.
 set -eu
-# The iteration with which docs/real.md was made.
+# The iteration with which docs/validation/real.md was made.
 paper="--solver sgm --stop none --smoothing 0 --pad 0 --psf-centre given"
 here=$(cd "$(dirname "$0")" && pwd)
 data=${1:-"$here/../../shared/data"}/hst-lensed-quasar

@@ -95,7 +95,7 @@ def deconvolve(
         grows with the iterations, most of all beside bright stars. "auto": a tenth of the noise of
         the data term's gradient, ``0.1 sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, < > the mean over
         pixels; with held-out counts 0 or 1, 3 or 10 times that, whichever they choose
-        (docs/sgp.md).
+        (docs/validation/sgp.md).
     solver : {"sgp", "sgm"}, optional
         Iteration to use: the scaled gradient projection method, which solves for the star fluxes at
         the start, so that those given matter little; or the split-gradient method, the paper's.
@@ -120,7 +120,7 @@ def deconvolve(
         as long as the PSFs or twice the images. Where images have such lengths, PSFs are no larger
         and ``pad=0``, the model is periodic. "auto": where light runs over the edge of an image,
         the radius with nine tenths of the PSFs' light, at most half the shorter side
-        (docs/frames.md); else 0.
+        (docs/validation/frames.md); else 0.
     initial_extended : array_like, of the shape of the result's, optional
         Extended source to start from, not 0 everywhere; by default flat. Pixels that start at 0
         stay 0 with "sgm".
@@ -210,7 +210,7 @@ def deconvolve(
     about four times as long as if the iteration had been known, and the memory of two runs and of
     about twenty estimates of each. Where smoothing is "auto" the halves then continue
     with larger and larger weights, each from a third of the chosen iteration, until the error
-    rises. That takes six times as long in the median, and up to eleven (docs/sgp.md).
+    rises. That takes six times as long in the median, and up to eleven (docs/validation/sgp.md).
 
     The split-gradient method lowers the objective at every iteration where PSFs are not negative.
     With many negative pixels, as in a raw frame of a star, the objective may rise again, and all

@@ -17,7 +17,8 @@ from lnocl.scene.scene import Scene
 # The core of a star is where its PSF is above this share of its peak; its wings go on to the other.
 CORE, WINGS = 0.5, 1e-3
 # Light round a star is looked for as far as so many widths of its PSF, in so many sectors, and is
-# worth a word from these shares of the star's flux, and of all light there, on (docs/psf.md).
+# worth a word from these shares of the star's flux, and of all light there, on
+# (docs/validation/psf.md).
 REACH, SECTORS = 12.0, 8
 MUCH_HALO, MUCH_SHARE = 0.1, 0.05
 # A misfit is this many times the noise, and as many standard errors above it.

@@ -104,8 +104,8 @@ class Result:
     star_flux_errors : ndarray of float64, shape (n,)
         Standard errors of the fluxes, electrons: of the joint Fisher information of all stars and
         of the extended source, which is not taken as known (`lnocl.solvers.star_errors`,
-        docs/errors.md). They are computed when they are first read. NaN where the images do not
-        determine them, such as those of stars that have moved to one place.
+        docs/validation/errors.md). They are computed when they are first read. NaN where the images
+        do not determine them, such as those of stars that have moved to one place.
     star_position_errors : ndarray of float64, shape (n, 2)
         Standard errors of the positions, pixels, likewise; NaN where they were not refined.
     n_iter : int
@@ -247,8 +247,8 @@ class Result:
         """Return the errors of stars, regions, profiles and pixels, by replicas of this result.
 
         A replica is a sky that the result may stand for, observed and reconstructed as the images
-        were, by as many iterations (`lnocl.runs.replicas`, docs/errors.md). It costs as much as a
-        run of all counts of that length; n of them use its buffers and programs.
+        were, by as many iterations (`lnocl.runs.replicas`, docs/validation/errors.md). It costs as
+        much as a run of all counts of that length; n of them use its buffers and programs.
 
         Parameters
         ----------

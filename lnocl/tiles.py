@@ -29,7 +29,7 @@ from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import EDGE, Scene
 from lnocl.scene.stars import check_positions
 
-# The side of a tile in those of the PSFs, where these vary: docs/tiles.md.
+# The side of a tile in those of the PSFs, where these vary: docs/validation/tiles.md.
 SIDES = 5
 # Where they do not.
 LARGE_TILE = 2048
@@ -233,7 +233,7 @@ def deconvolve_tiles(
     -----
     Tiles of one iteration agree with the whole where a pixel hangs on its neighbours alone: with
     "sgm", and with "sgp" when it has converged. Before that the steps of "sgp" differ from tile to
-    tile, by less than the noise (docs/tiles.md).
+    tile, by less than the noise (docs/validation/tiles.md).
 
     References
     ----------
@@ -378,7 +378,7 @@ def _choose(tiles: Sequence[_Tile], parallel: bool | int | str, options: dict[st
     """Return the choice in the middle of those of the tiles with the brightest extended source.
 
     One tile alone may be misled: of 1024 x 1024 fields, single tiles chose 5 to 136 iterations
-    where 8 was best (docs/tiles.md).
+    where 8 was best (docs/validation/tiles.md).
     """
     brightest = sorted(tiles, key=_light)[-N_CHOOSING:]
     with closing(work(partial(_Choosing, **options), brightest, parallel)) as answers:

@@ -8,7 +8,7 @@ the sum f_k = A_k + B_k is a reconstruction from all counts. But for a constant 
 as noise of independent halves averages out of these products, and structure that L iterations have
 not resolved is small where L is large. The noise alone is ||A_k - B_k||^2. The likelihood of the
 held-out half itself, the usual measure, is flat over most of the run and ends it two to four times
-too early: docs/sgp.md.
+too early: docs/validation/sgp.md.
 """
 
 from __future__ import annotations

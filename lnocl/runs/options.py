@@ -34,7 +34,7 @@ MAX_ITERATIONS = 2**31 - 2
 
 # The difference between single and double precision, as a share of the extended source, for each
 # iteration of a long run, and the share that is worth a warning (benchmarks/precision.py,
-# docs/precision.md).
+# docs/validation/precision.md).
 ROUNDING_PER_ITERATION = 8e-9
 ROUNDING_WORTH_A_WARNING = 1e-3
 

@@ -15,7 +15,7 @@ log = logging.getLogger("lnocl")
 MAX_AXIS = 8192
 # Odd factors of an axis, and the least power of two beside them: a transform takes blocks of 8
 # columns, and one of each pair (k, -k). With 11, 13 and 15 an iteration takes about as long as on
-# the next of these lengths (docs/speed.md).
+# the next of these lengths (docs/validation/speed.md).
 ODD_FACTORS = 1, 3, 5, 7, 9
 MIN_EVEN = 16
 

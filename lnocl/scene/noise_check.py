@@ -18,7 +18,7 @@ MAX_ROWS = 128
 # Second differences of neighbours, and of pixels so far apart.
 FAR = 3
 # What is said of: the variance over the mean beyond this factor of 1, and that of neighbours below
-# this share of that of pixels apart (docs/psf.md).
+# this share of that of pixels apart (docs/validation/psf.md).
 MAX_FACTOR = 1.5
 # The mean of the darker half of blocks of noise is a tenth of a pixel's noise below that of all.
 DARKNESS = 0.3

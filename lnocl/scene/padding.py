@@ -8,7 +8,7 @@ from lnocl.scene.detector import seen_psfs
 from lnocl.scene.observation import Array, Observation
 
 # Share of a PSF's light within the radius that is enough for a pad, and the share of the shorter
-# side of the images that the pad is at most (benchmarks/frames.py, docs/frames.md).
+# side of the images that the pad is at most (benchmarks/frames.py, docs/validation/frames.md).
 LIGHT = 0.9
 SHARE_OF_SIDE = 0.5
 # Light runs over an edge where so many pixels of it together exceed the background by so many times

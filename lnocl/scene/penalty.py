@@ -17,7 +17,7 @@ from lnocl.scene.observation import Observation
 MAX_WEIGHT = 2.0**64
 
 # The weight of the edge-preserving term in units of the noise of the gradient of the data term:
-# docs/sgp.md.
+# docs/validation/sgp.md.
 SMOOTHING = 0.1
 
 # To which Python compares an integer of any size without making a float of it.

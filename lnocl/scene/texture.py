@@ -7,7 +7,7 @@ The sky is expected to be
 
 The mean is the estimate f, but under a star's core it is the mean of f round it. The amplitude a is
 a share of f, smoothed; near a star a share of the brightest there. C is a correlation over a part
-of the resolution. How large these are was measured on simulated skies: docs/errors.md.
+of the resolution. How large these are was measured on simulated skies: docs/validation/errors.md.
 """
 
 from __future__ import annotations

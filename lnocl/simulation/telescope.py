@@ -45,7 +45,7 @@ def collecting_area() -> u.Quantity:
 class Experiment:
     """Instrument, filter and exposures; the defaults are those of La Camera et al. (2012).
 
-    The paper names neither the zero point nor the throughput: see docs/photometry.md.
+    The paper names neither the zero point nor the throughput: see docs/validation/photometry.md.
 
     Attributes
     ----------

@@ -17,7 +17,7 @@ from lnocl.solvers.fluxes import bounded_step, fit_fluxes, invert, movable_weigh
 
 # Share of the light of stars and background that shifts the scaling. With all of it the
 # empty sky takes up noise from the first steps on, without any it is stuck where it is 0: measured
-# in docs/sgp.md.
+# in docs/validation/sgp.md.
 SHIFT = 0.1
 # Least light of stars and background in a pixel, as a share of the images' mean.
 MIN_BACKGROUND = 2.0**-20

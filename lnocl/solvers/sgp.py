@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 SHORTER = 0.4
 SUFFICIENT = 1e-4
 ALPHA_BOUNDS = 1e-5, 1e5
-# The step is the smallest of so many Barzilai-Borwein steps: docs/sgp.md.
+# The step is the smallest of so many Barzilai-Borwein steps: docs/validation/sgp.md.
 N_LENGTHS = 2
 # A step that was shortened so often is lost in rounding.
 MAX_SHORTENINGS = 12

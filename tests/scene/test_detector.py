@@ -98,7 +98,7 @@ def test_light_is_conserved(q):
 @pytest.mark.parametrize("q", [2, 4])
 @pytest.mark.parametrize("fwhm", [1.0, 1.5, 2.0])
 def test_stars_anywhere_are_as_pixels_see_them(q, fwhm):
-    """Gaussians alone: others are in docs/oversample.md."""
+    """Gaussians alone: others are in docs/validation/oversample.md."""
     sigma = fwhm / 2.3548
     psf = DetectorPsf(fine_gaussian(q, sigma, 8), (32, 32), q, is_effective=False)
     worst = 0.0

@@ -172,7 +172,7 @@ def test_psf_beside_real_frame():
 
 
 def test_photometry_by_hand():
-    """The numbers of docs/photometry.md, from plain arithmetic."""
+    """The numbers of docs/validation/photometry.md, from plain arithmetic."""
     area = 2 * math.pi / 4 * (8.4**2 - 0.911**2)
     mag_0 = 666.7e-26 / 6.62607e-34 * 0.02 / 2.12
     star = mag_0 * 10 ** (-0.4 * 13) * area * 1800 * 0.3

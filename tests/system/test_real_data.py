@@ -333,7 +333,7 @@ def example():
 
 
 class TestExamples:
-    """What docs/real.md says of examples/*.sh."""
+    """What docs/validation/real.md says of examples/*.sh."""
 
     @pytest.mark.filterwarnings("ignore::lnocl.errors.LnoclWarning")
     def test_refined_stars_halve_the_residuals_of_the_lensed_quasar(self, example):
