@@ -29,7 +29,8 @@ OBSERVED_SHARE = 0.01
 # A PSF that rings by more than this share of its peak, moved by half a pixel, is warned of.
 # Gaussians do not ring where they are centred on a pixel; sharp ones do where they are not.
 MAX_RINGING = 0.01
-# In tiles of five times the PSF's side a field that grows by half varied by 0.1 (docs/validation/tiles.md).
+# Five times the PSF's side wide, a tile of a field that grows by half varied by 0.1
+# (docs/validation/tiles.md).
 MAX_VARIATION = 0.2
 
 # The one division guard: where the model is not above this (images have unit mean) the ratio is
