@@ -23,6 +23,7 @@ from lnocl.commands import (
     stars,
     study,
 )
+from lnocl.commands.parser import Parser
 
 # In the order of the help.
 COMMANDS = {
@@ -40,6 +41,11 @@ COMMANDS = {
     "devices": devices.COMMAND,
     "selftest": selftest.COMMAND,
 }
+
+
+def make_parser() -> Parser:
+    """Return the parser of all subcommands, from which the site has their options."""
+    return running.make_parser(COMMANDS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

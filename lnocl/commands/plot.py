@@ -13,7 +13,7 @@ OPTIONS = [
         "results",
         nargs="+",
         metavar="RESULT",
-        help="FITS file that lnocl deconvolve, lnocl demo or examples/hh34_table.py has written",
+        help="FITS file that lnocl deconvolve, lnocl demo or benchmarks/hh34_table.py has written",
     ),
     *output_folder("the figures, PNG files", required=True),
     option("--truth", metavar="TRUTH", help="FITS file with the true source, of lnocl simulate"),

@@ -31,7 +31,7 @@ def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
         with first_handled(ENDING, terminate), warnings.catch_warnings():
             warnings.simplefilter("always", LnoclWarning)
             warnings.showwarning = partial(messages.show_warning, flags)
-            parsed = _make_parser(commands).parse_args(words)
+            parsed = make_parser(commands).parse_args(words)
             flags |= parsed.command.flags(words)
             parsed.command.run(parsed)
     except InputError as error:
@@ -49,7 +49,8 @@ def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
     return 0
 
 
-def _make_parser(commands: Mapping[str, Command]) -> Parser:
+def make_parser(commands: Mapping[str, Command]) -> Parser:
+    """Return the parser of the whole command line."""
     parser = Parser(
         prog="lnocl",
         description="Multi-component Richardson-Lucy deconvolution of astronomical images.",

@@ -162,7 +162,7 @@ def test_psf_beside_real_frame():
     frame = DATA / "lbti-fizeau-altair" / "lm_180507_009030.fits"
     if not frame.is_file():
         pytest.skip("../shared/data/lbti-fizeau-altair is not here")
-    example = runpy.run_path(str(ROOT / "examples" / "psf_lbti.py"))
+    example = runpy.run_path(str(ROOT / "examples" / "real" / "psf_lbti.py"))
     real = example["read_frame"](frame)
     spacing, angle = example["fringe_spacing"](real)
     simulated, _ = example["fringe_spacing"](example["simulated_psf"](angle))

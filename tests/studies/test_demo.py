@@ -452,7 +452,7 @@ class TestExperiment:
 
 @pytest.fixture(scope="module")
 def main():
-    path = Path(__file__).parents[2] / "examples" / "hh34_table.py"
+    path = Path(__file__).parents[2] / "benchmarks" / "hh34_table.py"
     return runpy.run_path(str(path))["main"]
 
 

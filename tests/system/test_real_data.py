@@ -249,7 +249,7 @@ class TestAltair:
         program.parent.mkdir()
         program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m lnocl "$@"\n')
         program.chmod(0o755)
-        script = Path(__file__).parents[2] / "examples" / "altair_psfs.sh"
+        script = Path(__file__).parents[2] / "examples" / "real" / "altair_psfs.sh"
         path = f"{program.parent}{os.pathsep}{os.environ['PATH']}"
         done = subprocess.run(
             ["sh", script, DATA],
@@ -276,7 +276,7 @@ class TestAltair:
             assert (found - first - angle + 90) % 180 == pytest.approx(90, abs=1)
 
     def test_the_example_without_the_data_says_so(self, tmp_path):
-        script = Path(__file__).parents[2] / "examples" / "altair_psfs.sh"
+        script = Path(__file__).parents[2] / "examples" / "real" / "altair_psfs.sh"
         done = subprocess.run(["sh", script, tmp_path], capture_output=True, text=True, check=True)
         assert done.stdout.startswith("skipped: ")
         assert not list(tmp_path.iterdir())
@@ -324,8 +324,8 @@ def run(*words):
 
 @pytest.fixture(scope="module")
 def example():
-    """Return examples/real.py as a module."""
-    path = Path(__file__).parents[2] / "examples" / "real.py"
+    """Return examples/real/real.py as a module."""
+    path = Path(__file__).parents[2] / "examples" / "real" / "real.py"
     spec = importlib.util.spec_from_file_location("real", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -333,7 +333,7 @@ def example():
 
 
 class TestExamples:
-    """What docs/validation/real.md says of examples/*.sh."""
+    """What docs/validation/real.md says of examples/real/*.sh."""
 
     @pytest.mark.filterwarnings("ignore::lnocl.errors.LnoclWarning")
     def test_refined_stars_halve_the_residuals_of_the_lensed_quasar(self, example):

@@ -5,7 +5,7 @@ set -eu
 # The iteration with which docs/validation/real.md was made.
 paper="--solver sgm --stop none --smoothing 0 --pad 0 --psf-centre given"
 here=$(cd "$(dirname "$0")" && pwd)
-data=${1:-"$here/../../shared/data"}/chandra-sgra-pair
+data=${1:-"$here/../../../shared/data"}/chandra-sgra-pair
 out=${2:-$(mktemp -d)}
 mkdir -p "$out"
 [ -d "$data" ] || { echo "skipped: $data is not there"; exit 0; }

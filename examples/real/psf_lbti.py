@@ -4,7 +4,7 @@ The real one is a frame of Altair taken at 4.05 um with LMIRcam of the Large Bin
 Interferometer. Its core is clipped and the two beams are not quite in phase, so its bright fringe
 is off the centre; the spacing of the fringes does not depend on either.
 
-    python examples/psf_lbti.py [lm_180507_009030.fits] [-o psf_lbti.png]
+    python examples/real/psf_lbti.py [lm_180507_009030.fits] [-o psf_lbti.png]
 """
 
 import argparse
@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 from lnocl.simulation import fizeau_psf
 from lnocl.simulation.telescope import BASELINE
 
-FRAME = Path(__file__).parents[2] / "shared/data/lbti-fizeau-altair/lm_180507_009030.fits"
+FRAME = Path(__file__).parents[3] / "shared/data/lbti-fizeau-altair/lm_180507_009030.fits"
 WAVELENGTH = 4.05 * u.um  # Br alpha
 PIXEL_SCALE = 10.7 * u.mas  # LMIRcam
 STREHL = 0.8  # a plausible one: the frame is clipped, so its own cannot be measured

@@ -2,13 +2,13 @@
 # Make four PSFs of a Fizeau interferometer, at four angles of its baseline, from one real frame:
 # Altair at 4.05 um, taken with LMIRcam of the Large Binocular Telescope Interferometer.
 #
-#     sh examples/altair_psfs.sh [DATA]
+#     sh examples/real/altair_psfs.sh [DATA]
 #
 # writes altair_psfs.fits and altair_psfs.png to the current folder. DATA is the folder that
 # lbti-fizeau-altair/ is in.
 set -eu
 
-data=${1:-$(dirname "$0")/../../shared/data}
+data=${1:-$(dirname "$0")/../../../shared/data}
 frame=$data/lbti-fizeau-altair/lm_180507_009030.fits
 if [ ! -e "$frame" ]; then
     echo "skipped: $frame is not there"

@@ -3,7 +3,7 @@
 # The first argument is the folder of the data, the second one for the output.
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
-data=${1:-"$here/../../shared/data"}
+data=${1:-"$here/../../../shared/data"}
 out=${2:-$(mktemp -d)}
 mkdir -p "$out"
 [ -d "$data" ] || { echo "skipped: $data is not there"; exit 0; }

@@ -1,0 +1,83 @@
+"""Settings of Sphinx: ``sphinx-build -n -W docs build/site``."""
+
+import pydoc
+from importlib.metadata import version as version_of
+
+from docutils import nodes
+
+project = "lnocl"
+author = "The lnocl developers"
+copyright = "2026, The lnocl developers"
+release = version = version_of("lnocl")
+
+extensions = [
+    "myst_parser",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.intersphinx",
+    "sphinx.ext.mathjax",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+    "sphinxarg.ext",
+]
+templates_path = ["_templates"]
+exclude_patterns = ["build", "gallery/*.ipynb", "gallery/*.py"]
+nitpicky = True
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 4
+
+default_role = "py:obj"
+autodoc_typehints = "none"
+autosummary_generate = True
+numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+
+# With ``-t online`` names of other packages are links; without, nothing is fetched.
+intersphinx_mapping = {
+    name: (f"https://{address}", None)
+    for name, address in {
+        "python": "docs.python.org/3",
+        "numpy": "numpy.org/doc/stable",
+        "astropy": "docs.astropy.org/en/stable",
+        "photutils": "photutils.readthedocs.io/en/stable",
+    }.items()
+    if tags.has("online")  # noqa: F821 (Sphinx defines it)
+}
+
+sphinx_gallery_conf = {
+    "examples_dirs": "../examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"/examples/[^/]+\.py$",
+    "abort_on_example_error": True,
+    "show_memory": False,
+    "download_all_examples": False,
+    "copyfile_regex": r"",
+    "within_subsection_order": "FileNameSortKey",
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "lnocl"
+html_static_path = ["_static"]
+html_css_files = ["lnocl.css"]
+html_show_sourcelink = False
+html_theme_options = {
+    "show_prev_next": True,
+    "navigation_with_keys": False,
+    "header_links_before_dropdown": 8,
+}
+
+
+def name_without_page(app, env, node, contnode):
+    """Show parameters, and names of the code that exist but have no page, as code."""
+    name = node["reftarget"]
+    if node.get("reftype") == "obj" and (name.isidentifier() or pydoc.locate(name) is not None):
+        return nodes.literal(text=name)
+    return None
+
+
+def setup(app):
+    """Connect what Sphinx calls."""
+    app.connect("missing-reference", name_without_page)
