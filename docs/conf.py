@@ -25,6 +25,8 @@ extensions = [
 templates_path = ["_templates"]
 exclude_patterns = ["build", "gallery/*.ipynb", "gallery/*.py"]
 nitpicky = True
+# rho' and rho'' have straight quotes.
+smartquotes = False
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4

@@ -10,7 +10,7 @@ from result_views import make_view
 
 from lnocl.plotting.report import make_report
 
-PAGES = sorted((Path(__file__).parents[2] / "docs" / "look").glob("*.html"))
+PAGES = sorted((Path(__file__).parents[2] / "docs" / "start" / "look").glob("*.html"))
 
 pytestmark = pytest.mark.system
 selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
