@@ -1,6 +1,6 @@
 """The paper's table: RLM and MC-RL at several mu, to the smallest restoration errors.
 
-    python benchmarks/hh34_table.py [--scene hh34|FILE.fits] [--size 1024] [--mu 1e-8 3e-8 ...] -o DIR
+    python benchmarks/hh34_table.py [--scene hh34|FILE.fits] [--size 1024] [--mu 1e-8 ...] -o DIR
 
 Each row is written to DIR as soon as it is done and is not computed again, so that the script
 can be stopped and started; a row of another scene or of other parameters is refused.

@@ -30,4 +30,4 @@ def few_screens():
 
 
 # Fixtures that several folders of tests share.
-pytest_plugins = ["commandline", "frame_files", "program_count", "sound_files"]
+pytest_plugins = ["browsers", "commandline", "frame_files", "program_count", "sound_files"]

@@ -1,14 +1,14 @@
 """What the shell scripts beside this one need: PSFs made, figures printed and drawn.
 
-python examples/real/real.py star-psf FRAME OUT X,Y SIZE   PSF of a star in a frame
-python examples/real/real.py centred-psf FRAME OUT SIZE    PSF image without background, centred
-python examples/real/real.py finer-psf PSF OUT Q           the same PSF at Q times as many samples
-python examples/real/real.py airy-psf OUT FWHM HALF Q      Airy pattern in pixels, Q times as fine
-python examples/real/real.py pixel-psf PSF OUT             PSF spread over Chandra's pixels
-python examples/real/real.py offsets ALIGNED IMAGE IMAGE PSF PSF N   two images with their offset and not
-python examples/real/real.py stars-psf SCI EXPTIME OUT     one PSF of the lensed quasar's four images
-python examples/real/real.py figures RESULT...             counts, stars and residuals of results
-python examples/real/real.py draw OUT.png TITLE=FILE[,EXTENSION]:X,Y,HALF:LOW:HIGH...
+python real.py star-psf FRAME OUT X,Y SIZE   PSF of a star in a frame
+python real.py centred-psf FRAME OUT SIZE    PSF image without background, centred
+python real.py finer-psf PSF OUT Q           the same PSF at Q times as many samples
+python real.py airy-psf OUT FWHM HALF Q      Airy pattern in pixels, Q times as fine
+python real.py pixel-psf PSF OUT             PSF spread over Chandra's pixels
+python real.py offsets ALIGNED IMAGE IMAGE PSF PSF N   two images with their offset and not
+python real.py stars-psf SCI EXPTIME OUT     one PSF of the lensed quasar's four images
+python real.py figures RESULT...             counts, stars and residuals of results
+python real.py draw OUT.png TITLE=FILE[,EXTENSION]:X,Y,HALF:LOW:HIGH...
 """
 
 import sys

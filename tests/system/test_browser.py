@@ -1,11 +1,11 @@
 """The page of a result in a real browser, without a network: pictures, blink, stretch, keys."""
 
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browsers import wait_for
 from result_views import make_view
 
 from lnocl.plotting.report import make_report
@@ -13,29 +13,7 @@ from lnocl.plotting.report import make_report
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "start" / "look").glob("*.html"))
 
 pytestmark = pytest.mark.system
-selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 pytest.importorskip("matplotlib")
-
-
-@pytest.fixture(scope="module")
-def browser():
-    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if not (browser and driver):
-        pytest.skip("chromium and its driver are not installed")
-    options = selenium.ChromeOptions()
-    options.binary_location = browser
-    for word in (
-        "headless",
-        "no-sandbox",
-        "disable-gpu",
-        "disable-dev-shm-usage",
-        "window-size=1300,1200",
-    ):
-        options.add_argument(f"--{word}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    opened = selenium.Chrome(options, selenium.ChromeService(driver))
-    yield opened
-    opened.quit()
 
 
 @pytest.fixture
@@ -51,12 +29,6 @@ def page(browser, tmp_path):
     browser.get(path.as_uri())
     wait_for(browser, lambda: layer(browser) == "image")
     return browser
-
-
-def wait_for(browser, condition):
-    from selenium.webdriver.support.ui import WebDriverWait
-
-    WebDriverWait(browser, 20, poll_frequency=0.05).until(lambda _: condition())
 
 
 def layer(browser):

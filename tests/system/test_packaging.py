@@ -155,6 +155,13 @@ def test_it_runs_without_the_functions_that_windows_lacks(tmp_path):
     assert fits.getdata(tmp_path / "out.fits").shape == (8, 8)
 
 
+def test_the_citation_has_the_version():
+    version = re.search(r"^version = (\S+)$", (ROOT / "setup.cfg").read_text(), re.M)[1]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    headings = re.findall(r"^## \[?([^]\n]+)", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert headings[0] == "Unreleased" or headings[0].startswith(version)
+
+
 def test_no_advice_names_a_package_that_no_index_has():
     names = tracked("*.py", "*.md", "*.sh", "*.ipynb", ".ci")
     texts = {name: (ROOT / name).read_text() for name in names}

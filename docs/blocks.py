@@ -1,6 +1,7 @@
-"""Plugin of pytest that runs the code blocks of pages: ``pytest -p docs_blocks docs README.md``.
+"""Plugin of pytest that runs the code blocks of pages, as .ci/docs calls it.
 
 Blocks of a page run one after the other in one empty folder; those of Python share a namespace.
+A comment ``<!-- skip: next -->`` leaves the next block out.
 """
 
 import os
@@ -10,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from sybil import Sybil
-from sybil.parsers.myst import CodeBlockParser, PythonCodeBlockParser
+from sybil.parsers.myst import CodeBlockParser, PythonCodeBlockParser, SkipParser
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 
@@ -37,7 +38,7 @@ def leave_folder(namespace):
 
 
 pytest_collect_file = Sybil(
-    parsers=[PythonCodeBlockParser(), ShellBlockParser()],
+    parsers=[PythonCodeBlockParser(), ShellBlockParser(), SkipParser()],
     patterns=["*.md"],
     path=str(Path(__file__).parents[1]),
     setup=enter_folder,

@@ -1,0 +1,92 @@
+"""The built site in a real browser, without a network: links, search, gallery, a phone's width."""
+
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urldefrag
+
+import pytest
+from browsers import wait_for
+
+pytestmark = pytest.mark.system
+SITE = Path(__file__).parents[2] / "build" / "site"
+PAGES = sorted(path.relative_to(SITE) for path in SITE.rglob("*.html"))
+PHONE = 400
+
+if not PAGES:
+    pytest.skip("the site is not built: sphinx-build docs build/site", allow_module_level=True)
+
+
+class Reader(HTMLParser):
+    """Collects the places that a page refers to, and the anchors that it has."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.targets, self.anchors = [], set()
+        self.feed((SITE / page).read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        """Take the addresses of links and pictures, and the names of elements."""
+        given = dict(attrs)
+        self.targets += [given[name] for name in ("href", "src") if given.get(name)]
+        if "id" in given:
+            self.anchors.add(given["id"])
+
+
+@pytest.fixture(scope="module")
+def readers():
+    return {page: Reader(page) for page in PAGES}
+
+
+def test_all_links_inside_the_site_resolve(readers):
+    broken = []
+    for page, reader in readers.items():
+        for target in reader.targets:
+            address, anchor = urldefrag(target)
+            if "://" in address or address.startswith(("data:", "mailto:")):
+                continue
+            path = (SITE / page.parent / unquote(address.partition("?")[0])).resolve()
+            path = SITE / page if not address else path
+            if not path.exists():
+                broken.append((str(page), target))
+            elif anchor and path.suffix == ".html":
+                there = readers.get(path.relative_to(SITE))
+                if there and unquote(anchor) not in there.anchors and "highlight" not in anchor:
+                    broken.append((str(page), target))
+    assert broken == []
+
+
+def look(browser, page, width=1300):
+    browser.set_window_size(width, 900)
+    browser.get_log("browser")
+    browser.get((SITE / page).as_uri())
+
+
+# Pages that list code run to the width that they need in frames of their own.
+@pytest.mark.parametrize("width", [PHONE, 1300])
+@pytest.mark.parametrize("page", [page for page in PAGES if page.parts[0] != "_modules"], ids=str)
+def test_no_page_is_wider_than_the_window(page, width, browser):
+    look(browser, page, width)
+    body = "return [document.documentElement.scrollWidth, document.documentElement.clientWidth]"
+    needed, there = browser.execute_script(body)
+    assert needed <= there + 1
+
+
+def test_the_search_finds_a_page(browser):
+    look(browser, "search.html?q=checkpoint")
+    found = "#search-results li a"
+    wait_for(browser, lambda: browser.find_elements("css selector", found))
+    links = [each.get_attribute("href") for each in browser.find_elements("css selector", found)]
+    assert any("guide/long_runs.html" in each for each in links)
+
+
+def test_the_gallery_shows_a_picture_for_each_script(browser):
+    look(browser, "gallery/index.html")
+    pictures = browser.find_elements("css selector", ".sphx-glr-thumbcontainer img")
+    assert len(pictures) >= 10
+    loaded = "return arguments[0].complete && arguments[0].naturalWidth > 100"
+    assert all(browser.execute_script(loaded, each) for each in pictures)
+
+
+def test_equations_are_set_without_a_network(browser):
+    look(browser, "theory/model.html")
+    wait_for(browser, lambda: browser.find_elements("css selector", "math, .katex, mjx-container"))
