@@ -4,6 +4,7 @@ import pydoc
 from importlib.metadata import version as version_of
 
 from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 
 project = "lnocl"
 author = "The lnocl developers"
@@ -16,7 +17,6 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.intersphinx",
-    "sphinx.ext.mathjax",
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
@@ -25,6 +25,8 @@ extensions = [
 templates_path = ["_templates"]
 exclude_patterns = ["build", "gallery/*.ipynb", "gallery/*.py"]
 nitpicky = True
+# The domain of the shell's options takes no links by name.
+suppress_warnings = ["myst.domains"]
 # rho' and rho'' have straight quotes.
 smartquotes = False
 
@@ -55,11 +57,14 @@ sphinx_gallery_conf = {
     "filename_pattern": r"/examples/[^/]+\.py$",
     "abort_on_example_error": True,
     "show_memory": False,
+    "write_computation_times": False,
     "download_all_examples": False,
     "copyfile_regex": r"",
     "within_subsection_order": "FileNameSortKey",
 }
 
+# Browsers set MathML themselves, so that equations need no network.
+html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
 html_title = "lnocl"
 html_static_path = ["_static"]
@@ -80,6 +85,19 @@ def name_without_page(app, env, node, contnode):
     return None
 
 
+def show_inline(writer, node):
+    """Write a formula of a line."""
+    writer.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def show_block(writer, node):
+    """Write an equation."""
+    writer.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
 def setup(app):
     """Connect what Sphinx calls."""
+    app.add_html_math_renderer("mathml", (show_inline, None), (show_block, None))
     app.connect("missing-reference", name_without_page)

@@ -1,7 +1,7 @@
 """Make the figures of the pages again.
 
 ``python docs/figures.py`` lists them; ``python docs/figures.py NAME ...`` makes some, and ``all``
-makes all. DATA, by ``--data``, is the folder of the real frames (examples/real/README.md).
+makes all. DATA, by ``--data``, is the folder of the real frames (examples/real/DATA.md).
 """
 
 import argparse
