@@ -367,9 +367,9 @@ def draw(path, device):
     """Draw truth, periodic and padded model, and their errors."""
     from matplotlib.figure import Figure
 
-    seen = sky("fizeau", (256, 256), False, 0)
+    seen = sky("moffat", (256, 256), False, 0)
     truth = seen.cut(seen.truth)
-    images = {"one image": seen.cut(seen.counts)[0] - BACKGROUND, "truth": truth}
+    images = {"image": seen.cut(seen.counts)[0] - BACKGROUND, "truth": truth}
     rule = recommend_pad(seen.observation())
     for name, pad in (("periodic model (pad 0)", 0), (f"padded model (pad {rule})", rule)):
         _, errors, images[name] = seen.reconstruct("sgp", pad, device)
@@ -385,8 +385,8 @@ def draw(path, device):
         shown = axis.imshow(f, origin="lower", vmin=0, vmax=top, cmap="viridis")
         axis.set_title(name, fontsize=10)
     figure.colorbar(shown, ax=axes[0], label="electrons per pixel")
-    axes[1, 0].imshow(images["one image"], origin="lower", vmin=0, vmax=top, cmap="viridis")
-    axes[1, 0].set_title("one of four images", fontsize=10)
+    axes[1, 0].imshow(images["image"], origin="lower", vmin=0, vmax=top, cmap="viridis")
+    axes[1, 0].set_title("the image", fontsize=10)
     for axis, (name, f) in zip(axes[1, 1:], panels[1:], strict=True):
         shown = axis.imshow(f - truth, origin="lower", vmin=-top / 2, vmax=top / 2, cmap="RdBu_r")
         axis.set_title(f"{name.splitlines()[0]} less truth", fontsize=10)

@@ -51,7 +51,11 @@ RECIPES = {
     "look": Recipe(
         "1 min",
         "sh examples/real/look.sh $DATA $OUT",
-        same("start/look", "galactic_centre lensed_quasar quasar_host stars"),
+        same("start/look", "galactic_centre lensed_quasar quasar_host stars")
+        | {
+            f"start/look/{name}.html": f"{name}.html"
+            for name in ("galactic_centre", "lensed_quasar", "quasar_host")
+        },
     ),
     "experiment": Recipe(
         "2 h",
@@ -78,7 +82,7 @@ RECIPES = {
         {"validation/bands.png": "bands-512.png"},
     ),
     "edges": Recipe(
-        "1 h",
+        "5 min",
         "python benchmarks/frames.py edges --output $OUT/frames --figure $OUT/edges.png",
         same("validation", "edges"),
     ),

@@ -21,10 +21,12 @@ def figures():
 
 
 def shown():
-    """Yield the figures that the pages show."""
+    """Yield the figures that the pages show, and the reports that they link."""
     for page in [*DOCS.rglob("*.md"), ROOT / "README.md"]:
         if "gallery" not in page.parts:
-            for name in re.findall(r"```\{figure\} (\S+)|!\[[^]]*\]\((\S+)\)", page.read_text()):
+            for name in re.findall(
+                r"```\{figure\} (\S+)|!\[[^]]*\]\((\S+)\)|\]\((look/\S+\.html)\)", page.read_text()
+            ):
                 yield (page.parent / "".join(name)).resolve()
 
 
