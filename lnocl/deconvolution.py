@@ -62,52 +62,65 @@ def deconvolve(
     checkpoint_every: float = 60.0,
     resume: str | PathLike[str] | None = None,
 ) -> Result:
-    """Reconstruct the sky from several images as stars plus an extended source.
+    r"""Reconstruct the sky from several images as stars plus an extended source.
 
-    Minimises ``J = sum_j sum_n [g_j ln(g_j / m_j) + m_j - g_j] + mu / 2 sum f^2`` and, for
-    `smoothing`, ``+ smoothing sum [sqrt((f - f')^2 + delta^2) - delta]`` over pairs of neighbours,
-    over the star fluxes c and the extended source f. The model of image g_j is
-    ``m_j = A_j f + sum_s c_s P_js + b_j``: A_j convolves with PSF j, P_js is the image of star s
-    for flux 1, and b_j the background. The sky may be finer than the images (``oversample`` of the
-    observation): A_j then sums over the pixels of the sky that a pixel of the image holds.
+    The star fluxes c and the extended source f minimise the objective
+
+    .. math::
+
+       J = \sum_j \sum_n \left[ g_j \ln \frac{g_j}{m_j} + m_j - g_j \right]
+           + \frac{\mu}{2} \sum f^2
+           + \lambda \sum \left[ \sqrt{(f - f')^2 + \delta^2} - \delta \right]
+
+    for images :math:`g_j` of pixels n, with the models
+
+    .. math:: m_j = e_j \left( A_j f + \sum_s c_s P_{js} \right) + b_j .
+
+    Here :math:`A_j` convolves with PSF j, and :math:`P_{js}` is the image of star s for flux 1. The
+    background is :math:`b_j`, and the exposure :math:`e_j`, by default 1. The weights μ and λ of
+    the penalties are `mu` and `smoothing`; the last sum is over pairs of neighbouring pixels. The
+    sky may be finer than the images (``oversample`` of the observation). :math:`A_j` then sums over
+    the pixels of the sky that a pixel of the image holds.
 
     The defaults are for real frames. The paper's iteration is ``solver="sgm", stop=None,
-    smoothing=0, pad=0`` with `mu` and `n_iter` given; without stars and penalties it is
+    smoothing=0, pad=0`` with `mu` and `n_iter` given. Without stars and penalties that is
     Richardson-Lucy for several images. The scaled gradient projection method lowers the same
-    objective in a tenth of its iterations and less.
+    objective in a tenth of the iterations or fewer. The theory explains the model
+    (:doc:`/theory/model`) and the methods (:doc:`/theory/iterations`).
 
     Parameters
     ----------
     observation : Observation
         The p images of shape (ny, nx), with their PSFs, backgrounds, noise and masks.
     stars : iterable of (x, y) or astropy.table.Table, optional
-        Positions of the point sources in pixels of an image without offset, 0-based, x along
-        columns; they may be a Quantity in pixels, or a table with columns x and y, or as photutils
-        or SExtractor name them (`lnocl.scene.star_tables.IN_PIXELS`; those of SExtractor are
-        counted from 1). Two are at least a thousandth of a pixel apart.
-        Between pixels a star's image is the PSF moved in its spectrum
-        (`lnocl.scene.shifting.place`).
+        Positions of the n point sources in pixels of an image without offset, 0-based, x along
+        columns. Two are at least a thousandth of a pixel apart. They may be a Quantity in pixels,
+        or a table with columns x and y, or as photutils or SExtractor name them
+        (`lnocl.scene.star_tables.IN_PIXELS`). SExtractor counts from 1, and is converted. Between
+        pixels a star's image is the PSF moved in its spectrum (`lnocl.scene.shifting.place`).
     mu : float, optional
         Weight of the Tikhonov term on the extended source, per electron; zero or more.
     smoothing : float or "auto", optional
-        Weight of an edge-preserving term (`lnocl.scene.penalty.Penalty`), zero or more, without
-        unit; delta is three times the mean of the extended source. It keeps the noise down that
-        grows with the iterations, most of all beside bright stars. "auto": a tenth of the noise of
-        the data term's gradient, ``0.1 sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, < > the mean over
-        pixels; with held-out counts 0 or 1, 3 or 10 times that, whichever they choose
-        (docs/validation/sgp.md).
+        Weight λ of the edge-preserving term (`lnocl.scene.penalty.Penalty`), zero or more, without
+        unit. The length δ is three times the mean of the extended source. The term keeps the noise
+        down that grows with the iterations, most of all beside bright stars. "auto" is a tenth of
+        the noise of the data term's gradient, ``0.1 sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, with < >
+        the mean over pixels. With held-out counts it is 0, or 1, 3 or 10 times that, whichever they
+        choose (:doc:`/validation/sgp`).
     solver : {"sgp", "sgm"}, optional
-        Iteration to use: the scaled gradient projection method, which solves for the star fluxes at
-        the start, so that those given matter little; or the split-gradient method, the paper's.
+        Iteration to use. "sgp" is the scaled gradient projection method. It solves for the star
+        fluxes at the start, so that those given matter little. "sgm" is the split-gradient method,
+        the paper's.
     n_iter : int, optional
-        Iterations to do, at most where they may end sooner; 1 or more.
+        Iterations to do, 1 or more. Where `stop` or a callback may end the run sooner, the largest
+        number of them.
     stop : "held-out", "discrepancy", float or None, optional
         Rule by which to stop before `n_iter`. "held-out": the result is that of the iteration that
         held-out counts choose (see Notes). "discrepancy": when the data term has fallen to its
         expectation for Poisson counts of the model's means. A number in (0, 1): when the relative
-        change of the objective an iteration, averaged over ten, is below it. None: at `n_iter`.
+        change of the objective in an iteration, averaged over ten, is below it. None: at `n_iter`.
     precision : {"single", "double"}, optional
-        Arithmetic of the OpenCL engine. The reference always computes in double.
+        Arithmetic of the OpenCL engine. The NumPy reference always computes in double.
     engine : {"opencl", "numpy"}, optional
         Where the iterations are computed: OpenCL, or the plain NumPy reference.
     device : str, optional
@@ -115,12 +128,12 @@ def deconvolve(
         `lnocl.opencl.device.choose`). By default that of the environment variable PYOPENCL_CTX,
         else the first GPU, else the first CPU.
     pad : int or "auto", optional
-        Unobserved pixels kept round the images, at least. Each axis of the grid is then the next of
-        `lnocl.scene.grid.LENGTHS`: powers of two, and 3, 5, 7 or 9 times one from 16 up, at least
-        as long as the PSFs or twice the images. Where images have such lengths, PSFs are no larger
-        and ``pad=0``, the model is periodic. "auto": where light runs over the edge of an image,
-        the radius with nine tenths of the PSFs' light, at most half the shorter side
-        (docs/validation/frames.md); else 0.
+        Unobserved pixels round the images, at least. "auto" is 0 unless light runs over the edge of
+        an image. Then it is the radius with nine tenths of the PSFs' light, at most half the
+        shorter side (:doc:`/validation/frames`). Each axis of the grid is then the next of
+        `lnocl.scene.grid.LENGTHS`: powers of two, and 3, 5, 7 or 9 times one from 16 up. It is at
+        least as long as the PSFs or twice the images. The model is periodic where images have such
+        lengths, PSFs are no larger, and ``pad=0``.
     initial_extended : array_like, of the shape of the result's, optional
         Extended source to start from, not 0 everywhere; by default flat. Pixels that start at 0
         stay 0 with "sgm".
@@ -128,30 +141,23 @@ def deconvolve(
         Star fluxes to start from, more than 0 with "sgm" unless positions are refined; by default
         read off the data.
     callback : callable, optional
-        ``callback(iteration, estimate)``, called after every iteration; it stops the run by
-        returning True. The estimate has ``extended`` and ``star_fluxes``, which are fetched
-        from the device when they are read. With held-out counts it is the sum of both halves';
-        they go beyond the iteration of the result, and begin again for each smoothing.
+        Called after every iteration as ``callback(iteration, estimate)``, with a
+        `lnocl.result.Estimate`. It stops the run by returning True. With held-out counts the
+        estimate is the sum of both halves'. They go beyond the iteration of the result, and begin
+        again for each smoothing.
     progress : bool, optional
         Show a progress bar on stderr, where that is a terminal, with the objective or the quantity
         of the stopping rule.
     refine_positions : bool, optional
-        Move the stars to where they are most likely, at most 3 pixels away, by Fisher scoring of
-        all fluxes and positions with the extended source held fixed: at the start and after 3, 6,
-        12, 24 ... iterations (`lnocl.solvers.positions`).
+        Move the stars to where they are most likely, at most 3 pixels away. Fisher scoring of all
+        fluxes and positions does so, with the extended source held fixed
+        (`lnocl.solvers.positions`). It runs at the start and after 3, 6, 12, 24 ... iterations.
     refine_psfs : iterable of {"shift", "jitter", "strehl", "pupil", "modes", "pixels"}, optional
-        Fit parameters of each PSF before the reconstruction, with the stars and with the extended
-        source marginalised (`lnocl.scene.psf_families`, `lnocl.solvers.psf_fit`): its place, the
-        covariance of a blur, the Strehl ratio between it and ``ideal_psfs``, phases across
-        ``pupils``, the coefficients of ``psf_modes``; and with two stars or more each pixel, as far
-        as ``psf_scatter``, or what residuals show, allows. The PSFs given stand unless chi squared
-        exceeds its expectation by two standard deviations, with "pixels" by five, and falls by 0.65
-        of that. Star positions that are not refined are taken for right. The error that is left is
-        estimated; where it exceeds the noise at the stars it is added to that, and always where it
-        is given as ``psf_scatter``. At least one star.
+        Parameters of each PSF to fit before the reconstruction, with the stars, and with the
+        extended source marginalised. See Notes. At least one star.
     round_source : bool, optional
-        Whether the extended source lies all round a star, as a disc, a ring or a host: else what
-        does is taken for the star's while its PSF is refined.
+        Whether the extended source lies all round a star, as a disc, a ring or a host. Otherwise
+        light that lies all round a star is taken for the star's while its PSF is refined.
     checkpoint : str or path, optional
         File for checkpoints (FITS): written after the first iteration, then every
         `checkpoint_every` seconds, and at the end. Each replaces the one before once it is
@@ -159,8 +165,8 @@ def deconvolve(
     checkpoint_every : float, optional
         Seconds between checkpoints, zero or more.
     resume : str or path, optional
-        Checkpoint to resume from. Everything else must be as it was when it was written. The
-        result is then bit for bit that of a run that was never interrupted.
+        Checkpoint to resume from. Everything else must be as it was when it was written. The result
+        is then bit for bit that of a run that was never interrupted.
 
     Returns
     -------
@@ -170,60 +176,90 @@ def deconvolve(
     Raises
     ------
     InputError
-        `observation` is not an Observation; a parameter is out of its range, masked or too large
-        for the precision; a star lies outside the images; two
-        stars are at one position; stars are not in pixels; the start is not in counts, or is 0
-        and stays so; the device does not exist, or was given for
-        the reference; images or exposures are too large to be summed, or the sky for a number;
-        held-out counts were asked of images that hold no counts; PSFs are to be refined without a
-        star, in a way that is not known, or that needs what the observation lacks, or a shift of
-        one image beside free positions.
+        - `observation` is not an Observation.
+        - A parameter is out of its range, masked or too large for the precision.
+        - A star lies outside the images, two are at one position, or they are not in pixels.
+        - The start is not in counts, or is 0 and stays so.
+        - The device does not exist, or was given for the reference.
+        - Images or exposures are too large to be summed, or the sky overflows.
+        - Held-out counts were asked of images that hold no counts.
+        - PSFs are to be refined without a star, in a way that is not known, or that needs more than
+          the observation has.
+        - A shift of one image is to be refined beside free positions.
     FileError
         A checkpoint cannot be written or read, is damaged, or would replace that of another run.
     DivergedError
         The objective of the halves of held-out counts rises from the start.
     DeviceError
-        There is no OpenCL device; it has too little memory or no double precision; it or its
-        compiler fails; the process was forked from one that uses OpenCL.
+        - There is no OpenCL device, or it has too little memory or no double precision.
+        - The device or its compiler fails.
+        - The process was forked from one that uses OpenCL.
 
     Warns
     -----
     LnoclWarning
-        A PSF is larger than the grid, so that its wings wrap round, or rings where it is moved
-        between pixels, or varies over the images by a fifth; it is wider or narrower than a star,
-        or a star is elsewhere than it was said to be; PSFs that were to be refined are wrong by a
-        quarter; there are offsets without `pad`;
-        single precision is expected to stray from double by a thousandth of the extended source;
-        the noise of an image is not that of Poisson counts, or that of neighbouring pixels is
-        correlated; held-out counts choose an iteration too near `n_iter`; the images do not
-        determine stars that were refined; the objective rises or is not finite; a later checkpoint
-        cannot be written; compiled kernels cannot be kept or are damaged.
+        - A PSF is larger than the grid, so that its wings wrap round.
+        - A PSF rings by more than 1 % of its peak where it is moved between pixels.
+        - PSFs vary by more than a fifth over an image that has one for its extended source.
+        - A PSF is a tenth wider or narrower than a star.
+        - A star is not at the position given, or lies on bad pixels of all images.
+        - PSFs to be refined, or of a given scatter, have an error of more than 3 % at the stars.
+        - Images are offset by more than `pad` and the grid leave room for.
+        - Single precision is expected to stray from double by a thousandth of the extended source.
+        - The noise of an image is not that of Poisson counts, or neighbouring pixels share theirs.
+        - The background is above the darker half of an image.
+        - Held-out counts choose an iteration too near `n_iter`.
+        - The objective rises or is not finite.
+        - A later checkpoint cannot be written.
+        - Compiled kernels cannot be stored, or they or the tunings are damaged.
+
+    See Also
+    --------
+    lnocl.deconvolve_tiles : Reconstructs large images, and PSFs that vary, tile by tile.
+    lnocl.Result.bootstrap : Errors of stars, regions and pixels.
 
     Notes
     -----
-    Held-out counts are cross-validation by data thinning. The counts are split at random into two
-    halves, independent observations of the same sky. Both are reconstructed side by side, and the
+    **Held-out counts** are cross-validation by data thinning. The counts are split at random into
+    two halves, independent observations of the same sky. Both are reconstructed side by side. The
     error of their sum is estimated from the products of one's estimates with the other's
     (`lnocl.runs.assessment` has the equation). The last iteration with an error within a tenth of
-    the least is chosen, the halves run to twice that iteration, and the result is the sum of what
-    they were then: the extended source and the star fluxes; positions are the mean. All this takes
-    about four times as long as if the iteration had been known, and the memory of two runs and of
-    about twenty estimates of each. Where smoothing is "auto" the halves then continue
-    with larger and larger weights, each from a third of the chosen iteration, until the error
-    rises. That takes six times as long in the median, and up to eleven (docs/validation/sgp.md).
+    the least is chosen, and the halves run to twice that iteration. The result is the sum of their
+    extended sources and star fluxes at the chosen iteration, and the mean of their positions.
 
-    The split-gradient method lowers the objective at every iteration where PSFs are not negative.
-    With many negative pixels, as in a raw frame of a star, the objective may rise again, and all
-    the light may end in one pixel. Where it stays a tenth above its least for ten iterations, the
-    run ends with the estimate of the least objective and a warning that names what is wrong with
-    the PSFs. The scaled gradient projection method never accepts a rise.
+    That takes about four times as long as a run whose iteration is known. It takes the memory of
+    two runs and of about twenty estimates of each. Where smoothing is "auto" the halves then
+    continue with larger and larger weights, each from a third of the chosen iteration, until the
+    error rises. That takes six times as long in the median, and up to eleven
+    (:doc:`/validation/sgp`).
+
+    **Refined PSFs** have parameters of these kinds (`lnocl.scene.psf_families`,
+    `lnocl.solvers.psf_fit`):
+
+    - "shift", the place of the PSF;
+    - "jitter", the covariance of a blur;
+    - "strehl", the Strehl ratio between the PSF and ``ideal_psfs``;
+    - "pupil", phases across ``pupils``;
+    - "modes", the coefficients of ``psf_modes``;
+    - "pixels", each pixel, as far as ``psf_scatter`` or the residuals allow; for two stars or more.
+
+    The PSFs given stand unless chi squared exceeds its expectation by two standard deviations, with
+    "pixels" by five, and falls by 0.65 of that. Star positions that are not refined are taken for
+    right. The error that is left is estimated. Where it exceeds the noise at the stars it is added
+    to that, and always where it is given as ``psf_scatter`` (:doc:`/validation/psf`).
+
+    **The split-gradient method** lowers the objective at every iteration where PSFs are not
+    negative. With many negative pixels, as in a raw frame of a star, the objective may rise again.
+    All the light may then end in one pixel. Where the objective stays a tenth above its least for
+    ten iterations, the run ends with the estimate of the least objective. A warning names the fault
+    of the PSFs. The scaled gradient projection method never accepts a rise.
 
     References
     ----------
-    A. La Camera, S. Antoniucci, M. Bertero et al., "Image reconstruction for observations with
-    a high dynamic range: LINC-NIRVANA simulations of a stellar jet", Proc. SPIE 8445 (2012),
-    Eq. 7 to 9. S. Bonettini, R. Zanella, L. Zanni, "A scaled gradient projection method for
-    constrained image deblurring", Inverse Problems 25, 015002 (2009).
+    A. La Camera, S. Antoniucci, M. Bertero et al., "Image reconstruction for observations with a
+    high dynamic range: LINC-NIRVANA simulations of a stellar jet", Proc. SPIE 8445 (2012), Eq. 7 to
+    9. S. Bonettini, R. Zanella, L. Zanni, "A scaled gradient projection method for constrained
+    image deblurring", Inverse Problems 25, 015002 (2009).
 
     Examples
     --------
@@ -237,6 +273,14 @@ def deconvolve(
     >>> result = lnocl.deconvolve(obs, stars=[(8, 5)], smoothing=0, engine="numpy")
     >>> (result.extended.sum() + result.star_fluxes.sum()).round(6)
     np.float64(612.0)
+
+    A callback that ends the run after three iterations:
+
+    >>> def third(iteration, estimate):
+    ...     return iteration == 3
+    >>> result = lnocl.deconvolve(obs, stop=None, callback=third, engine="numpy")
+    >>> result.n_iter, result.stop_reason
+    (3, 'callback')
     """
     check_observation(observation)
     observation = copy(observation)  # its arrays are read-only, but its attributes may be replaced

@@ -52,22 +52,22 @@ def find_stars(
     mask: ArrayLike | None = None,
     saturation: float | None = None,
 ) -> Table:
-    r"""Return the stars in an image: local maxima of the shape of the PSF, by DAOFIND.
+    """Return the stars in an image: local maxima of the shape of the PSF, by DAOFIND.
 
-    The sky's level and noise are sigma-clipped medians in boxes, between which they are
-    interpolated; stars are sought in the image less its level, over its noise. What is not half as
-    bright again as the wings of brighter stars, as the PSF has them, is left out.
+    The sky's level and noise are sigma-clipped medians in boxes, and are interpolated between them.
+    Stars are sought in the image less its level, over its noise. Maxima in the wings of brighter
+    stars are left out unless they are half as bright again as those wings, as the PSF has them.
 
     Parameters
     ----------
     image : array_like, shape (ny, nx)
-        In any linear unit; pixels that are not finite are bad, and so are blocks of exactly 0 in an
+        In any linear unit. Pixels that are not finite are bad. So are blocks of exactly 0 in an
         image that is not of whole counts.
     psf : array_like, shape (ky, kx), optional
         Its PSF. Without it the width is measured on the image's own stars, and no wings are known.
     threshold : float, optional
-        Smallest significance of a star, that of its image through a filter of the PSF's width;
-        more than 0.
+        Smallest significance of a star, that of its image through a filter of the PSF's width; more
+        than 0.
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is bad.
     saturation : float, optional
@@ -76,21 +76,24 @@ def find_stars(
     Returns
     -------
     astropy.table.Table
-        Columns ``x`` and ``y``, pixels, 0-based; ``peak``, the brightest pixel above the sky, in
-        the unit of the image; ``significance``, over the noise of a pixel; ``saturated``, whether
-        a pixel in the core is saturated or bad. The brightest comes first.
+        A row for each star, the brightest first, with these columns:
+
+        - ``x`` and ``y``: pixels, 0-based;
+        - ``peak``: the brightest pixel above the sky, in the unit of the image;
+        - ``significance``: over the noise of a pixel;
+        - ``saturated``: whether a pixel in the core is saturated or bad.
 
     Raises
     ------
     InputError
-        An array of another shape or type; a threshold that is not more than 0; an image without a
+        An array has another shape or type, the threshold is not more than 0, or the image has no
         good pixel.
     LnoclError
         photutils is not installed.
 
     References
     ----------
-    P. B. Stetson, PASP 99, 191 (1987), for DAOFIND.
+    Stetson, P. B., PASP 99, 191 (1987), for DAOFIND.
 
     Examples
     --------

@@ -10,12 +10,29 @@ PACKAGE = str(Path(__file__).parent) + os.sep
 
 
 class LnoclError(Exception):
-    """Anything that lnocl refuses or fails at; its message is one line, meant for the user.
+    """Base class of all errors that lnocl raises.
+
+    The message is one line: what is wrong, and mostly what to do.
+
+    Parameters
+    ----------
+    message : str
+        Text of the error. Line breaks and repeated blanks in it become single blanks.
 
     Attributes
     ----------
     exit_status : int
-        What the command line returns for it: 1 failed, 2 wrong use.
+        Exit status of the command line after this error: 1 for a failure, 2 for wrong use.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> try:
+    ...     lnocl.Observation(np.ones((8, 8)), np.full((3, 3), np.nan))
+    ... except lnocl.LnoclError as error:
+    ...     print(type(error).__name__, error.exit_status)
+    InputError 2
     """
 
     exit_status = 1
@@ -25,21 +42,93 @@ class LnoclError(Exception):
 
 
 class InputError(LnoclError, ValueError):
-    """A value that cannot be used: an argument, an image, a PSF, a mask."""
+    """A value that cannot be used: an argument, an image, a PSF, a mask.
+
+    It is a `ValueError` too.
+
+    Parameters
+    ----------
+    message : str
+        Text of the error, as for `LnoclError`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> try:
+    ...     lnocl.Observation(np.ones((8, 8)), np.ones((3, 3)), oversample=3)
+    ... except lnocl.InputError as error:
+    ...     print(error)
+    oversample must be 1, 2 or 4; 3 was given
+    """
 
     exit_status = 2
 
 
 class FileError(LnoclError, OSError):
-    """A file that cannot be read or written."""
+    """A file that cannot be read or written.
+
+    It is an `OSError` too.
+
+    Parameters
+    ----------
+    message : str
+        Text of the error, as for `LnoclError`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> observation = lnocl.Observation(np.ones((8, 8)), np.ones((3, 3)))
+    >>> try:
+    ...     lnocl.deconvolve(observation, resume="lost.fits", engine="numpy")
+    ... except lnocl.FileError as error:
+    ...     print(error)
+    lost.fits cannot be opened: No such file or directory
+    """
 
 
 class DeviceError(LnoclError, RuntimeError):
-    """No usable OpenCL device, or the device cannot do what was asked of it."""
+    """No usable OpenCL device, or one that cannot do as it was asked.
+
+    It is a `RuntimeError` too. ``engine="numpy"`` of `lnocl.deconvolve` needs no device.
+
+    Parameters
+    ----------
+    message : str
+        Text of the error, as for `LnoclError`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> observation = lnocl.Observation(np.ones((8, 8)), np.ones((3, 3)))
+    >>> try:
+    ...     result = lnocl.deconvolve(observation, n_iter=9, stop=None, engine="numpy")
+    ... except lnocl.DeviceError as error:
+    ...     print("no OpenCL:", error)
+    >>> result.device
+    'numpy'
+    """
 
 
 class DivergedError(LnoclError):
-    """The objective rises where each iteration must lower it."""
+    """The objective rises where each iteration must lower it.
+
+    PSFs with many negative pixels do that. Held-out counts raise it; other runs return the estimate
+    of the least objective, with ``stop_reason`` "diverged" and a warning.
+
+    Parameters
+    ----------
+    message : str
+        Text of the error, as for `LnoclError`.
+
+    Examples
+    --------
+    >>> from lnocl.errors import DivergedError
+    >>> DivergedError("the objective rises").exit_status
+    1
+    """
 
 
 class NotFiniteError(DeviceError):
@@ -61,7 +150,35 @@ def counted(n: int, noun: str) -> str:
 
 
 class LnoclWarning(UserWarning):
-    """Something was changed or left out of the data, and the user should know."""
+    """Something was changed or left out of the data, or the result may be wrong.
+
+    The warning names the line of the caller. Filters of `warnings` apply to it as to any other.
+
+    Examples
+    --------
+    Make each warning an error:
+
+    >>> import warnings
+    >>> import numpy as np
+    >>> import lnocl
+    >>> image = np.ones((8, 8))
+    >>> image[3, 4] = np.nan
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", lnocl.LnoclWarning)
+    ...     try:
+    ...         lnocl.Observation(image, np.ones((3, 3)))
+    ...     except lnocl.LnoclWarning as warning:
+    ...         print(warning)
+    1 image pixel is not finite and was masked
+
+    Show no warning of lnocl:
+
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", lnocl.LnoclWarning)
+    ...     observation = lnocl.Observation(image, np.ones((3, 3)))
+    >>> bool(observation.mask[0, 3, 4])
+    True
+    """
 
 
 def warn(message: str) -> None:

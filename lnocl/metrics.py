@@ -38,7 +38,11 @@ def star_rows(star: tuple[int, int], shape: tuple[int, int]) -> slice:
     Raises
     ------
     InputError
-        Where one of the rows lies outside the image.
+        One of the rows lies outside the image.
+
+    References
+    ----------
+    La Camera et al. (2012), section 3.2.
 
     Examples
     --------
@@ -73,7 +77,7 @@ def mask_star(image: ArrayLike, star: tuple[int, int]) -> Array:
     Raises
     ------
     InputError
-        Where the image is not a plane of finite, unmasked numbers, or the box leaves it.
+        The image is not a plane of finite, unmasked numbers, or the box leaves it.
 
     Examples
     --------
@@ -93,19 +97,19 @@ def restoration_error(
     rows: slice | None = None,
     star: tuple[int, int] | None = None,
 ) -> float:
-    r"""Return the restoration error, the relative r.m.s. error of a reconstruction.
+    r"""Return the restoration error, the relative rms error of a reconstruction.
 
     .. math:: \rho = \| f - \bar f \| \, / \, \| \bar f \|
 
-    The paper's :math:`\rho'` is over all rows, its :math:`\rho''` over `star_rows`. For stars
-    apart from the extended source (MC-RL) compare the extended sources, without `star`. For both
-    in one image (RLM) give `star`: its pixels are masked in reconstruction and truth, so that the
-    truth with the star may be given as well as the truth without it.
+    The paper's :math:`\rho'` is over all rows, its :math:`\rho''` over `star_rows`. For stars apart
+    from the extended source (MC-RL) compare the extended sources, without `star`. For both in one
+    image (RLM) give `star`. Its pixels are then masked in reconstruction and truth, so that the
+    truth may be given with the star or without it.
 
     Parameters
     ----------
     reconstruction : array_like, shape (ny, nx)
-        f, the reconstructed source.
+        The reconstructed source, f.
     truth : array_like, shape (ny, nx)
         The true source, in the same unit.
     rows : slice, optional
@@ -121,8 +125,9 @@ def restoration_error(
     Raises
     ------
     InputError
-        Where the shapes differ, a value is masked, not finite or too large to be squared, the box
-        around the star leaves the image, or the truth is zero in all pixels compared.
+        - The shapes differ, or a value is masked, not finite or too large to be squared.
+        - The box around the star leaves the image.
+        - The truth is zero in all pixels compared.
 
     References
     ----------
@@ -168,7 +173,7 @@ def box_flux(image: ArrayLike, star: tuple[int, int]) -> float:
     Raises
     ------
     InputError
-        Where the image is not a plane of finite, unmasked numbers, or the box leaves it.
+        The image is not a plane of finite, unmasked numbers, or the box leaves it.
 
     Examples
     --------
@@ -199,7 +204,7 @@ def magnitude(flux: float, zero_magnitude_flux: float) -> float:
     Raises
     ------
     InputError
-        Where a flux is out of its range.
+        A flux is out of its range.
 
     Examples
     --------
@@ -234,7 +239,7 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
     Raises
     ------
     InputError
-        Where the image is not a plane of finite, unmasked numbers, or a masked row lies outside it.
+        The image is not a plane of finite, unmasked numbers, or a masked row lies outside it.
 
     References
     ----------
@@ -253,8 +258,8 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
 def width_profile(image: ArrayLike, threshold: float, star: tuple[int, int] | None = None) -> Array:
     """Return the width profile along the jet.
 
-    The width of a row is the number of pixels from the first to the last that are greater than
-    the threshold, both counted: ``last - first + 1``, and 0 where all are below it.
+    The width of a row is the number of pixels from the first to the last that are greater than the
+    threshold, both counted: ``last - first + 1``. It is 0 where all are below it.
 
     Parameters
     ----------
@@ -273,8 +278,8 @@ def width_profile(image: ArrayLike, threshold: float, star: tuple[int, int] | No
     Raises
     ------
     InputError
-        Where the image is not a plane of finite, unmasked numbers, the threshold is not finite, or
-        a masked row lies outside the image.
+        The image is not a plane of finite, unmasked numbers, the threshold is not finite, or a
+        masked row lies outside the image.
 
     References
     ----------
@@ -315,7 +320,7 @@ def relative_error(profile: ArrayLike, reference: ArrayLike) -> Array:
     Raises
     ------
     InputError
-        Where they are not two profiles of one length, of real numbers that are not masked.
+        They are not two profiles of one length, of real numbers that are not masked.
 
     Examples
     --------

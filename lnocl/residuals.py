@@ -38,6 +38,17 @@ class Fit(NamedTuple):
         The sum of ``(g - m)^2 / m``.
     variance : float
         Its variance for Poisson counts, ``sum (2 + 1 / m)``.
+
+    See Also
+    --------
+    lnocl.Result.fit : Returns it for all pixels.
+
+    Examples
+    --------
+    >>> from lnocl.residuals import Fit
+    >>> fit = Fit(n_pixels=10000, square_sum=40000.0, variance=20100.0)
+    >>> fit.rms, round(fit.error, 4), fit.is_misfit, fit.is_overfit
+    (2.0, 0.0071, True, False)
     """
 
     n_pixels: int = 0
@@ -62,7 +73,7 @@ class Fit(NamedTuple):
 
     @property
     def rms(self) -> float:
-        """The rms residual: 1 where only noise is left, less where the model follows the noise."""
+        """Rms of ``(g - m) / sqrt(m)``: 1 for noise alone, less where the model follows noise."""
         return math.sqrt(self.square_sum / self.n_pixels) if self.n_pixels else math.nan
 
     @property
@@ -72,12 +83,18 @@ class Fit(NamedTuple):
 
     @property
     def is_misfit(self) -> bool:
-        """Whether the rms is far above what noise gives."""
+        """Whether the rms is far above that of noise.
+
+        It is above 1.5, and above 1 by more than five standard errors.
+        """
         return self.rms > max(MISFIT, 1.0 + SIGNIFICANCE * self.error)
 
     @property
     def is_overfit(self) -> bool:
-        """Whether the rms is far below what noise gives."""
+        """Whether the rms is far below that of noise.
+
+        It is below 0.6, and below 1 by more than five standard errors.
+        """
         return self.rms < min(OVERFIT, 1.0 - SIGNIFICANCE * self.error)
 
 
@@ -86,13 +103,26 @@ class StarResiduals(NamedTuple):
 
     Attributes
     ----------
-    core, wings : Fit
-        In the core of its images, and in their wings.
+    core : Fit
+        In the core of the star's images, where the PSF is above half its peak.
+    wings : Fit
+        In the wings, down to a thousandth of the peak.
     halo : float
-        What lies all round the star in the extended source, falling outwards, as a share of the
-        star's flux: the light that a PSF too narrow or without wings leaves there.
+        Light of the extended source that lies all round the star and falls outwards, as a share of
+        the star's flux. A PSF that is too narrow, or without wings, leaves such light there.
     halo_share : float
-        The same as a share of all that lies round the star.
+        The same light as a share of all that lies round the star.
+
+    See Also
+    --------
+    lnocl.Result.star_residuals : Returns it for each star.
+
+    Examples
+    --------
+    >>> from lnocl.residuals import Fit, StarResiduals
+    >>> star = StarResiduals(Fit(20, 20.0, 40.0), Fit(300, 300.0, 600.0), 0.2, 0.8)
+    >>> star.is_misfit, star.has_halo
+    (False, True)
     """
 
     core: Fit
@@ -102,12 +132,15 @@ class StarResiduals(NamedTuple):
 
     @property
     def is_misfit(self) -> bool:
-        """Whether residuals are far above what noise gives."""
+        """Whether residuals in core or wings are far above noise (`Fit.is_misfit`)."""
         return self.core.is_misfit or self.wings.is_misfit
 
     @property
     def has_halo(self) -> bool:
-        """Whether much lies all round the star."""
+        """Whether much light lies all round the star.
+
+        It is more than a tenth of the star's flux, and more than 5 % of all light round it.
+        """
         return self.halo > MUCH_HALO and self.halo_share > MUCH_SHARE
 
 

@@ -45,17 +45,31 @@ class Iterating(Protocol):
 
 
 class Estimate:
-    """The estimate of an iteration, as a callback gets it: fetched from the device when read.
+    """The estimate of an iteration, as the callback of `lnocl.deconvolve` gets it.
+
+    An array is fetched from the device when it is first read, and has to be read before the
+    callback returns.
 
     Attributes
     ----------
     extended : ndarray of float64
-        Extended source, electrons per pixel of it; its shape is the observation's ``sky_shape``,
-        that of the images but for ``oversample``.
+        Extended source, electrons per pixel.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons.
     star_positions : ndarray of float64, shape (n, 2)
-        (x, y) in pixels, as last refined.
+        (x, y) in pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> obs = lnocl.Observation(np.full((8, 8), 4.0), np.ones((1, 1)))
+    >>> def show(iteration, estimate):
+    ...     print(iteration, estimate.extended.sum().round(6), estimate.star_fluxes.shape)
+    >>> options = {"n_iter": 2, "stop": None, "engine": "numpy"}
+    >>> result = lnocl.deconvolve(obs, solver="sgm", smoothing=0, callback=show, **options)
+    1 256.0 (0,)
+    2 256.0 (0,)
     """
 
     def __init__(self, run: Iterating) -> None:
@@ -63,17 +77,20 @@ class Estimate:
 
     @cached_property
     def extended(self) -> Array:
-        """Extended source, electrons per pixel."""
+        """Extended source, electrons per pixel of it.
+
+        Its shape is the observation's ``sky_shape``: that of the images, times ``oversample``.
+        """
         return self._live().extended()
 
     @cached_property
     def star_fluxes(self) -> Array:
-        """Star fluxes, electrons."""
+        """Star fluxes, electrons, shape (n,)."""
         return self._live().star_fluxes()
 
     @cached_property
     def star_positions(self) -> Array:
-        """Star positions, pixels."""
+        """Star positions, (x, y) in pixels as last refined, shape (n, 2)."""
         return self._live().star_positions().copy()
 
     def _live(self) -> Iterating:
@@ -90,50 +107,68 @@ Callback = Callable[[int, Estimate], Any]
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The result of `deconvolve`. Its arrays are read-only; results are compared by identity.
+    """The result of `lnocl.deconvolve`.
+
+    Its arrays are read-only, and results are compared by identity.
 
     Attributes
     ----------
     extended : ndarray of float64
-        Extended source, electrons per pixel of it; its shape is the observation's ``sky_shape``,
-        that of the images but for ``oversample``.
+        Extended source, electrons per pixel of it. Its shape is the observation's ``sky_shape``:
+        that of the images, times ``oversample``.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons, in the order of the stars given.
     star_positions : ndarray of float64, shape (n, 2)
         (x, y) in pixels, as given or refined.
-    star_flux_errors : ndarray of float64, shape (n,)
-        Standard errors of the fluxes, electrons: of the joint Fisher information of all stars and
-        of the extended source, which is not taken as known (`lnocl.solvers.star_errors`,
-        docs/validation/errors.md). They are computed when they are first read. NaN where the images
-        do not determine them, such as those of stars that have moved to one place.
-    star_position_errors : ndarray of float64, shape (n, 2)
-        Standard errors of the positions, pixels, likewise; NaN where they were not refined.
     n_iter : int
         The iteration of the estimate.
     stop_reason : str
-        Why the run ended. ``"n_iter"``: all iterations were done. ``"callback"``: the callback
-        returned True. ``"change"``, ``"discrepancy"``, ``"held-out"``: the stopping rule was met.
-        ``"converged"``: no step of ``"sgp"`` lowers the objective any more, in the precision used.
-        ``"diverged"``: the objective rose, as with PSFs that have many negative pixels.
-        ``"not finite"``: the objective became infinite or NaN. In the last two cases the estimate
-        is that of the least objective, and the history ends there.
+        Why the run ended:
+
+        - ``"n_iter"``: all iterations were done.
+        - ``"callback"``: the callback returned True.
+        - ``"change"``, ``"discrepancy"``, ``"held-out"``: the stopping rule was met.
+        - ``"converged"``: no step of ``"sgp"`` lowers the objective any more, in the precision
+          used.
+        - ``"diverged"``: the objective rose, as with PSFs that have many negative pixels.
+        - ``"not finite"``: the objective became infinite or NaN.
+
+        In the last two cases the estimate is that of the least objective, and the history ends
+        there.
     device : str
         Name of the device, its platform and driver; ``"numpy"`` for the reference.
     history : ndarray, fields ``iteration`` (int64) and ``objective`` (float64)
         The objective J after each iteration, from iteration 0, the start. With held-out counts the
         sum of the objectives of both halves.
     mu : float
-        Weight of the Tikhonov term, as given or as chosen.
+        Weight of the Tikhonov term, per electron, as given or as chosen.
     smoothing : float
         Weight of the edge-preserving term, as given or as chosen.
     held_out : ndarray, fields ``smoothing``, ``iteration`` (int64) and ``error``
         The relative error of the extended source that held-out counts estimate, for each smoothing
         and iteration that they compared last. Empty where they did not choose.
     psf_refinement : PsfRefinement or None
-        What became of the PSFs that were to be refined, or have a scatter that is given:
-        ``parameters``, ``values``, ``misfit`` before and after, ``is_accepted``, and the error that
-        is left: ``psf_error``, ``edges``, ``errors_in_rings``, ``is_noise``, ``may_be_faked``. None
-        without either.
+        The outcome for PSFs that were to be refined, or whose scatter was given
+        (`lnocl.runs.outcome.PsfRefinement`); None without either.
+
+    See Also
+    --------
+    lnocl.tiles.TiledResult : The result of `lnocl.deconvolve_tiles`.
+
+    Examples
+    --------
+    A star of 1000 electrons on a sky of 5 electrons per pixel:
+
+    >>> import numpy as np
+    >>> import lnocl
+    >>> y, x = np.indices((33, 33)) - 16
+    >>> psf = np.exp(-(x**2 + y**2) / 4)
+    >>> observation = lnocl.Observation(5 + 1000 * psf / psf.sum(), psf)
+    >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=20, engine="numpy")
+    >>> result.star_fluxes.round(), result.extended.mean().round()
+    (array([1000.]), np.float64(5.0))
+    >>> result.n_iter, result.stop_reason, len(result.history)
+    (20, 'n_iter', 21)
     """
 
     extended: Array
@@ -156,12 +191,56 @@ class Result:
 
     @property
     def star_flux_errors(self) -> Array:
-        """Standard errors of the star fluxes, electrons, shape (n,)."""
+        """Standard errors of the star fluxes, electrons, shape (n,).
+
+        They follow from the joint Fisher information of all stars and of the extended source, which
+        is not taken as known (`lnocl.solvers.star_errors`, :doc:`/validation/errors`). They are
+        computed when they are first read. They are NaN where the images do not determine the flux,
+        as for stars that have moved to one place.
+
+        Warns
+        -----
+        LnoclWarning
+            The images do not determine flux and position of a star.
+
+        Examples
+        --------
+        The noise of 1000 counts is 32 electrons. The sky and the extended source add to it:
+
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((33, 33)) - 16
+        >>> psf = np.exp(-(x**2 + y**2) / 4)
+        >>> observation = lnocl.Observation(5 + 1000 * psf / psf.sum(), psf)
+        >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=20, engine="numpy")
+        >>> bool(32 < result.star_flux_errors[0] < 100)
+        True
+        """
         return self._star_errors[0]
 
     @property
     def star_position_errors(self) -> Array:
-        """Standard errors of the star positions, pixels, shape (n, 2)."""
+        """Standard errors of the star positions, pixels, shape (n, 2).
+
+        They are computed as `star_flux_errors` are. NaN where the positions were not refined.
+
+        Warns
+        -----
+        LnoclWarning
+            The images do not determine flux and position of a star.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((33, 33)) - 16
+        >>> psf = np.exp(-(x**2 + y**2) / 4)
+        >>> observation = lnocl.Observation(5 + 1000 * psf / psf.sum(), psf)
+        >>> options = {"refine_positions": True, "stop": None, "n_iter": 20, "engine": "numpy"}
+        >>> result = lnocl.deconvolve(observation, [(16.2, 16.0)], **options)
+        >>> abs(result.star_positions - 16).max() < 0.01, (result.star_position_errors < 0.1).all()
+        (np.True_, np.True_)
+        """
         return self._star_errors[1]
 
     @cached_property
@@ -177,24 +256,58 @@ class Result:
 
     @property
     def psfs(self) -> Array:
-        """The PSFs of the model, shape (p, ky, kx), of unit sum: as given or refined."""
+        """The PSFs of the model, shape (p, ky, kx), of unit sum: as given or refined.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> observation = lnocl.Observation(np.full((2, 8, 8), 4.0), np.ones((3, 3)))
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=2, engine="numpy")
+        >>> result.psfs.shape, result.psfs[0].sum()
+        ((2, 3, 3), np.float64(1.0))
+        """
         return self._observation.psfs
 
     @property
     def doubtful(self) -> NDArray[np.bool_]:
-        """Pixels of the extended source, shape (ny, nx), that errors of the PSFs may have faked.
+        """Pixels of the extended source that errors of the PSFs may have faked, bool.
 
-        Those below ``psf_refinement.may_be_faked``; none where that was not asked for.
+        Those are the pixels below ``psf_refinement.may_be_faked``. The shape is that of `extended`.
+        All are False where PSFs were not refined and no scatter of them was given.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> observation = lnocl.Observation(np.full((8, 8), 4.0), np.ones((3, 3)))
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=2, engine="numpy")
+        >>> result.doubtful.shape, result.doubtful.any()
+        ((8, 8), np.False_)
         """
         if self.psf_refinement is None:
             return np.zeros(self.extended.shape, np.bool_)
         return self.extended < self.psf_refinement.may_be_faked
 
     def models(self) -> Array:
-        """Return the m_j, shape (p, ny, nx), electrons per pixel.
+        """Return the models of the images.
 
-        ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j``, in double precision. As in the observation,
-        the square of the read noise is included.
+        ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j``, in double precision, as in `lnocl.deconvolve`.
+        As in the observation, the square of the read noise is included.
+
+        Returns
+        -------
+        ndarray of float64, shape (p, ny, nx)
+            Electrons per pixel.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> observation = lnocl.Observation(np.full((2, 8, 8), 4.0), np.ones((3, 3)), background=1)
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=2, engine="numpy")
+        >>> result.models().shape, result.models().mean().round(3)
+        ((2, 8, 8), np.float64(4.0))
         """
         return np.array(list(self._models()))
 
@@ -202,9 +315,24 @@ class Result:
         return models_of(self._outcome)
 
     def residuals(self) -> Array:
-        """Return ``(g_j - m_j) / sqrt(m_j)``, shape (p, ny, nx): about 1 where only noise is left.
+        """Return the normalised residuals, ``(g_j - m_j) / sqrt(m_j)``.
 
-        NaN where a pixel is bad, or the model is 0.
+        Their rms is about 1 where only noise is left.
+
+        Returns
+        -------
+        ndarray of float64, shape (p, ny, nx)
+            NaN where a pixel is bad, or the model is 0.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> image = np.random.default_rng(0).poisson(100.0, (32, 32))
+        >>> observation = lnocl.Observation(image, np.ones((5, 5)))
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=1, engine="numpy")
+        >>> result.residuals().shape, bool(0.9 < result.residuals().std() < 1.1)
+        ((1, 32, 32), True)
         """
         return self._residuals(self._models())
 
@@ -214,10 +342,28 @@ class Result:
         return np.array([residuals(*each) for each in images])
 
     def to_table(self) -> QTable:
-        """Return the stars as a table of astropy, which `deconvolve` takes as stars again.
+        """Return the stars as a table of astropy, which `lnocl.deconvolve` takes as stars again.
 
-        Columns x and y in pixels, 0-based, and flux in electrons, per second where exposures were
-        given; with standard errors flux_error and, where positions were refined, x_error, y_error.
+        Returns
+        -------
+        astropy.table.QTable
+            Columns ``x`` and ``y`` in pixels, 0-based, and ``flux`` and ``flux_error`` in
+            electrons, per second where exposures were given. Where positions were refined, also
+            ``x_error`` and ``y_error``.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((33, 33)) - 16
+        >>> psf = np.exp(-(x**2 + y**2) / 4)
+        >>> observation = lnocl.Observation(5 + 1000 * psf / psf.sum(), psf)
+        >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=20, engine="numpy")
+        >>> table = result.to_table()
+        >>> table.colnames
+        ['x', 'y', 'flux', 'flux_error']
+        >>> print(table["flux"].round())
+        [1000.] electron
         """
         from astropy import units as u
         from astropy.table import QTable  # which takes its time to load
@@ -247,16 +393,18 @@ class Result:
         """Return the errors of stars, regions, profiles and pixels, by replicas of this result.
 
         A replica is a sky that the result may stand for, observed and reconstructed as the images
-        were, by as many iterations (`lnocl.runs.replicas`, docs/validation/errors.md). It costs as
-        much as a run of all counts of that length; n of them use its buffers and programs.
+        were, by as many iterations (`lnocl.runs.replicas`, :doc:`/validation/errors`). It costs as
+        much as a run of all counts of that length. All n of them use the buffers and programs of
+        one run.
 
         Parameters
         ----------
         n : int, optional
             Replicas, ten or more.
         regions : str, path or iterable of regions.Region, optional
-            Regions whose light of the extended source is measured: a file of them, as DS9 writes,
-            or these, of the package regions; in pixels of the extended source, or on the sky.
+            Regions whose light of the extended source is measured. A name is that of a file of
+            them, as DS9 writes. Others are objects of the package regions. They are in pixels of
+            the extended source, or on the sky.
         profiles : str, path or iterable of regions.RectanglePixelRegion, optional
             Boxes along whose longer sides light and width are measured, pixel by pixel, likewise.
         header : astropy.io.fits.Header, optional
@@ -266,26 +414,51 @@ class Result:
         progress : bool, optional
             Show a progress bar on stderr, where that is a terminal.
         earlier : Bootstrap, optional
-            Replicas of this result, regions and seed that are there already: the rest is added, and
-            all is bit for bit as if it had been computed at once.
+            Replicas of this result that exist already, of the same regions and seed. The rest is
+            added. All is bit for bit as if it had been computed at once.
         callback : callable, optional
-            Is given the errors so far after each replica from the second on.
+            Called with the errors so far, a `lnocl.runs.bootstrap.Bootstrap`, after each replica
+            from the second on.
         parallel : bool, int or "current-scheduler", optional
-            Where the replicas are computed (`lnocl.parallel.check_parallel`): one after the other
-            in this process; in as many processes as cores or so many; or by the workers of a
-            cluster of Dask. All give the same errors on the same kind of device.
+            Where the replicas are computed (`lnocl.parallel.check_parallel`). False: one after the
+            other in this process. True or a number: in as many processes as cores, or in that many.
+            "current-scheduler": by the workers of a cluster of Dask. All give the same errors on
+            the same kind of device.
+
+        Returns
+        -------
+        Bootstrap
+            The errors, `lnocl.runs.bootstrap.Bootstrap`.
 
         Raises
         ------
         InputError
-            n is less than 10, the seed negative; a region lies outside the images or encloses
-            nothing, or is on the sky without a header; earlier replicas are of something else.
+            - n is less than 10, or the seed is negative.
+            - A region lies outside the images or encloses nothing, or is on the sky without a
+              header.
+            - A profile is not a box.
+            - Earlier replicas are of another result, or of other regions or another seed.
         FileError
             The file of regions is missing, or holds none.
         LnoclError
             The package regions is missing, or Dask; the workers are lost.
         DeviceError
             As `lnocl.deconvolve`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((33, 33)) - 16
+        >>> psf = np.exp(-(x**2 + y**2) / 4)
+        >>> observation = lnocl.Observation(5 + 1000 * psf / psf.sum(), psf)
+        >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=5, engine="numpy")
+        >>> errors = result.bootstrap(10)
+        >>> errors.n, errors.quantities[0].name, errors.error_map.shape
+        (10, 'star 1 flux', (33, 33))
+        >>> errors = result.bootstrap(12, earlier=errors)
+        >>> errors.n
+        12
         """
         from lnocl.io.fitsread import sky_header
         from lnocl.io.regions import read_apertures, read_profiles
@@ -304,14 +477,34 @@ class Result:
         return bootstrap(self._outcome, n, parts, seed, progress, earlier, callback, parallel)
 
     def plot(self) -> Figure:
-        """Return a picture: image, model, residuals and extended source, whole and at each star.
+        """Return a picture of the result, whole and at each of the brightest stars.
 
-        `lnocl.plotting.result.draw_result` says what it shows; ``savefig`` of it writes a file.
+        Each row shows image, model, residuals and extended source. Below them are the errors that
+        held-out counts estimate, or else the objective (`lnocl.plotting.result.draw_result`).
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Its ``savefig`` writes a file.
 
         Raises
         ------
         LnoclError
             matplotlib is missing.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> import lnocl
+        >>> observation = lnocl.Observation(np.full((8, 8), 4.0), np.ones((3, 3)))
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=2, engine="numpy")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "result.png")
+        ...     result.plot().savefig(path, dpi=40)
+        ...     path.exists()
+        True
         """
         return draw_result(view_of(self))
 
@@ -320,17 +513,19 @@ class Result:
     ) -> None:
         """Write a FITS file, which ``lnocl plot`` and ``lnocl report`` read.
 
-        It is that of ``lnocl deconvolve --models --residuals``, without the command and what was
-        said: the primary HDU has the extended source, the tables STARS, HISTORY and HELDOUT what
-        their names say, MODELS and RESIDUALS those of each image; PSFS and others are there where
+        It is the file of ``lnocl deconvolve --models --residuals``, without the command and the
+        messages of the run. The primary HDU holds the extended source. The tables STARS, HISTORY
+        and HELDOUT hold the stars, the objectives, and the errors that held-out counts estimate.
+        The cubes MODELS and RESIDUALS hold those of each image. PSFS and others are added where
         PSFs were refined. Units are electrons, per second where exposures were given.
 
         Parameters
         ----------
         path : str
-            File to write.
+            File to write, named .fits, .fit or .fts.
         header : astropy.io.fits.Header, optional
-            Header of the first image: its coordinates, and what was observed, are taken over.
+            Header of the first image. Its coordinates, and the keywords of the target and the
+            observation, are copied.
         overwrite : bool, optional
             Whether an existing file may be replaced.
 
@@ -339,7 +534,21 @@ class Result:
         FileError
             The file cannot be written, or exists and must not be overwritten.
         InputError
-            A name that does not end in .fits, .fit or .fts.
+            The name does not end in .fits, .fit or .fts.
+
+        Examples
+        --------
+        >>> import os, tempfile
+        >>> import numpy as np
+        >>> from astropy.io import fits
+        >>> import lnocl
+        >>> observation = lnocl.Observation(np.full((8, 8), 4.0), np.ones((3, 3)))
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=2, engine="numpy")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = os.path.join(folder, "sky.fits")
+        ...     result.write(path)
+        ...     fits.getdata(path).shape, fits.getheader(path)["NITER"]
+        ((8, 8), 2)
         """
         from lnocl.io import atomic, fitswrite
         from lnocl.io.fitsread import wcs_cards
@@ -397,11 +606,45 @@ class Result:
         """Return how well the model fits all good pixels.
 
         It takes a convolution of each image in double precision on the host.
+
+        Returns
+        -------
+        Fit
+            The sum of the squared residuals, their rms and its error, `lnocl.residuals.Fit`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> image = np.random.default_rng(0).poisson(100.0, (32, 32))
+        >>> observation = lnocl.Observation(image, np.ones((5, 5)))
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=1, engine="numpy")
+        >>> fit = result.fit()
+        >>> fit.n_pixels, bool(0.9 < fit.rms < 1.1), fit.is_misfit
+        (1024, True, False)
         """
         return judge(self._observation, self._models())
 
     def star_residuals(self) -> list[StarResiduals]:
-        """Return how well the model fits at each star: in its core, its wings and round it."""
+        """Return how well the model fits at each star: in its core, its wings and round it.
+
+        Returns
+        -------
+        list of StarResiduals
+            One for each star, `lnocl.residuals.StarResiduals`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((33, 33)) - 16
+        >>> psf = np.exp(-(x**2 + y**2) / 4)
+        >>> observation = lnocl.Observation(5 + 1000 * psf / psf.sum(), psf)
+        >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=20, engine="numpy")
+        >>> (star,) = result.star_residuals()
+        >>> star.core.n_pixels, star.is_misfit, star.has_halo
+        (9, False, False)
+        """
         outcome = self._outcome
         return judge_stars(outcome.scene, outcome.sky, outcome.star_fluxes)
 

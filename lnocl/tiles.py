@@ -48,16 +48,34 @@ TILE_DTYPE = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class TiledResult(Result):
-    """The result of `deconvolve_tiles`: that of `deconvolve`, put together from those of tiles.
+    """The result of `lnocl.deconvolve_tiles`, put together from those of its tiles.
 
-    `bootstrap` is not there, `psfs` are those of the middle of the images, and `history` is the sum
-    of those of all tiles.
+    Attributes and methods are those of `lnocl.Result`, with these differences. ``psfs`` are those
+    of the middle of the images. ``history`` is the sum of those of all tiles. ``bootstrap`` raises
+    `lnocl.InputError`, as replicas are made of one run.
 
     Attributes
     ----------
     tiles : ndarray, fields ``x``, ``y``, ``width``, ``height``, ``n_iter``, ``objective``
-        The pixels of the images that each tile stands for, without its margins; its iterations, and
-        its last objective, margins included.
+        A row for each tile: the pixels of the images that it stands for, without its margins; its
+        iterations; and its last objective, margins included.
+
+    See Also
+    --------
+    lnocl.Result : The attributes and methods.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> obs = lnocl.Observation(np.full((64, 64), 9.0), np.ones((3, 3)))
+    >>> result = lnocl.deconvolve_tiles(obs, tile=40, stop=None, n_iter=2, engine="numpy")
+    >>> for tile in result.tiles:
+    ...     print(tile["x"], tile["y"], tile["width"], tile["height"])
+    0 0 32 32
+    32 0 32 32
+    0 32 32 32
+    32 32 32 32
     """
 
     tiles: NDArray[np.void]
@@ -186,54 +204,66 @@ def deconvolve_tiles(
 ) -> TiledResult:
     """Reconstruct the sky tile by tile: large images, or PSFs that vary over the field.
 
-    Each tile is a run of its own, of what is in its window: its part of the images, and margins of
-    half a PSF and the largest offset, so that nothing that lights its part is left out. Its PSFs
-    are those of the middle of its part, ``sum_i w_i K_i`` of a `PsfField`; each star has that of
-    its own place. The extended sources are blended across half of the margins.
+    Each tile is a run of its own on a window of the images. The window is its part and margins of
+    half a PSF and the largest offset. So no source that lights the part is left out. Its PSFs are
+    those of the middle of its part, ``K = sum_i w_i K_i`` of a `lnocl.PsfField`; each star has that
+    of its own place. The extended sources are blended across half of the margins.
 
-    All tiles have the same weights and delta of the edge-preserving term, and the same iterations
-    unless `stop` is a number. Where held-out counts or the discrepancy choose, it is the middle one
-    of the choices of the three tiles whose extended source is brightest.
+    All tiles have the same weights and the same δ of the edge-preserving term, and the same number
+    of iterations unless `stop` is a number. Where held-out counts or the discrepancy choose, the
+    three tiles with the brightest extended source do so. The middle one of their choices serves
+    all.
 
     Parameters
     ----------
     observation : Observation
-        As for `deconvolve`.
+        The p images, as for `lnocl.deconvolve`.
     stars : iterable of (x, y) or astropy.table.Table, optional
-        As for `deconvolve`.
+        Positions in pixels of an image without offset, as for `lnocl.deconvolve`.
     tile : int, optional
-        Side of the grid that a tile is computed on, with its margins and pad, pixels of the images;
-        by default about five times that of the PSFs where these vary, else 2048.
+        Side of the grid that a tile is computed on, with its margins and pad, pixels of the images.
+        By default about five times that of the PSFs where these vary, else 2048.
     parallel : bool, int or "current-scheduler", optional
-        Where the tiles are computed (`lnocl.parallel.check_parallel`).
-    mu, smoothing, n_iter, stop, progress : optional
-        As for `deconvolve`.
+        Where the tiles are computed (`lnocl.parallel.check_parallel`). False: one after the other
+        in this process. True or a number: in as many processes as cores, or in that many.
+        "current-scheduler": by the workers of a cluster of Dask.
+    mu : float, optional
+        Weight of the Tikhonov term, per electron, as for `lnocl.deconvolve`.
+    smoothing : float or "auto", optional
+        Weight of the edge-preserving term, as for `lnocl.deconvolve`.
+    n_iter : int, optional
+        Largest number of iterations, 1 or more.
+    stop : "held-out", "discrepancy", float or None, optional
+        Rule by which to stop before `n_iter`, as for `lnocl.deconvolve`.
+    progress : bool, optional
+        Show a progress bar on stderr, where that is a terminal.
     **options
-        Others of `deconvolve`: solver, precision, engine, device, pad, refine_positions.
+        Others of `lnocl.deconvolve`: solver, precision, engine, device, pad, refine_positions.
 
     Returns
     -------
     TiledResult
+        A `lnocl.Result` that is put together from those of the tiles, and the table of the tiles.
 
     Raises
     ------
     InputError
-        As `deconvolve`; a tile has no room for its margins; an option is not for tiles.
+        As `lnocl.deconvolve`; a tile has no room for its margins; an option is not for tiles.
     LnoclError
         Dask is missing; the workers are lost.
     DeviceError
-        As `deconvolve`.
+        As `lnocl.deconvolve`.
 
     Warns
     -----
     LnoclWarning
-        As `deconvolve`, for the first tiles of which there is something to say.
+        As `lnocl.deconvolve`, for each tile: the first three in full, and the number of the others.
 
     Notes
     -----
-    Tiles of one iteration agree with the whole where a pixel hangs on its neighbours alone: with
-    "sgm", and with "sgp" when it has converged. Before that the steps of "sgp" differ from tile to
-    tile, by less than the noise (docs/validation/tiles.md).
+    Tiles and one run of the whole agree where the steps of a pixel depend on its neighbours alone.
+    That is so with "sgm", and with "sgp" when it has converged. Before that the steps of "sgp"
+    differ from tile to tile, by less than the noise (:doc:`/validation/tiles`).
 
     References
     ----------
@@ -244,7 +274,8 @@ def deconvolve_tiles(
     --------
     >>> import numpy as np
     >>> import lnocl
-    >>> narrow, wide = np.eye(3)[[1]].T * np.eye(3)[1], np.full((3, 3), 1 / 9)
+    >>> narrow, wide = np.zeros((3, 3)), np.full((3, 3), 0.02)
+    >>> narrow[1, 1], wide[1, 1] = 1.0, 0.84
     >>> field = lnocl.PsfField([narrow, wide], [(0, 0), (63, 0)])
     >>> obs = lnocl.Observation(np.full((64, 64), 9.0), field)
     >>> result = lnocl.deconvolve_tiles(obs, tile=40, stop=None, n_iter=9, engine="numpy")

@@ -5,8 +5,10 @@ import re
 
 from lnocl.commands import cli
 
-# Flags, commands and quoted names in a text, which a page shows as code.
-CODE = re.compile(r"'[^' ]*'|lnocl [a-z]+(?: --[a-z-]+)*|(?<![\w-])--?[a-z][a-z-]*")
+# Quoted names, commands, flags and some values in a text, which a page shows as code.
+CODE = re.compile(
+    r"'[^' ]*'|lnocl [a-z]+(?: --[a-z-]+)*|(?<![\w-])--?[a-z][a-z-]*|\b(?:hh34|sgp|sgm|mc-rl)\b"
+)
 TITLES = {"positional arguments": "Arguments", "options": "Options"}
 
 
@@ -16,8 +18,9 @@ def make_parser() -> argparse.ArgumentParser:
     commands = next(
         each for each in parser._actions if isinstance(each, argparse._SubParsersAction)
     )
+    for each in (parser, *commands.choices.values()):
+        each.color = False  # no escape codes, which Python 3.14 would add
     for command in commands.choices.values():
-        command.description = _sentence(_code(command.description or ""))
         command.epilog = _code(command.epilog or "")
         formatter = command._get_formatter()
         for action in command._actions:
@@ -42,4 +45,4 @@ def _code(text: str) -> str:
 
 
 def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:] + ("" if text.endswith((".", ")")) else ".")
+    return text[:1].upper() + text[1:].removesuffix(".") + "."

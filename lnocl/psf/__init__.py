@@ -1,4 +1,4 @@
-"""PSFs made from frames of stars, and looked at."""
+"""PSFs made from frames of stars, PSFs of several frames summed up, and checks of a PSF."""
 
 from lnocl.psf.make import StarPsf, make_psf, make_psfs
 from lnocl.psf.modes import PsfModes, find_modes

@@ -28,12 +28,13 @@ class StarPsf:
     psf : ndarray of float64, shape (k, k)
         Point spread function of unit sum, the star's centre at ``(k // 2, k // 2)``.
     scatter : ndarray of float64, shape (k, k), or None
-        By how much the stars differ from it: the standard deviation of their own PSFs, weighted by
-        flux, noise included. None where it is made of one star.
-    shared_steps, own_steps : tuple of str
-        One line for each step, in order, with its numbers: those that PSFs at all angles share,
-        and the others. The flux left out of the crop is measured with the noise of all pixels of
-        that square.
+        Standard deviation of the stars' own PSFs from it, weighted by flux, noise included. None
+        where it is made of one star.
+    shared_steps : tuple of str
+        One line for each step that PSFs at all angles share, in order, with its numbers.
+    own_steps : tuple of str
+        The same for the other steps. The flux left out of the crop is measured with the noise of
+        all pixels of that square.
     flux : float
         Flux of the PSF before it was normalised, in the unit of the frame; that of all its stars.
     centres : tuple of tuple of float
@@ -44,6 +45,20 @@ class StarPsf:
         The frame as it was given; NaN where it was masked.
     bad : ndarray of bool, shape (ny, nx)
         True where a pixel was bad: not finite, masked or saturated.
+
+    See Also
+    --------
+    make_psf : Returns it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lnocl.psf import make_psf
+    >>> y, x = np.mgrid[:40, :50]
+    >>> frame = 100 + 5000 * np.exp(-((x - 23.3) ** 2 + (y - 18.8) ** 2) / 8)
+    >>> star = make_psf(frame, size=21, background=100.0)
+    >>> star.psf.shape, round(star.flux), star.background, star.scatter
+    ((21, 21), 125664, 100.0, None)
     """
 
     psf: Array
@@ -58,12 +73,32 @@ class StarPsf:
 
     @property
     def steps(self) -> tuple[str, ...]:
-        """All steps."""
+        """All steps, one line each: those that PSFs at all angles share, then the others.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lnocl.psf import make_psf
+        >>> y, x = np.mgrid[:40, :50]
+        >>> frame = 5000 * np.exp(-((x - 23.3) ** 2 + (y - 18.8) ** 2) / 8)
+        >>> make_psf(frame, size=21, background=0).steps[0]
+        'star: brightest pixel of the median-filtered frame, x = 23, y = 19'
+        """
         return self.shared_steps + self.own_steps
 
     @property
     def centre(self) -> tuple[float, float]:
-        """The first star's centre."""
+        """The first star's centre, (x, y) in 0-based pixels of the frame.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lnocl.psf import make_psf
+        >>> y, x = np.mgrid[:40, :50]
+        >>> frame = 5000 * np.exp(-((x - 23.3) ** 2 + (y - 18.8) ** 2) / 8)
+        >>> [round(each, 3) for each in make_psf(frame, size=21, background=0).centre]
+        [23.3, 18.8]
+        """
         return self.centres[0]
 
 
@@ -82,49 +117,11 @@ def make_psf(
 
     .. math:: K(r) = \frac{f(c + R^{-1} r) - b}{\sum_{r'} (f(c + R^{-1} r') - b)}
 
-    with the frame f, its bad pixels interpolated, the background b, the star's centre c and the
-    rotation R; r runs over the k x k pixels around ``(k // 2, k // 2)``.
+    Here f is the frame, with its bad pixels interpolated, and b the background. The star's centre
+    is c, the rotation R, and r runs over the k x k pixels around ``(k // 2, k // 2)``.
 
-    **Bad pixels** are interpolated from the `NEIGHBOURS` nearest good ones by quintic radial
-    functions. In a Fizeau core with fringes 6 pixels apart, one bad pixel is found to 0.02 % of
-    the peak rms, a block of 2 x 2 to 0.4 %, of 3 x 3 to 2 %, and a core clipped at 0.7 (0.5) of
-    the peak has 1 % (4 %) less flux than it should; with fringes 3.4 pixels apart 16 % (34 %): a
-    repaired core is a guess, and a warning says so. In the wings a repaired pixel is as noisy as
-    its neighbours or twice that. Bad pixels with fewer than `MIN_GOOD` good ones in the square of
-    side `WINDOW` around them, where all beyond the frame counts as bad, are set to the background.
-
-    **The centre** is that of the circular Gaussian that fits the star best by least squares,
-    together with a constant and without the bad pixels. It is not the brightest pixel: it is the
-    centre of the light in the core, and of a disc crossed by fringes it is the centre of the disc,
-    wherever the fringes lie, so PSFs at several angles turn about the same point of the sky. Rms
-    error in a coordinate, on Fizeau, Airy and Gaussian stars of 2 pixels (FWHM) and wider: 0.004
-    pixels and less without noise, 0.005 to 0.012 with noise of 1/100 of the peak in each pixel,
-    0.025 to 0.06 with 1/20. Without noise it is 0.002 where the FWHM is 1.5, and 0.012 where it
-    is 1. Stars that are brighter within 12 pixels pull it away.
-
-    **The shift** to the middle of a pixel takes the star for a sum of Gaussians on its pixels
-    (`lnocl.scene.shifting.place`). It is exact where the pixels sample the PSF, two to its FWHM
-    and more. Below that it blurs, by 7 to 10 % of the peak at a FWHM of 1.5, and it rings where
-    the star lies near the edge of a pixel: the darkest pixel of a Gaussian of FWHM 1, 1.5, 2, 2.5,
-    3 pixels has -8, -1.8, -0.38, -0.04, -0.003 % of its peak after the worst of shifts, and all
-    negative ones of 65 x 65 have -26, -7.6, -1.6, -0.18, -0.016 % of its flux. A quarter of a
-    pixel from the middle these are -8, -1.2, -0.45, -0.05, -0.004 %. Where negative pixels grow by
-    more than `RINGING` a warning says so. ``recentre=False`` leaves the pixels as they are.
-
-    **The rotation** is by three shears in Fourier space (Unser et al.), which on a simulated
-    Fizeau PSF at Nyquist's sampling is right to 3e-5 of the peak, where cubic splines are to 4e-2
-    and quintic ones to 1.4e-2.
-
-    **Several stars** give their effective PSF (Anderson & King 2000), by `effective.combine`: the
-    one that, moved to each of them as `lnocl.deconvolve` moves it, explains all of them together.
-    It has their noise together, no blur by a shift, also where they are undersampled, and no
-    neighbours: those in the list are modelled, others are masked where one star shows them and
-    another does not. Bad pixels are left to the other stars. Of four stars of 3e4 to 2e5 electrons,
-    FWHM 2.5, one with two bad pixels in its core and one with a neighbour, the PSF is right to
-    0.7 % of its peak, as noise allows; that of the brightest to 13 %, as it has the neighbour.
-
-    Background and centring are the steps that any frame of a star needs, so they are done unless
-    they are declined; cropping, clipping and rotating are choices, done if asked for.
+    Any frame of a star needs background and centring, so they are done unless they are declined.
+    Cropping, clipping and rotating are done if asked for.
 
     Parameters
     ----------
@@ -132,16 +129,16 @@ def make_psf(
         Image of a star, in any linear unit. A pixel that is not finite, or that is masked in a
         `numpy.ma` array or a CCDData, is bad. Other arguments must not be masked.
     position : array_like, shape (2,) or (n, 2), optional
-        Position of the star, or of several: (x, y), 0-based pixels, to `NEAR` pixels. By default
-        the brightest pixel of the frame after a median filter of 3 x 3 good pixels.
+        Position of the star, or of several: (x, y), 0-based pixels, to 5 pixels. By default the
+        brightest pixel of the frame after a median filter of 3 x 3 good pixels.
     size : int, optional
-        Side k of the PSF, pixels, 3 or more. By default the largest that the frame has around
-        the star, at this rotation.
+        Side k of the PSF, pixels, 3 or more. By default the largest that the frame has around the
+        star, at this rotation.
     background : float or "auto", optional
-        Level to subtract, in the unit of the frame. "auto" is the median of the good pixels, after
-        clipping at 3 sigma, in a square ring around the crop, half as wide as it, or around those
-        of all stars; in the frame's border where fewer than `MIN_SKY` are there, or where no size
-        is given.
+        Level to subtract, in the unit of the frame. "auto" is the median of the good pixels in a
+        square ring, after clipping at 3 sigma. The ring is around the crop, or around those of all
+        stars, and half as wide as the crop. Where it has fewer than 100 pixels, or no size is
+        given, the frame's border is taken.
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is bad.
     saturation : float, optional
@@ -152,9 +149,8 @@ def make_psf(
     clip_negative : bool, optional
         Whether to set negative pixels to 0; the flux of the PSF grows by their flux.
     rotate : float, optional
-        Angle, degrees, from the x axis towards the y axis: counter-clockwise with y up. The PSF
-        of a baseline at angle a becomes that of one at a + rotate. Multiples of 90 degrees are
-        exact.
+        Angle, degrees, from the x axis towards the y axis: counter-clockwise with y up. The PSF of
+        a baseline at angle a becomes that of one at a + rotate. Multiples of 90 degrees are exact.
 
     Returns
     -------
@@ -164,17 +160,82 @@ def make_psf(
     Raises
     ------
     InputError
-        Where an argument has the wrong type, shape or range, or, but for the frame, holds masked
-        values; where the star is outside the frame or not found; where the crop does not fit in
-        the frame; where all pixels are bad; where too few pixels of the star are good to repair
-        the others; where nothing is above the background; where a star has no good core, or no
-        star shows the middle.
+        - An argument has the wrong type, shape or range, or, but for the frame, masked values.
+        - The star is outside the frame or not found, or the crop does not fit in the frame.
+        - All pixels are bad, or too few pixels of the star are good to repair the others.
+        - Nothing is above the background.
+        - A star has no good core, or no star shows the middle.
 
     Warns
     -----
     LnoclWarning
-        Saturated pixels in the PSF, whose repair is a guess; bad pixels with too few good ones
-        around them, which were set to the background; ringing of an undersampled star.
+        - Saturated pixels of the PSF were repaired, which is a guess.
+        - Bad pixels have too few good ones around them, and were set to the background.
+        - An undersampled star rings.
+
+    See Also
+    --------
+    make_psfs : Makes PSFs at several angles.
+    examine : Checks a PSF.
+
+    Notes
+    -----
+    **Bad pixels** are interpolated from the 48 nearest good ones by quintic radial functions. Some
+    have fewer than 40 good ones in the square of side 11 around them, where all beyond the frame
+    counts as bad. They are set to the background. In the wings a repaired pixel is as noisy as its
+    neighbours or twice that. A repaired core is a guess, and a warning says so. This was measured
+    in a Fizeau core with fringes 6 pixels apart:
+
+    - One bad pixel is found to 0.02 % of the peak rms.
+    - A block of 2 x 2 is found to 0.4 %, one of 3 x 3 to 2 %.
+    - A core clipped at 0.7 (0.5) of the peak has 1 % (4 %) less flux than it should.
+    - With fringes 3.4 pixels apart such a core has 16 % (34 %) less.
+
+    **The centre** is that of the circular Gaussian that fits the star best by least squares,
+    together with a constant and without the bad pixels. It is the centre of the light in the core,
+    not the brightest pixel. Of a disc crossed by fringes it is the centre of the disc, wherever the
+    fringes lie. So PSFs at several angles turn about the same point of the sky. Stars that are
+    brighter within 12 pixels pull it away. The rms error in a coordinate was measured on Fizeau,
+    Airy and Gaussian stars of 2 pixels (FWHM) and wider:
+
+    - 0.004 pixels and less without noise;
+    - 0.005 to 0.012 pixels with noise of 1/100 of the peak in each pixel;
+    - 0.025 to 0.06 pixels with noise of 1/20.
+
+    Without noise it is 0.002 pixels where the FWHM is 1.5, and 0.012 where it is 1.
+
+    **The shift** to the middle of a pixel takes the star for a sum of Gaussians on its pixels
+    (`lnocl.scene.shifting.place`). It is exact where the pixels sample the PSF, two to its FWHM and
+    more. Below that it blurs, by 7 to 10 % of the peak at a FWHM of 1.5. It also rings where the
+    star lies near the edge of a pixel. The table has the negative pixels of a Gaussian in 65 x 65
+    pixels, after the worst of shifts and a quarter of a pixel from the middle.
+
+    ==== ======================= ================= =======================
+    FWHM darkest pixel, of peak, all of them, of   all of them, of flux,
+         worst shift             flux, worst shift quarter of a pixel off
+    ==== ======================= ================= =======================
+    1    -8 %                    -26 %             -8 %
+    1.5  -1.8 %                  -7.6 %            -1.2 %
+    2    -0.38 %                 -1.6 %            -0.45 %
+    2.5  -0.04 %                 -0.18 %           -0.05 %
+    3    -0.003 %                -0.016 %          -0.004 %
+    ==== ======================= ================= =======================
+
+    A warning says so where negative pixels grow by more than 1 % of the flux. ``recentre=False``
+    leaves the pixels as they are.
+
+    **The rotation** is by three shears in Fourier space (Unser et al.). On a simulated Fizeau PSF
+    at Nyquist's sampling it is right to 3e-5 of the peak. Cubic splines are right to 4e-2, quintic
+    ones to 1.4e-2.
+
+    **Several stars** give their effective PSF (Anderson & King 2000), by
+    `lnocl.psf.effective.combine`. Moved to each star as `lnocl.deconvolve` moves it, this PSF
+    explains all of them together. It has the noise of all stars together, and no blur by a shift,
+    also where they are undersampled. It has no neighbours: those in the list are modelled. Others
+    are masked where one star shows them and another does not. Bad pixels are left to the other
+    stars. This was measured with four stars of 3e4 to 2e5 electrons and FWHM 2.5. One had two bad
+    pixels in its core and one a neighbour. Their PSF is right to 0.7 % of its peak, as noise
+    allows. That of the brightest alone is right to 13 %, as it has the neighbour.
 
     References
     ----------
@@ -216,15 +277,29 @@ def make_psfs(
 ) -> list[StarPsf]:
     """Return the PSFs that a frame of a star gives at several angles.
 
-    Star, background, repair and centre are found once, so the PSFs differ in their angle only.
-    With one angle this is `make_psf`.
+    Star, background, repair and centre are found once, so the PSFs differ in their angle only. With
+    one angle this is `make_psf`.
 
     Parameters
     ----------
+    frame : array_like, shape (ny, nx)
+        Image of a star, as for `make_psf`.
     rotate : sequence of float
         Angles, degrees, as in `make_psf`. The four of the paper's baselines are 0, 45, 90, 135.
-    frame, position, size, background, mask, saturation, recentre, clip_negative
-        As in `make_psf`. The size, or the largest there is, is that which fits at all angles.
+    position : array_like, shape (2,) or (n, 2), optional
+        Position of the star, or of several, as for `make_psf`.
+    size : int, optional
+        Side of the PSFs, pixels. By default the largest that fits at all angles.
+    background : float or "auto", optional
+        Level to subtract, as for `make_psf`.
+    mask : array_like of bool, shape (ny, nx), optional
+        True where a pixel is bad.
+    saturation : float, optional
+        Pixels of this value, positive, and above are bad.
+    recentre : bool, optional
+        Whether to find the star's centre, as for `make_psf`.
+    clip_negative : bool, optional
+        Whether to set negative pixels to 0, as for `make_psf`.
 
     Returns
     -------
@@ -234,7 +309,7 @@ def make_psfs(
     Raises
     ------
     InputError
-        As `make_psf`; where `rotate` is empty.
+        As `make_psf`; or `rotate` is empty.
 
     Warns
     -----

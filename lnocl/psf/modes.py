@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 class PsfModes(NamedTuple):
-    """PSFs of several frames, summed up.
+    """Mean, principal components and scatter of the PSFs of several frames.
 
     Attributes
     ----------
@@ -23,9 +23,28 @@ class PsfModes(NamedTuple):
     modes : ndarray of float64, shape (n, ky, kx)
         Their principal components, one standard deviation each, that of the largest first.
     scatter : ndarray of float64, shape (ky, kx)
-        Standard deviation of a pixel.
+        Standard deviation of each pixel.
     share : float
-        The share of their variance that the modes have.
+        The share of their variance that the modes have, 0 to 1.
+
+    See Also
+    --------
+    find_modes : Returns it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> from lnocl.psf import find_modes
+    >>> y, x = np.indices((9, 9)) - 4
+    >>> psfs = [np.exp(-(x**2 + y**2) / width) for width in (4.0, 5.0, 6.0)]
+    >>> found = find_modes(psfs, 1)
+    >>> images = np.full((32, 32), 5.0)
+    >>> observation = lnocl.Observation(
+    ...     images, found.mean, psf_modes=found.modes, psf_scatter=found.scatter
+    ... )
+    >>> observation.psf_modes.shape
+    (1, 1, 9, 9)
     """
 
     mean: Array
@@ -35,10 +54,10 @@ class PsfModes(NamedTuple):
 
 
 def find_modes(psfs: ArrayLike, n_modes: int) -> PsfModes:
-    r"""Return mean, principal components and scatter of PSFs, for `Observation`.
+    r"""Return mean, principal components and scatter of PSFs, for `lnocl.Observation`.
 
-    With the differences from the mean, :math:`K_i - \bar K = U S V^T`, mode l is
-    :math:`V_l S_l / \sqrt{n - 1}`.
+    With the differences from the mean, :math:`K_i - \bar K = U S V^T`, mode l is :math:`V_l S_l /
+    \sqrt{n - 1}`.
 
     Parameters
     ----------
@@ -47,15 +66,20 @@ def find_modes(psfs: ArrayLike, n_modes: int) -> PsfModes:
     n_modes : int
         Modes wanted, at least 1 and fewer than PSFs.
 
+    Returns
+    -------
+    PsfModes
+        The mean, the modes, the scatter and the share of the variance that the modes have.
+
     Raises
     ------
     InputError
-        The PSFs are no cube of finite numbers, one has no positive sum, or there are not more of
+        The PSFs are not a cube of finite numbers, one has no positive sum, or there are not more of
         them than modes.
 
     References
     ----------
-    M. J. Jee et al., PASP 119, 1403 (2007), for principal components of PSFs.
+    Jee, M. J., et al., PASP 119, 1403 (2007), for principal components of PSFs.
 
     Examples
     --------

@@ -27,7 +27,7 @@ BETTER = "make it from brighter or more stars"
 
 
 class PsfReport(NamedTuple):
-    """A PSF as it shows by itself, beside no image.
+    """Measures of a PSF that need no image: its centre, width, negative pixels and wings.
 
     Attributes
     ----------
@@ -40,13 +40,26 @@ class PsfReport(NamedTuple):
     negative : float
         The light of negative pixels, as a share of all.
     noise : float
-        The light of what differs from pixel to pixel in wings and border, were it in all pixels, as
-        a share of all.
+        The light that differs from pixel to pixel in wings and border, extrapolated to all pixels,
+        as a share of all.
     border : float
         The light of a background at the border's level, as a share of all.
     fall : float
         The power of the radius by which light falls from the wings to the border; NaN where there
         is none. It is 0 for a background, and 3 for wings of seeing or diffraction.
+
+    See Also
+    --------
+    examine : Returns it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lnocl.psf import examine
+    >>> y, x = np.indices((33, 33)) - 16.0
+    >>> report = examine(np.exp(-(x**2 + y**2) / 8))
+    >>> report.shape, round(report.fwhm, 1), abs(report.negative)
+    ((33, 33), 4.7, 0.0)
     """
 
     shape: tuple[int, ...]
@@ -58,7 +71,23 @@ class PsfReport(NamedTuple):
     fall: float
 
     def lines(self) -> list[str]:
-        """Return all numbers, a sentence each."""
+        r"""Return all numbers, a sentence each.
+
+        Returns
+        -------
+        list of str
+            Six lines: size, centre, FWHM, negative pixels, noise and border.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lnocl.psf import examine
+        >>> y, x = np.indices((33, 33)) - 16.0
+        >>> print(*examine(np.exp(-(x**2 + y**2) / 8)).lines()[:3], sep="\n")
+        size: 33 x 33 pixels
+        centre: its core lies (0.00, 0.00) pixels from (16, 16)
+        FWHM: 4.73 pixels
+        """
         (dx, dy), (y, x) = self.off_centre, centre(self.shape)
         fall = f", and falls there as r^-{self.fall:.1f}" if self.fall > 0 else ""
         return [
@@ -71,7 +100,21 @@ class PsfReport(NamedTuple):
         ]
 
     def faults(self) -> list[str]:
-        """Return what speaks against it, with what to do."""
+        """Return the faults of the PSF, each with what to do.
+
+        Returns
+        -------
+        list of str
+            One sentence for each; empty for a PSF without them.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lnocl.psf import examine
+        >>> y, x = np.indices((33, 33)) - 16.0
+        >>> examine(np.exp(-(x**2 + y**2))).faults()
+        ['it is undersampled: fewer than two pixels to its FWHM']
+        """
         distance = float(np.hypot(*self.off_centre))
         refused = ", and is refused" if distance >= FAR_OFF_CENTRE else ""
         lit = self.border > MUCH_AT_BORDER
@@ -91,12 +134,17 @@ class PsfReport(NamedTuple):
 
 
 def examine(psf: ArrayLike) -> PsfReport:
-    r"""Return what a PSF shows by itself.
+    r"""Return measures of a PSF that need no image.
 
     Parameters
     ----------
     psf : array_like, shape (ky, kx)
         In any linear unit.
+
+    Returns
+    -------
+    PsfReport
+        Centre, width, negative pixels and wings, and the faults that follow from them.
 
     Raises
     ------

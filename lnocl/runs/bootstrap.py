@@ -36,20 +36,26 @@ Part = Aperture | Profile
 
 
 class Quantity(NamedTuple):
-    """Something that is measured.
+    """A quantity whose error a bootstrap estimates.
 
     Attributes
     ----------
     name : str
-        What it is.
+        Its name, such as "star 1 flux".
     kind : str
-        ``FLUX``, in electrons, or ``LENGTH``, in pixels.
+        "flux", in electrons, or "length", in pixels.
     value : float
-        What it is in the reconstruction.
+        Its value in the reconstruction.
     note : str
         Why its error may not hold; else empty.
     at : float or None
-        Where it is along a profile, pixels.
+        Position along a profile, pixels.
+
+    Examples
+    --------
+    >>> from lnocl.runs.bootstrap import Quantity
+    >>> Quantity("star 1 flux", "flux", 1000.0)
+    Quantity(name='star 1 flux', kind='flux', value=1000.0, note='', at=None)
     """
 
     name: str
@@ -61,37 +67,61 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Bootstrap:
-    """Errors of what is measured in a reconstruction, by replicas of it.
+    r"""Errors of quantities of a reconstruction, by replicas of it.
 
     A replica is a sky that the reconstruction may stand for (`lnocl.scene.texture`), observed and
-    reconstructed alike; its error is what was found less what was drawn. The mean of the errors is
-    the bias b, their standard deviation the standard error s. With the n replicas the interval of a
-    level round the value v is ``v - b +- t s sqrt(1 + 1 / n)``, t the quantile of Student's
-    distribution of n - 1 degrees of freedom.
+    reconstructed alike. Its errors are the values found less the values drawn. Their mean is the
+    bias b, their standard deviation the standard error s. The interval of a level round the value v
+    is
+
+    .. math:: v - b \pm t \, s \sqrt{1 + 1 / n}
+
+    for n replicas, with t the quantile of Student's distribution of n - 1 degrees of freedom.
 
     Attributes
     ----------
     quantities : tuple of k Quantity
-        What was measured: fluxes of stars, their positions where these were refined, the light of
-        the extended source in regions, light and widths along profiles.
+        Fluxes of stars, their positions where these were refined, the light of the extended source
+        in regions, light and widths along profiles.
     errors : ndarray of float64, shape (n, k)
-        The errors of each replica, in electrons or pixels; where the scatter of the PSFs is known,
-        with theirs.
+        The errors of each replica, in electrons or pixels. Those of the PSFs are included where
+        their scatter is known.
     of_psfs : ndarray of float64, shape (n, k) or (0, k)
-        The part of the errors that comes from PSFs; none where their scatter is not known.
+        The part of the errors that comes from PSFs; of length 0 where their scatter is not known.
     sums : ndarray of float64, shape (2, ny, nx)
         The sums over replicas of the errors of the extended source and of their squares, electrons
         per pixel, smoothed to the resolution.
     resolution : float
-        Full width at half maximum of that smoothing, pixels: what all images resolve together.
+        Full width at half maximum of that smoothing, pixels: the resolution of all images together.
     seed : int
         Of the replicas.
     unit : str
         Of light: ``electron``, or ``electron/s`` where exposures were given.
 
+    See Also
+    --------
+    lnocl.Result.bootstrap : Returns it.
+
     References
     ----------
-    B. Efron, R. J. Tibshirani, "An Introduction to the Bootstrap" (1993), chapter 6.5.
+    Efron, B., Tibshirani, R. J., "An Introduction to the Bootstrap" (1993), chapter 6.5.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> y, x = np.indices((33, 33)) - 16
+    >>> psf = np.exp(-(x**2 + y**2) / 4)
+    >>> observation = lnocl.Observation(5 + 1000 * psf / psf.sum(), psf)
+    >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=5, engine="numpy")
+    >>> found = result.bootstrap(10)
+    >>> found.n, found.unit, found.quantities[0].name, found.values.round()
+    (10, 'electron', 'star 1 flux', array([1000.]))
+    >>> low, high = found.interval(0.95)
+    >>> bool(low[0] < 1000 < high[0])
+    True
+    >>> found.bias.shape, found.standard_errors.shape, found.error_map.shape, found.bias_map.shape
+    ((1,), (1,), (33, 33), (33, 33))
     """
 
     quantities: tuple[Quantity, ...]
@@ -109,17 +139,17 @@ class Bootstrap:
 
     @property
     def values(self) -> Array:
-        """The values in the reconstruction, shape (k,)."""
+        """The values in the reconstruction, shape (k,), electrons or pixels."""
         return np.array([quantity.value for quantity in self.quantities])
 
     @property
     def bias(self) -> Array:
-        """The mean errors, shape (k,)."""
+        """The mean errors, shape (k,), electrons or pixels."""
         return self.errors.mean(axis=0)
 
     @property
     def standard_errors(self) -> Array:
-        """The standard deviations of the errors, shape (k,)."""
+        """The standard deviations of the errors, shape (k,), electrons or pixels."""
         return self.errors.std(axis=0, ddof=1)
 
     def units(self, electrons: float) -> Array:
@@ -127,17 +157,33 @@ class Bootstrap:
         return np.array([electrons if each.kind == FLUX else 1.0 for each in self.quantities])
 
     def interval(self, level: float) -> Array:
-        """Return the bounds that hold the truth with this probability, shape (2, k).
+        """Return the bounds that hold the truth with this probability.
 
         Parameters
         ----------
         level : float
-            In (0, 1).
+            The probability, in (0, 1).
+
+        Returns
+        -------
+        ndarray of float64, shape (2, k)
+            Lower and upper bounds, electrons or pixels.
 
         Raises
         ------
         InputError
-            It is not.
+            The level is not between 0 and 1.
+
+        Examples
+        --------
+        Ten errors of a flux of 100 electrons, without bias:
+
+        >>> import numpy as np
+        >>> from lnocl.runs.bootstrap import Bootstrap, Quantity
+        >>> flux, errors = Quantity("star 1 flux", "flux", 100.0), np.tile([[-3.0], [3.0]], (5, 1))
+        >>> found = Bootstrap((flux,), errors, errors[:0], np.zeros((2, 8, 8)), 2.0, seed=0)
+        >>> found.interval(0.68).ravel().round(1)
+        array([ 96.5, 103.5])
         """
         from scipy.stats import t
 
@@ -149,26 +195,40 @@ class Bootstrap:
 
     @property
     def bias_map(self) -> Array:
-        """The mean error of the extended source at the resolution, electrons per pixel."""
+        """Mean error of the extended source, electrons per pixel, at the resolution."""
         return np.asarray(self.sums[0] / self.n)
 
     @property
     def error_map(self) -> Array:
-        """Its standard error at the resolution, electrons per pixel, shape (ny, nx)."""
+        """Standard error of the extended source, electrons per pixel, at the resolution."""
         squares = self.sums[1] - self.sums[0] ** 2 / self.n
         return np.sqrt(np.maximum(squares, 0.0) / (self.n - 1))
 
     def to_table(self, electrons: float = 1.0, unit: str | None = None) -> QTable:
-        """Return a table: a row a quantity, with value, bias, standard error and intervals.
-
-        Where the scatter of the PSFs is known, its part of the error, and the rest, are apart.
+        """Return a table with a row for each quantity.
 
         Parameters
         ----------
         electrons : float, optional
             Electrons in the unit of fluxes.
         unit : str, optional
-            That unit; by default `unit`.
+            That unit; by default the attribute ``unit``.
+
+        Returns
+        -------
+        astropy.table.QTable
+            Columns ``name``, ``at`` and ``unit``; ``value``, ``bias`` and ``error``; ``low68``,
+            ``high68``, ``low95`` and ``high95``, the intervals; and ``note``. Where the scatter of
+            the PSFs is known, ``error_psf`` is its part of the error, and ``error_noise`` the rest.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lnocl.runs.bootstrap import Bootstrap, Quantity
+        >>> flux, errors = Quantity("star 1 flux", "flux", 100.0), np.tile([[-3.0], [3.0]], (5, 1))
+        >>> found = Bootstrap((flux,), errors, errors[:0], np.zeros((2, 8, 8)), 2.0, seed=0)
+        >>> print(found.to_table()["name", "value", "error"][0]["error"].round(2))
+        3.16
         """
         from astropy.table import QTable  # which takes its time to load
 

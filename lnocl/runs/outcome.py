@@ -19,32 +19,55 @@ CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("er
 
 @dataclass(frozen=True)
 class PsfRefinement:
-    """PSFs that were refined from the images, or would have been.
+    """The outcome for PSFs that were to be refined, or whose scatter was given.
 
     Attributes
     ----------
     parameters : tuple of str
         Names of the n parameters of each PSF (`lnocl.scene.psf_families.PsfFamilies`).
     values : ndarray of float64, shape (p, n)
-        What was found for them, whether it was accepted or not; lengths in pixels of the images.
+        The values found for them, whether they were accepted or not; lengths in pixels of the
+        images.
     misfit : tuple of float
-        Of the given PSFs and of the refined ones: the reduced chi squared of the images, with the
-        extended source marginalised, 1 where there is noise alone.
+        The reduced chi squared of the images for the given PSFs and for the refined ones, with the
+        extended source marginalised: 1 for noise alone.
     is_accepted : bool
-        Whether the refined PSFs are used: chi squared of those given exceeds its expectation by
-        ten for each parameter and more, and 0.65 of that is mended.
+        Whether the refined PSFs are used. Chi squared of those given then exceeds its expectation
+        by two standard deviations, with "pixels" by five. The refined ones take away 0.65 of that.
     psf_error : float
         Relative error that the PSFs used still have, by the corrections of their pixels that fit
-        the images best (`lnocl.runs.psf_errors`), or as given by ``psf_scatter``. A PSF that is too
-        wide or too narrow it hardly shows where a wider source explains the images as well.
-    edges, errors_in_rings : ndarray of float64, shapes (k + 1,) and (k,)
-        Radii of rings round a star, pixels, and that error in each.
+        the images best (`lnocl.runs.psf_errors`), or as given by ``psf_scatter``. It hardly shows a
+        PSF that is too wide or too narrow where a wider source explains the images as well.
+    edges : ndarray of float64, shape (k + 1,)
+        Radii of rings round a star, pixels.
+    errors_in_rings : ndarray of float64, shape (k,)
+        The same error in each ring.
     is_noise : bool
-        Whether this error was made a part of the noise: it was given, or exceeds the noise of the
-        counts at the stars, and is at most 0.15.
+        Whether this error was added to the noise. It was given, or it exceeds the noise of the
+        counts at the stars and is at most 0.15.
     may_be_faked : ndarray of float64, of the shape of the extended source
-        What this error may fake in the sky, electrons per pixel: in each ring its share of the
-        stars, seen through the PSFs, over the square root of p.
+        Light that this error may fake in the sky, electrons per pixel. In each ring it is the error
+        times the light of the stars, as the PSFs spread it, over the square root of p.
+
+    See Also
+    --------
+    lnocl.deconvolve : Refines PSFs with ``refine_psfs``.
+
+    Examples
+    --------
+    One image of a star, whose PSF is known to 1 % in each pixel:
+
+    >>> import numpy as np
+    >>> import lnocl
+    >>> y, x = np.indices((33, 33)) - 16
+    >>> psf = np.exp(-(x**2 + y**2) / 4)
+    >>> psf /= psf.sum()
+    >>> observation = lnocl.Observation(5 + 1000 * psf, psf, psf_scatter=0.01 * psf)
+    >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=5, engine="numpy")
+    >>> result.psf_refinement.is_accepted, result.psf_refinement.is_noise
+    (False, True)
+    >>> round(result.psf_refinement.psf_error, 4)
+    0.01
     """
 
     parameters: tuple[str, ...]

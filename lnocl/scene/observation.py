@@ -35,105 +35,119 @@ LITTLE_OFF_CENTRE, FAR_OFF_CENTRE = 0.25, 0.8
 class Observation:
     """Images of one sky, each with its point spread function, background and bad pixels.
 
-    The sky may be finer than their pixels.
+    The counts are taken to follow
 
-    All input is checked and copied once, and held in read-only arrays. The data follow
     ``images[j] ~ Poisson(exposure[j] (psfs[j] * sky) + background[j]) + Normal(0, read_noise[j])``,
-    the sky moved by ``offsets[j]``.
+
+    with * a convolution and the sky moved by ``offsets[j]``. All input is checked and copied once,
+    and held in read-only arrays. With `oversample` the sky is finer than the pixels of the images.
 
     Parameters
     ----------
     images : array_like, shape (p, ny, nx) or (ny, nx)
-        Counts in electrons per pixel. A pixel that is not finite, or that is masked in a
-        `numpy.ma` array, counts as bad. Counts that are negative after the square of the read noise
-        was added are set to zero, with a warning. An `astropy.units.Quantity`, an
-        `astropy.nddata.NDData` such as a CCDData, or a sequence of these, is taken with its unit
-        and mask; counts per time are multiplied by the exposure. Uncertainties are not used.
-        Maps may be masked where the images are; nothing else may hold masked values.
+        Counts in electrons per pixel. A pixel counts as bad where it is not finite, or masked in a
+        `numpy.ma` array. The square of the read noise is added; counts that are negative then are
+        set to zero, with a warning. An `astropy.units.Quantity`, an `astropy.nddata.NDData` such as
+        a CCDData, or a sequence of these is taken with its unit and mask. Counts per time are
+        multiplied by the exposure. Uncertainties are not used. Maps may be masked where the images
+        are; nothing else may hold masked values.
     psfs : array_like, shape (p, ky, kx) or (ky, kx), or PsfField
-        Point spread functions, centre at ``(ky // 2, kx // 2)``, of any positive sum: they are
-        normalised here. One serves all images. Negative pixels are kept, with a warning. A
-        `PsfField` or a `photutils.psf.GriddedPSFModel`, or one for each image, holds PSFs that vary
-        over the image: stars then have those of their own places, the extended source that of the
-        middle (`lnocl.deconvolve_tiles` has one for each tile).
+        Point spread functions, with their centres at ``(ky // 2, kx // 2)``. One serves all images.
+        Their sums are positive and are normalised to 1. Negative pixels stay, with a warning. A
+        `lnocl.PsfField` or a `photutils.psf.GriddedPSFModel`, or one for each image, holds PSFs
+        that vary over the image. Each star then has the PSF of its own place. The extended source
+        has that of the middle; `lnocl.deconvolve_tiles` has one for each tile.
     background : float or array_like, shape (p,) or (p, ny, nx), optional
-        Calibration background, electrons per pixel, zero or more. A Quantity may be per time.
+        Known background, electrons per pixel, zero or more. A Quantity may be per time.
     read_noise : float or array_like, shape (p,) or (p, ny, nx), optional
-        Standard deviation of the read noise, electrons, zero or more. Its square is added to
-        images and background (Snyder's approximation of Gaussian noise by Poisson noise). For a
+        Standard deviation of the read noise, electrons per pixel, zero or more. Its square is added
+        to images and background (Snyder's approximation of Gaussian noise by Poisson noise). For a
         survey's inverse variance of sky and read noise together, give one over its square root.
     mask : array_like of bool, shape (p, ny, nx) or (ny, nx), optional
         True where a pixel is bad, as in `numpy.ma`. One serves all images.
     exposure : float or array_like, shape (p,), (p, ny, nx) or (ny, nx), optional
-        Exposure of each image, or of each of its pixels, in seconds or relative to any unit: the
-        sky is in electrons per pixel and this unit; by default 1. More than zero; a map is zero
-        where a pixel saw nothing, which counts as bad.
+        Exposure of each image, or of each of its pixels, in seconds or relative to any unit; by
+        default 1. The sky is in electrons per pixel and this unit. Exposures are more than zero; a
+        map may be zero where a pixel saw nothing, and that pixel counts as bad.
     offsets : array_like, shape (p, 2), optional
-        ``(dx, dy)`` of each image, pixels: a source at (x, y) in the sky is at
-        ``(x + dx, y + dy)`` in the image. They are taken into the PSFs; no counts are resampled.
+        ``(dx, dy)`` of each image, pixels, each less than the image's side. A source at (x, y) in
+        the sky is at ``(x + dx, y + dy)`` in the image. Offsets are taken into the PSFs; no counts
+        are resampled.
     oversample : {1, 2, 4}, optional
         Pixels of the sky, and of the PSFs, to one of the images along each axis. The model of a
-        pixel is the sum over its pixels of the sky. For detectors with fewer than two pixels to the
-        PSF's width. Positions and offsets stay in pixels of the images.
+        pixel is the sum over its pixels of the sky. It is meant for detectors with fewer than two
+        pixels to the PSF's width. Positions and offsets stay in pixels of the images.
     effective_psfs : bool, optional
-        Whether the PSFs are effective PSFs: each sample holds what a pixel of the images sees, as
-        those of photutils and STDPSF files do. Else it holds what a pixel of the sky sees, as
-        STPSF's OVERSAMP and OVERDIST do. Without oversampling both are one.
+        Whether the PSFs are effective PSFs. Each sample then holds the light that a pixel of the
+        images collects, as those of photutils and STDPSF files do. Otherwise it holds the light
+        that a pixel of the sky collects, as STPSF's OVERSAMP and OVERDIST do. Without oversampling
+        both are the same.
     psf_centre : {"check", "fit", "given"}, optional
-        What becomes of a PSF whose core lies off its centre, by which it would move the sky.
-        "check": it is refused where it is off by 0.8 pixels or more, with a warning from 0.25 on.
-        "fit": it is moved to its centre (`lnocl.scene.shifting.place`). "given": nothing.
+        Treatment of a PSF whose core lies off its centre, and which would move the sky. "check"
+        refuses it where it is off by 0.8 pixels or more, and warns from 0.25 on. "fit" moves it to
+        its centre (`lnocl.scene.shifting.place`). "given" leaves it as it is.
     ideal_psfs : array_like, shape (p, ky, kx) or (ky, kx), optional
-        The PSFs without aberrations, limited by diffraction alone, for ``refine_psfs`` "strehl";
-        like `psfs` in shape, centre and normalisation. By default those of `pupils`.
+        The PSFs without aberrations, limited by diffraction alone, for ``refine_psfs`` "strehl".
+        Shape, centre and normalisation are those of `psfs`. By default those of `pupils`.
     pupils : array_like, shape (p, ky, kx) or (ky, kx), optional
         Transmissions of the pupils, zero or more, of the shape of the PSFs, for ``refine_psfs``
-        "pupil" and "strehl". They are sampled at the frequencies of a PSF's transform, 0 in the
-        middle, ``(ky // 2, kx // 2)``: along x a pixel is wavelength / (kx * pixel scale) long.
+        "pupil" and "strehl". They are sampled at the frequencies of a PSF's transform, with 0 in
+        the middle, ``(ky // 2, kx // 2)``. Along x a pixel is ``wavelength / (kx * pixel scale)``
+        long.
     psf_modes : array_like, shape (p, n, ky, kx) or (n, ky, kx), optional
-        Ways in which the PSFs may differ from those given, one standard deviation each, in units of
-        PSFs of unit sum, for ``refine_psfs`` "modes".
+        Ways in which the PSFs may differ from those given, for ``refine_psfs`` "modes". Each is one
+        standard deviation, in units of PSFs of unit sum.
     psf_scatter : array_like, shape (p, ky, kx) or (ky, kx), optional
-        Standard deviation of the pixels of the PSFs, zero or more, in units of PSFs of unit sum,
-        as far as it is known: for the noise near stars, and ``refine_psfs`` "pixels".
+        Standard deviation of the pixels of the PSFs, as far as it is known, zero or more, in units
+        of PSFs of unit sum. It serves the noise near stars, and ``refine_psfs`` "pixels".
 
     Attributes
     ----------
-    images, background : ndarray of float64
-        Shapes (p, ny, nx), and (p,) or (p, ny, nx); `read_noise` squared is included in both.
-        Bad pixels of the images hold 0.
-    read_noise, exposure : ndarray of float64, shape (p,) or (p, ny, nx)
+    images : ndarray of float64, shape (p, ny, nx)
+        Electrons per pixel, the square of `read_noise` included; 0 where a pixel is bad.
+    background : ndarray of float64, shape (p,) or (p, ny, nx)
+        Electrons per pixel, the square of `read_noise` included.
+    read_noise : ndarray of float64, shape (p,) or (p, ny, nx)
         As given.
-    offsets : ndarray of float64, shape (p, 2)
+    exposure : ndarray of float64, shape (p,) or (p, ny, nx)
         As given.
-    psfs : ndarray of float64, shape (p, ky, kx)
-        Of unit sum; where they vary over the field, those of the middle of the images.
-    psf_fields : tuple of PsfField
-        One for each image where PSFs vary over the field, else empty.
-    oversample : int
-    effective_psfs : bool
-        As given.
-    ideal_psfs, pupils, psf_scatter : ndarray of float64
-        Shape (p, ky, kx), or (0, ky, kx) where they were not given.
-    psf_modes : ndarray of float64, shape (p, n, ky, kx)
-        n is 0 where they were not given.
     mask : ndarray of bool, shape (p, ny, nx)
         True where a pixel is bad.
+    psfs : ndarray of float64, shape (p, ky, kx)
+        Of unit sum. Where they vary over the field, those of the middle of the images.
+    psf_fields : tuple of PsfField
+        One for each image where PSFs vary over the field, else empty.
+    offsets : ndarray of float64, shape (p, 2)
+        As given, or 0.
+    oversample : int
+        As given.
+    effective_psfs : bool
+        As given.
+    ideal_psfs, pupils, psf_scatter : ndarray of float64, shape (p, ky, kx) or (0, ky, kx)
+        As given; of length 0 where they were not.
+    psf_modes : ndarray of float64, shape (p, n, ky, kx)
+        As given; n is 0 where they were not.
 
     Raises
     ------
     InputError
-        `oversample` is not 1, 2 or 4, or `effective_psfs` not True or False; an array has the
-        wrong shape, type or unit, is empty, or holds values out of range; an array
-        other than `images` holds masked values; a PSF has no positive sum, or it or its sum is not
-        finite, or its core is off its centre; images or background become infinite by exposure or
-        read noise; no good pixel is left; an offset leaves nothing of an image.
+        - `oversample` is not 1, 2 or 4, or `effective_psfs` is not True or False.
+        - An array has the wrong shape, type or unit, is empty, or holds values out of range.
+        - An array other than `images` holds masked values.
+        - A PSF or its sum is not finite, its sum is not positive, or its core is off its centre.
+        - Images or background become infinite by exposure or read noise.
+        - No good pixel is left, or an offset leaves nothing of an image.
 
     Warns
     -----
     LnoclWarning
-        Pixels are not finite and were masked; counts are negative and were set to zero; pixels of
-        PSFs are negative, or their cores a little off their centres.
+        - Pixels are not finite and were masked.
+        - Counts are negative and were set to zero.
+        - Pixels of PSFs are negative, or their cores are a little off their centres.
+
+    See Also
+    --------
+    lnocl.deconvolve : Reconstructs the sky from an observation.
 
     References
     ----------
@@ -147,6 +161,12 @@ class Observation:
     >>> obs = lnocl.Observation(np.full((2, 8, 8), 5.0), np.ones((3, 3)), background=1.0)
     >>> obs.n_images, obs.shape, obs.psfs[0].sum()
     (2, (8, 8), np.float64(1.0))
+
+    Read noise of 3 electrons adds 9 to images and background:
+
+    >>> obs = lnocl.Observation(np.full((8, 8), 5.0), np.ones((3, 3)), read_noise=3.0)
+    >>> obs.images.max(), obs.background
+    (np.float64(14.0), array([9.]))
     """
 
     def __init__(
@@ -215,17 +235,41 @@ class Observation:
 
     @property
     def n_images(self) -> int:
-        """Number of images, p."""
+        """Number of images, p.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> lnocl.Observation(np.ones((2, 8, 8)), np.ones((3, 3))).n_images
+        2
+        """
         return self.images.shape[0]
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape (ny, nx) of each image."""
+        """Shape (ny, nx) of each image.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> lnocl.Observation(np.ones((2, 8, 9)), np.ones((3, 3))).shape
+        (8, 9)
+        """
         return self.images.shape[1], self.images.shape[2]
 
     @property
     def sky_shape(self) -> tuple[int, int]:
-        """Shape of the extended source: that of an image, finer by `oversample`."""
+        """Shape of the extended source: that of an image, times `oversample` along each axis.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> lnocl.Observation(np.ones((8, 9)), np.ones((3, 3)), oversample=2).sky_shape
+        (16, 18)
+        """
         return self.oversample * self.shape[0], self.oversample * self.shape[1]
 
     def window(self, rows: range, columns: range) -> Observation:

@@ -14,15 +14,16 @@ from lnocl.scene.arrays import Array, numbers
 
 
 class PsfField:
-    """PSFs at the nodes of a grid of positions, bilinear between them, constant beyond.
+    """PSFs that vary over an image, given at the nodes of a grid of positions.
 
-    Between four nodes the PSF is ``sum_i w_i K_i``, with the weights of bilinear interpolation, as
-    `photutils.psf.GriddedPSFModel` defines it.
+    Between four nodes the PSF is bilinear, ``K = sum_i w_i K_i``, with weights w_i that sum to 1,
+    as `photutils.psf.GriddedPSFModel` defines it. Beyond the nodes it is constant.
 
     Parameters
     ----------
     psfs : array_like, shape (n, ky, kx)
-        One a node, centre at ``(ky // 2, kx // 2)``.
+        PSF of each node, with its centre at ``(ky // 2, kx // 2)``. `lnocl.Observation` normalises
+        the sums to 1.
     positions : array_like, shape (n, 2)
         (x, y) of the nodes, pixels of the image, 0-based. They fill a rectangular grid.
 
@@ -30,6 +31,10 @@ class PsfField:
     ------
     InputError
         The shapes do not agree, positions are not finite, or they do not fill a grid.
+
+    See Also
+    --------
+    lnocl.deconvolve_tiles : Reconstructs each part of an image with its own PSF.
 
     References
     ----------
@@ -40,7 +45,8 @@ class PsfField:
     --------
     >>> import numpy as np
     >>> from lnocl import PsfField
-    >>> narrow, wide = np.eye(3)[[1]].T * np.eye(3)[1], np.full((3, 3), 1 / 9)
+    >>> narrow, wide = np.zeros((3, 3)), np.full((3, 3), 1 / 9)
+    >>> narrow[1, 1] = 1.0
     >>> field = PsfField([narrow, wide], [(0, 0), (100, 0)])
     >>> field.at(25, 7)[1, 1].round(4)
     np.float64(0.7778)
@@ -67,11 +73,39 @@ class PsfField:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape (ky, kx) of each PSF."""
+        """Shape (ky, kx) of each PSF.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lnocl import PsfField
+        >>> PsfField(np.ones((2, 3, 5)), [(0, 0), (100, 0)]).shape
+        (3, 5)
+        """
         return self._psfs.shape[2], self._psfs.shape[3]
 
     def at(self, x: float, y: float) -> Array:
-        """Return the PSF at a position, pixels of the image, shape (ky, kx)."""
+        """Return the PSF at a position.
+
+        Parameters
+        ----------
+        x, y : float
+            Position, pixels of the image, 0-based. Beyond the nodes the PSF is that of the nearest
+            edge of the grid.
+
+        Returns
+        -------
+        ndarray of float64, shape (ky, kx)
+            The PSF, in the unit in which the nodes were given.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lnocl import PsfField
+        >>> field = PsfField([np.zeros((3, 3)), np.ones((3, 3))], [(0, 0), (100, 0)])
+        >>> field.at(25, 7)[1, 1], field.at(500, 7)[1, 1]
+        (np.float64(0.25), np.float64(1.0))
+        """
         (i, u), (j, v) = _between(self._x, x), _between(self._y, y)
         weights = np.outer(v, u)
         cell = self._psfs[j : j + len(v), i : i + len(u)]
@@ -102,7 +136,33 @@ class PsfField:
 
     @classmethod
     def of_model(cls, model: Any, oversample: int) -> PsfField:
-        """Return the field of a `photutils.psf.GriddedPSFModel`, sampled on pixels of the sky."""
+        """Return the field of a gridded model of photutils.
+
+        `lnocl.Observation` takes such a model as it is; this samples its PSFs for other purposes.
+
+        Parameters
+        ----------
+        model : photutils.psf.GriddedPSFModel
+            Model of effective PSFs.
+        oversample : int
+            Samples to a pixel of the image along each axis, 1 or more.
+
+        Returns
+        -------
+        PsfField
+            The model's PSFs, sampled at that interval at the nodes of the model.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from astropy.nddata import NDData
+        >>> from photutils.psf import GriddedPSFModel
+        >>> from lnocl import PsfField
+        >>> meta = {"grid_xypos": [(0, 0), (50, 0), (0, 50), (50, 50)], "oversampling": 4}
+        >>> model = GriddedPSFModel(NDData(np.ones((4, 21, 21)), meta=meta))
+        >>> PsfField.of_model(model, oversample=2).shape
+        (9, 9)
+        """
         sizes = np.array(model.data.shape[1:]) / model.oversampling * oversample
         half_y, half_x = ((sizes - 1) // 2).astype(int).tolist()
         y, x = np.mgrid[-half_y : half_y + 1, -half_x : half_x + 1] / oversample

@@ -1,7 +1,8 @@
 """Images of a star and its jet through a Fizeau interferometer, as the paper simulated them.
 
-The experiment is that of La Camera et al. (2012), section 3: a target of stars and an extended
-source, one PSF for each hour angle, photon noise of target and sky, and read noise.
+The experiment is that of La Camera et al. (2012), section 3. A target has stars and an extended
+source. Each image has its own PSF, for one hour angle, and the photon noise of target and sky, and
+read noise.
 """
 
 from lnocl.simulation.fizeau import fizeau_psf

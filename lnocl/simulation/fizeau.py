@@ -46,39 +46,38 @@ def fizeau_psf(
 ) -> Array:
     r"""Return the long-exposure PSF of the Large Binocular Telescope in Fizeau mode.
 
-    The fields :math:`E_1, E_2` are the Fourier transforms of the two apertures, each a disc with
-    a central obscuration and its own residual phase. With the baseline B their light adds up to
+    The fields :math:`E_1, E_2` are the Fourier transforms of the two apertures, each a disc with a
+    central obscuration and its own residual phase. With the baseline B their light adds up to
 
     .. math:: K(x) \propto \langle |E_1|^2 + |E_2|^2 \rangle
               + 2 \Re [\langle E_1 E_2^* \rangle \exp(2 \pi i B \cdot x / \lambda)],
 
-    an Airy pattern crossed by fringes. The average is over `N_SCREENS` residual phases with the
-    power spectrum :math:`(1 + (k / k_c)^2)^{-11/6}`: that of Kolmogorov beyond the cut-off
-    :math:`k_c` of the adaptive optics, half a cycle per actuator, and flat below it. Their rms
-    is found such that the Strehl ratio is the one asked for.
+    an Airy pattern crossed by fringes. The average is over 100 residual phases with the power
+    spectrum :math:`(1 + (k / k_c)^2)^{-11/6}`. It is that of Kolmogorov beyond the cut-off
+    :math:`k_c` of the adaptive optics, half a cycle per actuator, and flat below it. Their rms is
+    found such that the Strehl ratio is the one asked for.
 
     The PSF is sampled at pixel centres, not integrated over pixels. The pixels must sample the
     longest spatial frequency, (B + D) / wavelength; so nothing is lost by it. Light that falls
     outside the frame comes back in at the opposite side, as on the periodic grid of the
-    convolution, so the sum holds for a frame of any size.
+    convolution. So the sum holds for a frame of any size.
 
     Parameters
     ----------
     shape : tuple of int
-        Shape (ny, nx); each even and `MIN_SIZE` or more.
+        Shape (ny, nx); each even and 32 or more.
     angle : Quantity
-        Angle of the baseline, from the x axis towards the y axis. The fringes are orthogonal to
-        it.
+        Angle of the baseline, from the x axis towards the y axis. The fringes are orthogonal to it.
     wavelength : Quantity
         A length, positive.
     pixel_scale : Quantity
-        Angle per pixel, positive, at most ``wavelength / (2 (B + D))``: 9.6 mas at 2.12 um; at
-        least the `MAX_GRID`-th part of `MIN_FIELD`, 0.5 mas.
+        Angle per pixel, positive, at most ``wavelength / (2 (B + D))``, 9.6 mas at 2.12 um. As the
+        grid has at most 8192 pixels along an axis, it is at least 0.5 mas there.
     strehl : float
-        Strehl ratio, the peak over that of the same PSF without residual phase, in (0, 1]. Met
-        to 0.001 in a frame of 1 arcsec or more, and to 0.004 in one of 0.6 arcsec; in a smaller
-        one the halo folded back lifts the peak, by 0.015 in 0.3 arcsec. Below 0.01 the halo
-        alone is as high.
+        Strehl ratio, the peak over that of the same PSF without residual phase, in (0, 1]. It is
+        met to 0.001 in a frame of 1 arcsec or more, and to 0.004 in one of 0.6 arcsec. In a smaller
+        frame the halo folded back lifts the peak, by 0.015 in 0.3 arcsec. Below 0.01 the halo alone
+        is as high.
     seed : int or SeedSequence
         Of the residual phases; not used where `strehl` is 1.
 
@@ -90,13 +89,13 @@ def fizeau_psf(
     Raises
     ------
     InputError
-        Where an argument has the wrong unit or is out of its range.
+        An argument has the wrong unit or is out of its range.
 
     References
     ----------
-    J. W. Goodman, "Introduction to Fourier Optics", section 6, for the pupil and the Strehl
-    ratio; R. J.-L. Fétick et al., A&A 628, A99 (2019), for the residual phase, flat below the
-    cut-off and of Kolmogorov's kind beyond it.
+    J. W. Goodman, "Introduction to Fourier Optics", section 6, for the pupil and the Strehl ratio;
+    R. J.-L. Fétick et al., A&A 628, A99 (2019), for the residual phase, flat below the cut-off and
+    of Kolmogorov's kind beyond it.
 
     Examples
     --------

@@ -31,7 +31,7 @@ class Simulation:
     Attributes
     ----------
     images : ndarray of float64, shape (p, ny, nx)
-        Electrons per pixel, with noise; read noise makes some negative where the sky is dark.
+        Electrons per pixel, with noise. Read noise makes some negative where the sky is dark.
     psfs : ndarray of float64, shape (p, ny, nx)
         Of unit sum, peak at ``(ny // 2, nx // 2)``.
     background : ndarray of float64, shape (p,)
@@ -48,6 +48,21 @@ class Simulation:
         Electrons of a star of magnitude 0.
     experiment : Experiment
         How the images were taken.
+
+    See Also
+    --------
+    simulate : Returns it.
+
+    Examples
+    --------
+    >>> import lnocl
+    >>> from lnocl.simulation import Experiment, hh34, simulate
+    >>> seen = simulate(hh34(64), Experiment(angles="0 deg", strehl=1.0))
+    >>> observation = lnocl.Observation(
+    ...     seen.images, seen.psfs, background=seen.background, read_noise=seen.read_noise
+    ... )
+    >>> observation.images.shape, seen.star_fluxes.shape
+    ((1, 64, 64), (1,))
     """
 
     images: Array
@@ -61,9 +76,19 @@ class Simulation:
     experiment: Experiment
 
     def record(self) -> dict[str, Any]:
-        """Return every number the simulation was made from, ready for `json.dump`.
+        """Return every number that the simulation was made from, ready for `json.dump`.
 
-        A quantity is its value and its unit.
+        Returns
+        -------
+        dict of str
+            Target, experiment, telescope and background. A quantity is its value and its unit.
+
+        Examples
+        --------
+        >>> from lnocl.simulation import Experiment, hh34, simulate
+        >>> record = simulate(hh34(64), Experiment(angles="0 deg", strehl=1.0)).record()
+        >>> record["telescope"]["baseline"]
+        {'value': 14.4, 'unit': 'm'}
         """
         record = {
             "target": {
@@ -111,14 +136,14 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
     Raises
     ------
     InputError
-        Where the pixels are too coarse for the wavelength; where the light of all sources, and of
-        the sky in a pixel, adds up to more than `MAX_ELECTRONS`.
+        The pixels are too coarse for the wavelength. Or the light of all sources, and of the sky in
+        a pixel, adds up to more than 1e15 electrons.
 
     References
     ----------
-    A. La Camera, S. Antoniucci, M. Bertero et al., "Image reconstruction for observations with
-    a high dynamic range: LINC-NIRVANA simulations of a stellar jet", Proc. SPIE 8445 (2012),
-    section 3.
+    A. La Camera, S. Antoniucci, M. Bertero et al., "Image reconstruction for observations with a
+    high dynamic range: LINC-NIRVANA simulations of a stellar jet", Proc. SPIE 8445 (2012), section
+    3.
 
     Examples
     --------

@@ -19,7 +19,9 @@ def photon_rate(
 ) -> u.Quantity:
     r"""Return the photons that arrive per second and square metre from a source.
 
-    .. math:: \frac{F_0}{h} \frac{\Delta\lambda}{\lambda} 10^{-0.4 m}, for a narrow band.
+    .. math:: \frac{F_0}{h} \frac{\Delta\lambda}{\lambda} 10^{-0.4 m}
+
+    for a narrow band of width Δλ at λ, with the zero point F_0 and the magnitude m.
 
     Parameters
     ----------
@@ -27,8 +29,10 @@ def photon_rate(
         In mag, finite.
     zero_point : Quantity
         Flux density of magnitude 0 per unit frequency, such as Jy; positive.
-    wavelength, bandwidth : Quantity
-        Lengths, positive.
+    wavelength : Quantity
+        Of the band, a length, positive.
+    bandwidth : Quantity
+        Of the band, a length, positive.
 
     Returns
     -------
@@ -38,7 +42,7 @@ def photon_rate(
     Raises
     ------
     InputError
-        Where an argument has the wrong unit or is out of its range.
+        An argument has the wrong unit or is out of its range.
 
     Examples
     --------
@@ -59,7 +63,7 @@ def photon_rate(
 def pixel_magnitude(surface_brightness: u.Quantity, pixel_scale: u.Quantity) -> u.Quantity:
     """Return the magnitude of one square pixel of a surface brightness.
 
-    ``S - 2.5 log10(pixel_scale^2 / arcsec^2)``
+    ``m = S - 2.5 log10(pixel_scale^2 / arcsec^2)`` for the surface brightness S.
 
     Parameters
     ----------
@@ -76,7 +80,7 @@ def pixel_magnitude(surface_brightness: u.Quantity, pixel_scale: u.Quantity) -> 
     Raises
     ------
     InputError
-        Where an argument has the wrong unit or is out of its range.
+        An argument has the wrong unit or is out of its range.
 
     Examples
     --------
@@ -106,7 +110,7 @@ def electrons(
     throughput : float
         Electrons per photon that reaches the telescope, in (0, 1].
     exposure_time : Quantity
-        Positive.
+        A time, positive.
 
     Returns
     -------
@@ -116,7 +120,7 @@ def electrons(
     Raises
     ------
     InputError
-        Where an argument has the wrong unit or is out of its range.
+        An argument has the wrong unit or is out of its range.
 
     Examples
     --------

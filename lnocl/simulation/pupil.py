@@ -24,28 +24,32 @@ def circular_pupil(
     obscuration: u.Quantity = 0.0 * u.m,
     centres: Sequence[u.Quantity] = ((0.0, 0.0) * u.m,),
 ) -> Array:
-    r"""Return the transmission of a pupil of circular apertures, for `Observation`'s ``pupils``.
+    """Return the transmission of a pupil of circular apertures.
 
-    A pixel is ``wavelength / (n pixel_scale)`` long, with n the PSF's pixels along the axis, so
-    that the PSF without aberrations is :math:`|F(P)|^2`, light beyond its frame wrapped round.
+    It is for the parameter ``pupils`` of `lnocl.Observation`.
+
+    A pixel is ``wavelength / (n pixel_scale)`` long, with n the PSF's pixels along the axis. The
+    PSF without aberrations is then :math:`|F(P)|^2`, with light beyond its frame wrapped round.
 
     Parameters
     ----------
     shape : tuple of int
-        Shape (ny, nx) of the PSF; each even and `MIN_SIZE` or more.
+        Shape (ny, nx) of the PSF; each even and 32 or more.
     wavelength : Quantity
         A length, positive.
     pixel_scale : Quantity
         Angle per pixel of the PSF, positive.
-    diameter, obscuration : Quantity
-        Of each aperture, and of what stands in its middle; lengths, the first more than the second.
+    diameter : Quantity
+        Diameter of each aperture, a length, positive.
+    obscuration : Quantity, optional
+        Diameter of the central obscuration of each aperture, zero or more and less than `diameter`.
     centres : sequence of Quantity, each of shape (2,), optional
         (x, y) of the apertures, lengths; by default one in the middle.
 
     Returns
     -------
     ndarray of float64, shape (ny, nx)
-        In 0 to 1; the middle of the pupil is at ``(ny // 2, nx // 2)``.
+        Transmission, 0 to 1; the middle of the pupil is at ``(ny // 2, nx // 2)``.
 
     Raises
     ------
@@ -54,7 +58,7 @@ def circular_pupil(
 
     References
     ----------
-    J. W. Goodman, "Introduction to Fourier Optics", section 6.
+    Goodman, J. W., "Introduction to Fourier Optics", section 6.
 
     Examples
     --------
@@ -89,16 +93,43 @@ def fizeau_pupil(
 ) -> Array:
     """Return the two apertures of the Large Binocular Telescope: those of `fizeau_psf`.
 
-    Parameters, shape, middle and errors are those of `circular_pupil`; `angle` is that of the
-    baseline, from the x axis towards the y axis.
+    They are sampled as `circular_pupil` samples them.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Shape (ny, nx) of the PSF; each even and 32 or more.
+    angle : Quantity
+        Angle of the baseline, from the x axis towards the y axis.
+    wavelength : Quantity
+        A length, positive.
+    pixel_scale : Quantity
+        Angle per pixel of the PSF, positive.
+
+    Returns
+    -------
+    ndarray of float64, shape (ny, nx)
+        Transmission, 0 to 1; the middle of the pupil is at ``(ny // 2, nx // 2)``.
+
+    Raises
+    ------
+    InputError
+        An argument has the wrong unit or is out of range, or an aperture lies beyond the frame.
+
+    References
+    ----------
+    Hill, J. M., Green, R. F., Slagle, J. H., Proc. SPIE 6267, 62670Y (2006), for the telescope.
 
     Examples
     --------
+    The middle between the apertures is dark, and their area is 110 m2:
+
     >>> import astropy.units as u
     >>> from lnocl.simulation import fizeau_pupil
     >>> pupil = fizeau_pupil((128, 128), 0 * u.deg, 2.12 * u.um, 5 * u.mas)
-    >>> bool(pupil[64, 64] == 0), round(float(pupil.sum() * (2.12e-6 / 5 * 206264806 / 128) ** 2))
-    (True, 110)
+    >>> side = (2.12 * u.um / (128 * 5 * u.mas).to_value(u.rad)).to(u.m)
+    >>> bool(pupil[64, 64] == 0), f"{pupil.sum() * side**2:.0f}"
+    (True, '110 m2')
     """
     theta = number("angle", angle, u.rad)
     half = BASELINE / 2.0 * (math.cos(theta), math.sin(theta))

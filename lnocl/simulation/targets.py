@@ -26,12 +26,19 @@ DEFAULT_SIZE = 1024
 class Star:
     """A point source.
 
-    Attributes
+    Parameters
     ----------
     x, y : int
         Position in pixels, 0-based, x along columns.
-    magnitude : Quantity
-        In mag.
+    magnitude : Quantity, optional
+        In mag, by default 13.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from lnocl.simulation import Star
+    >>> print(Star(30, 40, 11.5 * u.mag).magnitude)
+    11.5 mag
     """
 
     x: int
@@ -46,7 +53,7 @@ class Target:
     ----------
     extended : array_like, shape (ny, nx)
         Extended source in any unit of flux per pixel, not negative, of a positive sum. Both axes
-        even and `MIN_SIZE` or more.
+        are even and 32 pixels or more.
     stars : sequence of Star, optional
         Point sources, at whole pixels of the image.
 
@@ -60,9 +67,19 @@ class Target:
     Raises
     ------
     InputError
-        Where the extended source is not a plane of finite numbers, has masked or negative pixels,
-        no flux or one that is not finite, or an odd or too small side; where a star lies outside
-        it or between pixels.
+        - The extended source is not a plane of finite numbers, or has masked or negative pixels.
+        - It has no flux or one that is not finite, or a side is odd or too small.
+        - A star lies outside it or between pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lnocl.simulation import Star, Target
+    >>> disc = np.zeros((64, 64))
+    >>> disc[28:36, 28:36] = 5.0
+    >>> target = Target(disc, [Star(32, 32)])
+    >>> float(target.extended.sum()), target.stars[0].x
+    (1.0, 32)
     """
 
     def __init__(self, extended: ArrayLike, stars: Sequence[Star] = ()) -> None:
@@ -91,16 +108,16 @@ class Target:
 def hh34(size: int = DEFAULT_SIZE) -> Target:
     """Return a jet of the kind of HH 34 and the star that drives it, on a square of this size.
 
-    The axis of the jet lies along y. It leaves the star as a thin spine that widens and wiggles
-    a little, carries curved knots, the first 8 pixels from the star and each 1.45 times as far as
-    the one before, and ends in a bow shock. Width and knots are the same in a frame of any size;
-    the length follows the frame, so a jet in a smaller one is cut shorter and has fewer knots.
-    Nothing in it is random.
+    The axis of the jet lies along y. It leaves the star as a thin spine that widens and wiggles a
+    little, carries curved knots, and ends in a bow shock. The first knot is 8 pixels from the star,
+    and each is 1.45 times as far as the one before. Width and knots are the same in a frame of any
+    size. The length follows the frame, so a jet in a smaller one is cut shorter and has fewer
+    knots. Nothing in it is random.
 
     Parameters
     ----------
     size : int
-        Pixels along each side; even, `MIN_JET_SIZE` or more.
+        Pixels along each side; even, 64 or more.
 
     Returns
     -------
@@ -110,7 +127,7 @@ def hh34(size: int = DEFAULT_SIZE) -> Target:
     Raises
     ------
     InputError
-        Where the size is odd or too small.
+        The size is odd or too small.
 
     Examples
     --------
@@ -150,8 +167,8 @@ def load_target(
     Parameters
     ----------
     scene : str or Path
-        Name of a built-in scene (``"hh34"``), or a FITS file. Its pixels are taken as they are;
-        its WCS is not read.
+        Name of a built-in scene (``"hh34"``), or a FITS file. Its pixels are taken as they are; its
+        WCS is not read.
     size : int, optional
         Pixels along each side of a built-in scene, 1024 by default; a file has its own.
     stars : sequence of Star, optional
@@ -166,9 +183,9 @@ def load_target(
     Raises
     ------
     InputError
-        An unknown scene, a size given with a file, or anything that `Target` refuses.
+        The scene is unknown, a size is given with a file, or `Target` refuses it.
     FileError
-        A file that is not readable as FITS, or holds no image.
+        The file is not readable as FITS, or holds no image.
 
     Examples
     --------

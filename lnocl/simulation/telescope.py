@@ -32,6 +32,16 @@ def collecting_area() -> u.Quantity:
 
     ``2 pi / 4 (D^2 - d^2)`` with D = 8.4 m and d = 0.911 m.
 
+    Returns
+    -------
+    Quantity
+        In m2.
+
+    References
+    ----------
+    J. M. Hill, R. F. Green, J. H. Slagle, Proc. SPIE 6267, 62670Y (2006), for the mirrors; A.
+    Riccardi et al., Proc. SPIE 4839, 721 (2003), for the secondaries.
+
     Examples
     --------
     >>> from lnocl.simulation import collecting_area
@@ -45,40 +55,46 @@ def collecting_area() -> u.Quantity:
 class Experiment:
     """Instrument, filter and exposures; the defaults are those of La Camera et al. (2012).
 
-    The paper names neither the zero point nor the throughput: see docs/validation/photometry.md.
+    The paper names neither the zero point nor the throughput (:doc:`/validation/photometry`).
 
-    Attributes
+    Parameters
     ----------
-    wavelength, bandwidth : Quantity
-        Of the narrow-band filter, H2 at 2.12 um; lengths, positive.
-    pixel_scale : Quantity
-        Angle per pixel, positive, at most ``wavelength / (2 (B + D))``.
-    angles : Quantity
+    wavelength : Quantity, optional
+        Of the narrow-band filter, by default H2 at 2.12 um; a length, positive.
+    bandwidth : Quantity, optional
+        Of that filter, by default 0.02 um; a length, positive.
+    pixel_scale : Quantity, optional
+        Angle per pixel, by default 5 mas; positive, at most ``wavelength / (2 (B + D))``.
+    angles : Quantity, optional
         One or several angles of the baseline, one for each image, from the x axis towards the y
-        axis.
-    exposure_time : Quantity
-        Of each image, positive.
-    throughput : float
-        Electrons per photon that reaches the telescope, in (0, 1].
-    strehl : float
-        Strehl ratio of each PSF, in (0, 1].
-    zero_point : Quantity
-        Flux density of magnitude 0, positive: Ks of M. Cohen, W. A. Wheaton, S. T. Megeath, AJ
-        126, 1090 (2003).
-    extended_magnitude : Quantity
-        Integrated magnitude of the extended source.
-    sky_brightness : Quantity
-        In mag / arcsec2.
-    read_noise : Quantity
-        Standard deviation, electrons per pixel, zero or more.
-    seed : int
-        Of residual phases and noise, zero or more.
+        axis. By default 0, 45, 90 and 135 degrees.
+    exposure_time : Quantity, optional
+        Of each image, by default 30 minutes; positive.
+    throughput : float, optional
+        Electrons per photon that reaches the telescope, in (0, 1]; by default 0.3.
+    strehl : float, optional
+        Strehl ratio of each PSF, in (0, 1]; by default 0.7.
+    zero_point : Quantity, optional
+        Flux density of magnitude 0, positive; by default 666.7 Jy, Ks of M. Cohen, W. A. Wheaton,
+        S. T. Megeath, AJ 126, 1090 (2003).
+    extended_magnitude : Quantity, optional
+        Integrated magnitude of the extended source, by default 13 mag.
+    sky_brightness : Quantity, optional
+        In mag / arcsec2, by default 13.5.
+    read_noise : Quantity, optional
+        Standard deviation, electrons per pixel, zero or more; by default 10.
+    seed : int, optional
+        Of residual phases and noise, zero or more; by default 0.
 
     Raises
     ------
     InputError
-        Where a value has the wrong unit or is out of its range; where an image would hold more
-        than `MAX_ELECTRONS` of the extended source, of the sky in a pixel, or of read noise.
+        A value has the wrong unit or is out of its range. Or an image would hold more than 1e15
+        electrons of the extended source, of the sky in a pixel, or of read noise.
+
+    References
+    ----------
+    La Camera, A., Antoniucci, S., Bertero, M., et al., Proc. SPIE 8445 (2012), section 3.
 
     Examples
     --------
@@ -129,12 +145,42 @@ class Experiment:
             raise InputError("a star of magnitude 0 would leave infinitely many electrons")
 
     def source_electrons(self, magnitude: u.Quantity) -> float:
-        """Return the electrons that one image holds of a source of this magnitude."""
+        """Return the electrons that one image holds of a source.
+
+        Parameters
+        ----------
+        magnitude : Quantity
+            Magnitude of the source, in mag, finite.
+
+        Returns
+        -------
+        float
+            Electrons.
+
+        Raises
+        ------
+        InputError
+            The magnitude has the wrong unit, is not finite, or is too bright for any number.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from lnocl.simulation import Experiment
+        >>> print(f"{Experiment().source_electrons(13 * u.mag):.3g}")
+        3.54e+07
+        """
         rate = photon_rate(magnitude, self.zero_point, self.wavelength, self.bandwidth)
         area = collecting_area()
         return float(electrons(rate, area, self.throughput, self.exposure_time).value)
 
     @property
     def sky_electrons(self) -> float:
-        """Electrons of the sky in each pixel of one image."""
+        """Electrons of the sky in each pixel of one image.
+
+        Examples
+        --------
+        >>> from lnocl.simulation import Experiment
+        >>> round(Experiment().sky_electrons)
+        559
+        """
         return self.source_electrons(pixel_magnitude(self.sky_brightness, self.pixel_scale))
