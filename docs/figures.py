@@ -25,7 +25,7 @@ class Recipe(NamedTuple):
     time : str
         About how long it takes on two cores.
     command : str
-        For bash, in the root of the repository; it writes to $OUT, and reads $DATA.
+        For bash, in the root of the repository, $ROOT; it writes to $OUT, and reads $DATA.
     figures : dict of str to str
         The file in $OUT of each figure in docs/.
     """
@@ -50,7 +50,8 @@ RECIPES = {
     ),
     "look": Recipe(
         "1 min",
-        "sh examples/real/look.sh $DATA $OUT",
+        # By relative names, which the reports show.
+        "ln -s $DATA $OUT/data && cd $OUT && sh $ROOT/examples/real/look.sh data .",
         same("start/look", "galactic_centre lensed_quasar quasar_host stars")
         | {
             f"start/look/{name}.html": f"{name}.html"
@@ -136,7 +137,13 @@ def make(recipe: Recipe, data: str) -> None:
     """Run a recipe, and put its figures where the pages have them."""
     with tempfile.TemporaryDirectory() as out:
         path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-        environment = os.environ | {"OUT": out, "DATA": data, "MPLBACKEND": "Agg", "PATH": path}
+        environment = os.environ | {
+            "OUT": out,
+            "DATA": data,
+            "ROOT": str(ROOT),
+            "MPLBACKEND": "Agg",
+            "PATH": path,
+        }
         subprocess.run(["bash", "-euc", recipe.command], cwd=ROOT, env=environment, check=True)
         for figure, made in recipe.figures.items():
             shutil.copyfile(Path(out, made), DOCS / figure)
