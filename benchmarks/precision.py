@@ -1,12 +1,13 @@
 """How far single precision strays from double: against contrast, iterations, size, background.
 
-    python benchmarks/precision.py [--device SPEC] [--output STEM]
+    python benchmarks/precision.py [--device SPEC] [--output STEM] [--solver sgp]
 
 The scene is that of `lnocl demo`, four images of a jet and its star, with the star's flux, the
 number of iterations, the grid, or the background changed; no Tikhonov term. Deviations are those
 of the estimate of single precision from that of double after as many iterations: of the extended
 source ||f_s - f_d|| / ||f_d||, over all pixels and over the 24 rows round the star, and of the
 star's flux. With --output the table goes to STEM.ecsv and four plots to STEM.png.
+The solver is sgm; of sgp the iterations alone are printed.
 """
 
 import argparse
@@ -50,7 +51,7 @@ def scene(size=SIZE, contrast=CONTRAST, background=None):
     return lnocl.Observation(images, made.psfs, background=level), star
 
 
-def deviations(observation, star, checkpoints, device):
+def deviations(observation, star, checkpoints, device, **options):
     """Yield iterations and deviations: all rows, rows round the star, star flux."""
     estimates = {}
     for precision in ("double", "single"):
@@ -67,6 +68,7 @@ def deviations(observation, star, checkpoints, device):
             precision=precision,
             device=device,
             callback=keep,
+            **options,
         )
     near = star_rows(star, observation.shape)
     for iteration in checkpoints:
@@ -128,7 +130,12 @@ def main():
     )
     parser.add_argument("--device")
     parser.add_argument("--output")
+    parser.add_argument("--solver", choices=("sgm", "sgp"), default="sgm")
     given = parser.parse_args()
+    if given.solver == "sgp":
+        for found in deviations(*scene(), (30, 100, 300), given.device, solver="sgp"):
+            print(f"{found[0]:6d} ", *(f"{x:8.1e}" for x in found[1:]))
+        return
     rows = []
     for row in sweeps(given.device):
         print(

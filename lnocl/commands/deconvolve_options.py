@@ -50,8 +50,9 @@ OPTIONS = {
             choices=("check", "fit", "given"),
             default="check",
             card=("PSFCENTR", "what became of PSFs off their centre"),
-            help="what becomes of a PSF whose core lies off its centre, (ky // 2, kx // 2): check, "
-            "it is refused; fit, it is moved there; given, nothing (default: %(default)s)",
+            help="a PSF whose core lies off its centre, (ky // 2, kx // 2): check, a warning from "
+            "0.25 pixels on, an error from 0.8; fit, it is moved there; given, nothing (default: "
+            "%(default)s)",
         ),
     ],
     "output": [

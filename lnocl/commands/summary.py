@@ -102,12 +102,13 @@ def _verdict(
     if unfitted:
         verdict.append(
             f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
-            f"{' '.join(unfitted[:3])}: its PSF or its position is wrong"
+            f"{' '.join(unfitted[:3])}: its PSF or its position is wrong; try --refine, "
+            "--refine-psfs jitter, with two stars or more jitter pixels, or another PSF"
         )
         if result.stop_reason == "held-out":
             verdict.append(
-                "held-out counts share this error and choose too many iterations: look at fewer, "
-                "with --n-iter and --stop none"
+                "held-out counts share this error and choose too many iterations: compare with "
+                "fewer, by --n-iter and --stop none, once the PSF is better"
             )
     elif overall is not None and overall.is_misfit:
         verdict.append("the model does not fit: see to background, noise and gain")
