@@ -23,7 +23,6 @@ extensions = [
     "sphinxarg.ext",
 ]
 templates_path = ["_templates"]
-exclude_patterns = ["build", "gallery/*.ipynb", "gallery/*.py"]
 nitpicky = True
 # The domain of the shell's options takes no links by name.
 suppress_warnings = ["myst.domains"]
@@ -37,7 +36,6 @@ default_role = "py:obj"
 autodoc_typehints = "none"
 autosummary_generate = True
 numpydoc_show_class_members = False
-numpydoc_class_members_toctree = False
 
 # With ``-t online`` names of other packages are links; without, nothing is fetched.
 intersphinx_mapping = {
@@ -56,10 +54,8 @@ sphinx_gallery_conf = {
     "gallery_dirs": "gallery",
     "filename_pattern": r"/examples/[^/]+\.py$",
     "abort_on_example_error": True,
-    "show_memory": False,
     "write_computation_times": False,
     "download_all_examples": False,
-    "copyfile_regex": r"",
     "within_subsection_order": "FileNameSortKey",
 }
 

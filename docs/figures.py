@@ -152,12 +152,16 @@ def make(recipe: Recipe, data: str) -> None:
 def main() -> None:
     """Read the command line, and make what it names."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", choices=["all", *RECIPES, []])
+    parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--data", default="examples/real/data")
     given = parser.parse_args()
     if not given.names:
         for name, recipe in RECIPES.items():
             print(f"{name:14s} {recipe.time:8s} {recipe.command}")
+    if unknown := set(given.names) - {"all", *RECIPES}:
+        parser.error(
+            f"there is no recipe {', '.join(sorted(unknown))}; without a name all are listed"
+        )
     for name in RECIPES if "all" in given.names else given.names:
         make(RECIPES[name], os.path.abspath(given.data))
 

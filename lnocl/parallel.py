@@ -34,8 +34,8 @@ LOOK_EVERY = 0.02
 # And for workers, where nothing is done.
 LOOK_AFTER = 1.0
 _WITHOUT_GUARD = (
-    "worker processes cannot be started: a script needs 'if __name__ == \"__main__\":' round what "
-    "it does, as each of them reads it first"
+    "worker processes cannot be started, as each of them reads the script first: it has to be a "
+    "file, not standard input, with 'if __name__ == \"__main__\":' round what it does"
 )
 
 

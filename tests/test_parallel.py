@@ -206,15 +206,19 @@ def test_work_inside_a_task_is_refused(client, inner):
         list(work(make_nested, [inner], CURRENT))
 
 
-def test_a_script_that_starts_processes_without_a_guard_is_told(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(
-        "from lnocl.parallel import work\nfrom builtins import abs\n"
-        "def make():\n    return abs\nprint(list(work(make, [-1], 2)))\n"
-    )
-    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+@pytest.mark.parametrize("is_file", [True, False])
+def test_a_script_that_processes_cannot_read_is_told(tmp_path, is_file):
+    script = "from lnocl.parallel import work\ndef make():\n    return abs\n"
+    if is_file:
+        (tmp_path / "script.py").write_text(f"{script}print(list(work(make, [-1], 2)))\n")
+        command, given = [sys.executable, tmp_path / "script.py"], ""
+    else:
+        command = [sys.executable, "-"]
+        given = f"{script}if __name__ == '__main__':\n    print(list(work(make, [-1], 2)))\n"
+    ended = subprocess.run(command, input=given, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
-    assert "a script needs 'if __name__ == \"__main__\":' round what it does" in ended.stderr
+    last = ended.stderr.splitlines()[-1]
+    assert "it has to be a file, not standard input, with 'if __name__ == \"__main__\":'" in last
 
 
 def test_where_all_workers_have_gone_it_says_so(monkeypatch):

@@ -67,8 +67,8 @@ def read_targets(path: str) -> list[Target]:
     FileError
         The file cannot be read.
     InputError
-        Its ending is another; it has no row, or no column of images; a column is no option, or has
-        a unit; two targets have one name.
+        Its ending is another; it has no row, or no column of images; a column names no option, or
+        has a unit; two targets have one name.
     """
     table = _read(path)
     options = _options_of(path, table)

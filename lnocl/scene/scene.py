@@ -475,8 +475,8 @@ class Scene:
             if variation > MAX_VARIATION:
                 warn(
                     f"psf {j} varies over the image by {variation:.0%}, and what is not a star is "
-                    "reconstructed with that of the middle: take lnocl.deconvolve_tiles, or "
-                    "smaller tiles"
+                    "reconstructed with that of the middle: take tiles, by "
+                    "lnocl.deconvolve_tiles, or a smaller tile"
                 )
 
     def _warn_of_large_psf(self) -> None:
