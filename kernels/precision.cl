@@ -16,8 +16,8 @@
  *                   OVERSAMPLE divides that power of two
  *   ROWS            rows that a block of spectra takes in memory: NY and some padding
  *   MAX_STARS       room for stars: the scene has no more than these
- *   HAS_MU, HAS_SMOOTHING, HAS_WEIGHTS, HAS_BACKGROUND_MAP, HAS_EXPOSURE_MAP    0 or 1: what the
- *                   scene has
+ *   HAS_MU, HAS_SMOOTHING, HAS_SMOOTHING_MAP, HAS_WEIGHTS, HAS_BACKGROUND_MAP, HAS_EXPOSURE_MAP
+ *                   0 or 1: what the scene has
  *   MIN_MODEL     the division guard
  *
  * Layouts, in reals, the last index fastest:

@@ -91,9 +91,11 @@ class ReferenceEngine:
             self._star_fluxes,
         )
         smoothness = 0.0
-        if self.scene.smoothing:
+        if self.scene.is_smoothed:
+            weight = self.scene.smoothing_map
+            weight = self.scene.smoothing if weight is None else weight
             self._slope, self._curvature, smoothness = smooth(
-                self._extended, self.scene.smoothing, self.scene.edge
+                self._extended, weight, self.scene.edge
             )
         objective, self._star_corrections = collect_sums(
             self._data_term,

@@ -90,7 +90,8 @@ class OpenCLEngine:
             oversample=scene.oversample,
             n_stars=scene.n_stars,
             has_mu=scene.mu > 0,
-            has_smoothing=scene.smoothing > 0,
+            has_smoothing=scene.is_smoothed,
+            has_smoothing_map=scene.smoothing_map is not None,
             has_weights=scene.weights is not None,
             has_exposure_map=scene.has_exposure_map,
             has_background_map=self._has_background_map,
@@ -176,8 +177,9 @@ class OpenCLEngine:
             "ratio_sums": program.image_row_blocks * p * pair,
             "data_term": pair,
             "square_sums": program.row_blocks * pair,
-            "slope": pixels if scene.smoothing else item,
-            "curvature": pixels if scene.smoothing else item,
+            "slope": pixels if scene.is_smoothed else item,
+            "curvature": pixels if scene.is_smoothed else item,
+            "smoothing_map": pixels if scene.smoothing_map is not None else item,
             "smooth_sums": program.row_blocks * pair,
             "objectives": (n_iter + 1) * pair,
         }
@@ -224,7 +226,7 @@ class OpenCLEngine:
         """Bind the kernels of an iteration, in its order."""
         self._convolve = self._bind("convolve_columns")
         self._ratio = self._bind("ratio_rows")
-        if self.scene.smoothing:
+        if self.scene.is_smoothed:
             self._smooth = self._bind("smooth")
         self._collect = self._bind("collect_sums")
         self._correlate = self._bind("correlate_columns")
@@ -240,6 +242,8 @@ class OpenCLEngine:
             memory.upload_pixels("background", background)
         else:
             memory.upload("background", background)
+        if scene.smoothing_map is not None:
+            memory.upload_pixels("smoothing_map", [scene.smoothing_map])
         self._make_otfs()
         memory.upload_integers("star_corners", self._stars.corners)
         self.move_stars()
@@ -346,7 +350,7 @@ class OpenCLEngine:
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
         self._ratio()
-        if self.scene.smoothing:
+        if self.scene.is_smoothed:
             self._smooth_buffer("extended")
         self._collect.set(iteration=self._n_objectives)
         self._collect()
@@ -401,7 +405,7 @@ class OpenCLEngine:
 
     def step(self, alpha: float, share: float) -> tuple[float, Array]:
         """Step from the base; return ``<gradient, d>`` and ``<cross_information_s, d>``."""
-        if self.scene.smoothing and share < 1:  # the curvature is that of a longer step by now
+        if self.scene.is_smoothed and share < 1:  # the curvature is that of a longer step by now
             self._smooth_buffer("previous")
         self._step.set(alpha=float(alpha), share=float(share))
         self._step()

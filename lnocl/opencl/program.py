@@ -80,7 +80,8 @@ class Program:
         Pixels of the sky to one of the images, along each axis: 1, 2 or 4.
     n_stars : int, optional
         Stars of the scene, at most 4096; the program has room for more.
-    has_mu, has_smoothing, has_weights, has_background_map, has_exposure_map : bool, optional
+    has_mu, has_smoothing, has_smoothing_map : bool, optional
+    has_weights, has_background_map, has_exposure_map : bool, optional
         Parts that the scene has.
     min_model : float, optional
         The division guard.
@@ -118,6 +119,7 @@ class Program:
         n_stars: int = 0,
         has_mu: bool = False,
         has_smoothing: bool = False,
+        has_smoothing_map: bool = False,
         has_weights: bool = False,
         has_background_map: bool = False,
         has_exposure_map: bool = False,
@@ -164,6 +166,7 @@ class Program:
             "MAX_STARS": _room_for(n_stars),
             "HAS_MU": int(has_mu),
             "HAS_SMOOTHING": int(has_smoothing),
+            "HAS_SMOOTHING_MAP": int(has_smoothing_map),
             "HAS_WEIGHTS": int(has_weights),
             "HAS_BACKGROUND_MAP": int(has_background_map),
             "HAS_EXPOSURE_MAP": int(has_exposure_map),

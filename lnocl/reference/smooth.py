@@ -7,18 +7,22 @@ import numpy as np
 from lnocl.scene.observation import Array
 
 
-def smooth(extended: Array, smoothing: float, edge: float) -> tuple[Array, Array, float]:
+def smooth(extended: Array, smoothing: float | Array, edge: float) -> tuple[Array, Array, float]:
     """Return slope, curvature and value of the edge-preserving term.
 
-    ``smoothing * sum psi(f - f')`` over the pairs of neighbouring pixels, also across the borders
-    of the grid, ``psi(t) = sqrt(t^2 + edge^2) - edge``. The slope is its gradient. The curvature is
-    the sum of ``smoothing * psi'(f - f') / (f - f')`` over the four neighbours of a pixel.
+    ``sum (beta + beta') / 2 psi(f - f')`` over the pairs of neighbouring pixels, also across the
+    borders of the grid, ``psi(t) = sqrt(t^2 + edge^2) - edge``. The weight beta is `smoothing`, a
+    number or a map. The slope is the term's gradient. The curvature is the sum of
+    ``(beta + beta') / 2 psi'(f - f') / (f - f')`` over the four neighbours of a pixel.
     """
     slope, curvature, value = np.zeros_like(extended), np.zeros_like(extended), 0.0
+    weight = np.broadcast_to(smoothing, extended.shape)
     for axis in (-1, -2):
         step = extended - np.roll(extended, -1, axis)
+        pair = (weight + np.roll(weight, -1, axis)) / 2.0
         root = np.sqrt(step**2 + edge**2)
-        slope += step / root - np.roll(step / root, 1, axis)
-        curvature += 1.0 / root + np.roll(1.0 / root, 1, axis)
-        value += float((step**2 / (root + edge)).sum())
-    return smoothing * slope, smoothing * curvature, smoothing * value
+        share = pair / root
+        slope += share * step - np.roll(share * step, 1, axis)
+        curvature += share + np.roll(share, 1, axis)
+        value += float((pair * step**2 / (root + edge)).sum())
+    return slope, curvature, value

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Real
 from typing import Any, cast
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from lnocl.errors import InputError
 from lnocl.scene.detector import seen_psfs
-from lnocl.scene.observation import Observation
+from lnocl.scene.observation import Array, Observation
 
 # A larger weight leaves nothing of the data term of images at unit mean.
 MAX_WEIGHT = 2.0**64
@@ -41,6 +41,9 @@ class Penalty:
         exposure).
     edge : float or None
         delta, in the unit of the extended source; None: three times its mean, roughly.
+    near_stars : ndarray of float64, of the shape of the extended source, or None
+        Weight of the edge-preserving term beside `smoothing` in each pixel; a pair of pixels has
+        the mean of both. None: 0 everywhere.
 
     Raises
     ------
@@ -51,6 +54,7 @@ class Penalty:
     mu: float = 0.0
     smoothing: float = 0.0
     edge: float | None = None
+    near_stars: Array | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         weights: dict[str, Any] = {"mu": self.mu, "smoothing": self.smoothing}

@@ -82,6 +82,9 @@ class Scene:
         Electrons per exposure and unit of the estimate.
     mu, smoothing : float
         Weights of the penalty, scaled.
+    smoothing_map : ndarray of float64, shape (Ny, Nx), or None
+        The weight of the edge-preserving term in each pixel, scaled, where the penalty has a map;
+        with `smoothing` in it.
     edge : float
         delta of the edge-preserving term, scaled; 0 where there is no such term.
     weights : ndarray of bool or float64, shape (p, ny, nx) of the images' grid, or None
@@ -147,7 +150,22 @@ class Scene:
     def _penalise(self, penalty: Penalty) -> None:
         self.mu = self._scaled("mu", penalty.mu, self.unit / self._mean_exposure)
         self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / self._mean_exposure)
-        self.edge = self._edge(penalty) if self.smoothing else 0.0
+        self.smoothing_map = self._smoothing_map(penalty)
+        self.edge = self._edge(penalty) if self.is_smoothed else 0.0
+
+    @property
+    def is_smoothed(self) -> bool:
+        """Whether the extended source has an edge-preserving term."""
+        return self.smoothing > 0 or self.smoothing_map is not None
+
+    def _smoothing_map(self, penalty: Penalty) -> Array | None:
+        """Return the weight of the edge-preserving term on the grid, scaled, where it is a map."""
+        if penalty.near_stars is None:
+            return None
+        ny, nx = self.observation.sky_shape
+        total = np.full(self.grid, self.smoothing)
+        total[:ny, :nx] += penalty.near_stars / self._mean_exposure
+        return total
 
     def _edge(self, penalty: Penalty) -> float:
         """Return delta of the edge-preserving term, scaled."""

@@ -218,7 +218,8 @@ def _run_scale_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 
 
 def _run_smooth(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    slope, curvature, value = reference.smooth(given.extended, given.smoothing, given.edge)
+    weight = given.smoothing if given.smoothing_map is None else given.smoothing_map
+    slope, curvature, value = reference.smooth(given.extended, weight, given.edge)
     outs, sums = (harness.empty_pixels(), harness.empty_pixels()), harness.empty_sums()
     harness.launch(
         "smooth",
@@ -226,6 +227,7 @@ def _run_smooth(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         curvature=outs[1],
         smooth_sums=sums,
         extended=harness.put_pixels(given.extended),
+        smoothing_map=harness.put_pixels(given.extended if given.smoothing_map is None else weight),
         smoothing=given.smoothing,
         edge=given.edge,
     )

@@ -19,7 +19,7 @@ from lnocl.opencl.tuning import Tuning
 from lnocl.scene.scene import MIN_MODEL
 
 # Scenes with all parts, together, that a program can have.
-THREE_IMAGES = "three images, two stars, mask, background map, smoothing"
+THREE_IMAGES = "three images, two stars, mask, background map, map of smoothing"
 TWICE_AS_FINE = "sky twice as fine, three images, two stars, mask, background map"
 FOUR_TIMES_AS_FINE = "sky four times as fine, exposure map, mu"
 SCENES: dict[str, dict[str, Any]] = {
@@ -31,6 +31,7 @@ SCENES: dict[str, dict[str, Any]] = {
         "has_weights": True,
         "has_background_map": True,
         "has_smoothing": True,
+        "has_smoothing_map": True,
     },
     "mask, mu, smoothing": {
         "n_images": 1,
@@ -239,10 +240,12 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
     ny, nx = harness.grid
     image = harness.image_grid
     p, n = harness.n_images, harness.n_stars
-    has_map, has_weights, has_exposure_map, has_mu, has_smoothing = (
+    has_map, has_weights, has_exposure_map, has_mu, has_smoothing, has_smoothing_map = (
         harness.scene.get(f"has_{what}", False)
-        for what in ("background_map", "weights", "exposure_map", "mu", "smoothing")
-    )
+        for what in (
+            "background_map", "weights", "exposure_map", "mu", "smoothing", "smoothing_map"
+        )
+    )  # fmt: skip
     own = functools.partial(rounded, dtype=harness.dtype)
 
     def half_spectra(count: int) -> NDArray:
@@ -295,6 +298,7 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         slope=own(rng.uniform(-0.5, 1.0, (1, ny, nx))) if has_smoothing else 0.0,
         curvature=own(rng.random((1, ny, nx))) if has_smoothing else 0.0,
         smoothing=float(np.float32(0.4)) if has_smoothing else 0.0,
+        smoothing_map=own(rng.random((1, ny, nx))) if has_smoothing_map else None,
         edge=float(np.float32(0.3)),
         cross_information=cross_information,
         mu=float(np.float32(0.25)) if has_mu else 0.0,
