@@ -16,7 +16,8 @@ from lnocl.simulation import hh34
 
 N, STAR = 128, (64.0, 32.0)
 BACKGROUND, FLUX = 20.0, 5e5
-RUN = {"stop": None, "n_iter": 60}
+# A number for the smoothing: else PSFs and positions would be mended.
+RUN = {"stop": None, "n_iter": 60, "smoothing": 0}
 
 
 def moffat(fwhm, n=65):

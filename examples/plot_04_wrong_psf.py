@@ -3,7 +3,7 @@ A PSF that is wrong
 ===================
 
 A wrong PSF is the commonest fault of a reconstruction. This page shows how it looks, and how
-``refine_psfs`` mends one: before the reconstruction it fits the PSF to the star.
+the defaults mend one: before the reconstruction they fit the PSF to the star.
 """
 
 # %%
@@ -27,12 +27,13 @@ observation = lnocl.Observation(
     seen.images, wide_psfs, background=seen.background, read_noise=seen.read_noise
 )
 options = {"n_iter": 60, "stop": None, "pad": 0}
-given = lnocl.deconvolve(observation, seen.stars, **options)
-refined = lnocl.deconvolve(observation, seen.stars, refine_psfs=["jitter"], **options)
+given = lnocl.deconvolve(observation, seen.stars, smoothing=0, **options)
+refined = lnocl.deconvolve(observation, seen.stars, **options)
 
 # %%
-# "jitter" is a blur, or the reverse, of unknown widths in all directions. The misfit is the
-# reduced chi squared round the star: 1 where the PSFs are right. The :term:`restoration error` is
+# Where ``smoothing`` is a number, PSFs are taken as given; by default a blur, or the reverse, of
+# unknown widths in all directions is fitted, and a shift of each image. The misfit is the reduced
+# chi squared at the star: 1 where the PSFs are right. The :term:`restoration error` is
 # that of the jet.
 
 found = refined.psf_refinement

@@ -81,7 +81,6 @@ plt.show()
 
 # %%
 # Light right below the quasar looks as the quasar does, and is counted as its. That is little of
-# the quasar's flux: it is right to 0.06 %. Where PSFs are to be refined as well,
-# ``round_source=True`` says that the source lies all round the star.
+# the quasar's flux: it is right to 0.06 %.
 #
 # See also :doc:`/guide/stars` and :doc:`/guide/method`.

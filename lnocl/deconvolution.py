@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -18,10 +19,12 @@ from lnocl.runs.halves import Halves
 from lnocl.runs.held_out import HeldOutCounts
 from lnocl.runs.held_out import most_bytes as most_bytes_of_halves
 from lnocl.runs.options import (
+    CONVERGED,
     check_choices,
     check_families,
     check_length,
     check_observation,
+    check_refine_positions,
     check_types,
     read_penalties,
     read_start,
@@ -34,6 +37,7 @@ from lnocl.runs.start import Setup, make_start
 from lnocl.runs.stopping import Rule, make_rule
 from lnocl.scene.noise_check import warn_of_noise
 from lnocl.scene.observation import Observation
+from lnocl.scene.penalty import Penalty
 from lnocl.scene.star_check import warn_of_stars
 from lnocl.scene.stars import check_positions
 
@@ -55,9 +59,8 @@ def deconvolve(
     initial_star_fluxes: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: bool = False,
-    refine_positions: bool = False,
-    refine_psfs: Iterable[str] = (),
-    round_source: bool = False,
+    refine_positions: bool | str = "auto",
+    refine_psfs: Iterable[str] = "auto",
     checkpoint: str | PathLike[str] | None = None,
     checkpoint_every: float = 60.0,
     resume: str | PathLike[str] | None = None,
@@ -106,7 +109,8 @@ def deconvolve(
         down that grows with the iterations, most of all beside bright stars. "auto" is a tenth of
         the noise of the data term's gradient, ``0.1 sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, with < >
         the mean over pixels. With held-out counts it is 0, or 1, 3 or 10 times that, whichever they
-        choose (:doc:`/validation/sgp`).
+        choose (:doc:`/validation/sgp`). Where PSFs do not fit the stars it is 3 times that, and
+        more near the stars. See Notes.
     solver : {"sgp", "sgm"}, optional
         Iteration to use. "sgp" is the scaled gradient projection method. It solves for the star
         fluxes at the start, so that those given matter little. "sgm" is the split-gradient method,
@@ -116,9 +120,11 @@ def deconvolve(
         number of them.
     stop : "held-out", "discrepancy", float or None, optional
         Rule by which to stop before `n_iter`. "held-out": the result is that of the iteration that
-        held-out counts choose (see Notes). "discrepancy": when the data term has fallen to its
-        expectation for Poisson counts of the model's means. A number in (0, 1): when the relative
-        change of the objective in an iteration, averaged over ten, is below it. None: at `n_iter`.
+        held-out counts choose (see Notes); where PSFs do not fit, which held-out counts do not
+        notice, when the objective falls by less than 1e-6 of itself. "discrepancy": when the data
+        term has fallen to its expectation for Poisson counts of the model's means. A number in
+        (0, 1): when the relative change of the objective in an iteration, averaged over ten, is
+        below it. None: at `n_iter`.
     precision : {"single", "double"}, optional
         Arithmetic of the OpenCL engine. The NumPy reference always computes in double.
     engine : {"opencl", "numpy"}, optional
@@ -148,16 +154,16 @@ def deconvolve(
     progress : bool, optional
         Show a progress bar on stderr, where that is a terminal, with the objective or the quantity
         of the stopping rule.
-    refine_positions : bool, optional
+    refine_positions : bool or "auto", optional
         Move the stars to where they are most likely, at most 3 pixels away. Fisher scoring of all
         fluxes and positions does so, with the extended source held fixed
         (`lnocl.solvers.positions`). It runs at the start and after 3, 6, 12, 24 ... iterations.
-    refine_psfs : iterable of {"shift", "jitter", "strehl", "pupil", "modes", "pixels"}, optional
-        Parameters of each PSF to fit before the reconstruction, with the stars, and with the
-        extended source marginalised. See Notes. At least one star.
-    round_source : bool, optional
-        Whether the extended source lies all round a star, as a disc, a ring or a host. Otherwise
-        light that lies all round a star is taken for the star's while its PSF is refined.
+        "auto": where that mends a misfit, and `smoothing` is "auto" too. See Notes.
+    refine_psfs : iterable of {"shift", "jitter", "strehl", "pupil", "modes", "pixels"}, or "auto"
+        Parameters of each PSF to fit before the reconstruction where it does not fit, with the
+        stars, and with the extended source marginalised. "auto", where `smoothing` is "auto" too,
+        is jitter, for several images shift, and strehl, pupil and modes where the observation has
+        what they need. An empty sequence is for none. See Notes. At least one star.
     checkpoint : str or path, optional
         File for checkpoints (FITS): written after the first iteration, then every
         `checkpoint_every` seconds, and at the end. Each replaces the one before once it is
@@ -203,7 +209,7 @@ def deconvolve(
         - PSFs vary by more than a fifth over an image that has one for its extended source.
         - A PSF is a tenth wider or narrower than a star.
         - A star is not at the position given, or lies on bad pixels of all images.
-        - PSFs to be refined, or of a given scatter, have an error of more than 3 % at the stars.
+        - PSFs have an error of more than 3 % at the stars that refining has not mended.
         - Images are offset by more than `pad` and the grid leave room for.
         - Single precision is expected to stray from double by a thousandth of the extended source.
         - The noise of an image is not that of Poisson counts, or neighbouring pixels share theirs.
@@ -243,10 +249,20 @@ def deconvolve(
     - "modes", the coefficients of ``psf_modes``;
     - "pixels", each pixel, as far as ``psf_scatter`` or the residuals allow; for two stars or more.
 
-    The PSFs given stand unless chi squared exceeds its expectation by two standard deviations, with
-    "pixels" by five, and falls by 0.65 of that. Star positions that are not refined are taken for
-    right. The error that is left is estimated. Where it exceeds the noise at the stars it is added
-    to that, and always where it is given as ``psf_scatter`` (:doc:`/validation/psf`).
+    **PSFs that do not fit** leave light beside a star, and an extended source that is free there
+    takes it up. So PSFs are judged by short runs in a window round the stars. In these the
+    extended source is smoothed near the stars as strongly as the PSFs' own error asks for, which
+    the residuals at the stars show (`lnocl.scene.psf_misfit`, `lnocl.runs.guarded_runs`). Where
+    their chi squared exceeds its expectation by five standard deviations, positions and PSFs are
+    refined as far as they may be, and used where they leave less than half of the error. What is
+    left, a relative error κ of the PSFs, adds to λ twice the standard deviation of the data
+    term's gradient by it, ``2 sqrt(sum_j (A_j^2)^T (κ S_j / m_j)^2)``, with S_j the starlight. So
+    does a ``psf_scatter`` that is given. The run then ends where the objective hardly changes any
+    more (:doc:`/validation/psf`). Where `smoothing` is a number, none of this is done unless
+    `refine_psfs` names families; then it is as given. PSFs that vary over the field are not judged.
+
+    Stars whose positions are not refined are taken to be where they are given. Free pixels are used
+    only where they also change no star's flux by more than κ.
 
     **The split-gradient method** lowers the objective at every iteration where PSFs are not
     negative. With many negative pixels, as in a raw frame of a star, the objective may rise again.
@@ -286,22 +302,32 @@ def deconvolve(
     observation = copy(observation)  # its arrays are read-only, but its attributes may be replaced
     check_choices(solver, precision, engine, device)
     check_length(n_iter, stop)
-    check_types(
-        callback, progress=progress, refine_positions=refine_positions, round_source=round_source
-    )
-    fits_stars = solver == "sgp" or bool(refine_positions)
+    check_types(callback, progress=progress)
+    check_refine_positions(refine_positions)
+    fits_stars = solver == "sgp" or refine_positions is True
     positions = check_positions(stars, observation)
     initial_extended, initial_star_fluxes = read_start(
         observation, fits_stars, initial_extended, initial_star_fluxes
     )
-    families = check_families(refine_psfs, observation, positions, refine_positions)
-    setup = Setup(positions, pad, solver, precision, engine, device, refine_positions)
-    refinement, read_noise = None, observation.read_noise
-    if families or len(observation.psf_scatter):
-        from lnocl.runs.psf_refinement import refine_psfs as refine  # which loads scipy
+    Penalty(mu)  # which refuses what is no weight
+    is_auto = isinstance(smoothing, str) and smoothing == "auto" and len(positions) > 0
+    is_auto = is_auto and not observation.psf_fields  # which are not judged
+    families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
+    moves = refine_positions if is_auto else refine_positions is True
+    setup = Setup(positions, pad, solver, precision, engine, device, moves is True)
+    refinement, near_stars = None, None
+    if is_auto or families or len(observation.psf_scatter):
+        from lnocl.runs.psf_refinement import mend  # which loads scipy
 
-        observation, refinement = refine(setup, observation, families, round_source)
-    penalties = read_penalties(mu, smoothing, stop, observation)
+        is_asked = bool(families) and not isinstance(refine_psfs, str)
+        with suppress(NotFiniteError):  # of which the run itself tells
+            observation, is_moved, refinement, near_stars = mend(
+                setup, observation, families, moves, is_asked
+            )
+            setup = replace(setup, refine_positions=is_moved)
+    penalties = read_penalties(mu, smoothing, stop, observation, near_stars)
+    if is_auto and near_stars is not None and stop == "held-out":
+        stop = CONVERGED
     if engine == "opencl" and precision == "single":
         warn_of_rounding(int(n_iter))
     inputs = partial(
@@ -334,7 +360,7 @@ def deconvolve(
             del start, largest  # which hold arrays of the grid
             stop_reason = _complete(run, make_rule(stop), callback, bar, checkpointer)
             outcome = run.outcome(penalties[0], stop_reason)
-        return make_result(replace(outcome, psf_refinement=refinement, read_noise=read_noise))
+        return make_result(replace(outcome, psf_refinement=refinement))
 
 
 def _choose(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 import warnings
@@ -26,6 +27,19 @@ def ignored_warnings(category: type[Warning] = Warning) -> Iterator[None]:
     with LOCK, warnings.catch_warnings():
         warnings.simplefilter("ignore", category)
         yield
+
+
+@contextmanager
+def ignored_notes() -> Iterator[None]:
+    """Leave the notes of the log unsaid."""
+    log = logging.getLogger("lnocl")
+    with LOCK:
+        level = log.level
+        log.setLevel(logging.WARNING)
+        try:
+            yield
+        finally:
+            log.setLevel(level)
 
 
 @contextmanager

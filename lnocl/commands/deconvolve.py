@@ -65,7 +65,7 @@ def _solve_tiles(
 
     if arguments.bootstrap is not None:
         raise InputError("replicas are of one run, not of tiles; leave bootstrap out")
-    for name in ("checkpoint", "checkpoint_every", "resume", "refine_psfs", "round_source"):
+    for name in ("checkpoint", "checkpoint_every", "resume", "refine_psfs"):
         if parameters.pop(name, PARAMETERS[name]) not in (PARAMETERS[name], []):
             raise InputError(f"{name} is not for tiles; leave it out")
     return deconvolve_tiles(
@@ -176,7 +176,10 @@ def _given(values: Mapping[str, Any], names: Any) -> dict[str, Any]:
 def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parameters of `lnocl.deconvolve`; in the shell, no rule has a name."""
     rule = None if given["stop"] == "none" else given["stop"]
-    return _given(given, PARAMETERS) | {"stop": rule}
+    parameters = _given(given, PARAMETERS) | {"stop": rule}
+    if parameters.get("refine_psfs") == ["none"]:
+        parameters["refine_psfs"] = []
+    return parameters
 
 
 def _repeated(given: Mapping[str, Any], frames: Frames) -> dict[str, Any]:

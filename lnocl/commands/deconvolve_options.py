@@ -180,19 +180,27 @@ OPTIONS = {
             default=None,  # for no card where it is not given
             dest="refine_positions",
             card=("REFINED", "star positions"),
-            help="fit the positions of the stars too, each within 3 pixels of the one given",
+            help="fit the positions of the stars too, each within 3 pixels of the one given; by "
+            "default that is done where it mends a misfit at the stars and smoothing is chosen",
+        ),
+        option(
+            "--no-refine",
+            action="store_false",
+            default=None,  # as above
+            dest="refine_positions",
+            help="take the positions of the stars as given",
         ),
         option(
             "--refine-psfs",
             nargs="+",
-            choices=tuple(FAMILIES),
-            default=[],
+            choices=(*FAMILIES, "none"),
             metavar="WHAT",
             card=("REFPSF", "asked of the PSFs"),
-            help="fit the PSFs to the stars before the reconstruction, and use them where they fit "
-            "better: shift, jitter (a blur, or a sharpening), strehl (needs --ideal-psf or "
-            "--pupil), pupil (phases; needs --pupil), modes (needs --psf-modes), pixels "
-            "(needs two stars); at least one star",
+            help="fit the PSFs to the stars before the reconstruction where they do not fit, and "
+            "use them where they fit better: shift, jitter (a blur, or a sharpening), strehl "
+            "(needs --ideal-psf or --pupil), pupil (phases; needs --pupil), modes (needs "
+            "--psf-modes), pixels (needs two stars), none; by default, where smoothing is chosen, "
+            "jitter, of several images shift, and those whose files are given",
         ),
         option(
             "--ideal-psf",
@@ -227,16 +235,8 @@ OPTIONS = {
             metavar="FILE",
             checksum="SSUM",
             help="FITS file with the standard deviation of the pixels of a PSF of unit sum, in an "
-            "extension SCATTER, as lnocl psf writes it, or as its image: it is added to the noise "
-            "at the stars; one for all images or one for each",
-        ),
-        option(
-            "--round-source",
-            action="store_true",
-            default=None,  # for no card where it is not given
-            card=("ROUND", "the source lies all round a star"),
-            help="with --refine-psfs: a disc, ring or host lies all round a star, so that what "
-            "does is not the PSF's",
+            "extension SCATTER, as lnocl psf writes it, or as its image: the smoothing near "
+            "stars follows it; one for all images or one for each",
         ),
         option(
             "--zero-point",

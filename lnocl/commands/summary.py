@@ -93,23 +93,12 @@ def _verdict(
         if found.has_halo:
             lit.append(f"({x:.7g}, {y:.7g}), {100 * found.halo:.0f} %")
     verdict = []
-    refinement = result.psf_refinement
-    if refinement is not None and refinement.is_noise:
-        verdict.append(
-            f"the PSFs are wrong by {100 * refinement.psf_error:.2g} %, which the noise at the "
-            "stars was raised by: do not trust the sky near them, and give better PSFs"
-        )
     if unfitted:
         verdict.append(
             f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
-            f"{' '.join(unfitted[:3])}: its PSF or its position is wrong; try --refine, "
-            "--refine-psfs jitter, with two stars or more jitter pixels, or another PSF"
+            f"{' '.join(unfitted[:3])}: give a better PSF"
+            + (", or try --refine-psfs jitter pixels" if len(at_stars) > 1 else "")
         )
-        if result.stop_reason == "held-out":
-            verdict.append(
-                "held-out counts share this error and choose too many iterations: compare with "
-                "fewer, by --n-iter and --stop none, once the PSF is better"
-            )
     elif overall is not None and overall.is_misfit:
         verdict.append("the model does not fit: see to background, noise and gain")
     if dark:

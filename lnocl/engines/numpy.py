@@ -92,10 +92,11 @@ class ReferenceEngine:
         )
         smoothness = 0.0
         if self.scene.is_smoothed:
-            weight = self.scene.smoothing_map
-            weight = self.scene.smoothing if weight is None else weight
+            weights = self.scene.smoothing_map
             self._slope, self._curvature, smoothness = smooth(
-                self._extended, weight, self.scene.edge
+                self._extended,
+                self.scene.smoothing if weights is None else weights,
+                self.scene.edge,
             )
         objective, self._star_corrections = collect_sums(
             self._data_term,

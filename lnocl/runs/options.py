@@ -25,6 +25,14 @@ PAPER: dict[str, Any] = {"solver": "sgm", "stop": None, "smoothing": 0.0, "pad":
 # Of the smoothing that is recommended, from which held-out counts choose besides none.
 MULTIPLES = (1.0, 3.0, 10.0)
 
+# And that of which is taken where PSFs are wrong.
+WRONG_PSFS = 3.0
+# Such runs end where the objective falls by less than this share of itself in an iteration.
+CONVERGED = 1e-6
+
+# Families of PSFs, and what an observation must have for them.
+NEEDS = {"strehl": "ideal_psfs", "pupil": "pupils", "modes": "psf_modes"}
+
 PRECISIONS = ("single", "double")
 ENGINES = ("opencl", "numpy")
 STOPS = ("held-out", "discrepancy")
@@ -76,21 +84,46 @@ def check_choices(solver: str, precision: str, engine: str, device: object) -> N
         raise InputError(f"engine numpy uses no device; leave device {device!r} out")
 
 
+def check_refine_positions(value: object) -> None:
+    """Refuse anything but True, False and "auto".
+
+    Raises
+    ------
+    InputError
+        It is something else.
+    """
+    if not (isinstance(value, (bool, np.bool_)) or (isinstance(value, str) and value == "auto")):
+        raise InputError(f"refine_positions must be True, False or auto; {value!r} was given")
+
+
 def check_families(
-    names: object, observation: Observation, positions: Array, refine_positions: bool
+    names: object,
+    observation: Observation,
+    positions: Array,
+    refine_positions: bool | str,
+    is_auto: bool,
 ) -> tuple[str, ...]:
-    """Return the families of PSFs to refine.
+    """Return the families of PSFs that may be refined.
+
+    "auto" stands for those that any star shows, or for none where not all `is_auto`.
 
     Raises
     ------
     InputError
         A name is unknown, or one text is given instead of several; there is no star; the PSFs vary
-        over the field; ideal PSFs,
-        pupils or modes are lacking; pupils differ in their apertures; pixels are asked of one star,
-        or a shift of one image beside free positions.
+        over the field; ideal PSFs, pupils or modes are lacking; pupils differ in their apertures;
+        pixels are asked of one star, or a shift of one image beside free positions.
     """
+    if len(observation.psf_scatter) and not len(positions):
+        raise InputError(
+            "psf_scatter is the error of PSFs at stars; give stars, or leave psf_scatter out"
+        )
+    if isinstance(names, str) and names == "auto":
+        names = automatic_families(observation) if is_auto else ()
     if isinstance(names, str) or not isinstance(names, Iterable):
-        raise InputError(f"refine_psfs is {names!r}; give a sequence of {', '.join(FAMILIES)}")
+        raise InputError(
+            f"refine_psfs is {names!r}; give auto, or a sequence of {', '.join(FAMILIES)}"
+        )
     found = tuple(names)
     for name in found:
         if not (isinstance(name, str) and name in FAMILIES):
@@ -102,10 +135,7 @@ def check_families(
         )
     if found and not len(positions):
         raise InputError("refine_psfs needs a star, whose image shows the PSF; give stars")
-    if len(observation.psf_scatter) and not len(positions):
-        raise InputError("psf_scatter is the noise at stars; give stars, or leave psf_scatter out")
-    needs = {"strehl": "ideal_psfs", "pupil": "pupils", "modes": "psf_modes"}
-    for name, needed in needs.items():
+    for name, needed in NEEDS.items():
         if name in found and not getattr(observation, needed).size:
             raise InputError(f"refine_psfs {name} needs {needed}; give them, or leave {name} out")
     if "pupil" in found:
@@ -118,12 +148,19 @@ def check_families(
             "refine_psfs pixels needs two stars or more, since the pixels of one PSF may mimic any "
             "sky; give more stars, or leave pixels out"
         )
-    if "shift" in found and refine_positions and observation.n_images == 1:
+    if "shift" in found and refine_positions is True and observation.n_images == 1:
         raise InputError(
             "refine_psfs shift of one image is told from nothing but the stars' places; leave it "
             "out, or refine_positions"
         )
     return found
+
+
+def automatic_families(observation: Observation) -> tuple[str, ...]:
+    """Return the families that any star shows, where the observation has what they need."""
+    shift = ("shift",) if observation.n_images > 1 else ()
+    known = tuple(name for name, needed in NEEDS.items() if getattr(observation, needed).size)
+    return (*shift, "jitter", *known)
 
 
 def check_length(n_iter: object, stop: object) -> None:
@@ -199,9 +236,16 @@ def read_start(
 
 
 def read_penalties(
-    mu: Any, smoothing: Any, stop: object, observation: Observation
+    mu: Any,
+    smoothing: Any,
+    stop: object,
+    observation: Observation,
+    near_stars: Array | None = None,
 ) -> list[Penalty]:
     """Return the penalty; for smoothing "auto" with held-out counts those to choose from.
+
+    There is one alone where the PSFs are wrong: held-out counts share that error, and choose too
+    little. `near_stars` is the weight that the error asks for near stars.
 
     Raises
     ------
@@ -215,6 +259,13 @@ def read_penalties(
     if smoothing != "auto":
         raise InputError(f"smoothing {smoothing!r} is not known; give a number or auto")
     recommended = recommend_smoothing(observation)
+    if near_stars is not None:
+        weight = WRONG_PSFS * recommended
+        log.info(
+            f"smoothing chosen: {weight:.3g}, and up to {near_stars.max():.3g} more at the stars, "
+            "by the error of the PSFs"
+        )
+        return [Penalty(mu, weight, near_stars=near_stars)]
     if stop == "held-out":
         return [Penalty(mu, multiple * recommended) for multiple in (0.0, *MULTIPLES)]
     log.info("smoothing chosen: %.3g, by the noise of the counts", recommended)

@@ -19,7 +19,7 @@ CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("er
 
 @dataclass(frozen=True)
 class PsfRefinement:
-    """The outcome for PSFs that were to be refined, or whose scatter was given.
+    """The outcome for PSFs that do not fit, were to be refined, or whose scatter was given.
 
     Attributes
     ----------
@@ -29,22 +29,18 @@ class PsfRefinement:
         The values found for them, whether they were accepted or not; lengths in pixels of the
         images.
     misfit : tuple of float
-        The reduced chi squared of the images for the given PSFs and for the refined ones, with the
-        extended source marginalised: 1 for noise alone.
+        The reduced chi squared at the stars (`lnocl.scene.psf_misfit`), of the given PSFs and of
+        those last tried: 1 for noise alone.
     is_accepted : bool
-        Whether the refined PSFs are used. Chi squared of those given then exceeds its expectation
-        by two standard deviations, with "pixels" by five. The refined ones take away 0.65 of that.
+        Whether the refined PSFs are used. The misfit of those given then exceeds its expectation by
+        five standard deviations, and the refined ones leave less than half of their error.
     psf_error : float
-        Relative error that the PSFs used still have, by the corrections of their pixels that fit
-        the images best (`lnocl.runs.psf_errors`), or as given by ``psf_scatter``. It hardly shows a
-        PSF that is too wide or too narrow where a wider source explains the images as well.
+        Relative error that the PSFs used still have at the stars, or as given by ``psf_scatter``; 0
+        where it is not told from noise.
     edges : ndarray of float64, shape (k + 1,)
         Radii of rings round a star, pixels.
     errors_in_rings : ndarray of float64, shape (k,)
         The same error in each ring.
-    is_noise : bool
-        Whether this error was added to the noise. It was given, or it exceeds the noise of the
-        counts at the stars and is at most 0.15.
     may_be_faked : ndarray of float64, of the shape of the extended source
         Light that this error may fake in the sky, electrons per pixel. In each ring it is the error
         times the light of the stars, as the PSFs spread it, over the square root of p.
@@ -64,8 +60,8 @@ class PsfRefinement:
     >>> psf /= psf.sum()
     >>> observation = lnocl.Observation(5 + 1000 * psf, psf, psf_scatter=0.01 * psf)
     >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=5, engine="numpy")
-    >>> result.psf_refinement.is_accepted, result.psf_refinement.is_noise
-    (False, True)
+    >>> result.psf_refinement.is_accepted
+    False
     >>> round(result.psf_refinement.psf_error, 4)
     0.01
     """
@@ -77,7 +73,6 @@ class PsfRefinement:
     psf_error: float
     edges: Array
     errors_in_rings: Array
-    is_noise: bool
     may_be_faked: Array
 
     def table(self) -> NDArray[np.void]:
@@ -102,10 +97,9 @@ class PsfRefinement:
         before, after = self.misfit
         return [
             ("PSFUSED", self.is_accepted, "whether refined PSFs are used"),
-            ("PSFMIS1", before, "reduced chi squared, PSFs as given"),
-            ("PSFMIS2", after, "reduced chi squared, PSFs refined"),
+            ("PSFMIS1", before, "chi squared at stars, PSFs as given"),
+            ("PSFMIS2", after, "chi squared at stars, PSFs refined"),
             ("PSFERR", self.psf_error, "relative error that the PSFs used have"),
-            ("PSFNOISE", self.is_noise, "whether it was added to the noise"),
         ]
 
 
@@ -137,8 +131,6 @@ class Outcome:
         Returns where a run of the observation starts, given the penalty.
     psf_refinement : PsfRefinement or None
         None where the PSFs were not to be refined.
-    read_noise : ndarray of float64 or None
-        That of the counts, where `scene` has the error of the PSFs added to it.
     """
 
     scene: Scene
@@ -152,7 +144,6 @@ class Outcome:
     restart: Callable[[Penalty], Start]
     curve: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
     psf_refinement: PsfRefinement | None = None
-    read_noise: Array | None = None
 
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of star fluxes and positions, the extended source not known.

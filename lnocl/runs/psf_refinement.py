@@ -1,53 +1,108 @@
-"""PSFs that are refined from the images before the reconstruction, and whether that helped."""
+"""PSFs and positions that the images show to be wrong: mended where that helps, else allowed for.
+
+All is judged by one number, the error kappa of the PSFs that is left at the stars in
+`lnocl.runs.guarded_runs`: whether anything is wrong, whether a mend is taken, and how strongly the
+extended source is smoothed near the stars because of what could not be mended.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from lnocl.errors import warn
+from lnocl.process import ignored_warnings
+from lnocl.runs.guarded_runs import (
+    FIRST_ERROR,
+    Estimate,
+    GuardedRuns,
+    estimate_scatter,
+    rings_of,
+    with_psfs,
+)
 from lnocl.runs.outcome import PsfRefinement
-from lnocl.runs.psf_errors import PsfErrors
-from lnocl.runs.short_runs import Estimate, ShortRuns, estimate_scatter, find_window, with_psfs
-from lnocl.runs.start import Setup
+from lnocl.runs.start import Setup, make_model
+from lnocl.scene.detector import on_sky
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters
-from lnocl.solvers.psf_fit import Misfit, step
+from lnocl.scene.psf_misfit import PsfMisfit, smoothing_near_stars
+from lnocl.scene.psf_wings import without_negatives
+from lnocl.scene.rings import Rings
+from lnocl.scene.scene import Scene
+from lnocl.solvers.psf_fit import step
 
 log = logging.getLogger("lnocl")
 
-# Each round begins with the estimate after so many iterations with the present PSFs, and takes so
-# many steps from it. After fewer than 15 the extended source is too smooth, and the PSFs follow it.
-ITERATIONS, STEPS = (15, 15, 30), 2
-# Free pixels follow the noise in more steps than these.
-PIXEL_ITERATIONS, PIXEL_STEPS = (15, 15, 15, 15), 1
-# Refined PSFs are used where chi squared of those given exceeds its expectation by so many standard
-# deviations, and this share of that is mended.
-WRONG, MENDED = 2.0, 0.65
-# Free pixels may err by so many times what residuals show.
-LOOSE = 3.0
-# Where the PSFs' error exceeds the noise at the stars so many times, it is made a part of it: else
-# held-out counts, which do not see it, run until it ruins the sky near the star.
-RUINOUS = 4.0
-# PSFs that are wrong by more than this are not told from the sky, whatever their noise.
-HOPELESS = 0.15
+# A mend is taken where it leaves less than this share of kappa.
+MENDED = 0.5
+# Rounds of a search: each takes so many steps, and judges the PSFs. It ends where a round lowers
+# the misfit by less than so many of its standard deviations.
+ROUNDS, STEPS, IMPROVED = 4, 2, 0.3
+# PSFs are next taken to be wrong by so many times what they were, at most by `FIRST_ERROR`.
+LOOSE = 2.0
 # Of PSFs that are wrong by more than this it is warned.
-WORTH_SAYING = 0.03
+NOTABLE = 0.03
+# Where PSFs give so little of their peak, nothing is known of them.
+DARK = 1e-9
 # A step is halved so often, at most, until no OTF exceeds its value at frequency 0.
 MAX_HALVED = 10
 
 
-def refine_psfs(
-    setup: Setup, observation: Observation, names: Sequence[str], is_round: bool
-) -> tuple[Observation, PsfRefinement]:
-    """Return the observation with the PSFs that fit better, and what was found.
+class Mended(NamedTuple):
+    """An observation whose PSFs and positions fit as well as could be found.
 
-    Rounds of short runs, from the estimate of which parameters, star fluxes and perhaps positions
-    are fitted (`lnocl.solvers.psf_fit`), in a window round the stars. What the extended source has
-    all round a star is taken for the star's, unless it is round itself, and so is what the error of
-    its PSFs may have left there. The given PSFs stand where the refined ones mend too little.
+    Attributes
+    ----------
+    observation : Observation
+        With the refined PSFs, where they are used.
+    moves : bool
+        Whether stars are to be moved.
+    refinement : PsfRefinement or None
+        The outcome for the PSFs; None where they fit, and nothing was asked of them.
+    near_stars : ndarray of float64, of the shape of the extended source, or None
+        The weight of the edge-preserving term that the error of the PSFs asks for; None for 0.
+    """
+
+    observation: Observation
+    moves: bool
+    refinement: PsfRefinement | None
+    near_stars: Array | None
+
+
+@dataclass(frozen=True)
+class _State:
+    """PSFs, the estimate by which they are judged, and whether stars may move for them."""
+
+    psfs: Array
+    estimate: Estimate
+    moves: bool
+
+    @property
+    def misfit(self) -> PsfMisfit:
+        return self.estimate.misfit
+
+    @property
+    def error(self) -> float:
+        """The relative error of the PSFs, 0 where it is not told from noise."""
+        return self.misfit.kappa if self.misfit.is_significant else 0.0
+
+    def is_mended_by(self, other: _State) -> bool:
+        """Return whether other PSFs or positions mend enough to be taken."""
+        return other.misfit.kappa < MENDED * self.misfit.kappa
+
+
+def mend(
+    setup: Setup, observation: Observation, names: Sequence[str], moves: bool | str, is_asked: bool
+) -> Mended:
+    """Return an observation whose positions and PSFs are mended where the images ask for it.
+
+    Stars are moved first, then negative pixels of PSFs are repaired, the families are fitted, and
+    pixels freed. Each is tried only where the misfit before is significant, and taken only where it
+    leaves less than half of kappa; of the repair any gain is taken, since it has no parameter.
 
     Parameters
     ----------
@@ -56,126 +111,145 @@ def refine_psfs(
     observation : Observation
         The images and the given PSFs.
     names : sequence of str
-        Families of `PsfFamilies`.
-    is_round : bool
-        Whether the extended source lies all round a star.
+        Families of `PsfFamilies` that may be refined.
+    moves : bool or "auto"
+        Whether stars are moved; "auto": where that mends a misfit.
+    is_asked : bool
+        Whether the outcome is wanted though PSFs may fit.
     """
-    window, stars, first = find_window(setup, observation)
-    runs = ShortRuns(setup, window, stars, is_round)
-    before, of_given = runs.judge(observation.psfs)
-    families = PsfFamilies([name for name in names if name != "pixels"], observation)
-    values = np.zeros((observation.n_images, 0))
-    refined, after, of_refined = observation.psfs, before, of_given
-    if families.parameters:
-        refined, values = _find(runs, families, setup.refine_positions)
-        after, of_refined = runs.judge(refined)
-    if "pixels" in names:  # which are to mend what the others leave
-        pixels = _pixels(observation, refined, of_refined)
-        schedule = PIXEL_ITERATIONS, PIXEL_STEPS
-        found = _search(runs, pixels, pixels.first(), schedule, setup.refine_positions)
-        refined = pixels.psfs(found)
-        after, of_refined = runs.judge(refined)
-    is_accepted = _mends(before, after, "pixels" in names)
-    final, estimate, known = before, of_given, observation.psf_scatter
+    runs = GuardedRuns(setup, observation)
+    given = _State(
+        observation.psfs, runs.fit(observation.psfs, runs.stars, moves is True), moves is True
+    )
+    state = given
+    if state.misfit.is_significant and moves == "auto":
+        state = _move(runs, state)
+    if state.misfit.is_significant and names and (observation.psfs < 0).any():
+        state = _repair(runs, state)
+    families = PsfFamilies(
+        [name for name in names if name != "pixels"], with_psfs(observation, state.psfs)
+    )
+    values, tried = np.zeros((observation.n_images, len(families.prior))), state
+    if state.misfit.is_significant and families.parameters:
+        tried, values = _fit(runs, families, state, moves is not False)
+        state = tried if state.is_mended_by(tried) else state
+    if state.misfit.is_significant and "pixels" in names:
+        tried = _free_pixels(runs, observation.psf_scatter, state, moves is not False)
+        state = tried if _is_trusted(state, tried) else state
+    is_accepted = state.psfs is not observation.psfs
     if is_accepted:
-        observation, final, estimate = with_psfs(observation, refined), after, of_refined
-        known = known[:0] if "pixels" in names else known  # what was scattered is found
-    errors = PsfErrors(observation, estimate, first, final, known)
-    is_noise = len(known) > 0 or (errors.over_noise > RUINOUS and errors.overall <= HOPELESS)
+        observation = with_psfs(observation, state.psfs)
+    known = observation.psf_scatter[: 0 if is_accepted and "pixels" in names else None]
+    _tell(given, state, tried, is_accepted)
+    if not (is_asked or len(known) or given.misfit.is_significant):
+        return Mended(observation, state.moves, None, None)
+    allowance = _Allowance(observation, runs, state, known)
     refinement = PsfRefinement(
         tuple(families.parameters),
         values / families.units,
-        (before.reduced, after.reduced),
+        (given.misfit.reduced, tried.misfit.reduced),
         is_accepted,
-        errors.overall,
-        errors.edges,
-        errors.at_radius,
-        is_noise,
-        errors.in_sky(),
+        allowance.error,
+        allowance.edges,
+        allowance.in_rings,
+        allowance.may_be_faked(),
     )
-    log.info(_told(refinement))
     _warn(refinement)
-    return errors.as_noise() if is_noise else observation, refinement
+    return Mended(observation, state.moves, refinement, allowance.near_stars(setup.pad))
 
 
-def _pixels(observation: Observation, psfs: Array, estimate: Estimate) -> PsfFamilies:
-    """Return PSFs whose pixels are free, as far as their scatter is given, or residuals show it."""
-    scatter = observation.psf_scatter
-    if not len(scatter):
-        scatter = LOOSE * estimate_scatter(psfs, estimate.kappa, observation.oversample)
-    return PsfFamilies(("pixels",), with_psfs(observation, psfs), scatter)
+def _move(runs: GuardedRuns, state: _State) -> _State:
+    """Return the state with the stars where they fit best, where that mends it."""
+    moved = replace(state, estimate=runs.fit(state.psfs, runs.stars, True), moves=True)
+    return moved if state.is_mended_by(moved) else state
 
 
-def _mends(before: Misfit, after: Misfit, are_pixels_free: bool) -> bool:
-    """Return whether refined PSFs mend so much that they are used."""
-    if are_pixels_free and before.is_noise:  # which they may follow
-        return False
-    is_wrong = before.significance > WRONG
-    return is_wrong and before.square - after.square > MENDED * before.excess
+def _repair(runs: GuardedRuns, state: _State) -> _State:
+    """Return the state with PSFs that are not negative, where that lowers the misfit."""
+    psfs = without_negatives(state.psfs, runs.observation.oversample)
+    stars = state.estimate.scene.stars
+    repaired = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
+    return repaired if repaired.misfit.kappa < state.misfit.kappa else state
 
 
-def _told(refinement: PsfRefinement) -> str:
-    before, after = refinement.misfit
-    if before == after:  # nothing was asked to be refined
-        return f"the misfit of the PSFs is {before:.3g}, where noise gives 1"
-    words = "refined" if refinement.is_accepted else "left as given"
-    return f"PSFs {words}: their misfit is {before:.3g}, refined {after:.3g}, where noise gives 1"
-
-
-def _warn(refinement: PsfRefinement) -> None:
-    if refinement.psf_error <= WORTH_SAYING:
-        return
-    words = f"the PSFs do not fit the stars, by {100 * refinement.psf_error:.2g} %"
-    if refinement.psf_error > HOPELESS:
-        warn(f"{words}: give better ones; trust neither the sky near the stars nor their fluxes")
-    elif refinement.is_noise:
-        warn(f"{words}, which is added to the noise: trust nothing faint near the stars")
-    else:
-        warn(f"{words}: trust nothing fainter than this near the stars")
-
-
-def _find(runs: ShortRuns, families: PsfFamilies, moves: bool) -> tuple[Array, Array]:
-    """Return the PSFs that fit best, and their values; the stars' places may be fitted too."""
+def _fit(
+    runs: GuardedRuns, families: PsfFamilies, state: _State, moves: bool
+) -> tuple[_State, Array]:
+    """Return the state with the PSFs of families that fit best, and their values."""
     firsts = [families.first(search) for search in range(families.n_searches)]
-    schedule = ITERATIONS[:-1], STEPS
-    found = [_search(runs, families, first, schedule, moves) for first in firsts]
-    parameters = found[0]
-    if len(found) > 1:
-        parameters = _best_of_each_image(runs, families, found)
-    parameters = _search(runs, families, parameters, (ITERATIONS[-1:], STEPS), moves)
-    return families.psfs(parameters), parameters.values
+    found = [_search(runs, families, first, state, moves) for first in firsts]
+    parameters, fitted = min(found, key=lambda each: each[1].misfit.reduced)
+    if len(found) > 1:  # phases of one image may be right in one search, of another in another
+        squares = [each.misfit.squares for _, each in found]
+        best = np.argmin(squares, axis=0)
+        values = [found[search][0].values[j] for j, search in enumerate(best)]
+        first = parameters._replace(values=np.array(values))
+        again = _search(runs, families, first, fitted, moves)
+        if again[1].misfit.reduced < fitted.misfit.reduced:
+            parameters, fitted = again
+    return fitted, parameters.values
 
 
-def _best_of_each_image(
-    runs: ShortRuns, families: PsfFamilies, found: Sequence[PsfParameters]
-) -> PsfParameters:
-    """Return for each image the parameters that fit it best, of those that were found."""
-    squares = [runs.judge(families.psfs(each))[0].squares for each in found]
-    best = np.argmin(squares, axis=0)
-    values = [found[search].values[j] for j, search in enumerate(best)]
-    return found[0]._replace(values=np.array(values))
+def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) -> _State:
+    """Return the state with PSFs whose pixels are free, as far as scatter or residuals show."""
+    observation = with_psfs(runs.observation, state.psfs)
+    if not len(scatter):
+        rings = state.misfit.in_rings
+        scatter = estimate_scatter(state.psfs, rings, observation.oversample)
+    families = PsfFamilies(("pixels",), observation, scatter)
+    return _search(runs, families, families.first(), state, moves)[1]
+
+
+def _is_trusted(state: _State, tried: _State) -> bool:
+    """Return whether free pixels mend enough, and move no star's flux by more than kappa.
+
+    The wings of free PSFs may take the light of a host, and their cores that of a star.
+    """
+    before, after = state.estimate.fluxes, tried.estimate.fluxes
+    is_near = abs(after - before) <= state.misfit.kappa * before
+    return state.is_mended_by(tried) and bool(is_near.all())
 
 
 def _search(
-    runs: ShortRuns,
+    runs: GuardedRuns,
     families: PsfFamilies,
     parameters: PsfParameters,
-    schedule: tuple[Sequence[int], int],
+    state: _State,
     moves: bool,
-) -> PsfParameters:
-    """Return the parameters after rounds of so many iterations each, and so many steps."""
-    iterations, steps = schedule
-    for n_iter in iterations:
-        found = runs.at(families.psfs(parameters), n_iter)
-        for _ in range(steps):
-            change = step(found.scene, families, parameters, found.extended, found.fluxes, moves)
-            parameters = _follow(families, parameters, change.parameters)
-            if moves:  # which a common shift is not told from
-                parameters, common = families.without_common_shift(parameters)
-                moved = change.positions + common / found.scene.oversample
-                change = change._replace(positions=moved)
-            found = runs.moved(found, families.psfs(parameters), change)
-    return parameters
+) -> tuple[PsfParameters, _State]:
+    """Return the parameters of the least misfit that a search finds, and the state with them."""
+    found: list[tuple[PsfParameters, _State]] = []
+    error, estimate = state.misfit.kappa, state.estimate
+    for _ in range(ROUNDS):
+        parameters, stars = _step(runs, families, parameters, estimate, moves)
+        psfs = families.psfs(parameters)
+        estimate = runs.fit(psfs, stars, moves, min(FIRST_ERROR, LOOSE * error))
+        gain = found[-1][1].misfit.significance - estimate.misfit.significance if found else np.inf
+        found.append((parameters, _State(psfs, estimate, moves)))
+        if gain < IMPROVED:
+            break
+        error = estimate.misfit.kappa
+    return min(found, key=lambda each: each[1].misfit.reduced)
+
+
+def _step(
+    runs: GuardedRuns,
+    families: PsfFamilies,
+    parameters: PsfParameters,
+    estimate: Estimate,
+    moves: bool,
+) -> tuple[PsfParameters, Array]:
+    """Return the parameters and the stars after a few steps from an estimate."""
+    stars = estimate.scene.stars
+    found = runs.moved(estimate, families.psfs(parameters), estimate.fluxes, stars)
+    for _ in range(STEPS):
+        change = step(found.scene, families, parameters, found.extended, found.fluxes, moves)
+        parameters, stars = _follow(families, parameters, change.parameters), change.positions
+        if moves:  # which a common shift is not told from
+            parameters, common = families.without_common_shift(parameters)
+            stars = stars + common / found.scene.oversample
+        found = runs.moved(found, families.psfs(parameters), change.fluxes, stars)
+    return parameters, found.scene.stars
 
 
 def _follow(
@@ -187,3 +261,102 @@ def _follow(
         if families.are_possible(after):
             return after
     return parameters
+
+
+class _Allowance:
+    """The error that PSFs still have, and what follows from it for the extended source.
+
+    Attributes
+    ----------
+    error : float
+        Relative to the PSFs: what is left at the stars, or the scatter that is given.
+    edges, in_rings : ndarray of float64, shapes (k + 1,) and (k,)
+        Radii of rings round a star, pixels, and the error in each.
+    """
+
+    def __init__(
+        self, observation: Observation, runs: GuardedRuns, state: _State, scatter: Array
+    ) -> None:
+        self._observation, self._estimate, self._held = observation, state.estimate, runs.held
+        self._moved = state.estimate.scene.stars - runs.stars
+        self._stars = runs.all_stars
+        self.error, shares = state.error, state.misfit.in_rings * bool(state.error)
+        rings = rings_of(observation.psfs, observation.oversample)
+        if len(scatter):
+            errors, lights = (
+                np.bincount(rings.number.ravel(), (each**2).sum(axis=0).ravel())
+                for each in (scatter, observation.psfs)
+            )
+            self.error = max(self.error, float(np.sqrt(errors.sum() / lights.sum())))
+            # Where PSFs give next to nothing, a share of them means nothing.
+            least = np.bincount(rings.number.ravel()) * (DARK * observation.psfs.max()) ** 2
+            known = np.divide(errors, lights, out=np.zeros_like(errors), where=lights > least)
+            k = max(len(shares), len(known))
+            shares, known = (np.pad(each, (0, k - len(each)), "edge") for each in (shares, known))
+            shares = np.maximum(shares, np.sqrt(known))
+        self.in_rings = shares[: len(rings)]
+        self.edges = rings.edges[: len(self.in_rings) + 1]
+
+    def near_stars(self, pad: int | str) -> Array | None:
+        """Return the weight of the edge-preserving term for these errors, None for 0."""
+        if not self.in_rings.any():
+            return None
+        scene, fluxes = self._scene(pad)
+        return smoothing_near_stars(scene, make_model(scene), fluxes, self.in_rings)
+
+    def may_be_faked(self) -> Array:
+        """Return what the errors may fake in the sky, ``kappa(r) sum_s c_s K_s / sqrt(p)``.
+
+        Electrons per pixel of the sky: K is the mean over the PSFs, at the stars.
+        """
+        scene, fluxes = self._scene(0)
+        ny, nx = scene.observation.sky_shape
+        light = np.zeros(scene.grid)
+        for j in range(scene.n_images):
+            for s, flux in enumerate(fluxes):
+                stamp = scene.psf_on_sky(j, s)
+                light[stamp.window(scene.grid)] += flux * scene.unit * stamp.values
+        number = Rings((ny, nx), on_sky(scene.stars, scene.oversample), scene.oversample).number
+        kappa = self.in_rings[np.minimum(number, len(self.in_rings) - 1)]
+        return np.asarray(kappa * light[:ny, :nx] / scene.n_images**1.5)
+
+    def _scene(self, pad: int | str) -> tuple[Scene, Array]:
+        """Return the whole scene with the stars where they were found, and their fluxes."""
+        ny, nx = self._observation.shape
+        stars = self._stars.copy()
+        stars[self._held] += self._moved
+        with ignored_warnings():  # those of the reconstruction are the same
+            scene = Scene(self._observation, stars.clip(0, (nx - 1, ny - 1)), pad=pad)
+        fluxes = scene.start(None, None)[1]
+        fluxes[self._held] = self._estimate.fluxes * self._estimate.scene.unit / scene.unit
+        return scene, fluxes
+
+
+def _tell(given: _State, state: _State, tried: _State, is_accepted: bool) -> None:
+    """Say in a line what was done."""
+    before, after, found = (each.misfit.reduced for each in (given, state, tried))
+    if is_accepted:
+        log.info(
+            f"PSFs refined: their misfit is {after:.3g} instead of {before:.3g}, "
+            "where noise gives 1"
+        )
+    elif state.moves and not given.moves:
+        log.info(
+            f"positions refined: the misfit of the stars is {after:.3g} instead of {before:.3g}, "
+            "where noise gives 1"
+        )
+    elif tried is not given:
+        log.info(
+            f"PSFs left as given: their misfit is {before:.3g}, refined {found:.3g}, "
+            "where noise gives 1"
+        )
+    else:
+        log.info(f"the misfit of the PSFs is {before:.3g}, where noise gives 1")
+
+
+def _warn(refinement: PsfRefinement) -> None:
+    if refinement.psf_error > NOTABLE:
+        warn(
+            f"the PSFs do not fit the stars, by {100 * refinement.psf_error:.2g} %: trust nothing "
+            "fainter than this near the stars"
+        )

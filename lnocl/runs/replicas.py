@@ -71,14 +71,12 @@ class Replicas:
         )
         self._model = Model(scene)
         observation = scene.observation
-        self._noise = self._added = observation.read_noise**2
+        self._added = observation.read_noise**2
         self._pixels = None
         if len(observation.psf_scatter):
             self._pixels = PsfPixels(
                 observation.psfs, observation.psf_scatter, observation.oversample
             )
-            if outcome.read_noise is not None:  # the scatter of PSFs is drawn instead
-                self._noise = outcome.read_noise**2
         with ignored_warnings():  # those of the reconstruction are the same
             self._start = outcome.restart(outcome.penalty)
         self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
@@ -131,7 +129,7 @@ class Replicas:
     def _draw(self, models: Sequence[Array], seeds: Sequence[np.random.SeedSequence]) -> Array:
         """Return counts of these models, shape (p, ny, nx)."""
         with ThreadPoolExecutor() as pool:
-            return np.array(list(pool.map(_draw, models, self._added, self._noise, seeds)))
+            return np.array(list(pool.map(_draw, models, self._added, seeds)))
 
     def _means(self, model: Model, sky: Array) -> Iterator[Array]:
         """Yield the model of each image, electrons."""
@@ -144,12 +142,10 @@ class Replicas:
             yield image[:ny, :nx] * scene.scale
 
 
-def _draw(
-    model: Array, added: Array | float, noise: Array | float, seed: np.random.SeedSequence
-) -> Array:
-    """Return counts with read noise of this variance, and what was added to images and model."""
+def _draw(model: Array, added: Array, seed: np.random.SeedSequence) -> Array:
+    """Return counts with read noise of this variance, which images and model have had added."""
     rng = np.random.default_rng(seed)
     counts = rng.poisson(np.maximum(model - added, 0.0)).astype(np.float64)
-    if np.any(noise):
-        counts += rng.standard_normal(counts.shape) * np.sqrt(noise)
+    if np.any(added):
+        counts += rng.standard_normal(counts.shape) * np.sqrt(added)
     return np.maximum(counts + added, 0.0)

@@ -95,7 +95,11 @@ class SourceError:
 
     def forward(self, x: Array) -> Array:
         """Return the changes of the images, shape (p, Ny, Nx)."""
-        return self.images_of(self._amplitude * self._smooth.apply(x))
+        return self.images_of(self.of(x))
+
+    def of(self, x: Array) -> Array:
+        """Return the change of the extended source, ``a C^(1/2) x``, shape (Ny, Nx)."""
+        return np.asarray(self._amplitude * self._smooth.apply(x))
 
     def adjoint(self, images: Sequence[Array]) -> Array:
         """Return what `forward` is the transpose of, shape (Ny, Nx)."""
@@ -148,15 +152,6 @@ class LeastSquares:
         """Return the changes of the unknowns, from where they are, and of the fields."""
         change, x = self._solve(self._prior * at)
         return change, self._each(x)
-
-    def least_squares(self) -> tuple[Array, float]:
-        """Return the least squares of the images and of priors, from unknowns at their means."""
-        change, x = self._solve(np.zeros_like(self._prior))
-        left = self._left() - self._changes(change) - self._forward(x)
-        squares = [
-            float((e.precision * r * r).sum()) for e, r in zip(self._images, left, strict=True)
-        ]
-        return np.array(squares), float((x * x).sum() + self._prior @ change**2)
 
     def variance(self, unknown: int) -> float:
         """Return the variance of an unknown, the others and the fields not being known either."""

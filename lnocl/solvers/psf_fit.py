@@ -35,8 +35,6 @@ from lnocl.solvers.least_squares import Field, LeastSquares, LinearImage, Source
 CORRELATED, SMOOTHED = 1.5, 4.0
 # Steps of conjugate gradients, and the share of the gradient at which they end.
 N_STEPS, FINISHED = 40, 1e-4
-# Chi squared exceeds its expectation by so many of its standard deviations where PSFs are wrong.
-SIGNIFICANT = 5.0
 # A step moves no parameter by more of its prior's standard deviations, and no star by more pixels.
 MAX_STEP, MAX_MOVE = 3.0, 0.5
 
@@ -92,56 +90,32 @@ def step(
     return PsfStep(of_psfs, to, scene.stars + moved if moves else scene.stars)
 
 
-class Misfit(NamedTuple):
-    """How far an estimate is from the images, whatever error its extended source may have.
+def settle(
+    scene: Scene, model: Model, extended: Array, fluxes: Array, share: float
+) -> tuple[Array, Array]:
+    """Return the estimate nearest to one whose extended source may be off by a share of itself.
 
-    Attributes
+    It is that of the least squares with the PSFs held: ``f + share a C^(1/2) x``, which may be
+    negative, and the star fluxes that go with it.
+
+    Parameters
     ----------
-    squares : ndarray of float64, shape (p,)
-        The least squares with the PSFs held: those of the residuals of each image, weighted.
-    of_source : float
-        And that of the error of the extended source.
-    n_pixels : int
-        Pixels observed.
+    scene : Scene
+        What is modelled.
+    model : Model
+        Of the scene.
+    extended : ndarray of float64, shape (Ny, Nx)
+        Extended source, on the grid and scaled.
+    fluxes : ndarray of float64, shape (n,)
+        Star fluxes, scaled.
+    share : float
+        The standard deviation of f, over its smoothed self.
     """
-
-    squares: Array
-    of_source: float
-    n_pixels: int
-
-    @property
-    def square(self) -> float:
-        """The sum of all: noise alone gives `n_pixels`."""
-        return float(self.squares.sum()) + self.of_source
-
-    @property
-    def reduced(self) -> float:
-        """The square over its expectation: 1 where there is noise alone."""
-        return self.square / self.n_pixels
-
-    @property
-    def excess(self) -> float:
-        """The square beyond its expectation."""
-        return self.square - self.n_pixels
-
-    @property
-    def significance(self) -> float:
-        """The excess in standard deviations of that of noise."""
-        return float(self.excess / np.sqrt(2.0 * self.n_pixels))
-
-    @property
-    def is_noise(self) -> bool:
-        """Whether the excess is one that noise may have, of five standard deviations at most."""
-        return self.significance <= SIGNIFICANT
-
-
-def misfit(scene: Scene, extended: Array, fluxes: Array) -> Misfit:
-    """Return how well the PSFs of a scene fit, with fluxes fitted and the source marginalised."""
-    model, held = Model(scene), PsfFamilies((), scene.observation)
+    held = PsfFamilies((), scene.observation)
     images = _linearise(scene, held, held.first().values, model, extended, fluxes, False)
-    fit = _fit(images, [_source_error(model, extended)], np.zeros(len(fluxes)))
-    n_pixels = sum(int(np.count_nonzero(each.precision)) for each in images)
-    return Misfit(*fit.least_squares(), n_pixels)
+    error = _source_error(model, share * extended)
+    change, (x, *_) = _fit(images, [error], np.zeros(len(fluxes))).solve(np.zeros(len(fluxes)))
+    return extended + error.of(x), fluxes + change
 
 
 def _fit(images: list[LinearImage], fields: Sequence[Field], prior: Array) -> LeastSquares:

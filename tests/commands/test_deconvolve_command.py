@@ -93,8 +93,8 @@ class TestDeconvolve:
             "where noise gives 1",
             f"extended source: {expected.extended.sum():.6g} electrons",
             f"residuals {overall} in all, where noise gives 1",
-            "the model does not fit at 1 of 2 stars, (7, 5): its PSF or its position is wrong; try "
-            "--refine, --refine-psfs jitter, with two stars or more jitter pixels, or another PSF",
+            "the model does not fit at 1 of 2 stars, (7, 5): give a better PSF, or try "
+            "--refine-psfs jitter pixels",
             "written to out.fits",
         ]
 

@@ -65,15 +65,28 @@ def test_the_file_has_the_psfs_and_their_parameters(capsys):
         header = hdus[0].header
     assert [header["REFPSF1"], header["REFPSF2"], header["PSFUSED"]] == ["shift", "jitter", True]
     assert (header["PSFMIS1"], header["PSFMIS2"]) == result.psf_refinement.misfit
-    assert (header["PSFERR"], header["PSFNOISE"]) == (result.psf_refinement.psf_error, False)
+    assert header["PSFERR"] == result.psf_refinement.psf_error
     words = shlex.split("\n".join(header["HISTORY"]).replace("\\\n", ""))
     again = words[words.index("lnocl") + 1 :]
     assert cli.main([*again, "--overwrite"]) == 0
     np.testing.assert_array_equal(fits.getdata("out.fits"), result.extended)
 
 
-def test_without_it_the_file_has_neither():
+def test_by_default_what_does_not_fit_is_refined(capsys):
     assert run() == 0
+    assert "lnocl: PSFs refined: their misfit is " in capsys.readouterr().err
+    assert fits.getheader("out.fits")["PSFUSED"] is True
+
+
+def test_none_are_refined_where_that_is_asked(capsys):
+    assert run("--refine-psfs", "none", "--no-refine") == 0
+    assert "lnocl: the misfit of the PSFs is " in capsys.readouterr().err
+    header = fits.getheader("out.fits")
+    assert (header["PSFUSED"], header["REFPSF1"], header["REFINED"]) == (False, "none", False)
+
+
+def test_with_a_smoothing_that_is_given_the_file_has_neither():
+    assert run("--smoothing", "0") == 0
     with fits.open("out.fits") as hdus:
         assert not {"PSFS", "PSFFIT", "PSFERRORS", "DOUBTFUL"} & {hdu.name for hdu in hdus}
         assert "PSFUSED" not in hdus[0].header
@@ -90,15 +103,13 @@ def test_files_of_ideal_psfs_and_modes():
 def test_files_of_pupils_and_scatter():
     fits.writeto("pupil.fits", (np.hypot(X - 16, Y - 16) < 6.0).astype(float))
     fits.writeto("scatter.fits", 0.02 * PSF)
-    assert run("--refine-psfs", "pupil", "strehl", "--pupil", "pupil.fits", "--round-source",
+    assert run("--refine-psfs", "pupil", "strehl", "--pupil", "pupil.fits",
                "--psf-scatter", "scatter.fits") == 0  # fmt: skip
     with fits.open("out.fits") as hdus:
         names = ["image", "strehl_power", *(f"pupil_{i}" for i in range(1, 8))]
         assert hdus["PSFFIT"].data.names == names
         header = hdus[0].header
         assert {"TSUM1", "SSUM1"} <= set(header)
-        assert header["ROUND"] is True
-        assert header["PSFNOISE"] is True
         assert header["PSFERR"] == pytest.approx(0.02, rel=0.1)  # of other PSFs
         assert hdus["DOUBTFUL"].data[STAR[::-1]] == 1
 
@@ -144,7 +155,5 @@ def test_an_error_that_is_left_is_said_in_the_verdict(capsys):
     counts = np.random.default_rng(0).poisson(np.fft.irfft2(spectrum, sky.shape).clip(0) + 40.0)
     fits.writeto("image.fits", counts.astype(float), overwrite=True)
     assert run("--refine-psfs", "shift") == 0
-    said = capsys.readouterr().out
-    assert "the PSFs are wrong by " in said
-    assert "the model fits" not in said
+    assert "the model fits\n" not in capsys.readouterr().out
     assert 0.01 < fits.getheader("out.fits")["PSFERR"] < 0.25

@@ -271,26 +271,6 @@ def test_one_psf_for_all_images_has_one_error():
     np.testing.assert_array_equal(drawn[1:], drawn[:1].repeat(2, axis=0))
 
 
-@pytest.mark.filterwarnings("ignore:the PSFs do not fit")
-def test_noise_of_counts_is_as_given_where_psfs_are_drawn():
-    """The error of PSFs was added to the read noise of the run; it must not count twice."""
-    made = dataclasses.replace(BASE, read_noise=3.0).make()
-    scatter = 0.2 * made.psfs / made.psfs.sum(axis=(1, 2), keepdims=True)
-    result = lnocl.deconvolve(
-        made.observation(psf_scatter=scatter), made.stars, stop=None, n_iter=5, smoothing=1e-3,
-        pad=0, engine="numpy",
-    )  # fmt: skip
-    replicas, scene = Replicas(result._outcome, 0), result._outcome.scene
-    assert scene.observation.read_noise.max() > 4.0
-    draws = drawn_by(replicas, result._outcome, 300)
-    models, added = result.models(), scene.observation.read_noise**2
-    expected = models - added + 3.0**2
-    plenty = models > 40
-    ratio = draws.var(axis=0, ddof=1)[plenty] / expected[plenty]
-    assert np.mean(ratio) == pytest.approx(1.0, abs=0.02)
-    np.testing.assert_allclose(draws.mean(axis=0)[plenty], models[plenty], rtol=0.1)
-
-
 def test_regions_that_no_image_has_seen_are_named():
     made = dataclasses.replace(BASE, shape=(64, 64)).make()
     mask = np.zeros((64, 64), bool)

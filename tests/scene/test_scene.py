@@ -267,7 +267,10 @@ REFUSED = {
     ),
     "callback that is none": ({"callback": 3}, "callback must be a function or None; 3 was given"),
     "progress in words": ({"progress": "no"}, "progress must be True or False; 'no' was given"),
-    "refinement in numbers": ({"refine_positions": 1}, "refine_positions must be True or False; 1"),
+    "refinement in numbers": (
+        {"refine_positions": 1},
+        "refine_positions must be True, False or auto; 1",
+    ),
     "negative pad": ({"pad": -1}, "pad must be a whole number, 0 or more, or auto; -1 was given"),
     "fractional pad": (
         {"pad": 1.5},

@@ -1,0 +1,225 @@
+"""Short runs that judge PSFs: the extended source is kept from the light of the stars.
+
+A wrong PSF leaves light beside each star, and an extended source that is free there takes it up:
+the images fit, the star is too faint, and nothing shows that the PSF is wrong. So the weight of the
+edge-preserving term near stars follows the error of the PSFs (`lnocl.scene.psf_misfit`), which is
+first taken to be large and then measured, until it stays.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from lnocl.errors import DivergedError
+from lnocl.process import ignored_notes, ignored_warnings
+from lnocl.runs.options import WRONG_PSFS
+from lnocl.runs.run import Run
+from lnocl.runs.start import Setup, make_model, make_start
+from lnocl.scene.forward_model import Model
+from lnocl.scene.observation import Array, Observation
+from lnocl.scene.padding import choose_pad
+from lnocl.scene.penalty import Penalty, recommend_smoothing
+from lnocl.scene.psf_misfit import PsfMisfit, measure_misfit, smoothing_near_stars
+from lnocl.scene.rings import Rings
+from lnocl.scene.scene import Scene
+from lnocl.solvers.psf_fit import settle
+
+# PSFs are judged in a window of this side, pixels of the images.
+WINDOW = 256
+# The error that PSFs are first taken to have; later ones are measured until they change by less
+# than this share, or so often.
+FIRST_ERROR, SETTLED, MAX_ROUNDS = 0.3, 0.1, 4
+# Iterations of the first round, and of each further one, which begins where that ended.
+FIRST_ITERATIONS, ITERATIONS = 40, 30
+# The extended source of these runs may lack structure of this share of its light.
+UNRESOLVED = 0.25
+# The error of a PSF's pixel is a share of the PSF, smoothed over so many pixels of the images.
+SPREAD = 2.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An estimate whose extended source was kept from the stars, and how well it fits there.
+
+    Attributes
+    ----------
+    scene : Scene
+        The model, with the stars where they are.
+    extended, fluxes : ndarray of float64
+        Extended source, shape (Ny, Nx), and star fluxes, shape (n,), scaled.
+    misfit : PsfMisfit
+        How far the images are from their models at the stars.
+    """
+
+    scene: Scene
+    extended: Array
+    fluxes: Array
+    misfit: PsfMisfit
+
+    @cached_property
+    def model(self) -> Model:
+        """The model of the scene on the host."""
+        return make_model(self.scene)
+
+
+class GuardedRuns:
+    """Short runs in a window round most of the stars.
+
+    Parameters
+    ----------
+    setup : Setup
+        The parameters of the runs; one star or more among them.
+    observation : Observation
+        The images.
+
+    Attributes
+    ----------
+    observation : Observation
+        Those of the window.
+    stars : ndarray of float64, shape (n, 2)
+        The stars in it, and where they are in it.
+    held : ndarray of bool
+        Which of all stars they are.
+    all_stars : ndarray of float64, shape (n, 2)
+        All stars, in the whole images.
+    """
+
+    def __init__(self, setup: Setup, observation: Observation) -> None:
+        self.all_stars = setup.stars
+        self.observation, self.stars, self.held = find_window(setup, observation)
+        # One grid for all PSFs that are tried.
+        pad = choose_pad(observation) if setup.pad == "auto" else setup.pad
+        self._setup = replace(setup, solver="sgp", pad=pad)
+        self._smoothing = WRONG_PSFS * recommend_smoothing(self.observation)
+
+    def fit(self, psfs: Array, stars: Array, moves: bool, error: float = FIRST_ERROR) -> Estimate:
+        """Return the estimate with these PSFs.
+
+        Parameters
+        ----------
+        psfs : ndarray of float64, shape (p, ky, kx)
+            The PSFs.
+        stars : ndarray of float64, shape (n, 2)
+            Where the stars are, or are sought from.
+        moves : bool
+            Whether they are moved.
+        error : float
+            The relative error that the PSFs are first taken to have.
+        """
+        observation = with_psfs(self.observation, self._cut(psfs))
+        setup = replace(self._setup, stars=stars, refine_positions=moves)
+        with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
+            start = make_start(setup, observation, Penalty())
+            found = Estimate(start.scene, start.extended, start.star_fluxes, _unknown(error))
+            for n_iter in (FIRST_ITERATIONS, *[ITERATIONS] * (MAX_ROUNDS - 1)):
+                before, found = found, self._run(setup, found, n_iter)
+                if not found.misfit.is_significant or _is_settled(before.misfit, found.misfit):
+                    break
+        return found
+
+    def _run(self, setup: Setup, found: Estimate, n_iter: int) -> Estimate:
+        """Return the estimate after a run that begins at one, and is smoothed by its misfit."""
+        near = smoothing_near_stars(found.scene, found.model, found.fluxes, found.misfit.in_rings)
+        penalty = Penalty(smoothing=self._smoothing, near_stars=near)
+        ny, nx = found.scene.observation.sky_shape
+        unit = found.scene.unit
+        start = make_start(
+            replace(setup, stars=found.scene.stars),
+            found.scene.observation,
+            penalty,
+            np.maximum(found.extended[:ny, :nx], 0.0) * unit,
+            found.fluxes * unit,
+        )
+        run = Run(start, n_iter)
+        with suppress(DivergedError):  # by negative PSFs: the misfit tells how good the end is
+            for _ in run:
+                pass
+        extended, fluxes = run.engine.extended().astype(np.float64), run.engine.star_fluxes()
+        model = make_model(run.scene)
+        estimate = extended, fluxes
+        misfit = measure_misfit(run.scene, model, *estimate, estimate)
+        if misfit.is_significant:  # which may be of structure that was smoothed
+            settled = settle(run.scene, model, *estimate, UNRESOLVED)
+            misfit = measure_misfit(run.scene, model, *estimate, settled)
+        return Estimate(run.scene, extended, fluxes, misfit)
+
+    def moved(self, estimate: Estimate, psfs: Array, fluxes: Array, stars: Array) -> Estimate:
+        """Return an estimate with other PSFs and stars, whose misfit is that of before."""
+        ny, nx = self.observation.shape
+        observation = with_psfs(self.observation, self._cut(psfs))
+        with ignored_warnings():
+            scene = Scene(observation, stars.clip(0, (nx - 1, ny - 1)), pad=self._setup.pad)
+        return Estimate(scene, estimate.extended, fluxes, estimate.misfit)
+
+    def _cut(self, psfs: Array) -> Array:
+        """Return PSFs as far as the window may show them."""
+        most = WINDOW * self.observation.oversample
+        y, x = (
+            slice(n // 2 - min(n, most) // 2, n // 2 - min(n, most) // 2 + min(n, most))
+            for n in psfs.shape[1:]
+        )
+        return psfs[:, y, x]
+
+
+def find_window(setup: Setup, observation: Observation) -> tuple[Observation, Array, Array]:
+    """Return the observation cut to a window round most of the stars, these, and which they are."""
+    size = np.minimum(observation.shape[::-1], WINDOW)
+    last = np.array(observation.shape[::-1]) - size
+    middle = (setup.stars.min(axis=0) + setup.stars.max(axis=0)) / 2.0
+    firsts = [np.clip(np.round(at) - size // 2, 0, last) for at in (middle, *setup.stars)]
+    low = np.array(firsts)[:, None] - 0.5
+    held = np.all((setup.stars >= low) & (setup.stars < low + size), axis=2)
+    best = int(np.argmax(held.sum(axis=1)))
+    x, y = (slice(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
+    cut = copy(observation)
+    for name in ("images", "mask", "background", "exposure"):
+        values = getattr(observation, name)
+        setattr(cut, name, values[:, y, x] if values.ndim == 3 else values)
+    return cut, setup.stars[held[best]] - firsts[best], held[best]
+
+
+def with_psfs(observation: Observation, psfs: Array) -> Observation:
+    """Return an observation with other PSFs, as they are."""
+    other = copy(observation)
+    other.psfs = psfs
+    return other
+
+
+def estimate_scatter(psfs: Array, in_rings: Array, oversample: int) -> Array:
+    """Return the scatter of the pixels of PSFs, a share of the PSF round each pixel.
+
+    Parameters
+    ----------
+    psfs : ndarray of float64, shape (p, ky, kx)
+        The PSFs.
+    in_rings : ndarray of float64
+        Their relative error in each ring, as `PsfMisfit.in_rings`.
+    oversample : int
+        Pixels of the PSFs to one of the images, along each axis.
+    """
+    number = rings_of(psfs, oversample).number
+    share = in_rings[np.minimum(number, len(in_rings) - 1)]
+    width = SPREAD * oversample
+    return np.array([share * gaussian_filter(psf, width).clip(0.0) for psf in psfs])
+
+
+def rings_of(psfs: Array, oversample: int) -> Rings:
+    """Return the rings round the middle of PSFs."""
+    ky, kx = psfs.shape[1:]
+    return Rings((ky, kx), np.array([(kx // 2, ky // 2)]), oversample)
+
+
+def _unknown(error: float) -> PsfMisfit:
+    """Return the misfit of PSFs of this error, which are not yet looked at."""
+    return PsfMisfit(np.array([error**2]), 0.0, 0.0, 1.0, np.array([error]))
+
+
+def _is_settled(before: PsfMisfit, after: PsfMisfit) -> bool:
+    """Return whether a misfit has changed so little that the next would be the same."""
+    return abs(after.kappa - before.kappa) < SETTLED * after.kappa

@@ -1,0 +1,182 @@
+r"""How far images are from their models at the stars, as a relative error of the PSFs.
+
+A pixel counts by the square of the stars' share S of its model m, so that the sky beside the stars
+has no part:
+
+.. math:: \chi^2 = \sum_j \sum_n \frac{S^2}{m^2} \frac{(g - m)^2}{m}, \qquad
+          \kappa^2 = \Bigl(\chi^2 - \sum \frac{S^2}{m^2}\Bigr) \Big/ \sum \frac{S^4}{m^3}.
+
+Noise alone leaves ``sum S^2 / m^2``, and a PSF with a relative error kappa in each pixel
+``kappa^2 S^2`` beside the variance m.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.fft
+
+from lnocl.scene.forward_model import Model, spread
+from lnocl.scene.observation import Array
+from lnocl.scene.rings import Rings
+from lnocl.scene.scene import MIN_MODEL, Scene
+
+# The misfit is told from noise from so many of its standard deviations on; in a ring from so many.
+SIGNIFICANT, SIGNIFICANT_IN_RING = 5.0, 2.0
+# The weight of the edge-preserving term near stars, in standard deviations of the gradient of the
+# data term by the error of the PSFs: docs/validation/wrong_psfs.md.
+STRENGTH = 2.0
+
+
+class PsfMisfit(NamedTuple):
+    """How far images are from their models at the stars.
+
+    Attributes
+    ----------
+    squares : ndarray of float64, shape (p,)
+        chi squared of each image.
+    expected, variance : float
+        What noise alone gives, for all images, and its variance ``sum (2 + 1 / m) S^4 / m^4``.
+    norm : float
+        ``sum S^4 / m^3``.
+    in_rings : ndarray of float64
+        kappa in each of the `Rings` round the stars; 0 where it is not told from noise.
+    """
+
+    squares: Array
+    expected: float
+    variance: float
+    norm: float
+    in_rings: Array
+
+    @property
+    def reduced(self) -> float:
+        """Chi squared over its expectation: 1 where there is noise alone."""
+        return float(self.squares.sum()) / self.expected if self.expected else 1.0
+
+    @property
+    def significance(self) -> float:
+        """The excess of chi squared in standard deviations of noise."""
+        excess = float(self.squares.sum()) - self.expected
+        return excess / math.sqrt(self.variance) if self.variance else 0.0
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the excess is more than noise has, by five standard deviations."""
+        return self.significance > SIGNIFICANT
+
+    @property
+    def kappa(self) -> float:
+        """The relative error of the PSFs that the excess shows."""
+        return _kappa(float(self.squares.sum()) - self.expected, self.norm)
+
+
+def measure_misfit(
+    scene: Scene, model: Model, extended: Array, fluxes: Array, settled: tuple[Array, Array]
+) -> PsfMisfit:
+    """Return how far the images of a scene are from their models at its stars.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is modelled.
+    model : Model
+        Of the scene.
+    extended : ndarray of float64, shape (Ny, Nx)
+        Extended source, on the grid and scaled.
+    fluxes : ndarray of float64, shape (n,)
+        Star fluxes, scaled.
+    settled : tuple of ndarray of float64
+        Extended source and star fluxes whose residuals are looked at: these, or nearby ones that
+        fit better (`lnocl.solvers.psf_fit.settle`).
+    """
+    inside = tuple(map(slice, scene.observation.shape))
+    means = model.images(extended, fluxes)
+    found = model.forward(settled[0]) + model.background
+    squares, parts = np.zeros(scene.n_images), list[tuple[Array, ...]]()
+    images = zip(
+        scene.images(),
+        model.starlight(fluxes),
+        model.starlight(settled[1]),
+        model.weights,
+        strict=True,
+    )
+    for j, (counts, light, settled_light, weights) in enumerate(images):
+        seen = weights[inside] > 0
+        electrons = scene.scale * weights[inside][seen]
+        total = np.maximum(means[j][inside][seen], MIN_MODEL)
+        # Pixels where PSFs are negative show nothing.
+        share = (light[inside][seen] / total).clip(0.0, 1.0) ** 2
+        residuals = electrons * (counts - found[j] - settled_light)[inside][seen]
+        total *= electrons
+        left = share * residuals**2 / total
+        squares[j] = left.sum()
+        rings = Rings(scene.observation.shape, scene.stars + scene.observation.offsets[j])
+        parts.append(
+            (rings.number[seen], left - share, share**2 * (2.0 + 1.0 / total), share**2 * total)
+        )
+    number, excess, variance, norm = (np.concatenate(each) for each in zip(*parts, strict=True))
+    sums = [np.bincount(number, each) for each in (excess, variance, norm)]
+    in_rings = [
+        _kappa(e, n) if e > SIGNIFICANT_IN_RING * math.sqrt(v) else 0.0
+        for e, v, n in zip(*sums, strict=True)
+    ]
+    return PsfMisfit(
+        squares,
+        float(squares.sum() - excess.sum()),
+        float(variance.sum()),
+        float(norm.sum()),
+        np.array(in_rings),
+    )
+
+
+def smoothing_near_stars(scene: Scene, model: Model, fluxes: Array, in_rings: Array) -> Array:
+    r"""Return the weight of the edge-preserving term that PSFs of such errors ask for.
+
+    It is `STRENGTH` times the standard deviation of the gradient of the data term by the error of
+    the PSFs,
+
+    .. math:: \sqrt{\textstyle\sum_j (A_j^2)^T (\kappa S_j / m_j)^2},
+
+    with the squares of the elements of A_j, and for m_j the counts, or stars and background where
+    these are more. Where a star does not dominate, it is next to 0.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is modelled.
+    model : Model
+        Of the scene.
+    fluxes : ndarray of float64, shape (n,)
+        Star fluxes, scaled.
+    in_rings : ndarray of float64
+        kappa in each of the `Rings` round the stars; beyond the last it is that of the last.
+
+    Returns
+    -------
+    ndarray of float64, of the shape of the extended source
+        For `lnocl.scene.penalty.Penalty.near_stars`.
+    """
+    ny, nx = scene.observation.shape
+    spectra: Array | complex = 0.0
+    images = zip(scene.images(), model.starlight(fluxes), strict=True)
+    for j, (counts, light) in enumerate(images):
+        background = np.broadcast_to(model.background[j], light.shape)
+        total = np.maximum(np.maximum(counts, light + background), MIN_MODEL)
+        number = Rings((ny, nx), scene.stars + scene.observation.offsets[j]).number
+        kappa = np.zeros(light.shape)
+        kappa[:ny, :nx] = in_rings[np.minimum(number, len(in_rings) - 1)]
+        share = (light / total).clip(0.0)
+        relative = spread(model.weights[j] * kappa * share, scene.oversample)
+        squares = scipy.fft.rfft2(scene.psf(j) ** 2)
+        spectra = spectra + squares.conj() * scipy.fft.rfft2(relative**2)
+    variance = scipy.fft.irfft2(spectra, scene.grid)
+    ny, nx = scene.observation.sky_shape
+    deviation = np.sqrt(np.maximum(variance[:ny, :nx], 0.0))
+    return np.asarray(STRENGTH * scene.scale / scene.unit * deviation)
+
+
+def _kappa(excess: float, norm: float) -> float:
+    return math.sqrt(max(excess, 0.0) / norm) if norm > 0 else 0.0

@@ -1,0 +1,129 @@
+"""What the defaults do about PSFs and positions: nothing where they are right, else what mends."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import lnocl
+from lnocl.errors import LnoclWarning
+from lnocl.scene.psf_families import PsfFamilies
+
+N, STAR, LEVEL = 64, (30, 24), 50.0
+Y, X = np.indices((N, N))
+R = np.hypot(X - N // 2, Y - N // 2)
+PSF = (1.0 + R**2 / 6.0) ** -2.5
+PSF /= PSF.sum()
+SKY = 400.0 * np.exp(-((X - 30) ** 2) / 8.0 - ((Y - 36) / 8.0) ** 2)
+FLUX = 10.0 * SKY.sum()
+RUN = {"engine": "numpy", "pad": 0, "n_iter": 200}
+
+
+def blurred(*values):
+    families = PsfFamilies(["jitter"], lnocl.Observation(np.ones((N, N)), PSF))
+    return families.psfs(families.first()._replace(values=np.array([values])))[0]
+
+
+def solve(psf=PSF, beside=(0.0, 0.0), sky=SKY, given=PSF, **options):
+    spectrum = np.fft.rfft2(sky) * np.fft.rfft2(np.fft.ifftshift(psf))
+    means = np.fft.irfft2(spectrum, sky.shape)
+    means += FLUX * np.roll(psf, (STAR[1] - N // 2, STAR[0] - N // 2), (0, 1)) + LEVEL
+    counts = np.random.default_rng(3).poisson(means.clip(0.0)).astype(float)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LnoclWarning)
+        observation = lnocl.Observation(counts, given, background=LEVEL, psf_centre="given")
+        stars = [np.add(STAR, beside)]
+        return lnocl.deconvolve(observation, stars, **{**RUN, **options})
+
+
+@pytest.fixture(scope="module")
+def right():
+    return solve()
+
+
+def test_right_psfs_and_positions_are_left(right):
+    assert right.psf_refinement is None
+    assert right.stop_reason == "held-out"
+    np.testing.assert_array_equal(right.star_positions, [STAR])
+    off = solve(refine_positions=False, refine_psfs=())
+    np.testing.assert_array_equal(right.extended, off.extended)
+    np.testing.assert_array_equal(right.star_fluxes, off.star_fluxes)
+
+
+def test_a_star_beside_its_place_is_moved(caplog):
+    caplog.set_level("INFO", "lnocl")
+    found = solve(beside=(0.2, -0.1))
+    np.testing.assert_allclose(found.star_positions, [STAR], rtol=0, atol=0.02)
+    assert "positions refined: the misfit of the stars is " in caplog.text
+    assert not found.psf_refinement.is_accepted
+    kept = solve(beside=(0.2, -0.1), refine_positions=False, refine_psfs=())
+    np.testing.assert_array_equal(kept.star_positions, [np.add(STAR, (0.2, -0.1))])
+
+
+def test_a_wrong_width_is_mended(right):
+    psf = blurred(0.5, 0.0, 0.5)
+    found = solve(psf)
+    assert found.psf_refinement.is_accepted
+    assert np.linalg.norm(found.psfs[0] - psf) < 0.1 * np.linalg.norm(PSF - psf)
+    assert found.star_fluxes == pytest.approx(FLUX, rel=0.01)
+
+
+def test_a_width_a_little_wrong_is_seen_though_a_free_source_would_hide_it():
+    """The extended source takes it up where nothing keeps it from the star."""
+    psf = blurred(0.06, 0.0, 0.06)
+    found = solve(psf, sky=0.0 * SKY + 1.0)
+    assert found.psf_refinement.is_accepted
+    assert found.star_fluxes == pytest.approx(FLUX, rel=0.01)
+
+
+class TestAnErrorThatNothingMends:
+    SPECKLES = np.random.default_rng(4).standard_normal((N, N))
+    SMOOTH = np.fft.ifft2(np.fft.fft2(SPECKLES) * np.fft.fft2(np.fft.ifftshift(PSF))).real
+    TRUE = PSF * (1.0 + 0.15 * SMOOTH / SMOOTH.std())
+    TRUE = TRUE / TRUE.sum()
+
+    def test_the_star_keeps_its_light(self):
+        found = solve(self.TRUE)
+        assert not found.psf_refinement.is_accepted
+        assert 0.04 < found.psf_refinement.psf_error < 0.25
+        assert found.stop_reason == "change"
+        assert found.star_fluxes == pytest.approx(FLUX, rel=0.03)
+        free = solve(self.TRUE, smoothing=0)
+        assert free.star_fluxes < 0.95 * FLUX
+
+    def test_the_answer_does_not_hang_on_the_iteration(self):
+        fluxes = [solve(self.TRUE, stop=None, n_iter=n).star_fluxes for n in (100, 600)]
+        assert fluxes[1] == pytest.approx(fluxes[0], rel=0.005)
+
+    def test_it_is_said(self):
+        means = FLUX * np.roll(self.TRUE, (-8, -2), (0, 1)) + LEVEL
+        counts = np.random.default_rng(3).poisson(means)
+        observation = lnocl.Observation(counts, PSF, background=LEVEL, psf_centre="given")
+        with pytest.warns(LnoclWarning, match="the PSFs do not fit the stars, by"):
+            lnocl.deconvolve(observation, [STAR], **RUN)
+
+    def test_a_smoothing_that_is_given_stands(self):
+        found = solve(self.TRUE, smoothing=1e-3, stop=None, n_iter=5)
+        assert found.psf_refinement is None
+        assert found._outcome.penalty.near_stars is None
+
+
+def test_negative_pixels_are_repaired_where_that_helps():
+    noisy = PSF + 1e-4 * np.random.default_rng(5).standard_normal(PSF.shape)
+    found = solve(given=noisy)
+    assert found.psfs.min() > -1e-9
+    assert found.star_fluxes == pytest.approx(FLUX, rel=0.03)
+    kept = solve(given=noisy, refine_psfs=())
+    np.testing.assert_array_equal(kept.psfs[0], noisy / noisy.sum())
+
+
+@pytest.mark.parametrize("stop", [None, "held-out"])
+def test_both_engines_agree(stop):
+    options = {"n_iter": 60, "stop": stop, "refine_psfs": ()}
+    reference = solve(TestAnErrorThatNothingMends.TRUE, **options)
+    options |= {"engine": "opencl", "precision": "double"}
+    found = solve(TestAnErrorThatNothingMends.TRUE, **options)
+    assert found.n_iter == reference.n_iter
+    np.testing.assert_allclose(found.star_fluxes, reference.star_fluxes, rtol=1e-6)
+    off = np.linalg.norm(found.extended - reference.extended)
+    assert off < 1e-4 * np.linalg.norm(reference.extended)

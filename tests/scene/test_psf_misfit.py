@@ -1,0 +1,142 @@
+"""The error of PSFs that residuals at stars show, and the smoothing that it asks for."""
+
+import numpy as np
+import pytest
+
+import lnocl
+from lnocl.scene.forward_model import Model
+from lnocl.scene.psf_misfit import STRENGTH, measure_misfit, smoothing_near_stars
+from lnocl.scene.psf_wings import without_negatives
+from lnocl.scene.rings import Rings
+from lnocl.scene.scene import Scene
+
+N, STAR, FLUX, LEVEL = 48, (23.0, 20.0), 3e6, 40.0
+Y, X = np.indices((N, N)) - N // 2
+PSF = np.exp(-(X**2 + Y**2) / 8.0)
+PSF /= PSF.sum()
+RNG = np.random.default_rng(6)
+SKY = np.full((N, N), 5.0)
+
+
+def star_image(psf):
+    return np.roll(psf, (int(STAR[1]) - N // 2, int(STAR[0]) - N // 2), (0, 1))
+
+
+def a_scene(p=1, error=0.0, noise=True, seed=1, **known):
+    """Return a scene of PSFs with a relative error in each pixel, and its estimate, the truth."""
+    rng = np.random.default_rng(seed)
+    means = np.array(
+        [
+            FLUX * star_image(PSF * (1.0 + error * rng.standard_normal(PSF.shape))) + LEVEL + SKY
+            for _ in range(p)
+        ]
+    ).clip(0.0)
+    counts = rng.poisson(means).astype(float) if noise else means
+    observation = lnocl.Observation(counts, PSF, background=LEVEL, psf_centre="given", **known)
+    scene = Scene(observation, [STAR])
+    return scene, SKY / scene.unit, np.array([FLUX / scene.unit])
+
+
+def misfit_of(scene, sky, fluxes):
+    return measure_misfit(scene, Model(scene), sky, fluxes, (sky, fluxes))
+
+
+@pytest.mark.parametrize("p", [1, 3])
+@pytest.mark.parametrize("error", [0.02, 0.1, 0.3])
+def test_kappa_is_the_error_of_the_psfs(p, error):
+    found = misfit_of(*a_scene(p, error))
+    assert found.is_significant
+    assert found.kappa == pytest.approx(error, rel=0.3 / np.sqrt(p))
+    assert found.in_rings[:4] == pytest.approx(error, rel=0.6)
+
+
+def test_noise_alone_is_not_significant_and_spread_as_its_variance_says():
+    found = [misfit_of(*a_scene(seed=seed)) for seed in range(200)]
+    z = np.array([each.significance for each in found])
+    assert abs(z.mean()) < 0.25  # three standard errors of a mean of 200 are 0.21
+    assert z.std() == pytest.approx(1.0, abs=0.15)
+    assert not any(each.is_significant for each in found)
+    assert found[0].expected == pytest.approx(float(found[0].squares.sum()), rel=0.5)
+
+
+def test_it_is_the_formula():
+    scene, sky, fluxes = a_scene(error=0.1)
+    found = misfit_of(scene, sky, fluxes)
+    light, counts = FLUX * star_image(PSF), scene.observation.images[0]
+    model = light + LEVEL + SKY
+    share = (light / model) ** 2
+    np.testing.assert_allclose(found.squares, (share * (counts - model) ** 2 / model).sum())
+    np.testing.assert_allclose(found.expected, share.sum())
+    np.testing.assert_allclose(found.norm, (light**4 / model**3).sum())
+    number = Rings((N, N), np.array([STAR])).number == 2
+    excess = (share * ((counts - model) ** 2 / model - 1.0))[number].sum()
+    expected = np.sqrt(excess / (light**4 / model**3)[number].sum())
+    assert found.in_rings[2] == pytest.approx(expected)
+
+
+def test_bad_pixels_and_the_sky_have_no_part():
+    mask = np.zeros((1, N, N), bool)
+    mask[0, 22:26, 20:26] = True
+    scene, sky, fluxes = a_scene(mask=mask)  # where the counts are 0
+    assert not misfit_of(scene, sky, fluxes).is_significant
+    brighter = sky + 20.0 * (np.hypot(X - 12, Y - 15) < 4) / scene.unit
+    assert not misfit_of(scene, brighter, fluxes).is_significant
+
+
+def test_multiplying_counts_does_not_change_kappa():
+    scene, sky, fluxes = a_scene(error=0.1, noise=False)
+    once = misfit_of(scene, sky, fluxes)
+    observation = lnocl.Observation(
+        4.0 * scene.observation.images, PSF, background=4.0 * LEVEL, psf_centre="given"
+    )
+    bright = Scene(observation, [STAR])
+    again = misfit_of(bright, 4.0 * SKY / bright.unit, 4.0 * fluxes * scene.unit / bright.unit)
+    assert again.kappa == pytest.approx(once.kappa, rel=1e-2)  # but for the noise that is taken off
+
+
+def test_the_smoothing_is_the_deviation_of_the_gradient():
+    """By drawing PSFs of this error: the spread of the gradient of the data term."""
+    error, draws = 0.1, []
+    scene, _, fluxes = a_scene(noise=False)
+    model, light = Model(scene), star_image(PSF) * FLUX
+    near = smoothing_near_stars(scene, model, fluxes, np.array([error]))
+    mean = light + LEVEL + SKY
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        ratio = (mean + error * light * rng.standard_normal(light.shape)) / mean
+        draws.append(model.adjoint([1.0 - ratio]))
+    spread = np.std(draws, axis=0)
+    bright = spread > 0.05 * spread.max()
+    ratio = near[bright] / spread[bright]
+    assert ratio.mean() == pytest.approx(STRENGTH, rel=0.03)
+    assert ratio.std() < 0.1 * STRENGTH
+    assert near[0, -1] < 0.01 * near.max()
+
+
+def test_exposures_scale_the_smoothing_as_they_do_the_penalty():
+    found = []
+    for exposure in (1.0, 8.0):
+        counts = exposure * (FLUX * star_image(PSF) + LEVEL + SKY)
+        observation = lnocl.Observation(
+            counts, PSF, background=exposure * LEVEL, exposure=exposure, psf_centre="given"
+        )
+        scene = Scene(observation, [STAR])
+        fluxes = np.array([FLUX / scene.unit])
+        found.append(smoothing_near_stars(scene, Model(scene), fluxes, np.array([0.1])))
+    np.testing.assert_allclose(found[1], 8.0 * found[0], rtol=1e-6, atol=1e-6 * found[1].max())
+
+
+class TestPsfsWithoutNegatives:
+    NOISY = PSF + 3e-5 * RNG.standard_normal(PSF.shape)
+
+    def test_no_pixel_is_negative_and_rings_have_their_light(self):
+        (repaired,) = without_negatives(self.NOISY[None])
+        assert repaired.min() == 0.0
+        assert repaired.sum() == pytest.approx(1.0)
+        number = Rings((N, N), np.array([(N // 2, N // 2)])).number.ravel()
+        given, now = (np.bincount(number, each.ravel()) for each in (self.NOISY, repaired))
+        scale = now[0] / given[0]
+        np.testing.assert_allclose(now, scale * given.clip(0.0), rtol=1e-9, atol=1e-15)
+
+    def test_a_psf_without_them_is_as_it_was(self):
+        np.testing.assert_allclose(without_negatives(PSF[None]), PSF[None], rtol=1e-12)
