@@ -85,6 +85,7 @@ def try_it(image, psf, stars, device=None, **known):
         "pixels off its centre": "centre", "does not fit": "width", "pixels from there": "place",
         "negative and were kept": "negative", "too near the end": "length",
         "not that of its counts": "noise", "share their noise": "correlation",
+        "the PSFs do not fit the stars": "error left",
     }  # fmt: skip
     result, messages = None, []
     with warnings.catch_warnings(record=True) as caught:
@@ -99,6 +100,7 @@ def try_it(image, psf, stars, device=None, **known):
     said += [f"? {m}" for m in messages if not any(key in m for key in words)]
     if result is None:
         return None, ["refused", *said]
+    said += ["mended"] * (result.psf_refinement is not None)
     at_stars = result.star_residuals()
     said += ["residuals"] * any(each.is_misfit for each in at_stars)
     said += ["halo"] * any(each.has_halo for each in at_stars)

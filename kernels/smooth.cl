@@ -82,53 +82,6 @@ INLINE vec psi(const vec t, const real delta)
     return t * t / (sqrt(t * t + delta * delta) + delta);
 }
 
-/* The values of a pixel's own lanes and of its four neighbours; each pixel has two rows. */
-typedef struct {
-    cvec own, left, right;
-    vec above, below;
-} neighbours;
-
-INLINE neighbours load_neighbours(
-    __global const vec *restrict pixels, const int block, const int x, const int lane)
-{
-    __global const vec *row = pixels + (size_t)block * NX * 2 * SIDE + lane;
-    __global const real *lanes = (__global const real *)pixels;
-    neighbours n;
-    n.own = LOAD(row, x);
-    n.left = LOAD(row, (x + NX - 1) % NX);
-    n.right = LOAD(row, (x + 1) % NX);
-    n.above = lanes_above(lanes, block, x, 1, lane * LANES);
-    n.below = lanes_below(lanes, block, x, 0, lane * LANES);
-    return n;
-}
-
-/* The weights of a pixel's pairs: to the left, right, above and below, of both rows. */
-typedef struct {
-    cvec left, right, above, below;
-} pair_weights;
-
-INLINE pair_weights load_pair_weights(
-    __global const vec *restrict smoothing_map, const real smoothing, const int block, const int x,
-    const int lane)
-{
-    pair_weights beta;
-#if HAS_SMOOTHING_MAP
-    const neighbours b = load_neighbours(smoothing_map, block, x, lane);
-    beta.left.re = (b.own.re + b.left.re) / 2;
-    beta.left.im = (b.own.im + b.left.im) / 2;
-    beta.right.re = (b.own.re + b.right.re) / 2;
-    beta.right.im = (b.own.im + b.right.im) / 2;
-    beta.above.re = (b.own.re + b.above) / 2;
-    beta.above.im = (b.own.im + b.own.re) / 2;
-    beta.below.re = beta.above.im;
-    beta.below.im = (b.own.im + b.below) / 2;
-#else
-    const cvec same = {(vec)smoothing, (vec)smoothing};
-    beta.left = beta.right = beta.above = beta.below = same;
-#endif
-    return beta;
-}
-
 /* slope = sum over the four neighbours of (beta + beta') / 2 psi'(f - f'),
  * curvature = the same sum of psi'(t) / t; smooth_sums: the sum of (beta + beta') / 2 psi over all pairs.
  * extended: one array of pixels, const, f. slope, curvature: one array of pixels each, written.
@@ -142,28 +95,47 @@ KERNEL void smooth(
     __global const vec *restrict smoothing_map, const real smoothing, const real edge)
 {
     SHARED_SUMS(shared);
+    __global const real *pixels = (__global const real *)extended;
+#if HAS_SMOOTHING_MAP
+    __global const real *weights = (__global const real *)smoothing_map;
+#endif
     FOR_EACH_BLOCK(block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         vec_sum total = {0, 0};
         FOR_EACH(piece, NX * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
-            const neighbours f = load_neighbours(extended, block, x, lane);
-            const pair_weights beta = load_pair_weights(smoothing_map, smoothing, block, x, lane);
+            const int left = (x + NX - 1) % NX, right = (x + 1) % NX;
+            const cvec f = LOAD(extended + at + lane, x);
+            const cvec f_left = LOAD(extended + at + lane, left);
+            const cvec f_right = LOAD(extended + at + lane, right);
+            const vec f_above = lanes_above(pixels, block, x, 1, lane * LANES);
+            const vec f_below = lanes_below(pixels, block, x, 0, lane * LANES);
+#if HAS_SMOOTHING_MAP
+            const cvec b = LOAD(smoothing_map + at + lane, x);
+            const cvec b_left = LOAD(smoothing_map + at + lane, left);
+            const cvec b_right = LOAD(smoothing_map + at + lane, right);
+            const vec b_above = lanes_above(weights, block, x, 1, lane * LANES);
+            const vec b_below = lanes_below(weights, block, x, 0, lane * LANES);
+#else
+            const cvec b = {(vec)smoothing, (vec)smoothing}, b_left = b, b_right = b;
+            const vec b_above = b.re, b_below = b.re;
+#endif
+            const vec right_re = (b.re + b_right.re) / 2, right_im = (b.im + b_right.im) / 2;
+            const vec between = (b.re + b.im) / 2, below = (b.im + b_below) / 2;
             cvec s = {0, 0}, c = {0, 0};
-            add_pair(&s.re, &c.re, beta.left.re, f.own.re - f.left.re, edge);
-            add_pair(&s.im, &c.im, beta.left.im, f.own.im - f.left.im, edge);
-            add_pair(&s.re, &c.re, beta.right.re, f.own.re - f.right.re, edge);
-            add_pair(&s.im, &c.im, beta.right.im, f.own.im - f.right.im, edge);
-            add_pair(&s.re, &c.re, beta.above.re, f.own.re - f.above, edge);
-            add_pair(&s.im, &c.im, beta.above.im, f.own.im - f.own.re, edge);
-            add_pair(&s.re, &c.re, beta.below.re, f.own.re - f.own.im, edge);
-            add_pair(&s.im, &c.im, beta.below.im, f.own.im - f.below, edge);
+            add_pair(&s.re, &c.re, (b.re + b_left.re) / 2, f.re - f_left.re, edge);
+            add_pair(&s.im, &c.im, (b.im + b_left.im) / 2, f.im - f_left.im, edge);
+            add_pair(&s.re, &c.re, right_re, f.re - f_right.re, edge);
+            add_pair(&s.im, &c.im, right_im, f.im - f_right.im, edge);
+            add_pair(&s.re, &c.re, (b.re + b_above) / 2, f.re - f_above, edge);
+            add_pair(&s.im, &c.im, between, f.im - f.re, edge);
+            add_pair(&s.re, &c.re, between, f.re - f.im, edge);
+            add_pair(&s.im, &c.im, below, f.im - f_below, edge);
             STORE(slope + at + lane, x, s);
             STORE(curvature + at + lane, x, c);
-            const vec across = beta.right.re * psi(f.own.re - f.right.re, edge)
-                + beta.right.im * psi(f.own.im - f.right.im, edge);
-            const vec down = beta.below.re * psi(f.own.re - f.own.im, edge)
-                + beta.below.im * psi(f.own.im - f.below, edge);
+            const vec across =
+                right_re * psi(f.re - f_right.re, edge) + right_im * psi(f.im - f_right.im, edge);
+            const vec down = between * psi(f.re - f.im, edge) + below * psi(f.im - f_below, edge);
             ACCUMULATE(total, across + down);
         }
         store_pair(smooth_sums + 2 * block, sum_group(sum_lanes(total), shared));

@@ -258,11 +258,11 @@ def deconvolve(
     left, a relative error κ of the PSFs, adds to λ twice the standard deviation of the data
     term's gradient by it, ``2 sqrt(sum_j (A_j^2)^T (κ S_j / m_j)^2)``, with S_j the starlight. So
     does a ``psf_scatter`` that is given. The run then ends where the objective hardly changes any
-    more (:doc:`/validation/psf`). Where `smoothing` is a number, none of this is done unless
-    `refine_psfs` names families; then it is as given. PSFs that vary over the field are not judged.
+    more (:doc:`/validation/psf`). Where `smoothing` is a number it stays as it is, and PSFs are
+    judged only where `refine_psfs` names families. PSFs that vary over the field are not judged.
 
     Stars whose positions are not refined are taken to be where they are given. Free pixels are used
-    only where they also change no star's flux by more than κ.
+    only where they also change no star's flux by more than 2 κ.
 
     **The split-gradient method** lowers the objective at every iteration where PSFs are not
     negative. With many negative pixels, as in a raw frame of a star, the objective may rise again.

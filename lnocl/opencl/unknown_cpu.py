@@ -16,6 +16,9 @@ import pyopencl as cl
 
 POCL = "Portable Computing Language"
 TARGET, UNKNOWN = b"x86_64-unknown-linux-gnu\0", b"generic\0"
+# It calls a Zen 4 a Zen 3, which has no AVX-512, and its features those of a Zen 4: kernels with
+# vectors of 512 bits do not compile then, or are wrong.
+MISTAKEN, UNEXPECTED = b"znver3\0", "avx512f"
 # Levels of x86-64 by a feature that each of them has first.
 LEVELS = {"avx512f": b"x86-64-v4\0", "avx2": b"x86-64-v3\0", "sse4_2": b"x86-64-v2\0"}
 # Bytes of the record that are looked through.
@@ -25,7 +28,7 @@ MEMORY, FEATURES = "/proc/self/mem", "/proc/cpuinfo"
 
 @functools.cache
 def name_level(device: cl.Device) -> None:
-    """Have PoCL compile for the level of x86-64 where it does not know the CPU.
+    """Have PoCL compile for the level of x86-64 where it does not know the CPU, or mistakes it.
 
     Nothing is done for other devices, nor where PoCL knows the CPU, nor beyond Linux.
     """
@@ -38,7 +41,7 @@ def name_level(device: cl.Device) -> None:
         return
     try:
         place = find_name(memory, device.int_ptr)
-        if level and place and _text(memory, place) == UNKNOWN:
+        if level and place and _is_wrong(_text(memory, place), level):
             os.pwrite(memory, struct.pack("P", ctypes.addressof(_lasting(level))), place)
     finally:
         os.close(memory)
@@ -66,6 +69,12 @@ def _text(memory: int, place: int, length: int = len(UNKNOWN)) -> bytes:
         return os.pread(memory, length, address)
     except (OSError, OverflowError, struct.error):
         return b""
+
+
+def _is_wrong(name: bytes, level: bytes) -> bool:
+    """Return whether PoCL has no name for a CPU of this level, or that of an older one."""
+    is_older = name.startswith(MISTAKEN) and level == LEVELS[UNEXPECTED]
+    return name.startswith(UNKNOWN) or is_older
 
 
 def _level() -> bytes | None:

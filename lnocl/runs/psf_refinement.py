@@ -201,12 +201,12 @@ def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) 
 
 
 def _is_trusted(state: _State, tried: _State) -> bool:
-    """Return whether free pixels mend enough, and move no star's flux by more than kappa.
+    """Return whether free pixels mend enough, and move no star's flux by more than twice kappa.
 
     The wings of free PSFs may take the light of a host, and their cores that of a star.
     """
     before, after = state.estimate.fluxes, tried.estimate.fluxes
-    is_near = abs(after - before) <= state.misfit.kappa * before
+    is_near = abs(after - before) <= LOOSE * state.misfit.kappa * before
     return state.is_mended_by(tried) and bool(is_near.all())
 
 

@@ -59,3 +59,17 @@ def test_level_is_that_of_the_features(flags, level, tmp_path, monkeypatch):
     (tmp_path / "cpuinfo").write_text(f"model : 2\nflags\t\t: {flags}\nflags : avx512f\n")
     monkeypatch.setattr(unknown_cpu, "FEATURES", str(tmp_path / "cpuinfo"))
     assert unknown_cpu._level() == level
+
+
+@pytest.mark.parametrize(
+    ("name", "level", "expected"),
+    [
+        (b"generic\0", b"x86-64-v3\0", True),
+        (b"znver3\0\0", b"x86-64-v4\0", True),
+        (b"znver3\0\0", b"x86-64-v3\0", False),
+        (b"znver4\0\0", b"x86-64-v4\0", False),
+        (b"", b"x86-64-v4\0", False),
+    ],
+)
+def test_a_zen_4_that_is_called_a_zen_3_is_no_zen_3(name, level, expected):
+    assert unknown_cpu._is_wrong(name, level) is expected
