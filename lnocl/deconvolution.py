@@ -262,7 +262,7 @@ def deconvolve(
     judged only where `refine_psfs` names families. PSFs that vary over the field are not judged.
 
     Stars whose positions are not refined are taken to be where they are given. Free pixels are used
-    only where they also change no star's flux by more than 2 κ.
+    only where they also change no star's flux by more than 3 κ.
 
     **The split-gradient method** lowers the objective at every iteration where PSFs are not
     negative. With many negative pixels, as in a raw frame of a star, the objective may rise again.

@@ -44,6 +44,9 @@ MENDED = 0.5
 ROUNDS, STEPS, IMPROVED = 4, 2, 0.3
 # PSFs are next taken to be wrong by so many times what they were, at most by `FIRST_ERROR`.
 LOOSE = 2.0
+# Free pixels may err by so many times what residuals show, and change no star's flux by more than
+# so many times kappa.
+FREEDOM, TRUSTED = 2.0, 3.0
 # Of PSFs that are wrong by more than this it is warned.
 NOTABLE = 0.03
 # Where PSFs give so little of their peak, nothing is known of them.
@@ -195,18 +198,18 @@ def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) 
     observation = with_psfs(runs.observation, state.psfs)
     if not len(scatter):
         rings = state.misfit.in_rings
-        scatter = estimate_scatter(state.psfs, rings, observation.oversample)
+        scatter = FREEDOM * estimate_scatter(state.psfs, rings, observation.oversample)
     families = PsfFamilies(("pixels",), observation, scatter)
     return _search(runs, families, families.first(), state, moves)[1]
 
 
 def _is_trusted(state: _State, tried: _State) -> bool:
-    """Return whether free pixels mend enough, and move no star's flux by more than twice kappa.
+    """Return whether free pixels mend enough, and move no star's flux by more than thrice kappa.
 
     The wings of free PSFs may take the light of a host, and their cores that of a star.
     """
     before, after = state.estimate.fluxes, tried.estimate.fluxes
-    is_near = abs(after - before) <= LOOSE * state.misfit.kappa * before
+    is_near = abs(after - before) <= TRUSTED * state.misfit.kappa * before
     return state.is_mended_by(tried) and bool(is_near.all())
 
 

@@ -529,14 +529,13 @@ def test_psfs_finer_than_the_images_are_refined(oversample, names):
     given = {"solver": "sgp", "n_iter": 30, "engine": "numpy"}
     result = lnocl.deconvolve(observation, TWO, refine_psfs=names, **PAPER | given)
     assert result.psf_refinement.is_accepted
-    # Of pixels, rounding in BLAS decides how far the last steps go: to 0.89 or 1.20, and fluxes
-    # that are 0.5 or 1.2 % too small.
+    # Pixels as far as residuals show leave a part of a PSF that is a fifth too narrow.
     is_jitter = names == ("jitter",)
-    assert result.psf_refinement.misfit[1] < (1.2 if is_jitter else 1.3)
+    assert result.psf_refinement.misfit[1] < (1.2 if is_jitter else 2.0)
     true = undersampled(oversample, width=1.7).psfs[0]
     wrong, left = (abs(each - true).sum() for each in (observation.psfs[0], result.psfs[0]))
     assert left < (0.03 if is_jitter else 0.4) * wrong
-    np.testing.assert_allclose(result.star_fluxes, [2e5, 1e5], rtol=0.01 if is_jitter else 0.02)
+    np.testing.assert_allclose(result.star_fluxes, [2e5, 1e5], rtol=0.01 if is_jitter else 0.04)
     assert result.doubtful.shape == result.extended.shape == (40 * oversample, 40 * oversample)
 
 
