@@ -194,7 +194,8 @@ class Result:
         """Standard errors of the star fluxes, electrons, shape (n,).
 
         They follow from the joint Fisher information of all stars and of the extended source, which
-        is not taken as known (`lnocl.solvers.star_errors`, :doc:`/validation/errors`). They are
+        is not taken as known (`lnocl.solvers.star_errors`, :doc:`/validation/errors`). The relative
+        error that the PSFs still have (`psf_refinement`) is added in quadrature. They are
         computed when they are first read. They are NaN where the images do not determine the flux,
         as for stars that have moved to one place.
 

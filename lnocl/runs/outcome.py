@@ -148,7 +148,8 @@ class Outcome:
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of star fluxes and positions, the extended source not known.
 
-        `lnocl.solvers.star_errors` has the equation. NaN for positions that were not fitted, and
+        `lnocl.solvers.star_errors` has the equation. The relative error that the PSFs still have is
+        that of each flux too, added in quadrature. NaN for positions that were not fitted, and
         where the images do not determine them.
 
         Warns
@@ -168,6 +169,9 @@ class Outcome:
                 f"the images do not determine flux and position of each star at {named}, so that "
                 "these errors are NaN; leave out stars that lie on others"
             )
+        if self.psf_refinement is not None:
+            of_psfs = self.psf_refinement.psf_error * self.star_fluxes
+            errors[:, 0] = np.hypot(errors[:, 0], of_psfs)
         positions = errors[:, 1:]
         positions[positions > RADIUS] = np.nan  # no star is moved farther
         return errors[:, 0], positions

@@ -88,6 +88,7 @@ class TestAnErrorThatNothingMends:
         assert 0.04 < found.psf_refinement.psf_error < 0.25
         assert found.stop_reason == "change"
         assert found.star_fluxes == pytest.approx(FLUX, rel=0.03)
+        assert found.star_flux_errors > found.psf_refinement.psf_error * found.star_fluxes
         free = solve(self.TRUE, smoothing=0)
         assert free.star_fluxes < 0.95 * FLUX
 
