@@ -15,24 +15,20 @@ from typing import NamedTuple
 import numpy as np
 
 from lnocl.errors import warn
-from lnocl.process import ignored_warnings
 from lnocl.runs.guarded_runs import (
     FIRST_ERROR,
     Estimate,
     GuardedRuns,
     estimate_scatter,
-    rings_of,
     with_psfs,
 )
 from lnocl.runs.outcome import PsfRefinement
-from lnocl.runs.start import Setup, make_model
-from lnocl.scene.detector import on_sky
+from lnocl.runs.psf_allowance import Allowance
+from lnocl.runs.start import Setup
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters
-from lnocl.scene.psf_misfit import PsfMisfit, smoothing_near_stars
+from lnocl.scene.psf_misfit import PsfMisfit
 from lnocl.scene.psf_wings import without_negatives
-from lnocl.scene.rings import Rings
-from lnocl.scene.scene import Scene
 from lnocl.solvers.psf_fit import step
 
 log = logging.getLogger("lnocl")
@@ -49,8 +45,6 @@ LOOSE = 2.0
 FREEDOM, TRUSTED = 2.0, 3.0
 # Of PSFs that are wrong by more than this it is warned.
 NOTABLE = 0.03
-# Where PSFs give so little of their peak, nothing is known of them.
-DARK = 1e-9
 # A step is halved so often, at most, until no OTF exceeds its value at frequency 0.
 MAX_HALVED = 10
 
@@ -87,11 +81,6 @@ class _State:
     @property
     def misfit(self) -> PsfMisfit:
         return self.estimate.misfit
-
-    @property
-    def error(self) -> float:
-        """The relative error of the PSFs, 0 where it is not told from noise."""
-        return self.misfit.kappa if self.misfit.is_significant else 0.0
 
     def is_mended_by(self, other: _State) -> bool:
         """Return whether other PSFs or positions mend enough to be taken."""
@@ -143,10 +132,10 @@ def mend(
     if is_accepted:
         observation = with_psfs(observation, state.psfs)
     known = observation.psf_scatter[: 0 if is_accepted and "pixels" in names else None]
-    _tell(given, state, tried, is_accepted)
     if not (is_asked or len(known) or given.misfit.is_significant):
         return Mended(observation, state.moves, None, None)
-    allowance = _Allowance(observation, runs, state, known)
+    _tell(given, state, tried, is_accepted)
+    allowance = Allowance(observation, runs, state.estimate, known)
     refinement = PsfRefinement(
         tuple(families.parameters),
         values / families.units,
@@ -264,75 +253,6 @@ def _follow(
         if families.are_possible(after):
             return after
     return parameters
-
-
-class _Allowance:
-    """The error that PSFs still have, and what follows from it for the extended source.
-
-    Attributes
-    ----------
-    error : float
-        Relative to the PSFs: what is left at the stars, or the scatter that is given.
-    edges, in_rings : ndarray of float64, shapes (k + 1,) and (k,)
-        Radii of rings round a star, pixels, and the error in each.
-    """
-
-    def __init__(
-        self, observation: Observation, runs: GuardedRuns, state: _State, scatter: Array
-    ) -> None:
-        self._observation, self._estimate, self._held = observation, state.estimate, runs.held
-        self._moved = state.estimate.scene.stars - runs.stars
-        self._stars = runs.all_stars
-        self.error, shares = state.error, state.misfit.in_rings * bool(state.error)
-        rings = rings_of(observation.psfs, observation.oversample)
-        if len(scatter):
-            errors, lights = (
-                np.bincount(rings.number.ravel(), (each**2).sum(axis=0).ravel())
-                for each in (scatter, observation.psfs)
-            )
-            self.error = max(self.error, float(np.sqrt(errors.sum() / lights.sum())))
-            # Where PSFs give next to nothing, a share of them means nothing.
-            least = np.bincount(rings.number.ravel()) * (DARK * observation.psfs.max()) ** 2
-            known = np.divide(errors, lights, out=np.zeros_like(errors), where=lights > least)
-            k = max(len(shares), len(known))
-            shares, known = (np.pad(each, (0, k - len(each)), "edge") for each in (shares, known))
-            shares = np.maximum(shares, np.sqrt(known))
-        self.in_rings = shares[: len(rings)]
-        self.edges = rings.edges[: len(self.in_rings) + 1]
-
-    def near_stars(self, pad: int | str) -> Array | None:
-        """Return the weight of the edge-preserving term for these errors, None for 0."""
-        if not self.in_rings.any():
-            return None
-        scene, fluxes = self._scene(pad)
-        return smoothing_near_stars(scene, make_model(scene), fluxes, self.in_rings)
-
-    def may_be_faked(self) -> Array:
-        """Return what the errors may fake in the sky, ``kappa(r) sum_s c_s K_s / sqrt(p)``.
-
-        Electrons per pixel of the sky: K is the mean over the PSFs, at the stars.
-        """
-        scene, fluxes = self._scene(0)
-        ny, nx = scene.observation.sky_shape
-        light = np.zeros(scene.grid)
-        for j in range(scene.n_images):
-            for s, flux in enumerate(fluxes):
-                stamp = scene.psf_on_sky(j, s)
-                light[stamp.window(scene.grid)] += flux * scene.unit * stamp.values
-        number = Rings((ny, nx), on_sky(scene.stars, scene.oversample), scene.oversample).number
-        kappa = self.in_rings[np.minimum(number, len(self.in_rings) - 1)]
-        return np.asarray(kappa * light[:ny, :nx] / scene.n_images**1.5)
-
-    def _scene(self, pad: int | str) -> tuple[Scene, Array]:
-        """Return the whole scene with the stars where they were found, and their fluxes."""
-        ny, nx = self._observation.shape
-        stars = self._stars.copy()
-        stars[self._held] += self._moved
-        with ignored_warnings():  # those of the reconstruction are the same
-            scene = Scene(self._observation, stars.clip(0, (nx - 1, ny - 1)), pad=pad)
-        fluxes = scene.start(None, None)[1]
-        fluxes[self._held] = self._estimate.fluxes * self._estimate.scene.unit / scene.unit
-        return scene, fluxes
 
 
 def _tell(given: _State, state: _State, tried: _State, is_accepted: bool) -> None:

@@ -1,0 +1,99 @@
+"""What the error that PSFs still have asks for: smoothing near stars, and doubt of faint light."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lnocl.process import ignored_warnings
+from lnocl.runs.guarded_runs import Estimate, GuardedRuns, rings_of
+from lnocl.runs.start import make_model
+from lnocl.scene.detector import on_sky
+from lnocl.scene.observation import Array, Observation
+from lnocl.scene.psf_misfit import smoothing_near_stars
+from lnocl.scene.rings import Rings
+from lnocl.scene.scene import Scene
+
+# Where PSFs give so little of their peak, nothing is known of them.
+DARK = 1e-9
+
+
+class Allowance:
+    """The error that PSFs still have, and what follows from it for the extended source.
+
+    Parameters
+    ----------
+    observation : Observation
+        The images, with the PSFs that are used.
+    runs : GuardedRuns
+        The runs that have judged them.
+    estimate : Estimate
+        Their last estimate, with these PSFs.
+    scatter : ndarray of float64, shape (p, ky, kx)
+        Standard deviations of the PSFs' pixels; of shape (0, ky, kx) where they are not known.
+
+    Attributes
+    ----------
+    error : float
+        Relative to the PSFs: what is left at the stars, or the scatter that is given.
+    edges, in_rings : ndarray of float64, shapes (k + 1,) and (k,)
+        Radii of rings round a star, pixels, and the error in each.
+    """
+
+    def __init__(
+        self, observation: Observation, runs: GuardedRuns, estimate: Estimate, scatter: Array
+    ) -> None:
+        misfit = estimate.misfit
+        self._observation, self._estimate, self._held = observation, estimate, runs.held
+        self._moved = estimate.scene.stars - runs.stars
+        self._stars = runs.all_stars
+        self.error = misfit.kappa if misfit.is_significant else 0.0
+        shares = misfit.in_rings * bool(self.error)
+        rings = rings_of(observation.psfs, observation.oversample)
+        if len(scatter):
+            errors, lights = (
+                np.bincount(rings.number.ravel(), (each**2).sum(axis=0).ravel())
+                for each in (scatter, observation.psfs)
+            )
+            self.error = max(self.error, float(np.sqrt(errors.sum() / lights.sum())))
+            # Where PSFs give next to nothing, a share of them means nothing.
+            least = np.bincount(rings.number.ravel()) * (DARK * observation.psfs.max()) ** 2
+            known = np.divide(errors, lights, out=np.zeros_like(errors), where=lights > least)
+            k = max(len(shares), len(known))
+            shares, known = (np.pad(each, (0, k - len(each)), "edge") for each in (shares, known))
+            shares = np.maximum(shares, np.sqrt(known))
+        self.in_rings = shares[: len(rings)]
+        self.edges = rings.edges[: len(self.in_rings) + 1]
+
+    def near_stars(self, pad: int | str) -> Array | None:
+        """Return the weight of the edge-preserving term for these errors, None for 0."""
+        if not self.in_rings.any():
+            return None
+        scene, fluxes = self._scene(pad)
+        return smoothing_near_stars(scene, make_model(scene), fluxes, self.in_rings)
+
+    def may_be_faked(self) -> Array:
+        """Return what the errors may fake in the sky, ``kappa(r) sum_s c_s K_s / sqrt(p)``.
+
+        Electrons per pixel of the sky: K is the mean over the PSFs, at the stars.
+        """
+        scene, fluxes = self._scene(0)
+        ny, nx = scene.observation.sky_shape
+        light = np.zeros(scene.grid)
+        for j in range(scene.n_images):
+            for s, flux in enumerate(fluxes):
+                stamp = scene.psf_on_sky(j, s)
+                light[stamp.window(scene.grid)] += flux * scene.unit * stamp.values
+        number = Rings((ny, nx), on_sky(scene.stars, scene.oversample), scene.oversample).number
+        kappa = self.in_rings[np.minimum(number, len(self.in_rings) - 1)]
+        return np.asarray(kappa * light[:ny, :nx] / scene.n_images**1.5)
+
+    def _scene(self, pad: int | str) -> tuple[Scene, Array]:
+        """Return the whole scene with the stars where they were found, and their fluxes."""
+        ny, nx = self._observation.shape
+        stars = self._stars.copy()
+        stars[self._held] += self._moved
+        with ignored_warnings():  # those of the reconstruction are the same
+            scene = Scene(self._observation, stars.clip(0, (nx - 1, ny - 1)), pad=pad)
+        fluxes = scene.start(None, None)[1]
+        fluxes[self._held] = self._estimate.fluxes * self._estimate.scene.unit / scene.unit
+        return scene, fluxes
