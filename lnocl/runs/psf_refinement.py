@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lnocl.errors import warn
+from lnocl.errors import counted, warn
 from lnocl.runs.guarded_runs import (
     FIRST_ERROR,
     Estimate,
@@ -45,6 +45,8 @@ LOOSE = 2.0
 FREEDOM, TRUSTED = 2.0, 3.0
 # Of PSFs that are wrong by more than this it is warned.
 NOTABLE = 0.03
+# Of more stars in the window the least squares would take more memory than the run.
+MOST_STARS = 64
 # A step is halved so often, at most, until no OTF exceeds its value at frequency 0.
 MAX_HALVED = 10
 
@@ -110,6 +112,10 @@ def mend(
         Whether the outcome is wanted though PSFs may fit.
     """
     runs = GuardedRuns(setup, observation)
+    if len(runs.stars) > MOST_STARS and not (is_asked or len(observation.psf_scatter)):
+        number = counted(len(runs.stars), "star")
+        log.info(f"PSFs are not judged: {number} in the window; name refine_psfs to judge them")
+        return Mended(observation, moves is True, None, None)
     given = _State(
         observation.psfs, runs.fit(observation.psfs, runs.stars, moves is True), moves is True
     )

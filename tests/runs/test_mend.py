@@ -109,6 +109,15 @@ class TestAnErrorThatNothingMends:
         assert found._outcome.penalty.near_stars is None
 
 
+def test_psfs_of_many_stars_are_judged_only_where_that_is_asked(monkeypatch, caplog):
+    monkeypatch.setattr("lnocl.runs.psf_refinement.MOST_STARS", 0)
+    caplog.set_level("INFO", "lnocl")
+    assert solve(blurred(0.5, 0.0, 0.5), stop=None, n_iter=5).psf_refinement is None
+    assert "PSFs are not judged: 1 star in the window" in caplog.text
+    found = solve(blurred(0.5, 0.0, 0.5), stop=None, n_iter=5, refine_psfs=["jitter"])
+    assert found.psf_refinement.is_accepted
+
+
 def test_negative_pixels_are_repaired_where_that_helps():
     noisy = PSF + 1e-4 * np.random.default_rng(5).standard_normal(PSF.shape)
     found = solve(given=noisy)
