@@ -24,9 +24,9 @@ from lnocl.runs.options import (
     check_families,
     check_length,
     check_observation,
-    check_refine_positions,
     check_types,
     read_penalties,
+    read_refine_positions,
     read_start,
     warn_of_rounding,
 )
@@ -304,13 +304,13 @@ def deconvolve(
     check_choices(solver, precision, engine, device)
     check_length(n_iter, stop)
     check_types(callback, progress=progress)
-    check_refine_positions(refine_positions)
+    refine_positions = read_refine_positions(refine_positions)
     fits_stars = solver == "sgp" or refine_positions is True
     positions = check_positions(stars, observation)
     initial_extended, initial_star_fluxes = read_start(
         observation, fits_stars, initial_extended, initial_star_fluxes
     )
-    Penalty(mu)  # which refuses what is no weight
+    Penalty(mu)  # a wrong weight is refused before any work
     is_auto = isinstance(smoothing, str) and smoothing == "auto" and len(positions) > 0
     is_auto = is_auto and not observation.psf_fields  # which are not judged
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)

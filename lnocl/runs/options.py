@@ -84,16 +84,19 @@ def check_choices(solver: str, precision: str, engine: str, device: object) -> N
         raise InputError(f"engine numpy uses no device; leave device {device!r} out")
 
 
-def check_refine_positions(value: object) -> None:
-    """Refuse anything but True, False and "auto".
+def read_refine_positions(value: object) -> bool | str:
+    """Return True, False or "auto".
 
     Raises
     ------
     InputError
         It is something else.
     """
-    if not (isinstance(value, (bool, np.bool_)) or (isinstance(value, str) and value == "auto")):
-        raise InputError(f"refine_positions must be True, False or auto; {value!r} was given")
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, str) and value == "auto":
+        return value
+    raise InputError(f"refine_positions must be True, False or auto; {value!r} was given")
 
 
 def check_families(
