@@ -258,8 +258,9 @@ def deconvolve(
     left, a relative error κ of the PSFs, adds to λ twice the standard deviation of the data
     term's gradient by it, ``2 sqrt(sum_j (A_j^2)^T (κ S_j / m_j)^2)``, with S_j the starlight. So
     does a ``psf_scatter`` that is given. The run then ends where the objective hardly changes any
-    more (:doc:`/validation/psf`). Where `smoothing` is a number it stays as it is, and PSFs are
-    judged only where `refine_psfs` names families. PSFs that vary over the field are not judged,
+    more (:doc:`/validation/psf`). Where `smoothing` is a number, it stays as it is, scatter or not,
+    and PSFs are judged only where `refine_psfs` names families or a scatter is given. PSFs that
+    vary over the field are not judged,
     nor, unless families are named, those of more than 64 stars in the window.
 
     Stars whose positions are not refined are taken to be where they are given. Free pixels are used

@@ -46,8 +46,8 @@ def misfit_of(scene, sky, fluxes):
 def test_kappa_is_the_error_of_the_psfs(p, error):
     found = misfit_of(*a_scene(p, error))
     assert found.is_significant
-    assert found.kappa == pytest.approx(error, rel=0.3 / np.sqrt(p))
-    assert found.in_rings[:4] == pytest.approx(error, rel=0.6)
+    assert found.kappa == pytest.approx(error, rel=0.2 / np.sqrt(p))
+    assert found.in_rings[:4] == pytest.approx(error, rel=0.35)
 
 
 def test_noise_alone_is_not_significant_and_spread_as_its_variance_says():
