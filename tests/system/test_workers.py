@@ -34,22 +34,26 @@ def targets(tmp_path, monkeypatch):
     for k in range(N_TARGETS):
         fits.writeto(f"i{k}.fits", np.random.default_rng(k).poisson(made.images).astype(float))
         (x, y) = made.stars[0]
-        rows.append((f"i{k}.fits", "psfs.fits", f"{x},{y}", "given", 60, "none"))
+        rows.append((f"i{k}.fits", "psfs.fits", f"{x},{y}", "given", 60, "none", 0.01))
     rows[4] = ("gone.fits", *rows[4][1:])
-    names = ["images", "psf", "star", "psf_centre", "n_iter", "stop"]
+    names = ["images", "psf", "star", "psf_centre", "n_iter", "stop", "smoothing"]
     Table(rows=rows, names=names).write("targets.csv")
     return [row[0].removesuffix(".fits") for row in rows]
 
 
-def disturb(client):
-    """Kill a worker with half of the targets done, and cut the connection a little later."""
-    folder = Path("two")
-    while len(list(folder.glob("*.log"))) < N_TARGETS // 2:
-        time.sleep(0.01)
-    os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
-    while len(list(folder.glob("*.log"))) < N_TARGETS * 2 // 3:
-        time.sleep(0.01)
+def disturb(client, lost):
+    """Kill one worker after the other, and cut the connection a little later."""
+    lost += client.run(os.getpid).values()
+    for process, n_begun in zip(lost, (N_TARGETS // 3, N_TARGETS // 2), strict=True):
+        await_logs(n_begun)
+        os.kill(process, signal.SIGKILL)
+    await_logs(N_TARGETS * 2 // 3)
     client.loop.add_callback(client.scheduler_comm.comm.abort)
+
+
+def await_logs(number):
+    while len(list(Path("two").glob("*.log"))) < number:
+        time.sleep(0.01)
 
 
 def test_a_lost_worker_and_connection_change_no_result(targets, capfd):
@@ -60,7 +64,8 @@ def test_a_lost_worker_and_connection_change_no_result(targets, capfd):
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
-        thread = threading.Thread(target=disturb, args=(client,))
+        lost = []
+        thread = threading.Thread(target=disturb, args=(client, lost))
         thread.start()
         words = ["batch", "targets.csv", "-o", "two", "--parallel", "current-scheduler"]
         assert cli.main(words) == 1
@@ -70,6 +75,8 @@ def test_a_lost_worker_and_connection_change_no_result(targets, capfd):
     for name in ("name", "status", "message", "n_iter", "stopped", "warnings", "device"):
         assert one[name].tolist() == two[name].tolist(), name
     assert one["status"].tolist() == ["failed" if k == 4 else "done" for k in range(N_TARGETS)]
-    assert len({*two["process"]}) == 3  # two workers, and that in the place of the lost one
+    processes = {int(each.split(":")[1]) for each in two["process"]}
+    assert processes & {*lost}  # what lost workers had done is not done again
+    assert processes - {*lost}
     for name in set(targets) - {"gone"}:
         np.testing.assert_equal(outcome(f"one/{name}.fits"), outcome(f"two/{name}.fits"))
