@@ -1,7 +1,8 @@
 """Scenes with right and wrong PSFs by the defaults: light near stars and star fluxes.
 
     python benchmarks/defaults.py --seeds FIRST LAST [--images P ...] [--errors NAME ...]
-        [--kinds NAME ...] [--processes N] [--device SPEC] --output FILE.ecsv
+        [--kinds NAME ...] [--fine N] [--best] [--apertures] [--processes N] [--device SPEC]
+        --output FILE.ecsv
     python benchmarks/defaults.py --report FILE.ecsv
 
 Each scene has 96 x 96 pixels, a star 0.3 to 30 times as bright as its extended source, 1e5 to 2e6
@@ -20,7 +21,14 @@ star      the PSF given is the image of another star, with its noise and as it i
 Columns: the relative error of the extended source, in all and within 12 pixels of the stars; the
 mean relative error of the star fluxes, and the largest; the errors in units of those stated; the
 relative error of the PSFs given, and of those used; the error that was found; whether PSFs were
-refined; the sum of the models over that of the counts; iterations; seconds.
+refined; the sum of the models over that of the counts; iterations; seconds, and those of a
+run with one weight that judges no PSFs.
+
+--fine 2 has pixels twice as large, so that lambda / D is 1.25 of them, and dithers the images; the
+PSFs given are those of a star in the middle of a pixel. --best adds the least errors near the stars
+of any weight of the smoothing and any iteration, with the truth for a judge, once with the PSFs
+given and once with those that jitter, shift and free places make of them; and the star flux error
+there. --apertures adds the errors of four circles of radius 4 over those stated, from 20 replicas.
 """
 
 import argparse
@@ -33,9 +41,12 @@ import numpy as np
 from astropy.table import Table
 
 import lnocl
+from lnocl.scene.penalty import recommend_smoothing
 
 N = 96
 KINDS = ("jet", "host", "ring", "disc")
+# Of the smoothing that is recommended, for --best.
+WEIGHTS, ITERATIONS = (0, 1, 3, 10, 30, 100), 300
 ERRORS = ("right", "shift", "blur", "strehl", "phase", "speckles", "star")
 Y, X = np.indices((N, N)).astype(float)
 V, U = np.fft.fftfreq(N)[:, None], np.fft.rfftfreq(N)[None, :]
@@ -149,51 +160,163 @@ def psf_pair(error, optics, rng):
     return given, true
 
 
+class Scene:
+    """Images of a case, the PSFs given and true, and the truth."""
+
+    def __init__(self, kind, error, p, seed, fine):
+        rng = np.random.default_rng([seed, KINDS.index(kind), ERRORS.index(error), p])
+        light, stars, fluxes = sky(kind, rng)
+        self.contrast, counts = 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(5, 6.3)
+        self.background = 10 ** rng.uniform(0.5, 2.3)
+        light *= counts / light.sum()
+        self.fluxes = fluxes * self.contrast * counts / fluxes.sum()
+        optics = Optics()
+        given, true = np.swapaxes([psf_pair(error, optics, rng) for _ in range(p)], 0, 1)
+        offsets = rng.uniform(-fine, fine, (p, 2)) * (fine > 1)
+        self.images = []
+        for psf, offset in zip(true, offsets, strict=True):
+            origin = moved(np.fft.ifftshift(psf), *offset)
+            mean = filtered(light, np.fft.rfft2(origin))
+            mean += sum(
+                c * moved(origin, *star) for c, star in zip(self.fluxes, stars, strict=True)
+            )
+            self.images.append(rng.poisson(binned(mean.clip(0.0), fine) + self.background))
+        # A star at the middle of a large pixel lies half a small one beyond that pixel's first.
+        to_middle = (fine - 1) / 2
+        self.given, self.true = (
+            np.array([binned(moved(psf, to_middle, to_middle), fine) for psf in psfs])
+            for psfs in (given, true)
+        )
+        self.light = binned(light, fine)
+        self.stars = (stars - to_middle) / fine
+        self.offsets = offsets / fine if fine > 1 else None
+        y, x = np.indices(self.light.shape)
+        r = np.min([np.hypot(x - sx, y - sy) for sx, sy in self.stars], axis=0)
+        self.near = r < 12 / fine
+
+    def observation(self, psfs):
+        """Return the images with these PSFs."""
+        images = np.array(self.images, float)
+        return lnocl.Observation(images, psfs, background=self.background, offsets=self.offsets)
+
+    def error_near(self, extended):
+        """Return the relative error of an extended source near the stars."""
+        off = (extended - self.light)[self.near]
+        return np.linalg.norm(off) / np.linalg.norm(self.light[self.near])
+
+    def flux_error(self, fluxes):
+        """Return the mean relative error of star fluxes."""
+        return float((fluxes / self.fluxes - 1.0).mean())
+
+
+def binned(image, fine):
+    """Return an image in pixels that many times as large."""
+    n = len(image) // fine
+    return image.reshape(n, fine, n, fine).sum(axis=(1, 3))
+
+
 def run(case):
     """Return a row of the table."""
-    kind, error, p, seed, device = case
-    rng = np.random.default_rng([seed, KINDS.index(kind), ERRORS.index(error), p])
-    light, stars, fluxes = sky(kind, rng)
-    contrast, counts = 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(5, 6.3)
-    background = 10 ** rng.uniform(0.5, 2.3)
-    light *= counts / light.sum()
-    fluxes = fluxes * contrast * counts / fluxes.sum()
-    optics = Optics()
-    given, true = np.swapaxes([psf_pair(error, optics, rng) for _ in range(p)], 0, 1)
-    images = []
-    for psf in true:
-        origin = np.fft.ifftshift(psf)
-        mean = filtered(light, np.fft.rfft2(origin))
-        mean += sum(c * moved(origin, *star) for c, star in zip(fluxes, stars, strict=True))
-        images.append(rng.poisson(mean.clip(0.0) + background))
-    begin = time.perf_counter()
+    *scene, device, asks_best, asks_apertures = case
+    kind, error, p, seed, _ = scene
+    scene = Scene(*scene)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        observation = lnocl.Observation(np.array(images, float), given, background=background)
-        result = lnocl.deconvolve(observation, stars, pad=0, device=device)
+        observation = scene.observation(scene.given)
+        begin = time.perf_counter()
+        result = lnocl.deconvolve(observation, scene.stars, pad=0, device=device)
+        seconds = time.perf_counter() - begin
         stated = result.star_flux_errors
-    seconds = time.perf_counter() - begin
-    near = np.min([np.hypot(X - x, Y - y) for x, y in stars], axis=0) < 12
-    off, wrong = result.extended - light, result.star_fluxes - fluxes
+        weight = 3.0 * recommend_smoothing(observation)
+        begin = time.perf_counter()
+        lnocl.deconvolve(
+            observation, scene.stars, pad=0, device=device, smoothing=weight, stop=1e-6
+        )
+        seconds_of_a_run = time.perf_counter() - begin
+        more = best(scene, result, device) if asks_best else {}
+        more |= apertures(scene, result) if asks_apertures else {}
+    off, wrong = result.extended - scene.light, result.star_fluxes - scene.fluxes
     found = result.psf_refinement
     return {
         "kind": kind,
         "error": error,
         "images": p,
         "seed": seed,
-        "contrast": contrast,
-        "all": np.linalg.norm(off) / np.linalg.norm(light),
-        "near": np.linalg.norm(off[near]) / np.linalg.norm(light[near]),
-        "flux": float((wrong / fluxes).mean()),
-        "flux worst": float(abs(wrong / fluxes).max()),
+        "contrast": scene.contrast,
+        "all": np.linalg.norm(off) / np.linalg.norm(scene.light),
+        "near": scene.error_near(result.extended),
+        "flux": scene.flux_error(result.star_fluxes),
+        "flux worst": float(abs(wrong / scene.fluxes).max()),
         "of stated": float(np.median(abs(wrong / stated))),
-        "psf given": relative(given, true),
-        "psf used": relative(result.psfs, true),
+        "psf given": relative(scene.given, scene.true),
+        "psf used": relative(result.psfs, scene.true),
         "found": 0.0 if found is None else found.psf_error,
         "refined": found is not None and found.is_accepted,
-        "light": float(result.models().sum() / np.sum(images)),
+        "light": float(result.models().sum() / np.sum(scene.images)),
         "iterations": result.n_iter,
         "seconds": seconds,
+        "seconds of a run": seconds_of_a_run,
+        **more,
+    }
+
+
+def best(scene, result, device):
+    """Return the least errors near the stars of all weights and iterations, by the truth."""
+    found = []
+    asked = lnocl.deconvolve(
+        scene.observation(scene.given),
+        scene.stars,
+        pad=0,
+        device=device,
+        n_iter=20,
+        stop=None,
+        smoothing=0.0,
+        refine_positions=True,
+        refine_psfs=("jitter",) if len(scene.images) == 1 else ("jitter", "shift"),
+    )
+    for psfs, stars in ((scene.given, scene.stars), (asked.psfs, asked.star_positions)):
+        observation = scene.observation(psfs)
+        recommended = recommend_smoothing(observation)
+        for weight in WEIGHTS:
+
+            def look(iteration, estimate):
+                if iteration & (iteration - 1) == 0 or iteration % 25 == 0:
+                    at = scene.error_near(estimate.extended)
+                    found.append((at, scene.flux_error(estimate.star_fluxes)))
+
+            lnocl.deconvolve(
+                observation,
+                stars,
+                pad=0,
+                device=device,
+                n_iter=ITERATIONS,
+                stop=None,
+                smoothing=weight * recommended,
+                callback=look,
+            )
+    error, flux = min(found)
+    return {"best": error, "best flux": flux}
+
+
+def apertures(scene, result):
+    """Return how many stated errors the light of four circles is off."""
+    from regions import CirclePixelRegion, PixCoord
+
+    x, y = scene.stars[0]
+    places = [(x + 6, y), (x, y - 9), (x - 12, y), (x, y + 16)]
+    circles = [CirclePixelRegion(PixCoord(*at), 4.0) for at in places]
+    found = result.bootstrap(20, regions=circles)
+    truth = [(circle.to_mask("exact").multiply(scene.light)).sum() for circle in circles]
+    values = [
+        (quantity.value - bias, error)
+        for quantity, bias, error in zip(
+            found.quantities, found.bias, found.standard_errors, strict=True
+        )
+        if not quantity.name.startswith("star")
+    ]
+    return {
+        f"circle {k + 1}": float((value - light) / error)
+        for k, ((value, error), light) in enumerate(zip(values, truth, strict=True))
     }
 
 
@@ -221,8 +344,21 @@ def report(table):
         print(
             f"{error:8} {p} images, {len(rows):3}: {near} | {flux} | {psfs} | refined in "
             f"{rows['refined'].sum()}, errors found in {(rows['found'] > 0).sum()}; within 1, 2 "
-            f"stated errors {held[0]:.2f} {held[1]:.2f}; {np.median(rows['seconds']):.1f} s"
+            f"stated errors {held[0]:.2f} {held[1]:.2f}; {np.median(rows['seconds']):.1f} s, "
+            f""
+            f"{np.median(rows['seconds'] / rows['seconds of a run']):.1f} runs"
         )
+        if "best" in rows.colnames:
+            ratios = np.percentile(rows["near"] / rows["best"], (50, 90, 100))
+            print(
+                "         over the best: " + " ".join(f"{each:.2f}" for each in ratios),
+                f"| flux error there {np.median(abs(rows['best flux'])):.3f}",
+            )
+        if "circle 1" in rows.colnames:
+            off = abs(np.array([rows[f"circle {k}"] for k in range(1, 5)]))
+            print(
+                f"         circles within 1, 2 errors {(off < 1).mean():.2f} {(off < 2).mean():.2f}"
+            )
 
 
 def main():
@@ -234,6 +370,9 @@ def main():
     parser.add_argument("--images", nargs="+", type=int, default=(1, 4), metavar="P")
     parser.add_argument("--errors", nargs="+", choices=ERRORS, default=ERRORS)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--fine", type=int, default=1, metavar="N")
+    parser.add_argument("--best", action="store_true")
+    parser.add_argument("--apertures", action="store_true")
     parser.add_argument("--processes", type=int, default=2, metavar="N")
     parser.add_argument("--device", metavar="SPEC")
     parser.add_argument("--output", metavar="FILE.ecsv")
@@ -244,7 +383,7 @@ def main():
         return
     seeds = range(*given.seeds)
     cases = [
-        (kind, error, p, seed, given.device)
+        (kind, error, p, seed, given.fine, given.device, given.best, given.apertures)
         for seed, p, error, kind in product(seeds, given.images, given.errors, given.kinds)
     ]
     with ProcessPoolExecutor(given.processes) as pool:
