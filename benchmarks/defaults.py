@@ -1,8 +1,8 @@
 """Scenes with right and wrong PSFs by the defaults: light near stars and star fluxes.
 
     python benchmarks/defaults.py --seeds FIRST LAST [--images P ...] [--errors NAME ...]
-        [--kinds NAME ...] [--fine N] [--best] [--apertures] [--processes N] [--device SPEC]
-        --output FILE.ecsv
+        [--kinds NAME ...] [--fine N] [--drizzled] [--best] [--apertures]
+        [--processes N] [--device SPEC] --output FILE.ecsv
     python benchmarks/defaults.py --report FILE.ecsv
 
 Each scene has 96 x 96 pixels, a star 0.3 to 30 times as bright as its extended source, 1e5 to 2e6
@@ -24,17 +24,21 @@ relative error of the PSFs given, and of those used; the error that was found; w
 refined; the sum of the models over that of the counts; iterations; seconds, and those of a
 run with one weight that judges no PSFs.
 
---fine 2 has pixels twice as large, so that lambda / D is 1.25 of them, and dithers the images; the
-PSFs given are those of a star in the middle of a pixel. --best adds the least errors near the stars
-of any weight of the smoothing and any iteration, with the truth for a judge, once with the PSFs
-given and once with those that jitter, shift and free places make of them; and the star flux error
-there. --apertures adds the errors of four circles of radius 4 over those stated, from 20 replicas.
+--fine 2     pixels are twice as large, so that lambda / D is 1.25 of them, the images dithered, and
+             the PSFs given those of a star in the middle of a pixel
+--drizzled   each image is four dithered ones with pixels twice as large, dropped on its pixels, so
+             that neighbours share their noise
+--best       adds the least error near the stars of any weight of the smoothing and any iteration,
+             judged by the truth, with the PSFs given and with those that jitter, shift and free
+             places make of them; and the star flux error there
+--apertures  adds the errors of four circles of radius 4 over those stated, from 20 replicas
 """
 
 import argparse
 import time
 import warnings
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -50,6 +54,8 @@ WEIGHTS, ITERATIONS = (0, 1, 3, 10, 30, 100), 300
 ERRORS = ("right", "shift", "blur", "strehl", "phase", "speckles", "star")
 Y, X = np.indices((N, N)).astype(float)
 V, U = np.fft.fftfreq(N)[:, None], np.fft.rfftfreq(N)[None, :]
+# What `drizzled` does to a spectrum: pixels twice as large, and drops as large as they.
+DROP = (np.cos(np.pi * U) * np.cos(np.pi * V)) ** 2
 
 
 def filtered(image, otf):
@@ -163,7 +169,7 @@ def psf_pair(error, optics, rng):
 class Scene:
     """Images of a case, the PSFs given and true, and the truth."""
 
-    def __init__(self, kind, error, p, seed, fine):
+    def __init__(self, kind, error, p, seed, fine, is_drizzled):
         rng = np.random.default_rng([seed, KINDS.index(kind), ERRORS.index(error), p])
         light, stars, fluxes = sky(kind, rng)
         self.contrast, counts = 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(5, 6.3)
@@ -180,7 +186,12 @@ class Scene:
             mean += sum(
                 c * moved(origin, *star) for c, star in zip(self.fluxes, stars, strict=True)
             )
-            self.images.append(rng.poisson(binned(mean.clip(0.0), fine) + self.background))
+            observe = partial(drizzled, rng) if is_drizzled else rng.poisson
+            self.images.append(observe(binned(mean.clip(0.0), fine) + self.background))
+        if is_drizzled:
+            given, true = (
+                np.array([filtered(psf, DROP) for psf in psfs]) for psfs in (given, true)
+            )
         # A star at the middle of a large pixel lies half a small one beyond that pixel's first.
         to_middle = (fine - 1) / 2
         self.given, self.true = (
@@ -209,6 +220,16 @@ class Scene:
         return float((fluxes / self.fluxes - 1.0).mean())
 
 
+def drizzled(rng, mean):
+    """Return the sum of four images with pixels twice as large, dropped on these."""
+    total = np.zeros_like(mean)
+    for by in product((0, 1), repeat=2):
+        seen = rng.poisson(binned(np.roll(mean, by, (0, 1)), 2) / 4.0)
+        dropped = seen.repeat(2, axis=0).repeat(2, axis=1) / 4.0
+        total += np.roll(dropped, (-by[0], -by[1]), (0, 1))
+    return total
+
+
 def binned(image, fine):
     """Return an image in pixels that many times as large."""
     n = len(image) // fine
@@ -218,7 +239,7 @@ def binned(image, fine):
 def run(case):
     """Return a row of the table."""
     *scene, device, asks_best, asks_apertures = case
-    kind, error, p, seed, _ = scene
+    kind, error, p, seed = scene[:4]
     scene = Scene(*scene)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -371,6 +392,7 @@ def main():
     parser.add_argument("--errors", nargs="+", choices=ERRORS, default=ERRORS)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--fine", type=int, default=1, metavar="N")
+    parser.add_argument("--drizzled", action="store_true")
     parser.add_argument("--best", action="store_true")
     parser.add_argument("--apertures", action="store_true")
     parser.add_argument("--processes", type=int, default=2, metavar="N")
@@ -383,7 +405,10 @@ def main():
         return
     seeds = range(*given.seeds)
     cases = [
-        (kind, error, p, seed, given.fine, given.device, given.best, given.apertures)
+        (
+            *(kind, error, p, seed, given.fine, given.drizzled),
+            *(given.device, given.best, given.apertures),
+        )
         for seed, p, error, kind in product(seeds, given.images, given.errors, given.kinds)
     ]
     with ProcessPoolExecutor(given.processes) as pool:

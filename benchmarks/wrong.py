@@ -8,7 +8,7 @@ psfs   a star on a ring and a knot, seen through a Moffat PSF or a core with a h
        that are wrong, and the right one: what is said, and the error of the extended source
 right  50 scenes with right PSFs: 35 of the paper's experiment (seeds 700 to 734), 15 of the above,
        the star 0.2 to 100 times as bright: what is said
-noise  wrong gains, a sky that was subtracted, read noise left out, correlated noise
+noise  wrong gains, a sky that was subtracted, read noise left out, neighbours averaged
 images a picture of five of the wrong PSFs, STEM.png: 1000 iterations of the split-gradient method
        with the PSF as given, the defaults, and the defaults with the PSF centred
 """
@@ -84,7 +84,7 @@ def try_it(image, psf, stars, device=None, **known):
     words = {
         "pixels off its centre": "centre", "does not fit": "width", "pixels from there": "place",
         "negative and were kept": "negative", "too near the end": "length",
-        "not that of its counts": "noise", "share their noise": "correlation",
+        "not that of its counts": "noise",
         "the PSFs do not fit the stars": "error left",
     }  # fmt: skip
     result, messages = None, []
@@ -140,7 +140,7 @@ def right(device):
 def noise(device):
     """Yield rows of the part "noise"."""
     image, *_, psf = make_scene("moffat", 10.0)
-    drizzled = sum(np.roll(image, by, (0, 1)) for by in ((0, 0), (0, 1), (1, 0), (1, 1))) / 4.0
+    averaged = sum(np.roll(image, by, (0, 1)) for by in ((0, 0), (0, 1), (1, 0), (1, 1))) / 4.0
     read = np.random.default_rng(2).normal(0.0, 12.0, image.shape)
     for name, images, level in (
         ("right", image, LEVEL),
@@ -149,7 +149,7 @@ def noise(device):
         ("gain of 1000 left out", image / 1000.0, LEVEL / 1000.0),
         ("sky subtracted", image - LEVEL, 0.0),
         ("read noise of 12 left out", image + read, LEVEL),
-        ("drizzled", drizzled, LEVEL),
+        ("neighbours averaged", averaged, LEVEL),
     ):
         _, said = try_it(images, psf, [STAR], device, background=level)
         yield {"noise": name, "said": ", ".join(said)}

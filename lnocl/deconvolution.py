@@ -212,7 +212,7 @@ def deconvolve(
         - PSFs have an error of more than 3 % at the stars that refining has not mended.
         - Images are offset by more than `pad` and the grid leave room for.
         - Single precision is expected to stray from double by a thousandth of the extended source.
-        - The noise of an image is not that of Poisson counts, or neighbouring pixels share theirs.
+        - The noise of an image is not that of Poisson counts.
         - The background is above the darker half of an image.
         - Held-out counts choose an iteration too near `n_iter`.
         - The objective rises or is not finite.

@@ -103,8 +103,7 @@ class TestLensedQuasar:
     @engines
     def test_what_comes_out(self, arguments, engine, capsys):
         assert main([*arguments, "--engine", engine, "-o", "out.fits"]) == 0
-        warned = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
-        assert ["share their noise" in line for line in warned] == [True]  # it was drizzled
+        assert "warning" not in capsys.readouterr().err  # though it was drizzled
         check_file("out.fits")
         with fits.open("out.fits") as hdus:
             extended, stars, history, _ = (hdu.data for hdu in hdus)
