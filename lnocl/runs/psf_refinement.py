@@ -33,8 +33,11 @@ from lnocl.solvers.psf_fit import step
 
 log = logging.getLogger("lnocl")
 
-# A mend is taken where it leaves less than this share of kappa.
-MENDED = 0.5
+# A mend is taken where it leaves less than this share of kappa, or nothing to doubt and a misfit
+# that is less by so many of its standard deviations.
+MENDED, GONE = 0.5, 2.0
+# None is taken that leaves a star less than this share of its flux.
+FADED = 0.5
 # Rounds of a search: each takes so many steps, and judges the PSFs. It ends where a round lowers
 # the misfit by less than so many of its standard deviations.
 ROUNDS, STEPS, IMPROVED = 4, 2, 0.3
@@ -86,7 +89,11 @@ class _State:
 
     def is_mended_by(self, other: _State) -> bool:
         """Return whether other PSFs or positions mend enough to be taken."""
-        return other.misfit.kappa < MENDED * self.misfit.kappa
+        before, after = self.misfit, other.misfit
+        if (other.estimate.fluxes < FADED * self.estimate.fluxes).any():
+            return False  # a sharper PSF, and the star's light in the extended source
+        is_gone = not after.is_doubtful and before.significance - after.significance > GONE
+        return is_gone or after.kappa < MENDED * before.kappa
 
 
 def mend(
@@ -95,8 +102,9 @@ def mend(
     """Return an observation whose positions and PSFs are mended where the images ask for it.
 
     Stars are moved first, then negative pixels of PSFs are repaired, the families are fitted, and
-    pixels freed. Each is tried only where the misfit before is significant, and taken only where it
-    leaves less than half of kappa; of the repair any gain is taken, since it has no parameter.
+    pixels freed. Each is tried only where the misfit before is in doubt. It is taken where it
+    leaves less than half of kappa, or nothing to doubt, and every star more than half its flux; of
+    the repair any gain is taken, since it has no parameter.
 
     Parameters
     ----------
@@ -120,25 +128,26 @@ def mend(
         observation.psfs, runs.fit(observation.psfs, runs.stars, moves is True), moves is True
     )
     state = given
-    if state.misfit.is_significant and moves == "auto":
+    if state.misfit.is_doubtful and moves == "auto":
         state = _move(runs, state)
-    if state.misfit.is_significant and names and (observation.psfs < 0).any():
+    if state.misfit.is_doubtful and names and (observation.psfs < 0).any():
         state = _repair(runs, state)
     families = PsfFamilies(
         [name for name in names if name != "pixels"], with_psfs(observation, state.psfs)
     )
     values, tried = np.zeros((observation.n_images, len(families.prior))), state
-    if state.misfit.is_significant and families.parameters:
+    if state.misfit.is_doubtful and families.parameters:
         tried, values = _fit(runs, families, state, moves is not False)
         state = tried if state.is_mended_by(tried) else state
-    if state.misfit.is_significant and "pixels" in names:
+    if state.misfit.is_doubtful and "pixels" in names:
         tried = _free_pixels(runs, observation.psf_scatter, state, moves is not False)
         state = tried if _is_trusted(state, tried) else state
     is_accepted = state.psfs is not observation.psfs
     if is_accepted:
         observation = with_psfs(observation, state.psfs)
     known = observation.psf_scatter[: 0 if is_accepted and "pixels" in names else None]
-    if not (is_asked or len(known) or given.misfit.is_significant):
+    is_told = is_accepted or given.misfit.is_significant
+    if not (is_asked or len(known) or is_told):
         return Mended(observation, state.moves, None, None)
     _tell(given, state, tried, is_accepted)
     allowance = Allowance(observation, runs, state.estimate, known)

@@ -1,13 +1,14 @@
 r"""How far images are from their models at the stars, as a relative error of the PSFs.
 
 A pixel counts by the square of the stars' share S of its model m, so that the sky beside the stars
-has no part:
+has no part, and less where m is below an electron, since few counts tell nothing:
 
-.. math:: \chi^2 = \sum_j \sum_n \frac{S^2}{m^2} \frac{(g - m)^2}{m}, \qquad
-          \kappa^2 = \Bigl(\chi^2 - \sum \frac{S^2}{m^2}\Bigr) \Big/ \sum \frac{S^4}{m^3}.
+.. math:: \chi^2 = \sum_j \sum_n w \frac{(g - m)^2}{m}, \qquad
+          w = \frac{S^2}{m^2} \frac{m}{m + 1/2}, \qquad
+          \kappa^2 = \Bigl(\chi^2 - \sum w\Bigr) \Big/ \sum w \frac{S^2}{m}.
 
-Noise alone leaves ``sum S^2 / m^2``, and a PSF with a relative error kappa in each pixel
-``kappa^2 S^2`` beside the variance m.
+Noise alone leaves ``sum w``, with a variance of ``sum w^2 (2 + 1 / m)``. A PSF with a relative
+error kappa in each pixel adds ``kappa^2 S^2`` to the variance m.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ from lnocl.scene.scene import MIN_MODEL, Scene
 
 # The misfit is told from noise from so many of its standard deviations on; in a ring from so many.
 SIGNIFICANT, SIGNIFICANT_IN_RING = 5.0, 2.0
+# A mend is tried from fewer on too where kappa is large: in few counts no error is significant, and
+# in many the smoothing of the extended source leaves as many standard deviations, but little kappa.
+DOUBTFUL, LARGE = 3.0, 0.1
 # The weight of the edge-preserving term near stars, in standard deviations of the gradient of the
 # data term by the error of the PSFs: docs/validation/wrong_psfs.md.
 STRENGTH = 2.0
@@ -38,9 +42,9 @@ class PsfMisfit(NamedTuple):
     squares : ndarray of float64, shape (p,)
         chi squared of each image.
     expected, variance : float
-        What noise alone gives, for all images, and its variance ``sum (2 + 1 / m) S^4 / m^4``.
+        What noise alone gives, for all images, and its variance.
     norm : float
-        ``sum S^4 / m^3``.
+        ``sum w S^2 / m``.
     in_rings : ndarray of float64
         kappa in each of the `Rings` round the stars; 0 where it is not told from noise.
     """
@@ -61,6 +65,11 @@ class PsfMisfit(NamedTuple):
         """The excess of chi squared in standard deviations of noise."""
         excess = float(self.squares.sum()) - self.expected
         return excess / math.sqrt(self.variance) if self.variance else 0.0
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether a mend is worth a trial: the excess is significant, or three and kappa large."""
+        return self.is_significant or (self.significance > DOUBTFUL and self.kappa > LARGE)
 
     @property
     def is_significant(self) -> bool:
@@ -108,15 +117,15 @@ def measure_misfit(
         electrons = scene.scale * weights[inside][seen]
         total = np.maximum(means[j][inside][seen], MIN_MODEL)
         # Pixels where PSFs are negative show nothing.
-        share = (light[inside][seen] / total).clip(0.0, 1.0) ** 2
+        squared = (light[inside][seen] / total).clip(0.0, 1.0) ** 2
         residuals = electrons * (counts - found[j] - settled_light)[inside][seen]
         total *= electrons
-        left = share * residuals**2 / total
+        weight = squared * total / (total + 0.5)
+        left = weight * residuals**2 / total
         squares[j] = left.sum()
         rings = Rings(scene.observation.shape, scene.stars + scene.observation.offsets[j])
-        parts.append(
-            (rings.number[seen], left - share, share**2 * (2.0 + 1.0 / total), share**2 * total)
-        )
+        variance = weight**2 * (2.0 + 1.0 / total)
+        parts.append((rings.number[seen], left - weight, variance, weight * squared * total))
     number, excess, variance, norm = (np.concatenate(each) for each in zip(*parts, strict=True))
     sums = [np.bincount(number, each) for each in (excess, variance, norm)]
     in_rings = [

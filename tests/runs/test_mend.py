@@ -1,13 +1,16 @@
 """What the defaults do about PSFs and positions: nothing where they are right, else what mends."""
 
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import lnocl
 from lnocl.errors import LnoclWarning
+from lnocl.runs.psf_refinement import _State
 from lnocl.scene.psf_families import PsfFamilies
+from lnocl.scene.psf_misfit import PsfMisfit
 
 N, STAR, LEVEL = 64, (30, 24), 50.0
 Y, X = np.indices((N, N))
@@ -58,6 +61,27 @@ def test_a_star_beside_its_place_is_moved(caplog):
     assert not found.psf_refinement.is_accepted
     kept = solve(beside=(0.2, -0.1), refine_positions=np.False_, refine_psfs=())
     np.testing.assert_array_equal(kept.star_positions, [np.add(STAR, (0.2, -0.1))])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_star_of_few_counts_is_moved(seed):
+    """As an X-ray source: in no pixel is the misfit significant, nor in all by five deviations."""
+    counts = np.random.default_rng(seed).poisson(1500.0 * np.roll(PSF, (-7, -2), (0, 1)) + 0.003)
+    observation = lnocl.Observation(counts, PSF, background=0.003, psf_centre="given")
+    found = lnocl.deconvolve(observation, [STAR], **RUN)
+    np.testing.assert_allclose(found.star_positions, [np.add(STAR, (0, 1))], rtol=0, atol=0.25)
+    assert found.star_fluxes == pytest.approx(1500.0, rel=0.1)
+
+
+def test_a_sharper_psf_that_takes_the_star_away_is_refused():
+    def state(kappa, flux):
+        misfit = PsfMisfit(np.array([100.0 * kappa]), 1.0, 1.0, 100.0, np.zeros(1))
+        return _State(PSF, SimpleNamespace(misfit=misfit, fluxes=np.array([1e4, flux])), False)
+
+    before = state(0.2, 1e4)
+    assert before.is_mended_by(state(0.02, 0.6e4))
+    assert not before.is_mended_by(state(0.02, 0.4e4))
+    assert not before.is_mended_by(state(0.19, 1e4))
 
 
 def test_a_wrong_width_is_mended(right):

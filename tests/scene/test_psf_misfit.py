@@ -64,13 +64,14 @@ def test_it_is_the_formula():
     found = misfit_of(scene, sky, fluxes)
     light, counts = FLUX * star_image(PSF), scene.observation.images[0]
     model = light + LEVEL + SKY
-    share = (light / model) ** 2
-    np.testing.assert_allclose(found.squares, (share * (counts - model) ** 2 / model).sum())
-    np.testing.assert_allclose(found.expected, share.sum())
-    np.testing.assert_allclose(found.norm, (light**4 / model**3).sum())
+    weight = light**2 / model / (model + 0.5)
+    np.testing.assert_allclose(found.squares, (weight * (counts - model) ** 2 / model).sum())
+    np.testing.assert_allclose(found.expected, weight.sum())
+    np.testing.assert_allclose(found.variance, (weight**2 * (2.0 + 1.0 / model)).sum())
+    np.testing.assert_allclose(found.norm, (weight * light**2 / model).sum())
     number = Rings((N, N), np.array([STAR])).number == 2
-    excess = (share * ((counts - model) ** 2 / model - 1.0))[number].sum()
-    expected = np.sqrt(excess / (light**4 / model**3)[number].sum())
+    excess = (weight * ((counts - model) ** 2 / model - 1.0))[number].sum()
+    expected = np.sqrt(excess / (weight * light**2 / model)[number].sum())
     assert found.in_rings[2] == pytest.approx(expected)
 
 
