@@ -350,7 +350,7 @@ def deconvolve(
     with bar, np.errstate(over="ignore", invalid="ignore"):
         start = make_start(setup, observation, penalties[0], initial_extended, initial_star_fluxes)
         warn_of_noise(observation)
-        warn_of_stars(start.scene)
+        warn_of_stars(start.scene, setup.refine_positions)
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes
         largest = partial(measure, start, int(n_iter))
         checkpointer = Checkpointer(checkpoint, checkpoint_every, resume, inputs, largest)

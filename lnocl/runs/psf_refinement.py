@@ -146,7 +146,7 @@ def mend(
     if is_accepted:
         observation = with_psfs(observation, state.psfs)
     known = observation.psf_scatter[: 0 if is_accepted and "pixels" in names else None]
-    is_told = is_accepted or given.misfit.is_significant
+    is_told = state is not given or given.misfit.is_significant
     if not (is_asked or len(known) or is_told):
         return Mended(observation, state.moves, None, None)
     _tell(given, state, tried, is_accepted)

@@ -108,8 +108,15 @@ def _masked_stars(scene: Scene) -> Iterator[int]:
             yield s
 
 
-def warn_of_stars(scene: Scene) -> None:
+def warn_of_stars(scene: Scene, moves: bool) -> None:
     """Warn of masked stars, of the PSF whose width fits a star least, and of the star farthest off.
+
+    Parameters
+    ----------
+    scene : Scene
+        The stars and the images.
+    moves : bool
+        Whether positions are refined, so that none is off.
 
     Warns
     -----
@@ -145,7 +152,7 @@ def warn_of_stars(scene: Scene) -> None:
         )
         return  # the place means little then
     farthest = max(found, key=StarCheck.excess_distance)
-    if farthest.excess_distance() > 0:
+    if farthest.excess_distance() > 0 and not moves:
         (dx, dy), (x, y) = farthest.offset, scene.stars[farthest.star]
         warn(
             f"the star at ({x:.7g}, {y:.7g}) lies ({dx:z.2f}, {dy:z.2f}) pixels from there in "

@@ -30,6 +30,12 @@ def test_every_option_is_a_parameter_and_every_parameter_an_option():
     assert taken - names == NOT_OPTIONS
 
 
+def test_messages_name_the_flag_that_does_it_and_not_the_one_that_undoes_it():
+    flags = deconvolve.COMMAND.flags()
+    named = messages.in_shell("give its place, take refine_positions, or mend it", flags)
+    assert named == "give its place, take --refine, or mend it"
+
+
 @pytest.mark.parametrize("table", [deconvolve.ALL_OPTIONS, psf.OPTIONS])
 def test_no_two_options_share_a_keyword_or_a_checksum(table):
     keywords = [each.card[0] for each in table if each.card]

@@ -64,13 +64,15 @@ def test_a_star_beside_its_place_is_moved(caplog):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_star_of_few_counts_is_moved(seed):
+def test_a_star_of_few_counts_is_moved(seed, caplog):
     """As an X-ray source: in no pixel is the misfit significant, nor in all by five deviations."""
+    caplog.set_level("INFO", "lnocl")
     counts = np.random.default_rng(seed).poisson(1500.0 * np.roll(PSF, (-7, -2), (0, 1)) + 0.003)
     observation = lnocl.Observation(counts, PSF, background=0.003, psf_centre="given")
     found = lnocl.deconvolve(observation, [STAR], **RUN)
     np.testing.assert_allclose(found.star_positions, [np.add(STAR, (0, 1))], rtol=0, atol=0.25)
     assert found.star_fluxes == pytest.approx(1500.0, rel=0.1)
+    assert "positions refined" in caplog.text
 
 
 def test_a_sharper_psf_that_takes_the_star_away_is_refused():

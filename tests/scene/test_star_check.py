@@ -34,10 +34,10 @@ def observe(psf, flux=1e5, star=STAR, extended=0.0, seed=0, **given):
     return lnocl.Observation(image, psf, background=LEVEL, **given)
 
 
-def said(observation, star=STAR):
+def said(observation, star=STAR, moves=False):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        warn_of_stars(Scene(observation, [star]))
+        warn_of_stars(Scene(observation, [star]), moves)
     return [str(each.message) for each in caught]
 
 
@@ -72,10 +72,12 @@ def test_a_psf_of_another_width_is_said(factor):
 
 @pytest.mark.parametrize("offset", [0.3, 1.0])
 def test_a_star_elsewhere_is_said(offset):
-    (message,) = said(observe(moffat(WIDTH), star=(STAR[0] + offset, STAR[1])))
+    observation = observe(moffat(WIDTH), star=(STAR[0] + offset, STAR[1]))
+    (message,) = said(observation)
     stated = float(message.split("lies (")[1].split(",")[0])
     assert stated == pytest.approx(offset, abs=0.05)
     assert "give its place, take refine_positions, or mend the centre of psf 0" in message
+    assert said(observation, moves=True) == []
 
 
 def test_what_was_refined_is_not_said():
