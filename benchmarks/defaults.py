@@ -7,7 +7,8 @@
 
 Each scene has 96 x 96 pixels, a star 0.3 to 30 times as bright as its extended source, 1e5 to 2e6
 electrons of that in each image, and a PSF of a telescope behind adaptive optics, lambda / D being
-2.5 pixels. Kinds: a jet, a host with a cusp, four stars on a ring with a galaxy inside, a disc.
+2.5 pixels. Kinds: a jet, a host with a cusp, four stars on a ring with a galaxy inside, a disc; and
+on request a star alone, whose errors of the extended source are relative to its flux.
 The images are made with PSFs that differ from those given:
 
 right     in nothing
@@ -48,7 +49,7 @@ import lnocl
 from lnocl.scene.penalty import recommend_smoothing
 
 N = 96
-KINDS = ("jet", "host", "ring", "disc")
+KINDS = ("jet", "host", "ring", "disc", "alone")
 # Of the smoothing that is recommended, for --best.
 WEIGHTS, ITERATIONS = (0, 1, 3, 10, 30, 100), 300
 ERRORS = ("right", "shift", "blur", "strehl", "phase", "speckles", "star")
@@ -108,7 +109,9 @@ def sky(kind, rng):
     r, angle = np.hypot(dx, dy), rng.uniform(0, 2 * np.pi)
     along = dx * np.cos(angle) + dy * np.sin(angle)
     across = dy * np.cos(angle) - dx * np.sin(angle)
-    if kind == "jet":
+    if kind == "alone":
+        light = np.zeros((N, N))
+    elif kind == "jet":
         bent = across - 1.5 * np.sin(along / 7)
         light = np.exp(-(bent**2) / 2.9 - along / 25) * (along > 2)
         for _ in range(3):
@@ -174,7 +177,7 @@ class Scene:
         light, stars, fluxes = sky(kind, rng)
         self.contrast, counts = 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(5, 6.3)
         self.background = 10 ** rng.uniform(0.5, 2.3)
-        light *= counts / light.sum()
+        light *= counts / (light.sum() or 1.0)
         self.fluxes = fluxes * self.contrast * counts / fluxes.sum()
         optics = Optics()
         given, true = np.swapaxes([psf_pair(error, optics, rng) for _ in range(p)], 0, 1)
@@ -213,7 +216,7 @@ class Scene:
     def error_near(self, extended):
         """Return the relative error of an extended source near the stars."""
         off = (extended - self.light)[self.near]
-        return np.linalg.norm(off) / np.linalg.norm(self.light[self.near])
+        return np.linalg.norm(off) / (np.linalg.norm(self.light[self.near]) or self.fluxes.sum())
 
     def flux_error(self, fluxes):
         """Return the mean relative error of star fluxes."""
@@ -264,7 +267,7 @@ def run(case):
         "images": p,
         "seed": seed,
         "contrast": scene.contrast,
-        "all": np.linalg.norm(off) / np.linalg.norm(scene.light),
+        "all": np.linalg.norm(off) / (np.linalg.norm(scene.light) or scene.fluxes.sum()),
         "near": scene.error_near(result.extended),
         "flux": scene.flux_error(result.star_fluxes),
         "flux worst": float(abs(wrong / scene.fluxes).max()),
@@ -390,7 +393,7 @@ def main():
     parser.add_argument("--seeds", nargs=2, type=int, metavar=("FIRST", "LAST"), default=(0, 1))
     parser.add_argument("--images", nargs="+", type=int, default=(1, 4), metavar="P")
     parser.add_argument("--errors", nargs="+", choices=ERRORS, default=ERRORS)
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:4])
     parser.add_argument("--fine", type=int, default=1, metavar="N")
     parser.add_argument("--drizzled", action="store_true")
     parser.add_argument("--best", action="store_true")

@@ -36,6 +36,8 @@ log = logging.getLogger("lnocl")
 # A mend is taken where it leaves less than this share of kappa, or nothing to doubt and a misfit
 # that is less by so many of its standard deviations.
 MENDED, GONE = 0.5, 2.0
+# The repair of negative pixels is taken where it leaves less than this share.
+REPAIRED = 0.9
 # None is taken that leaves a star less than this share of its flux.
 FADED = 0.5
 # Rounds of a search: each takes so many steps, and judges the PSFs. It ends where a round lowers
@@ -103,8 +105,8 @@ def mend(
 
     Stars are moved first, then negative pixels of PSFs are repaired, the families are fitted, and
     pixels freed. Each is tried only where the misfit before is in doubt. It is taken where it
-    leaves less than half of kappa, or nothing to doubt, and every star more than half its flux; of
-    the repair any gain is taken, since it has no parameter.
+    leaves less than half of kappa, or nothing to doubt, and every star more than half its flux. The
+    repair has no parameter, and is taken where it lowers kappa by a tenth.
 
     Parameters
     ----------
@@ -172,11 +174,11 @@ def _move(runs: GuardedRuns, state: _State) -> _State:
 
 
 def _repair(runs: GuardedRuns, state: _State) -> _State:
-    """Return the state with PSFs that are not negative, where that lowers the misfit."""
+    """Return the state with PSFs that are not negative, where that lowers kappa by a tenth."""
     psfs = without_negatives(state.psfs, runs.observation.oversample)
     stars = state.estimate.scene.stars
     repaired = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
-    return repaired if repaired.misfit.kappa < state.misfit.kappa else state
+    return repaired if repaired.misfit.kappa < REPAIRED * state.misfit.kappa else state
 
 
 def _fit(
