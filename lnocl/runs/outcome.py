@@ -32,8 +32,7 @@ class PsfRefinement:
         The reduced chi squared at the stars (`lnocl.scene.psf_misfit`), of the given PSFs and of
         those last tried: 1 for noise alone.
     is_accepted : bool
-        Whether the refined PSFs are used. The misfit of those given then exceeds its expectation by
-        five standard deviations, and the refined ones leave less than half of their error.
+        Whether the refined PSFs are used (`lnocl.runs.psf_refinement.mend`).
     psf_error : float
         Relative error that the PSFs used still have at the stars, or as given by ``psf_scatter``; 0
         where it is not told from noise.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lnocl.process import ignored_warnings
-from lnocl.runs.guarded_runs import Estimate, GuardedRuns, rings_of
+from lnocl.runs.guarded_runs import Estimate, GuardedRuns, estimate_scatter, rings_of
 from lnocl.runs.start import make_model
 from lnocl.scene.detector import on_sky
 from lnocl.scene.observation import Array, Observation
@@ -70,6 +70,13 @@ class Allowance:
             return None
         scene, fluxes = self._scene(pad)
         return smoothing_near_stars(scene, make_model(scene), fluxes, self.in_rings)
+
+    def scatter(self) -> Array:
+        """Return the standard deviations of the PSFs' pixels; of shape (0, ky, kx) for no error."""
+        psfs = self._observation.psfs
+        if not self.in_rings.any():
+            return psfs[:0]
+        return estimate_scatter(psfs, self.in_rings, self._observation.oversample)
 
     def may_be_faked(self) -> Array:
         """Return what the errors may fake in the sky, ``kappa(r) sum_s c_s K_s / sqrt(p)``.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -62,7 +63,7 @@ class Mended(NamedTuple):
     Attributes
     ----------
     observation : Observation
-        With the refined PSFs, where they are used.
+        With the refined PSFs, where they are used, and the scatter that they have left.
     moves : bool
         Whether stars are to be moved.
     refinement : PsfRefinement or None
@@ -164,6 +165,9 @@ def mend(
         allowance.may_be_faked(),
     )
     _warn(refinement)
+    # Replicas draw PSFs from it, so that the errors of regions contain that of the PSFs.
+    observation = copy(observation)
+    observation.psf_scatter = known if len(known) else allowance.scatter()
     return Mended(observation, state.moves, refinement, allowance.near_stars(setup.pad))
 
 

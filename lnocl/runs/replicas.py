@@ -53,8 +53,9 @@ class Replicas:
     noise as observed, and reconstructed by as many iterations, with the same penalty, from the same
     start. All replicas use the buffers and programs of one run.
 
-    Where the scatter of the PSFs is known, the same sky is also seen through PSFs that are drawn
-    from it, with the same noise, and reconstructed with those of the answer.
+    Where the scatter of the PSFs is known, or an error of them was found, the same sky is also seen
+    through PSFs that are drawn from it, with the same noise, and reconstructed with those of the
+    answer.
 
     Parameters
     ----------

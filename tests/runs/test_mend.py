@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from regions import CirclePixelRegion, PixCoord
 
 import lnocl
 from lnocl.errors import LnoclWarning
@@ -121,6 +122,14 @@ class TestAnErrorThatNothingMends:
     def test_the_answer_does_not_hang_on_the_iteration(self):
         fluxes = [solve(self.TRUE, stop=None, n_iter=n).star_fluxes for n in (100, 600)]
         assert fluxes[1] == pytest.approx(fluxes[0], rel=0.005)
+
+    def test_replicas_have_it_too(self, right):
+        circle = CirclePixelRegion(PixCoord(30, 30), 4.0)
+        found = solve(self.TRUE, n_iter=30).bootstrap(10, regions=[circle])
+        of_psfs, errors = found.of_psfs.std(axis=0), found.standard_errors
+        assert of_psfs[-1] > 0.5 * errors[-1]
+        assert of_psfs[-1] < errors[-1] * 1.1
+        assert not len(right.bootstrap(10, regions=[circle]).of_psfs)
 
     def test_it_is_said(self):
         means = FLUX * np.roll(self.TRUE, (-8, -2), (0, 1)) + LEVEL
