@@ -35,6 +35,9 @@ WINDOW = 256
 # The error that PSFs are first taken to have; later ones are measured until they change by less
 # than this share, or so often.
 FIRST_ERROR, SETTLED, MAX_ROUNDS = 0.3, 0.1, 4
+# The weight of the edge-preserving term near stars, in standard deviations of the gradient of the
+# data term by the error of the PSFs: the halo that a wrong Strehl ratio leaves bends less.
+GUARD = 20.0
 # Iterations of the first round, and of each further one, which begins where that ended.
 FIRST_ITERATIONS, ITERATIONS = 40, 30
 # The extended source of these runs may lack structure of this share of its light.
@@ -125,7 +128,8 @@ class GuardedRuns:
 
     def _run(self, setup: Setup, found: Estimate, n_iter: int) -> Estimate:
         """Return the estimate after a run that begins at one, and is smoothed by its misfit."""
-        near = smoothing_near_stars(found.scene, found.model, found.fluxes, found.misfit.in_rings)
+        rings = found.misfit.in_rings
+        near = smoothing_near_stars(found.scene, found.model, found.fluxes, rings, GUARD)
         penalty = Penalty(smoothing=self._smoothing, near_stars=near)
         ny, nx = found.scene.observation.sky_shape
         unit = found.scene.unit

@@ -13,6 +13,10 @@ from lnocl.scene.psf_misfit import smoothing_near_stars
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import Scene
 
+# The weight of the edge-preserving term near stars, in standard deviations of the gradient of the
+# data term by the error of the PSFs. More flattens the hosts of stars, less leaves halos
+# (docs/validation/psf.md).
+STRENGTH = 2.0
 # Where PSFs give so little of their peak, nothing is known of them.
 DARK = 1e-9
 
@@ -69,7 +73,7 @@ class Allowance:
         if not self.in_rings.any():
             return None
         scene, fluxes = self._scene(pad)
-        return smoothing_near_stars(scene, make_model(scene), fluxes, self.in_rings)
+        return smoothing_near_stars(scene, make_model(scene), fluxes, self.in_rings, STRENGTH)
 
     def scatter(self) -> Array:
         """Return the standard deviations of the PSFs' pixels; of shape (0, ky, kx) for no error."""

@@ -29,9 +29,6 @@ SIGNIFICANT, SIGNIFICANT_IN_RING = 5.0, 2.0
 # A mend is tried from fewer on too where kappa is large: in few counts no error is significant, and
 # in many the smoothing of the extended source leaves as many standard deviations, but little kappa.
 DOUBTFUL, LARGE = 3.0, 0.1
-# The weight of the edge-preserving term near stars, in standard deviations of the gradient of the
-# data term by the error of the PSFs: docs/validation/wrong_psfs.md.
-STRENGTH = 2.0
 
 
 class PsfMisfit(NamedTuple):
@@ -141,10 +138,12 @@ def measure_misfit(
     )
 
 
-def smoothing_near_stars(scene: Scene, model: Model, fluxes: Array, in_rings: Array) -> Array:
+def smoothing_near_stars(
+    scene: Scene, model: Model, fluxes: Array, in_rings: Array, strength: float
+) -> Array:
     r"""Return the weight of the edge-preserving term that PSFs of such errors ask for.
 
-    It is `STRENGTH` times the standard deviation of the gradient of the data term by the error of
+    It is `strength` times the standard deviation of the gradient of the data term by the error of
     the PSFs,
 
     .. math:: \sqrt{\textstyle\sum_j (A_j^2)^T (\kappa S_j / m_j)^2},
@@ -162,6 +161,8 @@ def smoothing_near_stars(scene: Scene, model: Model, fluxes: Array, in_rings: Ar
         Star fluxes, scaled.
     in_rings : ndarray of float64
         kappa in each of the `Rings` round the stars; beyond the last it is that of the last.
+    strength : float
+        Standard deviations.
 
     Returns
     -------
@@ -184,7 +185,7 @@ def smoothing_near_stars(scene: Scene, model: Model, fluxes: Array, in_rings: Ar
     variance = scipy.fft.irfft2(spectra, scene.grid)
     ny, nx = scene.observation.sky_shape
     deviation = np.sqrt(np.maximum(variance[:ny, :nx], 0.0))
-    return np.asarray(STRENGTH * scene.scale / scene.unit * deviation)
+    return np.asarray(strength * scene.scale / scene.unit * deviation)
 
 
 def _kappa(excess: float, norm: float) -> float:

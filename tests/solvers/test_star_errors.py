@@ -32,7 +32,7 @@ KNOWN = {
 }
 
 
-def a_scene(stars=STARS, sky=SKY, psfs=PSFS, **known):
+def a_scene(stars=STARS, sky=SKY, psfs=PSFS, seed=0, **known):
     """Return a scene of counts of this sky, and it and the fluxes, scaled."""
     shape = (len(psfs), *sky.shape)
     flat = Scene(lnocl.Observation(np.full(shape, 9.0), psfs, background=3.0, **known), stars)
@@ -40,7 +40,12 @@ def a_scene(stars=STARS, sky=SKY, psfs=PSFS, **known):
     light = Model(flat).images(sky / flat.unit, fluxes / flat.unit) * flat.scale
     if flat.has_exposure_map:
         light *= flat.weights
-    scene = Scene(lnocl.Observation(RNG.poisson(light), psfs, background=3.0, **known), stars)
+    scene = Scene(
+        lnocl.Observation(
+            np.random.default_rng(seed).poisson(light), psfs, background=3.0, **known
+        ),
+        stars,
+    )
     return scene, sky, fluxes
 
 
