@@ -57,7 +57,7 @@ def summarise(
         f"extended source: {result.extended.sum() / frames.electrons:.6g} {unit}",
         *([] if overall is None else [f"residuals {_rms(overall)} in all, where noise gives 1"]),
         *_shortness(arguments, result),
-        *_verdict(result, at_stars, overall, is_warned),
+        *_verdict(arguments, result, at_stars, overall, is_warned),
     ]
 
 
@@ -79,7 +79,11 @@ def _rms(fit: Fit) -> str:
 
 
 def _verdict(
-    result: Result, at_stars: Sequence[StarResiduals], overall: Fit | None, is_warned: bool
+    arguments: argparse.Namespace,
+    result: Result,
+    at_stars: Sequence[StarResiduals],
+    overall: Fit | None,
+    is_warned: bool,
 ) -> list[str]:
     """Return whether the model fits, and where not what to do."""
     unfitted, lit, dark = [], [], []
@@ -94,10 +98,11 @@ def _verdict(
             lit.append(f"({x:.7g}, {y:.7g}), {100 * found.halo:.0f} %")
     verdict = []
     if unfitted:
+        may_free = len(at_stars) > 1 and "pixels" not in (arguments.refine_psfs or ())
         verdict.append(
             f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
             f"{' '.join(unfitted[:3])}: give a better PSF"
-            + (", or try --refine-psfs jitter pixels" if len(at_stars) > 1 else "")
+            + (", or try --refine-psfs jitter pixels" if may_free else "")
         )
     elif overall is not None and overall.is_misfit:
         verdict.append("the model does not fit: see to background, noise and gain")

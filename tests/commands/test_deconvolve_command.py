@@ -98,6 +98,13 @@ class TestDeconvolve:
             "written to out.fits",
         ]
 
+    def test_what_was_tried_is_not_advised(self, capsys):
+        inputs = ("a.fits", "b.fits", "--psf", "k1.fits", "--refine-psfs", "pixels")
+        assert cli.main(["deconvolve", *inputs, *NUMPY, *self.ARGUMENTS, "-o", "out.fits"]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        (line,) = (each for each in lines if each.startswith("the model does not fit"))
+        assert line.endswith(": give a better PSF")
+
     def test_every_parameter_is_in_the_header(self):
         inputs = ("a.fits", "b.fits", "--psf", "k1.fits")
         assert cli.main(["deconvolve", *inputs, *NUMPY, *self.ARGUMENTS, "-o", "out.fits"]) == 0
