@@ -101,7 +101,14 @@ class GuardedRuns:
         self._setup = replace(setup, solver="sgp", pad=pad)
         self._smoothing = WRONG_PSFS * recommend_smoothing(self.observation)
 
-    def fit(self, psfs: Array, stars: Array, moves: bool, error: float = FIRST_ERROR) -> Estimate:
+    def fit(
+        self,
+        psfs: Array,
+        stars: Array,
+        moves: bool,
+        error: float = FIRST_ERROR,
+        guard: float = GUARD,
+    ) -> Estimate:
         """Return the estimate with these PSFs.
 
         Parameters
@@ -114,6 +121,8 @@ class GuardedRuns:
             Whether they are moved.
         error : float
             The relative error that the PSFs are first taken to have.
+        guard : float
+            How strongly the extended source is kept from the stars, as `GUARD`.
         """
         observation = with_psfs(self.observation, self._cut(psfs))
         setup = replace(self._setup, stars=stars, refine_positions=moves)
@@ -121,15 +130,15 @@ class GuardedRuns:
             start = make_start(setup, observation, Penalty())
             found = Estimate(start.scene, start.extended, start.star_fluxes, _unknown(error))
             for n_iter in (FIRST_ITERATIONS, *[ITERATIONS] * (MAX_ROUNDS - 1)):
-                before, found = found, self._run(setup, found, n_iter)
+                before, found = found, self._run(setup, found, n_iter, guard)
                 if not found.misfit.is_significant or _is_settled(before.misfit, found.misfit):
                     break
         return found
 
-    def _run(self, setup: Setup, found: Estimate, n_iter: int) -> Estimate:
+    def _run(self, setup: Setup, found: Estimate, n_iter: int, guard: float) -> Estimate:
         """Return the estimate after a run that begins at one, and is smoothed by its misfit."""
         rings = found.misfit.in_rings
-        near = smoothing_near_stars(found.scene, found.model, found.fluxes, rings, GUARD)
+        near = smoothing_near_stars(found.scene, found.model, found.fluxes, rings, guard)
         penalty = Penalty(smoothing=self._smoothing, near_stars=near)
         ny, nx = found.scene.observation.sky_shape
         unit = found.scene.unit

@@ -18,13 +18,14 @@ import numpy as np
 from lnocl.errors import counted, warn
 from lnocl.runs.guarded_runs import (
     FIRST_ERROR,
+    GUARD,
     Estimate,
     GuardedRuns,
     estimate_scatter,
     with_psfs,
 )
 from lnocl.runs.outcome import PsfRefinement
-from lnocl.runs.psf_allowance import Allowance
+from lnocl.runs.psf_allowance import STRENGTH, Allowance
 from lnocl.runs.start import Setup
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters
@@ -143,8 +144,9 @@ def mend(
         tried, values = _fit(runs, families, state, moves is not False)
         state = tried if state.is_mended_by(tried) else state
     if state.misfit.is_doubtful and "pixels" in names:
-        tried = _free_pixels(runs, observation.psf_scatter, state, moves is not False)
-        state = tried if _is_trusted(state, tried) else state
+        loose = _loosen(runs, state)
+        tried = _free_pixels(runs, observation.psf_scatter, loose, moves is not False)
+        state = tried if _is_trusted(loose, tried) else state
     is_accepted = state.psfs is not observation.psfs
     if is_accepted:
         observation = with_psfs(observation, state.psfs)
@@ -203,6 +205,15 @@ def _fit(
     return fitted, parameters.values
 
 
+def _loosen(runs: GuardedRuns, state: _State) -> _State:
+    """Return the state with an extended source that is smoothed as in the reconstruction.
+
+    One that is kept from the stars more strongly leaves its own errors to pixels that are free.
+    """
+    stars = state.estimate.scene.stars
+    return replace(state, estimate=runs.fit(state.psfs, stars, state.moves, guard=STRENGTH))
+
+
 def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) -> _State:
     """Return the state with PSFs whose pixels are free, as far as scatter or residuals show."""
     observation = with_psfs(runs.observation, state.psfs)
@@ -210,7 +221,7 @@ def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) 
         rings = state.misfit.in_rings
         scatter = FREEDOM * estimate_scatter(state.psfs, rings, observation.oversample)
     families = PsfFamilies(("pixels",), observation, scatter)
-    return _search(runs, families, families.first(), state, moves)[1]
+    return _search(runs, families, families.first(), state, moves, STRENGTH)[1]
 
 
 def _is_trusted(state: _State, tried: _State) -> bool:
@@ -229,6 +240,7 @@ def _search(
     parameters: PsfParameters,
     state: _State,
     moves: bool,
+    guard: float = GUARD,
 ) -> tuple[PsfParameters, _State]:
     """Return the parameters of the least misfit that a search finds, and the state with them."""
     found: list[tuple[PsfParameters, _State]] = []
@@ -236,7 +248,7 @@ def _search(
     for _ in range(ROUNDS):
         parameters, stars = _step(runs, families, parameters, estimate, moves)
         psfs = families.psfs(parameters)
-        estimate = runs.fit(psfs, stars, moves, min(FIRST_ERROR, LOOSE * error))
+        estimate = runs.fit(psfs, stars, moves, min(FIRST_ERROR, LOOSE * error), guard)
         gain = found[-1][1].misfit.significance - estimate.misfit.significance if found else np.inf
         found.append((parameters, _State(psfs, estimate, moves)))
         if gain < IMPROVED:

@@ -153,8 +153,8 @@ def test_fluxes_scatter_as_their_errors_say(light, expected):
     """
     rng, ratios = np.random.default_rng(77), []
     texture = Texture(light * SKY, STARS[:1], resolution(a_scene(STARS[:1])[0]))
-    for _ in range(200):
-        scene, _, _ = a_scene(STARS[:1], texture.draw(rng))
+    for seed in range(200):
+        scene, _, _ = a_scene(STARS[:1], texture.draw(rng), seed=seed)
         result = lnocl.deconvolve(scene.observation, STARS[:1], n_iter=4000, pad=0, engine="numpy")
         ratios.append((result.star_fluxes - FLUXES[:1]) / result.star_flux_errors)
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(expected, abs=0.15)
