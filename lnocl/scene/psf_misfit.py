@@ -1,7 +1,8 @@
 r"""How far images are from their models at the stars, as a relative error of the PSFs.
 
-A pixel counts by the square of the stars' share S of its model m, so that the sky beside the stars
-has no part, and less where m is below an electron, since few counts tell nothing:
+A pixel counts where stars give more than half of its model m, by the square of their share S of it,
+so that the sky beside the stars has no part. It counts less where m is below an electron, since few
+counts tell nothing:
 
 .. math:: \chi^2 = \sum_j \sum_n w \frac{(g - m)^2}{m}, \qquad
           w = \frac{S^2}{m^2} \frac{m}{m + 1/2}, \qquad
@@ -24,6 +25,9 @@ from lnocl.scene.observation import Array
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import MIN_MODEL, Scene
 
+# Pixels count where stars give more than this share of the model: below it, what does not fit is
+# more likely the structure of the sky.
+DOMINANT = 0.5
 # The misfit is told from noise from so many of its standard deviations on; in a ring from so many.
 SIGNIFICANT, SIGNIFICANT_IN_RING = 5.0, 2.0
 # A mend is tried from fewer on too where kappa is large: in few counts no error is significant, and
@@ -114,7 +118,8 @@ def measure_misfit(
         electrons = scene.scale * weights[inside][seen]
         total = np.maximum(means[j][inside][seen], MIN_MODEL)
         # Pixels where PSFs are negative show nothing.
-        squared = (light[inside][seen] / total).clip(0.0, 1.0) ** 2
+        share = (light[inside][seen] / total).clip(0.0, 1.0)
+        squared = np.where(share > DOMINANT, share**2, 0.0)
         residuals = electrons * (counts - found[j] - settled_light)[inside][seen]
         total *= electrons
         weight = squared * total / (total + 0.5)
