@@ -162,8 +162,8 @@ def deconvolve(
     refine_psfs : iterable of {"shift", "jitter", "strehl", "pupil", "modes", "pixels"}, or "auto"
         Parameters of each PSF to fit before the reconstruction where it does not fit, with the
         stars, and with the extended source marginalised. "auto", where `smoothing` is "auto" too,
-        is jitter, for several images shift, and strehl, pupil and modes where the observation has
-        what they need. An empty sequence is for none. See Notes. At least one star.
+        is jitter, for several images shift, strehl, pupil and modes where the observation has what
+        they need, and then pixels. An empty sequence is for none. See Notes. At least one star.
     checkpoint : str or path, optional
         File for checkpoints (FITS): written after the first iteration, then every
         `checkpoint_every` seconds, and at the end. Each replaces the one before once it is
@@ -247,7 +247,7 @@ def deconvolve(
     - "strehl", the Strehl ratio between the PSF and ``ideal_psfs``;
     - "pupil", phases across ``pupils``;
     - "modes", the coefficients of ``psf_modes``;
-    - "pixels", each pixel, as far as ``psf_scatter`` or the residuals allow; for two stars or more.
+    - "pixels", each pixel, as far as ``psf_scatter`` or the residuals allow.
 
     **PSFs that do not fit** leave light beside a star, and an extended source that is free there
     takes it up. So PSFs are judged by short runs in a window round the stars. In these the
@@ -255,17 +255,24 @@ def deconvolve(
     the residuals at the stars show (`lnocl.scene.psf_misfit`, `lnocl.runs.guarded_runs`). Where
     their chi squared exceeds its expectation by five standard deviations, or by three and the error
     is above a tenth, positions and PSFs are refined as far as they may be. They are used where they
-    leave less than half of the error, or nothing that noise does not explain. What is
-    left, a relative error κ of the PSFs, adds to λ twice the standard deviation of the data
-    term's gradient by it, ``2 sqrt(sum_j (A_j^2)^T (κ S_j / m_j)^2)``, with S_j the starlight. So
-    does a ``psf_scatter`` that is given. The run then ends where the objective hardly changes any
-    more (:doc:`/validation/psf`). Where `smoothing` is a number, it stays as it is, scatter or not,
-    and PSFs are judged only where `refine_psfs` names families or a scatter is given. PSFs that
-    vary over the field are not judged,
-    nor, unless families are named, those of more than 64 stars in the window.
+    leave less than half of the error, or nothing that noise does not explain. Free pixels, which
+    may fit anything, are used where they leave less than a quarter of it, and change no star's flux
+    by more than κ.
 
-    Stars whose positions are not refined are taken to be where they are given. Free pixels are used
-    only where they also change no star's flux by more than 3 κ.
+    What is left, a relative error κ of the PSFs, adds to λ twice the standard deviation of the data
+    term's gradient by it, ``2 sqrt(sum_j (A_j^2)^T (κ S_j / m_j)^2)``, with S_j the starlight. So
+    does a ``psf_scatter`` that is given, and the error that free pixels have mended. The run then
+    ends where the objective hardly changes any more (:doc:`/validation/psf`). Where `smoothing` is
+    a number, it stays as it is, scatter or not, and PSFs are judged only where `refine_psfs` names
+    families or a scatter is given. PSFs that vary over the field are not judged, nor, unless
+    families are named, those of more than 64 stars in the window. Stars whose positions are not
+    refined are taken to be where they are given.
+
+    **Star fluxes are marginal** where PSFs were judged and fit. What lies under a star belongs to
+    it or to the extended source, and early iterations leave it to the star. So after the last
+    iteration each star takes a step of Newton to the flux that the counts give it with the extended
+    source marginalised. The extended source takes up what the stars lose (`lnocl.solvers.marginal`).
+    A callback and the history have the iterations as they were.
 
     **The split-gradient method** lowers the objective at every iteration where PSFs are not
     negative. With many negative pixels, as in a raw frame of a star, the objective may rise again.
@@ -318,16 +325,16 @@ def deconvolve(
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
     moves = refine_positions if is_auto else refine_positions is True
     setup = Setup(positions, pad, solver, precision, engine, device, moves is True)
-    refinement, near_stars = None, None
+    refinement, near_stars, fits = None, None, False
     if is_auto or families or len(observation.psf_scatter):
         from lnocl.runs.psf_refinement import mend  # which loads scipy
 
         is_asked = bool(families) and not isinstance(refine_psfs, str)
         with suppress(NotFiniteError):  # of which the run itself tells
-            observation, is_moved, refinement, near_stars = mend(
-                setup, observation, families, moves, is_asked
-            )
-            setup = replace(setup, refine_positions=is_moved)
+            mended = mend(setup, observation, families, moves, is_asked)
+            observation, refinement = mended.observation, mended.refinement
+            near_stars, fits = mended.near_stars, mended.fits
+            setup = replace(setup, refine_positions=mended.moves)
     penalties = read_penalties(mu, smoothing, stop, observation, near_stars)
     if is_auto and near_stars is not None and stop == "held-out":
         stop = CONVERGED
@@ -363,6 +370,8 @@ def deconvolve(
             del start, largest  # which hold arrays of the grid
             stop_reason = _complete(run, make_rule(stop), callback, bar, checkpointer)
             outcome = run.outcome(penalties[0], stop_reason)
+        if is_auto and fits:
+            outcome = outcome.marginal()
         return make_result(replace(outcome, psf_refinement=refinement))
 
 

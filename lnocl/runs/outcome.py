@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ class PsfRefinement:
         Whether the refined PSFs are used (`lnocl.runs.psf_refinement.mend`).
     psf_error : float
         Relative error that the PSFs used still have at the stars, or as given by ``psf_scatter``; 0
-        where it is not told from noise.
+        where it is not told from noise. Where pixels were fitted it is the error before that.
     edges : ndarray of float64, shape (k + 1,)
         Radii of rings round a star, pixels.
     errors_in_rings : ndarray of float64, shape (k,)
@@ -43,6 +43,8 @@ class PsfRefinement:
     may_be_faked : ndarray of float64, of the shape of the extended source
         Light that this error may fake in the sky, electrons per pixel. In each ring it is the error
         times the light of the stars, as the PSFs spread it, over the square root of p.
+    has_free_pixels : bool
+        Whether the PSFs used were fitted pixel by pixel, and so follow the noise too.
 
     See Also
     --------
@@ -73,6 +75,7 @@ class PsfRefinement:
     edges: Array
     errors_in_rings: Array
     may_be_faked: Array
+    has_free_pixels: bool = False
 
     def table(self) -> NDArray[np.void]:
         """Return the parameters of the PSFs, a row an image, for a FITS table."""
@@ -130,6 +133,8 @@ class Outcome:
         Returns where a run of the observation starts, given the penalty.
     psf_refinement : PsfRefinement or None
         None where the PSFs were not to be refined.
+    is_marginal : bool
+        Whether the star fluxes are those of `marginal`, and so those of replicas.
     """
 
     scene: Scene
@@ -143,6 +148,14 @@ class Outcome:
     restart: Callable[[Penalty], Start]
     curve: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
     psf_refinement: PsfRefinement | None = None
+    is_marginal: bool = False
+
+    def marginal(self) -> Outcome:
+        """Return the outcome with marginal star fluxes, as `lnocl.solvers.marginal` has them."""
+        from lnocl.solvers.marginal import marginal
+
+        sky, star_fluxes = marginal(self.scene, self.sky, self.star_fluxes)
+        return replace(self, sky=sky, star_fluxes=star_fluxes, is_marginal=True)
 
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of star fluxes and positions, the extended source not known.

@@ -17,6 +17,7 @@ from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.texture import Texture, resolution
+from lnocl.solvers.marginal import marginal
 
 
 class Sky(NamedTuple):
@@ -115,7 +116,11 @@ class Replicas:
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in run:
                 pass
-        return Sky(run.extended(), run.star_fluxes(), run.star_positions())
+        if not self._outcome.is_marginal:
+            return Sky(run.extended(), run.star_fluxes(), run.star_positions())
+        unit, (ny, nx) = run.scene.unit, observation.sky_shape
+        sky, star_fluxes = marginal(run.scene, run.engine.extended() * unit, run.star_fluxes())
+        return Sky(sky[:ny, :nx], star_fluxes, run.star_positions())
 
     def _draw_psfs(self, seed: np.random.SeedSequence) -> Array:
         psfs = self._outcome.scene.observation.psfs

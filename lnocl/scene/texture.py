@@ -5,15 +5,17 @@ The sky is expected to be
 
 .. math:: \max(\bar f + a\, C^{1/2} x, 0), \qquad x \sim N(0, 1).
 
-The mean is the estimate f, but under a star's core it is the mean of f round it. The amplitude a is
-a share of f, smoothed; near a star a share of the brightest there. C is a correlation over a part
-of the resolution. How large these are was measured on simulated skies: docs/validation/errors.md.
+The mean is the estimate f, but under a star's core it continues inwards what lies round it. The
+amplitude a is a share of f, smoothed; near a star a share of the brightest there. C is a
+correlation over a part of the resolution. How large these are was measured on simulated skies:
+docs/validation/errors.md.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import scipy.fft
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from lnocl.scene.cores import fwhm
@@ -30,6 +32,8 @@ CORRELATED, SMOOTHED, SMOOTHED_NEAR = 0.4, 0.55, 0.28
 # What lies to the first distance of a star is its core, to the second it is near, to the third
 # round it; the core ends over a width.
 CORE, NEAR, ROUND, EDGE = 0.85, 1.1, 1.65, 0.4
+# What is expected under the core is at most so many times the mean round it.
+STEEPEST = 4.0
 
 
 class Texture:
@@ -62,7 +66,7 @@ class Texture:
             self._fill(star, extended, bright)
 
     def _fill(self, star: Array, extended: Array, bright: Array) -> None:
-        """Expect under a star's core what lies round it, and near it as much as the brightest."""
+        """Expect the light round a star's core to go on under it; near it vary by the brightest."""
         grid = extended.shape
         half = min(int(np.ceil(ROUND * self._resolution)), (min(grid) - 1) // 2)
         columns, rows = (round(at) + np.arange(-half, half + 1) for at in star)
@@ -73,9 +77,9 @@ class Texture:
             return
         least = np.where(distance <= NEAR, SHARE_NEAR * bright[window][distance <= ROUND].max(), 0)
         self.amplitude[window] = np.maximum(self.amplitude[window], least)
-        share = np.clip((CORE - distance) / EDGE + 1.0, 0.0, 1.0)
-        around = extended[window][is_round].mean()
-        self.mean[window] += share * (around - self.mean[window])
+        share = core(distance)
+        expected = _continued(extended[window], distance, is_round)
+        self.mean[window] += share * (expected - self.mean[window])
 
     def apply(self, x: Array) -> Array:
         """Return the field ``a C^(1/2) x`` of white noise x."""
@@ -84,6 +88,11 @@ class Texture:
     def draw(self, rng: np.random.Generator) -> Array:
         """Return a sky, shape (Ny, Nx)."""
         return np.maximum(self.mean + self.apply(rng.standard_normal(self.mean.shape)), 0.0)
+
+
+def core(distance: Array) -> Array:
+    """Return the core of a star: 1 in its middle, falling to 0 at distances in resolutions."""
+    return np.clip((CORE - distance) / EDGE + 1.0, 0.0, 1.0)
 
 
 def resolution(scene: Scene) -> float:
@@ -97,6 +106,21 @@ def resolution(scene: Scene) -> float:
     pixel = abs(pixel_spectrum(v[:, None], u, observation)) / observation.oversample**2
     power = np.mean([abs(scipy.fft.fft2(psf) * pixel) ** 2 for psf in psfs], axis=0)
     return fwhm(scipy.fft.fftshift(scipy.fft.ifft2(np.sqrt(power)).real))
+
+
+def _continued(values: Array, distance: Array, is_round: NDArray[np.bool_]) -> Array:
+    """Return the exponential of the distance that the inner and outer half of a ring determine."""
+    mean = values[is_round].mean()
+    middle = distance[is_round].mean()
+    halves = is_round & (distance <= middle), is_round & (distance > middle)
+    inner, outer = (values[half].mean() if half.any() else 0.0 for half in halves)
+    if not (inner > 0 and outer > 0):
+        return np.full(values.shape, mean)
+    near, far = (distance[half].mean() for half in halves)
+    slope = np.log(inner / outer) / (far - near)
+    # A logarithm, as the power may overflow.
+    power = np.minimum(slope * (near - distance), np.log(STEEPEST * mean / inner))
+    return np.asarray(inner * np.exp(power))
 
 
 def _smooth(sky: Array, width: float) -> Array:

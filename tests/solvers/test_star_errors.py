@@ -7,7 +7,7 @@ import lnocl
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.scene.texture import Texture, resolution
-from lnocl.solvers import star_errors
+from lnocl.solvers import near_star
 from lnocl.solvers.star_errors import standard_errors
 
 N = 32
@@ -108,7 +108,7 @@ def test_a_window_is_enough(monkeypatch):
     stars = [(60.2, 58.1), (66.0, 64.0)]
     estimate = a_scene(stars, sky, psf[None], offsets=[(0.3, 0.0)], mask=np.eye(128, dtype=bool))
     found = standard_errors(*estimate, True)
-    monkeypatch.setattr(star_errors, "WINDOW", 1000.0)
+    monkeypatch.setattr(near_star, "WINDOW", 1000.0)
     whole = standard_errors(*estimate, True)
     assert 1e-6 < abs(found / whole - 1).max() < 0.03
 
@@ -166,11 +166,11 @@ def test_windows_hold_what_the_grid_does(known):
     """Beyond padded images too, and where the window wraps round."""
     counts = RNG.poisson(20.0, (2, N, N))
     scene = Scene(lnocl.Observation(counts, PSFS, background=3.0, **known), STARS, pad=4)
-    window = star_errors._Window(-5, 40, (32, 40))
+    window = near_star.Window(-5, 40, (32, 40))
     there = window.of(scene.grid)
     background = scene.background()
     for j, image in enumerate(scene.images()):
-        found = star_errors._observed(scene, j, window)
+        found = near_star._observed(scene, j, window)
         weights = np.ones(scene.grid) if scene.weights is None else scene.weights[j]
         level = np.broadcast_to(background[j], scene.grid)
         for values, expected in zip(found, (image, level, weights), strict=True):

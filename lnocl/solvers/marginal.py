@@ -1,0 +1,76 @@
+r"""Star fluxes with the extended source marginalised, whatever iteration a run ended with.
+
+What lies under the core of a star belongs to it or to the extended source: the counts hardly tell,
+and early iterations leave it to the star, with a hole in the extended source. Each star takes a
+step of Newton to where the least squares of `lnocl.solvers.near_star` have it,
+
+.. math:: c_s \gets \max(c_s + \Delta c_s, 0),
+
+in which the extended source is expected to be under the star as it is round it. It takes the light
+that the same step gives it in the core of the star, but no more than the star has lost or won.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lnocl.scene.detector import on_sky
+from lnocl.scene.observation import Array
+from lnocl.scene.scene import Scene
+from lnocl.scene.texture import core
+from lnocl.solvers.fluxes import variances
+from lnocl.solvers.near_star import NearStar, Surroundings
+
+# The share of the gradient at which conjugate gradients end.
+FINISHED = 1e-4
+
+
+def marginal(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array]:
+    """Return the extended source and the star fluxes after that step, the positions held.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is modelled, with the stars where they are.
+    sky : ndarray of float64, shape (Ny, Nx)
+        Extended source on the grid, electrons per pixel, zero or more.
+    star_fluxes : ndarray of float64, shape (n,)
+        Electrons.
+
+    Returns
+    -------
+    sky, star_fluxes : ndarray of float64
+        Those after the step. A star without light, or that the images do not determine, stays.
+    """
+    around = Surroundings(scene, sky, star_fluxes, False)
+    after, fluxes = sky.copy(), star_fluxes.copy()
+    for star, flux in enumerate(star_fluxes):
+        near = NearStar(around, star, FINISHED)
+        if not (flux > 0 and np.isfinite(variances(near.fit.information)[0])):
+            continue
+        change, (x,) = near.fit.solve(np.zeros(near.n_held))
+        fluxes[star] = max(flux + change[0] * scene.unit, 0.0)
+        there = near.places(scene)
+        light = _core_of(near, scene, star) * (near.expected + near.source.of(x)) * scene.unit
+        light = np.maximum(light, -after[there])
+        after[there] += _at_most(light, flux - fluxes[star])
+    return after, fluxes
+
+
+def _core_of(near: NearStar, scene: Scene, star: int) -> Array:
+    """Return the core of a star in its window, 1 in its middle."""
+    window, (x, y) = (
+        near.window.finer(scene.oversample),
+        on_sky(scene.stars, scene.oversample)[star],
+    )
+    rows, columns = (
+        first + np.arange(k) - at
+        for first, k, at in zip((window.y, window.x), window.shape, (y, x), strict=True)
+    )
+    return core(np.hypot(rows[:, None], columns) / near.resolution)
+
+
+def _at_most(light: Array, total: float) -> Array:
+    """Return a share of some light, so that its sum lies between 0 and a total."""
+    whole = float(light.sum())
+    return light * (np.clip(total / whole, 0.0, 1.0) if whole else 0.0)

@@ -1,0 +1,279 @@
+"""The least squares of a star and of the extended source round it, in a window.
+
+The extended source is a field of the covariance that `lnocl.scene.texture` expects. So the fluxes
+and positions of stars, and their errors, hang on no iteration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
+from lnocl.scene.forward_model import add_to_window, sampled, spread
+from lnocl.scene.observation import Array
+from lnocl.scene.scene import MIN_MODEL, Scene
+from lnocl.scene.shifting import MovablePsf, Stamp
+from lnocl.scene.texture import Texture, resolution
+from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
+
+# Side of the window round a star, and how far off other stars may be that are not taken as known,
+# resolutions.
+WINDOW, NEIGHBOURS = 9.0, 4.0
+# What lies farther from a window has no part in the texture there, resolutions.
+MARGIN = 3.0
+# Steps of conjugate gradients at most.
+N_STEPS = 2000
+
+
+class Window(NamedTuple):
+    """A window of the periodic grid: its first row and column, and its shape."""
+
+    y: int
+    x: int
+    shape: tuple[int, int]
+
+    def of(self, grid: tuple[int, int]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """Return its rows and columns, to index arrays on the grid with."""
+        rows, columns = (
+            np.arange(first, first + k) % n
+            for first, k, n in zip((self.y, self.x), self.shape, grid, strict=True)
+        )
+        return rows[:, None], columns
+
+    def moved(self, dx: int, dy: int) -> Window:
+        """Return it moved by whole pixels."""
+        return self._replace(y=self.y + dy, x=self.x + dx)
+
+    def finer(self, q: int) -> Window:
+        """Return the pixels of a sky q times as fine that it holds."""
+        return Window(q * self.y, q * self.x, (q * self.shape[0], q * self.shape[1]))
+
+
+class Surroundings:
+    """What the windows of all stars of an estimate share.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is modelled, with the stars where they are.
+    sky : ndarray of float64, shape (Ny, Nx)
+        Extended source on the grid, electrons per pixel.
+    star_fluxes : ndarray of float64, shape (n,)
+        Electrons.
+    moves : bool
+        Whether positions are unknown too; else they are taken as known.
+
+    Attributes
+    ----------
+    width : float
+        The resolution, pixels of the sky.
+    """
+
+    def __init__(self, scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -> None:
+        self.scene, self.sky, self.star_fluxes, self.moves = scene, sky, star_fluxes, moves
+        self.width = resolution(scene)
+        self.psfs = movable_psfs(scene.scaled_psfs(), scene.observation, scene.image_grid)
+
+
+class NearStar:
+    """One star, those near it, and the extended source round them.
+
+    All is computed in a window: arrays on the grid would take more memory than the run.
+
+    Parameters
+    ----------
+    around : Surroundings
+        The estimate.
+    star : int
+        The star.
+    finished : float
+        The share of the gradient at which conjugate gradients end.
+
+    Attributes
+    ----------
+    window : Window
+        The pixels of the images, without offset.
+    n_held : int
+        Stars that are fitted: this, which is the first, and those near it.
+    resolution : float
+        What all images resolve together, pixels of the sky.
+    source : SourceError
+        The extended source less its expected mean, in the window.
+    expected : ndarray of float64
+        That mean less the estimate, in the window of the sky, scaled.
+    """
+
+    def __init__(self, around: Surroundings, star: int, finished: float) -> None:
+        scene, sky, width = around.scene, around.sky, around.width
+        self.window = _window_round(scene, scene.stars[star], width)
+        held = np.append(star, _neighbours(scene, star, width))
+        there, texture = _texture_in(self.window, scene, sky, width)
+        self.source = _source_error(
+            scene, around.psfs, texture.amplitude[there], texture.width, self.window
+        )
+        self.n_held, self.resolution, self._finished = len(held), width, finished
+        self.expected = texture.mean[there] - sky[self.places(scene)] / scene.unit
+        beyond = self.source.images_of(self.expected)
+        self._images = [
+            _linearise(
+                scene, j, sky, around.star_fluxes, held, self.window, around.moves, beyond[j]
+            )
+            for j in range(scene.n_images)
+        ]
+
+    def places(self, scene: Scene) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """Return the rows and columns of the window in the sky, on the grid."""
+        return self.window.finer(scene.oversample).of(scene.grid)
+
+    @cached_property
+    def fit(self) -> LeastSquares:
+        """The least squares: the unknowns are all fluxes, perhaps all x, and all y."""
+        k = len(self._images[0].slopes)
+        return LeastSquares(self._images, [self.source], np.zeros(k), N_STEPS, self._finished)
+
+
+def _texture_in(
+    window: Window, scene: Scene, sky: Array, width: float
+) -> tuple[tuple[slice, slice], Texture]:
+    """Return the texture round a window of the images, and where the window lies in it."""
+    window = window.finer(scene.oversample)
+    margin = int(np.ceil(MARGIN * width))
+    (y, height), (x, breadth) = (
+        (first - margin, k + 2 * margin) if k + 2 * margin < n else (first, n)
+        for first, k, n in zip((window.y, window.x), window.shape, scene.grid, strict=True)
+    )
+    around = Window(y, x, (height, breadth))
+    stars = (on_sky(scene.stars, scene.oversample) - (x, y)) % scene.grid[::-1]
+    inside = (stars < (breadth, height)).all(axis=1)
+    there = tuple(
+        slice(first - start, first - start + k)
+        for first, start, k in zip((window.y, window.x), (y, x), window.shape, strict=True)
+    )
+    extended = sky[around.of(scene.grid)] / scene.unit
+    return (there[0], there[1]), Texture(extended, stars[inside], width)
+
+
+def _observed(scene: Scene, j: int, there: Window) -> tuple[Array, Array, Array]:
+    """Return counts, background and weights of image j in a window, as `Scene` has them."""
+    observation, (ny, nx) = scene.observation, scene.observation.shape
+    rows, columns = there.of(scene.image_grid)
+    inside = (rows < ny) & (columns < nx)
+    pixels = np.minimum(rows, ny - 1), np.minimum(columns, nx - 1)
+    counts = np.where(inside, observation.images[j][pixels] / scene.scale, 0.0)
+    if observation.background.ndim == 1:
+        background = np.full(there.shape, observation.background[j] / scene.scale)
+    else:
+        known = observation.background[j][pixels] / scene.scale
+        background = np.where(inside, known, 1.0)
+    if scene.weights is None:
+        return counts, background, np.ones(there.shape)
+    weights = scene.weights[j][rows, columns].astype(np.float64)
+    if scene.has_exposure_map:
+        seen = weights > 0
+        counts = np.divide(counts, weights, out=np.zeros(there.shape), where=seen)
+        background = np.divide(background, weights, out=np.ones(there.shape), where=seen)
+    return counts, background, weights
+
+
+def _in_image(scene: Scene, j: int, window: Window) -> Window:
+    """Return where a window of an image without offset lies in image j, to the nearest pixel."""
+    dx, dy = np.round(scene.observation.offsets[j]).astype(int).tolist()
+    return window.moved(dx, dy)
+
+
+def _window_round(scene: Scene, star: Array, resolution: float) -> Window:
+    """Return a window round a star: the whole axis of the grid where it is not twice as long."""
+    length = int(np.ceil(WINDOW * resolution / scene.oversample))
+    size = scipy.fft.next_fast_len(length, real=True)
+    height, width = (size if 2 * size <= n else n for n in scene.image_grid)
+    x, y = np.round(star).astype(int).tolist()
+    return Window(y - height // 2, x - width // 2, (height, width))
+
+
+def _neighbours(scene: Scene, star: int, resolution: float) -> NDArray[np.int_]:
+    """Return which other stars are near one; those beyond are taken as known."""
+    size = np.array(scene.grid[::-1])
+    away = scene.oversample * (scene.stars - scene.stars[star])
+    away = (away + size / 2) % size - size / 2
+    near = np.flatnonzero(np.hypot(*away.T) <= NEIGHBOURS * resolution)
+    return near[near != star]
+
+
+def _source_error(
+    scene: Scene,
+    psfs: Sequence[MovablePsf | DetectorPsf],
+    amplitude: Array,
+    width: float,
+    window: Window,
+) -> SourceError:
+    """Return the error of the extended source in a window of the images, and its change there."""
+    q, window = scene.oversample, window.finer(scene.oversample)
+    # Twice the window, in which nothing wraps round; or the grid, on which it does.
+    height, breadth = (min(2 * k, n) for k, n in zip(window.shape, scene.grid, strict=True))
+    shape = height, breadth
+    around = Window(-(height // 2), -(breadth // 2), shape)
+    otfs = []
+    for psf, offset in zip(psfs, scene.observation.offsets, strict=True):
+        cut = _cut(psf.response(*(offset - np.round(offset))), around, scene.grid)
+        otfs.append(scipy.fft.rfft2(np.roll(cut, (around.y, around.x), axis=(0, 1))))
+    inside = (..., *map(slice, window.shape))
+
+    def forward(sky: Array) -> Array:
+        images = scipy.fft.irfft2(otfs * scipy.fft.rfft2(sky, shape), shape)
+        return np.asarray(sampled(images[inside], q))
+
+    def adjoint(images: Iterable[Array]) -> Array:
+        spectra = np.conj(otfs) * scipy.fft.rfft2(spread(np.array(images), q), shape)
+        return np.asarray(scipy.fft.irfft2(spectra.sum(axis=0), shape)[inside])
+
+    return SourceError(forward, adjoint, amplitude, width)
+
+
+def _linearise(
+    scene: Scene,
+    j: int,
+    sky: Array,
+    star_fluxes: Array,
+    held: NDArray[np.int_],
+    window: Window,
+    moves: bool,
+    beyond: Array,
+) -> LinearImage:
+    """Return image j near the estimate: its slopes in all fluxes, perhaps all x, and all y.
+
+    `beyond` is the light of the sky that is expected, less that of the estimate.
+    """
+    there = _in_image(scene, j, window)
+    counts, background, weights = _observed(scene, j, there)
+    model = background.copy()
+    first = there.y % scene.image_grid[0], there.x % scene.image_grid[1]
+    add_to_window(model, scene, sky, np.zeros_like(star_fluxes), j, first)
+    for stamp, flux in zip(scene.star_field.stamps[j], star_fluxes, strict=True):
+        model += flux / scene.unit * _cut(stamp, there, scene.image_grid)
+    total = np.maximum(model, MIN_MODEL)
+    precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
+    slopes = [_cut(scene.star_stamp(j, s), there, scene.image_grid) for s in held]
+    if moves:
+        offset, psfs = scene.observation.offsets[j], scene.star_field.psfs[j]
+        moved = [psfs[s].with_slopes(*(scene.stars[s] + offset)) for s in held]
+        for axis in (1, 2):
+            for s, (stamp, values) in zip(held, moved, strict=True):
+                slope = stamp._replace(values=star_fluxes[s] / scene.unit * values[axis])
+                slopes.append(_cut(slope, there, scene.image_grid))
+    k, left = len(slopes), counts - total - beyond
+    return LinearImage(np.array(slopes).reshape(k, -1), np.arange(k), left, precision)
+
+
+def _cut(stamp: Stamp, window: Window, grid: tuple[int, int]) -> Array:
+    """Return the values of a stamp that lie in a window, and 0 elsewhere."""
+    light = np.zeros(window.shape)
+    y, x = (stamp.rows(grid) - window.y) % grid[0], (stamp.columns(grid) - window.x) % grid[1]
+    y_in, x_in = y < window.shape[0], x < window.shape[1]
+    light[np.ix_(y[y_in], x[x_in])] = stamp.values[np.ix_(y_in, x_in)]
+    return light
