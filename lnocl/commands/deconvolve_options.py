@@ -199,8 +199,8 @@ OPTIONS = {
             help="fit the PSFs to the stars before the reconstruction where they do not fit, and "
             "use them where they fit better: shift, jitter (a blur, or a sharpening), strehl "
             "(needs --ideal-psf or --pupil), pupil (phases; needs --pupil), modes (needs "
-            "--psf-modes), pixels (needs two stars), none; by default, where smoothing is chosen, "
-            "jitter, of several images shift, and those whose files are given",
+            "--psf-modes), pixels, none; by default, where smoothing is chosen, jitter, of several "
+            "images shift, those whose files are given, and pixels",
         ),
         option(
             "--ideal-psf",

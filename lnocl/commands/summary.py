@@ -98,7 +98,8 @@ def _verdict(
             lit.append(f"({x:.7g}, {y:.7g}), {100 * found.halo:.0f} %")
     verdict = []
     if unfitted:
-        may_free = len(at_stars) > 1 and "pixels" not in (arguments.refine_psfs or ())
+        by_default = [] if isinstance(arguments.smoothing, float) else ["pixels"]
+        may_free = "pixels" not in (arguments.refine_psfs or by_default)
         verdict.append(
             f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
             f"{' '.join(unfitted[:3])}: give a better PSF"
@@ -112,7 +113,9 @@ def _verdict(
             "none, or it is elsewhere; lnocl stars finds where"
         )
     fits = [overall] if overall is not None else [found.wings for found in at_stars]
-    if any(fit.is_overfit for fit in fits):
+    refinement = result.psf_refinement
+    is_fitted = refinement is not None and refinement.has_free_pixels  # which follow the noise
+    if any(fit.is_overfit for fit in fits) and not is_fitted:
         verdict.append(
             "the residuals are far less than noise: the noise that is taken is too large (see to "
             "unit, gain, exposure, background and read noise), or the model follows the noise "

@@ -129,8 +129,10 @@ class GuardedRuns:
         with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
             start = make_start(setup, observation, Penalty())
             found = Estimate(start.scene, start.extended, start.star_fluxes, _unknown(error))
-            for n_iter in (FIRST_ITERATIONS, *[ITERATIONS] * (MAX_ROUNDS - 1)):
-                before, found = found, self._run(setup, found, n_iter, guard)
+            moved = replace(setup, refine_positions=False)
+            rounds = (moved, FIRST_ITERATIONS), *[(setup, ITERATIONS)] * (MAX_ROUNDS - 1)
+            for each, n_iter in rounds:
+                before, found = found, self._run(each, found, n_iter, guard)
                 if not found.misfit.is_significant or _is_settled(before.misfit, found.misfit):
                     break
         return found
@@ -149,7 +151,8 @@ class GuardedRuns:
             np.maximum(found.extended[:ny, :nx], 0.0) * unit,
             found.fluxes * unit,
         )
-        run = Run(start, n_iter)
+        # Stars are moved at the start of a round alone.
+        run = Run(replace(start, setup=replace(start.setup, refine_positions=False)), n_iter)
         with suppress(DivergedError):  # by negative PSFs: the misfit tells how good the end is
             for _ in run:
                 pass

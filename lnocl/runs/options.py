@@ -115,7 +115,7 @@ def check_families(
     InputError
         A name is unknown, or one text is given instead of several; there is no star; the PSFs vary
         over the field; ideal PSFs, pupils or modes are lacking; pupils differ in their apertures;
-        pixels are asked of one star, or a shift of one image beside free positions.
+        a shift of one image is asked for beside free positions.
     """
     if len(observation.psf_scatter) and not len(positions):
         raise InputError(
@@ -146,11 +146,6 @@ def check_families(
 
         if len({Pupil(each).n_phases for each in observation.pupils}) > 1:
             raise InputError("pupils differ in their number of apertures; give as many in each")
-    if "pixels" in found and len(positions) < 2:
-        raise InputError(
-            "refine_psfs pixels needs two stars or more, since the pixels of one PSF may mimic any "
-            "sky; give more stars, or leave pixels out"
-        )
     if "shift" in found and refine_positions is True and observation.n_images == 1:
         raise InputError(
             "refine_psfs shift of one image is told from nothing but the stars' places; leave it "
@@ -163,7 +158,7 @@ def automatic_families(observation: Observation) -> tuple[str, ...]:
     """Return the families that any star shows, where the observation has what they need."""
     shift = ("shift",) if observation.n_images > 1 else ()
     known = tuple(name for name, needed in NEEDS.items() if getattr(observation, needed).size)
-    return (*shift, "jitter", *known)
+    return (*shift, "jitter", *known, "pixels")
 
 
 def check_length(n_iter: object, stop: object) -> None:

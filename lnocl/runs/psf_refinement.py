@@ -30,7 +30,7 @@ from lnocl.runs.start import Setup
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters
 from lnocl.scene.psf_misfit import PsfMisfit
-from lnocl.scene.psf_wings import without_negatives
+from lnocl.scene.psf_wings import without_noise
 from lnocl.solvers.psf_fit import step
 
 log = logging.getLogger("lnocl")
@@ -38,19 +38,19 @@ log = logging.getLogger("lnocl")
 # A mend is taken where it leaves less than this share of kappa, or nothing to doubt and a misfit
 # that is less by so many of its standard deviations.
 MENDED, GONE = 0.5, 2.0
-# The repair of negative pixels is taken where it leaves less than this share.
-REPAIRED = 0.9
 # None is taken that leaves a star less than this share of its flux.
 FADED = 0.5
+# Wings without noise are to leave less than this share.
+CLEANED = 0.99
+# Free pixels, which may fit anything, are to leave less than this share of kappa.
+FITTED = 0.25
 # Rounds of a search: each takes so many steps, and judges the PSFs. It ends where a round lowers
 # the misfit by less than so many of its standard deviations.
 ROUNDS, STEPS, IMPROVED = 4, 2, 0.3
 # PSFs are next taken to be wrong by so many times what they were, at most by `FIRST_ERROR`.
 LOOSE = 2.0
-# Free pixels may err by so many times what residuals show, and change no star's flux by more than
-# so many times kappa.
-FREEDOM, TRUSTED = 2.0, 3.0
-# Of PSFs that are wrong by more than this it is warned.
+# Of PSFs that are left wrong by more than this it is warned; of those whose pixels were fitted, by
+# more than `FIRST_ERROR`.
 NOTABLE = 0.03
 # Of more stars in the window the least squares would take more memory than the run.
 MOST_STARS = 64
@@ -71,12 +71,20 @@ class Mended(NamedTuple):
         The outcome for the PSFs; None where they fit, and nothing was asked of them.
     near_stars : ndarray of float64, of the shape of the extended source, or None
         The weight of the edge-preserving term that the error of the PSFs asks for; None for 0.
+    is_judged : bool
+        Whether the PSFs were looked at.
     """
 
     observation: Observation
     moves: bool
     refinement: PsfRefinement | None
     near_stars: Array | None
+    is_judged: bool = True
+
+    @property
+    def fits(self) -> bool:
+        """Whether the PSFs were looked at, and nothing is left to allow for."""
+        return self.is_judged and self.near_stars is None
 
 
 @dataclass(frozen=True)
@@ -105,10 +113,13 @@ def mend(
 ) -> Mended:
     """Return an observation whose positions and PSFs are mended where the images ask for it.
 
-    Stars are moved first, then negative pixels of PSFs are repaired, the families are fitted, and
-    pixels freed. Each is tried only where the misfit before is in doubt. It is taken where it
-    leaves less than half of kappa, or nothing to doubt, and every star more than half its flux. The
-    repair has no parameter, and is taken where it lowers kappa by a tenth.
+    Stars are moved first, then the noise of PSFs is taken from their wings, the families are
+    fitted, and pixels freed. Each is tried only where the misfit before is in doubt. It is taken
+    where it leaves less than half of kappa, or nothing to doubt, and every star more than half its
+    flux. Wings without noise are taken where they lower kappa.
+
+    Free pixels fit any star, and may take some of its surroundings for the PSF. So the error that
+    is allowed for is the one before them.
 
     Parameters
     ----------
@@ -127,7 +138,7 @@ def mend(
     if len(runs.stars) > MOST_STARS and not (is_asked or len(observation.psf_scatter)):
         number = counted(len(runs.stars), "star")
         log.info(f"PSFs are not judged: {number} in the window; name refine_psfs to judge them")
-        return Mended(observation, moves is True, None, None)
+        return Mended(observation, moves is True, None, None, is_judged=False)
     given = _State(
         observation.psfs, runs.fit(observation.psfs, runs.stars, moves is True), moves is True
     )
@@ -135,27 +146,29 @@ def mend(
     if state.misfit.is_doubtful and moves == "auto":
         state = _move(runs, state)
     if state.misfit.is_doubtful and names and (observation.psfs < 0).any():
-        state = _repair(runs, state)
+        state = _clean(runs, state)
     families = PsfFamilies(
         [name for name in names if name != "pixels"], with_psfs(observation, state.psfs)
     )
-    values, tried = np.zeros((observation.n_images, len(families.prior))), state
+    values, tried, left = np.zeros((observation.n_images, len(families.prior))), state, None
     if state.misfit.is_doubtful and families.parameters:
         tried, values = _fit(runs, families, state, moves is not False)
         state = tried if state.is_mended_by(tried) else state
     if state.misfit.is_doubtful and "pixels" in names:
         loose = _loosen(runs, state)
         tried = _free_pixels(runs, observation.psf_scatter, loose, moves is not False)
-        state = tried if _is_trusted(loose, tried) else state
+        if _is_trusted(loose, tried):
+            left, state = state.misfit, tried
     is_accepted = state.psfs is not observation.psfs
     if is_accepted:
         observation = with_psfs(observation, state.psfs)
-    known = observation.psf_scatter[: 0 if is_accepted and "pixels" in names else None]
+    known = observation.psf_scatter
     is_told = state is not given or given.misfit.is_significant
     if not (is_asked or len(known) or is_told):
         return Mended(observation, state.moves, None, None)
     _tell(given, state, tried, is_accepted)
-    allowance = Allowance(observation, runs, state.estimate, known)
+    estimate = replace(state.estimate, misfit=left or state.misfit)
+    allowance = Allowance(observation, runs, estimate, known)
     refinement = PsfRefinement(
         tuple(families.parameters),
         values / families.units,
@@ -165,6 +178,7 @@ def mend(
         allowance.edges,
         allowance.in_rings,
         allowance.may_be_faked(),
+        left is not None,
     )
     _warn(refinement)
     # Replicas draw PSFs from it, so that the errors of regions contain that of the PSFs.
@@ -179,12 +193,12 @@ def _move(runs: GuardedRuns, state: _State) -> _State:
     return moved if state.is_mended_by(moved) else state
 
 
-def _repair(runs: GuardedRuns, state: _State) -> _State:
-    """Return the state with PSFs that are not negative, where that lowers kappa by a tenth."""
-    psfs = without_negatives(state.psfs, runs.observation.oversample)
+def _clean(runs: GuardedRuns, state: _State) -> _State:
+    """Return the state with the noise taken from the wings of PSFs, where that lowers kappa."""
+    psfs = without_noise(state.psfs, runs.observation.oversample)
     stars = state.estimate.scene.stars
-    repaired = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
-    return repaired if repaired.misfit.kappa < REPAIRED * state.misfit.kappa else state
+    cleaned = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
+    return cleaned if cleaned.misfit.kappa < CLEANED * state.misfit.kappa else state
 
 
 def _fit(
@@ -218,20 +232,20 @@ def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) 
     """Return the state with PSFs whose pixels are free, as far as scatter or residuals show."""
     observation = with_psfs(runs.observation, state.psfs)
     if not len(scatter):
-        rings = state.misfit.in_rings
-        scatter = FREEDOM * estimate_scatter(state.psfs, rings, observation.oversample)
+        scatter = estimate_scatter(state.psfs, state.misfit.in_rings, observation.oversample)
     families = PsfFamilies(("pixels",), observation, scatter)
     return _search(runs, families, families.first(), state, moves, STRENGTH)[1]
 
 
 def _is_trusted(state: _State, tried: _State) -> bool:
-    """Return whether free pixels mend enough, and move no star's flux by more than thrice kappa.
+    """Return whether free pixels leave little of kappa, and change no star's flux by more than it.
 
     The wings of free PSFs may take the light of a host, and their cores that of a star.
     """
     before, after = state.estimate.fluxes, tried.estimate.fluxes
-    is_near = abs(after - before) <= TRUSTED * state.misfit.kappa * before
-    return state.is_mended_by(tried) and bool(is_near.all())
+    is_near = abs(after - before) <= state.misfit.kappa * before
+    is_fitted = tried.misfit.kappa < FITTED * state.misfit.kappa
+    return is_fitted and bool(is_near.all())
 
 
 def _search(
@@ -311,7 +325,13 @@ def _tell(given: _State, state: _State, tried: _State, is_accepted: bool) -> Non
 
 
 def _warn(refinement: PsfRefinement) -> None:
-    if refinement.psf_error > NOTABLE:
+    if refinement.has_free_pixels and refinement.psf_error > FIRST_ERROR:
+        warn(
+            f"the PSFs given do not fit the stars, by {100 * refinement.psf_error:.0f} %, and "
+            "their pixels were fitted there: see whether they are of these images, and sampled "
+            "alike"
+        )
+    if not refinement.has_free_pixels and refinement.psf_error > NOTABLE:
         warn(
             f"the PSFs do not fit the stars, by {100 * refinement.psf_error:.2g} %: trust nothing "
             "fainter than this near the stars"

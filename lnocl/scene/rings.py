@@ -47,6 +47,10 @@ class Rings:
     def __len__(self) -> int:
         return len(self.edges) - 1
 
+    def sums(self, image: Array) -> Array:
+        """Return the sum of the pixels in each ring, round all stars."""
+        return np.asarray(np.bincount(self.number.ravel(), image.ravel(), len(self)), np.float64)
+
     def round_stars(self, image: Array, share: float) -> Array:
         """Return what an image has all round each star: falling outwards, and 0 at the last ring.
 

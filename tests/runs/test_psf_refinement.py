@@ -272,7 +272,6 @@ REFUSED = {
     "no sequence": ({"names": 1}, "give auto, or a sequence"),
     "unknown": ({"names": ["tilt"]}, "refine_psfs 'tilt' is not known"),
     "no modes": ({"names": ["modes"]}, "refine_psfs modes needs psf_modes"),
-    "pixels of one star": ({"names": ["pixels"]}, "refine_psfs pixels needs two stars or more"),
     "no pupils": ({"names": ["pupil"]}, "refine_psfs pupil needs pupils"),
     "one free shift": ({"names": ["shift"], "refine_positions": True}, "shift of one image"),
 }

@@ -6,7 +6,7 @@ import pytest
 import lnocl
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_misfit import measure_misfit, smoothing_near_stars
-from lnocl.scene.psf_wings import without_negatives
+from lnocl.scene.psf_wings import without_noise
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import Scene
 
@@ -127,11 +127,11 @@ def test_exposures_scale_the_smoothing_as_they_do_the_penalty():
     np.testing.assert_allclose(found[1], 8.0 * found[0], rtol=1e-6, atol=1e-6 * found[1].max())
 
 
-class TestPsfsWithoutNegatives:
+class TestPsfsWithoutNoise:
     NOISY = PSF + 3e-5 * RNG.standard_normal(PSF.shape)
 
     def test_no_pixel_is_negative_and_rings_have_their_light(self):
-        (repaired,) = without_negatives(self.NOISY[None])
+        (repaired,) = without_noise(self.NOISY[None])
         assert repaired.min() == 0.0
         assert repaired.sum() == pytest.approx(1.0)
         number = Rings((N, N), np.array([(N // 2, N // 2)])).number.ravel()
@@ -139,5 +139,13 @@ class TestPsfsWithoutNegatives:
         scale = now[0] / given[0]
         np.testing.assert_allclose(now, scale * given.clip(0.0), rtol=1e-9, atol=1e-15)
 
-    def test_a_psf_without_them_is_as_it_was(self):
-        np.testing.assert_allclose(without_negatives(PSF[None]), PSF[None], rtol=1e-12)
+    def test_the_wings_are_nearer_to_the_truth_and_the_core_stays(self):
+        (cleaned,) = without_noise(self.NOISY[None])
+        far = np.hypot(*(np.indices((N, N)) - N // 2)) > 8
+        before, after = (np.linalg.norm((each - PSF)[far]) for each in (self.NOISY, cleaned))
+        assert after < 0.5 * before
+        core = ~far & (PSF.max() < 10 * PSF)
+        np.testing.assert_allclose(cleaned[core], self.NOISY[core], rtol=0.005)
+
+    def test_a_psf_without_it_is_as_it_was(self):
+        np.testing.assert_allclose(without_noise(PSF[None]), PSF[None], rtol=1e-12, atol=1e-25)
