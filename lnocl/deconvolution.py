@@ -271,7 +271,7 @@ def deconvolve(
     **Star fluxes are marginal** where PSFs were judged and fit. What lies under a star belongs to
     it or to the extended source, and early iterations leave it to the star. So after the last
     iteration each star takes a step of Newton to the flux that the counts give it with the extended
-    source marginalised. The extended source takes up what the stars lose (`lnocl.solvers.marginal`).
+    source marginalised (`lnocl.solvers.marginal`). The extended source takes up what stars lose.
     A callback and the history have the iterations as they were.
 
     **The split-gradient method** lowers the objective at every iteration where PSFs are not
