@@ -256,8 +256,8 @@ def deconvolve(
     their chi squared exceeds its expectation by five standard deviations, or by three and the error
     is above a tenth, positions and PSFs are refined as far as they may be. They are used where they
     leave less than half of the error, or nothing that noise does not explain. Free pixels, which
-    may fit anything, are used where they leave less than a quarter of it, and change no star's flux
-    by more than κ.
+    may fit anything, are used where they leave less than 0.3 of it, and change no star's flux by
+    more than κ.
 
     What is left, a relative error κ of the PSFs, adds to λ twice the standard deviation of the data
     term's gradient by it, ``2 sqrt(sum_j (A_j^2)^T (κ S_j / m_j)^2)``, with S_j the starlight. So

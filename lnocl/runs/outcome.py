@@ -45,6 +45,9 @@ class PsfRefinement:
         times the light of the stars, as the PSFs spread it, over the square root of p.
     has_free_pixels : bool
         Whether the PSFs used were fitted pixel by pixel, and so follow the noise too.
+    hidden_error : float
+        Relative error that refined PSFs or places may have though noise hides it; it is in the
+        errors of star fluxes.
 
     See Also
     --------
@@ -76,6 +79,7 @@ class PsfRefinement:
     errors_in_rings: Array
     may_be_faked: Array
     has_free_pixels: bool = False
+    hidden_error: float = 0.0
 
     def table(self) -> NDArray[np.void]:
         """Return the parameters of the PSFs, a row an image, for a FITS table."""
@@ -182,8 +186,9 @@ class Outcome:
                 "these errors are NaN; leave out stars that lie on others"
             )
         if self.psf_refinement is not None:
-            of_psfs = self.psf_refinement.psf_error * self.star_fluxes
-            errors[:, 0] = np.hypot(errors[:, 0], of_psfs)
+            refinement = self.psf_refinement
+            of_psfs = np.hypot(refinement.psf_error, refinement.hidden_error)
+            errors[:, 0] = np.hypot(errors[:, 0], of_psfs * self.star_fluxes)
         positions = errors[:, 1:]
         positions[positions > RADIUS] = np.nan  # no star is moved farther
         return errors[:, 0], positions

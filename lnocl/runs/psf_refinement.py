@@ -43,7 +43,7 @@ FADED = 0.5
 # Wings without noise are to leave less than this share.
 CLEANED = 0.99
 # Free pixels, which may fit anything, are to leave less than this share of kappa.
-FITTED = 0.25
+FITTED = 0.3
 # Rounds of a search: each takes so many steps, and judges the PSFs. It ends where a round lowers
 # the misfit by less than so many of its standard deviations.
 ROUNDS, STEPS, IMPROVED = 4, 2, 0.3
@@ -155,9 +155,9 @@ def mend(
         tried, values = _fit(runs, families, state, moves is not False)
         state = tried if state.is_mended_by(tried) else state
     if state.misfit.is_doubtful and "pixels" in names:
-        loose = _loosen(runs, state)
+        loose = _loosen(runs, min(state, tried, key=lambda each: each.misfit.kappa))
         tried = _free_pixels(runs, observation.psf_scatter, loose, moves is not False)
-        if _is_trusted(loose, tried):
+        if _is_trusted(tried, loose, state.misfit.kappa):
             left, state = state.misfit, tried
     is_accepted = state.psfs is not observation.psfs
     if is_accepted:
@@ -179,6 +179,7 @@ def mend(
         allowance.in_rings,
         allowance.may_be_faked(),
         left is not None,
+        state.misfit.hidden if state is not given else 0.0,
     )
     _warn(refinement)
     # Replicas draw PSFs from it, so that the errors of regions contain that of the PSFs.
@@ -237,14 +238,15 @@ def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) 
     return _search(runs, families, families.first(), state, moves, STRENGTH)[1]
 
 
-def _is_trusted(state: _State, tried: _State) -> bool:
+def _is_trusted(tried: _State, state: _State, given: float) -> bool:
     """Return whether free pixels leave little of kappa, and change no star's flux by more than it.
 
-    The wings of free PSFs may take the light of a host, and their cores that of a star.
+    The wings of free PSFs may take the light of a host, and their cores that of a star. The state
+    is the one that they begin from; given is kappa before, which families may have lowered.
     """
     before, after = state.estimate.fluxes, tried.estimate.fluxes
     is_near = abs(after - before) <= state.misfit.kappa * before
-    is_fitted = tried.misfit.kappa < FITTED * state.misfit.kappa
+    is_fitted = tried.misfit.kappa < FITTED * given
     return is_fitted and bool(is_near.all())
 
 

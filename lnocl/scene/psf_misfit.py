@@ -82,6 +82,11 @@ class PsfMisfit(NamedTuple):
         """The relative error of the PSFs that the excess shows."""
         return _kappa(float(self.squares.sum()) - self.expected, self.norm)
 
+    @property
+    def hidden(self) -> float:
+        """The relative error of PSFs whose excess is one standard deviation of noise."""
+        return _kappa(math.sqrt(self.variance), self.norm)
+
 
 def measure_misfit(
     scene: Scene, model: Model, extended: Array, fluxes: Array, settled: tuple[Array, Array]
