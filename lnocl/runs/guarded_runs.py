@@ -124,7 +124,7 @@ class GuardedRuns:
         guard : float
             How strongly the extended source is kept from the stars, as `GUARD`.
         """
-        observation = with_psfs(self.observation, self._cut(psfs))
+        observation = with_psfs(self.observation, self.cut(psfs))
         setup = replace(self._setup, stars=stars, refine_positions=moves)
         with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
             start = make_start(setup, observation, Penalty())
@@ -168,19 +168,28 @@ class GuardedRuns:
     def moved(self, estimate: Estimate, psfs: Array, fluxes: Array, stars: Array) -> Estimate:
         """Return an estimate with other PSFs and stars, whose misfit is that of before."""
         ny, nx = self.observation.shape
-        observation = with_psfs(self.observation, self._cut(psfs))
+        observation = with_psfs(self.observation, self.cut(psfs))
         with ignored_warnings():
             scene = Scene(observation, stars.clip(0, (nx - 1, ny - 1)), pad=self._setup.pad)
         return Estimate(scene, estimate.extended, fluxes, estimate.misfit)
 
-    def _cut(self, psfs: Array) -> Array:
+    def cut(self, psfs: Array) -> Array:
         """Return PSFs as far as the window may show them."""
+        return psfs[:, *self._shown(psfs)]
+
+    def completed(self, psfs: Array, inner: Array) -> Array:
+        """Return PSFs that are others as far as the window may show them."""
+        whole = psfs.copy()
+        whole[:, *self._shown(psfs)] = inner
+        return np.asarray(whole / whole.sum(axis=(1, 2), keepdims=True))
+
+    def _shown(self, psfs: Array) -> tuple[slice, slice]:
         most = WINDOW * self.observation.oversample
         y, x = (
             slice(n // 2 - min(n, most) // 2, n // 2 - min(n, most) // 2 + min(n, most))
             for n in psfs.shape[1:]
         )
-        return psfs[:, y, x]
+        return y, x
 
 
 def find_window(setup: Setup, observation: Observation) -> tuple[Observation, Array, Array]:

@@ -231,11 +231,15 @@ def _loosen(runs: GuardedRuns, state: _State) -> _State:
 
 def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) -> _State:
     """Return the state with PSFs whose pixels are free, as far as scatter or residuals show."""
-    observation = with_psfs(runs.observation, state.psfs)
-    if not len(scatter):
-        scatter = estimate_scatter(state.psfs, state.misfit.in_rings, observation.oversample)
+    observation = with_psfs(runs.observation, runs.cut(state.psfs))
+    scatter = (
+        runs.cut(scatter)
+        if len(scatter)
+        else estimate_scatter(observation.psfs, state.misfit.in_rings, observation.oversample)
+    )
     families = PsfFamilies(("pixels",), observation, scatter)
-    return _search(runs, families, families.first(), state, moves, STRENGTH)[1]
+    found = _search(runs, families, families.first(), state, moves, STRENGTH)[1]
+    return replace(found, psfs=runs.completed(state.psfs, found.psfs))
 
 
 def _is_trusted(tried: _State, state: _State, given: float) -> bool:
