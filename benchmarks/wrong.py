@@ -86,6 +86,7 @@ def try_it(image, psf, stars, device=None, **known):
         "negative and were kept": "negative", "too near the end": "length",
         "not that of its counts": "noise",
         "the PSFs do not fit the stars": "error left",
+        "the PSFs given do not fit the stars": "error fitted",
     }  # fmt: skip
     result, messages = None, []
     with warnings.catch_warnings(record=True) as caught:

@@ -144,12 +144,12 @@ def test_stars_beyond_all_information_have_no_error():
 @pytest.mark.filterwarnings("ignore:psf . does not fit")
 # One sky in twenty beside the ridge looks as a wrong PSF would leave it.
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit the stars")
-@pytest.mark.parametrize(("light", "expected"), [(0.0, 1.0), (30.0, 0.7)])
+@pytest.mark.parametrize(("light", "expected"), [(0.0, 1.0), (30.0, 0.85)])
 def test_fluxes_scatter_as_their_errors_say(light, expected):
     """Of 200 skies with texture, reconstructed by default: no light, or a bright ridge.
 
-    200 tell the ratio to 5 %. Beside the ridge errors are too careful: what is not where it was
-    expected is in them too.
+    200 tell the ratio to 5 %. Beside the ridge errors are a little too careful: what is not where
+    it was expected is in them too.
     """
     rng, ratios = np.random.default_rng(77), []
     texture = Texture(light * SKY, STARS[:1], resolution(a_scene(STARS[:1])[0]))
