@@ -9,7 +9,7 @@ from regions import CirclePixelRegion, PixCoord
 
 import lnocl
 from lnocl.errors import LnoclWarning
-from lnocl.runs.psf_refinement import _State
+from lnocl.runs.psf_refinement import _is_trusted, _State
 from lnocl.scene.psf_families import PsfFamilies
 from lnocl.scene.psf_misfit import PsfMisfit
 
@@ -76,15 +76,24 @@ def test_a_star_of_few_counts_is_moved(seed, caplog):
     assert "positions refined" in caplog.text
 
 
-def test_a_sharper_psf_that_takes_the_star_away_is_refused():
-    def state(kappa, flux):
-        misfit = PsfMisfit(np.array([100.0 * kappa]), 1.0, 1.0, 100.0, np.zeros(1))
-        return _State(PSF, SimpleNamespace(misfit=misfit, fluxes=np.array([1e4, flux])), False)
+def state(kappa, flux):
+    misfit = PsfMisfit(np.array([1.0 + 100.0 * kappa**2]), 1.0, 1.0, 100.0, np.zeros(1))
+    return _State(PSF, SimpleNamespace(misfit=misfit, fluxes=np.array([1e4, flux])), False)
 
+
+def test_a_sharper_psf_that_takes_the_star_away_is_refused():
     before = state(0.2, 1e4)
     assert before.is_mended_by(state(0.02, 0.6e4))
     assert not before.is_mended_by(state(0.02, 0.4e4))
     assert not before.is_mended_by(state(0.19, 1e4))
+
+
+def test_free_pixels_are_refused_that_fit_in_part_or_change_a_flux_by_more_than_the_error():
+    before = state(0.2, 1e4)
+    assert _is_trusted(state(0.05, 1.19e4), before, 0.2)
+    assert not _is_trusted(state(0.05, 1.21e4), before, 0.2)
+    assert not _is_trusted(state(0.07, 1e4), before, 0.2)
+    assert _is_trusted(state(0.07, 1e4), before, 0.25)
 
 
 def test_a_wrong_width_is_mended(right):

@@ -141,10 +141,11 @@ class TestPsfsWithoutNoise:
 
     def test_the_wings_are_nearer_to_the_truth_and_the_core_stays(self):
         (cleaned,) = without_noise(self.NOISY[None])
-        far = np.hypot(*(np.indices((N, N)) - N // 2)) > 8
+        distance = np.hypot(*(np.indices((N, N)) - N // 2))
+        far = (distance > 8) & (distance < 12)
         before, after = (np.linalg.norm((each - PSF)[far]) for each in (self.NOISY, cleaned))
-        assert after < 0.5 * before
-        core = ~far & (PSF.max() < 10 * PSF)
+        assert after < 0.25 * before  # 0.18 was measured; pixels at 0 alone leave 0.34
+        core = PSF.max() < 10 * PSF
         np.testing.assert_allclose(cleaned[core], self.NOISY[core], rtol=0.005)
 
     def test_a_psf_without_it_is_as_it_was(self):
