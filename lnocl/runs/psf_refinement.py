@@ -118,8 +118,8 @@ def mend(
     where it leaves less than half of kappa, or nothing to doubt, and every star more than half its
     flux. Wings without noise are taken where they lower kappa.
 
-    Free pixels fit any star, and may take some of its surroundings for the PSF. So the error that
-    is allowed for is the one before them.
+    Free pixels fit any star, and may take some of its surroundings for the PSF. So they are to
+    leave less than 0.3 of kappa, and the error that is allowed for is the one before them.
 
     Parameters
     ----------
@@ -232,11 +232,10 @@ def _loosen(runs: GuardedRuns, state: _State) -> _State:
 def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) -> _State:
     """Return the state with PSFs whose pixels are free, as far as scatter or residuals show."""
     observation = with_psfs(runs.observation, runs.cut(state.psfs))
-    scatter = (
-        runs.cut(scatter)
-        if len(scatter)
-        else estimate_scatter(observation.psfs, state.misfit.in_rings, observation.oversample)
-    )
+    scatter = runs.cut(scatter)
+    if not len(scatter):
+        rings = state.misfit.in_rings
+        scatter = estimate_scatter(observation.psfs, rings, observation.oversample)
     families = PsfFamilies(("pixels",), observation, scatter)
     found = _search(runs, families, families.first(), state, moves, STRENGTH)[1]
     return replace(found, psfs=runs.completed(state.psfs, found.psfs))

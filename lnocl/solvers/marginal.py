@@ -6,8 +6,9 @@ step of Newton to where the least squares of `lnocl.solvers.near_star` have it,
 
 .. math:: c_s \gets \max(c_s + \Delta c_s, 0),
 
-in which the extended source is expected to be under the star as it is round it. It takes the light
-that the same step gives it in the core of the star, but no more than the star has lost or won.
+in which the extended source is expected to go on under the star as it falls round it
+(`lnocl.scene.texture`). It takes the light that the same step gives it in the core of the star, but
+no more than the star has lost or won.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ def marginal(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array
     """
     around = Surroundings(scene, sky, star_fluxes, False)
     after, fluxes = sky.copy(), star_fluxes.copy()
-    for star, flux in enumerate(star_fluxes):
-        near = NearStar(around, star, FINISHED)
-        if not (flux > 0 and np.isfinite(variances(near.fit.information)[0])):
+    for star in np.flatnonzero(star_fluxes > 0).tolist():
+        near, flux = NearStar(around, star, FINISHED), star_fluxes[star]
+        if not np.isfinite(variances(near.fit.information)[0]):
             continue
         change, (x,) = near.fit.solve(np.zeros(near.n_held))
         fluxes[star] = max(flux + change[0] * scene.unit, 0.0)
