@@ -29,10 +29,12 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.opencl import device
+    from lnocl.opencl import device, linking
     from lnocl.studies import demo
 
-    spec = device.spec_of(device.choose(arguments.device).device)
+    chosen = device.choose(arguments.device).device
+    linking.check(chosen)  # before anything is written
+    spec = device.spec_of(chosen)
     for line in demo.run(
         arguments.output, arguments.size, arguments.seed, spec, arguments.overwrite
     ):

@@ -11,7 +11,7 @@ from lnocl.commands.parser import Command
 def _run(arguments: argparse.Namespace) -> None:
     import numpy as np
 
-    from lnocl.opencl import device
+    from lnocl.opencl import device, linking
     from lnocl.opencl.tuning import describe_tuning
 
     if arguments.tune:
@@ -20,13 +20,12 @@ def _run(arguments: argparse.Namespace) -> None:
     found, single = device.find_devices(), np.dtype(np.float32)
     choice = device.choose(None)
     messages.say(
-        [
-            *(
-                f"{device.spec_of(each)} {device.describe(each)}; {describe_tuning(each, single)}"
-                for each in found
-            ),
-            f"lnocl uses {device.spec_of(choice.device)} unless told otherwise: {choice.reason}",
-        ]
+        f"{device.spec_of(each)} {device.describe(each)}; {describe_tuning(each, single)}"
+        for each in found
+    )
+    linking.check(choice.device)
+    messages.say(
+        [f"lnocl uses {device.spec_of(choice.device)} unless told otherwise: {choice.reason}"]
     )
 
 

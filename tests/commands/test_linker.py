@@ -1,0 +1,28 @@
+"""Commands that compile, on a machine without a linker."""
+
+import os
+
+import pytest
+
+from lnocl.commands import cli
+from lnocl.errors import DeviceError
+from lnocl.opencl import linking
+
+
+@pytest.mark.parametrize("command", ["demo", "selftest", "devices"])
+def test_a_linker_that_is_missing_is_said_before_anything_else(
+    command, tmp_path, monkeypatch, capsys
+):
+    """So that the same command works once there is one."""
+
+    def check(_):
+        raise DeviceError("PoCL cannot link kernels: no linker was found")
+
+    monkeypatch.setattr(linking, "check", check)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([command]) == 1
+    said = capsys.readouterr()
+    assert said.err == "lnocl: error: PoCL cannot link kernels: no linker was found\n"
+    assert "lnocl uses" not in said.out
+    assert "WRONG" not in said.out
+    assert os.listdir() == []
