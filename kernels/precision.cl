@@ -11,6 +11,7 @@
  *                   the same of the images' axes, whose odd factors are those of the sky's
  *   CHUNK           points of a transform that are finished before the next are begun
  *   SCRATCH_IS_GLOBAL   0 or 1: where a block lies while it is transformed
+ *   HAS_BUILTIN_PREFETCH   0 or 1: whether the compiler is known to take __builtin_prefetch
  *   NX, NY          the grid of the sky, each 1, 3, 5, 7 or 9 times a power of two, up to 8192
  *   OVERSAMPLE      pixels of the sky to one of the images, along each axis: 1, 2 or 4; 2 BLOCK
  *                   OVERSAMPLE divides that power of two
@@ -84,14 +85,15 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define OWN_SCRATCH(scratch, points) (scratch)
 #endif
 
-/* Asks for the cache line at p before it is needed; PoCL's own prefetch() does nothing. */
-#if GROUP == 1 && defined(__has_builtin)
-#if __has_builtin(__builtin_prefetch)
-#define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
-#endif
-#endif
-#ifndef PREFETCH
+/* Asks for the cache line at p before it is needed. PoCL's prefetch() does nothing, and compilers
+ * that go through SPIR-V end the process at the builtin.
+ */
+#if GROUP > 1
 #define PREFETCH(p)
+#elif HAS_BUILTIN_PREFETCH
+#define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
+#else
+#define PREFETCH(p) prefetch(p, 1)
 #endif
 
 /* Shares n blocks among however many work-groups were launched. */

@@ -16,6 +16,9 @@ from lnocl.opencl.faults import after_fault, claim_process
 
 T = TypeVar("T")
 
+# A number of threads that PoCL cannot have ends the process.
+THREADS, MAX_THREADS = "POCL_MAX_PTHREAD_COUNT", 4096
+
 
 class Choice(NamedTuple):
     """A device and why it was chosen."""
@@ -32,6 +35,8 @@ def find_devices() -> list[cl.Device]:
     DeviceError
         Where there is no platform, or no device on any; in a process that was forked from one
         that uses OpenCL.
+    InputError
+        POCL_MAX_PTHREAD_COUNT is no number of threads.
     """
     devices = [device for platform in _usable_platforms() for device in _devices_of(platform)]
     if not devices:
@@ -56,7 +61,7 @@ def choose(spec: str | None = None) -> Choice:
     Raises
     ------
     InputError
-        Where the specification fits no device.
+        Where the specification fits no device, or as `find_devices`.
     DeviceError
         Where there is none at all.
     """
@@ -111,6 +116,12 @@ def has_double(device: cl.Device) -> bool:
 def _usable_platforms() -> list[cl.Platform]:
     """Return the platforms that have a device; indices in a specification count these."""
     claim_process()
+    threads = os.environ.get(THREADS, "").strip()
+    if threads and threads not in map(str, range(1, MAX_THREADS + 1)):
+        raise InputError(
+            f"{THREADS} is {threads!r}; set it to a whole number from 1 to {MAX_THREADS}, or unset "
+            "it for a thread a core"
+        )
     with kernel_cache.private():
         try:
             platforms = cl.get_platforms()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import re
 import weakref
@@ -41,10 +42,14 @@ SOURCES = (
 
 # Rooms for stars that programs are built with. More stars seldom build another program; where there
 # are none, or one, the loops over stars cost nothing.
-STAR_ROOMS = (0, 1, 8, 64, 512, 4096)
+STAR_ROOMS = (0, 1, 8, 64, 512, 4096, 32768)
 
 # Built programs that a process holds, the last used; each takes some 3 MiB.
 MAX_PROGRAMS = 16
+
+# Bytes of addresses with which PoCL builds and launches kernels for sure. With too few it fails
+# while it holds its locks, and waits for them as the process ends.
+ROOM = 512 * 2**20
 
 
 def radices(n: int) -> tuple[int, int, int]:
@@ -79,7 +84,7 @@ class Program:
     oversample : int, optional
         Pixels of the sky to one of the images, along each axis: 1, 2 or 4.
     n_stars : int, optional
-        Stars of the scene, at most 4096; the program has room for more.
+        Stars of the scene, at most 32768; the program has room for more.
     has_mu, has_smoothing, has_smoothing_map : bool, optional
     has_weights, has_background_map, has_exposure_map : bool, optional
         Parts that the scene has.
@@ -105,7 +110,7 @@ class Program:
     ------
     DeviceError
         The device has no double precision and float64 is asked of it, its compiler fails, or the
-        scene has more than 4096 stars.
+        scene has more than 32768 stars.
     """
 
     def __init__(
@@ -159,6 +164,7 @@ class Program:
             "IMAGE_COLUMN_LAST": self.image_column_radices[2],
             "CHUNK": self.tuning.chunk,
             "SCRATCH_IS_GLOBAL": int(self.tuning.scratch_is_global),
+            "HAS_BUILTIN_PREFETCH": int(_has_builtin_prefetch(device)),
             "NX": grid[1],
             "NY": grid[0],
             "OVERSAMPLE": oversample,
@@ -207,6 +213,11 @@ class Program:
         """Bytes that a work-group needs for its block."""
         points = scratch_points(self.grid, self.oversample)
         return points * 2 * self.tuning.block * self.dtype.itemsize
+
+
+def _has_builtin_prefetch(device: cl.Device) -> bool:
+    """Return whether a device's compiler is known to take clang's builtin."""
+    return device.platform.name == unknown_cpu.POCL and bool(device.type & cl.device_type.CPU)
 
 
 def _room_for(n_stars: int) -> int:
@@ -296,15 +307,35 @@ def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
     """Return a program that the process has, that a file holds, or that is compiled now."""
     key = context, text, options
     with LOCK:
-        unknown_cpu.name_level(context.devices[0])
-        linking.check(context.devices[0])
         if key not in _programs:
+            _need_room(context.devices[0])
+            unknown_cpu.name_level(context.devices[0])
+            linking.check(context.devices[0])
             name = "\n".join([describe(context.devices[0]), *options, text])
             _programs[key] = _Built(context, text, options, kernel_cache.file_of(name))
             while len(_programs) > MAX_PROGRAMS:
                 _programs.popitem(last=False)
         _programs.move_to_end(key)
         return _programs[key]
+
+
+def _need_room(device: cl.Device) -> None:
+    """Refuse to compile with PoCL where addresses are too few.
+
+    Raises
+    ------
+    DeviceError
+        They are.
+    """
+    if device.platform.name != unknown_cpu.POCL or not hasattr(mmap, "MAP_PRIVATE"):
+        return
+    try:
+        mmap.mmap(-1, ROOM, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
+    except OSError as error:
+        raise DeviceError(
+            f"PoCL needs {ROOM // 2**20} MiB of addresses more than this process may have: raise "
+            "the limit of memory (ulimit -v), or take engine numpy"
+        ) from error
 
 
 @after_fault

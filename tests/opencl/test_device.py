@@ -67,6 +67,24 @@ def test_environment_decides_where_nothing_is_asked_for(machine, monkeypatch):
     assert device.choose("1").device is GPU
 
 
+@pytest.mark.parametrize("threads", ["-1", "0", "4097", "9" * 20, "9" * 5000, "1.5", "all"])
+def test_numbers_of_threads_that_end_pocl_are_refused_before_it_is_loaded(monkeypatch, threads):
+    monkeypatch.setattr(cl, "get_platforms", lambda: pytest.fail("it is loaded"))
+    monkeypatch.setenv("POCL_MAX_PTHREAD_COUNT", threads)
+    with pytest.raises(lnocl.InputError) as caught:
+        device.choose()
+    assert str(caught.value) == (
+        f"POCL_MAX_PTHREAD_COUNT is '{threads}'; set it to a whole number from 1 to 4096, or unset "
+        "it for a thread a core"
+    )
+
+
+@pytest.mark.parametrize("threads", ["1", "4096", " 2 ", ""])
+def test_other_numbers_of_threads_are_taken(machine, monkeypatch, threads):
+    monkeypatch.setenv("POCL_MAX_PTHREAD_COUNT", threads)
+    assert device.choose().device is GPU
+
+
 @pytest.mark.parametrize("spec", ["2", "0:2", "nosuch", "vendor:cpu", "", ":0"])
 def test_unknown_device_is_refused_with_what_there_is(machine, spec):
     with pytest.raises(
@@ -232,17 +250,10 @@ def test_build_options_are_recorded_and_kernels_fetched_once():
     assert engine.program.kernel("scale_rows") is engine.program.kernel("scale_rows")
 
 
-@pytest.mark.parametrize(
-    ("keywords", "name"),
-    [
-        ({"initial_extended": np.full((16, 32), 1e300)}, "extended"),
-        ({"stars": [(1, 1)], "initial_star_fluxes": [1e300]}, "star fluxes"),
-    ],
-)
-def test_values_too_large_for_single_precision_are_refused(keywords, name):
+def test_values_too_large_for_single_precision_are_refused():
     observation = lnocl.Observation(np.ones((16, 32)), np.ones((1, 1)))
-    with pytest.raises(lnocl.InputError, match=f"{name} as large as .* held in float32"):
-        paper(observation, n_iter=1, **keywords)
+    with pytest.raises(lnocl.InputError, match=r"star fluxes as large as .* held in float32"):
+        paper(observation, [(1, 1)], n_iter=1, initial_star_fluxes=[1e300])
 
 
 @pytest.mark.parametrize("engine", ["numpy", "opencl"])

@@ -1,6 +1,9 @@
 """Devices that fail, caches that are broken, forks, and objectives that are not finite."""
 
 import re
+import resource
+from collections import OrderedDict
+from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
@@ -150,6 +153,23 @@ def test_a_log_that_cannot_be_saved_is_no_other_error(monkeypatch):
     device.choose()  # has made its folder
     monkeypatch.setattr("tempfile.tempdir", "/nonexistent")
     assert "could not be saved" in refused()
+
+
+@on_pocl
+def test_too_few_addresses_are_refused_before_pocl_compiles(monkeypatch):
+    """It fails while it holds locks that it then waits for, as the process ends."""
+    monkeypatch.setattr(program, "_programs", OrderedDict())
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + 400 * 2**20, before[1]))
+    try:
+        message = refused()
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+    assert message == (
+        "PoCL needs 512 MiB of addresses more than this process may have: raise the limit of "
+        "memory (ulimit -v), or take engine numpy"
+    )
 
 
 @pytest.mark.system

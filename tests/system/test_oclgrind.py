@@ -32,8 +32,7 @@ NOT_IN_A_DECONVOLUTION = {"fft_columns", "ifft_columns"}
 # Nothing reads it, there or in the copy; a kernel that did would be reported.
 EXCUSED = "Uninitialized value written to global memory address in put_part, input.cl:4"
 
-# Oclgrind has no llvm.prefetch, nor would it check one.
-BUILD_OPTIONS = "-O0 -disable-llvm-passes -D__builtin_prefetch(p)=((void)(p))"
+BUILD_OPTIONS = "-O0 -disable-llvm-passes"
 OPTIONS = ["--data-races", "--uniform-writes", "--uninitialized", "--max-errors", "100000"]
 
 pytestmark = [
