@@ -9,6 +9,10 @@ Describe the images with `Observation`, reconstruct the sky with `deconvolve`, a
 The command ``lnocl --help`` does the same for FITS files, and more.
 """
 
+from lnocl import loading
+
+loading.begin()  # before what takes its time
+# ruff: noqa: E402
 from importlib.metadata import version
 
 from lnocl.deconvolution import deconvolve

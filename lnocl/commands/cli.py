@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from lnocl import loading
 from lnocl.commands import (
     batch,
     bench,
@@ -62,6 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 129 (SIGHUP) or 143
         (SIGTERM) terminated.
     """
+    loading.end()
     messages.replace_closed_streams()
     environment.prepare()
     return running.run(COMMANDS, sys.argv[1:] if arguments is None else arguments)

@@ -226,9 +226,9 @@ READ_NOISE = option(
     metavar="S",
     card=("RON", "read noise, electrons"),
     checksum="RSUM",
-    help="standard deviation in electrons, a FITS file with a map of it, or auto, what the "
-    "scatter of the sky has beyond the noise of its counts; one for all images or one for each "
-    "(default: 0)",
+    help="standard deviation in electrons, a FITS file with a map of it, a keyword of the images' "
+    "headers such as RDNOISE, or auto, what the scatter of the sky has beyond the noise of its "
+    "counts; one for all images or one for each (default: 0)",
 )
 SATURATION = option(
     "--saturation",
@@ -245,6 +245,14 @@ STARS = option(
     dest="stars",
     metavar="X,Y",
     help="position of a star in pixels, 0-based, x along columns; may be repeated",
+)
+STAR_TABLE = option(
+    "--stars",
+    metavar="FILE",
+    dest="star_table",
+    is_input=True,
+    help="table of stars in any format of astropy, with columns x and y, or ra and dec, or as "
+    "photutils, SExtractor, Gaia and VizieR name them",
 )
 DEVICE = option(
     "--device",

@@ -16,6 +16,7 @@ from lnocl.commands.parser import Command
 from lnocl.errors import InputError, counted
 
 if TYPE_CHECKING:
+    from astropy.io import fits
     from matplotlib.figure import Figure
 
     from lnocl.io.fitswrite import Card
@@ -47,6 +48,7 @@ OPTIONS = [
         "brightest pixel that is not a single hot one); several give the PSF that they share, "
         "and an extension SCATTER with the standard deviation of theirs from it",
     ),
+    options.STAR_TABLE,
     option(
         "--modes",
         type=int,
@@ -123,18 +125,20 @@ def _run(arguments: argparse.Namespace) -> None:
     folder = os.getcwd()
 
     from lnocl import psf
-    from lnocl.io import fitswrite
+    from lnocl.io import fitsread, fitswrite
 
     sha256: dict[str, list[str]] = {}
     mask = None
     with messages.shown_log(arguments.quiet):
-        frame, sha256["frame"] = _read_image(arguments.frame)
+        stack = fitsread.read_single(arguments.frame)
+        frame, sha256["frame"] = stack.data[0], stack.sha256
+        positions = _positions(arguments, stack.header)
         if arguments.mask is not None:
             mask, sha256["mask"] = _read_mask(arguments.mask, arguments.frame, frame.shape)
     stars = psf.make_psfs(
         frame,
         arguments.rotate,
-        position=arguments.position or None,
+        position=positions,
         size=arguments.size,
         background=arguments.background,
         mask=mask,
@@ -186,11 +190,12 @@ def _make_modes(arguments: argparse.Namespace) -> None:
 
     with messages.shown_log(arguments.quiet):
         stack = fitsread.read_stack([arguments.frame])
+        positions = _positions(arguments, stack.header)
     stars = [
         psf.make_psf(
             frame,
             rotate=arguments.rotate[0],
-            position=arguments.position or None,
+            position=positions,
             size=arguments.size,
             background=arguments.background,
             saturation=arguments.saturation,
@@ -231,6 +236,18 @@ def _make_modes(arguments: argparse.Namespace) -> None:
     )
     if not arguments.quiet:
         messages.say(lines)
+
+
+def _positions(
+    arguments: argparse.Namespace, header: fits.Header
+) -> list[tuple[float, float]] | None:
+    """Return the positions of the stars that are given, by --star and --stars."""
+    positions = list(arguments.position)
+    if arguments.star_table is not None:
+        from lnocl.io.sky import read_stars
+
+        positions += read_stars(arguments.star_table, header, arguments.frame).tolist()
+    return positions or None
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:

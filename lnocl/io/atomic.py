@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import functools
 import io
 import os
+import re
 import secrets
 import stat
+import time
 from collections.abc import Iterable, Iterator
 from typing import IO, Any
 
@@ -14,6 +18,9 @@ from lnocl.errors import FileError, InputError
 
 COMPRESSED = (".gz", ".bz2", ".xz", ".zip", ".z", ".fz")
 FITS_ENDINGS = (".fits", ".fit", ".fts")
+_TEMPORARY = re.compile(r"\.lnocl-[0-9a-f]{16}\.tmp")
+# Seconds after the last write to a temporary file from which on nobody writes to it.
+ABANDONED = 24 * 3600.0
 
 
 def check_folder(
@@ -182,7 +189,44 @@ def write_text(path: str, text: str, overwrite: bool = False) -> None:
 
 
 def _create(path: str) -> io.FileIO:
-    return open(path, "xb", buffering=0)
+    """Open a temporary file, locked as long as it is open."""
+    _remove_abandoned(os.path.dirname(path))
+    file = open(path, "xb", buffering=0)  # noqa: SIM115  its caller closes it
+    _lock(file.fileno())
+    return file
+
+
+@functools.cache
+def _remove_abandoned(folder: str) -> None:
+    """Remove temporary files that killed processes left in a folder, once in a process.
+
+    Nobody has them locked, and as not all file systems tell other machines of locks, nobody has
+    written to them for a day.
+    """
+    before = time.time() - ABANDONED
+    with contextlib.suppress(OSError):  # of a folder that cannot be listed
+        for entry in list(os.scandir(folder)):
+            with contextlib.suppress(OSError):  # of a file of another user, or that is gone
+                if not _TEMPORARY.fullmatch(entry.name) or not entry.is_file(follow_symlinks=False):
+                    continue
+                if entry.stat(follow_symlinks=False).st_mtime > before:
+                    continue
+                with open(entry.path, "rb") as file:
+                    if _lock(file.fileno(), shared=True):
+                        os.unlink(entry.path)
+
+
+def _lock(file: int, shared: bool = False) -> bool:
+    """Lock an open file, and return whether nobody else has, as far as its file system knows."""
+    try:
+        import fcntl
+    except ImportError:  # Windows, which removes no file that is open
+        return True
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in (errno.EAGAIN, errno.EACCES)
+    return True
 
 
 class _Output(io.RawIOBase):

@@ -7,6 +7,7 @@ import errno
 import hashlib
 import io
 import os
+import re
 import stat
 from collections.abc import Iterator
 from typing import IO, Any
@@ -19,7 +20,10 @@ from numpy.typing import NDArray
 from lnocl.errors import FileError, LnoclError, warn
 from lnocl.process import recorded_warnings
 
-# Keywords whose value astropy counts to when it reads a header, and the largest that FITS allows.
+# Keywords that say how many bytes of data follow. Of two with different values astropy takes one to
+# read them and the other to go on.
+SIZES = re.compile("BITPIX|NAXIS[0-9]*|[PG]COUNT|GROUPS|TFIELDS")
+# Those whose value astropy counts to when it reads a header, and the largest that FITS allows.
 COUNTS = ("NAXIS", "TFIELDS")
 MAX_COUNT = 999
 # Bytes of a block of a FITS file.
@@ -70,8 +74,6 @@ class FitsFile:
         """
         for hdu in self._hdus:
             where = hdu.fileinfo()
-            # With a keyword given twice it may be another size than that of check_header.
-            check_size(self.path, self._length, where["datLoc"], hdu.size)
             if hdu.header.get("ZIMAGE") is True:
                 # Decompressing damaged tiles corrupts the memory (so in astropy 8.0).
                 raise FileError(
@@ -152,37 +154,32 @@ def check_header(path: str, content: IO[bytes], length: int, start: int) -> None
     ------
     FileError
         The header that starts at this byte has more axes or columns than FITS allows, data that
-        are not there, or more rows than the file has bytes.
+        are not there or of two sizes, or more rows than the file has bytes.
     Exception
         Any error of astropy on bytes that are not a header.
     """
     content.seek(start)
     header = fits.Header.fromfile(content)
+    sizes: dict[str, Any] = {}
     for card in header.cards:
-        if card.keyword in COUNTS and not 0 <= card.value <= MAX_COUNT:
-            raise FileError(f"{path} is damaged: {card.keyword} is {card.value}")
-    check_size(path, length, content.tell(), header.data_size)
-    for rows in (card.value for card in header.cards if card.keyword == "NAXIS2"):
-        # Rows of no bytes are always there, and take as long to read as others.
-        if isinstance(rows, (int, float)) and rows > length:
-            raise FileError(f"{path} is damaged: it has {rows} rows in {length} bytes")
-
-
-def check_size(path: str, length: int, start: int, size: int) -> None:
-    """Refuse data that are not there.
-
-    Raises
-    ------
-    FileError
-        They have a negative size, or end beyond the end of the file.
-    """
-    if size < 0:
+        keyword = card.keyword.upper()
+        if not SIZES.fullmatch(keyword):
+            continue
+        if keyword in COUNTS and not 0 <= card.value <= MAX_COUNT:
+            raise FileError(f"{path} is damaged: {keyword} is {card.value}")
+        if sizes.setdefault(keyword, card.value) != card.value:
+            raise FileError(
+                f"{path} is damaged: {keyword} is both {sizes[keyword]} and {card.value}; delete "
+                "the wrong one"
+            )
+    if header.data_size < 0:
         # This would send astropy round in circles.
         raise FileError(f"{path} is damaged: the size of an extension is negative")
-    if length < start + size:
-        raise FileError(
-            f"{path} is truncated: it should have {start + size} bytes and has {length}"
-        )
+    if length < (end := content.tell() + header.data_size):
+        raise FileError(f"{path} is truncated: it should have {end} bytes and has {length}")
+    # Rows of no bytes are always there, and take as long to read as others.
+    if isinstance(rows := sizes.get("NAXIS2"), (int, float)) and rows > length:
+        raise FileError(f"{path} is damaged: it has {rows} rows in {length} bytes")
 
 
 def open_regular(path: str) -> io.BufferedReader:

@@ -46,8 +46,9 @@ class Calibration(NamedTuple):
         Electrons per pixel, one or one for each image: a number, a map, or ``"auto"``, the
         sigma-clipped median of the image.
     read_noise : sequence of Word
-        Standard deviation, electrons: numbers, maps, or ``"auto"``, what the sigma-clipped scatter
-        of the image has beyond the noise of its counts.
+        Standard deviation, electrons: numbers, maps, a keyword of the headers, of the images or
+        their files, or ``"auto"``, what the sigma-clipped scatter of the image has beyond the noise
+        of its counts.
     inverse_variance, variance, rms : sequence of str
         Maps of one over the variance of all noise but that of the source, of this variance, or of
         its root, in units of the images; one kind at most. 0 where a pixel is bad.
@@ -114,7 +115,7 @@ class Frames(NamedTuple):
     header : astropy.io.fits.Header
         Header of the first image.
     background, read_noise : list of Word
-        As given, with the numbers that ``"auto"`` found.
+        As given, with the numbers of keywords, and those that ``"auto"`` found.
     sha256 : dict of str to list of str
         Checksums of all files, by the option they belong to: images, psfs, background, ...
     unit : str
@@ -385,7 +386,8 @@ class _Reader:
             raise InputError(
                 f"{keyword} of {path} is {value!r}, not a number; give {name} as a number"
             )
-        log.info("image %d: %s %g%s, from %s", j + 1, name, value, unit, keyword)
+        noted = name.replace("_", " ")
+        log.info("image %d: %s %g%s, from %s", j + 1, noted, value, unit, keyword)
         return float(value)
 
     def _noise_map(self) -> NoiseMap | None:
@@ -478,15 +480,17 @@ class _Reader:
         )
 
     def _read_noise_words(self, counts: Array, mask: Mask) -> list[Word]:
-        """Return the read noise with numbers in the place of "auto"."""
+        """Return the read noise with numbers in the place of keywords and "auto"."""
         words = list(self._calibration.read_noise)
-        if "auto" not in words:
+        if not any(isinstance(word, str) for word in words):
             return words
-        return self._maps.fill(
-            "read_noise",
-            words,
-            lambda j, word: sky_noise(j, counts[j], mask[j]) if word == "auto" else None,
-        )
+
+        def electrons(j: int, word: str) -> float | None:
+            if word == "auto":
+                return sky_noise(j, counts[j], mask[j])
+            return self._from_header("read_noise", j, word, " electrons")
+
+        return self._maps.fill("read_noise", words, electrons)
 
     def _offsets(self) -> Array | None:
         if self._calibration.align is None:

@@ -21,7 +21,7 @@ UNITS = {"background": units.COUNTS, "read_noise": units.COUNTS, "exposure": ("s
 # The words that a quantity may be, besides a number and a file.
 OTHER_WORDS = {
     "background": "auto, ",
-    "read_noise": "auto, ",
+    "read_noise": "auto, a keyword of the images' headers, ",
     "exposure": "a keyword of the images' headers, ",
 }
 

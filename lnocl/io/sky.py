@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import math
+from codecs import BOM_UTF8
 from collections.abc import Callable, Sequence
 from typing import IO, Any
 
@@ -36,6 +38,9 @@ MAX_OFFSET_VARIATION = 0.1
 SAME_PLACE = 1.0
 # Keywords with the date of an image, and their formats.
 DATES = {"MJD-AVG": "mjd", "MJD-OBS": "mjd", "DATE-OBS": "fits"}
+# Most that is read of a table of stars: plain text takes up to a hundred times its size in memory,
+# and compressed files unpack to a thousand times theirs.
+MAX_ROWS, MAX_MEBIBYTES = 1_000_000, 128
 # Points across an image at which the offset is computed.
 POINTS = 5
 
@@ -175,10 +180,10 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
     Raises
     ------
     FileError
-        A file that cannot be read.
+        A file that cannot be read, or with more than `MAX_ROWS`.
     InputError
-        A table without these columns; coordinates on the sky for an image without WCS; those of
-        pixels and of the sky are of different places; no star lies on the image.
+        A table without these columns, or with x and X; coordinates on the sky for an image without
+        WCS; those of pixels and of the sky are of different places; no star, or none on the image.
 
     Warns
     -----
@@ -203,6 +208,8 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
             f"{path} has neither columns x and y nor ra and dec; it has "
             f"{', '.join(table.colnames) or 'no columns'}: rename two of them"
         )
+    if not len(found):
+        raise InputError(f"{path} has no row; give one a star, or leave --stars out for none")
     origin = ", the first pixel 1" if columns is not None and columns.origin else ""
     log.info("%s: %s, by %s%s", path, counted(len(found), "star"), " and ".join(names), origin)
     return _within(path, found, header, image)
@@ -219,7 +226,7 @@ def _within(path: str, positions: Pairs, header: fits.Header, image: str) -> Pai
     size = np.array([header.get("NAXIS1", np.inf), header.get("NAXIS2", np.inf)])
     lies = ((positions >= -0.5) & (positions < size - 0.5)).all(axis=1)
     n, n_outside = len(positions), int((~lies).sum())
-    if n_outside == n > 0:
+    if n_outside == n:
         raise InputError(f"{path} has no star on {image}: see whether it is of the same field")
     if n_outside:
         warn(f"{n_outside} of {counted(n, 'star')} of {path} lie outside {image} and are left out")
@@ -256,18 +263,18 @@ def _moved(path: str, of_sky: SkyCoord, table: Table, date: Time | None) -> SkyC
 
     A row without them stays where it is.
     """
-    names = {name.lower(): name for name in table.colnames}
-    if not {"pmra", "pmdec"} <= set(names):
+    names = star_tables.spelled(table.colnames, "pmra", "pmdec")
+    if names is None:
         return of_sky
-    if date is None or "ref_epoch" not in names:
+    of_epoch = star_tables.spelled(table.colnames, "ref_epoch")
+    if date is None or of_epoch is None:
         lacking = "the image has no date" if date is None else "there is no column ref_epoch"
         log.info("%s: its proper motions are not heeded, as %s", path, lacking)
         return of_sky
     motions: list[NDArray[np.float64]] = [
-        np.nan_to_num(np.ma.filled(np.ma.asarray(table[names[name]], float), 0.0))
-        for name in ("pmra", "pmdec")
+        np.nan_to_num(np.ma.filled(np.ma.asarray(table[name], float), 0.0)) for name in names
     ]
-    epoch = star_tables.column_numbers(table[names["ref_epoch"]], path, "yr")
+    epoch = star_tables.column_numbers(table[of_epoch[0]], path, "yr")
     with ignored_warnings():  # that distances are not known
         now = SkyCoord(
             of_sky.ra,
@@ -315,6 +322,10 @@ def _read_table(path: str) -> Table:
             kind = formats[0] if formats else "ascii"
             if kind == "fits":
                 return _read_fits_table(path)
+            _check_length(path, content)
+            if content.read(len(BOM_UTF8)) == BOM_UTF8:  # which Excel writes
+                content = io.BytesIO(content.read())
+            content.seek(0)
             if kind == "votable":
                 _check_votable(path, content)
             # Its name would be taken for a table if it held a line break, for an address, ...
@@ -328,7 +339,28 @@ def _read_table(path: str) -> Table:
 
 def _read_fits_table(path: str) -> Table:
     with open_fits(path, "cannot be read as a table") as file:
-        return Table.read(fits.HDUList(list(file.hdus())), format="fits")
+        hdus = fits.HDUList(list(file.hdus()))
+        if any(hdu.header["NAXIS2"] > MAX_ROWS for hdu in hdus if not hdu.is_image):
+            raise _too_large(path)
+        return Table.read(hdus, format="fits")
+
+
+def _check_length(path: str, content: IO[bytes]) -> None:
+    """Refuse a table that is too large, before it is unpacked in memory."""
+    rows = size = 0
+    while block := content.read(2**20):
+        size += len(block)
+        rows += max(block.count(b"\n"), block.count(b"\r"))
+        if rows > MAX_ROWS or size > MAX_MEBIBYTES * 2**20:
+            raise _too_large(path)
+    content.seek(0)
+
+
+def _too_large(path: str) -> FileError:
+    return FileError(
+        f"{path} is too large for a table of stars: at most {MAX_ROWS} rows and, but for FITS, "
+        f"{MAX_MEBIBYTES} MiB are read; cut it to the stars of the image"
+    )
 
 
 def _check_votable(path: str, content: IO[bytes]) -> None:

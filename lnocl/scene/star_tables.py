@@ -57,17 +57,42 @@ ON_SKY = (
 def find_columns(names: Iterable[str], choices: Iterable[Columns]) -> Columns | None:
     """Return the first of some pairs of columns that a table has, as it spells them, or None.
 
+    Raises
+    ------
+    InputError
+        As `spelled`.
+
     Examples
     --------
     >>> from lnocl.scene.star_tables import IN_PIXELS, find_columns
     >>> find_columns(["NUMBER", "X_IMAGE", "Y_IMAGE"], IN_PIXELS)
     Columns(first='X_IMAGE', second='Y_IMAGE', origin=1)
     """
-    spelled = {name.lower(): name for name in names}
+    names = list(names)
     for choice in choices:
-        if choice.first in spelled and choice.second in spelled:
-            return choice._replace(first=spelled[choice.first], second=spelled[choice.second])
+        if pair := spelled(names, *choice[:2]):
+            return choice._replace(first=pair[0], second=pair[1])
     return None
+
+
+def spelled(names: Iterable[str], *wanted: str) -> list[str] | None:
+    """Return the names of columns, wanted in small letters, as a table has them; None without one.
+
+    Raises
+    ------
+    InputError
+        The table has two that differ in upper and lower case alone.
+    """
+    found = [[name for name in names if name.lower() == each] for each in wanted]
+    if not all(found):
+        return None
+    for first, *others in found:
+        if others:
+            raise InputError(
+                f"the table of stars has columns {first} and {others[0]}, either of which may be "
+                "meant; delete or rename one"
+            )
+    return [first for (first,) in found]
 
 
 def in_pixels(table: Any, columns: Columns, name: str) -> Array:

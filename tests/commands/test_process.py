@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -155,6 +156,28 @@ class TestProcess:
 
     def test_a_progress_bar_stays_off_a_stderr_that_is_no_terminal(self):
         assert outside(*self.ARGUMENTS, "-o", "out.fits").stderr == ""
+
+
+@pytest.mark.parametrize("way", ["script", "module", "library"])
+def test_an_interrupt_while_modules_are_loaded_is_one_line(way, tmp_path):
+    """Here a NumPy that is interrupted as it is imported."""
+    (tmp_path / "numpy.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\n")
+    script = "from lnocl.commands.cli import main\nraise SystemExit(main())\n"
+    (tmp_path / "lnocl").write_text(script)
+    path = os.pathsep.join([str(tmp_path), str(Path(lnocl.__file__).parents[1])])
+    done = subprocess.run(
+        [sys.executable, *{"script": [tmp_path / "lnocl"], "module": ["-m", "lnocl"],
+                           "library": ["-c", script]}[way]],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path},
+        # Whoever runs the tests in the background may ignore it.
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    if way == "library":
+        assert done.stderr.endswith("KeyboardInterrupt\n")
+    else:
+        assert (done.returncode, done.stderr) == (130, "lnocl: error: interrupted\n")
 
 
 class TestDevices:

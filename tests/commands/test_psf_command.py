@@ -169,6 +169,16 @@ class TestWhatItMakes:
         words = shlex.split("\n".join(fits.getheader("out.fits")["HISTORY"]).replace("\\\n", ""))
         assert words.count("--star") == 2
 
+    def test_a_table_of_stars_is_as_good_as_their_positions(self, capsys):
+        Path("stars.csv").write_text("x,y\n30,29\n50,45\n")
+        assert run("--stars", "stars.csv", "--size", "15") == 0
+        assert run("--star", "30,29", "--star", "50,45", "--size", "15", output="two.fits") == 0
+        np.testing.assert_array_equal(fits.getdata("out.fits"), fits.getdata("two.fits"))
+        assert "--stars stars.csv" in str(fits.getheader("out.fits")["HISTORY"])
+        capsys.readouterr()
+        assert run("--stars", "stars.csv", "--check", output=None) == 2
+        assert complaint(capsys.readouterr()) == "--check makes nothing; leave --stars out"
+
     def test_several_stars_at_several_angles_give_two_cubes(self):
         assert run("--star", "30,29", "--star", "50,45", "--size", "9", "--rotate", "0", "90") == 0
         expected = make_psfs(FRAME, [0, 90], [(30, 29), (50, 45)], 9)

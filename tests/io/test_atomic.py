@@ -9,6 +9,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -403,6 +404,62 @@ def test_a_signal_that_comes_as_a_file_is_made_leaves_none(work, tmp_path, monke
     with pytest.raises(KeyboardInterrupt):
         work(str(tmp_path / "out.txt"))
     assert not list(tmp_path.iterdir())
+
+
+def age(path, days=2):
+    then = time.time() - 86400 * days
+    os.utime(path, (then, then), follow_symlinks=False)
+    return path
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda path: atomic.check_output(path, overwrite=True),
+        lambda path: atomic.write_text(path, "words", overwrite=True),
+    ],
+    ids=["check", "write"],
+)
+def test_what_a_killed_process_left_is_removed(work, tmp_path):
+    code = (
+        "import os, signal, sys; from lnocl.io import atomic\n"
+        "with atomic.whole_file(sys.argv[1]) as stream:\n"
+        "    stream.write(b'part'); stream.flush(); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    path = tmp_path / "out.txt"
+    subprocess.run([sys.executable, "-c", code, path], check=False)
+    (left,) = tmp_path.iterdir()
+    work(str(path))
+    assert left.exists()  # for a day, whoever has it
+    age(left)
+    atomic._remove_abandoned.cache_clear()
+    work(str(path))
+    assert not left.exists()
+
+
+def test_what_another_process_writes_stays(tmp_path):
+    with atomic.whole_file(str(tmp_path / "one.txt")) as stream:
+        stream.write(b"words")
+        stream.flush()
+        (temporary,) = tmp_path.iterdir()
+        age(temporary)
+        code = "import sys; from lnocl.io import atomic; atomic.write_text(sys.argv[1], 'words')"
+        subprocess.run([sys.executable, "-c", code, tmp_path / "two.txt"], check=True)
+    assert names(tmp_path) == ["one.txt", "two.txt"]
+
+
+def test_what_is_no_temporary_file_stays(tmp_path):
+    name = ".lnocl-0123456789abcdef.tmp"
+    (tmp_path / "folder" / name).mkdir(parents=True)
+    (tmp_path / f"{name}.fits").write_text("mine")
+    (tmp_path / name).symlink_to(tmp_path / f"{name}.fits")
+    for path in tmp_path.iterdir():
+        age(path)
+    before = names(tmp_path)
+    atomic.write_text(str(tmp_path / "folder" / "out.txt"), "words")
+    atomic.check_output(str(tmp_path / "out.txt"), overwrite=True)
+    assert names(tmp_path) == before
+    assert names(tmp_path / "folder") == [name, "out.txt"]
 
 
 def test_a_file_in_the_place_of_an_output_folder(tmp_path):

@@ -214,10 +214,22 @@ class TestNoise:
         np.testing.assert_array_equal(observation.images, IMAGES + MAP**2)
         mixed = observe(read_noise=[2.0, "map.fits"])
         np.testing.assert_array_equal(mixed.background, [np.full(SHAPE, 4.0), MAP**2])
-        with pytest.raises(
-            InputError, match="read_noise 'none' is not a number, auto, or a file that exists"
-        ):
+        expected = "read_noise 'none' is not a number, auto, a keyword of the images' headers, or a"
+        with pytest.raises(InputError, match=f"{expected} file that exists"):
             observe(read_noise=["none"])
+
+    def test_the_read_noise_may_be_in_the_headers(self, log):
+        save_images(RDNOISE=3.0, TEXT="a")
+        fits.setval("2.fits", "RDNOISE", value=5)
+        found = read(read_noise=["RDNOISE"])
+        assert found.read_noise == [3.0, 5.0]
+        np.testing.assert_array_equal(found.observation.background, [9.0, 25.0])
+        assert notes(log) == [
+            "image 1: read noise 3 electrons, from RDNOISE",
+            "image 2: read noise 5 electrons, from RDNOISE",
+        ]
+        with pytest.raises(InputError, match=r"^TEXT of 1\.fits is 'a', not a number; give read"):
+            observe(read_noise=["TEXT"])
 
     @pytest.mark.parametrize(
         ("cards", "known", "factor"),

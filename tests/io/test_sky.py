@@ -1,5 +1,6 @@
 """Positions on the sky and tables of stars, against astropy, and offsets by the WCS."""
 
+import codecs
 import logging
 
 import numpy as np
@@ -345,15 +346,30 @@ class TestTables:
         save(name, "x y mag\n1 2.5 17\n3 4 18\n")
         np.testing.assert_array_equal(stars(name), [(1, 2.5), (3, 4)])
 
+    @pytest.mark.parametrize("name", ["t.csv", "t.ecsv", "t.dat"])
+    def test_a_mark_of_the_encoding_as_excel_writes_it(self, name):
+        Table({"x": [1, 3], "y": [2.5, 4], "id": ["\xe9", "b"]}).write(
+            name, format="ascii.csv" if name == "t.csv" else "ascii.ecsv"
+        )
+        with open(name, "r+b") as stream:
+            text = stream.read()
+            stream.seek(0)
+            stream.write(codecs.BOM_UTF8 + text)
+        np.testing.assert_array_equal(stars(name), [(1, 2.5), (3, 4)])
+
     def test_units_in_other_words(self):
         columns = [fits.Column("x", "D", unit="pixels", array=[1.0]),
                    fits.Column("y", "D", unit="PIXEL", array=[2.0])]  # fmt: skip
         fits.BinTableHDU.from_columns(columns).writeto("t.fits")
         np.testing.assert_array_equal(stars("t.fits"), [(1, 2)])
 
-    def test_an_empty_table_has_no_stars(self):
-        assert stars(save("t.csv", "x,y\n")).shape == (0, 2)
-        assert stars(save("s.csv", "ra,dec\n")).shape == (0, 2)
+    @pytest.mark.parametrize("names", ["x,y", "ra,dec"])
+    def test_an_empty_table_is_refused(self, names):
+        with pytest.raises(InputError) as caught:
+            stars(save("t.csv", f"{names}\n"))
+        assert str(caught.value) == (
+            "t.csv has no row; give one a star, or leave --stars out for none"
+        )
 
     @pytest.mark.parametrize("name", ["t.ecsv", "t.fits", "t.csv"])
     @pytest.mark.parametrize("kind", [float, int])

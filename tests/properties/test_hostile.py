@@ -1,6 +1,9 @@
 """Hostile files: no claim of theirs costs time or memory, and lnocl's own errors refuse them."""
 
+import bz2
 import gzip
+import io
+import lzma
 import os
 import re
 import time
@@ -69,6 +72,28 @@ def test_what_a_header_claims_is_not_believed(sound, tmp_path, use, claims, comp
 
 
 @pytest.mark.usefixtures("limits")
+@pytest.mark.parametrize("compress", [bytes, gzip.compress, bz2.compress, lzma.compress])
+@pytest.mark.parametrize("keyword", ["NAXIS1", "BITPIX", "GCOUNT"])
+def test_data_of_two_sizes_are_refused(tmp_path, keyword, compress):
+    """Astropy would read by the first, and go on by the last, which leads back to the start."""
+    header = fits.PrimaryHDU(COUNTS.astype("i2")).header
+    header.set("GCOUNT", 1)
+    header.append((keyword, -99999999999))
+    path = tmp_path / "damaged"
+    path.write_bytes(compress(header.tostring().encode() + bytes(BLOCK)))
+    with pytest.raises(FileError, match=rf"damaged: {keyword} is both \d+ and -99999999999; del"):
+        fitsread.read_stack([str(path)])
+
+
+def test_a_size_that_is_given_twice_alike_is_read(tmp_path):
+    header = fits.PrimaryHDU(COUNTS.astype("i2")).header
+    header.append(("NAXIS1", header["NAXIS1"]))
+    path = tmp_path / "a.fits"
+    path.write_bytes(header.tostring().encode() + bytes(BLOCK))
+    assert fitsread.read_stack([str(path)]).data.shape[1:] == COUNTS.shape
+
+
+@pytest.mark.usefixtures("limits")
 def test_an_image_larger_than_the_memory_is_not_read(sound, tmp_path):
     path = tmp_path / "damaged"
     path.write_bytes(hostile({"NAXIS1": 10**6, "NAXIS2": 10**6}))
@@ -88,6 +113,30 @@ def test_what_a_table_claims_is_not_believed(sound, tmp_path, keyword, name):
     path.write_bytes(content)
     with pytest.raises(FileError, match=rf"{path} is (damaged: {keyword} is|truncated)"):
         (read_stars if name.startswith("star") else read_saved)(sound, str(path), name)
+
+
+def rows_in_fits():
+    columns = [fits.Column(name, "B", array=np.zeros(10**6 + 1)) for name in "xy"]
+    content = io.BytesIO()
+    fits.BinTableHDU.from_columns(columns).writeto(content)
+    return content.getvalue()
+
+
+@pytest.mark.usefixtures("limits")
+@pytest.mark.parametrize("make", [
+    lambda: b"x,y\n" + b"1,2\n" * 10**6, lambda: b"x,y\r" + b"1,2\r" * 10**6, rows_in_fits,
+    lambda: b"x,y\n1,2" + b" " * 2**23,
+], ids=["lines", "of old Macs", "FITS", "one line"])  # fmt: skip
+def test_a_table_of_stars_does_not_unpack_without_end(tmp_path, monkeypatch, make):
+    monkeypatch.setattr(sky, "MAX_MEBIBYTES", 8)
+    path = tmp_path / "stars.csv.gz"
+    path.write_bytes(gzip.compress(make(), 1))
+    with pytest.raises(FileError) as caught:
+        sky.read_stars(str(path), fits.Header(SIP), "a.fits")
+    assert str(caught.value) == (
+        f"{path} is too large for a table of stars: at most 1000000 rows and, but for FITS, 8 "
+        "MiB are read; cut it to the stars of the image"
+    )
 
 
 NO_BYTES = {

@@ -57,3 +57,18 @@ def test_the_better_columns_are_chosen():
     assert find_columns(["x_centroid", "y", "x"], IN_PIXELS) == ("x", "y", 0)
     assert find_columns(["RAJ2000", "DEJ2000", "RA_ICRS", "DE_ICRS"], ON_SKY)[0] == "RA_ICRS"
     assert find_columns(["x", "dec"], [*IN_PIXELS, *ON_SKY]) is None
+
+
+@pytest.mark.parametrize(
+    ("names", "which"),
+    [(["x", "y", "X"], "x and X"), (["X_IMAGE", "x_image", "y_image", "id"], "X_IMAGE and x_im")],
+)
+def test_columns_that_differ_in_case_alone_are_refused(names, which):
+    table = Table(np.ones((1, len(names))), names=names)
+    with pytest.raises(lnocl.InputError, match=f"has columns {which}.*, either .*; delete or ren"):
+        check_positions(table, OBSERVATION)
+
+
+def test_columns_that_are_not_used_may_differ_in_case_alone():
+    table = Table(np.ones((1, 5)), names=["x", "y", "Mag", "mag", "X_IMAGE"])
+    assert check_positions(table, OBSERVATION).shape == (1, 2)
