@@ -30,6 +30,7 @@ class ReferenceEngine:
     """
 
     name = "numpy"
+    rounding = 0.0
 
     def __init__(self, scene: Scene, scaling: Scaling | None = None) -> None:
         self.scene, self.scaling = scene, scaling

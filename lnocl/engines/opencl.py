@@ -13,7 +13,7 @@ from lnocl.opencl.device import choose, context_of, describe
 from lnocl.opencl.faults import guarded
 from lnocl.opencl.launch import Launch, Launcher
 from lnocl.opencl.layout import Layout
-from lnocl.opencl.memory import Memory, Transfer, announce, refuse_if_too_large
+from lnocl.opencl.memory import Memory, Transfer, announce, held_bytes, refuse_if_too_large
 from lnocl.opencl.program import Program
 from lnocl.opencl.tuning import Tuning, describe_tuning
 from lnocl.opencl.windows import StarWindows
@@ -29,8 +29,10 @@ ITERATIONS_AHEAD = 4
 # And looks at the objectives once in so many, at those of as many before: a transfer costs the host
 # as much as launching an iteration.
 FETCH_EVERY = 64
-# Bytes that Python takes with NumPy, SciPy, Astropy and PoCL.
-LIBRARIES = 280 * 2**20
+# Share of the objective that single precision may round a step's fall by: 8e-7 and less were seen.
+ROUNDING = 3e-7
+# Bytes, half of those that PoCL's compiler takes in a first run: later ones find its kernels.
+COMPILER = 40 * 2**20
 # Estimates of both halves of the counts that are held (`lnocl.runs.halves`).
 SNAPSHOTS = 22
 
@@ -80,7 +82,7 @@ class OpenCLEngine:
         self.name, self.bytes_needed = "the device", 0
         self._forget_record()
         chosen = choose(device).device
-        self.name = describe(chosen)
+        self.name, self._device_type = describe(chosen), chosen.type
         self.scene, self.scaling = scene, scaling
         self.program = Program(
             context_of(chosen),
@@ -97,6 +99,7 @@ class OpenCLEngine:
             has_background_map=self._has_background_map,
             min_model=MIN_MODEL,
         )
+        self.rounding = ROUNDING if precision == "single" else 0.0
         self.layout = Layout(self.program)
         self._stars = StarWindows(
             self.layout.images, [scene.star_box(s) for s in range(scene.n_stars)]
@@ -122,7 +125,7 @@ class OpenCLEngine:
         self._upload_scene()
         self._bind_iteration()
         if scaling is not None:
-            self.set_scaling(scaling)
+            self._upload_scaling(scaling)
 
     @property
     def is_proven(self) -> bool:
@@ -134,15 +137,18 @@ class OpenCLEngine:
         return self.scene.has_exposure_map or self.scene.observation.background.ndim == 3
 
     def _host_bytes(self) -> int:
-        """Return about how many bytes a run takes on the host, where stars' images are small.
+        """Return about how many bytes the process takes on the host, besides the device's.
 
-        Besides the observation: one array, the start or the answer; for the scaling OTFs and
-        model images, and eight arrays.
+        It holds most of them by now: libraries, the observation and the stars. To come are the
+        answer, a model to judge it by, and the compiler; with a scaling, the factor of the
+        information.
         """
-        scene = self.scene
-        arrays = 1 if self.scaling is None else 2 * scene.n_images + 8
-        held = scene.observation.nbytes + (0 if scene.weights is None else scene.weights.nbytes)
-        return LIBRARIES + held + arrays * math.prod(scene.grid) * np.dtype(np.float64).itemsize
+        to_come = COMPILER + 4 * math.prod(self.scene.grid) * np.dtype(np.float64).itemsize
+        if self.scaling is not None:
+            to_come += 2 * self.scaling.star_information.band.nbytes
+        held, most = held_bytes()
+        is_shared = bool(self._device_type & cl.device_type.CPU)
+        return max(held + to_come, most - (self.bytes_needed if is_shared else 0))
 
     def _bytes_of_halves(self) -> int:
         """Return about how many bytes halves take on the host besides: counts and snapshots."""
@@ -276,6 +282,9 @@ class OpenCLEngine:
         self.scaling = scaling
         self._cross = self._cross_windows()
         self._memory.allocate(**self._cross_sizes())
+        self._upload_scaling(scaling)
+
+    def _upload_scaling(self, scaling: Scaling) -> None:
         self._memory.upload_pixels("shift", [scaling.shift])
         self._memory.upload_pixels(
             "cross_information",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
@@ -19,6 +21,8 @@ log = logging.getLogger("lnocl")
 
 # Bytes of pixels that are converted and copied at once, lest a second array of all is needed.
 MAX_COPIED = 16 * 2**20
+# And bytes from which on a copy costs more than the call.
+MIN_COPIED = 2**20
 
 
 class Transfer:
@@ -105,11 +109,26 @@ class Memory:
     def upload_pixels(self, name: str, arrays: Iterable[NDArray]) -> None:
         """Copy arrays of pixels, or of some blocks' rows, to a buffer, one behind the other."""
         offset = 0
+        for pixels in self._copied_at_once(arrays):
+            packed = self._layout.pack_pixels(self._rounded(name, pixels))
+            cl.enqueue_copy(self._queue, self.buffers[name], packed, dst_offset=offset)
+            offset += packed.nbytes
+
+    def _copied_at_once(self, arrays: Iterable[NDArray]) -> Iterator[NDArray]:
+        """Yield several small arrays together, and large ones in parts of some rows."""
+        small = list[NDArray]()
         for array in arrays:
-            for rows in self._layout.row_slices(len(array), MAX_COPIED):
-                packed = self._layout.pack_pixels(self._rounded(name, array[rows]))
-                cl.enqueue_copy(self._queue, self.buffers[name], packed, dst_offset=offset)
-                offset += packed.nbytes
+            small.append(array)
+            if array.nbytes * len(small) < MIN_COPIED:
+                continue
+            if len(small) > 1:
+                yield np.array(small)
+            else:
+                slices = self._layout.row_slices(len(array), MAX_COPIED)
+                yield from (array[rows] for rows in slices)
+            small.clear()
+        if small:
+            yield np.array(small)
 
     def download(self, name: str, count: int) -> Array:
         """Return the first numbers in a buffer, as float64."""
@@ -196,6 +215,26 @@ def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int], count: int)
             "smaller images, fewer stars, precision single, or another device"
         )
     return total
+
+
+def held_bytes() -> tuple[int, int]:
+    """Return the bytes of memory that this process holds, and the most that it has held.
+
+    Where only the second is known they are the same; where neither is, they are 0.
+    """
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").split("\n")
+        held, most = (
+            1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
+            for name in ("VmRSS:", "VmHWM:")
+        )
+        return held, most
+    try:
+        import resource
+    except ImportError:  # on Windows
+        return 0, 0
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on a Mac
+    return most, most
 
 
 def announce(device: cl.Device, device_bytes: int, host_bytes: int, tuned: str) -> None:

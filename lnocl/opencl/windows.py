@@ -53,5 +53,8 @@ class StarWindows:
         rows = (stamp.rows(grid) - first) % grid[0]
         columns = (stamp.columns(grid) - column) % grid[1]
         row_in, column_in = rows < window.shape[0], columns < window.shape[1]
-        window[np.ix_(rows[row_in], columns[column_in])] = stamp.values[np.ix_(row_in, column_in)]
+        values = stamp.values
+        if not (row_in.all() and column_in.all()):
+            values = values[np.ix_(row_in, column_in)]
+        window[rows[row_in][:, None], columns[column_in]] = values
         return window

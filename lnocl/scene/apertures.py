@@ -65,9 +65,9 @@ class Aperture(NamedTuple):
         """Return what `measure` measures."""
         return [Label(self.name, FLUX)]
 
-    def measure(self, sky: Array) -> Array:
-        """Return the light of a sky, shape (1,)."""
-        return np.array([self.flux(sky)])
+    def measure(self, sky: Array, light: Array) -> Array:
+        """Return the flux of the light, shape (1,)."""
+        return np.array([self.flux(light)])
 
 
 class Profile(NamedTuple):
@@ -97,20 +97,20 @@ class Profile(NamedTuple):
             *(Label(f"{self.name} width", LENGTH, at) for at in self.at),
         ]
 
-    def measure(self, sky: Array) -> Array:
-        """Return the light of each slice, and 2.355 standard deviations of it across, (2 k,).
+    def measure(self, sky: Array, light: Array) -> Array:
+        """Return the flux of the light, and 2.355 standard deviations of the sky across, (2 k,).
 
-        The width of a slice without light is 0.
+        Light may be negative where noise is; the sky is not. The width of a slice without light is
+        0.
         """
-        fluxes, widths = [], []
+        widths = []
         for each, across in zip(self.slices, self.across, strict=True):
-            light = each.light(sky)
-            flux = float(light.sum())
-            fluxes.append(flux)
+            within = each.light(sky)
+            flux = float(within.sum())
             if flux <= 0:
                 widths.append(0.0)
                 continue
-            mean = (light * across).sum() / flux
-            variance = (light * (across - mean) ** 2).sum() / flux
+            mean = (within * across).sum() / flux
+            variance = (within * (across - mean) ** 2).sum() / flux
             widths.append(FWHM * float(np.sqrt(max(variance, 0.0))))
-        return np.array([*fluxes, *widths])
+        return np.array([*(each.flux(light) for each in self.slices), *widths])

@@ -41,6 +41,9 @@ class Model:
         Its relative exposure where a pixel was observed, else 0.
     background : ndarray of float64, shape (p, 1, 1) or (p, ny, nx)
         b_j.
+    sums : ndarray of float64, shape (p,)
+        What a flat sky of ones is in each image: it stays flat. So does the adjoint of a flat
+        image.
 
     Notes
     -----
@@ -54,9 +57,8 @@ class Model:
         self.grid, self.oversample = scene.grid, scene.oversample
         self._window_otfs: dict[Any, NDArray[np.complex128]] = {}
         self._psfs = [scene.psf_stamp(j) for j in range(scene.n_images)]
-        # What a flat sky is multiplied by: it stays flat. So does what comes back of a flat image.
-        self._sums = np.array([psf.values.sum() for psf in self._psfs])
-        self._back_sums = self._sums / scene.oversample**2
+        self.sums = np.array([psf.values.sum() for psf in self._psfs])
+        self._back_sums = self.sums / scene.oversample**2
         weights = np.ones((1, 1, 1)) if scene.weights is None else scene.weights
         if not weights.strides[0]:  # all images share them
             weights = weights[:1]
@@ -72,7 +74,7 @@ class Model:
         """Return the ``A_j f``, shape (p, ny, nx)."""
         images = np.empty(self.shape)
         if is_flat(extended):
-            images[:] = extended[0, 0] * self._sums[:, None, None]
+            images[:] = extended[0, 0] * self.sums[:, None, None]
             return images
         for image, sky in zip(images, self.convolved(extended), strict=True):
             image[:] = sampled(sky, self.oversample)
@@ -174,7 +176,7 @@ class Model:
             rows, columns = (range(side.start, side.stop) for side in box)
             image[box] = np.broadcast_to(self.background[j], image.shape)[box]
             if flat:
-                image[box] += self._sums[j] * extended[0, 0]
+                image[box] += self.sums[j] * extended[0, 0]
             else:
                 image[box] += self._convolve_at(extended, j, rows, columns)
             np.maximum(image[box], 0.0, out=image[box])
@@ -259,14 +261,23 @@ def _around(pixels: Array, rows: range, columns: range) -> Array:
 def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[Array]:
     """Yield the m_j, as `Model.images` returns them; nothing but one of them is held."""
     background = scene.background()
+    for j, image in enumerate(images_of_sky(scene, extended)):
+        _illuminate(image, background[j], scene.star_field.light(j, star_fluxes))
+        yield image
+
+
+def images_of_sky(scene: Scene, extended: Array) -> Iterator[Array]:
+    """Yield the ``A_j f``, as `Model.forward` returns them; nothing but one of them is held."""
+    if is_flat(extended):
+        for j in range(scene.n_images):
+            yield np.full(scene.image_grid, extended[0, 0] * scene.psf_stamp(j).values.sum())
+        return
     spectrum = scipy.fft.rfft2(extended, workers=-1)
     for j in range(scene.n_images):
         otf = scipy.fft.rfft2(scene.psf(j), workers=-1)
         otf *= spectrum
         sky = scipy.fft.irfft2(otf, scene.grid, workers=-1, overwrite_x=True)
-        image = np.ascontiguousarray(sampled(sky, scene.oversample))
-        _illuminate(image, background[j], scene.star_field.light(j, star_fluxes))
-        yield image
+        yield np.ascontiguousarray(sampled(sky, scene.oversample))
 
 
 def add_to_window(
@@ -290,8 +301,9 @@ def add_to_window(
     rows, columns = (range(at, at + n) for at, n in zip(first, image.shape, strict=True))
     seen = convolve_at(sky, scene.psf_stamp(j), rows, columns, scene.oversample)
     image += seen / scene.unit
-    for stamp, flux in zip(scene.star_field.stamps[j], star_fluxes, strict=True):
-        stamp.add_to(image, rows, columns, scene.image_grid, flux / scene.unit)
+    stamps = scene.star_field.stamps[j]
+    for s in scene.star_field.reaching(j, first, image.shape):
+        stamps[s].add_to(image, rows, columns, scene.image_grid, star_fluxes[s] / scene.unit)
 
 
 def _illuminate(image: Array, background: Array | float, starlight: Array) -> None:

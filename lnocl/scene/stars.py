@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence, Set
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -11,18 +11,47 @@ from numpy.typing import NDArray
 
 from lnocl.errors import InputError
 from lnocl.scene import containers, star_tables
+from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.observation import Array, Observation, numbers
-from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
+from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp, Window, window
 
 # Pixels of a flattened array: a slice where they are all of it, which takes no gathering.
 Pixels = NDArray[np.intp] | slice
 
-# Pixels that are taken together where images light all of them: as many as a cache holds.
-CHUNK = 1 << 14
+# Side of the squares of pixels in which products of images are summed, by matrices of stars and
+# pixels that a cache holds.
+TILE = 32
 
-# Some pixels, and k values at each of them, shape (k, number of pixels).
-Piece = tuple[Pixels, Array]
+
+class Piece(NamedTuple):
+    """k functions of the pixels in a window of a periodic grid: values, and its first pixel.
+
+    The values have shape (k, h, w).
+    """
+
+    values: Array
+    y: int
+    x: int
+
+    def window(self, grid: tuple[int, int]) -> Window:
+        """Return where the values lie, as an index of arrays on the grid."""
+        return window(self.y, self.x, self.values.shape[1:], grid)
+
+
+class Order(NamedTuple):
+    """An order of stars in which those that light the same pixels are near each other.
+
+    Attributes
+    ----------
+    places : ndarray of int, shape (n,)
+        The place of each star.
+    width : int
+        How many places such stars are apart, at most.
+    """
+
+    places: NDArray[np.int_]
+    width: int
 
 
 class StarImages:
@@ -30,58 +59,147 @@ class StarImages:
 
     Parameters
     ----------
-    size : int
-        Number of pixels.
-    pieces : list of lists of (pixels, ndarray of float64, shape (k, m))
-        The image of each star is the sum of its pieces, each over m pixels.
-    overlap : ndarray of bool, shape (n, n)
-        Which stars may light the same pixels as which.
+    lit : ndarray of bool, shape (Ny, Nx)
+        The pixels that are looked at.
+    pieces : list of lists of Piece
+        The image of each star is the sum of its pieces. The first may be of all k functions, the
+        others of the image alone, which does not move.
+    order : Order
+        Of the stars.
     """
 
-    def __init__(self, size: int, pieces: list[list[Piece]], overlap: NDArray[np.bool_]) -> None:
-        self._size, self._pieces, self._overlap = size, pieces, overlap
-        self._k = pieces[0][0][1].shape[0] if pieces else 1
+    def __init__(self, lit: NDArray[np.bool_], pieces: list[list[Piece]], order: Order) -> None:
+        self._grid = lit.shape[0], lit.shape[1]
+        self._lit = slice(None) if lit.all() else np.flatnonzero(lit)
+        self._pieces, self._order = pieces, order
+        self._k = pieces[0][0].values.shape[0] if pieces else 1
 
     def light(self, fluxes: Array) -> Array:
-        """Return ``sum_s c_s P_s``, shape (size,)."""
-        total = np.zeros(self._size)
+        """Return ``sum_s c_s P_s``, of the pixels that are lit."""
+        total = np.zeros(self._grid)
         for flux, pieces in zip(fluxes, self._pieces, strict=True):
-            for pixels, values in pieces:
-                total[pixels] += flux * values[0]
-        return total
+            for piece in pieces:
+                total[piece.window(self._grid)] += flux * piece.values[0]
+        return np.asarray(total.reshape(-1)[self._lit])
 
     def products(self, x: Array) -> Array:
         """Return the ``<P_s, x>``, shape (k, n)."""
-        products = [sum(values @ x[pixels] for pixels, values in each) for each in self._pieces]
-        return np.array(products).reshape(len(self._pieces), self._k).T
+        x = self._on_grid(x)
+        products = np.zeros((len(self._pieces), self._k))
+        for product, pieces in zip(products, self._pieces, strict=True):
+            for values, y, left in pieces:
+                there = x[window(y, left, values.shape[1:], self._grid)].ravel()
+                product[: len(values)] += values.reshape(len(values), -1) @ there
+        return products.T
 
-    def information(self, weights: Array) -> Array:
-        """Return the ``<P_s, w P_t>``, shape (k n, k n), all stars for each of the k in turn."""
+    def information(self, weights: Array) -> BandMatrix:
+        """Return the ``<P_s, w P_t>``: all stars for each of the k unknowns in turn."""
         k, n = self._k, len(self._pieces)
-        if all(isinstance(pixels, slice) for each in self._pieces for pixels, _ in each):
-            return self._information_of_full_images(weights)
-        information = np.zeros((k, n, k, n))
-        weighted = np.zeros((k, self._size))
-        for s, pieces in enumerate(self._pieces):
-            for pixels, values in pieces:
-                weighted[:, pixels] += weights[pixels] * values
-            for t in s + np.flatnonzero(self._overlap[s, s:]):
-                block = sum(weighted[:, pixels] @ values.T for pixels, values in self._pieces[t])
-                information[:, s, :, t] = block
-                information[:, t, :, s] = np.transpose(block)
-            for pixels, _ in pieces:
-                weighted[:, pixels] = 0.0
-        return information.reshape(k * n, k * n)
+        places = k * self._order.places + np.arange(k)[:, None]
+        band = np.zeros((min(k * (self._order.width + 1), k * n), k * n), order="F")
+        roots = np.sqrt(self._on_grid(weights))
+        flat, step = band.reshape(-1, order="F"), len(band) - 1
+        for tile, stars, images in self._tiles(np.argsort(self._order.places)):
+            images *= roots[tile]
+            columns = images.reshape(k * len(stars), -1)
+            block = columns @ columns.T
+            at = places[:, stars].T.ravel()
+            distance = at[:, None] - at
+            is_near = (distance >= 0) & (distance <= step)  # what is beyond is 0
+            flat[np.add.outer(at, step * at)[is_near]] += block[is_near]
+        return BandMatrix(band, places.ravel())
 
-    def _information_of_full_images(self, weights: Array) -> Array:
-        """Return the information of images that light all pixels: a product of matrices."""
-        information: Any = 0.0
-        for first in range(0, self._size, CHUNK):
-            part = slice(first, first + CHUNK)
-            images = np.array([sum(v[:, part] for _, v in pieces) for pieces in self._pieces])
-            columns = images.swapaxes(0, 1).reshape(-1, images.shape[2])
-            information = information + (columns * weights[part]) @ columns.T
-        return np.asarray(information, np.float64)
+    def _on_grid(self, x: Array) -> Array:
+        laid = np.zeros(self._grid)
+        laid.reshape(-1)[self._lit] = x
+        return laid
+
+    def _tiles(
+        self, stars: NDArray[np.intp]
+    ) -> Iterator[tuple[tuple[slice, slice], NDArray[np.intp], Array]]:
+        """Yield squares of the grid, which stars have light there, and their images of it."""
+        owners = [i for i, s in enumerate(stars) for _ in self._pieces[s]]
+        pieces = [piece for s in stars for piece in self._pieces[s]]
+        shapes = np.array([piece.values.shape[1:] for piece in pieces]).reshape(-1, 2)
+        corners = np.array([piece[1:] for piece in pieces]).reshape(-1, 2)
+        parts = [
+            [
+                (slice(at, min(at + TILE, n)), _shared(corners[:, i], shapes[:, i], at, n))
+                for at in range(0, n, TILE)
+            ]
+            for i, n in enumerate(self._grid)
+        ]
+        for rows, rows_of in parts[0]:
+            for columns, columns_of in parts[1]:
+                here = sorted(rows_of.keys() & columns_of.keys())
+                if not here:
+                    continue
+                lighting, slots = np.unique([owners[i] for i in here], return_inverse=True)
+                size = rows.stop - rows.start, columns.stop - columns.start
+                images = np.zeros((len(lighting), self._k, *size))
+                for i, slot in zip(here, slots, strict=True):
+                    values = pieces[i].values
+                    for to_y, from_y in rows_of[i]:
+                        for to_x, from_x in columns_of[i]:
+                            images[slot, : len(values), to_y, to_x] += values[:, from_y, from_x]
+                yield (rows, columns), stars[lighting], images
+
+
+def _shared(
+    firsts: NDArray[np.int_], sizes: NDArray[np.int_], at: int, n: int
+) -> dict[int, list[tuple[slice, slice]]]:
+    """Return which ranges of n points round a circle reach into a tile, and where.
+
+    For each a list of slices: of the tile, which begins at a point, and of the range.
+    """
+    length = min(TILE, n - at)
+    into, ahead = (at - firsts) % n, (firsts - at) % n
+    shared: dict[int, list[tuple[slice, slice]]] = {}
+    for i in np.flatnonzero((into < sizes) | (ahead < length)).tolist():
+        skipped, first, size = int(into[i]), int(ahead[i]), int(sizes[i])
+        shared[i] = []
+        if skipped < size:
+            count = min(size - skipped, length)
+            shared[i].append((slice(0, count), slice(skipped, skipped + count)))
+        if 0 < first < length:
+            count = min(size, length - first)
+            shared[i].append((slice(first, first + count), slice(0, count)))
+    return shared
+
+
+def order_of(
+    stars: Array, images: Iterable[tuple[Array, Sequence[Stamp]]], grid: tuple[int, int]
+) -> Order:
+    """Return the order of stars along the axis that leaves the least of them between neighbours.
+
+    Parameters
+    ----------
+    stars : ndarray of float64, shape (n, 2)
+        Positions, pixels of an image without offset.
+    images : iterable of (ndarray of float64, shape (2,), sequence of n Stamp)
+        For each image its offset, and what the stars may light there.
+    grid : tuple of int
+        Shape of the images' grid, which is periodic.
+    """
+    n = len(stars)
+    reach = np.zeros((n, 2))
+    for offset, stamps in images:
+        first = np.array([stamp[1:] for stamp in stamps]).reshape(n, 2)
+        size = np.array([stamp.values.shape for stamp in stamps]).reshape(n, 2)
+        away = (stars + offset)[:, ::-1] - first
+        is_whole = size >= grid
+        reach = np.maximum(reach, np.where(is_whole, grid, np.maximum(away, size - away)))
+    orders = []
+    for axis, length in enumerate(grid):
+        at, far = stars[:, 1 - axis] % length, reach[:, axis].max(initial=0.0)
+        goes_round = (at < far).any() or (at + far > length).any()
+        keys = np.minimum(at, length - at) if goes_round else at
+        by_key = np.argsort(keys, kind="stable")
+        ends = np.searchsorted(keys[by_key], keys[by_key] + 2.0 * far + 1.0)
+        places = np.empty(n, int)
+        places[by_key] = np.arange(n)
+        orders.append(Order(places, int((ends - np.arange(n)).max(initial=1)) - 1))
+    return min(orders, key=lambda order: order.width)
 
 
 class StarField:
@@ -123,6 +241,11 @@ class StarField:
             for psfs, offset in zip(self.psfs, self._offsets, strict=True)
         ]
 
+    @cached_property
+    def _order(self) -> Order:
+        images = zip(self._offsets, self.stamps, strict=True)
+        return order_of(self.positions, images, self._grid)
+
     def light(self, j: int, fluxes: Array) -> Array:
         """Return ``sum_s c_s P_js``, shape (Ny, Nx)."""
         total = np.zeros(self._grid)
@@ -135,16 +258,27 @@ class StarField:
         """Return the pixels of image j that any star lights, shape (Ny, Nx)."""
         return light_up(self.stamps[j], self._grid)
 
+    def reaching(self, j: int, first: tuple[int, int], shape: tuple[int, int]) -> list[int]:
+        """Return the stars whose light in image j reaches into a window of the periodic grid."""
+        firsts, sizes = self._windows[j]
+        ahead, into = (firsts - first) % self._grid, (first - firsts) % self._grid
+        return np.flatnonzero(((ahead < shape) | (into < sizes)).all(axis=1)).tolist()
+
+    @cached_property
+    def _windows(self) -> list[tuple[NDArray[np.int_], NDArray[np.int_]]]:
+        """For each image the first pixels and the shapes of the stamps, shape (n, 2) each."""
+        return [
+            (
+                np.array([stamp[1:] for stamp in stamps]).reshape(-1, 2),
+                np.array([stamp.values.shape for stamp in stamps]).reshape(-1, 2),
+            )
+            for stamps in self.stamps
+        ]
+
     def images(self, j: int, lit: NDArray[np.bool_]) -> StarImages:
         """Return the P_js over these pixels, to which all that any star lights must belong."""
-        place, size = places(lit), int(np.count_nonzero(lit))
-        pieces: list[list[Piece]] = []
-        for stamp in self.stamps[j]:
-            window = stamp.window(self._grid)
-            fills = stamp.values.size == size and isinstance(window[0], slice)
-            pixels = slice(None) if fills else place[window].ravel()
-            pieces.append([(pixels, stamp.values.reshape(1, -1))])
-        return StarImages(size, pieces, overlap(self.stamps[j], self._grid))
+        pieces = [[Piece(stamp.values[None], stamp.y, stamp.x)] for stamp in self.stamps[j]]
+        return StarImages(lit, pieces, self._order)
 
 
 def light_up(stamps: Sequence[Stamp], grid: tuple[int, int]) -> NDArray[np.bool_]:
@@ -160,17 +294,6 @@ def places(lit: NDArray[np.bool_]) -> NDArray[np.intp]:
     place = np.full(lit.shape, -1)
     place[lit] = np.arange(np.count_nonzero(lit))
     return place
-
-
-def overlap(stamps: Sequence[Stamp], grid: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return which stamps overlap which, shape (n, n)."""
-    overlap = np.ones((len(stamps), len(stamps)), bool)
-    for axis, n in enumerate(grid):
-        first = np.array([stamp[1 + axis] for stamp in stamps], int)
-        size = np.array([stamp.values.shape[axis] for stamp in stamps], int)
-        distance = np.subtract.outer(first, first)
-        overlap &= (distance % n < size) | (-distance % n < size[:, None])
-    return overlap
 
 
 class Lit(NamedTuple):

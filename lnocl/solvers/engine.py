@@ -25,11 +25,15 @@ class Engine(Protocol):
     ----------
     name : str
         The device, its platform and driver.
+    rounding : float
+        A rise of the objective, as a share of it, that may be rounding: in single precision, where
+        a step promises less than that long before the estimate is at the minimum.
     scaling : Scaling or None
         The scaling of steps, for the scaled gradient projection method.
     """
 
     name: str
+    rounding: float
     scaling: Scaling | None
 
     def start(self, extended: Array, star_fluxes: Array) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import reduce
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
@@ -18,14 +21,11 @@ MAX_FADING = 0.1
 # The fit of the fluxes ends where they change by less of their standard error.
 FIT_CHANGE = 1e-6
 FIT_ROUNDS = 50
-# Share of its information that each unknown must have left beside the others, rooted, for the
-# matrix to count as regular.
-MIN_DETERMINED = 1e-4
 # Rounding of the information, relative to its diagonal: a combination of unknowns with less is not
 # determined, and the unknowns that have more than this share in it are not either.
 UNDETERMINED = 1e-12
 UNDETERMINED_SHARE = 1e-4
-# A larger relative change of a flux has the information computed anew.
+# A larger relative change of the model in any pixel has the information computed anew.
 INFORMATION_CHANGE = 0.01
 
 
@@ -100,13 +100,15 @@ class StarLikelihood:
         ]
         return np.sum(gradients, axis=0)
 
-    def information(self, stars: Sequence[StarImages], models: Sequence[Array]) -> Array:
-        """Return the Fisher information, shape (k n, k n)."""
-        information = [
-            there.information(movable_weights(weights, model) / model)
-            for (_, _, weights), there, model in zip(self._images, stars, models, strict=True)
-        ]
-        return np.sum(information, axis=0)
+    def information(self, stars: Sequence[StarImages], models: Sequence[Array]) -> BandMatrix:
+        """Return the Fisher information of the k n unknowns."""
+        return reduce(
+            add,
+            (
+                there.information(movable_weights(weights, model) / model)
+                for (_, _, weights), there, model in zip(self._images, stars, models, strict=True)
+            ),
+        )
 
     def linear_flux(self, lights: Sequence[Array]) -> float:
         """Return the flux of one star of these images by least squares, weighted by the counts."""
@@ -133,39 +135,17 @@ def fit_fluxes(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Arr
     lit = [scene.star_field.lit(j) for j in range(scene.n_images)]
     likelihood = StarLikelihood.of_scene(scene, model, diffuse, lit)
     stars = [scene.star_field.images(j, where) for j, where in enumerate(lit)]
-    step = np.full_like(fluxes, np.inf)
+    used = list[Array]()
     for _ in range(FIT_ROUNDS):
         models = likelihood.models([each.light(fluxes) for each in stars])
-        if (abs(step) > INFORMATION_CHANGE * fluxes).any():
-            information = likelihood.information(stars, models)
-            inverse = invert(information)
-        step = bounded_step(information, inverse, likelihood.gradient(stars, models)[0], fluxes)
+        changes = zip(models, used, strict=False)
+        if not used or any((abs(m - u) > INFORMATION_CHANGE * u).any() for m, u in changes):
+            information, used = likelihood.information(stars, models), models
+        step = bounded_step(information, likelihood.gradient(stars, models)[0], fluxes)
         fluxes = fluxes + step
-        if (abs(step) * np.sqrt(np.diag(information)) <= FIT_CHANGE).all():
+        if (abs(step) * np.sqrt(information.diagonal) <= FIT_CHANGE).all():
             break
     return fluxes
-
-
-def invert(information: Array) -> Array:
-    """Return the inverse, in units of its diagonal's: those of fluxes and positions are far apart.
-
-    It is the pseudo-inverse where it is singular, as for two stars at one place. Unknowns without
-    information, such as the position of a star of no flux, have rows of 0.
-    """
-    roots = np.sqrt(np.diag(information))
-    units = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > 0)
-    units = units[:, None] * units
-    scaled = information * units
-    try:
-        factor = np.linalg.cholesky(scaled)
-        if np.diag(factor).min(initial=1.0) < MIN_DETERMINED:
-            raise np.linalg.LinAlgError
-    except np.linalg.LinAlgError:
-        inverse = np.asarray(np.linalg.pinv(scaled, hermitian=True), np.float64)
-    else:  # a tenth of the time
-        root = np.linalg.inv(factor)
-        inverse = root.T @ root
-    return inverse * units
 
 
 def variances(information: Array) -> Array:
@@ -184,21 +164,30 @@ def variances(information: Array) -> Array:
     return np.where(is_known, np.where(is_blended, np.nan, sums / roots**2), np.inf)
 
 
-def bounded_step(information: Array, inverse: Array, gradient: Array, fluxes: Array) -> Array:
+def bounded_step(information: BandMatrix, gradient: Array, fluxes: Array) -> Array:
     """Return the change of the fluxes by Newton's method, none falling by more than nine tenths.
 
     Where one would, the others are those that are best with it held there: the step minimises
     ``<gradient, step> + <step, F step> / 2`` within those bounds, so that it never leads uphill.
     """
     least = (MAX_FADING - 1.0) * fluxes
-    step = -inverse @ gradient
-    if (step >= least).all():
-        return step
-    import scipy.optimize  # it takes half a second, and few fits need it
+    free = step = -information.solve(gradient)
+    held = np.zeros(len(fluxes), bool)
+    while (too_low := (step < least) & ~held).any():
+        import scipy.optimize  # it takes half a second, and few fits need it
 
-    values, vectors = np.linalg.eigh(information)
-    determined = values > values.max() * len(fluxes) * np.finfo(np.float64).eps
-    root = np.sqrt(values[determined])
-    matrix = root[:, None] * vectors[:, determined].T
-    target = -(vectors[:, determined].T @ gradient) / root
-    return least + scipy.optimize.nnls(matrix, target - matrix @ least)[0]
+        held |= too_low
+        at = np.flatnonzero(held)
+        # The forces that hold them there push, and never pull.
+        pushes = np.zeros((len(fluxes), len(at)))
+        pushes[at, np.arange(len(at))] = np.sqrt(information.diagonal[at])
+        moved = information.solve(pushes)
+        values, vectors = np.linalg.eigh(pushes[at].diagonal()[:, None] * moved[at])
+        determined = values > values.max() * len(at) * np.finfo(np.float64).eps
+        root = np.sqrt(values[determined])
+        lifted = vectors[:, determined].T @ (pushes[at].diagonal() * (least - free)[at]) / root
+        forces = scipy.optimize.nnls(root[:, None] * vectors[:, determined].T, lifted)[0]
+        step = free + moved @ forces
+        bound = at[forces > 0]
+        step[bound] = least[bound]  # without rounding, which fluxes near 0 have to fall below
+    return np.maximum(step, least)

@@ -141,7 +141,7 @@ class LeastSquares:
         self._ends = np.cumsum([field.at.size for field in fields])[:-1]
         self.information = information = np.diag(prior)
         for each in images:
-            block = (each.slopes * each.precision.ravel()) @ each.slopes.T
+            block = _sum("ik,jk->ij", each.slopes * each.precision.ravel(), each.slopes)
             information[np.ix_(each.unknowns, each.unknowns)] += block
         self._units = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
         scaled = information * self._units * self._units[:, None]
@@ -157,7 +157,7 @@ class LeastSquares:
         """Return the variance of an unknown, the others and the fields not being known either."""
         direct = self._invert(np.eye(len(self._prior))[unknown])
         wanted = self._adjoint(self._changes(direct))
-        return float(direct[unknown] + wanted @ self._find_fields(wanted))
+        return float(direct[unknown] + _sum("i,i", wanted, self._find_fields(wanted)))
 
     def _left(self) -> Array:
         return np.array([each.left for each in self._images])
@@ -173,14 +173,14 @@ class LeastSquares:
     def _find_fields(self, wanted: Array) -> Array:
         """Return the changes of the fields, by conjugate gradients."""
         x, rest, along = np.zeros_like(wanted), wanted, wanted
-        square = first = float(rest @ rest)
+        square = first = float(_sum("i,i", rest, rest))
         for _ in range(self._n_steps):
             if square <= self._finished**2 * first:
                 break
             image = self._curvature(along)
-            share = square / float(along @ image)
+            share = square / float(_sum("i,i", along, image))
             x, rest = x + share * along, rest - share * image
-            before, square = square, float(rest @ rest)
+            before, square = square, float(_sum("i,i", rest, rest))
             along = rest + square / before * along
         return x
 
@@ -212,17 +212,23 @@ class LeastSquares:
         """Return the products of images with the slopes, weighted."""
         moments = np.zeros(len(self._prior))
         for each, image in zip(self._images, images, strict=True):
-            moments[each.unknowns] += each.slopes @ (each.precision * image).ravel()
+            weighted = (each.precision * image).ravel()
+            moments[each.unknowns] += _sum("ik,k->i", each.slopes, weighted)
         return moments
 
     def _changes(self, change: Array) -> Array:
         """Return the changes of the models, shape (p, Ny, Nx), where the unknowns change."""
         return np.array(
             [
-                (change[each.unknowns] @ each.slopes).reshape(each.left.shape)
+                _sum("i,ik->k", change[each.unknowns], each.slopes).reshape(each.left.shape)
                 for each in self._images
             ]
         )
 
     def _invert(self, moments: Array) -> Array:
         return np.asarray(self._units * scipy.linalg.cho_solve(self._factor, self._units * moments))
+
+
+def _sum(products: str, a: Array, b: Array) -> Array:
+    """Return sums of products, whose rounding hangs on no number of threads as BLAS's does."""
+    return np.asarray(np.einsum(products, a, b))

@@ -15,7 +15,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
-from lnocl.scene.forward_model import add_to_window, sampled, spread
+from lnocl.scene.forward_model import convolve_at, sampled, spread
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import MovablePsf, Stamp
@@ -253,9 +253,11 @@ def _linearise(
     counts, background, weights = _observed(scene, j, there)
     model = background.copy()
     first = there.y % scene.image_grid[0], there.x % scene.image_grid[1]
-    add_to_window(model, scene, sky, np.zeros_like(star_fluxes), j, first)
-    for stamp, flux in zip(scene.star_field.stamps[j], star_fluxes, strict=True):
-        model += flux / scene.unit * _cut(stamp, there, scene.image_grid)
+    rows, columns = (range(at, at + n) for at, n in zip(first, there.shape, strict=True))
+    model += convolve_at(sky, scene.psf_stamp(j), rows, columns, scene.oversample) / scene.unit
+    for s in scene.star_field.reaching(j, first, there.shape):
+        light = _cut(scene.star_stamp(j, s), there, scene.image_grid)
+        model += star_fluxes[s] / scene.unit * light
     total = np.maximum(model, MIN_MODEL)
     precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
     slopes = [_cut(scene.star_stamp(j, s), there, scene.image_grid) for s in held]

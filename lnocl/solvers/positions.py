@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.forward_model import ROUNDING, Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
-from lnocl.scene.stars import Piece, StarImages, light_up, overlap, places
-from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood, invert
+from lnocl.scene.stars import Order, Piece, StarImages, light_up, order_of, places
+from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood
 
 # How far from where it was given a star may go, in pixels.
 RADIUS = 3.0
@@ -82,10 +83,16 @@ class StarFit:
             for offset in self._offsets
         ]
         lit = [light_up(each, scene.image_grid) for each in squares]
+        reached = [
+            (offset, stamps)
+            for offset, *both in zip(self._offsets, scene.star_field.stamps, squares, strict=True)
+            for stamps in both
+        ]
+        order = order_of(scene.stars, reached, scene.image_grid)
         diffuse = model.forward(extended) + model.background
         self._likelihood = StarLikelihood.of_scene(scene, model, diffuse, lit)
         self._stars = [
-            _MovableStars(psfs, where, scene.stars + offset, whole, around)
+            _MovableStars(psfs, where, scene.stars + offset, whole, around, order)
             for psfs, offset, where, whole, around in zip(
                 scene.star_psfs(scene.stars, part),
                 self._offsets,
@@ -108,16 +115,16 @@ class StarFit:
         """Return J_0 over the pixels that stars may light, but for a constant."""
         return self._try(stars).objective
 
-    def derivatives(self, stars: Stars) -> tuple[Array, Array]:
+    def derivatives(self, stars: Stars) -> tuple[Array, BandMatrix]:
         """Return gradient and Fisher information of J_0 in (c_1 ... c_n, x_1 ..., y_1 ...)."""
         return self._derivatives(self._try(stars))
 
-    def _derivatives(self, trial: _Trial) -> tuple[Array, Array]:
+    def _derivatives(self, trial: _Trial) -> tuple[Array, BandMatrix]:
         fluxes = trial.stars.fluxes
         units = np.concatenate([np.ones_like(fluxes), fluxes, fluxes])
         gradient = self._likelihood.gradient(trial.images, trial.models).ravel()
         information = self._likelihood.information(trial.images, trial.models)
-        return units * gradient, units[:, None] * units * information
+        return units * gradient, information.scaled(units)
 
     def look_round(self, stars: Stars) -> Stars:
         """Return each star at the best of nine places, the others where they are, and its flux."""
@@ -153,7 +160,7 @@ class StarFit:
         trial = self._try(stars)
         for _ in range(MAX_STEPS):
             gradient, information = self._derivatives(trial)
-            step = -invert(information) @ gradient
+            step = -information.solve(gradient)
             for _ in range(MAX_HALVED):
                 following = self._try(self._follow(trial.stars, step))
                 if following.objective <= trial.objective:
@@ -168,7 +175,7 @@ class StarFit:
                 ]
             )
             trial = following
-            if (abs(change) * np.sqrt(np.diag(information)) < FINISHED).all():
+            if (abs(change) * np.sqrt(information.diagonal) < FINISHED).all():
                 break
         return trial.stars
 
@@ -195,6 +202,8 @@ class _MovableStars:
         That whole PSF, for each star.
     squares : sequence of Stamp
         The part of the grid that each star may light, wherever it goes.
+    order : Order
+        Of the stars.
 
     Attributes
     ----------
@@ -209,40 +218,38 @@ class _MovableStars:
         positions: Array,
         whole: Sequence[Stamp],
         squares: Sequence[Stamp],
+        order: Order,
     ) -> None:
-        n, self._grid = len(positions), (lit.shape[0], lit.shape[1])
+        self._grid, self._lit, self._order = (lit.shape[0], lit.shape[1]), lit, order
         self._psfs, self._places = psfs, places(lit)
-        both = overlap([*squares, *whole], self._grid).reshape(2, n, 2, n)
-        self._overlap: NDArray[np.bool_] = np.any(both, axis=(0, 2))
-        self._size = int(lit.sum())
         # One number more, which the dark pixels share: their place is -1.
-        self._image = np.zeros(self._size + 1)
+        self._image = np.zeros(int(lit.sum()) + 1)
         self.around: list[NDArray[np.intp]] = []
         self._beyond: list[Piece] = []
         for s, (position, stamp, square) in enumerate(zip(positions, whole, squares, strict=True)):
-            reached = np.zeros(self._size + 1, bool)
-            for each in (stamp, square):
-                reached[self._places[each.window(self._grid)]] = True
-            self.around.append(np.flatnonzero(reached[:-1]))
+            at = [self._places[each.window(self._grid)].ravel() for each in (stamp, square)]
+            reached = np.unique(np.concatenate(at))
+            self.around.append(reached[reached >= 0])
             self._beyond.append(self._find_beyond(s, position, stamp))
 
     def _find_beyond(self, s: int, position: Array, whole: Stamp) -> Piece:
         """Return the whole PSF of star s less the part that moves."""
-        at = self._places[whole.window(self._grid)]
+        at = self._at(whole)
         self._image[at] = whole.values
-        pixels, values = self._moving(s, position)
-        self._image[pixels] -= values[0]
-        beyond = self._image[at].ravel()
-        self._image[at] = self._image[pixels] = 0.0
-        is_left = (abs(beyond) > ROUNDING * whole.values.max()) & (at.ravel() >= 0)
-        values = np.zeros((3, int(is_left.sum())))
-        values[0] = beyond[is_left]
-        return at.ravel()[is_left], values
+        moving = self._moving(s, position)
+        self._image[self._at(moving)] -= moving.values[0]
+        beyond = self._image[at]
+        self._image[at] = self._image[self._at(moving)] = 0.0
+        is_left = (abs(beyond) > ROUNDING * whole.values.max()) & (at >= 0)
+        return Piece(np.where(is_left, beyond, 0.0)[None], whole.y, whole.x)
+
+    def _at(self, part: Stamp | Piece) -> NDArray[np.intp]:
+        return self._places[part.window(self._grid)]
 
     def _moving(self, s: int, position: Array) -> Piece:
         """Return the part of star s's PSF that moves, and its derivatives along x and y."""
         stamp, values = self._psfs[s].with_slopes(*position)
-        return self._places[stamp.window(self._grid)].ravel(), values.reshape(3, -1)
+        return Piece(values, stamp.y, stamp.x)
 
     def at(self, positions: Array) -> StarImages:
         """Return the images of the stars and their derivatives along x and y."""
@@ -250,16 +257,16 @@ class _MovableStars:
             [self._moving(s, position), beyond]
             for s, (position, beyond) in enumerate(zip(positions, self._beyond, strict=True))
         ]
-        return StarImages(self._size, pieces, self._overlap)
+        return StarImages(self._lit, pieces, self._order)
 
     def image_around(self, s: int, position: Array) -> Array:
         """Return the image of star s, there, over the pixels that it may light."""
         pieces = [self._moving(s, position), self._beyond[s]]
-        for pixels, values in pieces:
-            self._image[pixels] += values[0]
+        for piece in pieces:
+            self._image[self._at(piece)] += piece.values[0]
         image = self._image[self.around[s]]
-        for pixels, _ in pieces:
-            self._image[pixels] = 0.0
+        for piece in pieces:
+            self._image[self._at(piece)] = 0.0
         return image
 
 

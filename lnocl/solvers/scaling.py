@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.scene.forward_model import Box, Model
+from lnocl.scene.band_matrix import BandMatrix
+from lnocl.scene.forward_model import Box, Model, largest_window
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Stamp
-from lnocl.solvers.fluxes import bounded_step, fit_fluxes, invert, movable_weights
+from lnocl.solvers.fluxes import bounded_step, fit_fluxes, movable_weights
 
 # Share of the light of stars and background that shifts the scaling. With all of it the
 # empty sky takes up noise from the first steps on, without any it is stuck where it is 0: measured
@@ -33,7 +36,7 @@ class Scaling:
         z in the scaling ``D = (f + z) / (alpha + mu (f + z))``, ``alpha = sum_j A_j^T w_j``: a
         share of ``alpha / sum_j A_j^T (w_j / (sum_s c_s P_js + b_j))``, the light of stars and
         background that reaches the pixel.
-    star_information : ndarray of float64, shape (n, n)
+    star_information : BandMatrix
         Fisher information of the star fluxes, ``sum_j <P_js, w_j P_jt / m_j>`` at the start.
     cross_values : ndarray of float64
         The values of `cross_information`, one stamp after the other.
@@ -42,25 +45,25 @@ class Scaling:
     """
 
     shift: Array
-    star_information: Array
+    star_information: BandMatrix
     cross_values: Array
     cross_windows: NDArray[np.int32]
 
     @classmethod
-    def of_stamps(cls, shift: Array, star_information: Array, stamps: Sequence[Stamp]) -> Scaling:
-        """Return the scaling with this cross information, a stamp for each star."""
-        values = np.concatenate([np.zeros(0), *(stamp.values.ravel() for stamp in stamps)])
-        windows = [(stamp.y, stamp.x, *stamp.values.shape) for stamp in stamps]
-        return cls(shift, star_information, values, np.array(windows, np.int32).reshape(-1, 4))
-
-    @classmethod
     def from_state(cls, state: Mapping[str, NDArray]) -> Scaling:
         """Return the scaling of a state."""
-        return cls(**{each.name: state[each.name] for each in fields(cls)})
+        information = BandMatrix(state["star_information"].T, state["star_order"])
+        return cls(state["shift"], information, state["cross_values"], state["cross_windows"])
 
     def state(self) -> dict[str, NDArray]:
         """Return what `from_state` needs."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
+        return {
+            "shift": self.shift,
+            "star_information": self.star_information.band.T,
+            "star_order": self.star_information.places,
+            "cross_values": self.cross_values,
+            "cross_windows": self.cross_windows,
+        }
 
     @property
     def cross_information(self) -> list[Stamp]:
@@ -82,21 +85,19 @@ class Scaling:
         leads, to second order, with the information F of the start; none falls by more than nine
         tenths.
         """
-        return bounded_step(self.star_information, self._inverse, gradient + coupling, fluxes)
+        return bounded_step(self.star_information, gradient + coupling, fluxes)
 
     def is_usable(self) -> bool:
         """Return whether the star information can be inverted, as that of any scene can."""
-        diagonal = np.diag(self.star_information)
+        diagonal, places = self.star_information.diagonal, self.star_information.places
+        if not np.array_equal(np.sort(places), np.arange(len(places))):
+            return False
         if not ((diagonal == 0) | (diagonal >= np.finfo(np.float32).tiny)).all():
             return False
         try:
-            return bool(np.isfinite(self._inverse).all())
+            return bool(np.isfinite(self.star_information.solve(diagonal)).all())
         except np.linalg.LinAlgError:
             return False
-
-    @cached_property
-    def _inverse(self) -> Array:
-        return invert(self.star_information)
 
 
 def prepare(
@@ -119,7 +120,8 @@ def prepare(
         Where the fluxes are sought from, scaled.
     """
     total_weight, inverse = _back_projections(model)
-    information, cross = np.zeros((scene.n_stars, scene.n_stars)), list[Stamp]()
+    information = BandMatrix(np.zeros((1, 0)), np.zeros(0, int))
+    values, windows = np.zeros(0), np.zeros((0, 4), np.int32)
     if scene.n_stars:
         lit = [scene.star_field.lit(j) for j in range(scene.n_images)]
         boxes = [_box(each) for each in lit]
@@ -128,11 +130,12 @@ def prepare(
         star_fluxes = fit_fluxes(scene, model, diffuse, star_fluxes)
         change = _change_by_stars(model, star_fluxes, boxes)
         inverse[change.window(scene.grid)] += change.values
-        information, cross = _star_information(scene, model, diffuse, star_fluxes, lit)
+        information, ratios = _star_information(scene, model, diffuse, star_fluxes, lit)
+        values, windows = _cross_information(scene, model, ratios)
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     np.maximum(shift, 0.0, out=shift)
     shift *= SHIFT
-    return star_fluxes, Scaling.of_stamps(shift, information, cross)
+    return star_fluxes, Scaling(shift, information, values, windows)
 
 
 def _back_projections(model: Model) -> tuple[Array, Array]:
@@ -172,18 +175,33 @@ def _star_information(
     diffuse: Array,
     star_fluxes: Array,
     lit: Sequence[NDArray[np.bool_]],
-) -> tuple[Array, list[Stamp]]:
-    """Return the Fisher information of the star fluxes, and that with the extended source."""
-    information = np.zeros((scene.n_stars, scene.n_stars))
-    stamps: list[list[Stamp]] = [[] for _ in range(scene.n_stars)]  # w_j P_js / m_j of each star
+) -> tuple[BandMatrix, list[Array]]:
+    """Return the Fisher information of the star fluxes, and the w_j / m_j under stars."""
+    informations, ratios = [], []
     for j, (light, where) in enumerate(zip(model.starlight(star_fluxes), lit, strict=True)):
         total = np.maximum(light[where] + diffuse[j][where], MIN_MODEL)
         ratio = np.zeros(scene.image_grid)
         ratio[where] = movable_weights(model.weights[j][where], total) / total
-        information += scene.star_field.images(j, where).information(ratio[where])
-        for s, of_star in enumerate(stamps):
-            of_star.append(_times(scene.star_stamp(j, s), ratio))
-    return information, [model.adjoint_of_stamps(each) for each in stamps]
+        informations.append(scene.star_field.images(j, where).information(ratio[where]))
+        ratios.append(ratio)
+    return reduce(add, informations), ratios
+
+
+def _cross_information(
+    scene: Scene, model: Model, ratios: Sequence[Array]
+) -> tuple[Array, NDArray[np.int32]]:
+    """Return the values and the windows of the cross information."""
+    # Memory is taken where values are written, and a list of them would take it twice.
+    values = np.empty(scene.n_stars * math.prod(largest_window(scene)))
+    windows, end = np.empty((scene.n_stars, 4), np.int32), 0
+    for s, at in enumerate(windows):
+        stamp = model.adjoint_of_stamps(
+            [_times(scene.star_stamp(j, s), ratio) for j, ratio in enumerate(ratios)]
+        )
+        at[:] = stamp.y, stamp.x, *stamp.values.shape
+        begin, end = end, end + stamp.values.size
+        values[begin:end] = stamp.values.ravel()
+    return values[:end], windows
 
 
 def _box(lit: NDArray[np.bool_]) -> Box:

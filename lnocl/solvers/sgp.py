@@ -53,7 +53,8 @@ def sgp(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int
     Problems 25, 015002). alpha is the smaller of the last two steps of Barzilai and Borwein (1988,
     IMA J. Numer. Anal. 8, 141), their second, in the metric of D. The star fluxes follow the
     extended source, by `Scaling.star_step`. The share is 1, shortened until the objective falls
-    enough; it never rises. The method ends early where no step lowers the objective any more.
+    enough, or rises by no more than rounding. The method ends early where no step lowers the
+    objective any more.
     """
     steps = steps or Steps()
     engine.ratio()
@@ -86,13 +87,13 @@ def _descend(engine: Engine, alpha: float) -> bool:
     if slope + gradient @ change >= 0:  # following the extended source would lead uphill
         change = scaling.star_step(fluxes, gradient, np.zeros_like(coupling))
     slope += float(gradient @ change)
-    share = 1.0
+    share, rounding = 1.0, engine.rounding * abs(objective)
     for _ in range(MAX_SHORTENINGS):
         engine.set_star_fluxes(fluxes + share * change)
         engine.ratio()
         engine.correct()  # perhaps in vain, but the device need not wait
         trial_objective = engine.objective()
-        if trial_objective <= objective + SUFFICIENT * share * slope:
+        if trial_objective <= objective + SUFFICIENT * share * slope + rounding:
             return True
         engine.forget_objective()
         share *= SHORTER

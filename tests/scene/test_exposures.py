@@ -329,15 +329,9 @@ def test_exposures_that_cannot_be_summed_are_refused(exposure):
         paper(observation, n_iter=1, **numpy_alone)
 
 
-def test_an_image_whose_scale_is_beyond_all_numbers_is_refused():
-    observation = lnocl.Observation([[1e308]], [[1.0]])
-    with pytest.raises(lnocl.InputError, match=r"^the images are too large to be summed: divide"):
-        paper(observation, n_iter=1, **numpy_alone)
-
-
 @pytest.mark.parametrize(
     ("counts", "exposure"),
-    [(1.0, 1e-307), (1.0, 5e-324), (1e200, 1e-200), (1e-300, 1e300)],
+    [(1.0, 1e-307), (1.0, 5e-324), (1e20, 1e-300), (1e-300, 1e300)],
 )
 def test_a_sky_that_no_number_holds_is_refused(counts, exposure):
     images = np.full((2, *SHAPE), counts)
@@ -363,17 +357,17 @@ def test_mu_too_large_is_refused_in_terms_of_what_was_given():
     made = EACH.make()
     observation = made.observation(exposure=made.exposure * 1e6)
     with pytest.raises(lnocl.InputError, match=r"mu 1e.40 is too large") as caught:
-        made.deconvolve(observation, mu=1e40, n_iter=1, **numpy_alone)
+        paper(observation, made.stars, mu=1e40, n_iter=1, **numpy_alone)
     most = float(str(caught.value).rsplit(" ", 1)[-1])
-    made.deconvolve(observation, mu=0.99 * most, n_iter=1, **numpy_alone)
+    paper(observation, made.stars, mu=0.99 * most, n_iter=1, **numpy_alone)
     with pytest.raises(lnocl.InputError):
-        made.deconvolve(observation, mu=1.01 * most, n_iter=1, **numpy_alone)
+        paper(observation, made.stars, mu=1.01 * most, n_iter=1, **numpy_alone)
 
 
 @pytest.mark.parametrize("engine", ["numpy", "opencl"])
 def test_skies_that_no_number_holds_in_the_longest_exposure_are_refused(engine):
-    """Scaled to about 1 the start has 1e38; in electrons its objective is infinite."""
-    exposure = np.array([[[7.5, 1e40]]])
-    observation = lnocl.Observation([[[1e300, 7.0]]], [[[2.1]]], exposure=exposure)
+    """Scaled to about 1 it is a number; in electrons its objective is infinite."""
+    exposure = np.array([[[7.5, 1e300]]])
+    observation = lnocl.Observation([[[1e25, 7.0]]], [[[2.1]]], exposure=exposure)
     with pytest.raises(lnocl.InputError, match="than a number holds: divide images"):
         paper(observation, n_iter=1, engine=engine)

@@ -11,10 +11,12 @@ import lnocl
 from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_start
 from lnocl.scene import shifting
+from lnocl.scene import stars as star_images
+from lnocl.scene.forward_model import add_to_window
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import Stamp
-from lnocl.scene.stars import StarImages, check_positions, overlap
+from lnocl.scene.stars import Order, Piece, StarImages, check_positions, order_of
 
 # One is alone, two are neighbours, one wraps round two edges; or all of the grid is lit.
 FIELDS = {
@@ -51,33 +53,82 @@ def test_sums_are_those_over_all_pixels(name, j):
     assert worst(field.light(j, fluxes).ravel(), fluxes @ dense) <= 5e-16
     assert worst(images.products(x[lit]), [dense @ x.ravel()]) <= 2e-15
     expected = (dense * weights.ravel()) @ dense.T
-    assert worst(images.information(weights[lit]), expected) <= 1e-15
+    assert worst(images.information(weights[lit]).dense(), expected) <= 1e-15
 
 
-def test_sums_over_images_of_several_pieces_and_derivatives():
-    size, k, rng = 50, 3, np.random.default_rng(1)
-    dense, pieces = np.zeros((k, 4, size)), []
-    for s in range(4):
+@pytest.mark.parametrize("tile", [4, 32])
+def test_sums_over_images_of_several_pieces_and_derivatives(tile, monkeypatch):
+    """The second piece is of the image alone; pieces wrap round the edges of the grid."""
+    monkeypatch.setattr(star_images, "TILE", tile)
+    grid, n, rng = (10, 14), 4, np.random.default_rng(1)
+    dense, pieces = np.zeros((3, n, *grid)), []
+    lit = rng.random(grid) < 0.8
+    for s in range(n):
         pieces.append([])
-        for n in (7, 12):
-            pixels, values = rng.permutation(size)[:n], rng.normal(size=(k, n))
-            pieces[s].append((pixels, values))
-            dense[:, s, pixels] += values
-    images = StarImages(size, pieces, np.ones((4, 4), bool))
-    x, columns = rng.random(size), dense.reshape(-1, size)
-    assert worst(images.light(x[:4]), x[:4] @ dense[0]) <= 1e-15
+        for k in (3, 1):
+            shape = k, *rng.integers(3, 11, 2)
+            piece = Piece(rng.normal(size=shape), *rng.integers(-20, 20, 2).tolist())
+            pieces[s].append(piece)
+            for values, each in zip(piece.values, dense[:, s], strict=False):
+                each += Stamp(values, piece.y, piece.x).on_grid(grid)
+    images = StarImages(lit, pieces, Order(np.array([2, 0, 3, 1]), n - 1))
+    x, columns = rng.random(np.count_nonzero(lit)), dense[..., lit].reshape(3 * n, -1)
+    assert worst(images.light(x[:n]), x[:n] @ columns[:n]) <= 1e-15
     assert worst(images.products(x).ravel(), columns @ x) <= 1e-15
-    assert worst(images.information(x), (columns * x) @ columns.T) <= 1e-15
+    information = images.information(x)
+    assert worst(information.dense(), (columns * x) @ columns.T) <= 1e-15
+    np.testing.assert_array_equal(information.diagonal, np.diag(information.dense()))
 
 
-def test_stamps_overlap_where_they_share_pixels():
-    grid, rng = (12, 16), np.random.default_rng(2)
-    stamps = [
-        Stamp(np.ones(rng.integers(1, 7, 2)), *rng.integers(-20, 20, 2).tolist()) for _ in range(30)
+@pytest.mark.parametrize("goes_round", [False, True])
+def test_stars_that_share_pixels_are_near_in_their_order(goes_round):
+    grid, rng = (400, 96), np.random.default_rng(2)
+    margin = 0 if goes_round else 20
+    stars = rng.uniform(margin, np.subtract(grid[::-1], margin), (200, 2))
+    offsets = np.array([(0.0, 0.0), (2.6, -3.3)])
+    images = [
+        [Stamp(np.ones((k, 15)), int(y) - k // 2, int(x) - 7) for x, y in stars + offset]
+        for k, offset in zip((21, 16), offsets, strict=True)
     ]
-    dense = np.array([stamp.on_grid(grid).ravel() for stamp in stamps])
-    np.testing.assert_array_equal(overlap(stamps, grid), dense @ dense.T > 0)
-    assert 0.1 < overlap(stamps, grid).mean() < 0.9
+    places, width = order_of(stars, zip(offsets, images, strict=True), grid)
+    np.testing.assert_array_equal(np.sort(places), np.arange(200))
+    for stamps in images:
+        dense = np.array([stamp.on_grid(grid).ravel() for stamp in stamps])
+        one, other = np.nonzero(dense @ dense.T)
+        assert abs(places[one] - places[other]).max() <= width
+    assert width < 70  # along the other axis all 200 stars meet
+
+
+def count_products(n):
+    """Return the elements of the information of n stars on a grid that grows with them."""
+    ny, rng = 16 * n, np.random.default_rng(3)
+    stars = np.column_stack([rng.uniform(12, 52, n), 16 * np.arange(n) + 8.0])
+    observation = lnocl.Observation(np.ones((ny, 64)), make_smooth_psfs(1, (7, 8)))
+    field = Scene(observation, stars, pad=0).star_field
+    lit = field.lit(0)
+    return field.images(0, lit).information(np.ones(np.count_nonzero(lit))).band.size
+
+
+def test_information_is_of_stars_that_overlap_alone():
+    """Four times as many stars on four times the sky take four times as much; before, 16 times."""
+    assert count_products(128) <= 5 * count_products(32)
+
+
+def test_light_of_a_window_is_that_of_the_stars_that_reach_it(monkeypatch):
+    """Before, every star of the scene was laid into the window of each."""
+    rng = np.random.default_rng(4)
+    stars = rng.uniform(10, 246, (60, 2))
+    observation = lnocl.Observation(rng.poisson(50.0, (256, 256)), make_smooth_psfs(1, (7, 8)))
+    scene = Scene(observation, stars, pad=0)
+    laid, add_to = [], Stamp.add_to
+    monkeypatch.setattr(Stamp, "add_to", lambda *args: [laid.append(args), add_to(*args)])
+    first, image = (10, 90), np.zeros((40, 50))
+    fluxes = rng.uniform(1.0, 2.0, 60)
+    add_to_window(image, scene, np.zeros(scene.grid), fluxes, 0, first)
+    whole = scene.star_field.light(0, fluxes / scene.unit)
+    expected = whole[10:50, 90:140]
+    np.testing.assert_allclose(image, expected, rtol=1e-12, atol=1e-15)
+    assert 0 < len(laid) < 30
 
 
 def test_each_psf_is_transformed_once_and_each_star_placed_once(monkeypatch):

@@ -64,12 +64,12 @@ def test_the_truth_stays():
 
 
 def test_the_order_of_stars_does_not_matter():
-    """But for where conjugate gradients end: by 6e-7 of fluxes, 6e-6 of the brightest pixel."""
+    """But for where conjugate gradients end: by 4e-6 of fluxes, 6e-6 of the brightest pixel."""
     sky, fluxes = with_hole()
     first = marginal(a_scene(), sky, fluxes)
     turned = a_scene(stars=STARS[::-1], fluxes=FLUXES[::-1])
     other = marginal(turned, sky, fluxes[::-1])
-    np.testing.assert_allclose(other[1][::-1], first[1], rtol=2e-6)
+    np.testing.assert_allclose(other[1][::-1], first[1], rtol=8e-6)
     np.testing.assert_allclose(other[0], first[0], rtol=0, atol=2e-5 * sky.max())
 
 

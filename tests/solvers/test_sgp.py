@@ -81,6 +81,13 @@ OFF_THE_MINIMUM = {"double": 1e-5, "single": 0.1}
 
 
 @functools.cache
+def falls(result, engine="numpy", precision="double"):
+    """Return whether the objective falls, in single precision but for rounding."""
+    allowed = 0.0 if "double" in (engine, precision) or engine == "numpy" else opencl.ROUNDING
+    objectives = result.history["objective"]
+    return bool((np.diff(objectives) <= allowed * objectives[:-1]).all())
+
+
 def minimum(name):
     problem = problem_of(MINIMA[name].make())
     return problem, problem.minimum()
@@ -194,7 +201,7 @@ OBJECTIVE_ROUNDING = {"double": 6e-15, "single": 3.5e-6}
 def test_objective_never_rises(engine, name):
     result = run(name, n_iter=100, **engine)
     np.testing.assert_array_equal(result.history["iteration"], np.arange(result.n_iter + 1))
-    assert (np.diff(result.history["objective"]) <= 0).all()
+    assert falls(result, **engine)
 
 
 @pytest.mark.parametrize("name", PERIODIC)
@@ -277,7 +284,7 @@ def small_scenes(share):
 @given(scene=small_scenes(st.just(0.0) | logarithmic(-3, 3)), mu=st.just(0.0) | logarithmic(-6, 1))
 def test_objective_never_rises_in_any_scene(scene, mu):
     result = solve(**scene, mu=mu, n_iter=50)
-    assert (np.diff(result.history["objective"]) <= 0).all()
+    assert falls(result)
 
 
 @settings(max_examples=10, deadline=None)
@@ -532,4 +539,22 @@ def test_extremes(engine, images, background):
     for values in (result.extended, result.star_fluxes, result.history["objective"]):
         assert np.isfinite(values).all()
         assert (values >= 0).all()
-    assert (np.diff(result.history["objective"]) <= 0).all()
+    assert falls(result, **engine)
+
+
+def test_single_precision_goes_on_where_a_step_promises_less_than_rounding():
+    from lnocl.simulation import Experiment, hh34, simulate
+
+    seen = simulate(hh34(96), Experiment(exposure_time="1 min"))
+    images = np.random.default_rng(1).poisson(np.maximum(seen.images[:1], 0))
+    observation = lnocl.Observation(
+        images, seen.psfs[:1], background=seen.background[:1], read_noise=seen.read_noise
+    )
+    options = {"pad": 0, "stop": None, "n_iter": 400, "smoothing": 5e-4}
+    single, double = (
+        lnocl.deconvolve(observation, seen.stars, precision=precision, **options)
+        for precision in ("single", "double")
+    )
+    # Without an allowance for rounding it ended at iteration 336, 1.6 % from double precision.
+    assert (single.n_iter, single.stop_reason) == (400, "n_iter")
+    assert relative_error(single.extended, double.extended) < 0.015  # measured 0.0102

@@ -17,6 +17,8 @@ class Scripted:
     Its stars have the information 1 each.
     """
 
+    rounding = 0.0
+
     def __init__(self, changes=(), objectives=(), slope=-1.0, star=None, coupling=0.0):
         self.changes = chain(changes, repeat((1.0, 1.0)))
         self.to_record = chain(objectives, map(float, range(0, -1000, -1)))
@@ -96,6 +98,14 @@ def test_alpha_is_the_smaller_of_two_steps_of_barzilai_and_borwein(changes, alph
     assert engine.alphas == alphas
     assert engine.shares == [1.0] * n
     assert engine.recorded == list(range(0, -n - 1, -1))
+
+
+@pytest.mark.parametrize(("rise", "is_taken"), [(0.9, True), (1.1, False)])
+def test_a_rise_below_rounding_is_taken(rise, is_taken):
+    engine = Scripted(objectives=[1000.0, 1000.0 + rise], slope=-1e-3)
+    engine.rounding = 1e-3
+    assert list(sgp(engine, 1)) == [1]
+    assert (engine.shares == [1.0]) == is_taken
 
 
 def test_steps_go_on_from_what_is_remembered():
