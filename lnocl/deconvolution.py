@@ -97,8 +97,8 @@ def deconvolve(
         The p images of shape (ny, nx), with their PSFs, backgrounds, noise and masks.
     stars : iterable of (x, y) or astropy.table.Table, optional
         Positions of the n point sources in pixels of an image without offset, 0-based, x along
-        columns. Two are at least a thousandth of a pixel apart. They may be a Quantity in pixels,
-        or a table with columns x and y, or as photutils or SExtractor name them
+        columns. Two stars must lie a thousandth of a pixel apart or more. They may be a Quantity in
+        pixels, or a table with columns x and y, or as photutils or SExtractor name them
         (`lnocl.scene.star_tables.IN_PIXELS`). SExtractor counts from 1, and is converted. Between
         pixels a star's image is the PSF moved in its spectrum (`lnocl.scene.shifting.place`).
     mu : float, optional
@@ -135,14 +135,15 @@ def deconvolve(
         else the first GPU, else the first CPU.
     pad : int or "auto", optional
         Unobserved pixels round the images, at least. "auto" is 0 unless light runs over the edge of
-        an image. Then it is the radius with nine tenths of the PSFs' light, at most half the
+        an image. There it is the radius that holds nine tenths of the PSFs' light, at most half the
         shorter side (:doc:`/validation/frames`). Each axis of the grid is then the next of
         `lnocl.scene.grid.LENGTHS`: powers of two, and 3, 5, 7 or 9 times one from 16 up. It is at
         least as long as the PSFs or twice the images. The model is periodic where images have such
         lengths, PSFs are no larger, and ``pad=0``.
     initial_extended : array_like, of the shape of the result's, optional
         Extended source to start from, not 0 everywhere; by default flat. Pixels that start at 0
-        stay 0 with "sgm".
+        stay 0 with "sgm". One that is far brighter than the images, as in another unit, is made as
+        bright as they are.
     initial_star_fluxes : array_like, shape (n,), optional
         Star fluxes to start from, more than 0 with "sgm" unless positions are refined; by default
         read off the data.
@@ -187,7 +188,7 @@ def deconvolve(
         - A star lies outside the images, two are at one position, or they are not in pixels.
         - The start is not in counts, or is 0 and stays so.
         - The device does not exist, or was given for the reference.
-        - Images or exposures are too large to be summed, or the sky overflows.
+        - Exposures are too large to be summed, or the sky overflows.
         - Held-out counts were asked of images that hold no counts.
         - PSFs are to be refined without a star, in a way that is not known, or that needs more than
           the observation has.
@@ -214,6 +215,7 @@ def deconvolve(
         - Single precision is expected to stray from double by a thousandth of the extended source.
         - The noise of an image is not that of Poisson counts.
         - The background is above the darker half of an image.
+        - The extended source to start from was far brighter than the images.
         - Held-out counts choose an iteration too near `n_iter`.
         - The objective rises or is not finite.
         - A later checkpoint cannot be written.
@@ -278,7 +280,8 @@ def deconvolve(
     negative. With many negative pixels, as in a raw frame of a star, the objective may rise again.
     All the light may then end in one pixel. Where the objective stays a tenth above its least for
     ten iterations, the run ends with the estimate of the least objective. A warning names the fault
-    of the PSFs. The scaled gradient projection method never accepts a rise.
+    of the PSFs. The scaled gradient projection method accepts no rise above
+    rounding.
 
     References
     ----------

@@ -251,6 +251,33 @@ class Result:
             each.flags.writeable = False
         return errors
 
+    @cached_property
+    def extended_flux(self) -> tuple[float, float]:
+        r"""The light of the extended source in the frame and its standard error, electrons.
+
+        It is the sum of the extended source and of what the residuals have beside it
+        (`lnocl.solvers.light`), so that it has no bias, and may be negative where there is little
+        but noise. ``extended.sum()`` is too large there, as no pixel is negative. The error is that
+        of counts and of `star_flux_errors`. It is computed when it is first read.
+
+        Examples
+        --------
+        A sky of 5 electrons per pixel that is all background:
+
+        >>> import numpy as np
+        >>> import lnocl
+        >>> images = np.random.default_rng(0).poisson(5.0, (64, 64))
+        >>> observation = lnocl.Observation(images, np.ones((5, 5)), background=5)
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
+        >>> flux, error = result.extended_flux
+        >>> bool(abs(flux - (images - 5).sum()) < 10), bool(130 < error < 160)
+        (True, True)
+        >>> bool(result.extended.sum() > 3 * error)
+        True
+        """
+        whole = np.broadcast_to(1.0, self.extended.shape)
+        return self._outcome.light().flux(whole, self.star_flux_errors)
+
     @property
     def _observation(self) -> Observation:
         return self._outcome.scene.observation
@@ -594,7 +621,7 @@ class Result:
         rows = {
             "iterations": f"{self.n_iter} ({self.stop_reason})",
             "stars": "\n".join(shown) or "none",
-            "extended source": f"{self.extended.sum():.5g}",
+            "extended source": "{:.5g} +- {:.2g}".format(*self.extended_flux),
             "device": self.device,
         }
         return html_card("lnocl.Result", rows, self.extended)

@@ -82,6 +82,7 @@ class TiledResult(Result):
     _images: Observation
     _all_models: Array
     _errors: tuple[Array, Array]
+    _flux: tuple[float, float]
     _at_stars: list[StarResiduals]
 
     @property
@@ -94,6 +95,11 @@ class TiledResult(Result):
     @property
     def _star_errors(self) -> tuple[Array, Array]:
         return self._errors
+
+    @property
+    def extended_flux(self) -> tuple[float, float]:
+        """The light of the extended source in the frame and its standard error, electrons."""
+        return self._flux
 
     def star_residuals(self) -> list[StarResiduals]:
         """Return how well the model fits at each star: in its core, its wings and round it."""
@@ -181,6 +187,7 @@ class _Found(NamedTuple):
 
     extended: Array
     models: Array
+    flux: tuple[float, float]
     stars: tuple[Array, Array, Array, Array]
     at_stars: list[StarResiduals]
     history: NDArray[np.void]
@@ -488,6 +495,7 @@ class _Solving:
         return _Found(
             result.extended,
             result.models()[:, rows, columns],
+            _flux_within(result, rows, columns),
             cast(Any, tuple(each[tile.own] for each in stars)),
             [at_stars[s] for s in tile.own],
             result.history,
@@ -499,6 +507,14 @@ class _Solving:
                 if issubclass(each.category, LnoclWarning)
             ],
         )
+
+
+def _flux_within(result: Result, rows: slice, columns: slice) -> tuple[float, float]:
+    """Return the light of the extended source in some pixels of the images, and its error."""
+    q = result._observation.oversample
+    within = np.zeros(result.extended.shape)
+    within[q * rows.start : q * rows.stop, q * columns.start : q * columns.stop] = 1.0
+    return result._outcome.light().flux(within, result.star_flux_errors)
 
 
 class _Mosaic:
@@ -551,6 +567,7 @@ class _Mosaic:
         extended = np.divide(
             self._extended, self._weight, out=self._extended, where=self._weight > 0
         )
+        fluxes, errors = zip(*(found.flux for found in self._found), strict=True)
         return TiledResult(
             extended=extended,
             star_fluxes=self._stars[:, 2],
@@ -568,6 +585,7 @@ class _Mosaic:
             _images=self._observation,
             _all_models=self._models,
             _errors=(self._stars[:, 3], self._stars[:, 4:]),
+            _flux=(sum(fluxes), math.hypot(*errors)),
             _at_stars=cast(Any, self._at_stars),
         )
 

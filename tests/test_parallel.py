@@ -125,7 +125,7 @@ def test_processes_of_its_own_end_with_the_work():
 
 
 def test_workers_hold_what_does_the_tasks(client):
-    answers = list(work(partial(Squares, 0.02), range(20), CURRENT))
+    answers = list(work(partial(Squares, 0.2), range(20), CURRENT))
     assert [each[0] for each in answers] == [k**2 for k in range(20)]
     pids = [each[1] for each in answers]
     assert len(set(pids)) == 2

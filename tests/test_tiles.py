@@ -260,6 +260,9 @@ def test_tiles_are_the_whole(run, n_stars, middle, blends):
     np.testing.assert_allclose(result.star_fluxes, whole.star_fluxes, rtol=3e-6)
     np.testing.assert_array_equal(result.star_positions, stars)
     np.testing.assert_allclose(result.star_flux_errors, whole.star_flux_errors, rtol=1e-5)
+    (flux, error), (expected, its_error) = result.extended_flux, whole.extended_flux
+    assert abs(flux - expected) < 0.05 * its_error
+    assert error == pytest.approx(its_error, rel=0.03)  # what tiles share at their edges
     assert result.fit().rms == pytest.approx(whole.fit().rms, rel=3e-5)
     assert len(result.star_residuals()) == len(stars)
 
@@ -272,6 +275,7 @@ def test_one_tile_is_the_whole_bit_for_bit():
     for name in ("extended", "star_fluxes", "star_flux_errors", "history"):
         np.testing.assert_array_equal(getattr(result, name), getattr(whole, name), name)
     np.testing.assert_array_equal(result.models(), whole.models())
+    assert result.extended_flux == pytest.approx(whole.extended_flux, rel=1e-9)
     assert result.n_iter == whole.n_iter
 
 

@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import math
 import os
 import shlex
 import socket
@@ -21,6 +22,7 @@ from lnocl.commands import deconvolve, environment, messages, options, pictures,
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.commands.signals import Terminated
+from lnocl.commands.summary import FITS
 from lnocl.commands.targets import Target, read_targets
 from lnocl.errors import FileError, LnoclError, counted
 
@@ -86,13 +88,23 @@ OPTIONS = [
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """What became of a target: a row of the summary, and its file NAME.json."""
+    """What became of a target: a row of the summary, and its file NAME.json.
+
+    The star is the first of the row; of more, and of their fits, its file has a table.
+    """
 
     name: str
     status: str
     message: str = ""
     n_iter: int = 0
     stopped: str = ""
+    star_flux: float = math.nan
+    star_flux_error: float = math.nan
+    extended_flux: float = math.nan
+    extended_flux_error: float = math.nan
+    unit: str = ""
+    residual_rms: float = math.nan
+    verdict: str = ""
     warnings: int = 0
     seconds: float = 0.0
     device: str = ""
@@ -210,10 +222,20 @@ def _found(said: str, output: str, status: int) -> dict[str, Any]:
         return {"message": errors[-1] if errors else f"exit status {status}", "warnings": warnings}
     from astropy.io import fits
 
-    header = fits.getheader(output)
+    with fits.open(output) as hdus:
+        header, stars = hdus[0].header, hdus["STARS"].data
+        of_star = {
+            f"star_{name}": float(stars[name][0]) for name in ("flux", "flux_error") if len(stars)
+        }
     return {
         "n_iter": header["NITER"],
         "stopped": header["STOPPED"],
+        **of_star,
+        "extended_flux": header.get("EXTFLUX", math.nan),
+        "extended_flux_error": header.get("EXTERROR", math.nan),
+        "unit": header["BUNIT"],
+        "residual_rms": header.get("RESIDRMS", math.nan),
+        "verdict": header["VERDICT"],
         "device": header["DEVICE"],
         "warnings": warnings,
     }
@@ -339,8 +361,15 @@ def _said(summary: Table, n_old: int, folder: Folder) -> list[str]:
         if each in statuses
     )
     before = f" ({n_old} of them before)" if n_old else ""
+    verdicts = [verdict for verdict in summary["verdict"].tolist() if verdict]
+    n_faults = sum(not verdict.startswith(FITS) for verdict in verdicts)
+    faults = [
+        f"in {n_faults} of the {len(verdicts)} that are done the model has faults, which the "
+        "column verdict says"
+    ]
     return [
         f"{counted(len(summary), 'target')}: {counts}{before}",
+        *(faults if n_faults else []),
         f"written to {os.path.join(folder.path, SUMMARY)}",
     ]
 

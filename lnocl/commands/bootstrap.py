@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lnocl.commands.options import option
-from lnocl.scene.apertures import Profile
+from lnocl.scene.apertures import Aperture
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -26,7 +26,7 @@ log = logging.getLogger("lnocl")
 DEFAULT = 50
 # Seconds between two writings of the replicas so far.
 WRITE_EVERY = 10.0
-# Quantities of which the run says the errors.
+# Quantities of which the run says the errors, unless more regions were given.
 MAX_SAID = 12
 
 OPTIONS = [
@@ -160,7 +160,7 @@ def add_errors(
     finally:
         if latest:
             _write(path, latest[0], parts, frames)
-    return _said(found, frames)
+    return _said(found, parts, frames)
 
 
 def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None:
@@ -189,10 +189,11 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
 def _write(path: str, found: Bootstrap, parts: Sequence[Part], frames: Frames) -> None:
     from lnocl.io.fitserrors import write_errors
 
+    quantities = found.to_table(frames.electrons, frames.unit)
     write_errors(
         path,
-        found.to_table(frames.electrons, frames.unit),
-        _table_of(parts),
+        quantities,
+        _table_of(_regions(parts), quantities[[each.at is None for each in found.quantities]]),
         (found.error_map / frames.electrons, found.bias_map / frames.electrons),
         found.errors,
         found.of_psfs,
@@ -203,28 +204,37 @@ def _write(path: str, found: Bootstrap, parts: Sequence[Part], frames: Frames) -
     )
 
 
-def _table_of(parts: Sequence[Part]) -> QTable:
-    """Return the regions as a table: name, area and centre."""
+def _regions(parts: Sequence[Part]) -> list[Aperture]:
+    return [each for each in parts if isinstance(each, Aperture)]
+
+
+def _table_of(regions: Sequence[Aperture], measured: QTable) -> QTable:
+    """Return the regions, which are measured last, as a table: name, area, centre and flux."""
     from astropy.table import QTable
 
     columns: dict[str, list[Any]] = {name: [] for name in ("name", "pixels", "x", "y")}
-    for each in parts:
-        if isinstance(each, Profile):
-            continue
+    for each in regions:
         y, x = each.places
         columns["name"].append(each.name)
         columns["pixels"].append(each.n_pixels)
         columns["x"].append((each.weights * x).sum() / each.n_pixels)
         columns["y"].append((each.weights * y).sum() / each.n_pixels)
-    return QTable(columns, dtype=(str, float, float, float))
+    table = QTable(columns, dtype=(str, float, float, float))
+    of_regions = measured[len(measured) - len(regions) :]
+    table["flux"] = of_regions["value"] - of_regions["bias"]
+    for name in ("error", "unit", "note"):
+        table[name] = of_regions[name]
+    return table
 
 
-def _said(found: Bootstrap, frames: Frames) -> list[str]:
-    """Return a line a quantity."""
+def _said(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[str]:
+    """Return a line a quantity, first those of regions, which were asked for."""
     table = found.to_table(frames.electrons, frames.unit)
     table = table[[each.at is None for each in found.quantities]]  # profiles are to be drawn
+    n_regions = len(_regions(parts))
+    table, n_said = table[np.roll(np.arange(len(table)), n_regions)], max(MAX_SAID, n_regions)
     lines = [f"errors by {found.n} replicas, less their bias; in brackets 95 %:"]
-    for row in table[:MAX_SAID]:
+    for row in table[:n_said]:
         note = f"; {row['note']}: do not trust its error" if row["note"] else ""
         if len(found.of_psfs):
             note += f"; noise {row['error_noise']:.2g}, PSF {row['error_psf']:.2g}"
@@ -232,6 +242,6 @@ def _said(found: Bootstrap, frames: Frames) -> list[str]:
             f"{row['name']}: {row['value'] - row['bias']:.6g} +- {row['error']:.2g} "
             f"{row['unit']} ({row['low95']:.6g} to {row['high95']:.6g}{note})"
         )
-    if len(table) > MAX_SAID:
-        lines.append(f"and {len(table) - MAX_SAID} more in the table ERRORS")
+    if len(table) > n_said:
+        lines.append(f"and {len(table) - n_said} more in the table ERRORS")
     return lines

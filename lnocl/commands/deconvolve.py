@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from lnocl.commands import bootstrap, checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
-from lnocl.commands.summary import summarise
+from lnocl.commands.summary import summarise, verdict_on
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
 from lnocl.residuals import Fit, StarResiduals
@@ -20,7 +21,7 @@ from lnocl.result import Result, saved_parts, view_of
 if TYPE_CHECKING:
     from astropy.io import fits
 
-    from lnocl.io.fitswrite import StarColumn
+    from lnocl.io.fitswrite import Card, StarColumn
     from lnocl.io.frames import Frames
     from lnocl.plotting.result import ResultView
     from lnocl.runs.bootstrap import Part
@@ -92,10 +93,12 @@ def _run(arguments: argparse.Namespace) -> None:
             result = dataclasses.replace(result, stop_reason="interrupt")
         at_stars = result.star_residuals()
         view = _view(arguments, result, frames)
-        overall = Fit.of(view.residuals, view.models) if arguments.residuals and view else None
-        said = summarise(arguments, result, frames, at_stars, overall, bool(warned))
+        overall = Fit.of(view.residuals, view.models) if view else result.fit()
+        verdict = verdict_on(arguments, result, at_stars, overall, bool(warned))
+        said = [*summarise(arguments, result, frames, at_stars, overall), *verdict]
+        measured = _measured(result, frames, overall, verdict)
         wcs = fitsread.wcs_cards(frames.header)
-        _write(arguments, result, frames, given, at_stars, view, wcs, [*warned, *said])
+        _write(arguments, result, frames, given, at_stars, view, wcs, measured, [*warned, *said])
         said.append(f"written to {arguments.output}")
         if arguments.plot is not None and view is not None:
             from lnocl.plotting.result import draw_result
@@ -128,6 +131,7 @@ def _write(
     at_stars: Sequence[StarResiduals],
     view: ResultView | None,
     wcs: fits.Header,
+    measured: Sequence[Card],
     said: Sequence[str],
 ) -> None:
     """Write the result with the command that repeats it."""
@@ -150,6 +154,7 @@ def _write(
                 repeated | _used(repeated, frames, result),
                 frames.sha256,
                 [
+                    *measured,
                     *parts.pop("cards"),
                     *(fitswrite.offset_cards(offsets) if arguments.align else []),
                 ],
@@ -166,6 +171,18 @@ def _write(
         said=said,
         **parts,
     )
+
+
+def _measured(result: Result, frames: Frames, overall: Fit, verdict: Sequence[str]) -> list[Card]:
+    """Return the cards of what is in no table, but for values that a card cannot hold."""
+    flux, error = (each / frames.electrons for each in result.extended_flux)
+    cards: list[Card] = [
+        ("EXTFLUX", flux, "flux of the extended source"),
+        ("EXTERROR", error, "its standard error"),
+        ("RESIDRMS", overall.rms, "rms residual, 1 by noise"),
+        ("VERDICT", "; ".join(verdict), ""),
+    ]
+    return [card for card in cards if isinstance(card[1], str) or math.isfinite(card[1])]
 
 
 def _given(values: Mapping[str, Any], names: Any) -> dict[str, Any]:

@@ -74,7 +74,7 @@ OPTIONS = {
             "--residuals",
             action="store_true",
             help="add a cube with the residuals of each image, (image - model) / sqrt(model), with "
-            "the same header; say how well the model fits in all pixels",
+            "the same header",
         ),
         options.PICTURE.but(
             help="picture of image, model, residuals and extended source, whole and at each star, "
@@ -166,14 +166,7 @@ OPTIONS = {
             help="position of a star on the sky (ICRS), in degrees or as hh:mm:ss,dd:mm:ss; may "
             "be repeated",
         ),
-        option(
-            "--stars",
-            metavar="FILE",
-            dest="star_table",
-            is_input=True,
-            help="table of stars in any format of astropy, with columns x and y, or ra and dec, "
-            "or as photutils, SExtractor, Gaia and VizieR name them",
-        ),
+        options.STAR_TABLE,
         option(
             "--refine",
             action="store_true",

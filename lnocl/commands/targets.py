@@ -22,6 +22,8 @@ FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
 NAME = "name"
 # What the batch gives itself.
 OWN = ("output", "overwrite", "quiet", "resume", "checkpoint", "parallel")
+# Bytes of a name that file systems take, but for an ending.
+MAX_NAME = 255 - len(".fits")
 YES, NO = ("true", "yes", "1"), ("false", "no", "0", "")
 
 
@@ -91,7 +93,9 @@ def _read(path: str) -> Table:
     if ending is None:
         raise InputError(f"{path} is no table of targets; its name ends in {', '.join(FORMATS)}")
     try:
-        return Table.read(path, format=FORMATS[ending])
+        # Excel begins them with a mark of the encoding.
+        given = {} if ending == ".fits" else {"encoding": "utf-8-sig"}
+        return Table.read(path, format=FORMATS[ending], **given)
     except FileNotFoundError as error:
         raise FileError(f"{path} does not exist") from error
     except Exception as error:  # of its readers, which raise any
@@ -140,10 +144,19 @@ def _target(row: Row, options: dict[str, Option]) -> Target:
         fault = str(error)
     if NAME in row.colnames and (given := _text(row[NAME])):
         name = given
-    if not name or name != os.path.basename(name) or name.startswith("."):
+    if not _is_file_name(name):
         fault = fault or f"its name {name!r} cannot be that of a file; give another in column name"
         name = f"row{row.index + 1}"
+    if "\0" in "".join([*words, *inputs]):
+        fault = fault or "one of its values has a NUL character, which no command line can have"
+        words, inputs = [], []
     return Target(name, tuple(words), tuple(inputs), fault)
+
+
+def _is_file_name(name: str) -> bool:
+    """Return whether outputs may be called so: it is visible, in no other folder, and not long."""
+    is_plain = name == os.path.basename(name) and not name.startswith(".") and "\0" not in name
+    return bool(name) and is_plain and len(os.fsencode(name)) <= MAX_NAME
 
 
 def _values(cell: Any, option: Option) -> bool | list[str] | None:

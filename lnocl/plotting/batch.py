@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lnocl.io.saved_results import read_result
-from lnocl.plotting.figure import COLOUR_MAP, new_figure
+from lnocl.plotting.figure import COLOUR_MAP, as_text, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,5 +57,5 @@ def draw_batch(results: Mapping[str, str]) -> Figure:
         each.imshow(shown, origin="lower", cmap=COLOUR_MAP, norm=norm, extent=extent)
         for x, y in saved.sky_stars:
             each.plot(x, y, "+", color="white", markersize=4)
-        each.set_title(name, fontsize=6, pad=2)
+        each.set_title(as_text(name), fontsize=6, pad=2)
     return figure

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import MARKERS, Array, line_style, new_figure, plain_ticks
+from lnocl.plotting.figure import MARKERS, Array, as_text, line_style, new_figure, plain_ticks
 
 
 def draw_errors(curves: Mapping[str, Mapping[str, Array]]) -> Figure:
@@ -44,7 +44,7 @@ def draw_errors(curves: Mapping[str, Mapping[str, Array]]) -> Figure:
     ):
         for i, (name, curve) in enumerate(curves.items()):
             x, y = curve["iteration"], 100 * curve[column]
-            axis.plot(x, y, **line_style(i), label=name)
+            axis.plot(x, y, **line_style(i), label=as_text(name))
             axis.plot(x[y.argmin()], y.min(), "o", ms=6, color=line_style(i)["color"])
         axis.set(xscale="log", yscale="log", xlabel="iteration", ylabel="error (%)")
         axis.set_title(title, fontsize=10)
@@ -79,7 +79,7 @@ def draw_magnitudes(curves: Mapping[str, Mapping[str, Array]], true: float | Non
     if true is not None:
         axis.axhline(true, color="black", lw=1, label="truth")
     for i, (name, curve) in enumerate(curves.items()):
-        axis.plot(curve["iteration"], curve["magnitude"], **line_style(i), label=name)
+        axis.plot(curve["iteration"], curve["magnitude"], **line_style(i), label=as_text(name))
     axis.set(xscale="log", xlabel="iteration", ylabel="star (mag)")
     axis.ticklabel_format(axis="y", useOffset=False)
     axis.invert_yaxis()
@@ -126,7 +126,7 @@ def draw_costs(settings: Mapping[str, Mapping[str, NDArray]], measure: str) -> F
             columns["deviation"][shown],
             MARKERS[i % len(MARKERS)],
             color=line_style(i)["color"],
-            label=name,
+            label=as_text(name),
         )
     for time in seconds[deviation == 0]:
         axis.axvline(time, color="black", lw=1, ls=":", label="reference (deviation 0)")

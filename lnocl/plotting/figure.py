@@ -87,6 +87,11 @@ def line_style(i: int) -> dict[str, Any]:
     return {"color": COLOURS[i % len(COLOURS)], "linestyle": STYLES[i % len(STYLES)]}
 
 
+def as_text(words: str) -> str:
+    """Return words of a user or of a file, of which matplotlib draws each $ as one: no formula."""
+    return words.replace("$", r"\$")
+
+
 def plain_ticks(axis: Any) -> None:
     """Label a short logarithmic axis with plain numbers."""
     from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOURS, Array, line_style, new_figure
+from lnocl.plotting.figure import COLOURS, Array, as_text, line_style, new_figure
 from lnocl.plotting.sources import Frame, Source, whole_pixel
 
 # Share of the brightest true row below which relative errors are not shown.
@@ -48,7 +48,7 @@ def draw_bands(name: str, flux: Mapping[str, Any], width: Mapping[str, Any], uni
     """
     figure = new_figure(8.0, 6.0)
     axes = figure.subplots(2, 1, sharex=True)
-    labels = f"light of a slice ({unit})", "width (pixels)"
+    labels = f"light of a slice ({as_text(unit)})", "width (pixels)"
     for axis, rows, label in zip(axes, (flux, width), labels, strict=True):
         at = np.asarray(rows["at"])
         for level, share in ((95, 0.15), (68, 0.3)):
@@ -64,7 +64,7 @@ def draw_bands(name: str, flux: Mapping[str, Any], width: Mapping[str, Any], uni
         low, high = min(0.0, float(shown.min())), float(shown.max())
         axis.set_ylim(low, high + 0.2 * (high - low) or 1.0)
         axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=9, ncols=4, title=name)
+    axes[0].legend(fontsize=9, ncols=4, title=as_text(name))
     axes[1].set_xlabel("position along the axis (pixels)")
     return figure
 
@@ -168,8 +168,8 @@ def draw_rows(
     for i, source in enumerate(found):
         values = measure(source)
         percent = 100 * metrics.relative_error(values, reference)[rows]
-        profile.plot(y, values[rows] * scale, **line_style(i), label=source.name)
-        error.plot(y, percent, **line_style(i), marker=".", ms=4, label=source.name)
+        profile.plot(y, values[rows] * scale, **line_style(i), label=as_text(source.name))
+        error.plot(y, percent, **line_style(i), marker=".", ms=4, label=as_text(source.name))
         largest = max([largest, *np.abs(percent[np.isfinite(percent)])])
     error.set_ylim(*(np.array([-1.1, 1.1]) * min(largest, MAX_PERCENT)))
     error.axhline(0, color="black", lw=1)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOUR_MAP, Array, line_style, new_figure
+from lnocl.plotting.figure import COLOUR_MAP, Array, as_text, line_style, new_figure
 
 # Stars that are shown enlarged, the brightest; more are not numbered from as many on.
 MAX_ZOOMS, MAX_NUMBERS = 6, 40
@@ -132,8 +132,8 @@ def draw_result(view: ResultView) -> Figure:
     -------
     matplotlib.figure.Figure
         A row for the whole frame and one for each of the six brightest stars: image, model,
-        residuals and extended source. Of several images a row shows that whose residuals there are
-        largest. Below them the errors that held-out counts estimate, or else the objective.
+        residuals and extended source. With several images, each row shows that whose residuals are
+        largest there. Below them the errors that held-out counts estimate, or else the objective.
 
     Raises
     ------
@@ -239,7 +239,7 @@ def _draw_extended(axis: Axes, view: ResultView, region: Region, title: str) -> 
         outline(axis, view.doubtful, there, view.oversample)
         title += f"\n{OUTLINED}"
     axis.set_title(title, fontsize=10)
-    _add_bar(axis, shown, view.unit)
+    _add_bar(axis, shown, as_text(view.unit))
     _mark_stars(axis, view)
 
 

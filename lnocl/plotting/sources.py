@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOUR_MAP, Array, new_figure
+from lnocl.plotting.figure import COLOUR_MAP, Array, as_text, new_figure
 
 # Pixels shown around the star: to the left and right, before and beyond it along the jet.
 ACROSS, BEFORE, BEYOND = 24, 16, 32
@@ -152,7 +152,8 @@ def draw_panels(
             interpolation="nearest",
             extent=(x[0] - step, x[-1] + step, y[0] - step, y[-1] + step),
         )
-        axis.set_title("\n".join(filter(None, (source.name, source.note))), fontsize=11)
+        title = "\n".join(filter(None, (source.name, source.note)))
+        axis.set_title(as_text(title), fontsize=11)
         if source.doubtful is not None and source.doubtful.any():
             axis.contour(x, y, source.doubtful, [0.5], colors="red", linewidths=0.8)
         if last is None or last.is_last_row():

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lnocl.plotting.figure import MARKERS, Array, line_style, new_figure
+from lnocl.plotting.figure import MARKERS, Array, as_text, line_style, new_figure
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -59,7 +59,7 @@ def draw_study(table: Table, axes: Sequence[str]) -> Figure:
                 _draw_line(panel, table[is_of_it], name, (column, factor), i, words)
             _scale(panel.xaxis, np.array(table[name], float), 10.0)
             _scale(panel.yaxis, abs(np.array(table[column], float)), 1.0)
-            panel.set(xlabel=name.replace("_", " "), ylabel=label)
+            panel.set(xlabel=as_text(name.replace("_", " ")), ylabel=label)
             panel.grid(alpha=0.3)
         if others:
             small = len(settings) > MANY
@@ -90,4 +90,6 @@ def _draw_line(
     below = middle - [each.min() for each in errors]
     above = [each.max() for each in errors] - middle
     style = line_style(i) | {"marker": MARKERS[i % len(MARKERS)], "markersize": 4, "capsize": 2}
-    panel.errorbar(places, middle, yerr=(below, above), label=words, linewidth=1.2, **style)
+    panel.errorbar(
+        places, middle, yerr=(below, above), label=as_text(words), linewidth=1.2, **style
+    )

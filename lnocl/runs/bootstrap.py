@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -21,6 +21,7 @@ from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
+from lnocl.scene.shifting import Stamp
 from lnocl.scene.texture import CORE, resolution
 
 if TYPE_CHECKING:
@@ -71,8 +72,9 @@ class Bootstrap:
 
     A replica is a sky that the reconstruction may stand for (`lnocl.scene.texture`), observed and
     reconstructed alike. Its errors are the values found less the values drawn. Their mean is the
-    bias b, their standard deviation the standard error s. The interval of a level round the value v
-    is
+    bias b, their standard deviation the standard error s. Where the stated errors of stars are
+    larger than replicas tell, s has the rest too, with the share of each star that a region holds.
+    The interval of a level round the value v is
 
     .. math:: v - b \pm t \, s \sqrt{1 + 1 / n}
 
@@ -97,6 +99,10 @@ class Bootstrap:
         Of the replicas.
     unit : str
         Of light: ``electron``, or ``electron/s`` where exposures were given.
+    stated : ndarray of float64, shape (n_stars,)
+        Standard errors of the star fluxes, `lnocl.Result.star_flux_errors`.
+    shares : ndarray of float64, shape (k, n_stars)
+        The share of each star's light that each quantity holds, 1 for its own flux.
 
     See Also
     --------
@@ -131,6 +137,8 @@ class Bootstrap:
     resolution: float
     seed: int
     unit: str = "electron"
+    stated: Array = field(default_factory=lambda: np.zeros(0))
+    shares: Array = field(default_factory=lambda: np.zeros((1, 0)))
 
     @property
     def n(self) -> int:
@@ -149,8 +157,10 @@ class Bootstrap:
 
     @property
     def standard_errors(self) -> Array:
-        """The standard deviations of the errors, shape (k,), electrons or pixels."""
-        return self.errors.std(axis=0, ddof=1)
+        """The standard errors, shape (k,), electrons or pixels."""
+        variances = self.errors.var(axis=0, ddof=1)
+        hidden = np.maximum(self.stated**2 - variances[: len(self.stated)], 0.0)
+        return np.asarray(np.sqrt(variances + self.shares**2 @ hidden))
 
     def units(self, electrons: float) -> Array:
         """Return electrons in the unit of each quantity, 1 for positions, shape (k,)."""
@@ -311,11 +321,13 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     """Return what will be measured of a reconstruction, before its first replica."""
     width = resolution(outcome.scene)
     quantities = _quantities(outcome, parts, width)
+    stated = np.nan_to_num(outcome.star_errors()[0])
     pixels = np.zeros((2, *outcome.scene.observation.sky_shape))
     none = np.zeros((0, len(quantities)))
     is_rate = (outcome.scene.observation.exposure != 1.0).any()
     unit = "electron/s" if is_rate else "electron"
-    return Bootstrap(quantities, none, none, pixels, width, seed, unit)
+    shares = _shares(outcome, parts, len(quantities))
+    return Bootstrap(quantities, none, none, pixels, width, seed, unit, stated, shares)
 
 
 def check_number(n: object, seed: object) -> None:
@@ -378,7 +390,7 @@ def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
 def _measure(sky: Sky, parts: Sequence[Part], moves: bool) -> Array:
     positions = sky.star_positions.ravel() if moves else np.zeros(0)
     return np.concatenate(
-        [sky.star_fluxes, positions, *(part.measure(sky.extended) for part in parts)]
+        [sky.star_fluxes, positions, *(part.measure(sky.extended, sky.light) for part in parts)]
     )
 
 
@@ -395,12 +407,41 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
     observed = _observed(scene)[:ny, :nx] if parts else np.ones((0, 0), bool)
     stars = on_sky(scene.stars, scene.oversample)
     notes += [note for part in parts for note in _notes(part, stars, width, observed)]
-    sky = Sky(outcome.sky[:ny, :nx], outcome.star_fluxes, scene.stars)
+    light = outcome.light().sky() if parts else outcome.sky
+    sky = Sky(outcome.sky[:ny, :nx], light, outcome.star_fluxes, scene.stars)
     values = _measure(sky, parts, moves).tolist()
     return tuple(
         Quantity(label.name, label.kind, value, note, label.at)
         for label, value, note in zip(labels, values, notes, strict=True)
     )
+
+
+def _shares(outcome: Outcome, parts: Sequence[Part], n_quantities: int) -> Array:
+    """Return the share of each star's light in each quantity, in the order of `_measure`."""
+    scene = outcome.scene
+    shares = np.zeros((n_quantities, scene.n_stars))
+    for s in range(scene.n_stars):
+        shares[s, s] = 1.0
+        stamps = [scene.psf_on_sky(j, s) for j in range(scene.n_images)]
+        k = scene.n_stars if outcome.given_stars is None else 3 * scene.n_stars
+        for part in parts:
+            slices = part.slices if isinstance(part, Profile) else [part]
+            shares[k : k + len(slices), s] = [
+                _light_within(each, stamps, scene.grid) for each in slices
+            ]
+            k += len(part.labels())  # widths hold no light
+    return shares
+
+
+def _light_within(aperture: Aperture, stamps: Sequence[Stamp], grid: tuple[int, int]) -> float:
+    """Return the mean light of stamps on the periodic grid within an aperture."""
+    light = np.zeros(aperture.weights.shape)
+    height, width = aperture.weights.shape
+    rows = range(aperture.y, aperture.y + height)
+    columns = range(aperture.x, aperture.x + width)
+    for stamp in stamps:
+        stamp.add_to(light, rows, columns, grid, 1.0 / len(stamps))
+    return float((aperture.weights * light).sum())
 
 
 def _observed(scene: Scene) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from lnocl.errors import DivergedError
@@ -197,16 +198,30 @@ def find_window(setup: Setup, observation: Observation) -> tuple[Observation, Ar
     size = np.minimum(observation.shape[::-1], WINDOW)
     last = np.array(observation.shape[::-1]) - size
     middle = (setup.stars.min(axis=0) + setup.stars.max(axis=0)) / 2.0
-    firsts = [np.clip(np.round(at) - size // 2, 0, last) for at in (middle, *setup.stars)]
-    low = np.array(firsts)[:, None] - 0.5
-    held = np.all((setup.stars >= low) & (setup.stars < low + size), axis=2)
-    best = int(np.argmax(held.sum(axis=1)))
+    firsts = np.clip(np.round(np.vstack([middle, setup.stars])) - size // 2, 0, last).astype(int)
+    best = int(np.argmax(_count_in_windows(setup.stars, firsts, size, observation.shape)))
+    low = firsts[best] - 0.5
+    held = np.all((setup.stars >= low) & (setup.stars < low + size), axis=1)
     x, y = (slice(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
     cut = copy(observation)
     for name in ("images", "mask", "background", "exposure"):
         values = getattr(observation, name)
         setattr(cut, name, values[:, y, x] if values.ndim == 3 else values)
-    return cut, setup.stars[held[best]] - firsts[best], held[best]
+    return cut, setup.stars[held] - firsts[best], held
+
+
+def _count_in_windows(
+    stars: Array, firsts: NDArray[np.int_], size: NDArray[np.int_], shape: tuple[int, int]
+) -> NDArray[np.int_]:
+    """Return how many stars lie in each window of this size, from sums over all pixels before."""
+    x, y = np.floor(stars + 0.5).astype(int).T
+    inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
+    before = np.zeros((shape[0] + 1, shape[1] + 1), int)
+    np.add.at(before, (y[inside] + 1, x[inside] + 1), 1)
+    before = before.cumsum(axis=0).cumsum(axis=1)
+    (left, top), (right, bottom) = firsts.T, (firsts + size).T
+    counts = before[bottom, right] - before[top, right] - before[bottom, left] + before[top, left]
+    return np.asarray(counts)
 
 
 def with_psfs(observation: Observation, psfs: Array) -> Observation:

@@ -127,8 +127,8 @@ class HeldOutCounts:
         if LENGTH_RATIO * first.n_iter > self._n_iter:
             warn(
                 f"held-out counts have chosen iteration {first.n_iter} of {self._n_iter}, too near "
-                "the end to be sure: see to what is said of PSF and noise, which they do not see; "
-                f"where all is well give n_iter {LENGTH_RATIO * first.n_iter} or more"
+                "the end to be sure: first mend PSF and noise where warnings name them, as these "
+                f"counts do not see such faults; then give n_iter {LENGTH_RATIO * first.n_iter}"
             )
         penalty = self._penalties[best.trial]
         if len(self._penalties) > 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,9 @@ from lnocl.runs.start import Start
 from lnocl.scene.observation import Array
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from lnocl.solvers.light import Light
 
 CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("error", np.float64)])
 
@@ -160,6 +164,12 @@ class Outcome:
 
         sky, star_fluxes = marginal(self.scene, self.sky, self.star_fluxes)
         return replace(self, sky=sky, star_fluxes=star_fluxes, is_marginal=True)
+
+    def light(self) -> Light:
+        """Return the light of the extended source without bias."""
+        from lnocl.solvers.light import Light  # which loads scipy
+
+        return Light(self.scene, self.sky, self.star_fluxes)
 
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of star fluxes and positions, the extended source not known.

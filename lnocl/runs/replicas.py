@@ -17,6 +17,7 @@ from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.texture import Texture, resolution
+from lnocl.solvers.light import Light
 from lnocl.solvers.marginal import marginal
 
 
@@ -27,6 +28,8 @@ class Sky(NamedTuple):
     ----------
     extended : ndarray of float64, shape (ny, nx)
         Extended source, electrons per pixel.
+    light : ndarray of float64, shape (ny, nx)
+        Its light without bias (`lnocl.solvers.light`), where it was found.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons.
     star_positions : ndarray of float64, shape (n, 2)
@@ -34,6 +37,7 @@ class Sky(NamedTuple):
     """
 
     extended: Array
+    light: Array
     star_fluxes: Array
     star_positions: Array
 
@@ -97,7 +101,8 @@ class Replicas:
         )
         sky = self._texture.draw(np.random.default_rng(of_sky))
         ny, nx = scene.observation.sky_shape
-        drawn = Sky(sky[:ny, :nx] * scene.unit, self._outcome.star_fluxes, scene.stars)
+        extended = sky[:ny, :nx] * scene.unit
+        drawn = Sky(extended, extended, self._outcome.star_fluxes, scene.stars)
         models = list(self._means(self._model, sky))
         counts = self._draw(models, of_images)
         found = self._find(counts)
@@ -116,11 +121,12 @@ class Replicas:
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in run:
                 pass
-        if not self._outcome.is_marginal:
-            return Sky(run.extended(), run.star_fluxes(), run.star_positions())
-        unit, (ny, nx) = run.scene.unit, observation.sky_shape
-        sky, star_fluxes = marginal(run.scene, run.engine.extended() * unit, run.star_fluxes())
-        return Sky(sky[:ny, :nx], star_fluxes, run.star_positions())
+        scene, (ny, nx) = run.scene, observation.sky_shape
+        sky, star_fluxes = run.engine.extended() * scene.unit, run.star_fluxes()
+        if self._outcome.is_marginal:
+            sky, star_fluxes = marginal(scene, sky, star_fluxes)
+        light = Light(scene, sky, star_fluxes).sky()
+        return Sky(sky[:ny, :nx], light, star_fluxes, run.star_positions())
 
     def _draw_psfs(self, seed: np.random.SeedSequence) -> Array:
         psfs = self._outcome.scene.observation.psfs

@@ -175,9 +175,12 @@ class Run:
         if self.engine.scaling is not None:
             state["cross_windows"] = windows = self._take_windows(saved, own["cross_windows"])
             shapes["cross_values"] = (int(windows[:, 2:].prod(axis=1).sum()),)
+            n_stars = self.scene.n_stars
+            shapes["star_information"] = n_stars, range(1, max(n_stars, 1) + 1)
         bounds: dict[str, tuple[ArrayLike, ArrayLike]] = {
             "steps": ALPHA_BOUNDS,
             "positions": self._bounds_of_stars(),
+            "star_order": (0, max(self.scene.n_stars - 1, 0)),
             **dict.fromkeys(("extended", "previous", "shift", "star_fluxes"), (0.0, LARGEST)),
         }
         for name in [name for name in own if name not in state]:

@@ -23,6 +23,10 @@ Array = NDArray[np.float64]
 MAX_CHANNELS = 4
 MIN_SIDE = 8
 
+# Most electrons in a pixel: sums of squares of a sky of so many remain far from the largest number,
+# and float32, in which results are written, holds their sum.
+MAX_COUNTS = 1e30
+
 # Pixels of the sky to one of an image, along each axis. The frequencies that an image cannot tell
 # apart are neighbours in the transform's order where this is a power of two (kernels/convolve.cl).
 OVERSAMPLES = 1, 2, 4
@@ -135,7 +139,7 @@ class Observation:
         - An array has the wrong shape, type or unit, is empty, or holds values out of range.
         - An array other than `images` holds masked values.
         - A PSF or its sum is not finite, its sum is not positive, or its core is off its centre.
-        - Images or background become infinite by exposure or read noise.
+        - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
 
     Warns
@@ -393,10 +397,11 @@ class Observation:
 
     def _refuse_overflow(self) -> None:
         for name, values in (("images", self.images), ("background", self.background)):
-            if not np.isfinite(values).all():
+            if not (values <= MAX_COUNTS).all():
                 raise InputError(
-                    f"the {name}, with exposure and the square of read_noise, must be finite: "
-                    "divide the counts and read_noise by a constant"
+                    f"the {name}, with exposure and the square of read_noise, must be at most "
+                    f"{MAX_COUNTS:g} electrons per pixel: divide the counts and read_noise by a "
+                    "constant"
                 )
 
     def _one_or_map(self, name: str, given: ArrayLike, masked: float) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, warn
+from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
 from lnocl.scene.grid import grid_of
 from lnocl.scene.observation import Array, Observation, numbers
@@ -39,6 +40,9 @@ MIN_MODEL = 2.0**-64
 
 NO_PENALTY = Penalty()
 
+# A start may be so many times as bright as the images, beside so many times the noise of their sum,
+# as the floor of an estimate is.
+BRIGHTER, FLOOR = 3.0, 30.0
 # delta of the edge-preserving term, in means of a flat extended source: docs/validation/sgp.md.
 EDGE = 3.0
 
@@ -100,8 +104,8 @@ class Scene:
     ------
     InputError
         A star outside the images, or masked in all of them; penalty or pad out of range; images too
-        large for the transform; images or exposures too large to be summed; a sky, images over
-        exposures, that is no finite number, or 0.
+        large for the transform; exposures too large to be summed; a sky, images over exposures,
+        that is no finite number, or 0.
 
     Warns
     -----
@@ -131,11 +135,11 @@ class Scene:
         # A power of two just above the mean; 1 where that is 0.
         n_good = int(np.count_nonzero(~observation.mask))
         # Bad pixels hold 0.
-        self.scale = 2.0 ** math.frexp(_mean("images", observation.images, n_good))[1]
+        self.scale = 2.0 ** math.frexp(float(observation.images.sum() / n_good))[1]
         exposure = observation.exposure
         has_map = exposure.ndim == 3
         seen = exposure[~observation.mask] if has_map else exposure
-        self._mean_exposure = _mean("exposures", seen, seen.size)
+        self._mean_exposure = _mean_exposure(seen)
         self.unit = self._sky_unit(self._mean_exposure)
         relative = exposure / self._mean_exposure
         self.gains = np.ones(self.n_images) if has_map else relative
@@ -349,7 +353,8 @@ class Scene:
         ----------
         extended : array_like, of shape `lnocl.Observation.sky_shape`, optional
             Extended source, electrons per pixel, finite and not negative. Beyond the images the
-            grid is filled with its mean. By default flat, with the flux that the stars leave.
+            grid is filled with its mean. By default flat, with the flux that the stars leave. One
+            that is far brighter than the images is made as bright as that.
         star_fluxes : array_like, shape (n,), optional
             Electrons, finite and not negative. By default a least-squares fit of the star
             images and one constant to the images.
@@ -369,8 +374,34 @@ class Scene:
             self._refuse_if_too_bright(level * math.prod(self.grid) + float(fluxes.sum()))
             return np.full(self.grid, level), fluxes
         given = _check_start("initial_extended", extended, self.observation.sky_shape) / self.unit
+        given = self._in_their_unit(given)
         self._refuse_if_too_bright(float(given.sum() + fluxes.sum()))
         return _lay(given, self.grid, fill=given.mean()), fluxes
+
+    def _in_their_unit(self, extended: Array) -> Array:
+        """Return an extended source to begin with, as bright as images if far brighter.
+
+        Iterations do not find back from one that is: pixels fall to 0, and stay there.
+        """
+        counts = excess = exposures = 0.0
+        for j, (image, background) in enumerate(zip(self.images(), self.background(), strict=True)):
+            weights = np.ones(self.image_grid) if self.weights is None else self.weights[j]
+            counts += float((weights * image).sum())
+            excess += float((weights * (image - background)).sum())
+            exposures += float(self.gains[j] * weights.sum())
+        noise = math.sqrt(counts / self.scale)
+        most = (BRIGHTER * max(excess, 0.0) + FLOOR * noise) / exposures / self.oversample**2
+        with np.errstate(over="ignore"):
+            mean = float(extended.mean())
+        if mean <= most:
+            return extended
+        level = self._rough_fit[1]
+        warn(
+            f"initial_extended has {mean / level:.2g} times the light of the images, as in another "
+            "unit, and was divided by that; it is in electrons per pixel, per second with exposures"
+        )
+        shape = extended / extended.max()
+        return np.asarray(shape * (level / shape.mean()))
 
     def _refuse_if_too_bright(self, light: float) -> None:
         """Refuse a start whose counts, in electrons, no number holds."""
@@ -390,8 +421,8 @@ class Scene:
     def _rough_fit(self) -> tuple[Array, float]:
         """Star fluxes and the level of a flat extended source, by linear least squares."""
         total, n_observed = 0.0, 0
-        normal = np.zeros((self.n_stars, self.n_stars))
-        moment = np.zeros(self.n_stars)
+        normal: BandMatrix | None = None
+        moment, levels = np.zeros(self.n_stars), []
         background = self.background()
         for j, excess in enumerate(self.images()):
             excess -= background[j]
@@ -404,15 +435,15 @@ class Scene:
             lit = self._field.lit(j)
             stars, weights = self._field.images(j, lit), observed[lit].astype(np.float64)
             sums = stars.products(weights)[0]
-            normal += stars.information(weights) - np.outer(sums, sums / n_there)
+            information = stars.information(weights)
+            normal = information if normal is None else normal + information
+            levels.append(sums / np.sqrt(n_there))
             moment += stars.products(weights * (excess[lit] - light / n_there))[0]
         mean = total / n_observed
         # A star or a sky that starts at zero stays there, so each keeps a small share.
         least = max(1e-3 * mean, float(np.finfo(np.float32).eps))
-        fluxes = np.maximum(
-            np.linalg.lstsq(normal, moment, rcond=None)[0],
-            least * math.prod(self.image_grid) / 100,
-        )
+        best = moment if normal is None else _solve_beside(normal, np.array(levels).T, moment)
+        fluxes = np.maximum(best, least * math.prod(self.image_grid) / 100)
         level = mean - float(fluxes @ self.star_weights) / n_observed
         return fluxes, max(level, least) / self.oversample**2
 
@@ -506,6 +537,14 @@ class Scene:
             )
 
 
+def _solve_beside(normal: BandMatrix, levels: Array, moment: Array) -> Array:
+    """Return ``(F - U U^T)^-1 m``: the stars beside the level of each image (Woodbury)."""
+    with_levels = normal.solve(levels)
+    left = np.eye(levels.shape[1]) - levels.T @ with_levels
+    alone = normal.solve(moment)
+    return alone + with_levels @ (np.linalg.pinv(left, hermitian=True) @ (levels.T @ alone))
+
+
 def _lay(array: NDArray, grid: tuple[int, int], fill: float = 0.0) -> NDArray:
     """Return an array at the origin of a grid."""
     ny, nx = array.shape[-2:]
@@ -518,11 +557,11 @@ def _lay(array: NDArray, grid: tuple[int, int], fill: float = 0.0) -> NDArray:
     return laid
 
 
-def _mean(name: str, values: Array, n: int) -> float:
+def _mean_exposure(exposures: Array) -> float:
     with np.errstate(over="ignore"):
-        mean = float(values.sum() / n)
-    if not math.isfinite(2.0 * mean):  # the power of two above it
-        raise InputError(f"the {name} are too large to be summed: divide them by a constant")
+        mean = float(exposures.mean())
+    if not math.isfinite(mean):
+        raise InputError("the exposures are too large to be summed: divide them by a constant")
     return mean
 
 

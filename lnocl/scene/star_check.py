@@ -55,14 +55,15 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
     observation = scene.observation
     if not scene.n_stars:
         return
+    from scipy.spatial import KDTree  # which the start of a command need not load
+
     for j, psf in enumerate(seen_psfs(observation)):
         reach = int(np.clip(np.ceil(REACH * fwhm(psf)), LEAST_REACH, MOST_REACH))
         light = observation.images[j] - observation.background[j]
         positions = scene.stars + observation.offsets[j]
-        for s, position in enumerate(positions):
-            others = np.delete(positions, s, axis=0)
-            if len(others) and np.abs(others - position).max(axis=1).min() < 2 * reach:
-                continue
+        nearest = KDTree(positions).query(positions, k=[2], p=np.inf)[0]  # infinite if alone
+        for s in np.flatnonzero(nearest >= 2 * reach).tolist():
+            position = positions[s]
             x, y = np.round(position).astype(int)
             rows, columns = (slice(at - reach, at + reach + 1) for at in (y, x))
             star = light[max(rows.start, 0) : rows.stop, max(columns.start, 0) : columns.stop]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -46,8 +47,9 @@ def test_each_target_is_what_its_command_gives(capsys):
     assert batch() == 0
     said = capsys.readouterr()
     assert said.err == ""
-    assert said.out == "2 targets: 2 done\nwritten to {}\n".format(
-        os.path.abspath("out/summary.ecsv")
+    assert said.out == (
+        "2 targets: 2 done\nin 2 of the 2 that are done the model has faults, which the column "
+        f"verdict says\nwritten to {os.path.abspath('out/summary.ecsv')}\n"
     )
     assert sorted(os.listdir("out")) == [
         "one.fits", "one.json", "one.log", "summary.ecsv", "two.fits", "two.json", "two.log",
@@ -64,6 +66,37 @@ def test_each_target_is_what_its_command_gives(capsys):
     log = Path("out/one.log").read_text()
     assert log.startswith(f"$ cd {os.getcwd()}; {found['one']['command']}\n")
     assert "3 iterations on numpy" in log
+
+
+def test_the_summary_says_what_was_found_and_whether_it_fits(capsys):
+    flat = np.random.default_rng(0).poisson(50.0, (32, 32)).astype(float)
+    fits.writeto("flat.fits", flat, fits.Header({"BUNIT": "electron"}))
+    write_targets("lost,gone.fits,k1.fits,,1", GOOD[0], "flat,flat.fits,k1.fits,,9")
+    assert batch("--quiet") == 1
+    found = summary()
+    alone = ["a.fits", "--psf", "k1.fits", "--star", "7,5", "--star", "3.5,2", "--n-iter", "3"]
+    command = ["deconvolve", *alone, "--engine", "numpy", *PAPER, *GIVEN, "-o", "alone.fits"]
+    assert cli.main(command) == 0
+    one, said = found["one"], capsys.readouterr().out
+    star = "star at (7, 5): {star_flux:.6g} +- {star_flux_error:.2g} {unit}s; ".format(**one)
+    light = "extended source: {extended_flux:.6g} +- {extended_flux_error:.2g} {unit}s\n"
+    assert star in said
+    assert light.format(**one) in said
+    assert f"residuals {one['residual_rms']:.2f} +- " in said
+    assert one["verdict"].startswith("the model does not fit at ")
+    assert f"\n{one['verdict'].partition('; ')[0]}" in said
+    assert found["flat"]["verdict"] == "the model fits"
+    assert np.isnan(found["flat"]["star_flux"])
+    assert np.isnan(found["lost"]["residual_rms"])
+    assert batch() == 1  # those that are done are not done again
+    assert "in 1 of the 2 that are done the model has faults" in capsys.readouterr().out
+    assert summary()["one"] == one
+
+
+def test_a_table_of_excel_begins_with_a_mark_of_its_encoding():
+    write_targets(*GOOD)
+    Path("targets.csv").write_text(Path("targets.csv").read_text(), encoding="utf-8-sig")
+    assert [target.name for target in read_targets("targets.csv")] == ["one", "two"]
 
 
 def test_a_bad_target_is_a_row_and_stops_no_other(capsys):
@@ -84,6 +117,31 @@ def test_a_bad_target_is_a_row_and_stops_no_other(capsys):
     assert "argument --n-iter: invalid int value: 'two'" in found["bad"]["message"]
     assert found["flagged"]["message"] == "--models is true or false; 'maybe' was given"
     assert "lnocl: error: gone.fits cannot be opened" in Path("out/lost.log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("n" * 300 + ",a.fits,k1.fits,,2", "its name 'nnn.*' cannot be that of a file; give anoth"),
+        ("\u00e9" * 126 + ",a.fits,k1.fits,,2", "its name .* cannot be that of a file; give anoth"),
+        ("," + "i" * 300 + ".fits,k1.fits,,2", "its name 'iii.*' cannot be that of a file; give a"),
+        ("a\0b,a.fits,k1.fits,,2", "its name 'a.x00b' cannot be that of a file; give another in"),
+        ("nul,a\0.fits,k1.fits,,2", "one of its values has a NUL character, which no command"),
+    ],
+)
+def test_names_that_no_file_has_stop_no_other_target(row, message):
+    write_targets(row, GOOD[0])
+    assert batch("--quiet") == 1
+    failed, done = summary().values()
+    assert re.match(message, failed["message"])
+    assert done["status"] == "done"
+
+
+def test_the_longest_name_of_a_file():
+    name = "n" * 250
+    write_targets(f"{name},a.fits,k1.fits,,2")
+    assert batch("--quiet") == 0
+    assert os.path.exists(f"out/{name}.fits")
 
 
 def test_what_is_done_is_not_done_again(capsys):
@@ -195,7 +253,8 @@ def test_the_picture_shows_what_is_done(capsys):
     pytest.importorskip("matplotlib")
     from matplotlib.image import imread
 
-    write_targets(*GOOD, "lost,gone.fits,k1.fits,,2")
+    name = r"$\two{$"  # which is no formula
+    write_targets(GOOD[0], GOOD[1].replace("two", name), "lost,gone.fits,k1.fits,,2")
     assert batch("--plot", "page.png") == 1
     assert "drew page.png" in capsys.readouterr().out
     assert imread("page.png").std() > 0.1

@@ -80,6 +80,7 @@ class TestDeconvolve:
         parts = expected.fit(), *at_stars[0][:2], *at_stars[1][:2]
         shown = [f"{part.rms:.2f} +- {part.error:.2f}" for part in parts]
         overall, core_1, wings_1, core_2, wings_2 = shown
+        darkest = np.quantile(expected.extended, 0.05)
         flux_1, flux_2 = (
             f"{flux:.6g} +- {error:.2g} electrons"
             for flux, error in zip(expected.star_fluxes, expected.star_flux_errors, strict=True)
@@ -91,12 +92,31 @@ class TestDeconvolve:
             "where noise gives 1",
             f"star at (2, 9): {flux_2}; residuals {core_2} in its core, {wings_2} in its wings, "
             "where noise gives 1",
-            f"extended source: {expected.extended.sum():.6g} electrons",
+            "extended source: {:.6g} +- {:.2g} electrons".format(*expected.extended_flux),
+            f"the extended source is hardly darker anywhere than {darkest:.3g} electrons a pixel: "
+            "the background is too low by that, or light fills the frame",
             f"residuals {overall} in all, where noise gives 1",
             "the model does not fit at 1 of 2 stars, (7, 5): give a better PSF, or try "
             "--refine-psfs jitter pixels",
             "written to out.fits",
         ]
+
+    @pytest.mark.parametrize("background", [25.0, 50.0])
+    def test_a_background_too_low_is_said(self, capsys, background):
+        image = np.random.default_rng(0).poisson(50.0, (32, 32)).astype(float)
+        fits.writeto("flat.fits", image)
+        arguments = ["--background", str(background), "--n-iter", "5", "--stop", "none"]
+        inputs = ("flat.fits", "--psf", "k1.fits")
+        assert cli.main(["deconvolve", *inputs, *NUMPY, *arguments, "-o", "out.fits"]) == 0
+        said = [
+            line for line in capsys.readouterr().out.splitlines() if "background is too" in line
+        ]
+        assert len(said) == (background < 50)
+        if said:
+            darkest = float(
+                re.search(r"darker anywhere than ([\d.]+) electrons a pixel", said[0])[1]
+            )
+            assert 15 < darkest < 25
 
     def test_what_was_tried_is_not_advised(self, capsys):
         inputs = ("a.fits", "b.fits", "--psf", "k1.fits", "--refine-psfs", "pixels")
@@ -181,7 +201,7 @@ class TestDeconvolve:
         Path(name).write_bytes(Path("a.fits").read_bytes())
         options = ("--psf", "k1.fits", "--n-iter", "1", *PAPER, *NUMPY, f"-oout-{name}")
         assert cli.main(["deconvolve", *options, "--", name]) == 0
-        assert capsys.readouterr().out.count("\n") == 4
+        assert capsys.readouterr().out.count("\n") == 7
         first = fits.getdata(f"out-{name}")
         script = "\n".join(fits.getheader(f"out-{name}")["HISTORY"])
         os.unlink(f"out-{name}")

@@ -44,7 +44,7 @@ def test_errors_are_added_to_the_file(words, capsys):
     words.remove("--quiet")
     assert cli.main([*words, "10"]) == 0
     said = capsys.readouterr().out
-    assert "errors by 10 replicas, less their bias; in brackets 95 %:\nstar 1 flux: " in said
+    assert "errors by 10 replicas, less their bias; in brackets 95 %:\nround: " in said
     assert "below the resolution: do not trust its error)" in said
     found = held()
     assert list(found)[-6:] == EXTENSIONS
@@ -60,8 +60,24 @@ def test_errors_are_added_to_the_file(words, capsys):
     header = found["ERROR"].header
     assert (header["NREPL"], header["SEED"], header["BUNIT"]) == (10, 0, "electron")
     assert found["ERROR"].data.shape == found["BIAS"].data.shape == (64, 64)
-    assert found["REGIONS"].data["pixels"][1] == pytest.approx(96)
+    regions = found["REGIONS"].data
+    assert regions["pixels"][1] == pytest.approx(96)
+    assert regions["unit"].tolist() == 3 * ["electron"]
+    np.testing.assert_allclose(regions["flux"], (table["value"] - table["bias"])[1:], rtol=1e-12)
+    for name in ("name", "error", "note"):
+        assert regions[name].tolist() == table[name][1:].tolist()
     assert lnocl.io.saved_results.read_result("out.fits").extended.shape == (64, 64)
+
+
+def test_regions_are_said_before_stars_and_all_of_them(words, capsys, monkeypatch):
+    monkeypatch.setattr("lnocl.commands.bootstrap.MAX_SAID", 2)
+    words.remove("--quiet")
+    assert cli.main([*words, "10"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("errors by 10 replicas"))
+    assert [line.partition(": ")[0] for line in lines[first + 1 :]] == [
+        *NAMES[1:], "and 1 more in the table ERRORS",
+    ]  # fmt: skip
 
 
 def test_profiles_are_drawn_with_their_errors(words, capsys):

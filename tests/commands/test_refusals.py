@@ -83,7 +83,7 @@ BAD_ARGUMENTS = {
     "read noise a word": (
         ["--read-noise", "some"],
         2,
-        "--read-noise 'some' is not a number, auto, or a file",
+        "--read-noise 'some' is not a number, auto, a keyword of the images'",
     ),
     "background a word": (
         ["--background", "Auto"],

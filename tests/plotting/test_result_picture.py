@@ -100,6 +100,10 @@ def test_any_unit_is_drawn(scale, tmp_path):
     )
 
 
+def test_a_unit_is_no_formula():
+    draw_result(dataclasses.replace(make_view(p=0), unit=r"$\bad{$")).draw_without_rendering()
+
+
 @pytest.mark.parametrize("value", [0.0, 5.0])
 def test_a_flat_image_and_an_empty_source_are_drawn(value, tmp_path):
     flat = np.full((1, 60, 70), value)

@@ -160,6 +160,7 @@ def test_one_iteration_through_a_single_pixel_averages_the_images(engine):
 
 
 @every_engine
+@pytest.mark.filterwarnings("ignore:initial_extended has .* times the light of the images")
 def test_dark_images_give_a_dark_sky(engine):
     made = MASKED.make()
     result = made.deconvolve(made.observation(images=0.0 * made.images), n_iter=1, **engine)

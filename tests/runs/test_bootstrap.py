@@ -17,6 +17,7 @@ from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_start
 from lnocl.scene.apertures import Aperture
 from lnocl.scene.penalty import Penalty
+from lnocl.scene.shifting import place
 
 BASE = Recipe((32, 32), 2, 1, smooth=True)
 RECIPES = {
@@ -120,6 +121,31 @@ def run_bootstrap(outcome, n, **changes):
     return bootstrap.bootstrap(outcome, n, APERTURES, 7, **changes)
 
 
+def test_stated_errors_of_stars_are_those_of_what_is_round_them():
+    flux, light = Quantity("star 1 flux", "flux", 100.0), Quantity("a", "flux", 50.0)
+    errors = np.tile([[-3.0, -4.0], [3.0, 4.0]], (5, 1))
+    alone = Bootstrap((flux, light), errors, errors[:0], np.zeros((2, 8, 8)), 2.0, 0)
+    of_star, of_light = alone.standard_errors
+    shares = np.array([[1.0], [0.5]])
+    stated = dataclasses.replace(alone, stated=np.array([10.0]), shares=shares)
+    rest = 10.0**2 - of_star**2
+    expected = [10.0, np.hypot(of_light, 0.5 * np.sqrt(rest))]
+    np.testing.assert_allclose(stated.standard_errors, expected)
+    less = dataclasses.replace(alone, stated=np.array([1.0]), shares=shares)
+    np.testing.assert_array_equal(less.standard_errors, alone.standard_errors)
+
+
+def test_shares_of_stars_are_their_light_in_each_region():
+    outcome = solved(refine_positions=True)._outcome
+    found = bootstrap.without_replicas(outcome, APERTURES, 7)
+    observation, (x, y) = outcome.scene.observation, outcome.scene.stars[0]
+    shape = observation.shape
+    light = np.mean([place(psf, shape, x, y).on_grid(shape) for psf in observation.psfs], axis=0)
+    within = [each.flux(light) for each in APERTURES]
+    np.testing.assert_allclose(found.shares[:, 0], [1, 0, 0, *within], atol=1e-12)
+    np.testing.assert_allclose(found.stated, outcome.star_errors()[0])
+
+
 def test_errors_are_found_less_drawn():
     outcome = solved(refine_positions=True)._outcome
     found = run_bootstrap(outcome, 10)
@@ -130,12 +156,12 @@ def test_errors_are_found_less_drawn():
     for k in (0, 9):
         drawn, seen, _ = replicas.reconstruct(k)
         flux = seen.star_fluxes[0] - outcome.star_fluxes[0]
-        light = (seen.extended - drawn.extended)[4:16, 6:18].sum()
+        light = (seen.light - drawn.extended)[4:16, 6:18].sum()
         assert found.errors[k, [0, 3]] == pytest.approx([flux, light], rel=1e-9)
         moved = seen.star_positions[0] - outcome.scene.stars[0]
         np.testing.assert_array_equal(found.errors[k, 1:3], moved)
     ny, nx = outcome.scene.observation.shape
-    np.testing.assert_allclose(found.values[3], outcome.sky[4:16, 6:18].sum())
+    np.testing.assert_allclose(found.values[3], outcome.light().sky()[4:16, 6:18].sum())
     assert found.error_map.shape == found.bias_map.shape == (ny, nx)
     errors = []
     for k in range(10):

@@ -144,7 +144,7 @@ class TestSpeckles:
     def test_replicas_have_it_too(self, right):
         circle = CirclePixelRegion(PixCoord(30, 30), 4.0)
         found = solve(self.TRUE, n_iter=30).bootstrap(10, regions=[circle])
-        of_psfs, errors = found.of_psfs.std(axis=0), found.standard_errors
+        of_psfs, errors = found.of_psfs.std(axis=0), found.errors.std(axis=0)
         assert of_psfs[-1] > 0.5 * errors[-1]
         assert of_psfs[-1] < errors[-1] * 1.1
         assert not len(right.bootstrap(10, regions=[circle]).of_psfs)

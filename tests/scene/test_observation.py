@@ -339,12 +339,12 @@ REFUSED = {
     "mask of another shape": ({"mask": np.zeros((4, 5), bool)}, "mask has shape (4, 5)"),
     "too few masks": ({"mask": np.zeros((2, 4, 4), bool)}, "mask has shape (2, 4, 4)"),
     "background beyond all numbers with read noise": (
-        {"background": 1.7e308, "read_noise": 1e154},
-        "the background, with exposure and the square of read_noise, must be finite: divide the",
+        {"background": 1e30, "read_noise": 9e14},
+        "the background, with exposure and the square of read_noise, must be at most 1e+30 ele",
     ),
     "images beyond all numbers with read noise": (
         {"images": np.where(IMAGES == 7, 1.7e308, 1.0), "read_noise": 1e154},
-        "the images, with exposure and the square of read_noise, must be finite: divide the counts",
+        "the images, with exposure and the square of read_noise, must be at most 1e+30 ele",
     ),
     "masked psfs": (
         {"psfs": masked(PSF, 1)},
@@ -574,9 +574,27 @@ def test_negative_psf_pixels_are_kept_and_counted():
     np.testing.assert_array_equal(observation.psfs[0], PSF / 8)
 
 
+@pytest.mark.parametrize(
+    "given",
+    [{"read_noise": 2e15}, {"images": [[2e30]]}, {"images": [[1e150]]}],
+)
+def test_counts_that_nothing_has_are_refused(given):
+    with pytest.raises(lnocl.InputError) as caught:
+        lnocl.Observation(**{"images": np.ones((4, 4)), "psfs": np.ones((1, 1))} | given)
+    assert str(caught.value) == (
+        "the images, with exposure and the square of read_noise, must be at most 1e+30 electrons "
+        "per pixel: divide the counts and read_noise by a constant"
+    )
+
+
 def test_read_noise_whose_square_overflows_is_refused():
     with pytest.raises(lnocl.InputError, match="the square of read_noise must be finite"):
         lnocl.Observation(np.ones((4, 4)), np.ones((1, 1)), read_noise=1e200)
+
+
+def test_a_background_that_nothing_has_is_refused():
+    with pytest.raises(lnocl.InputError, match=r"^the background, with exposure and the square"):
+        lnocl.Observation(np.ones((4, 4)), np.ones((1, 1)), background=1e31)
 
 
 @pytest.mark.parametrize("maps", [False, True])

@@ -484,3 +484,25 @@ def test_an_image_that_is_all_masked_says_nothing_of_stars():
         paper(observation, stars=[(3, 3)], n_iter=5, engine="numpy") for observation in (both, one)
     )
     assert np.allclose(found.star_fluxes, expected.star_fluxes, rtol=1e-10)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e7, 1e12, 1e200])
+@pytest.mark.parametrize("known", [{}, {"exposure": [0.5, 20.0]}, {"background": 7.0}])
+def test_a_start_in_another_unit_is_made_as_bright_as_the_images(factor, known):
+    shape = 1.0 + (np.indices((32, 32))[1] > 16)
+    observation = lnocl.Observation(np.full((2, 32, 32), 9.0), np.ones((3, 3)), **known)
+    flat = Scene(observation)
+    level = flat.start(None, None)[0].mean()
+    with pytest.warns(
+        lnocl.LnoclWarning, match="times the light of the images, as in another unit"
+    ):
+        extended, _ = Scene(observation).start(factor * shape, None)
+    np.testing.assert_allclose(extended, level * shape / shape.mean(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("factor", [1e-12, 1.0, 2.9])
+def test_a_start_that_is_no_brighter_than_the_images_stays(factor):
+    observation = lnocl.Observation(np.full((32, 32), 9.0), np.ones((3, 3)), background=4.0)
+    scene = Scene(observation)
+    extended, _ = scene.start(np.full((32, 32), 5.0 * factor), None)
+    np.testing.assert_allclose(extended * scene.unit, 5.0 * factor, rtol=1e-12)
