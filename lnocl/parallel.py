@@ -9,14 +9,14 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from lnocl import process
 from lnocl.errors import InputError, LnoclError, counted
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client, Future, LocalCluster
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
@@ -135,20 +135,27 @@ def _client_of(parallel: bool | int | str) -> Iterator[Client]:
     n = int(parallel) if parallel is not True else int(cores or 1)
     # PoCL starts a thread a core in each process, where they would share the cores.
     threads = {"POCL_MAX_PTHREAD_COUNT": str(max(int(cores or 1) // n, 1))}
-    with (
-        # A worker that ends twice within this time is given up, even where it was started again.
-        dask.config.set({"distributed.deploy.lost-worker-timeout": "1 day"}),
-        distributed.LocalCluster(
+    # A worker that ends twice within this time is given up, even where it was started again.
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 day"}):
+        cluster = distributed.LocalCluster(
             n_workers=n,
             threads_per_worker=1,
             processes=True,
             dashboard_address="127.0.0.1:0",
             memory_limit=None,
             env={**threads, **os.environ},
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
-        yield client
+        )
+        try:
+            with distributed.Client(cluster, set_as_default=False) as client:
+                yield client
+        finally:
+            close_cluster(cluster)
+
+
+def close_cluster(cluster: LocalCluster) -> None:
+    """Close a cluster of Dask, whose list of workers may lack one that was killed."""
+    with suppress(KeyError):
+        cluster.close()
 
 
 def _refuse_a_script_without_guard() -> None:

@@ -71,13 +71,14 @@ def end_if_odd(number):
 @contextmanager
 def cluster_of_two():
     """Two workers, as a user would start them; the client is current."""
-    with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        yield client
+    cluster = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
+    )
+    try:
+        with distributed.Client(cluster) as client:
+            yield client
+    finally:
+        parallel.close_cluster(cluster)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +115,14 @@ def test_without_a_client_there_is_no_current_scheduler():
         next(work(Squares, [1], CURRENT))
 
 
-def test_processes_of_its_own_end_with_the_work():
+def test_processes_of_its_own_end_with_the_work(monkeypatch):
+    close = distributed.LocalCluster.close
+
+    def close_after_a_lost_worker(cluster):
+        close(cluster)
+        raise KeyError("tcp://127.0.0.1:1")
+
+    monkeypatch.setattr(distributed.LocalCluster, "close", close_after_a_lost_worker)
     answers = list(work(Squares, range(6), 2))
     assert [each[0] for each in answers] == [0, 1, 4, 9, 16, 25]
     pids = {each[1] for each in answers}
