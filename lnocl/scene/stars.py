@@ -23,6 +23,10 @@ Pixels = NDArray[np.intp] | slice
 # pixels that a cache holds.
 TILE = 32
 
+# Outer rows and columns of a star with less than this share of its peak have no part in the Fisher
+# information that measures steps: all of them together change it by 2e-7.
+FAINT = 1e-6
+
 
 class Piece(NamedTuple):
     """k functions of the pixels in a window of a periodic grid: values, and its first pixel.
@@ -66,12 +70,21 @@ class StarImages:
         others of the image alone, which does not move.
     order : Order
         Of the stars.
+    cores : list of lists of Piece, optional
+        What the information is of, where that is less than the images.
     """
 
-    def __init__(self, lit: NDArray[np.bool_], pieces: list[list[Piece]], order: Order) -> None:
+    def __init__(
+        self,
+        lit: NDArray[np.bool_],
+        pieces: list[list[Piece]],
+        order: Order,
+        cores: list[list[Piece]] | None = None,
+    ) -> None:
         self._grid = lit.shape[0], lit.shape[1]
         self._lit = slice(None) if lit.all() else np.flatnonzero(lit)
         self._pieces, self._order = pieces, order
+        self._cores = pieces if cores is None else cores
         self._k = pieces[0][0].values.shape[0] if pieces else 1
 
     def light(self, fluxes: Array) -> Array:
@@ -118,8 +131,8 @@ class StarImages:
         self, stars: NDArray[np.intp]
     ) -> Iterator[tuple[tuple[slice, slice], NDArray[np.intp], Array]]:
         """Yield squares of the grid, which stars have light there, and their images of it."""
-        owners = [i for i, s in enumerate(stars) for _ in self._pieces[s]]
-        pieces = [piece for s in stars for piece in self._pieces[s]]
+        owners = [i for i, s in enumerate(stars) for _ in self._cores[s]]
+        pieces = [piece for s in stars for piece in self._cores[s]]
         shapes = np.array([piece.values.shape[1:] for piece in pieces]).reshape(-1, 2)
         corners = np.array([piece[1:] for piece in pieces]).reshape(-1, 2)
         parts = [
@@ -242,8 +255,16 @@ class StarField:
         ]
 
     @cached_property
+    def cores(self) -> list[list[Stamp]]:
+        """The P_js without their faint outer pixels."""
+        return [
+            [stamp.trimmed(FAINT * float(abs(stamp.values).max())) for stamp in stamps]
+            for stamps in self.stamps
+        ]
+
+    @cached_property
     def _order(self) -> Order:
-        images = zip(self._offsets, self.stamps, strict=True)
+        images = zip(self._offsets, self.cores, strict=True)
         return order_of(self.positions, images, self._grid)
 
     def light(self, j: int, fluxes: Array) -> Array:
@@ -277,8 +298,11 @@ class StarField:
 
     def images(self, j: int, lit: NDArray[np.bool_]) -> StarImages:
         """Return the P_js over these pixels, to which all that any star lights must belong."""
-        pieces = [[Piece(stamp.values[None], stamp.y, stamp.x)] for stamp in self.stamps[j]]
-        return StarImages(lit, pieces, self._order)
+        pieces, cores = (
+            [[Piece(stamp.values[None], stamp.y, stamp.x)] for stamp in stamps]
+            for stamps in (self.stamps[j], self.cores[j])
+        )
+        return StarImages(lit, pieces, self._order, cores)
 
 
 def light_up(stamps: Sequence[Stamp], grid: tuple[int, int]) -> NDArray[np.bool_]:

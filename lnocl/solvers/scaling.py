@@ -196,7 +196,7 @@ def _cross_information(
     windows, end = np.empty((scene.n_stars, 4), np.int32), 0
     for s, at in enumerate(windows):
         stamp = model.adjoint_of_stamps(
-            [_times(scene.star_stamp(j, s), ratio) for j, ratio in enumerate(ratios)]
+            [_times(cores[s], w) for cores, w in zip(scene.star_field.cores, ratios, strict=True)]
         )
         at[:] = stamp.y, stamp.x, *stamp.values.shape
         begin, end = end, end + stamp.values.size
