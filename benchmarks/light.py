@@ -119,7 +119,8 @@ def report(table):
             there = of_kind["place"] == where
             if where == "all":
                 there = of_kind["place"] != "printed"
-            for radius in np.unique(of_kind["radius"][there]) if where != "all" else [-1]:
+            radii = np.unique(of_kind["radius"][there])
+            for radius in radii if where != "all" else [-1] * bool(len(radii)):
                 rows = of_kind[there & ((of_kind["radius"] == radius) | (radius < 0))]
                 z = (rows["value"] - rows["truth"]) / rows["error"]
                 plain = (rows["sum"] - rows["truth"]) / rows["error"]

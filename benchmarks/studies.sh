@@ -6,7 +6,7 @@ folder=$1
 study() { # NAME AXIS...
   local name=$1
   shift
-  lnocl study -o "$folder/study-$name.ecsv" --plot "$folder/study-$name.png" --quiet \
+  python "$(dirname "$0")/study.py" -o "$folder/study-$name.ecsv" --plot "$folder/study-$name.png" \
     "$@"
 }
 study contrast --size 512 --contrast 0.0001 0.001 0.01 0.1 1 10 100 1000 10000 --method mc-rl rl --seed 0 1 2 3

@@ -22,7 +22,6 @@ from lnocl.commands import (
     selftest,
     simulate,
     stars,
-    study,
 )
 from lnocl.commands.parser import Parser
 
@@ -37,7 +36,6 @@ COMMANDS = {
     "report": report.COMMAND,
     "demo": demo.COMMAND,
     "simulate": simulate.COMMAND,
-    "study": study.COMMAND,
     "bench": bench.COMMAND,
     "devices": devices.COMMAND,
     "selftest": selftest.COMMAND,

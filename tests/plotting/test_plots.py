@@ -4,7 +4,6 @@ import sys
 
 import numpy as np
 import pytest
-from astropy.table import Table
 
 from lnocl.errors import LnoclError
 from lnocl.plotting.curves import draw_costs, draw_errors, draw_magnitudes
@@ -13,7 +12,6 @@ from lnocl.plotting.overview import draw_overview
 from lnocl.plotting.profiles import draw_bands, draw_profiles
 from lnocl.plotting.psf import PSF_FLOOR, draw_star_psf
 from lnocl.plotting.sources import Frame, Source, draw_objects
-from lnocl.plotting.study import SHOWN, draw_study
 
 pytest.importorskip("matplotlib")
 
@@ -181,10 +179,6 @@ def test_several_psfs_are_shown_in_a_row_each():
 
 BAD = r"$\bad{$"  # a formula to matplotlib, which it cannot read
 BAND = {name: [1.0, 2.0] for name in ("at", "value", "bias", "low68", "high68", "low95", "high95")}
-STUDY = Table(
-    {"seed": [1] * 4, "mu": [1.0, 2.0, 1.0, 2.0], "solver": ["sgp", "sgp", BAD, BAD]}
-    | {column: [0.1, 0.2, 0.3, 0.4] for column, _, _ in SHOWN}
-)
 
 
 @pytest.mark.parametrize(
@@ -198,9 +192,8 @@ STUDY = Table(
             {BAD: {name: np.ones(2) for name in ("seconds", "deviation", "front")}}, "all rows"
         ),
         lambda: draw_bands(BAD, BAND, BAND, BAD),
-        lambda: draw_study(STUDY, ["seed", "mu", "solver"]),
     ],
-    ids=["objects", "profiles", "errors", "magnitudes", "costs", "bands", "study"],
+    ids=["objects", "profiles", "errors", "magnitudes", "costs", "bands"],
 )
 def test_words_of_users_and_files_are_no_formulas(draw):
     from matplotlib.text import Text
