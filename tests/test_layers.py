@@ -12,6 +12,7 @@ FLOORS = [
     {"errors", "process", "notebook", "kernels", "loading"},
     {"parallel"},
     {"scene"},
+    {"matched_filter"},
     {"metrics", "residuals", "detection", "psf", "io", "reference", "solvers", "opencl"},
     {"simulation", "plotting"},
     {"engines"},

@@ -33,8 +33,8 @@ OPTIONS = [
         "--psf",
         metavar="PSF",
         is_input=True,
-        help="FITS file with its PSF: its width is that of a star, and what may be in the wings of "
-        "brighter stars is left out (default: a width measured on the image's stars)",
+        help="FITS file with its PSF, which tells stars from side lobes and extended sources "
+        "(default: a round one, as wide as the image's stars)",
     ),
     option(
         "--threshold",
@@ -90,14 +90,15 @@ def _run(arguments: argparse.Namespace) -> None:
         positions = np.array([stars["x"], stars["y"]]).T
         stars["ra"], stars["dec"] = sky.to_sky(positions, stack.header).T
         stars["ra"].unit = stars["dec"].unit = "deg"
+    n_extended = stars.meta["n_extended"]
     stars.meta = {"ORIGIN": "x and y begin at 0"}
     for name in ("x", "y"):
         stars[name].format, stars[name].unit = ".3f", "pix"
-    for name in ("peak", "significance"):
+    for name in ("peak", "significance", "width"):
         stars[name].format = ".5g"
     with atomic.whole_file(arguments.output, arguments.overwrite) as stream:
         _write(stars, stream, FORMATS[ending])
-    said = [*_told(stars), f"written to {arguments.output}"]
+    said = [*_told(stars, n_extended), f"written to {arguments.output}"]
     if arguments.plot is not None:
         from lnocl.plotting.stars import draw_stars
 
@@ -138,17 +139,21 @@ def _write(stars: Table, stream: IO[bytes], kind: str) -> None:
     stream.write(text.getvalue().encode())
 
 
-def _told(stars: Table) -> list[str]:
-    """Return how many stars there are, and which are saturated."""
+def _told(stars: Table, n_extended: int) -> list[str]:
+    """Return how many stars there are, how many sources are none, and which are saturated."""
     n = len(stars)
+    wider = f"{counted(n_extended, 'source')} wider than the PSF left out"
+    left_out = [wider] if n_extended else []
     if not n:
         return [
             "no star is found: give --psf with the PSF of the image, or a lower --threshold, and "
-            "look at the image"
+            "look at the image",
+            *left_out,
         ]
     saturated = [str(number) for number in stars["star"][stars["saturated"]]]
     lines = [
-        f"{counted(n, 'star')} found, the brightest at ({stars['x'][0]:.2f}, {stars['y'][0]:.2f})"
+        f"{counted(n, 'star')} found, the brightest at ({stars['x'][0]:.2f}, {stars['y'][0]:.2f})",
+        *left_out,
     ]
     if saturated:
         shown = ", ".join(saturated[:10]) + (", ..." if len(saturated) > 10 else "")
@@ -163,5 +168,6 @@ COMMAND = Command(
     "find the stars in an image: a table for lnocl deconvolve --stars, and a picture with numbers",
     {"": OPTIONS},
     _run,
-    "Stars are found by DAOFIND of photutils, which pip install photutils brings.",
+    "Stars are found by a matched filter; photutils, which pip install photutils brings, finds the "
+    "sky.",
 )
