@@ -2,12 +2,11 @@
 
 import functools
 import re
-from pathlib import Path
 
-import lnocl.kernels
 import numpy as np
 import pytest
 
+from lnocl.opencl import program
 from lnocl.opencl.device import choose, context_of
 from lnocl.opencl.tuning import Tuning
 from lnocl.verify.comparison import ALLOWED, deviation, kernels_of
@@ -80,7 +79,7 @@ RUNS = [
     for d in precisions
 ]
 
-FOLDER = Path(lnocl.kernels.__file__).parent
+FOLDER = program.folder()
 
 
 def kernels_in(file):

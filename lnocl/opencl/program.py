@@ -9,7 +9,6 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Mapping
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import cast
 
@@ -233,10 +232,16 @@ def _room_for(n_stars: int) -> int:
 @cache
 def source() -> str:
     """Return the OpenCL source of all kernels."""
-    folder = resources.files("lnocl.kernels")
     return "".join(
-        f'#line 1 "{name}"\n{(folder / name).read_text(encoding="ascii")}' for name in SOURCES
+        f'#line 1 "{name}"\n{(folder() / name).read_text(encoding="ascii")}' for name in SOURCES
     )
+
+
+def folder() -> Path:
+    """Return the folder of the kernels: inside the package, or beside it in a clone."""
+    package = Path(__file__).parents[1]
+    inside = package / "kernels"
+    return inside if inside.is_dir() else package.parent / "kernels"
 
 
 def _arguments(text: str, kernel_names: list[str]) -> Mapping[str, tuple[str, ...]]:

@@ -63,12 +63,12 @@ def unpacked(built, tmp_path_factory):
     return root
 
 
-def environment(folder, *target):
+def environment(folder, *target, within=()):
     """Make an environment with lnocl that borrows the dependencies of this one."""
     venv.create(folder, with_pip=False, symlinks=True)
     python = folder / "bin" / "python"
     pip = [sys.executable, "-m", "pip", f"--python={python}"]
-    run(*pip, "install", "--quiet", "--no-deps", *target)
+    run(*within, *pip, "install", "--quiet", "--no-deps", *target)
     site = folder / f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
     borrowed = [path for path in sys.path if "site-packages" in path]
     (site / "borrowed.pth").write_text("\n".join(borrowed))
@@ -104,19 +104,39 @@ def test_wheel(built):
     assert "lnocl/py.typed" in names
 
 
-@pytest.mark.parametrize("kind", ["wheel", "editable"])
+# A folder is seen as one that cannot be written to, by root too.
+READ_ONLY = "unshare", "--map-root-user", "--mount", "sh", "-c"
+BIND = 'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && ! touch "$0/new" && exec "$@"'
+
+
+@pytest.mark.parametrize("kind", ["wheel", "editable", "clone", "clone, editable"])
 def test_installed(built, kind, tmp_path):
-    """A fresh environment, which borrows the dependencies of this one, finds every kernel."""
-    target = [*built.glob("*.whl")] if kind == "wheel" else ["--editable", built / "source"]
-    python, site = environment(tmp_path, *target)
+    """A fresh environment, which borrows the dependencies of this one, has kernels and types.
+
+    The clone cannot be written to.
+    """
+    source, within = built / "source", ()
+    target = [*built.glob("*.whl")] if kind == "wheel" else [source]
+    if "editable" in kind:
+        target = ["--editable", source]
+    if "clone" in kind:
+        within = *READ_ONLY, BIND, source
+        if subprocess.run([*within, "true"], capture_output=True).returncode:
+            pytest.skip("no folder can be made one that cannot be written to")
+    python, site = environment(tmp_path, *target, within=within)
     code = (
         "import lnocl, lnocl.commands.cli\n"
-        "from importlib import resources\n"
-        "print(lnocl.__file__, *(file.name for file in resources.files('lnocl.kernels').iterdir()))"
+        "from lnocl.opencl import program\n"
+        "print(lnocl.__file__, *(file.name for file in program.folder().iterdir()))"
     )
     found, *files = run(python, "-I", "-c", code, cwd=tmp_path).split()
-    assert found.startswith(str(site if kind == "wheel" else built / "source"))
+    assert found.startswith(str(source if "editable" in kind else site))
     assert set(files) >= KERNELS
+    if kind in ("wheel", "editable"):
+        pytest.importorskip("mypy")
+        (tmp_path / "user.py").write_text("import lnocl\nreveal_type(lnocl.deconvolve)\n")
+        mypy = [sys.executable, "-m", "mypy", "--python-executable", python, "user.py"]
+        assert "observation: lnocl.scene.observation.Observation" in run(*mypy, cwd=tmp_path)
 
 
 @pytest.mark.parametrize(

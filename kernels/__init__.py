@@ -1,1 +1,0 @@
-"""The OpenCL sources, carried as package data."""
