@@ -8,6 +8,7 @@ from copy import copy
 from dataclasses import replace
 from functools import partial
 from os import PathLike
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +21,9 @@ from lnocl.runs.held_out import HeldOutCounts
 from lnocl.runs.held_out import most_bytes as most_bytes_of_halves
 from lnocl.runs.options import (
     CONVERGED,
+    EngineName,
+    Precision,
+    StopName,
     check_choices,
     check_families,
     check_length,
@@ -38,8 +42,10 @@ from lnocl.runs.stopping import Rule, make_rule
 from lnocl.scene.noise_check import warn_of_noise
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
+from lnocl.scene.psf_families import Family
 from lnocl.scene.star_check import warn_of_stars
 from lnocl.scene.stars import check_positions
+from lnocl.solvers import SolverName
 
 
 def deconvolve(
@@ -47,20 +53,20 @@ def deconvolve(
     stars: Iterable[tuple[float, float]] = (),
     *,
     mu: float = 0.0,
-    smoothing: float | str = "auto",
-    solver: str = "sgp",
+    smoothing: float | Literal["auto"] = "auto",
+    solver: SolverName = "sgp",
     n_iter: int = 1000,
-    stop: str | float | None = "held-out",
-    precision: str = "single",
-    engine: str = "opencl",
+    stop: StopName | float | None = "held-out",
+    precision: Precision = "single",
+    engine: EngineName = "opencl",
     device: str | None = None,
-    pad: int | str = "auto",
+    pad: int | Literal["auto"] = "auto",
     initial_extended: ArrayLike | None = None,
     initial_star_fluxes: ArrayLike | None = None,
     callback: Callback | None = None,
     progress: bool = False,
-    refine_positions: bool | str = "auto",
-    refine_psfs: Iterable[str] = "auto",
+    refine_positions: bool | Literal["auto"] = "auto",
+    refine_psfs: Literal["auto"] | Iterable[Family] = "auto",
     checkpoint: str | PathLike[str] | None = None,
     checkpoint_every: float = 60.0,
     resume: str | PathLike[str] | None = None,

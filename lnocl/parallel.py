@@ -10,7 +10,7 @@ import uuid
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from lnocl import process
 from lnocl.errors import InputError, LnoclError, counted
@@ -25,6 +25,7 @@ Maker = Callable[[], Callable[[Task], Answer]]
 Said = list[tuple[type[Warning], str]]
 
 CURRENT = "current-scheduler"
+Parallel = bool | int | Literal["current-scheduler"]
 # Times in a row that tasks are sent anew although none was done since the last time.
 MAX_FRUITLESS = 5
 # Seconds to wait for a scheduler that is gone, and for its workers.
@@ -73,7 +74,7 @@ def check_parallel(parallel: object) -> None:
 def work(
     make: Maker[Task, Answer],
     tasks: Iterable[Task],
-    parallel: bool | int | str = False,
+    parallel: Parallel = False,
     instead: Callable[[Task, str], Answer] | None = None,
 ) -> Generator[Answer]:
     """Yield the answer to each task, in the order of the tasks.
@@ -115,7 +116,7 @@ def work(
 
 
 @contextmanager
-def _client_of(parallel: bool | int | str) -> Iterator[Client]:
+def _client_of(parallel: Parallel) -> Iterator[Client]:
     import dask
     import distributed
 

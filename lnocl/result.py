@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
     from matplotlib.figure import Figure
 
+    from lnocl.parallel import Parallel
     from lnocl.runs.bootstrap import Bootstrap, Part
 
 # Stars that a notebook lists.
@@ -416,7 +417,7 @@ class Result:
         progress: bool = False,
         earlier: Bootstrap | None = None,
         callback: Callable[[Bootstrap], None] | None = None,
-        parallel: bool | int | str = False,
+        parallel: Parallel = False,
     ) -> Bootstrap:
         """Return the errors of stars, regions, profiles and pixels, by replicas of this result.
 

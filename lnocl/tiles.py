@@ -8,18 +8,18 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, NoReturn, cast
+from typing import Any, Literal, NamedTuple, NoReturn, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, LnoclWarning, counted, warn
-from lnocl.parallel import check_parallel, work
+from lnocl.parallel import Parallel, check_parallel, work
 from lnocl.process import ignored_warnings, recorded_warnings
 from lnocl.residuals import StarResiduals
 from lnocl.result import Result
-from lnocl.runs.options import check_length, check_observation, read_penalties
+from lnocl.runs.options import StopName, check_length, check_observation, read_penalties
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome
 from lnocl.runs.progress import make_bar
 from lnocl.scene.grid import length_for
@@ -201,11 +201,11 @@ def deconvolve_tiles(
     stars: Iterable[tuple[float, float]] = (),
     *,
     tile: int | None = None,
-    parallel: bool | int | str = False,
+    parallel: Parallel = False,
     mu: float = 0.0,
-    smoothing: float | str = "auto",
+    smoothing: float | Literal["auto"] = "auto",
     n_iter: int = 1000,
-    stop: str | float | None = "held-out",
+    stop: StopName | float | None = "held-out",
     progress: bool = False,
     **options: Any,
 ) -> TiledResult:
@@ -412,7 +412,11 @@ def _are_own(positions: Array, spans: tuple[_Span, _Span]) -> NDArray[np.bool_]:
     return are_own
 
 
-def _choose(tiles: Sequence[_Tile], parallel: bool | int | str, options: dict[str, Any]) -> _Choice:
+def _choose(
+    tiles: Sequence[_Tile],
+    parallel: Parallel,
+    options: dict[str, Any],
+) -> _Choice:
     """Return the choice in the middle of those of the tiles with the brightest extended source.
 
     One tile alone may be misled: of 1024 x 1024 fields, single tiles chose 5 to 136 iterations

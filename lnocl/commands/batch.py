@@ -29,6 +29,8 @@ from lnocl.errors import FileError, LnoclError, counted
 if TYPE_CHECKING:
     from astropy.table import Table
 
+    from lnocl.parallel import Parallel
+
 SUMMARY = "summary.ecsv"
 # Seconds between two writings of the summary.
 WRITE_EVERY = 10.0
@@ -317,7 +319,7 @@ def _apart(targets: Sequence[Target], folder: Folder) -> list[Target]:
 
 
 def _records(
-    folder: Folder, targets: Sequence[Target], start: str, parallel: bool | int | str
+    folder: Folder, targets: Sequence[Target], start: str, parallel: Parallel
 ) -> Iterator[Record]:
     """Yield the record of each target as it is done."""
     from lnocl.parallel import work

@@ -21,7 +21,7 @@ from lnocl.io.maps import Maps, Word
 from lnocl.io.noise import VARIANCES, NoiseMap, electrons_by_variance, read_noise_map
 from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
-from lnocl.scene.observation import OVERSAMPLES, Array, Observation
+from lnocl.scene.observation import OVERSAMPLES, Array, Observation, PsfCentre
 
 log = logging.getLogger("lnocl")
 
@@ -98,7 +98,7 @@ class Calibration(NamedTuple):
     align: str | None = None
     oversample: int = 1
     effective_psfs: bool = False
-    psf_centre: str = "check"
+    psf_centre: PsfCentre = "check"
     ideal_psfs: Sequence[str] = ()
     pupils: Sequence[str] = ()
     psf_scatter: Sequence[str] = ()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -106,7 +106,7 @@ def make_psf(
     frame: ArrayLike,
     position: ArrayLike | None = None,
     size: int | None = None,
-    background: float | str = "auto",
+    background: float | Literal["auto"] = "auto",
     mask: ArrayLike | None = None,
     saturation: float | None = None,
     recentre: bool = True,
@@ -269,7 +269,7 @@ def make_psfs(
     rotate: Sequence[float],
     position: ArrayLike | None = None,
     size: int | None = None,
-    background: float | str = "auto",
+    background: float | Literal["auto"] = "auto",
     mask: ArrayLike | None = None,
     saturation: float | None = None,
     recentre: bool = True,

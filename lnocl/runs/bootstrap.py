@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError
-from lnocl.parallel import work
+from lnocl.parallel import Parallel, work
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.progress import make_bar
 from lnocl.runs.replicas import Replicas, Sky
@@ -270,7 +270,7 @@ def bootstrap(
     progress: bool = False,
     earlier: Bootstrap | None = None,
     look: Callable[[Bootstrap], None] | None = None,
-    parallel: bool | int | str = False,
+    parallel: Parallel = False,
 ) -> Bootstrap:
     """Return the errors of a reconstruction by n replicas, of which some may be there already.
 

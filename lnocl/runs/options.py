@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from numbers import Real
-from typing import Any, cast
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,9 +33,12 @@ CONVERGED = 1e-6
 # Families of PSFs, and what an observation must have for them.
 NEEDS = {"strehl": "ideal_psfs", "pupil": "pupils", "modes": "psf_modes"}
 
-PRECISIONS = ("single", "double")
-ENGINES = ("opencl", "numpy")
-STOPS = ("held-out", "discrepancy")
+Precision = Literal["single", "double"]
+EngineName = Literal["opencl", "numpy"]
+StopName = Literal["held-out", "discrepancy"]
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+ENGINES: tuple[EngineName, ...] = get_args(EngineName)
+STOPS: tuple[StopName, ...] = get_args(StopName)
 
 # Kernels count iterations in 32 bits.
 MAX_ITERATIONS = 2**31 - 2
@@ -84,7 +87,7 @@ def check_choices(solver: str, precision: str, engine: str, device: object) -> N
         raise InputError(f"engine numpy uses no device; leave device {device!r} out")
 
 
-def read_refine_positions(value: object) -> bool | str:
+def read_refine_positions(value: object) -> bool | Literal["auto"]:
     """Return True, False or "auto".
 
     Raises
@@ -95,7 +98,7 @@ def read_refine_positions(value: object) -> bool | str:
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     if isinstance(value, str) and value == "auto":
-        return value
+        return "auto"
     raise InputError(f"refine_positions must be True, False or auto; {value!r} was given")
 
 

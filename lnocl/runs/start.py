@@ -16,6 +16,7 @@ from lnocl.scene.scene import Scene
 
 if TYPE_CHECKING:
     from lnocl.scene.forward_model import Model
+    from lnocl.solvers import SolverName
     from lnocl.solvers.scaling import Scaling
 
 
@@ -25,7 +26,7 @@ class Setup:
 
     stars: Array
     pad: int | str
-    solver: str
+    solver: SolverName
     precision: str
     engine: str
     device: str | None

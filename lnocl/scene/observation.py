@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,7 @@ from lnocl.scene.psf_errors import check_modes, check_pixels
 from lnocl.scene.psf_field import PsfField, read_fields
 
 Array = NDArray[np.float64]
+PsfCentre = Literal["check", "fit", "given"]
 
 # An array whose last axis is so short, and the others so long, has its channels last.
 MAX_CHANNELS = 4
@@ -185,7 +186,7 @@ class Observation:
         offsets: ArrayLike | None = None,
         oversample: int = 1,
         effective_psfs: bool = False,
-        psf_centre: str = "check",
+        psf_centre: PsfCentre = "check",
         ideal_psfs: ArrayLike | None = None,
         pupils: ArrayLike | None = None,
         psf_modes: ArrayLike | None = None,
@@ -321,7 +322,7 @@ class Observation:
         image = np.where(self.mask[0], np.nan, self.images[0])
         return html_card("lnocl.Observation", rows, image)
 
-    def _check_ideals(self, ideals: ArrayLike | None, psf_centre: str) -> Array:
+    def _check_ideals(self, ideals: ArrayLike | None, psf_centre: PsfCentre) -> Array:
         if ideals is None and len(self.pupils):
             from lnocl.scene.pupils import Pupil  # which loads scipy
 

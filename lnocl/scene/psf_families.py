@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,8 @@ Spectrum = NDArray[np.complex128]
 SHIFT, JITTER, STREHL, PUPIL, MODE = 0.5, 0.7, 0.7, 0.3, 1.0
 # The parameters of each family; those of pupils and modes are numbered, those of pixels have no
 # names.
-FAMILIES = {
+Family = Literal["shift", "jitter", "strehl", "pupil", "modes", "pixels"]
+FAMILIES: dict[Family, tuple[str, ...]] = {
     "shift": ("x", "y"),
     "jitter": ("xx", "xy", "yy"),
     "strehl": ("power",),

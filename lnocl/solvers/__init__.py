@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Literal
 
 from lnocl.solvers import sgm, sgp
 from lnocl.solvers.engine import Engine
 
 Solver = Callable[[Engine, int, sgp.Steps], Iterator[int]]
-SOLVERS: dict[str, Solver] = {"sgm": sgm.sgm, "sgp": sgp.sgp}
+SolverName = Literal["sgp", "sgm"]
+SOLVERS: dict[SolverName, Solver] = {"sgm": sgm.sgm, "sgp": sgp.sgp}

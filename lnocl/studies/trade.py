@@ -17,7 +17,7 @@ from lnocl import metrics
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.result import Estimate, Result
-from lnocl.runs.options import PAPER
+from lnocl.runs.options import PAPER, Precision
 from lnocl.runs.progress import make_bar
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.simulation import Simulation
@@ -236,7 +236,7 @@ class Setting:
         Least unobserved pixels round the images.
     """
 
-    precision: str
+    precision: Precision
     pad: int
 
 
