@@ -1,8 +1,10 @@
-"""Take the folder kernels/ into the package as it is built; all else is in setup.cfg."""
+"""What setup.cfg cannot say: the kernels go into the package, and README onto its page."""
 
 import os
+import re
 import tempfile
 from glob import glob
+from pathlib import Path
 
 from setuptools import setup
 from setuptools.command.build_py import build_py
@@ -20,8 +22,18 @@ class BuildWithKernels(build_py):
                 self.copy_file(file, f"{self.build_lib}/lnocl/kernels")
 
 
+def read_description() -> str:
+    """Return README without its picture and with the words of links to files of the repository."""
+    text = Path("README.md").read_text(encoding="utf-8")
+    text = re.sub(r"!\[.*\]\(.*\)\n\n", "", text)
+    return re.sub(r"\[([^]]*)\]\((?!https?:)[^)]*\)", r"\1", text)
+
+
 with tempfile.TemporaryDirectory() as folder:
     # A clone that cannot be written to is built elsewhere.
     elsewhere = {"egg_info": {"egg_base": folder}, "build": {"build_base": folder}}
-    options = {} if os.access(".", os.W_OK) else elsewhere
-    setup(cmdclass={"build_py": BuildWithKernels}, options=options)
+    setup(
+        cmdclass={"build_py": BuildWithKernels},
+        long_description=read_description(),
+        options={} if os.access(".", os.W_OK) else elsewhere,
+    )

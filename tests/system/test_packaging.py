@@ -1,5 +1,6 @@
 """Install, editable install, sdist and wheel carry the kernels, and the sdist its tests."""
 
+import os
 import re
 import subprocess
 import sys
@@ -48,6 +49,8 @@ def built(tmp_path_factory):
         target = folder / "source" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes((ROOT / name).read_bytes())
+    (folder / "source" / "docs" / "gallery").mkdir()
+    (folder / "source" / "docs" / "gallery" / "built.md").touch()
     run(sys.executable, "-m", "build", "--outdir", folder, folder / "source")
     return folder
 
@@ -63,6 +66,14 @@ def unpacked(built, tmp_path_factory):
     return root
 
 
+def metadata(built):
+    """Return the metadata of the wheel."""
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        return Metadata.from_email(archive.read(name), validate=False)
+
+
 def environment(folder, *target, within=()):
     """Make an environment with lnocl that borrows the dependencies of this one."""
     venv.create(folder, with_pip=False, symlinks=True)
@@ -75,9 +86,16 @@ def environment(folder, *target, within=()):
     return python, site
 
 
-def test_the_sdist_has_every_file(unpacked):
+def is_for_show(name):
+    """Return whether only the pages need a file, which is left out of the sdist."""
+    return re.match(r"benchmarks/results/|docs/.*\.(png|html)$", name)
+
+
+def test_the_sdist_has_every_file_but_pictures(unpacked):
     files = {str(path.relative_to(unpacked)) for path in unpacked.rglob("*") if path.is_file()}
-    assert {*tracked()} - {".gitignore"} <= files
+    wanted = {name for name in tracked() if not is_for_show(name)} - {".gitignore"}
+    made = {name for name in files if name == "PKG-INFO" or name.startswith("lnocl.egg-info/")}
+    assert files - made == wanted
 
 
 def test_links_of_the_sdist_resolve(unpacked):
@@ -86,6 +104,7 @@ def test_links_of_the_sdist_resolve(unpacked):
         for page in unpacked.rglob("*.md")
         for link in re.findall(r"\]\(([^)#\s]+)", page.read_text())
         if "://" not in link
+        if not is_for_show(os.path.relpath(page.parent / link, unpacked))
     ]
     assert len(links) > 10
     assert [link for page, link in links if not (page.parent / link).exists()] == []
@@ -93,15 +112,23 @@ def test_links_of_the_sdist_resolve(unpacked):
 
 def test_the_tests_of_the_sdist_run(unpacked, tmp_path):
     python, _ = environment(tmp_path, "--editable", unpacked)
-    told = run(python, "-m", "pytest", "-q", "tests/test_metrics.py", "tests/io", cwd=unpacked)
+    told = run(
+        python, "-m", "pytest", "-q", "tests/test_metrics.py", "tests/test_figures.py", cwd=unpacked
+    )
     assert re.search(r"\d+ passed", told)
 
 
 def test_wheel(built):
     (wheel,) = built.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {f"lnocl/kernels/{name}" for name in KERNELS} <= names
+    assert {name for name in names if "kernels/" in name} == {f"lnocl/kernels/{k}" for k in KERNELS}
     assert "lnocl/py.typed" in names
+
+
+def test_the_page_of_an_index_has_no_link_to_a_file_of_the_repository(built):
+    description = metadata(built).description
+    assert "lnocl reconstructs faint structure" in description
+    assert re.findall(r"\]\((?!https?:)", description) == []
 
 
 # A folder is seen as one that cannot be written to, by root too.
@@ -134,8 +161,14 @@ def test_installed(built, kind, tmp_path):
     assert set(files) >= KERNELS
     if kind in ("wheel", "editable"):
         pytest.importorskip("mypy")
-        (tmp_path / "user.py").write_text("import lnocl\nreveal_type(lnocl.deconvolve)\n")
-        mypy = [sys.executable, "-m", "mypy", "--python-executable", python, "user.py"]
+        (tmp_path / "user.py").write_text(
+            "import lnocl\n"
+            "reveal_type(lnocl.deconvolve)\n"
+            "given = lnocl.Observation([], [])\n"
+            "lnocl.deconvolve(given, solver='other')  # type: ignore[arg-type]\n"
+        )
+        mypy = [sys.executable, "-m", "mypy", "--python-executable", python]
+        mypy += ["--warn-unused-ignores", "user.py"]
         assert "observation: lnocl.scene.observation.Observation" in run(*mypy, cwd=tmp_path)
 
 
@@ -149,10 +182,7 @@ def test_installed(built, kind, tmp_path):
     ],
 )
 def test_pocl_is_required_where_its_wheel_exists(built, system, machine, pocl):
-    (wheel,) = built.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
-        required = Metadata.from_email(archive.read(name), validate=False).requires_dist
+    required = metadata(built).requires_dist
     place = {"sys_platform": system, "platform_machine": machine, "extra": ""}
     extras = [
         one.extras
