@@ -29,11 +29,11 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.opencl import device, linking
+    from lnocl.opencl import device, trial
     from lnocl.studies import demo
 
     chosen = device.choose(arguments.device).device
-    linking.check(chosen)  # before anything is written
+    trial.check(chosen)  # before anything is written
     spec = device.spec_of(chosen)
     for line in demo.run(
         arguments.output, arguments.size, arguments.seed, spec, arguments.overwrite

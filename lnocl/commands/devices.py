@@ -11,7 +11,7 @@ from lnocl.commands.parser import Command
 def _run(arguments: argparse.Namespace) -> None:
     import numpy as np
 
-    from lnocl.opencl import device, linking
+    from lnocl.opencl import device, trial
     from lnocl.opencl.tuning import describe_tuning
 
     if arguments.tune:
@@ -23,7 +23,7 @@ def _run(arguments: argparse.Namespace) -> None:
         f"{device.spec_of(each)} {device.describe(each)}; {describe_tuning(each, single)}"
         for each in found
     )
-    linking.check(choice.device)
+    trial.check(choice.device)
     messages.say(
         [f"lnocl uses {device.spec_of(choice.device)} unless told otherwise: {choice.reason}"]
     )

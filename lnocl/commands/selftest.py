@@ -10,11 +10,11 @@ from lnocl.commands.parser import Command
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.opencl import device, linking
+    from lnocl.opencl import device, trial
     from lnocl.verify import selftest
 
     chosen = device.choose(arguments.device).device
-    linking.check(chosen)
+    trial.check(chosen)
     messages.say(
         [
             f"lnocl {__version__} on {device.describe(chosen)}, {chosen.version}; this takes up to "

@@ -16,7 +16,7 @@ import numpy as np
 import pyopencl as cl
 
 from lnocl.errors import DeviceError
-from lnocl.opencl import kernel_cache, linking, unknown_cpu
+from lnocl.opencl import kernel_cache, trial, unknown_cpu
 from lnocl.opencl.device import describe, has_double
 from lnocl.opencl.faults import after_fault, build_failure
 from lnocl.opencl.tuning import Tuning, odd_part, scratch_points, tune
@@ -315,7 +315,7 @@ def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
         if key not in _programs:
             _need_room(context.devices[0])
             unknown_cpu.name_level(context.devices[0])
-            linking.check(context.devices[0])
+            trial.check(context.devices[0])
             name = "\n".join([describe(context.devices[0]), *options, text])
             _programs[key] = _Built(context, text, options, kernel_cache.file_of(name))
             while len(_programs) > MAX_PROGRAMS:

@@ -1,7 +1,8 @@
-"""The linker that PoCL needs: it links each kernel, and aborts the process where that fails.
+"""A device on trial: a driver that fails as it compiles may end the process without a word.
 
-So a process of its own links a kernel first, once in an environment. Where the system has no
-linker, that of the package ziglang is taken if it is installed.
+So a process of its own compiles kernels first, once for a driver and the kernels. PoCL aborts where
+the linker fails, once for each environment: where the system has none, that of the package ziglang
+is taken if it is installed.
 """
 
 from __future__ import annotations
@@ -21,19 +22,33 @@ import pyopencl as cl
 
 from lnocl.errors import DeviceError
 from lnocl.opencl import kernel_cache
+from lnocl.opencl.device import describe
 from lnocl.opencl.unknown_cpu import POCL
 
 # What the outcome may hang on, besides the device.
 VARIABLES = ("PATH", "COMPILER_PATH", "LIBRARY_PATH", "TMPDIR", "TEMP", "TMP")
 LIMITS = ("RLIMIT_NOFILE", "RLIMIT_NPROC", "RLIMIT_AS", "RLIMIT_FSIZE")
 LIBRARIES = ("/usr/lib*/gcc/*/*", "/usr/lib*/crti.o", "/usr/lib*/*/crti.o")
+# A process that its driver ends does not come to the last line.
 TRIAL = """
-import sys
-import numpy
-import pyopencl as cl
+try:
+    import sys
+    import numpy
+    import pyopencl as cl
+    platform, device = map(int, sys.argv[2:])
+    context = cl.Context([cl.get_platforms()[platform].get_devices()[device]])
+    exec(sys.argv[1])
+finally:
+    print("lives")
+"""
+KERNELS = """
+from lnocl.opencl import transform, trial
+trial.check = lambda device: None
+transform.Transform(context, (8, 8), numpy.dtype("f4")).rfft2(numpy.ones((8, 8)))
+"""
+# Enough for a linker.
+KERNEL = """
 from lnocl.opencl.unknown_cpu import name_level
-platform, device = map(int, sys.argv[1:])
-context = cl.Context([cl.get_platforms()[platform].get_devices()[device]])
 name_level(context.devices[0])
 queue, found = cl.CommandQueue(context), numpy.zeros(1, numpy.float32)
 buffer = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, 4)
@@ -71,27 +86,35 @@ CAUSES = {
 
 @functools.cache
 def check(device: cl.Device) -> None:
-    """Refuse a device of PoCL where its kernels cannot be linked.
+    """Refuse a device whose driver ends the process as it compiles kernels.
 
-    The store of compiled kernels holds the outcome for later processes. Other runtimes are left
-    alone.
+    The store of compiled kernels holds the outcome for later processes.
 
     Raises
     ------
     DeviceError
-        They cannot; the message says what to install or to set.
+        It does; the message says what to install, to set or to take.
     """
-    if device.platform.name != POCL:
-        return
-    _need_files()
-    note = kernel_cache.file_of(_environment(device)).with_suffix(".linker")
-    linker = kernel_cache.read(note)
-    if linker is None:
-        linker = _find(device)
-        if linker and kernel_cache.can_write(note.parent):
-            kernel_cache.write(note, linker)
-    elif linker == b"ziglang":
+    is_pocl = device.platform.name == POCL
+    if is_pocl:
+        _need_files()
+    note = kernel_cache.file_of(_environment(device)).with_suffix(".trial")
+    outcome = kernel_cache.read(note)
+    if outcome is None:
+        outcome = _find_linker(device) if is_pocl else _compile(device)
+        if outcome and kernel_cache.can_write(note.parent):
+            kernel_cache.write(note, outcome)
+    elif outcome == b"ziglang":
         _take_ziglang()
+
+
+def _compile(device: cl.Device) -> bytes:
+    if failure := _try(device, KERNELS):
+        raise DeviceError(
+            f"the driver of {describe(device)} ends the process as it compiles kernels "
+            f"({failure}): update the driver, take another device, or engine numpy"
+        )
+    return b"lives"
 
 
 def _need_files() -> None:
@@ -108,7 +131,11 @@ def _need_files() -> None:
 
 
 def _environment(device: cl.Device) -> str:
-    words = [sys.executable, cl.VERSION_TEXT, device.name, device.driver_version]
+    words = [sys.executable, cl.VERSION_TEXT, describe(device)]
+    if device.platform.name != POCL:
+        from lnocl.opencl.program import source  # which imports this
+
+        return "\n".join([*words, source()])
     words += [_foreign(os.environ.get(name, "")) for name in VARIABLES]
     words += [str(shutil.which("ld")), *(file for each in LIBRARIES for file in sorted(glob(each)))]
     with contextlib.suppress(ImportError):  # there is none on Windows
@@ -124,26 +151,26 @@ def _foreign(folders: str) -> str:
     return os.pathsep.join(part for part in parts if kernel_cache.PREFIX not in part)
 
 
-def _find(device: cl.Device) -> bytes:
+def _find_linker(device: cl.Device) -> bytes:
     """Return the linker that works: b"system" or b"ziglang"; b"" where that cannot be tried."""
-    failure = _try(device)
+    failure = _try(device, KERNEL)
     if not failure:
         return b"" if failure is None else b"system"
     if importlib.util.find_spec("ziglang"):
         _take_ziglang()
-        if _try(device) == "":
+        if _try(device, KERNEL) == "":
             return b"ziglang"
     cause = next((CAUSES[words] for words in CAUSES if words in failure), failure)
     raise DeviceError(f"PoCL cannot link kernels: {cause}")
 
 
-def _try(device: cl.Device) -> str | None:
-    """Link a kernel in another process; return its last words where it was aborted, else "".
+def _try(device: cl.Device, kernels: str) -> str | None:
+    """Compile in another process; return its last words where its driver ended it, else "".
 
-    None where it ended by another error, which says nothing of the linker.
+    None where it ended by an error of Python, which says nothing of the driver.
     """
     platform = cl.get_platforms().index(device.platform)
-    place = [str(platform), str(device.platform.get_devices().index(device))]
+    trial = [TRIAL, kernels, str(platform), str(device.platform.get_devices().index(device))]
     folder = kernel_cache.new_folder()
     try:
         # In a thread, where no signal interrupts it: the process is never left to itself.
@@ -151,7 +178,7 @@ def _try(device: cl.Device) -> str | None:
             thread.submit(int).result()  # a thread that is there is waited for in any case
             done = thread.submit(
                 subprocess.run,
-                [sys.executable, "-P", "-c", TRIAL, *place],  # not from the current folder
+                [sys.executable, "-P", "-c", *trial],  # not from the current folder
                 env={**os.environ, kernel_cache.VARIABLE: folder, "XDG_CACHE_HOME": folder},
                 capture_output=True,
                 text=True,
@@ -161,9 +188,9 @@ def _try(device: cl.Device) -> str | None:
         return str(error.strerror)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    if done.returncode >= 0:
+    if "lives" in done.stdout:
         return None if done.returncode else ""
-    return " ".join(done.stderr.split())[-400:] or f"signal {-done.returncode}"
+    return " ".join(done.stderr.split())[-400:] or f"exit status {done.returncode}"
 
 
 def _take_ziglang() -> None:

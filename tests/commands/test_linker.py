@@ -6,7 +6,7 @@ import pytest
 
 from lnocl.commands import cli
 from lnocl.errors import DeviceError
-from lnocl.opencl import linking
+from lnocl.opencl import trial
 
 
 @pytest.mark.parametrize("command", ["demo", "selftest", "devices"])
@@ -18,7 +18,7 @@ def test_a_linker_that_is_missing_is_said_before_anything_else(
     def check(_):
         raise DeviceError("PoCL cannot link kernels: no linker was found")
 
-    monkeypatch.setattr(linking, "check", check)
+    monkeypatch.setattr(trial, "check", check)
     monkeypatch.chdir(tmp_path)
     assert cli.main([command]) == 1
     said = capsys.readouterr()

@@ -101,7 +101,7 @@ def test_clangs_builtin_is_left_to_pocl_on_cpus(compiled, monkeypatch, platform,
 
     Device.platform = type("", (), {"name": platform})
     monkeypatch.setattr(program.unknown_cpu, "name_level", lambda _: None)
-    monkeypatch.setattr(program.linking, "check", lambda _: None)
+    monkeypatch.setattr(program.trial, "check", lambda _: None)
     build(type("", (), {"devices": [Device]}))
     assert f"-DHAS_BUILTIN_PREFETCH={expected}" in compiled[0]
     code = re.sub(r"/\*.*?\*/", "", program.source(), flags=re.DOTALL)

@@ -1,4 +1,4 @@
-"""PoCL on machines where it cannot link kernels, and would abort the process."""
+"""Drivers that end the process as they compile: PoCL where it cannot link, and any other."""
 
 import os
 import signal
@@ -11,7 +11,7 @@ from processes import run_python
 from runtimes import on_pocl
 
 import lnocl
-from lnocl.opencl import device, kernel_cache, linking
+from lnocl.opencl import device, kernel_cache, trial
 
 pytestmark = [on_pocl, pytest.mark.system]
 
@@ -79,12 +79,12 @@ def test_the_linker_of_ziglang_is_taken(without_linker, tmp_path):
 def test_it_is_tried_once(tmp_path, monkeypatch):
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
     chosen = device.choose().device
-    linking.check.__wrapped__(chosen)
-    monkeypatch.setattr(linking, "_try", lambda _: pytest.fail("tried again"))
-    linking.check.__wrapped__(chosen)
+    trial.check.__wrapped__(chosen)
+    monkeypatch.setattr(trial, "_try", lambda *_: pytest.fail("tried again"))
+    trial.check.__wrapped__(chosen)
     monkeypatch.setenv("PATH", "/elsewhere")
     with pytest.raises(pytest.fail.Exception, match="tried again"):
-        linking.check.__wrapped__(chosen)
+        trial.check.__wrapped__(chosen)
 
 
 def test_an_interrupted_trial_leaves_nothing(monkeypatch):
@@ -105,7 +105,7 @@ def test_an_interrupted_trial_leaves_nothing(monkeypatch):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which may be ignored here
     try:
         with pytest.raises(KeyboardInterrupt):
-            linking._try(device.choose().device)
+            trial._try(device.choose().device, trial.KERNEL)
     finally:
         signal.signal(signal.SIGINT, before)
     assert [process.returncode for process in started] == [0]
@@ -115,24 +115,24 @@ def test_an_interrupted_trial_leaves_nothing(monkeypatch):
 def test_it_is_tried_again_where_the_linker_went(tmp_path, monkeypatch):
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
     chosen = device.choose().device
-    linking.check.__wrapped__(chosen)
-    monkeypatch.setattr(linking, "_try", lambda _: pytest.fail("tried again"))
+    trial.check.__wrapped__(chosen)
+    monkeypatch.setattr(trial, "_try", lambda *_: pytest.fail("tried again"))
     monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.raises(pytest.fail.Exception, match="tried again"):
-        linking.check.__wrapped__(chosen)
+        trial.check.__wrapped__(chosen)
 
 
 def test_the_trial_runs_no_code_of_the_current_folder(tmp_path, monkeypatch):
     (tmp_path / "numpy.py").write_text("open('planted', 'w'); raise SystemExit(3)")
     monkeypatch.chdir(tmp_path)
-    assert linking._try(device.choose().device) == ""
+    assert trial._try(device.choose().device, trial.KERNEL) == ""
     assert not (tmp_path / "planted").exists()
 
 
 def test_a_trial_that_ends_otherwise_says_nothing_of_the_linker(tmp_path, monkeypatch):
-    monkeypatch.setattr(linking, "TRIAL", "import no_such_module")
+    monkeypatch.setattr(trial, "KERNEL", "import no_such_module")
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
-    linking.check.__wrapped__(device.choose().device)
+    trial.check.__wrapped__(device.choose().device)
     assert not list(tmp_path.iterdir())
 
 
@@ -145,9 +145,29 @@ def test_too_few_files_are_refused(tmp_path):
     assert "too few files may be open: raise the limit (ulimit -n)" in done.stdout
 
 
-def test_other_runtimes_are_left_alone(monkeypatch):
-    monkeypatch.setattr(linking, "_try", lambda _: pytest.fail("tried"))
-    linking.check.__wrapped__(SimpleNamespace(platform=SimpleNamespace(name="Another")))
+@pytest.mark.parametrize(
+    ("ending", "words"),
+    [
+        ("import os; os._exit(8)", "exit status 8"),
+        ("import os; os.abort()", "exit status -6"),
+        ("import os; os.write(2, b'LLVM: 9'); os._exit(0)", "LLVM: 9"),
+    ],
+)
+def test_a_driver_that_ends_the_process_is_named(ending, words, tmp_path, monkeypatch):
+    """Each time, as there may be a newer driver; any other error is that of a run."""
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(trial, "POCL", "another")
+    monkeypatch.setattr(trial, "KERNELS", ending)
+    chosen = device.choose().device
+    for _ in range(2):
+        with pytest.raises(lnocl.DeviceError) as told:
+            trial.check.__wrapped__(chosen)
+        assert f"the driver of {device.describe(chosen)} ends the process" in str(told.value)
+        assert words in str(told.value)
+    monkeypatch.setattr(trial, "KERNELS", "raise ValueError")
+    trial.check.__wrapped__(chosen)
+    monkeypatch.setattr(trial, "_try", lambda *_: pytest.fail("tried again"))
+    trial.check.__wrapped__(chosen)
 
 
 @pytest.mark.parametrize("lack", ["noexec", "space", "files"])
@@ -195,4 +215,4 @@ def test_no_usable_folder_for_temporary_files_is_said(tmp_path, monkeypatch):
 
 def test_names_in_other_encodings_are_taken(monkeypatch):
     monkeypatch.setenv("PATH", "/caf\udce9")
-    assert kernel_cache.file_of(linking._environment(device.choose().device)).name
+    assert kernel_cache.file_of(trial._environment(device.choose().device)).name
