@@ -17,6 +17,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.intersphinx",
+    "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
@@ -62,7 +63,7 @@ sphinx_gallery_conf = {
 # Browsers set MathML themselves, so that equations need no network.
 html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
-html_title = "lnocl"
+html_title = f"lnocl {release}"
 html_static_path = ["_static"]
 html_css_files = ["lnocl.css"]
 html_show_sourcelink = False
