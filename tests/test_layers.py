@@ -9,7 +9,7 @@ import lnocl
 
 # Each room may import those above it in this list, never one of its own line or below.
 FLOORS = [
-    {"errors", "process", "notebook", "kernels", "loading"},
+    {"errors", "process", "notebook", "loading"},
     {"parallel"},
     {"scene"},
     {"matched_filter"},
