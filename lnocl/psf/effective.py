@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from astropy.stats import sigma_clipped_stats
-from scipy.ndimage import binary_dilation, fourier_shift, maximum_filter
+from scipy.ndimage import binary_dilation, maximum_filter, shift
+from scipy.spatial import KDTree
 
 from lnocl.errors import InputError, counted
 from lnocl.psf.centring import Array, Mask, Point
@@ -15,7 +16,9 @@ from lnocl.psf.steps import cut_square, nearest_pixel
 from lnocl.scene.shifting import MovablePsf, Stamp
 
 # Rounds of fitting the stars and adding what is left of them to the PSF.
-ROUNDS = 12
+ROUNDS = 20
+# The first rounds take each pixel for the star nearest to it, so that no star is another's wings.
+FIRST_ROUNDS = 3
 # Outside its core, a star's pixel is a neighbour's where it exceeds another star's by this share,
 # and by so many times the noise; and so are the pixels beside it.
 EXCESS, SIGNIFICANCE, BESIDE = 0.5, 5.0, 2
@@ -66,7 +69,7 @@ class EffectivePsf(NamedTuple):
     n_neighbours: int
 
 
-def combine(light: Array, bad: Mask, centres: list[Point], half: int) -> EffectivePsf:
+def combine(light: Array, bad: Mask, centres: list[Point], half: int, n_given: int) -> EffectivePsf:
     r"""Return the PSF that explains all stars of a frame together.
 
     .. math:: K \leftarrow K + \frac{\sum_s c_s T_s^{-1} w (d - \sum_t c_t T_t K) / \sum_t c_t}
@@ -74,7 +77,7 @@ def combine(light: Array, bad: Mask, centres: list[Point], half: int) -> Effecti
 
     with the frame d above its background, the fluxes c, the translations T to the stars, and w,
     0 at bad pixels and at neighbours that are not in the list. Those that are in it are
-    modelled. Each round fits flux and place of each star too; their mean place stays.
+    modelled. Each round fits flux and place of each star too.
 
     Parameters
     ----------
@@ -86,6 +89,8 @@ def combine(light: Array, bad: Mask, centres: list[Point], half: int) -> Effecti
         Row and column of each star.
     half : int
         The PSF reaches so many pixels from its middle.
+    n_given : int
+        The mean place of the first so many stars stays.
 
     Raises
     ------
@@ -99,7 +104,7 @@ def combine(light: Array, bad: Mask, centres: list[Point], half: int) -> Effecti
     Principles of Computerized Tomographic Imaging (1988), chapter 7, for the weights of its
     iteration (SIRT).
     """
-    return _Stars(light, bad, centres, half).combine()
+    return _Stars(light, bad, centres, half, n_given).combine()
 
 
 def lines(found: EffectivePsf) -> tuple[str, ...]:
@@ -123,8 +128,10 @@ def lines(found: EffectivePsf) -> tuple[str, ...]:
 class _Stars:
     """The stars of a frame with margins, in which the PSF fits round each of them."""
 
-    def __init__(self, light: Array, bad: Mask, centres: list[Point], half: int) -> None:
-        self._half = half
+    def __init__(
+        self, light: Array, bad: Mask, centres: list[Point], half: int, n_given: int
+    ) -> None:
+        self._half, self._n_given = half, n_given
         self._repaired = np.pad(light, half)
         self._good = np.pad(~bad, half)
         self._light = np.where(self._good, self._repaired, 0.0)
@@ -151,16 +158,23 @@ class _Stars:
                 "no star shows the middle of the PSF: all are bad there; give other stars"
             )
         psf = np.zeros((side, side))
-        for _ in range(ROUNDS):
-            left, overlap = self._residual(psf)
+        for done in range(ROUNDS):
+            own = self._nearest() if done < FIRST_ROUNDS else self._outside_others(psf)
+            left, overlap = self._residual(psf, own)
             left /= np.maximum(overlap, self._fluxes.min())
-            steps = [c * self._centred(left, s) * shown[s] for s, c in enumerate(self._fluxes)]
+            used = own * shown
+            weight = np.einsum("s,syx->yx", self._fluxes, used)
+            steps = [
+                c * self._centred(left, s, own[s]) * used[s] for s, c in enumerate(self._fluxes)
+            ]
             psf += np.divide(sum(steps), weight, out=np.zeros_like(psf), where=weight > 0)
             self._fit(psf)
-            weight = np.einsum("s,syx->yx", self._fluxes, shown)
-        hidden = weight == 0
+        weight = np.einsum("s,syx->yx", self._fluxes, used)
+        hidden = np.einsum("s,syx->yx", self._fluxes, shown) == 0
         repair(psf, hidden, hidden)
-        return self._finished(psf, shown, weight)
+        covered = (weight == 0) & ~hidden  # by others: what lies opposite is the best guess
+        psf[covered] = np.where(covered, 0.0, psf)[::-1, ::-1][covered]
+        return self._finished(psf, used, weight)
 
     def _finished(self, psf: Array, shown: Array, weight: Array) -> EffectivePsf:
         left, _ = self._residual(psf)
@@ -195,13 +209,27 @@ class _Stars:
         self._n_neighbours = int((foreign & good).sum())
         return (good & ~foreign).astype(np.float64)
 
-    def _residual(self, psf: Array) -> tuple[Array, Array]:
-        """Return what the model leaves of good pixels, and the fluxes that reach each pixel."""
+    def _nearest(self) -> Array:
+        """Return where each star's own pixels are nearer to it than to any other: (n, k, k)."""
+        y, x = np.indices(self._light.shape)
+        nearest = KDTree(self._places).query(np.stack([y, x], axis=-1))[1]
+        return np.array([nearest[self._window(s)] == s for s in range(len(self._places))])
+
+    def _outside_others(self, psf: Array) -> Array:
+        """Return where each star's own pixels are outside the cores of the others: (n, k, k)."""
+        core = binary_dilation(psf > CORE * psf.max(), iterations=BESIDE)
+        covered = np.zeros(self._light.shape, int)
+        for s in range(len(self._places)):
+            covered[self._window(s)] += core
+        return np.array([covered[self._window(s)] == core for s in range(len(self._places))])
+
+    def _residual(self, psf: Array, own: Array | None = None) -> tuple[Array, Array]:
+        """Return what the model leaves of good pixels, and the fluxes that each is used for."""
         left, overlap = self._light.copy(), np.zeros_like(self._light)
         movable = MovablePsf(psf, psf.shape)
         for s, c in enumerate(self._fluxes):
             left[self._window(s)] -= c * movable.at(*self._middle(s)).on_grid(psf.shape)
-            overlap[self._window(s)] += c
+            overlap[self._window(s)] += c * (1.0 if own is None else own[s])
         left *= self._good
         return left, overlap
 
@@ -226,7 +254,8 @@ class _Stars:
             found = np.linalg.lstsq(design, left[self._window(s)][used], rcond=None)[0]
             self._fluxes[s] = max(c + found[0], c / 2)
             steps[s] = found[1:].clip(-0.5, 0.5)
-        self._places += steps - np.average(steps, axis=0, weights=self._fluxes)
+        n = self._n_given
+        self._places += steps - np.average(steps[:n], axis=0, weights=self._fluxes[:n])
 
     def _name(self, s: int) -> str:
         y, x = self._places[s] - self._half
@@ -241,8 +270,8 @@ class _Stars:
         y, x = (slice(i - self._half, i + self._half + 1) for i in self._pixels[s])
         return y, x
 
-    def _centred(self, image: Array, s: int) -> Array:
+    def _centred(self, image: Array, s: int, own: Array | float = 1.0) -> Array:
         """Return the square round a star, moved so that the star is in its middle."""
         fraction = self._places[s] - self._pixels[s]
-        spectrum = fourier_shift(np.fft.fft2(image[self._window(s)]), -fraction)
-        return np.asarray(np.fft.ifft2(spectrum).real)
+        # Splines do not ring where neighbours are cut.
+        return np.asarray(shift(own * image[self._window(s)], -fraction, mode="nearest"))

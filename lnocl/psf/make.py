@@ -172,6 +172,7 @@ def make_psf(
         - Saturated pixels of the PSF were repaired, which is a guess.
         - Bad pixels have too few good ones around them, and were set to the background.
         - An undersampled star rings.
+        - Wings reach beyond the frame, and were taken for background.
 
     See Also
     --------
@@ -190,6 +191,10 @@ def make_psf(
     - A block of 2 x 2 is found to 0.4 %, one of 3 x 3 to 2 %.
     - A core clipped at 0.7 (0.5) of the peak has 1 % (4 %) less flux than it should.
     - With fringes 3.4 pixels apart such a core has 16 % (34 %) less.
+
+    **Wings** reach into the ring that the background is measured in. So all pixels from three
+    widths on are fitted with a level and the wings of a Moffat function. Where the level is lower
+    by five of its errors and 0.1 % of the flux it is taken, unless wings reach beyond the frame.
 
     **The centre** is that of the circular Gaussian that fits the star best by least squares,
     together with a constant and without the bad pixels. It is the centre of the light in the core,
@@ -231,11 +236,14 @@ def make_psf(
     **Several stars** give their effective PSF (Anderson & King 2000), by
     `lnocl.psf.effective.combine`. Moved to each star as `lnocl.deconvolve` moves it, this PSF
     explains all of them together. It has the noise of all stars together, and no blur by a shift,
-    also where they are undersampled. It has no neighbours: those in the list are modelled. Others
-    are masked where one star shows them and another does not. Bad pixels are left to the other
-    stars. This was measured with four stars of 3e4 to 2e5 electrons and FWHM 2.5. One had two bad
-    pixels in its core and one a neighbour. Their PSF is right to 0.7 % of its peak, as noise
-    allows. That of the brightest alone is right to 13 %, as it has the neighbour.
+    also where they are undersampled. Bad pixels are left to the other stars.
+
+    **Neighbours** are stars too: those not given that lie three widths or more from the given ones,
+    with a twentieth of the peak of one of them or more, are found in the crop and taken with them.
+    Sources of another width are masked. So the PSF is the effective one wherever there are
+    neighbours. This was measured with four stars of 3e4 to 2e5 electrons and FWHM 2.5. One had two
+    bad pixels in its core and one a neighbour. Their PSF is right to 0.7 % of its peak, as noise
+    allows.
 
     References
     ----------
@@ -359,24 +367,33 @@ def _make(
     light = np.where(unusable, 0.0, pixels - level)
     region = steps.reachable(pixels.shape, places, half)
     unrepairable, repaired = steps.repair_bad(light, unusable, saturated, region)
-    centres, shift, centred = steps.find_centres(light, unusable, places, level, recentre)
+    centres, shift, centred, width = steps.find_centres(light, unusable, places, level, recentre)
     middles = [steps.nearest_pixel(centre) for centre in centres]
     side = min(
         steps.fitting_side(given.shape, pixel, side, angle) for angle in angles for pixel in middles
     )
     scatter: Array | None = None
     combined: tuple[str, ...] = ()
+    far = max(resampling.reach(side, angle) for angle in angles) + steps.MARGIN
+    lowered, others = list[str](), list[str]()
+    if width:
+        more, masked, others = steps.find_neighbours(light, unusable, centres, width, far)
+        centres = [*centres, *more]
+        if isinstance(background, str):
+            before = level
+            level, lowered = steps.lower_background(level, light, unusable, centres, width, side)
+            light = np.where(unrepairable, 0.0, light + before - level)
     if len(middles) == 1:
         (pixel,) = middles
         steps.refuse_hole(unrepairable, pixel)
         steps.warn_of_guess(saturated, light, pixel, side)
-    else:
-        far = max(resampling.reach(side, angle) for angle in angles) + steps.MARGIN
-        stars = effective.combine(light, unusable, centres, far)
+    if len(centres) > 1 or others:
+        hidden = masked | (unusable if len(centres) > 1 else unrepairable)
+        stars = effective.combine(light, hidden, centres, far, len(middles))
         centres = [(star.y, star.x) for star in stars.stars]
         flux = sum(star.flux for star in stars.stars)
         light, scatter, pixel, shift = flux * stars.psf, flux * stars.scatter, (far, far), None
-        combined = effective.lines(stars)
+        combined = (*others, *effective.lines(stars))
     squares = [
         _make_square(light, pixel, shift, side, angle, level, clip_negative) for angle in angles
     ]
@@ -385,7 +402,7 @@ def _make(
         StarPsf(
             square.psf / square.flux,
             None if scatter is None else _turn_scatter(scatter, side, angle) / square.flux,
-            (*found, measured, repaired, *centred, *combined),
+            (*found, measured, *lowered, repaired, *centred, *combined),
             square.lines,
             square.flux,
             tuple((x, y) for y, x in centres),

@@ -8,20 +8,30 @@ from collections.abc import Sequence
 import numpy as np
 from astropy.stats import sigma_clipped_stats
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter
 
-from lnocl.errors import InputError, warn
+from lnocl.errors import InputError, counted, warn
 from lnocl.psf import resampling
 from lnocl.psf.centring import FWHM, SEARCH, Array, Mask, Pixel, Point, brightest, fit_gaussian
 from lnocl.psf.checks import MIN_SIZE, one_number
 from lnocl.psf.repair import WINDOW, repair
+from lnocl.psf.wings import FROM, fit_sky
 from lnocl.scene.arrays import numbers
 
 # Pixels around the crop while it is shifted and rotated: both wrap round its edges.
 MARGIN = 16
+# The background is lowered by so many of its errors or more, and by this share of the flux; where
+# the farthest pixels are above it by less than this share of that. Of a larger share it is warned.
+CERTAIN, LITTLE, TRUSTED, MUCH = 5.0, 0.001, 0.5, 0.01
 # Fewest pixels that a background is measured from.
 MIN_SKY = 100
 # Width of the frame's border, as a share of the shorter side.
 BORDER = 1 / 16
+# Another star is a maximum so many widths from the given ones, above this share of the peak of one
+# that it is near, and so many times the noise: what is nearer or fainter may be rings and speckles.
+APART, BRIGHT, SIGNIFICANT = 3.0, 0.05, 5.0
+# It is a star where it is as wide, but for this share; else it is masked to so many widths.
+ALIKE, MASKED = 0.15, 2.0
 # Growth of negative pixels by shift and rotation that calls for a warning: a share of the flux on
 # top of a share of the negative flux before, since both change noise too.
 RINGING, OF_NOISE = 0.01, 0.2
@@ -96,6 +106,55 @@ def measure_background(
     )
 
 
+def lower_background(
+    level: float, light: Array, bad: Mask, centres: list[Point], width: float, side: int
+) -> tuple[float, list[str]]:
+    """Return the background beneath the wings of stars, where it is lower, and a line for that.
+
+    Parameters
+    ----------
+    level : float
+        The background as measured.
+    light : ndarray of float64, shape (ny, nx)
+        The frame above it.
+    bad : ndarray of bool, shape (ny, nx)
+        True where a pixel is bad.
+    centres : list of tuple of float
+        Row and column of the stars.
+    width : float
+        Their FWHM, pixels.
+    side : int
+        The side of the PSF.
+
+    Warns
+    -----
+    LnoclWarning
+        Wings reach beyond the frame, so that their light is taken for sky.
+    """
+    peaks = np.array([light[nearest_pixel(centre)] for centre in centres]).clip(0.0)
+    sky = fit_sky(light, bad, centres, peaks, width, 2 * side)
+    y, x = np.indices(light.shape)
+    core = np.min([np.hypot(y - r, x - c) for r, c in centres], axis=0) < FROM * width
+    flux = float(light[core & ~bad].sum())
+    if sky is None or not flux > 0:
+        return level, []
+    share = -sky.level * len(centres) * side**2 / flux
+    if sky.level > -CERTAIN * sky.error or share < LITTLE:
+        return level, []
+    if sky.nearest > TRUSTED * -sky.level:
+        if share > MUCH:
+            warn(
+                f"the wings of the star reach beyond the frame: up to about {_percent(share, 0)} "
+                "of its light is taken for background; give background as a number, or a smaller "
+                "size"
+            )
+        return level, []
+    return level + sky.level, [
+        f"background: {level + sky.level:g} instead, to which the wings fall; it held "
+        f"{_percent(share)} of the flux"
+    ]
+
+
 def repair_bad(light: Array, bad: Mask, saturated: Mask, region: Mask) -> tuple[Mask, str]:
     """Interpolate the bad pixels of a region in place; return those that are too far inside."""
     if not bad.any():
@@ -114,26 +173,91 @@ def repair_bad(light: Array, bad: Mask, saturated: Mask, region: Mask) -> tuple[
 
 def find_centres(
     light: Array, unusable: Mask, starts: list[Pixel], level: float, recentre: bool
-) -> tuple[list[Point], Point | None, list[str]]:
-    """Return the stars' centres and the shift of one to the middle of a pixel; None for none."""
+) -> tuple[list[Point], Point | None, list[str], float]:
+    """Return the stars' centres, the shift of one to the middle of a pixel, lines, and the FWHM.
+
+    The shift is None for none, the width that of the widest, and 0 where none is measured.
+    """
     if not recentre:
         if len(starts) > 1:
             raise InputError("several stars must be recentred; give one, or leave recentre")
         centre = float(starts[0][0]), float(starts[0][1])
-        return [centre], None, [f"centre: pixel {_at(starts[0])}; not shifted"]
-    centres, lines = [], []
+        return [centre], None, [f"centre: pixel {_at(starts[0])}; not shifted"], 0.0
+    centres, lines, width = [], [], 0.0
     for start in starts:
         centre, sigma = fit_gaussian(light, unusable, start, level)
         centres.append(centre)
+        width = max(width, FWHM * sigma)
         lines.append(
             f"centre: x = {centre[1]:.3f}, y = {centre[0]:.3f}, FWHM {FWHM * sigma:.2f} pixels"
         )
     if len(starts) > 1:
-        return centres, None, lines
+        return centres, None, lines, width
     pixel = nearest_pixel(centres[0])
     shift = pixel[0] - centres[0][0], pixel[1] - centres[0][1]
     moved = f"; shifted by x {_plain(shift[1], 3)}, y {_plain(shift[0], 3)}"
-    return centres, shift, [lines[0] + moved]
+    return centres, shift, [lines[0] + moved], width
+
+
+def find_neighbours(
+    light: Array, bad: Mask, centres: list[Point], width: float, half: int
+) -> tuple[list[Point], Mask, list[str]]:
+    """Return other stars that the windows of these show, pixels of other sources, and a line.
+
+    Parameters
+    ----------
+    light : ndarray of float64, shape (ny, nx)
+        The frame above its background.
+    bad : ndarray of bool, shape (ny, nx)
+        True where a pixel is bad.
+    centres : list of tuple of float
+        Row and column of the stars.
+    width : float
+        Their FWHM, pixels.
+    half : int
+        Half the side of the windows.
+    """
+    noise = float(sigma_clipped_stats(light[~bad])[2])
+    y, x = np.indices(bad.shape)
+    far = np.min([np.maximum(abs(y - r), abs(x - c)) for r, c in centres], axis=0) > half
+    highest = (light == maximum_filter(light, 2 * math.ceil(width) + 1)) & ~bad
+    stars, masked, n_masked = list[Point](), np.zeros_like(bad), 0
+    for row, column in np.argwhere(highest & (light > SIGNIFICANT * noise)).tolist():
+        offsets = np.abs(np.array(centres) - (row, column))
+        peaks = [light[nearest_pixel(centres[s])] for s in range(len(centres))]
+        is_near = offsets.max(axis=1) < half + APART * width
+        is_bright = light[row, column] > BRIGHT * np.array(peaks)
+        if np.hypot(*offsets.T).min() < APART * width or not (is_near & is_bright).any():
+            continue
+        try:
+            place, sigma = fit_gaussian(light, bad, (row, column), 0.0)
+        except InputError:
+            place, sigma = (row, column), width / FWHM
+        is_there = math.dist(place, (row, column)) < width
+        if (
+            is_there
+            and abs(FWHM * sigma / width - 1.0) < ALIKE
+            and not _touches(bad | far, place, width)
+        ):
+            stars.append(place)
+        else:
+            masked |= np.hypot(y - row, x - column) < MASKED * width
+            n_masked += 1
+    if not (stars or n_masked):
+        return [], masked, []
+    return (
+        stars,
+        masked | far,
+        [
+            f"neighbours: {counted(len(stars), 'star')} not given, taken too; "
+            f"{counted(n_masked, 'other source')} masked"
+        ],
+    )
+
+
+def _touches(bad: Mask, place: Point, width: float) -> bool:
+    """Return whether pixels of a core are bad."""
+    return bool(cut_square(bad, nearest_pixel(place), math.ceil(width / 2)).any())
 
 
 def _largest(shape: tuple[int, ...], pixel: Pixel, angle: float) -> int:

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from star_frames import gaussian, quiet
+from star_frames import gaussian, line, quiet
 
 from lnocl.errors import InputError
 from lnocl.psf.make import make_psf, make_psfs
@@ -81,12 +81,23 @@ def test_neighbours_that_are_given_are_modelled():
     assert error(star, 2.5) < 2e-3
 
 
-def test_other_neighbours_are_left_out():
+@pytest.mark.parametrize("given", [PLACES, PLACES[0]])
+def test_other_neighbours_are_taken_too(given):
     frame = a_frame(2.5, [*PLACES, (38.2, 33.4)], [*FLUXES, 0.2])
-    star = make_psf(frame, PLACES, SIZE, background=0.0)
-    assert error(make_psf(frame, PLACES[0], SIZE, background=0.0), 2.5) > 0.1
+    star = make_psf(frame, given, SIZE, background=0.0)
     assert error(star, 2.5) < 4e-3
-    assert "0 pixels of neighbours" not in star.steps[-4]
+    assert line(star, "neighbours").startswith("neighbours: 1 star not given, taken too; 0 ")
+
+
+@pytest.mark.parametrize(("n_given", "most"), [(9, 0.01), (1, 0.02)])
+def test_stars_packed_within_the_window_are_not_its_wings(n_given, most):
+    rng = np.random.default_rng(1)
+    places = (70.0, 59.5) + 28 * np.array([(x, y) for x in (0, 1, -1) for y in (0, 1, -1)])
+    places += rng.uniform(-0.5, 0.5, places.shape)
+    frame = rng.poisson(50 + a_frame(4.0, places, 10 ** rng.uniform(0, 1, 9)))
+    star = make_psf(frame, places[:n_given], 61)
+    expected = gaussian(4.0, 30, 30, (61, 61))
+    assert abs(star.psf - expected / expected.sum()).max() < most * expected.max()
 
 
 def test_bad_and_saturated_pixels_are_left_to_other_stars():

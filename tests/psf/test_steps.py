@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from star_frames import STAR, gaussian, line
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, LnoclWarning
 from lnocl.psf.make import make_psf
 
 
@@ -42,6 +42,26 @@ def test_the_ring_lies_outside_the_crop():
     star = make_psf(frame, size=21, position=(30, 30))
     assert star.background == 7.0
     assert f"median of {41**2 - 21**2} pixels" in line(star, "background")
+
+
+def a_wide_star(power, width, n):
+    y, x = np.indices((n, n)) - n / 2
+    wings = (1 + (x**2 + y**2) / width**2) ** -power
+    return np.random.default_rng(8).poisson(100 + 1e6 * wings * (power - 1) / (np.pi * width**2))
+
+
+def test_wings_are_not_taken_for_background():
+    frame = a_wide_star(2.0, 3.1, 128)
+    star = make_psf(frame, size=31)
+    assert star.background == pytest.approx(100, abs=0.5)
+    before, after = (step for step in star.steps if step.startswith("background"))
+    assert float(before.split()[1]) > 105
+    assert " instead, to which the wings fall; it held 0." in after
+
+
+def test_wings_beyond_the_frame_are_announced():
+    with pytest.warns(LnoclWarning, match=r"reach beyond the frame: up to about \d+ % of its"):
+        make_psf(a_wide_star(3.0, 17.0, 96) + a_wide_star(4.0, 3.0, 96))
 
 
 def test_a_background_given_is_subtracted():
