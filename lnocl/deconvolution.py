@@ -451,6 +451,8 @@ def _iterate(
     stop_reason = stop_reason or ("n_iter" if run.done == run.n_iter else "converged")
     run.finish()
     run.check_descent()
+    if stop_reason in ("n_iter", "converged"):
+        rule.miss(run)
     save(stop_reason)
     return stop_reason
 

@@ -23,6 +23,7 @@ from lnocl.runs.options import WRONG_PSFS
 from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_model, make_start
 from lnocl.scene.forward_model import Model
+from lnocl.scene.noise_check import with_noise_shown
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.padding import choose_pad
 from lnocl.scene.penalty import Penalty, recommend_smoothing
@@ -85,7 +86,7 @@ class GuardedRuns:
     Attributes
     ----------
     observation : Observation
-        Those of the window.
+        Those of the window, with the noise that they show.
     stars : ndarray of float64, shape (n, 2)
         The stars in it, and where they are in it.
     held : ndarray of bool
@@ -96,7 +97,8 @@ class GuardedRuns:
 
     def __init__(self, setup: Setup, observation: Observation) -> None:
         self.all_stars = setup.stars
-        self.observation, self.stars, self.held = find_window(setup, observation)
+        shown = with_noise_shown(observation)
+        self.observation, self.stars, self.held = find_window(setup, shown)
         # One grid for all PSFs that are tried.
         pad = choose_pad(observation) if setup.pad == "auto" else setup.pad
         self._setup = replace(setup, solver="sgp", pad=pad)

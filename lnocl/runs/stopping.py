@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lnocl.errors import warn
 from lnocl.runs.run import Run
 from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved
 from lnocl.scene.observation import Array
@@ -27,6 +28,9 @@ class Rule(Protocol):
 
     def met(self, run: Run) -> bool:
         """Return whether the run should end; asked once after each iteration."""
+
+    def miss(self, run: Run) -> None:
+        """Tell, after the last iteration, that the rule was not met, where that matters."""
 
     def quantity(self, run: Run) -> str:
         """Return the quantity that decides, for the progress bar."""
@@ -53,6 +57,9 @@ class NoRule:
         """Return False."""
         return False
 
+    def miss(self, run: Run) -> None:
+        """Do nothing."""
+
     def quantity(self, run: Run) -> str:
         """Return the objective."""
         return f"objective {run.objective():.6g}"
@@ -78,6 +85,9 @@ class Change:
         """Return whether the objective has settled."""
         self._recent.append(run.objective())
         return len(self._recent) > CHANGE_WINDOW and self._change() < self._threshold
+
+    def miss(self, run: Run) -> None:
+        """Do nothing."""
 
     def quantity(self, run: Run) -> str:
         """Return the relative change an iteration."""
@@ -123,6 +133,15 @@ class Discrepancy:
             return False
         self._expected = self._expect(run)
         return self._discrepancy(run) <= 1.0
+
+    def miss(self, run: Run) -> None:
+        """Warn of a model that does not fit as noise would."""
+        self._expected = self._expect(run)
+        warn(
+            f"the discrepancy was not reached: after {run.done} iterations it is "
+            f"{self._discrepancy(run):.3g}, where noise gives 1; see to PSFs and noise, or raise "
+            "n_iter"
+        )
 
     def quantity(self, run: Run) -> str:
         """Return the data term over its expectation."""

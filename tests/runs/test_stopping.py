@@ -86,6 +86,11 @@ class TestChange:
         assert (result.stop_reason, result.n_iter) == ("n_iter", 20)
 
 
+def test_a_discrepancy_that_is_not_reached_is_announced():
+    with pytest.warns(LnoclWarning, match=r"not reached: after 2 iterations it is \d"):
+        assert run(scene()[0], stop="discrepancy", n_iter=2).stop_reason == "n_iter"
+
+
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
 @pytest.mark.parametrize("mask", [False, True], ids=["", "masked"])
 def test_discrepancy_stops_where_noise_is_reached(mask, solver):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.scene.noise_check import _some_rows, measure_noise, warn_of_noise
+from lnocl.scene.noise_check import _some_rows, measure_noise, warn_of_noise, with_noise_shown
 
 SHAPE, LEVEL = (128, 130), 60.0
 Y, X = np.indices(SHAPE) - 64.0
@@ -83,6 +83,21 @@ def test_other_noise_is_said(case):
     (message,) = said(np.array([counts(5), WRONG[case]]))
     assert message.startswith("the noise of image 1 is not that of its counts: where it is darkest")
     assert "see to gain, background" in message
+
+
+@pytest.mark.parametrize("n", [40, 128])
+def test_read_noise_that_is_too_large_is_said_and_taken_back(n):
+    image = (counts() + np.random.default_rng(1).normal(0.0, 12.0, SHAPE))[:n, :n]
+    (message,) = said(image, background=LEVEL, read_noise=24.0)
+    assert message.startswith("the noise of image 0 is not that of its counts")
+    given = lnocl.Observation(image, np.ones((1, 1)), background=LEVEL, read_noise=24.0)
+    shown = with_noise_shown(given)
+    assert shown.background[0] == pytest.approx(LEVEL + 12.0**2, rel=0.2)
+    np.testing.assert_allclose(
+        shown.images - given.images, shown.background[0] - given.background[0], rtol=1e-6
+    )
+    right = lnocl.Observation(image, np.ones((1, 1)), background=LEVEL, read_noise=12.0)
+    assert with_noise_shown(right) is right
 
 
 @pytest.mark.parametrize("times", [1, 2])
