@@ -35,7 +35,7 @@ from lnocl.solvers.psf_fit import step
 
 log = logging.getLogger("lnocl")
 
-# A mend is taken where it leaves less than this share of kappa, or nothing to doubt and a misfit
+# A mend is taken where it leaves less than this share of kappa, or nothing to doubt, and a misfit
 # that is less by so many of its standard deviations.
 MENDED, GONE = 0.5, 2.0
 # None is taken that leaves a star less than this share of its flux.
@@ -104,8 +104,8 @@ class _State:
         before, after = self.misfit, other.misfit
         if (other.estimate.fluxes < FADED * self.estimate.fluxes).any():
             return False  # a sharper PSF, and the star's light in the extended source
-        is_gone = not after.is_doubtful and before.significance - after.significance > GONE
-        return is_gone or after.kappa < MENDED * before.kappa
+        is_less = before.significance - after.significance > GONE
+        return is_less and (not after.is_doubtful or after.kappa < MENDED * before.kappa)
 
 
 def mend(

@@ -30,9 +30,10 @@ from lnocl.scene.scene import MIN_MODEL, Scene
 DOMINANT = 0.5
 # The misfit is told from noise from so many of its standard deviations on; in a ring from so many.
 SIGNIFICANT, SIGNIFICANT_IN_RING = 5.0, 2.0
-# A mend is tried from fewer on too where kappa is large: in few counts no error is significant, and
-# in many the smoothing of the extended source leaves as many standard deviations, but little kappa.
-DOUBTFUL, LARGE = 3.0, 0.1
+# A mend is tried from fewer on too where kappa is large: in few counts or pixels no error is
+# significant, and in many the smoothing of the extended source leaves as many standard deviations,
+# but little kappa.
+DOUBTFUL, LARGE = 2.0, 0.025
 
 
 class PsfMisfit(NamedTuple):
@@ -69,7 +70,7 @@ class PsfMisfit(NamedTuple):
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether a mend is worth a trial: the excess is significant, or three and kappa large."""
+        """Whether a mend is worth a trial: the excess is significant, or two and kappa large."""
         return self.is_significant or (self.significance > DOUBTFUL and self.kappa > LARGE)
 
     @property
