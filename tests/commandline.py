@@ -44,7 +44,7 @@ def command_files(tmp_path_factory):
         "cube": images,
         "oblong": images[0].T,
         "line": images[0, 0],
-        "four": images[None],
+        "four": images[:, None],
         "nan": np.full(SHAPE, np.nan),
         "k1": psfs[0],
         "k2": psfs[1],

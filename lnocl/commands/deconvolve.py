@@ -83,7 +83,7 @@ def _run(arguments: argparse.Namespace) -> None:
     checkpoints.check(arguments, inputs)
     bootstrap.check(arguments)
     with (
-        messages.shown_log(arguments.quiet),
+        messages.shown_log(arguments.quiet, COMMAND.flags()),
         messages.recorded_warnings(COMMAND.flags()) as warned,
         checkpoints.Interrupts() as interrupts,
     ):

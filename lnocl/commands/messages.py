@@ -62,7 +62,7 @@ def in_shell(message: str, flags: Mapping[str, str]) -> str:
     special = [name for name in flags if "_" in name]
     place = "|".join(["^", *(rf"(?<=\b{word} )" for word in BEFORE_NAMES)])
     name = rf"(?:{'|'.join(ordinary + special)})\b(?![./'-])"
-    for pattern in (
+    for pattern in flags and (
         rf"(?:{place}){name}(?:(?:, | and ){name})*",
         rf"(?<![\w./'-])(?:{'|'.join(special)})(?![\w./'-])",
     ):
@@ -104,12 +104,12 @@ def recorded_warnings(flags: Mapping[str, str]) -> Iterator[list[str]]:
 
 
 @contextlib.contextmanager
-def shown_log(quiet: bool = False) -> Iterator[None]:
-    """Show the notes that the library logs on stderr, unless it is quiet."""
+def shown_log(quiet: bool = False, flags: Mapping[str, str] | None = None) -> Iterator[None]:
+    """Show the notes that the library logs on stderr, with `in_shell`, unless it is quiet."""
     if quiet:
         yield
         return
-    log, handler = logging.getLogger("lnocl"), _Notes()
+    log, handler = logging.getLogger("lnocl"), _Notes(flags or {})
     level = log.level
     log.addHandler(handler)
     log.setLevel(logging.INFO)
@@ -133,12 +133,13 @@ def _note(message: str) -> None:
 class _Notes(logging.Handler):
     """Handler that shows each note once, where several runs log the same."""
 
-    def __init__(self) -> None:
+    def __init__(self, flags: Mapping[str, str]) -> None:
         super().__init__()
+        self._flags = flags
         self._shown: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        message = record.getMessage()
+        message = in_shell(record.getMessage(), self._flags)
         if message not in self._shown:
             self._shown.add(message)
             _note(message)

@@ -143,10 +143,11 @@ def verdict_on(
     refinement = result.psf_refinement
     is_fitted = refinement is not None and refinement.has_free_pixels  # which follow the noise
     if overall.is_overfit and not is_fitted:
+        is_smoothed = bool((result.smoothing or 0.0) > 0.0)
         verdict.append(
             "the residuals are far less than noise: the noise that is taken is too large (see to "
-            "unit, gain, exposure, background and read noise), or the model follows the noise "
-            "(take fewer iterations, or --smoothing)"
+            "unit, gain, exposure, background and read noise), or the model follows the noise"
+            + ("" if is_smoothed else " (take fewer iterations, or --smoothing)")
         )
     if lit:
         verdict.append(

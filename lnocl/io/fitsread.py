@@ -68,7 +68,8 @@ def read_stack(paths: Sequence[str]) -> Stack:
     Parameters
     ----------
     paths : sequence of str
-        One file with an image (ny, nx) or a cube (p, ny, nx), or p files with an image each.
+        One file with an image (ny, nx) or a cube (p, ny, nx), or p files with an image each; first
+        axes of length 1 are left out.
 
     Returns
     -------
@@ -259,7 +260,10 @@ def _read_file(
             log.info("%s: the image is %s", path, describe(index, hdus[index]))
         hdu = hdus[index]
         checksum = file.sha256() if extension is None else ""  # which reads all of the file
-        return file.pixels(hdu), readable(hdu.header), checksum
+        pixels = file.pixels(hdu)
+        while pixels.ndim > 2 and len(pixels) == 1:
+            pixels = pixels[0]
+        return pixels, readable(hdu.header), checksum
 
 
 def _check_shape(
@@ -271,17 +275,19 @@ def _check_shape(
 ) -> None:
     found = f"{path} has an image of {counted(len(shape), 'dimension')}"
     if alone and len(shape) not in (2, 3):
-        raise InputError(
-            f"{found}; two are needed, or three for a cube of images: leave out the others, such "
-            "as axes of length 1"
-        )
+        raise InputError(f"{found}; two are needed, or three for a cube of images: cut the others")
     if len(shape) == 3 and shape[-1] <= MAX_CHANNELS < min(shape[:-1]):
         raise InputError(
             f"{path} has the shape {shape}: its last axis is of colours or channels; give one of "
             "them, as an image of its own"
         )
+    if not alone and len(shape) == 3:
+        raise InputError(
+            f"{path} holds {shape[0]} images, such as integrations; each of several files needs "
+            "one: give their mean, or one of them"
+        )
     if not alone and len(shape) != 2:
-        raise InputError(f"{found}; each of several files needs two (a cube must be the only file)")
+        raise InputError(f"{found}; two are needed")
     if shape != first_shape:
         raise InputError(
             f"{path} has the shape {shape} and {first_path} {first_shape}; they must be the same"

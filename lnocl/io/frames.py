@@ -16,9 +16,9 @@ from lnocl.errors import InputError, counted, warn
 from lnocl.io import sky
 from lnocl.io.fitsread import read_contents, read_extension, read_keyword, read_stack
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
-from lnocl.io.levels import sky_level, sky_noise
+from lnocl.io.levels import is_rate, sky_level, sky_noise
 from lnocl.io.maps import Maps, Word
-from lnocl.io.noise import VARIANCES, NoiseMap, electrons_by_variance, read_noise_map
+from lnocl.io.noise import VARIANCES, WITH_SOURCE, NoiseMap, electrons_by_variance, read_noise_map
 from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.observation import OVERSAMPLES, Array, Observation, PsfCentre
@@ -31,6 +31,8 @@ Mask = NDArray[np.bool_]
 MAX_SCALE_ERROR = 0.02
 # Of more masked pixels than this share of an image it is warned.
 MUCH_MASKED = 0.1
+# Of images with more negative pixels than this share the sky was subtracted.
+SUBTRACTED = 0.01
 # Words for masks in the images' own files.
 MASK_WORDS = ("dq", "wht")
 # The extensions in which `lnocl psf` writes what it finds beside a PSF.
@@ -177,8 +179,8 @@ class _Reader:
 
     def frames(self) -> Frames:
         """Return the observation in the files."""
-        factor, are_rates = self._electrons()
         exposure = self._exposure()
+        factor, are_rates = self._electrons(exposure)
         if are_rates and exposure is None:
             raise InputError(
                 f"{self._paths[0]} holds counts per time; give exposure, in seconds: a number, a "
@@ -188,16 +190,17 @@ class _Reader:
         if not self._grids:  # which are sampled on the images' pixels as they need
             self._warn_of_pixel_scales()
         each = factor * (_maps(exposure) if are_rates and exposure is not None else 1.0)
-        noise = self._noise_map()
+        noise = self._noise_map
         mask = self._mask(exposure, noise)
         counts = self._images.data
         counts *= each
         background = self._background(counts, mask)
+        levels = self._without_sky(counts, background)
         read_noise = self._read_noise_words(counts, mask)
         observation = Observation(
             counts,
             self._grids or self._psfs.data,
-            background=self._maps.combine("background", background),
+            background=self._maps.combine("background", levels),
             read_noise=self._maps.combine("read_noise", read_noise)
             if noise is None
             else noise.read_noise(counts, each, mask),
@@ -217,7 +220,7 @@ class _Reader:
         }
         unit = self._unit()
         name, of_unit = (units.spelled(unit), factor) if units.is_known(unit) else ("electron", 1.0)
-        if exposure is not None and not are_rates:
+        if exposure is not None and (name == "electron" or not are_rates):
             name += "/s"
         return Frames(
             observation,
@@ -281,57 +284,103 @@ class _Reader:
                 )
                 return
 
-    def _electrons(self) -> tuple[float, bool]:
+    def _electrons(self, exposure: Array | None) -> tuple[float, bool]:
         """Return the electrons in a unit of the images, and whether they are per second."""
         if self._electrons_in_units is not None:
             return 1.0, True
-        gain = self._gain
+        gain, counts = self._gain, self._counts(("adu",))
         if gain is not None and not (np.isfinite(gain) and gain > 0):
             raise InputError(f"gain must be more than 0; {gain:g} was given")
-        unit = self._unit()
-        if unit.is_equivalent(dimensionless_unscaled) and unit != dimensionless_unscaled:
-            unit = None  # numbers and per cents do not count anything
-        if gain is not None:
-            factor, are_rates = units.count_of(unit, (*units.COUNTS, "adu")) or (1.0, False)
-            return gain * factor, are_rates
-        counts = units.count_of(unit)
-        if not self._bunit(0):
-            log.info("%s has no BUNIT: its unit is taken to be electrons", self._paths[0])
-        if counts is None:
+        if gain is None and self._counts() is None:
             raise InputError(
                 f"{self._paths[0]} is in {self._bunit(0)}, not in counts; give gain, the electrons "
-                "for each of these units: a number, or a keyword of its header such as GAIN"
+                "in one of these units: a number, "
+                + (
+                    "or a keyword of its header such as GAIN"
+                    if counts or not units.is_known(self._unit())
+                    else "the exposure in seconds over the value of one electron per second"
+                )
             )
-        return counts
+        factor, are_rates = counts or (1.0, exposure is not None and units.is_known(self._unit()))
+        factor *= 1.0 if gain is None else gain
+        if not units.is_known(self._unit()):
+            if exposure is not None:
+                means = exposure.reshape(len(exposure), -1).mean(axis=1)
+                are_rates = all(
+                    is_rate(factor * image, means[min(j, len(means) - 1)])
+                    for j, image in enumerate(self._images.data)
+                )
+            name = "electrons" if gain is None else "counts"
+            log.info(
+                "%s has %s: %s",
+                self._paths[0],
+                f"BUNIT {self._bunit(0)}" if self._bunit(0) else "no BUNIT",
+                f"by its noise it is in {name} per second"
+                if are_rates
+                else f"its unit is taken to be {name}",
+            )
+        elif units.count_of(self._unit(), ("electron",)) and gain not in (None, 1.0):
+            warn(
+                f"{self._paths[0]} is in {self._bunit(0)} by BUNIT, and is taken times gain "
+                f"{gain:g}: leave gain out, unless BUNIT is wrong"
+            )
+        return factor, are_rates
+
+    def _counts(self, others: Sequence[str] = ()) -> tuple[float, bool] | None:
+        """Return the counts in the unit of the images, of these kinds too, as `units.count_of`."""
+        unit = self._unit()
+        if unit.is_equivalent(dimensionless_unscaled) and unit != dimensionless_unscaled:
+            return None  # numbers and per cents do not count anything
+        return units.count_of(unit, (*units.COUNTS, *others))
 
     @cached_property
     def _electrons_in_units(self) -> Array | None:
-        """The electrons in a unit of each image, where gain names the variance of their counts.
+        """The electrons in a unit of each image, where they follow from its noise.
 
         They are to the image what an exposure is to a rate.
         """
-        word = self._calibration.gain
-        if not isinstance(word, str):
-            return None
+        counts = self._counts(("adu",))
+        return self._by_noise if counts is None or counts[1] else None
+
+    @cached_property
+    def _by_noise(self) -> Array | None:
+        """The electrons in a unit of each image, by the variance of its counts.
+
+        That is the extension that gain names; where no gain is given and the images are not in
+        counts it is VAR_POISSON, or error, or the extension ERR.
+        """
+        gain = self._calibration.gain
         held = frozenset.intersection(*(read_contents(path).extensions for path in self._paths))
-        if word.upper() not in held:
+        words = [gain.upper()] if isinstance(gain, str) else ["VAR_POISSON", "error", "ERR"]
+        if isinstance(gain, float) or (gain is None and self._counts() is not None):
             return None
-        variances = self._extensions(word.upper(), "gain")
+        noise = self._noise_map
+        has_errors = noise is not None and noise.kind == WITH_SOURCE
+        found_in = [word for word in words if word in held or (word == "error" and has_errors)]
+        if not found_in:
+            return None
+        word = found_in[0]
+        if word == "error" and noise is not None:
+            variances = noise.variance
+        else:
+            variances = self._extensions(word, "gain") ** (2 if word == "ERR" else 1)
         flags = self._extensions("DQ", "mask") if "DQ" in held else [None] * len(variances)
         planes = zip(self._images.data, variances, flags, strict=True)
         found = [
             electrons_by_variance(image, variance, self._paths[min(j, len(self._paths) - 1)], sums)
             for j, (image, variance, sums) in enumerate(planes)
         ]
-        for j, electrons in enumerate(found, 1):
-            log.info("image %d: %.4g electrons in its unit, by %s", j, electrons, word.upper())
+        for j, electrons in enumerate(found):
+            log.info("image %d: %.4g electrons in its unit, by %s", j, electrons, word)
         return np.array(found)
 
     @cached_property
     def _gain(self) -> float | None:
         word = self._calibration.gain
-        if not isinstance(word, str) or self._electrons_in_units is not None:
-            return word if isinstance(word, float) else None
+        if self._by_noise is not None:
+            return float(self._by_noise.mean()) if self._electrons_in_units is None else None
+        if not isinstance(word, str):
+            return word
         found = [self._from_header("gain", j, word) for j in range(len(self._paths))]
         for path, gain in zip(self._paths, found, strict=True):
             if gain is None:
@@ -363,9 +412,7 @@ class _Reader:
         words = self._calibration.exposure
         if self._electrons_in_units is not None:
             if words:
-                raise InputError(
-                    f"give exposure or gain {self._calibration.gain}, which has it, not both"
-                )
+                log.info("exposure is left out: the electrons in the unit have it")
             return self._electrons_in_units
         if not words:
             return None
@@ -387,9 +434,10 @@ class _Reader:
                 f"{keyword} of {path} is {value!r}, not a number; give {name} as a number"
             )
         noted = name.replace("_", " ")
-        log.info("image %d: %s %g%s, from %s", j + 1, noted, value, unit, keyword)
+        log.info("image %d: %s %g%s, from %s", j, noted, value, unit, keyword)
         return float(value)
 
+    @cached_property
     def _noise_map(self) -> NoiseMap | None:
         given = {kind: getattr(self._calibration, kind) for kind in VARIANCES}
         found = read_noise_map(given, self._maps, lambda: self._extensions("ERR", "error"))
@@ -401,7 +449,7 @@ class _Reader:
         """Return which pixels are bad, and log their number, each pixel for its first reason."""
         masked = np.zeros(self._images.data.shape, bool)
         for why, bad in self._bad_pixels(exposure, noise):
-            for j, count in enumerate((bad & ~masked).sum(axis=(1, 2)), 1):
+            for j, count in enumerate((bad & ~masked).sum(axis=(1, 2))):
                 log.info("image %d: %s masked %s", j, counted(count, "pixel"), why)
             masked |= bad
         for j, share in enumerate(masked.mean(axis=(1, 2))):
@@ -479,9 +527,25 @@ class _Reader:
             lambda j, word: sky_level(j, counts[j], mask[j]) if word == "auto" else None,
         )
 
+    def _without_sky(self, counts: Array, background: list[Word]) -> list[Word]:
+        """Return the background, but for what is below 0, which is taken from the counts.
+
+        That is of a sky of which too much was subtracted; its noise is known apart from its level.
+        """
+        levels = list(background)
+        for j, level in enumerate(background):
+            if isinstance(level, float) and -np.inf < level < 0:
+                counts[j] -= level
+                levels[j] = 0.0
+        return levels
+
     def _read_noise_words(self, counts: Array, mask: Mask) -> list[Word]:
         """Return the read noise with numbers in the place of keywords and "auto"."""
         words = list(self._calibration.read_noise)
+        is_subtracted = (counts < 0)[~mask].mean() > SUBTRACTED if not mask.all() else False
+        if is_subtracted and not any(words) and self._noise_map is None:
+            log.info("the sky of the images was subtracted: its noise is measured as read noise")
+            words = ["auto"]
         if not any(isinstance(word, str) for word in words):
             return words
 
@@ -493,18 +557,35 @@ class _Reader:
         return self._maps.fill("read_noise", words, electrons)
 
     def _offsets(self) -> Array | None:
-        if self._calibration.align is None:
-            return None
         images, headers = self._images.data, self._images.headers
+        if self._calibration.align is None:
+            if len(headers) > 1 and all(map(sky.has_celestial, headers)):
+                self._warn_of_offsets()
+            return None
         if len(headers) != len(images):
             raise InputError(
                 f"{self._paths[0]} is a cube, with one WCS for all its images; to align them give "
                 "a file for each"
             )
         found = sky.offsets(headers, self._paths, images.shape[1:])
-        for j, (dx, dy) in enumerate(found[1:], 2):
+        for j, (dx, dy) in enumerate(found[1:], 1):
             log.info("image %d: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
         return found
+
+    def _warn_of_offsets(self) -> None:
+        """Warn of the first image that is not where the first is, by their coordinates."""
+        try:
+            found = sky.offsets(self._images.headers, self._paths, self._images.data.shape[1:])
+        except InputError as error:
+            warn(str(error))
+            return
+        for path, (dx, dy) in zip(self._paths, found, strict=True):
+            if max(abs(dx), abs(dy)) > sky.MAX_OFFSET_VARIATION:
+                warn(
+                    f"{path} lies ({dx:.2f}, {dy:.2f}) pixels off {self._paths[0]}, by their sky "
+                    "coordinates: give align wcs, unless their pixels were registered"
+                )
+                return
 
 
 def _have(n: int) -> str:

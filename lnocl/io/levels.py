@@ -8,15 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError
+from lnocl.scene.noise_check import noise_of
 from lnocl.scene.observation import Array
 
 log = logging.getLogger("lnocl")
 
 Mask = NDArray[np.bool_]
 
+# Counted electrons of fewer than this a pixel are whole numbers, most of them the same.
+FEW = 0.1
+# Pixels whose difference is the noise, so far apart that resampling does not correlate them.
+LAG = 3
+
 
 def sky_level(j: int, counts: Array, mask: Mask) -> float:
-    """Return the background of image j: the sigma-clipped median of its good pixels, or 0.
+    """Return the background of image j, as `clipped_sky`; negative where too much was subtracted.
 
     Raises
     ------
@@ -26,17 +32,13 @@ def sky_level(j: int, counts: Array, mask: Mask) -> float:
     median, scatter = clipped_sky(j, counts, mask)
     log.info(
         "image %d: background %.6g electrons per pixel, scatter %.3g (sigma-clipped median)",
-        j + 1,
+        j,
         median,
         scatter,
     )
     if median < 0:
-        log.info(
-            "image %d: its sky was subtracted; taken are a background of 0, and its noise as "
-            "read noise, which may be auto",
-            j + 1,
-        )
-    return max(median, 0.0)
+        log.info("image %d: its sky was subtracted; %.6g electrons are added again", j, -median)
+    return median
 
 
 def sky_noise(j: int, counts: Array, mask: Mask) -> float:
@@ -49,12 +51,14 @@ def sky_noise(j: int, counts: Array, mask: Mask) -> float:
     """
     median, scatter = clipped_sky(j, counts, mask)
     noise = float(np.sqrt(max(scatter**2 - max(median, 0.0), 0.0)))
-    log.info("image %d: read noise %.4g electrons (sigma-clipped scatter)", j + 1, noise)
+    log.info("image %d: read noise %.4g electrons (sigma-clipped scatter)", j, noise)
     return noise
 
 
 def clipped_sky(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
     """Return the sigma-clipped median and scatter of the good pixels of image j.
+
+    Where light fills most of the image they are those of its darker half, by blocks.
 
     Raises
     ------
@@ -70,4 +74,30 @@ def clipped_sky(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
             "background and read_noise as numbers"
         )
     _, median, scatter = sigma_clipped_stats(good)
+    dark = noise_of(counts, mask | ~np.isfinite(counts), 0.0)
+    if dark is not None and dark.is_darker_than(median, dark.variance_apart):
+        return dark.mean, float(np.sqrt(dark.variance_apart))
     return float(median), float(scatter)
+
+
+def is_rate(image: Array, seconds: float) -> bool:
+    """Return whether an image without unit is of electrons per second, by its noise.
+
+    The variance of counts is at least their mean; in rates it is that over the exposure.
+
+    Parameters
+    ----------
+    image : ndarray of float64, shape (ny, nx)
+        Electrons, or electrons per second.
+    seconds : float
+        The exposure.
+    """
+    from astropy.stats import sigma_clipped_stats
+
+    good = np.isfinite(image)
+    pairs = good[:, LAG:] & good[:, :-LAG]
+    if not pairs.any():
+        return False
+    variance = sigma_clipped_stats((image[:, LAG:] - image[:, :-LAG])[pairs])[2] ** 2 / 2.0
+    mean = max(sigma_clipped_stats(image[good])[1], FEW)
+    return bool(0 < variance < mean / max(2.0, np.sqrt(seconds)))

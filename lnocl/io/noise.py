@@ -82,7 +82,7 @@ class NoiseMap(NamedTuple):
             log.info(
                 "image %d: noise besides its counts %.3g electrons in the median; %s with less "
                 "than that of the counts %s none",
-                j + 1,
+                j,
                 median,
                 counted(n_below, "pixel"),
                 "has" if n_below == 1 else "have",
@@ -112,7 +112,8 @@ def electrons_by_variance(
 
     Counts n = e g of an image g have the variance g / e in its units: e is the difference of image
     between the brightest hundredth of its pixels and the median one, over that of the variance. A
-    sky that was subtracted, and the variance of the dark current, cancel.
+    sky that was subtracted, and the variance of read noise and dark current, cancel. Pixels are
+    bright by their neighbours, whose noise is not theirs.
 
     Parameters
     ----------
@@ -134,8 +135,12 @@ def electrons_by_variance(
     values, variances = image[known], variance[known]
     electrons = 0.0
     if values.size:
-        bright = values >= np.quantile(values, 1.0 - BRIGHT)
-        middle = values <= np.median(values)
+        from scipy.ndimage import uniform_filter
+
+        whole = np.where(known, image, np.median(values))
+        beside = (9.0 * uniform_filter(whole, 3) - whole)[known]
+        bright = beside >= np.quantile(beside, 1.0 - BRIGHT)
+        middle = beside <= np.median(beside)
         rise = variances[bright].mean() - variances[middle].mean()
         electrons = (values[bright].mean() - values[middle].mean()) / rise if rise > 0 else 0.0
     if not 0.0 < electrons < np.inf:

@@ -7,6 +7,7 @@ from copy import copy
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.errors import warn
 from lnocl.scene.observation import Array, Observation
@@ -49,6 +50,11 @@ class Noise(NamedTuple):
         least = float(np.finfo(float).tiny)
         return float(np.log(max(self.variance, least) / max(self.mean, least)))
 
+    def is_darker_than(self, level: float, variance: float) -> bool:
+        """Return whether it is darker than a level of this variance by more than noise makes it."""
+        noise = np.sqrt(max(variance, self.variance))
+        return bool(level - self.mean > DARKNESS * noise)
+
     def is_white(self) -> bool:
         """Return whether neighbours differ as much as pixels apart."""
         return self.variance >= MIN_SHARE * self.variance_apart
@@ -56,24 +62,35 @@ class Noise(NamedTuple):
 
 def measure_noise(observation: Observation) -> Iterator[Noise | None]:
     """Yield the noise of each image; None where too few blocks are free of bad pixels."""
-    ny, nx = (n - n % BLOCK for n in observation.shape)
-    counts = zip(observation.images, observation.mask, observation.background, strict=True)
-    for image, mask, background in counts:
-        image, mask, background = (
-            _some_rows(np.broadcast_to(each, observation.shape)[:ny, :nx])
-            for each in (image, mask, background)
-        )
-        means = _block_means(image)
-        good = ~_block_means(mask).astype(bool)
-        if good.sum() < 2 * MIN_BLOCKS:
-            yield None
-            continue
-        dark = good & (means <= np.median(means[good]))
-        excess = image - background  # the background may have structure that is known
-        near, apart = (_block_means(_squares(excess, lag))[dark] for lag in (1, FAR))
-        level = means - _block_means(excess)
-        values = means[dark], level[dark], near, apart
-        yield Noise(*map(float, map(np.median, values)))  # many blocks may hold next to nothing
+    each = zip(observation.images, observation.mask, observation.background, strict=True)
+    yield from map(noise_of, *zip(*each, strict=True))
+
+
+def noise_of(image: Array, mask: NDArray[np.bool_], background: Array | float) -> Noise | None:
+    """Return the noise of an image; None where too few blocks are free of bad pixels.
+
+    Parameters
+    ----------
+    image, mask : ndarray, shape (ny, nx)
+        Electrons per pixel; True where a pixel is bad.
+    background : float or ndarray, shape (ny, nx)
+        Electrons per pixel.
+    """
+    ny, nx = (n - n % BLOCK for n in image.shape)
+    image, bad, background = (
+        _some_rows(np.broadcast_to(each, image.shape)[:ny, :nx])
+        for each in (np.where(mask, 0.0, image), mask.astype(np.float64), background)
+    )
+    means = _block_means(image)
+    good = _block_means(bad) == 0
+    if good.sum() < 2 * MIN_BLOCKS:
+        return None
+    dark = good & (means <= np.median(means[good]))
+    excess = image - background  # the background may have structure that is known
+    near, apart = (_block_means(_squares(excess, lag))[dark] for lag in (1, FAR))
+    level = means - _block_means(excess)
+    values = means[dark], level[dark], near, apart
+    return Noise(*map(float, map(np.median, values)))  # many blocks may hold next to nothing
 
 
 def with_noise_shown(observation: Observation) -> Observation:
@@ -134,7 +151,7 @@ def warn_of_noise(observation: Observation) -> None:
         (j, noise) for j, noise in enumerate(measure_noise(observation)) if noise is not None
     ]
     for j, noise in measured:
-        if noise.level - noise.mean > DARKNESS * np.sqrt(noise.level):
+        if noise.is_darker_than(noise.level, noise.level):
             warn(
                 f"the background of image {j} is too high: it is {noise.level:.6g} electrons per "
                 f"pixel where the darker half of the image has {noise.mean:.6g}"

@@ -443,10 +443,13 @@ class Observation:
         negative = self.images < 0
         if n_negative := int(negative.sum()):
             self.images[negative] = 0.0
+            words = _pixels(n_negative, "image", "negative", "set to 0")
+            if self.read_noise.any():
+                warn(f"{words}, with the square of read_noise added")
+                return
             warn(
-                f"{_pixels(n_negative, 'image', 'negative', 'set to 0')}; if the sky was "
-                "subtracted, give the noise that it left as read_noise, or add the sky to the "
-                "images and give it as background"
+                f"{words}; if the sky was subtracted, give the noise that it left as read_noise, "
+                "or add the sky to the images and give it as background"
             )
 
 

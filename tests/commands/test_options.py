@@ -98,7 +98,7 @@ COMPLAINTS = {
         ["--checkpoint", "c.fits", "--checkpoint-every", "-1"],
         "--checkpoint-every must be seconds, 0 or more; -1.0 was given",
     ),
-    "--background": (["--background", "-1"], "--background must be finite and not negative"),
+    "--background": (["--background", "nan"], "--background must be finite and not negative"),
     "--background auto": (["--background", "Auto"], "--background 'Auto' is not a number, auto"),
     "--read-noise": (["--read-noise", "-1"], "--read-noise must be finite and not negative"),
     "--read-noise word": (["--read-noise", "low"], "--read-noise 'low' is not a number, auto"),

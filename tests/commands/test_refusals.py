@@ -65,7 +65,7 @@ BAD_ARGUMENTS = {
         "--smoothing 'little' is not known; give a number or auto",
     ),
     "smoothing negative": (["--smoothing", "-1"], 2, "--smoothing must be"),
-    "background": (["--background", "-1"], 2, "--background must be finite and not negative; -1"),
+    "background": (["--background", "nan"], 2, "--background must be finite and not negative; nan"),
     "background nan": (["--background", "nan"], 2, "--background must be finite"),
     "background inf": (["--background", "-inf"], 2, "--background must be finite"),
     "backgrounds": (["--background", "1", "2"], 2, "--background has shape (2,)"),

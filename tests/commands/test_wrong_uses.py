@@ -58,7 +58,7 @@ def folder(tmp_path_factory):
     save("neg_psf", psf - 1.5 * psf.mean())
     save("energy", np.stack([image] * 3), CTYPE3="ENERGY")
     save("rgb", np.stack([image] * 3, -1))
-    save("cube4", image[None, None])
+    save("cube4", np.stack([image[None]] * 2))
     save("other", image[:50])
     save("rms", np.full((N, N), 5.0, "f4"))
     save("ivm", np.full((N, N), 1e4, "f4"))

@@ -8,7 +8,7 @@ from frame_files import IMAGES, notes, observe, read, save, save_images
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, LnoclWarning
 from lnocl.scene import units
 
 pytestmark = pytest.mark.usefixtures("frame_folder")
@@ -19,7 +19,8 @@ RATES = ["ELECTRONS/S", "electron/s/pix", "electron/s", "counts/s", "Counts/sec"
          "e-/s", "e- s-1", "e/s", "electron s^-1", "electrons per second", "cps"]  # fmt: skip
 DIGITAL = ["DN", "adu", "ADU", "dn", "DN/pixel"]
 DIGITAL_RATES = ["ADU/s", "adu s-1", "DN/s", "DN/sec", "DN/s/pix"]
-OTHERS = ["MJy/sr", "mJy", "10**-20 erg/s/cm2", "mag", "UNKNOWN", "total nonsense", "(", "[e-]",
+LIGHT = ["MJy/sr", "mJy", "10**-20 erg/s/cm2"]
+OTHERS = [*LIGHT, "mag", "UNKNOWN", "total nonsense", "(", "[e-]",
           "5", "1000", "%"]  # fmt: skip
 
 
@@ -42,7 +43,7 @@ class TestTheUnitOfTheSky:
             ("DN", {"gain": 2.0}, "adu", 2.0),
             ("DN/s", {"gain": 2.0, "exposure": [20.0]}, "adu/s", 2.0),
             ("MJy/sr", {"gain": 30.0}, "MJy/sr", 30.0),
-            ("MJy/sr", {"gain": 30.0, "exposure": [20.0]}, "MJy/sr/s", 30.0),
+            ("MJy/sr", {"gain": 30.0, "exposure": [20.0]}, "MJy/sr", 30.0),
             ("%", {"gain": 30.0}, "electron", 1.0),
             ("total nonsense", {"gain": 30.0}, "electron", 1.0),
         ],
@@ -59,7 +60,8 @@ class TestUnits:
         save_images(BUNIT=unit)
         np.testing.assert_array_equal(observe().images, IMAGES)
         np.testing.assert_array_equal(observe(exposure=[20.0]).images, IMAGES)
-        np.testing.assert_array_equal(observe(gain=2.5).images, 2.5 * IMAGES)
+        if "e" not in unit.lower():
+            np.testing.assert_array_equal(observe(gain=2.5).images, 2.5 * IMAGES)
 
     @pytest.mark.parametrize("unit", RATES)
     def test_counts_per_second_are_times_the_exposure(self, unit):
@@ -68,19 +70,36 @@ class TestUnits:
         expected = IMAGES * np.array([20.0, 30.0])[:, None, None]
         np.testing.assert_array_equal(observation.images, expected)
         np.testing.assert_array_equal(observation.exposure, [20.0, 30.0])
-        both = observe(exposure=[20.0, 30.0], gain=2.0)
-        np.testing.assert_array_equal(both.images, 2.0 * expected)
+        if "e" not in unit.lower():
+            both = observe(exposure=[20.0, 30.0], gain=2.0)
+            np.testing.assert_array_equal(both.images, 2.0 * expected)
         with pytest.raises(InputError, match=r"1\.fits holds counts per time; give exposure"):
             observe()
-        with pytest.raises(InputError, match="holds counts per time"):
-            observe(gain=2.0)
+
+    def test_electrons_times_a_gain_are_warned_of(self):
+        save_images(BUNIT="electron")
+        with pytest.warns(LnoclWarning, match="1.fits is in electron by BUNIT, and is taken times"):
+            np.testing.assert_array_equal(observe(gain=2.5).images, 2.5 * IMAGES)
+
+    @pytest.mark.parametrize("sky", [0.0, 400.0])
+    @pytest.mark.parametrize("gain", [None, 2.0])
+    def test_rates_without_a_unit_are_known_by_their_noise(self, log, sky, gain):
+        counts = np.random.default_rng(1).normal(sky, 23.0, (1, 40, 40))
+        each = 2000.0 * (gain or 1.0)
+        save_images(counts / each)
+        found = read("1.fits", exposure=[2000.0], gain=gain, background=["auto"])
+        assert found.unit == "electron/s"
+        added = min(found.background[0], 0.0)
+        raw = found.observation.images - found.observation.read_noise[0] ** 2
+        assert np.median(raw) == pytest.approx(np.median(counts) - added, abs=0.1)
+        assert "1.fits has no BUNIT: by its noise it is in" in log.text
 
     def test_the_gain_may_be_in_the_headers(self, log):
         save_images(BUNIT="adu", EGAIN=2.5)
         found = read(gain="EGAIN")
         np.testing.assert_array_equal(found.observation.images, 2.5 * IMAGES)
         assert (found.gain, found.electrons, found.unit) == (2.5, 2.5, "adu")
-        assert notes(log) == ["image 1: gain 2.5, from EGAIN", "image 2: gain 2.5, from EGAIN"]
+        assert notes(log) == ["image 0: gain 2.5, from EGAIN", "image 1: gain 2.5, from EGAIN"]
 
     def test_gains_in_headers_that_are_none(self):
         save_images(BUNIT="adu", EGAIN=2.5, TEXT="a", ZERO=0.0)
@@ -104,12 +123,41 @@ class TestUnits:
         save_images(BUNIT=unit)
         with pytest.raises(InputError) as caught:
             observe(exposure=[20.0])
+        of_light = unit in LIGHT
         assert str(caught.value) == (
-            f"1.fits is in {unit}, not in counts; give gain, the electrons "
-            "for each of these units: a number, or a keyword of its header such as GAIN"
+            f"1.fits is in {unit}, not in counts; give gain, the electrons in one of these units: "
+            "a number, "
+            + (
+                "the exposure in seconds over the value of one electron per second"
+                if of_light
+                else "or a keyword of its header such as GAIN"
+            )
         )
-        expected = IMAGES * (2.0 if unit not in DIGITAL_RATES else 40.0)
+        expected = IMAGES * (40.0 if of_light or unit in DIGITAL_RATES else 2.0)
         np.testing.assert_array_equal(observe(exposure=[20.0], gain=2.0).images, expected)
+
+    @pytest.mark.parametrize("unit", ["MJy/sr", "adu/s", "adu"])
+    @pytest.mark.parametrize("word", ["ERR", "VAR_POISSON", "file"])
+    def test_it_follows_from_the_noise(self, log, unit, word):
+        """Of a sky, read noise and a source whose variance all but the noise of the pixels has."""
+        means = 400.0 + 4e4 * np.exp(-np.hypot(*(np.indices((40, 40)) - 20.0)) / 3.0)
+        images = np.random.default_rng(4).poisson(means, (2, 40, 40)) / np.reshape(
+            [100.0, 100.0 if unit == "adu" else 50.0], (2, 1, 1)
+        )
+        for j, each in enumerate([100.0, 100.0 if unit == "adu" else 50.0]):
+            variance = (means + 144.0) / each**2
+            extra = {"VAR_POISSON": variance, "ERR": np.sqrt(variance)}
+            hdus = [fits.PrimaryHDU(images[j], fits.Header({"BUNIT": unit}))]
+            if word != "file":
+                hdus.append(fits.ImageHDU(extra[word], name=word))
+            fits.HDUList(hdus).writeto(f"{j + 1}.fits")
+            save(f"e{j}.fits", extra["ERR"])
+        known = {"error": ["e0.fits", "e1.fits"]} if word == "file" else {}
+        found = read(**known)
+        assert found.unit == unit
+        raw = found.observation.images - (found.observation.background if known else 0.0)
+        np.testing.assert_allclose(raw.sum(axis=(1, 2)), means.sum(), rtol=0.02)
+        assert "electrons in its unit, by " in log.text
 
     @pytest.mark.parametrize("unit", DIGITAL_RATES)
     def test_adu_per_second_need_the_exposure_too(self, unit):
@@ -117,7 +165,7 @@ class TestUnits:
         with pytest.raises(InputError, match="holds counts per time"):
             observe(gain=2.0)
 
-    @pytest.mark.parametrize("unit", ["electron/min", "ADU/min"])
+    @pytest.mark.parametrize("unit", ["count/min", "ADU/min"])
     def test_a_minute_is_sixty_seconds(self, unit):
         save_images(BUNIT=unit)
         found = observe(exposure=[120.0], gain=1.5).images

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lnocl.errors import FileError, InputError, LnoclWarning, counted
+from lnocl.scene.noise_check import warn_of_noise
 
 pytestmark = pytest.mark.usefixtures("frame_folder")
 
@@ -37,15 +38,15 @@ class TestExposure:
         save("map.fits", exposure)
         observation = observe(exposure=["map.fits"])
         np.testing.assert_array_equal(observation.mask, [exposure == 0] * 2)
-        assert "image 2: 2 pixels masked without exposure" in notes(log)
+        assert "image 1: 2 pixels masked without exposure" in notes(log)
 
     def test_a_keyword_of_each_header(self, log):
         save("1.fits", IMAGES[0], EXPTIME=100.0)
         save("2.fits", IMAGES[1], EXPTIME=200)
         np.testing.assert_array_equal(observe(exposure=["EXPTIME"]).exposure, [100.0, 200.0])
         assert notes(log) == [
-            "image 1: exposure 100 seconds, from EXPTIME",
-            "image 2: exposure 200 seconds, from EXPTIME",
+            "image 0: exposure 100 seconds, from EXPTIME",
+            "image 1: exposure 200 seconds, from EXPTIME",
         ]
 
     def test_a_keyword_beside_a_number_and_a_map(self):
@@ -138,7 +139,7 @@ class TestBackground:
         stats = [sigma_clipped_stats(15.0 * image) for image in images]
         assert found.background == [median for _, median, _ in stats]
         np.testing.assert_array_equal(found.observation.background, found.background)
-        for j, (_, median, scatter) in enumerate(stats, 1):
+        for j, (_, median, scatter) in enumerate(stats):
             assert (
                 f"image {j}: background {median:.6g} electrons per pixel, scatter {scatter:.3g} "
                 "(sigma-clipped median)"
@@ -171,11 +172,27 @@ class TestBackground:
             )
         assert found.background == [5.0]
 
-    def test_auto_of_a_subtracted_image_is_0_and_said(self, caplog):
+    def test_what_was_subtracted_too_much_is_added_and_the_noise_measured(self, log):
         save_images(IMAGES - 60.0)
-        with caplog.at_level("INFO", "lnocl"), pytest.warns(LnoclWarning, match="negative"):
-            assert read("1.fits", background=["auto"]).background == [0.0]
-        assert "image 1: its sky was subtracted; taken are a background of 0" in caplog.text
+        found = read("1.fits", background=["auto"])
+        assert found.background == [-9.5]
+        scatter = sigma_clipped_stats(IMAGES[0])[2]
+        assert found.read_noise == [pytest.approx(scatter)]
+        observation = found.observation
+        np.testing.assert_allclose(observation.images[0], (IMAGES[0] - 50.5 + scatter**2).clip(0.0))
+        np.testing.assert_allclose(observation.background, scatter**2)
+        assert "image 0: its sky was subtracted; 9.5 electrons are added again" in notes(log)
+        again = read("1.fits", background=found.background, read_noise=found.read_noise)
+        np.testing.assert_array_equal(again.observation.images, observation.images)
+
+    def test_auto_where_light_fills_most_of_the_image(self):
+        y, x = np.indices((96, 96)) - 40.0
+        light = 1000.0 * np.exp(-(x**2 + y**2) / 1000.0)
+        save("1.fits", np.random.default_rng(1).poisson(400.0 + light).astype(float))
+        found = read("1.fits", background=["auto"], read_noise=["auto"])
+        assert 400.0 < found.background[0] < np.median(light) + 400.0 - 20.0
+        assert found.read_noise[0] < 20.0
+        warn_of_noise(found.observation)  # of which the tests would make an error
 
     @pytest.mark.parametrize(
         ("background", "message"),
@@ -186,7 +203,7 @@ class TestBackground:
             (["cube.fits", 1.0], "background cube.fits has the shape (2, 10, 12) and the images"),
             (["oblong.fits"], "background oblong.fits has the shape (1, 12, 10) and the images "
              "(2, 10, 12); give one map that fits all images, or one for each"),
-            ([-1.0], "background must be finite and not negative; -1"),
+            ([-np.inf], "background must be finite and not negative; -inf"),
         ],
     )  # fmt: skip
     def test_refusals(self, background, message):
@@ -225,8 +242,8 @@ class TestNoise:
         assert found.read_noise == [3.0, 5.0]
         np.testing.assert_array_equal(found.observation.background, [9.0, 25.0])
         assert notes(log) == [
-            "image 1: read noise 3 electrons, from RDNOISE",
-            "image 2: read noise 5 electrons, from RDNOISE",
+            "image 0: read noise 3 electrons, from RDNOISE",
+            "image 1: read noise 5 electrons, from RDNOISE",
         ]
         with pytest.raises(InputError, match=r"^TEXT of 1\.fits is 'a', not a number; give read"):
             observe(read_noise=["TEXT"])
@@ -264,7 +281,7 @@ class TestNoise:
         np.testing.assert_array_equal(found.observation.mask, [bad, bad])
         background = found.observation.background[0]
         np.testing.assert_allclose(background[~bad], 2.25 * MAP[~bad], rtol=1e-14)
-        assert f"image 1: 3 pixels masked without {kind.replace('_', ' ')}" in notes(log)
+        assert f"image 0: 3 pixels masked without {kind.replace('_', ' ')}" in notes(log)
         assert len(found.sha256[kind]) == 1
 
     def test_errors_with_those_of_the_counts(self, log):
@@ -288,7 +305,7 @@ class TestNoise:
             np.testing.assert_array_equal(found.mask, bad)
             np.testing.assert_allclose(found.background[~bad], expected[~bad], rtol=1e-12, atol=0)
             assert notes(log)[-2].endswith("0 pixels with less than that of the counts have none")
-            assert notes(log)[-1].startswith("image 2: noise besides its counts 2.44 electrons in")
+            assert notes(log)[-1].startswith("image 1: noise besides its counts 2.44 electrons in")
             assert notes(log)[-1].endswith("1 pixel with less than that of the counts has none")
 
     def test_what_the_sky_has_beyond_its_counts(self, log):
@@ -303,7 +320,7 @@ class TestNoise:
         ]
         np.testing.assert_allclose(found.read_noise, expected, rtol=2e-3)
         np.testing.assert_allclose(found.read_noise, np.sqrt(30.0 + 64.0), rtol=0.03)
-        assert notes(log)[-1].startswith("image 2: read noise 9.")
+        assert notes(log)[-1].startswith("image 1: read noise 9.")
         save_images(np.full((2, 8, 8), 100.0))  # with less noise than counts have
         assert read(read_noise=["auto"]).read_noise == [0.0, 0.0]
 
@@ -338,8 +355,8 @@ class TestNoise:
         bad = (inverse == 0) | ~np.isfinite(inverse)
         np.testing.assert_array_equal(observation.mask, [bad, bad])
         np.testing.assert_allclose(observation.background[0][~bad], MAP[~bad], rtol=1e-14)
-        assert "image 1: 1 pixel masked by the mask" in notes(log)
-        assert "image 1: 2 pixels masked without inverse variance" in notes(log)
+        assert "image 0: 1 pixel masked by the mask" in notes(log)
+        assert "image 0: 2 pixels masked without inverse variance" in notes(log)
 
     def test_one_for_each(self):
         save_images()
@@ -384,8 +401,8 @@ class TestMask:
         np.testing.assert_array_equal(both.observation.mask, masks != 0)
         assert len(both.sha256["mask"]) == 2
         assert notes(log) == [
-            "image 1: 2 pixels masked by the mask",
-            "image 2: 1 pixel masked by the mask",
+            "image 0: 2 pixels masked by the mask",
+            "image 1: 1 pixel masked by the mask",
         ]
 
     def test_dq_of_each_file_and_a_mask_besides(self, log):
@@ -401,12 +418,12 @@ class TestMask:
         assert notes(log) == [
             "1.fits: the image is HDU 1 (SCI)",
             "2.fits: the image is HDU 1 (SCI)",
+            "image 0: 1 pixel masked by the mask",
             "image 1: 1 pixel masked by the mask",
-            "image 2: 1 pixel masked by the mask",
             "1.fits: 1 pixel has the flag 4 of DQ",
             "2.fits: 1 pixel has the flag 4096 of DQ",
-            "image 1: 0 pixels masked by the extension DQ",
-            "image 2: 1 pixel masked by the extension DQ",
+            "image 0: 0 pixels masked by the extension DQ",
+            "image 1: 1 pixel masked by the extension DQ",
         ]
 
     def test_dq_of_a_cube(self):
@@ -490,7 +507,7 @@ class TestMask:
         expected = [(image == level).sum() for image in IMAGES]
         assert notes(log) == [
             f"image {j}: {counted(count, 'pixel')} masked as saturated, at {level:g} or above"
-            for j, count in enumerate(expected, 1)
+            for j, count in enumerate(expected)
         ]
 
     def test_without_any_nothing_is_masked_or_said(self, log):
@@ -554,9 +571,18 @@ class TestOffsets:
     def test_by_the_wcs(self, log):
         save("1.fits", IMAGES[0], **WCS)
         save("2.fits", IMAGES[1], **(WCS | {"CRPIX1": 7.25, "CRPIX2": 4.5}))
-        np.testing.assert_array_equal(observe().offsets, 0.0)
+        with pytest.warns(LnoclWarning, match=r"2.fits lies \(1.25, -0.50\) .*: give align wcs"):
+            np.testing.assert_array_equal(observe().offsets, 0.0)
         np.testing.assert_allclose(observe(align="wcs").offsets, [(0, 0), (1.25, -0.5)], atol=1e-6)
-        assert notes(log) == ["image 2: offset 1.250, -0.500 pixels in x, y, from the WCS"]
+        assert notes(log) == ["image 1: offset 1.250, -0.500 pixels in x, y, from the WCS"]
+
+    def test_turned_images_are_warned_of(self):
+        save("1.fits", IMAGES[0], **WCS)
+        save(
+            "2.fits", IMAGES[1], **(WCS | {"PC1_1": 0.8, "PC1_2": 0.6, "PC2_1": -0.6, "PC2_2": 0.8})
+        )
+        with pytest.warns(LnoclWarning, match="2.fits is rotated by .* relative to 1.fits"):
+            observe()
 
     def test_a_cube_has_one_wcs(self):
         save("cube.fits", IMAGES, **WCS)
