@@ -35,7 +35,7 @@ from lnocl.runs.options import (
     warn_of_rounding,
 )
 from lnocl.runs.outcome import Outcome
-from lnocl.runs.progress import Bar
+from lnocl.runs.progress import Bar, Progress
 from lnocl.runs.run import Run, most_bytes
 from lnocl.runs.start import Setup, make_start
 from lnocl.runs.stopping import Rule, make_rule
@@ -340,8 +340,9 @@ def deconvolve(
         from lnocl.runs.psf_refinement import mend  # which loads scipy
 
         is_asked = bool(families) and not isinstance(refine_psfs, str)
-        with suppress(NotFiniteError):  # of which the run itself tells
-            mended = mend(setup, observation, families, moves, is_asked)
+        judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
+        with judging, suppress(NotFiniteError):  # of which the run itself tells
+            mended = mend(setup, observation, families, moves, is_asked, judging.update)
             observation, refinement = mended.observation, mended.refinement
             near_stars, fits = mended.near_stars, mended.fits
             setup = replace(setup, refine_positions=mended.moves)
@@ -361,27 +362,31 @@ def deconvolve(
         initial_extended=initial_extended,
         initial_star_fluxes=initial_star_fluxes,
     )
-    bar = Bar(int(n_iter), bool(progress))
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
     # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
-    with bar, np.errstate(over="ignore", invalid="ignore"):
-        start = make_start(setup, observation, penalties[0], initial_extended, initial_star_fluxes)
+    with np.errstate(over="ignore", invalid="ignore"):
+        with Progress(None, "", bool(progress), "measuring steps", stays=False):
+            start = make_start(
+                setup, observation, penalties[0], initial_extended, initial_star_fluxes
+            )
         warn_of_noise(observation)
         warn_of_stars(start.scene, setup.refine_positions)
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes
         largest = partial(measure, start, int(n_iter))
         checkpointer = Checkpointer(checkpoint, checkpoint_every, resume, inputs, largest)
-        if stop == "held-out":
-            held_out = HeldOutCounts(start, penalties, int(n_iter))
-            outcome = _choose(held_out, callback, bar, checkpointer)
-        else:
-            run = Run(start, int(n_iter))
-            del start, largest  # which hold arrays of the grid
-            stop_reason = _complete(run, make_rule(stop), callback, bar, checkpointer)
-            outcome = run.outcome(penalties[0], stop_reason)
+        with Bar(int(n_iter), bool(progress)) as bar:
+            if stop == "held-out":
+                held_out = HeldOutCounts(start, penalties, int(n_iter))
+                outcome = _choose(held_out, callback, bar, checkpointer)
+            else:
+                run = Run(start, int(n_iter))
+                del start, largest  # which hold arrays of the grid
+                stop_reason = _complete(run, make_rule(stop), callback, bar, checkpointer)
+                outcome = run.outcome(penalties[0], stop_reason)
         if is_auto and fits:
-            outcome = outcome.marginal()
+            with Progress(None, "", bool(progress), "fitting star fluxes", stays=False):
+                outcome = outcome.marginal()
         return make_result(replace(outcome, psf_refinement=refinement))
 
 

@@ -21,7 +21,7 @@ from lnocl.residuals import StarResiduals
 from lnocl.result import Result
 from lnocl.runs.options import StopName, check_length, check_observation, read_penalties
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome
-from lnocl.runs.progress import make_bar
+from lnocl.runs.progress import Progress
 from lnocl.scene.grid import length_for
 from lnocl.scene.observation import Array, Observation
 from lnocl.scene.padding import recommend_pad
@@ -314,7 +314,7 @@ def deconvolve_tiles(
     make = partial(_Solving, smoothing=[penalty], n_iter=max(n_iter, 1), stop=last, **options)
     mosaic = _Mosaic(observation, len(positions))
     with (
-        make_bar(len(observed), "tile", progress) as bar,
+        Progress(len(observed), "tile", progress, "deconvolving") as bar,
         closing(work(make, observed, parallel)) as answers,
     ):
         for each, found in zip(observed, answers, strict=True):

@@ -256,7 +256,7 @@ def _write_log(folder: Folder, record: Record, said: str) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     from lnocl.io import atomic
     from lnocl.parallel import check_parallel
-    from lnocl.runs.progress import make_bar
+    from lnocl.runs.progress import Progress
 
     check_parallel(arguments.parallel)
     targets = read_targets(arguments.targets)
@@ -280,10 +280,9 @@ def _run(arguments: argparse.Namespace) -> None:
         ]
     written = time.monotonic()
     try:
-        with make_bar(len(due), "target", not arguments.quiet) as bar:
+        with Progress(len(due), "target", not arguments.quiet) as bar:
             for record in _records(folder, due, start, arguments.parallel):
-                bar.update()
-                bar.set_postfix_str(f"{record.name} {record.status}")
+                bar.update(words=f"{record.name} {record.status}")
                 if time.monotonic() - written > WRITE_EVERY:
                     _write_summary(folder, targets, start)
                     written = time.monotonic()

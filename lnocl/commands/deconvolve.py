@@ -17,6 +17,7 @@ from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
 from lnocl.residuals import Fit, StarResiduals
 from lnocl.result import Result, saved_parts, view_of
+from lnocl.runs.progress import Progress
 
 if TYPE_CHECKING:
     from astropy.io import fits
@@ -91,12 +92,13 @@ def _run(arguments: argparse.Namespace) -> None:
         interrupts.listen()  # a run that was resumed at its end has no iteration to start from
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
-        at_stars = result.star_residuals()
-        view = _view(arguments, result, frames)
-        overall = Fit.of(view.residuals, view.models) if view else result.fit()
-        verdict = verdict_on(arguments, result, at_stars, overall, bool(warned))
-        said = [*summarise(arguments, result, frames, at_stars, overall), *verdict]
-        measured = _measured(result, frames, overall, verdict)
+        with Progress(None, "", not arguments.quiet, "measuring errors", stays=False):
+            at_stars = result.star_residuals()
+            view = _view(arguments, result, frames)
+            overall = Fit.of(view.residuals, view.models) if view else result.fit()
+            verdict = verdict_on(arguments, result, at_stars, overall, bool(warned))
+            said = [*summarise(arguments, result, frames, at_stars, overall), *verdict]
+            measured = _measured(result, frames, overall, verdict)
         wcs = fitsread.wcs_cards(frames.header)
         _write(arguments, result, frames, given, at_stars, view, wcs, measured, [*warned, *said])
         said.append(f"written to {arguments.output}")
@@ -108,9 +110,10 @@ def _run(arguments: argparse.Namespace) -> None:
             messages.say(said)
     interrupts.explain(arguments, result)
     if arguments.bootstrap is not None:
-        said = bootstrap.add_errors(
-            arguments, result, frames, parts, arguments.output, continues=False
-        )
+        with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
+            said = bootstrap.add_errors(
+                arguments, result, frames, parts, arguments.output, continues=False
+            )
         if not arguments.quiet:
             messages.say(said)
 

@@ -67,7 +67,8 @@ def _run(arguments: argparse.Namespace) -> None:
     try:
         there = contextlib.chdir(folder)
         # What the run has to say it has said.
-        with there, ignored_warnings(), checkpoints.Interrupts() as interrupts:
+        progress = messages.shown_log(run.quiet, name=messages.PROGRESS)
+        with there, progress, ignored_warnings(), checkpoints.Interrupts() as interrupts:
             solved = deconvolve.solve(run, interrupts)
     except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
         raise FileError(
@@ -91,7 +92,8 @@ def _run(arguments: argparse.Namespace) -> None:
             f"the run of {arguments.result} gives another result now: its images, PSFs or options "
             "have changed; deconvolve again"
         )
-    said = bootstrap.add_errors(run, found, frames, solved.parts, path, not arguments.overwrite)
+    with messages.shown_log(run.quiet, name=messages.PROGRESS):
+        said = bootstrap.add_errors(run, found, frames, solved.parts, path, not arguments.overwrite)
     if not arguments.quiet:
         messages.say([*said, f"added to {arguments.result}"])
 

@@ -16,6 +16,10 @@ from typing import Any, TextIO
 BEFORE_NAMES = ("as", "give", "leave", "take", "with")
 
 
+# The logger of lines of progress.
+PROGRESS = "lnocl.progress"
+
+
 def replace_closed_streams() -> None:
     """Replace a closed stdin, stdout or stderr, as after ``2>&-``, by one that discards output.
 
@@ -104,20 +108,27 @@ def recorded_warnings(flags: Mapping[str, str]) -> Iterator[list[str]]:
 
 
 @contextlib.contextmanager
-def shown_log(quiet: bool = False, flags: Mapping[str, str] | None = None) -> Iterator[None]:
-    """Show the notes that the library logs on stderr, with `in_shell`, unless it is quiet."""
+def shown_log(
+    quiet: bool = False, flags: Mapping[str, str] | None = None, name: str = "lnocl"
+) -> Iterator[None]:
+    """Show the notes that the library logs on stderr, with `in_shell`, unless it is quiet.
+
+    Progress is shown where other notes are left out; a name of `PROGRESS` shows nothing else.
+    """
     if quiet:
         yield
         return
-    log, handler = logging.getLogger("lnocl"), _Notes(flags or {})
-    level = log.level
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
+    handler = _Notes(flags or {})
+    levels = {log: log.level for log in map(logging.getLogger, (name, PROGRESS))}
+    logging.getLogger(name).addHandler(handler)
+    for log in levels:
+        log.setLevel(logging.INFO)
     try:
         yield
     finally:
-        log.setLevel(level)
-        log.removeHandler(handler)
+        for log, level in levels.items():
+            log.setLevel(level)
+        logging.getLogger(name).removeHandler(handler)
 
 
 def _complain(kind: str, message: str) -> None:
@@ -125,7 +136,9 @@ def _complain(kind: str, message: str) -> None:
 
 
 def _note(message: str) -> None:
-    with contextlib.suppress(OSError):
+    tqdm = sys.modules.get("tqdm")
+    above = tqdm.tqdm.external_write_mode(sys.stderr) if tqdm else contextlib.nullcontext()
+    with contextlib.suppress(OSError), above:  # of bars that are shown
         sys.stderr.write(_one_line(f"lnocl: {message}", sys.stderr) + "\n")
         sys.stderr.flush()
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lnocl.errors import InputError
 from lnocl.parallel import Parallel, work
 from lnocl.runs.outcome import Outcome
-from lnocl.runs.progress import make_bar
+from lnocl.runs.progress import Progress
 from lnocl.runs.replicas import Replicas, Sky
 from lnocl.scene.apertures import FLUX, FWHM, LENGTH, Aperture, Label, Profile
 from lnocl.scene.detector import on_sky
@@ -305,7 +305,7 @@ def bootstrap(
         found = earlier
     make = partial(_Measuring, outcome, parts, seed, found.resolution)
     with (
-        make_bar(n, "replica", progress) as bar,
+        Progress(n, "replica", progress, "replicas") as bar,
         closing(work(make, range(found.n, n), parallel)) as measured,
     ):
         bar.update(found.n)

@@ -8,6 +8,7 @@ first taken to be large and then measured, until it stays.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
@@ -82,6 +83,8 @@ class GuardedRuns:
         The parameters of the runs; one star or more among them.
     observation : Observation
         The images.
+    tick : callable, optional
+        Is called after each iteration.
 
     Attributes
     ----------
@@ -95,7 +98,10 @@ class GuardedRuns:
         All stars, in the whole images.
     """
 
-    def __init__(self, setup: Setup, observation: Observation) -> None:
+    def __init__(
+        self, setup: Setup, observation: Observation, tick: Callable[[], object] = int
+    ) -> None:
+        self._tick = tick
         self.all_stars = setup.stars
         shown = with_noise_shown(observation)
         self.observation, self.stars, self.held = find_window(setup, shown)
@@ -158,7 +164,7 @@ class GuardedRuns:
         run = Run(replace(start, setup=replace(start.setup, refine_positions=False)), n_iter)
         with suppress(DivergedError):  # by negative PSFs: the misfit tells how good the end is
             for _ in run:
-                pass
+                self._tick()
         extended, fluxes = run.engine.extended().astype(np.float64), run.engine.star_fluxes()
         model = make_model(run.scene)
         estimate = extended, fluxes

@@ -1,49 +1,129 @@
-"""The progress bar of a run."""
+"""Progress: a bar on a terminal or in a notebook, else lines in the log."""
 
 from __future__ import annotations
 
+import logging
 import sys
+import threading
 import time
 from collections.abc import Callable
 
-from tqdm import tqdm
+log = logging.getLogger("lnocl.progress")
 
 # Seconds between two updates: each reads the objective, and waits for the device.
 PROGRESS_INTERVAL = 0.1
+# Seconds between two lines of the log, and between two looks at the clock of a bar.
+LINE_INTERVAL, CLOCK_INTERVAL = 60.0, 1.0
 
 
-def make_bar(total: int, unit: str, progress: bool) -> tqdm:
-    """Return a progress bar of so many steps: in a notebook, or on stderr if it is a terminal."""
-    if not (progress and sys.stderr):
-        return tqdm(total=total, unit=unit, disable=True)
-    from tqdm.auto import tqdm as bar  # which takes its time to load
+class Progress:
+    """The progress of one phase; its clock goes on where steps are long.
 
-    # With disable=None, it is quiet where stderr is not a terminal.
-    return bar(total=total, unit=unit, disable=None)
+    Parameters
+    ----------
+    total : int or None
+        Steps, where their number is known.
+    unit : str
+        What a step is, in the singular; empty where none is counted.
+    is_shown : bool
+        Whether it is shown: by tqdm where stderr is a terminal or in a notebook, else by a line in
+        the log each minute.
+    name : str, optional
+        What is done.
+    stays : bool, optional
+        Whether the bar stays on the screen after its end.
+
+    Attributes
+    ----------
+    n : int
+        Steps done.
+    total : int or None
+        As given; it may be changed.
+    is_lines : bool
+        Whether it is shown in the log.
+    """
+
+    def __init__(
+        self, total: int | None, unit: str, is_shown: bool, name: str = "", stays: bool = True
+    ) -> None:
+        self.n, self.total, self._unit, self._name = 0, total, unit, name
+        self._bar, self.is_lines, self._start = None, False, time.monotonic()
+        self._is_ended = threading.Event()
+        if not (is_shown and sys.stderr):
+            return
+        from tqdm.auto import tqdm  # which takes its time to load
+
+        # With disable=None, it is quiet where stderr is not a terminal.
+        clock = None if unit else "{desc}: {elapsed}"
+        bar = tqdm(
+            total=total, unit=unit, desc=name or None, disable=None, leave=stays, bar_format=clock
+        )
+        self.is_lines = bool(bar.disable)
+        self._bar = None if bar.disable else bar
+        if self.is_lines or sys.stderr.isatty():  # a notebook is not drawn by other threads
+            threading.Thread(target=self._go_on, daemon=True).start()
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @property
+    def is_bar(self) -> bool:
+        """Whether it is shown as a bar."""
+        return self._bar is not None
+
+    def update(self, n: int = 1, words: str = "") -> None:
+        """Count steps that are done, and show a few words beside the bar."""
+        self.n += n
+        if self._bar is not None:
+            self._bar.total = self.total
+            if words:
+                self._bar.set_postfix_str(words, refresh=False)
+            self._bar.update(n)
+
+    def close(self) -> None:
+        """End it."""
+        self._is_ended.set()
+        if self._bar is not None:
+            self._bar.close()
+
+    def _go_on(self) -> None:
+        while not self._is_ended.wait(LINE_INTERVAL if self.is_lines else CLOCK_INTERVAL):
+            if self._bar is not None:
+                self._bar.refresh()
+            else:
+                log.info(self._line())
+
+    def _line(self) -> str:
+        minutes = (time.monotonic() - self._start) / 60.0
+        of = "" if self.total is None else f" of {self.total}"
+        steps = f"{self._unit} {self.n}{of}, " if self.n or of else ""
+        return f"{self._name or 'running'}: {steps}{minutes:.0f} min"
 
 
 class Bar:
-    """A progress bar that reads the objective at most every tenth of a second."""
+    """The progress of iterations, which reads a quantity at most every tenth of a second."""
 
-    def __init__(self, n_iter: int, progress: bool) -> None:
-        self._bar = make_bar(n_iter, "it", progress)
+    def __init__(self, n_iter: int, is_shown: bool) -> None:
+        self._progress = Progress(n_iter, "it", is_shown, "iterations")
         self._shown = time.monotonic()
 
     def __enter__(self) -> Bar:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._bar.close()
+        self._progress.close()
 
     def expect(self, n_iter: int | None) -> None:
         """Change the number of iterations, which may be unknown."""
-        self._bar.total = n_iter
+        self._progress.total = n_iter
 
     def show(self, iteration: int, quantity: Callable[[], str], last: bool = False) -> None:
         """Show the iteration and a quantity, where an update is due or this is the last."""
-        if self._bar.disable:
-            return
-        if last or time.monotonic() - self._shown > PROGRESS_INTERVAL:
-            self._bar.set_postfix_str(quantity(), refresh=False)
-            self._bar.update(iteration - self._bar.n)
+        is_due = last or time.monotonic() - self._shown > PROGRESS_INTERVAL
+        if self._progress.is_lines or (self._progress.is_bar and is_due):
+            words = quantity() if self._progress.is_bar else ""
+            self._progress.update(iteration - self._progress.n, words)
             self._shown = time.monotonic()

@@ -8,7 +8,7 @@ extended source is smoothed near the stars because of what could not be mended.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -109,7 +109,12 @@ class _State:
 
 
 def mend(
-    setup: Setup, observation: Observation, names: Sequence[str], moves: bool | str, is_asked: bool
+    setup: Setup,
+    observation: Observation,
+    names: Sequence[str],
+    moves: bool | str,
+    is_asked: bool,
+    tick: Callable[[], object] = int,
 ) -> Mended:
     """Return an observation whose positions and PSFs are mended where the images ask for it.
 
@@ -133,8 +138,10 @@ def mend(
         Whether stars are moved; "auto": where that mends a misfit.
     is_asked : bool
         Whether the outcome is wanted though PSFs may fit.
+    tick : callable, optional
+        Is called after each iteration of the runs.
     """
-    runs = GuardedRuns(setup, observation)
+    runs = GuardedRuns(setup, observation, tick)
     if len(runs.stars) > MOST_STARS and not (is_asked or len(observation.psf_scatter)):
         number = counted(len(runs.stars), "star")
         log.info(f"PSFs are not judged: {number} in the window; name refine_psfs to judge them")

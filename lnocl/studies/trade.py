@@ -18,7 +18,7 @@ from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, LnoclWarning
 from lnocl.result import Estimate, Result
 from lnocl.runs.options import PAPER, Precision
-from lnocl.runs.progress import make_bar
+from lnocl.runs.progress import Progress
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.simulation import Simulation
 from lnocl.studies import experiment
@@ -148,7 +148,7 @@ def compare(
     checkpoints = sorted({n_iter // part for part in PARTS})
     rows: list[dict[str, Any]] = []
     reference = None
-    with make_bar(len(settings) * len(checkpoints), "row", progress) as bar:
+    with Progress(len(settings) * len(checkpoints), "row", progress) as bar:
         _compile(settings[1:], reconstruct)
         for setting in settings:
             timer = IterationTimer(checkpoints, bar.update)

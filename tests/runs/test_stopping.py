@@ -2,6 +2,7 @@
 
 import functools
 import io
+import time
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ import lnocl
 from lnocl.errors import LnoclWarning
 from lnocl.runs.assessment import assess
 from lnocl.runs.halves import Snapshot
+from lnocl.runs.progress import Progress
 from lnocl.runs.stopping import CHANGE_WINDOW, expected_deviance
 from lnocl.runs.thinning import split_counts
 from lnocl.scene.penalty import SMOOTHING, Penalty, recommend_smoothing
@@ -446,3 +448,24 @@ class TestSmoothing:
             gradient += sum(v * np.roll(excess, 2 - x, 1) for x, v in enumerate(psf.ravel()))
         found = recommend_smoothing(observation) / SMOOTHING
         assert found == pytest.approx(gradient.std(), rel=0.04)
+
+
+def test_each_phase_is_shown(monkeypatch):
+    screen = Screen()
+    monkeypatch.setattr("sys.stderr", screen)
+    options = {"stop": "held-out", "smoothing": "auto", "progress": True}
+    lnocl.deconvolve(scene()[0], [STAR], engine="numpy", n_iter=60, **options)
+    for phase in ("judging the PSFs", "measuring steps", "iterations", "fitting star fluxes"):
+        assert f"\r{phase}: " in screen.getvalue()
+
+
+def test_without_a_terminal_the_log_has_lines_while_a_step_is_long(monkeypatch, caplog):
+    monkeypatch.setattr("lnocl.runs.progress.LINE_INTERVAL", 0.01)
+    caplog.set_level("INFO", "lnocl.progress")
+    with Progress(3, "tile", True, "deconvolving") as progress:
+        progress.update()
+        end = time.monotonic() + 10.0
+        while len(caplog.messages) < 2 and time.monotonic() < end:
+            time.sleep(0.01)
+    assert caplog.messages[0] == "deconvolving: tile 1 of 3, 0 min"
+    assert len(caplog.messages) >= 2
