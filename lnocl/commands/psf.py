@@ -28,11 +28,12 @@ MAX_DRAWN = 16
 
 OPTIONS = [
     option(
-        "frame",
+        "frames",
+        nargs="+",
         metavar="FRAME",
         checksum="ISUM",
-        help="FITS file with an image of stars, in any linear unit; with --check, with a PSF or a "
-        "cube of them",
+        help="FITS file with an image of stars, in any linear unit, or several with a star each, "
+        "whose effective PSF is made; with --check, with a PSF or a cube of them",
     ),
     option("-o", "--output", metavar="PSF.fits", help="FITS file for the PSF or PSFs"),
     option(
@@ -130,23 +131,28 @@ def _run(arguments: argparse.Namespace) -> None:
     sha256: dict[str, list[str]] = {}
     mask = None
     with messages.shown_log(arguments.quiet):
-        stack = fitsread.read_single(arguments.frame)
-        frame, sha256["frame"] = stack.data[0], stack.sha256
+        stack = fitsread.read_single(arguments.frames[0])
+        frame, sha256["frames"], background = stack.data[0], stack.sha256, arguments.background
         positions = _positions(arguments, stack.header)
         if arguments.mask is not None:
-            mask, sha256["mask"] = _read_mask(arguments.mask, arguments.frame, frame.shape)
+            mask, sha256["mask"] = _read_mask(arguments.mask, arguments.frames[0], frame.shape)
+        if len(arguments.frames) > 1:
+            frame, positions, sha256["frames"] = _joined(arguments)
+            background = 0.0
     stars = psf.make_psfs(
         frame,
         arguments.rotate,
         position=positions,
         size=arguments.size,
-        background=arguments.background,
+        background=background,
         mask=mask,
         saturation=arguments.saturation,
         recentre=arguments.recentre,
         clip_negative=arguments.clip_negative,
     )
     lines = _lines(stars, arguments.rotate)
+    if len(arguments.frames) > 1:
+        lines.insert(0, f"{len(arguments.frames)} frames: their stars are laid side by side")
     psfs = np.array([star.psf for star in stars])
     scatters = None if stars[0].scatter is None else np.array([star.scatter for star in stars])
     given = vars(arguments)
@@ -176,6 +182,27 @@ def _run(arguments: argparse.Namespace) -> None:
         messages.say(lines)
 
 
+def _joined(
+    arguments: argparse.Namespace,
+) -> tuple[NDArray[np.float64], list[tuple[float, float]], list[str]]:
+    """Return the stars of several frames side by side, their places and the files' checksums."""
+    from lnocl.io import fitsread
+    from lnocl.psf import effective
+
+    if arguments.position or arguments.star_table or arguments.mask or not arguments.recentre:
+        raise InputError(
+            "of several frames the brightest star of each is taken, and centred; leave --star, "
+            "--stars, --mask and --no-recentre out (bad pixels may be NaN)"
+        )
+    if arguments.background != "auto":
+        raise InputError("several frames have a background each; leave --background auto")
+    stacks = [fitsread.read_single(path) for path in arguments.frames]
+    frames = [stack.data[0] for stack in stacks]
+    level = np.inf if arguments.saturation is None else arguments.saturation
+    bad = [~np.isfinite(frame) | (frame >= level) for frame in frames]
+    return *effective.join(frames, bad), [sha for stack in stacks for sha in stack.sha256]
+
+
 def _make_modes(arguments: argparse.Namespace) -> None:
     """Make the mean of the PSFs of several frames, and say how they differ."""
     _check_outputs(arguments)
@@ -189,7 +216,7 @@ def _make_modes(arguments: argparse.Namespace) -> None:
     from lnocl.io import fitsread, fitswrite
 
     with messages.shown_log(arguments.quiet):
-        stack = fitsread.read_stack([arguments.frame])
+        stack = fitsread.read_stack(arguments.frames)
         positions = _positions(arguments, stack.header)
     stars = [
         psf.make_psf(
@@ -224,7 +251,7 @@ def _make_modes(arguments: argparse.Namespace) -> None:
     fitswrite.write_image(
         arguments.output,
         found.mean,
-        cards=record.make_cards(OPTIONS, given, {"frame": stack.sha256}, []),
+        cards=record.make_cards(OPTIONS, given, {"frames": stack.sha256}, []),
         overwrite=arguments.overwrite,
         notes=lines,
         commands=record.make_commands("psf", OPTIONS, given, folder),
@@ -246,7 +273,7 @@ def _positions(
     if arguments.star_table is not None:
         from lnocl.io.sky import read_stars
 
-        positions += read_stars(arguments.star_table, header, arguments.frame).tolist()
+        positions += read_stars(arguments.star_table, header, arguments.frames[0]).tolist()
     return positions or None
 
 
@@ -272,10 +299,10 @@ def _report(arguments: argparse.Namespace) -> None:
 
     for each in OPTIONS:
         is_given = each.words(vars(arguments)[each.name]) != each.words(each.default)
-        if each.name not in ("frame", "check", "quiet") and is_given:
+        if each.name not in ("frames", "check", "quiet") and is_given:
             raise InputError(f"--check makes nothing; leave {each.flags[0]} out")
     with messages.shown_log(arguments.quiet):
-        stack = fitsread.read_stack([arguments.frame])
+        stack = fitsread.read_stack(arguments.frames)
     scale, finer = sky.pixel_scale(stack.headers[0]), sky.oversampling(stack.headers[0])
     lines = [f"pixels: {scale:.4g} arcsec, by its header"] if scale else []
     if finer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +11,9 @@ from scipy.ndimage import binary_dilation, maximum_filter, shift
 from scipy.spatial import KDTree
 
 from lnocl.errors import InputError, counted
-from lnocl.psf.centring import Array, Mask, Point
+from lnocl.psf.centring import Array, Mask, Point, brightest
 from lnocl.psf.repair import repair
-from lnocl.psf.steps import cut_square, nearest_pixel
+from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
 from lnocl.scene.shifting import MovablePsf, Stamp
 
 # Rounds of fitting the stars and adding what is left of them to the PSF.
@@ -105,6 +106,38 @@ def combine(light: Array, bad: Mask, centres: list[Point], half: int, n_given: i
     iteration (SIRT).
     """
     return _Stars(light, bad, centres, half, n_given).combine()
+
+
+def join(frames: Sequence[Array], bad: Sequence[Mask]) -> tuple[Array, list[Point]]:
+    """Return squares round the brightest star of each frame side by side, and where the stars are.
+
+    Each is above its own background, the median of the frame's border.
+
+    Parameters
+    ----------
+    frames : sequence of ndarray of float64, shape (ny, nx)
+        Frames of a star each, of any shapes.
+    bad : sequence of ndarray of bool, shape (ny, nx)
+        True where a pixel counts for nothing; it is NaN in what is returned.
+
+    Returns
+    -------
+    ndarray of float64, shape (2 h + 1, n (2 h + 1))
+        The squares, as large as all frames have them.
+    list of tuple of float
+        Column and row of each star.
+    """
+    squares, lights = [], []
+    for frame, without in zip(frames, bad, strict=True):
+        pixels = np.where(without, 0.0, frame)
+        row, column = place = brightest(pixels, without)
+        level, _ = measure_background("auto", pixels, without, [place], None)
+        lights.append((np.where(without, np.nan, frame - level), place))
+        squares.append(min(row, column, frame.shape[0] - 1 - row, frame.shape[1] - 1 - column))
+    half = min(squares)
+    cut = [cut_square(light, place, half) for light, place in lights]
+    places = [(float(half + j * (2 * half + 1)), float(half)) for j in range(len(cut))]
+    return np.concatenate(cut, axis=1), places
 
 
 def lines(found: EffectivePsf) -> tuple[str, ...]:

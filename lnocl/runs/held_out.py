@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError, warn
+from lnocl.process import ignored_notes
 from lnocl.runs.assessment import assess
 from lnocl.runs.halves import Halves, Snapshot, next_snapshot, pack, take
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome
@@ -88,7 +89,8 @@ class HeldOutCounts:
             for half, extended, star_fluxes, positions in zip(starts, *estimates, strict=True)
         ]
         last = min(self._n_iter, math.ceil(LATER_LENGTH * self._first.n_iter))
-        halves = Halves(starts, last, iteration)
+        with ignored_notes():  # of memory, which the first halves have announced
+            halves = Halves(starts, last, iteration)
         halves.snapshots.append(self._first.origin)
         return halves
 

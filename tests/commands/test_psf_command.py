@@ -169,6 +169,23 @@ class TestWhatItMakes:
         words = shlex.split("\n".join(fits.getheader("out.fits")["HISTORY"]).replace("\\\n", ""))
         assert words.count("--star") == 2
 
+    def test_several_files_with_a_star_each_give_what_they_share(self, capsys):
+        names, chance = [], np.random.default_rng(3)
+        for n, x, y, flux in [(31, 15.3, 14.8, 4e6), (35, 18.6, 16.1, 9e6), (33, 16.1, 16.4, 3e6)]:
+            rows, columns = np.indices((n, n))
+            light = flux * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 8.0) / (8.0 * np.pi)
+            names.append(f"cut{n}.fits")
+            fits.writeto(names[-1], chance.poisson(light + n).astype(float))
+        assert cli.main(["psf", *names, "-o", "out.fits", "--size", "21"]) == 0
+        assert "3 frames: their stars are laid side by side" in capsys.readouterr().out
+        psf, header = fits.getdata("out.fits"), fits.getheader("out.fits")
+        rows, columns = np.indices((21, 21)) - 10.0
+        true = np.exp(-(rows**2 + columns**2) / 8.0) / (8.0 * np.pi)
+        assert abs(psf - true).max() < 0.005 * true.max()
+        assert (header["NSTARS"], len({header[f"ISUM{j}"] for j in (1, 2, 3)})) == (3, 3)
+        assert cli.main(["psf", *names, "-o", "no.fits", "--star", "3,4"]) == 2
+        assert "the brightest star of each is taken" in capsys.readouterr().err
+
     def test_a_table_of_stars_is_as_good_as_their_positions(self, capsys):
         Path("stars.csv").write_text("x,y\n30,29\n50,45\n")
         assert run("--stars", "stars.csv", "--size", "15") == 0
