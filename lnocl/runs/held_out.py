@@ -36,6 +36,9 @@ log = logging.getLogger("lnocl")
 
 # The halves run to this multiple of the chosen iteration, so that the references are resolved.
 LENGTH_RATIO = 2
+# Where they cannot, the choice is as good down to this multiple; below it is warned, and so many
+# times the iterations are named, as the halves end by themselves.
+LEAST_RATIO, MORE = 1.25, 10
 MIN_ITERATIONS = 10
 # Snapshots before this share of the chosen iteration are dropped.
 OLDEST_SNAPSHOT = 1.0 / 3.0
@@ -126,11 +129,11 @@ class HeldOutCounts:
             if is_better and len(self._curves) < len(self._penalties):
                 self._halves = self._begin()
         best, first = cast(_Best, self._best), cast(_First, self._first)
-        if LENGTH_RATIO * first.n_iter > self._n_iter:
+        if LEAST_RATIO * first.n_iter > self._n_iter:
             warn(
                 f"held-out counts have chosen iteration {first.n_iter} of {self._n_iter}, too near "
-                "the end to be sure: first mend PSF and noise where warnings name them, as these "
-                f"counts do not see such faults; then give n_iter {LENGTH_RATIO * first.n_iter}"
+                f"the end to be sure: give n_iter {MORE * self._n_iter}, of which they do as many "
+                "as they need; if that is too near too, PSF or noise are wrong"
             )
         penalty = self._penalties[best.trial]
         if len(self._penalties) > 1:
