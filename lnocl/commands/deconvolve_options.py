@@ -93,7 +93,8 @@ OPTIONS = {
             card=("EXP", "exposure, seconds"),
             checksum="ESUM",
             help="seconds, a FITS file with a map of them, or a keyword of the images' headers "
-            "such as EXPTIME; one for all images or one for each; the result is then per second",
+            "such as EXPTIME; one for all images or one for each. Rates are multiplied by it; the "
+            "result of counts is then per second",
         ),
         option(
             "--gain",
@@ -102,7 +103,8 @@ OPTIONS = {
             card=("GAIN", "electrons for each unit of the images"),
             help="electrons for each adu, or for each of whatever unit the images have; or a "
             "keyword of the images' headers such as GAIN; or their extension with the variance of "
-            "counts, as VAR_POISSON of JWST",
+            "counts, as VAR_POISSON of JWST (default: 1 for counts; for other units what their "
+            "VAR_POISSON, --error or ERR shows)",
         ),
         option(
             "--mask",
@@ -153,7 +155,8 @@ OPTIONS = {
         option(
             "--align",
             choices=("wcs",),
-            help="take the offsets between the images from their sky coordinates",
+            help="take the offsets between the images from their sky coordinates (default: they "
+            "have none)",
         ),
     ],
     "stars": [

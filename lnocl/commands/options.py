@@ -197,7 +197,7 @@ IMAGES = option(
     metavar="IMAGE",
     checksum="ISUM",
     help="FITS file with an image, or one file with a cube of them, in the unit of its BUNIT, or "
-    "else in electrons per pixel; an extension of any FITS file is named as in 'FILE[SCI]', "
+    "else in electrons; an extension of any FITS file is named as in 'FILE[SCI]', "
     "'FILE[SCI,2]' or 'FILE[1]'",
 )
 PSFS = option(
@@ -217,7 +217,8 @@ BACKGROUND = option(
     card=("BKG", "background, electrons"),
     checksum="BSUM",
     help="electrons per pixel, a FITS file with a map of them, or auto, the sigma-clipped median "
-    "of the image; one for all images or one for each (default: 0)",
+    "of the image, or of its darker half where light fills it; below 0 where too much sky was "
+    "subtracted; one for all images or one for each (default: 0)",
 )
 READ_NOISE = option(
     "--read-noise",
@@ -228,7 +229,7 @@ READ_NOISE = option(
     checksum="RSUM",
     help="standard deviation in electrons, a FITS file with a map of it, a keyword of the images' "
     "headers such as RDNOISE, or auto, what the scatter of the sky has beyond the noise of its "
-    "counts; one for all images or one for each (default: 0)",
+    "counts; one for all images or one for each (default: 0; auto where the sky was subtracted)",
 )
 SATURATION = option(
     "--saturation",

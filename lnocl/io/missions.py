@@ -60,7 +60,7 @@ def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
         found |= _electrons(path, contents)
     for name, value in found.items():
         words = value if isinstance(value, str) else " ".join(value)
-        log.info("%s: %s %s, as for images of %s", path, name, words, telescope)
+        log.info("%s: with %s %s, as for images of %s", path, name, words, telescope)
     return found
 
 

@@ -25,6 +25,8 @@ VARIANCES: Mapping[str, Callable[[Array], Array]] = {
 }
 # No image has so many times the noise that its sky shows.
 TOO_NOISY = 5.0
+# A gain that follows from the errors leaves them below the noise of the counts by so much.
+ROUNDING = 0.05
 # The share of pixels that are the brightest.
 BRIGHT = 0.01
 # The flags DO_NOT_USE, SATURATED and JUMP_DET of JWST: the counts of such a pixel were not summed
@@ -72,7 +74,7 @@ class NoiseMap(NamedTuple):
             return np.asarray(np.sqrt(variance))
         variance -= np.where(mask, 0.0, counts.clip(0.0))
         for j, (left, bad) in enumerate(zip(variance, mask, strict=True)):
-            n_below = int((left < 0).sum())
+            n_below = int((left < -ROUNDING * counts[j].clip(0.0)).sum())
             if n_below > 0.5 * (~bad).sum():
                 raise InputError(
                     f"error of image {j} is less than the noise of its counts in most pixels; see "
@@ -80,8 +82,8 @@ class NoiseMap(NamedTuple):
                 )
             median = np.sqrt(np.median(left[~bad].clip(0.0))) if not bad.all() else 0.0
             log.info(
-                "image %d: noise besides its counts %.3g electrons in the median; %s with less "
-                "than that of the counts %s none",
+                "image %d: noise apart from that of its counts %.3g electrons in the median; %s "
+                "whose error is less than the noise of its counts %s none",
                 j,
                 median,
                 counted(n_below, "pixel"),

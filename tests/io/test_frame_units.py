@@ -159,6 +159,14 @@ class TestUnits:
         np.testing.assert_allclose(raw.sum(axis=(1, 2)), means.sum(), rtol=0.02)
         assert "electrons in its unit, by " in log.text
 
+    def test_errors_of_counts_alone_give_the_gain_and_no_other_noise(self):
+        means = 400.0 + 4e4 * np.exp(-np.hypot(*(np.indices((40, 40)) - 20.0)) / 3.0)
+        image = np.random.default_rng(4).poisson(means) / 100.0
+        save("1.fits", image, BUNIT="MJy/sr")
+        save("err.fits", np.sqrt(image / 100.0).astype("f4") * 0.999)
+        found = observe("1.fits", error=["err.fits"])
+        assert np.median(found.background) < 1.0
+
     @pytest.mark.parametrize("unit", DIGITAL_RATES)
     def test_adu_per_second_need_the_exposure_too(self, unit):
         save_images(BUNIT=unit)

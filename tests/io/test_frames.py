@@ -289,7 +289,7 @@ class TestNoise:
         counts = IMAGES.copy()
         counts[0, 0, 0] = -0.5
         errors = np.sqrt(counts.clip(0.0) / 2.0 + MAP)
-        errors[1, 5, 5], errors[1, 6, 6] = 0.0, np.sqrt(0.5 * counts[1, 6, 6] - 0.1)
+        errors[1, 5, 5], errors[1, 6, 6] = 0.0, np.sqrt(0.4 * counts[1, 6, 6])
         for j in range(2):
             hdus = [fits.PrimaryHDU(), fits.ImageHDU(counts[j], name="SCI")]
             hdus += [fits.ImageHDU(errors[j], name="ERR")]
@@ -304,9 +304,15 @@ class TestNoise:
             bad = errors == 0
             np.testing.assert_array_equal(found.mask, bad)
             np.testing.assert_allclose(found.background[~bad], expected[~bad], rtol=1e-12, atol=0)
-            assert notes(log)[-2].endswith("0 pixels with less than that of the counts have none")
-            assert notes(log)[-1].startswith("image 1: noise besides its counts 2.44 electrons in")
-            assert notes(log)[-1].endswith("1 pixel with less than that of the counts has none")
+            assert notes(log)[-2].endswith(
+                "0 pixels whose error is less than the noise of its counts have none"
+            )
+            assert notes(log)[-1].startswith(
+                "image 1: noise apart from that of its counts 2.44 electrons in"
+            )
+            assert notes(log)[-1].endswith(
+                "1 pixel whose error is less than the noise of its counts has none"
+            )
 
     def test_what_the_sky_has_beyond_its_counts(self, log):
         """Of a sky of 50 electrons, 30 of which were subtracted, and a read noise of 8."""
