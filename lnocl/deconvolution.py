@@ -159,8 +159,9 @@ def deconvolve(
         estimate is the sum of both halves'. They go beyond the iteration of the result, and begin
         again for each smoothing.
     progress : bool, optional
-        Show a progress bar on stderr, where that is a terminal, with the objective or the quantity
-        of the stopping rule.
+        Show a progress bar on stderr, where that is a terminal, for each long phase, with the
+        objective or the quantity of the stopping rule. Elsewhere the logger "lnocl.progress" has a
+        line each minute.
     refine_positions : bool or "auto", optional
         Move the stars to where they are most likely, at most 3 pixels away. Fisher scoring of all
         fluxes and positions does so, with the extended source held fixed

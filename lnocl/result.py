@@ -441,7 +441,7 @@ class Result:
         seed : int, optional
             Zero or more. The same seed gives the same numbers on the same device.
         progress : bool, optional
-            Show a progress bar on stderr, where that is a terminal.
+            Show progress, as `lnocl.deconvolve` does.
         earlier : Bootstrap, optional
             Replicas of this result that exist already, of the same regions and seed. The rest is
             added. All is bit for bit as if it had been computed at once.

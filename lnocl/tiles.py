@@ -243,7 +243,7 @@ def deconvolve_tiles(
     stop : "held-out", "discrepancy", float or None, optional
         Rule by which to stop before `n_iter`, as for `lnocl.deconvolve`.
     progress : bool, optional
-        Show a progress bar on stderr, where that is a terminal.
+        Show progress, as `lnocl.deconvolve` does.
     **options
         Others of `lnocl.deconvolve`: solver, precision, engine, device, pad, refine_positions.
 

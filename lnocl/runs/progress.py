@@ -99,7 +99,8 @@ class Progress:
     def _line(self) -> str:
         minutes = (time.monotonic() - self._start) / 60.0
         of = "" if self.total is None else f" of {self.total}"
-        steps = f"{self._unit} {self.n}{of}, " if self.n or of else ""
+        unit = "iteration" if self._unit == "it" else self._unit
+        steps = f"{unit} {self.n}{of}, " if self.n or of else ""
         return f"{self._name or 'running'}: {steps}{minutes:.0f} min"
 
 
