@@ -15,7 +15,7 @@ from lnocl.psf import resampling
 from lnocl.psf.centring import FWHM, SEARCH, Array, Mask, Pixel, Point, brightest, fit_gaussian
 from lnocl.psf.checks import MIN_SIZE, one_number
 from lnocl.psf.repair import WINDOW, repair
-from lnocl.psf.wings import FROM, fit_sky
+from lnocl.psf.wings import FROM, distance, fit_sky
 from lnocl.scene.arrays import numbers
 
 # Pixels around the crop while it is shifted and rotated: both wrap round its edges.
@@ -133,8 +133,7 @@ def lower_background(
     """
     peaks = np.array([light[nearest_pixel(centre)] for centre in centres]).clip(0.0)
     sky = fit_sky(light, bad, centres, peaks, width, 2 * side)
-    y, x = np.indices(light.shape)
-    core = np.min([np.hypot(y - r, x - c) for r, c in centres], axis=0) < FROM * width
+    core = distance(light.shape, centres) < FROM * width
     flux = float(light[core & ~bad].sum())
     if sky is None or not flux > 0:
         return level, []
@@ -218,10 +217,9 @@ def find_neighbours(
         Half the side of the windows.
     """
     noise = float(sigma_clipped_stats(light[~bad])[2])
-    y, x = np.indices(bad.shape)
-    far = np.min([np.maximum(abs(y - r), abs(x - c)) for r, c in centres], axis=0) > half
+    far = _distance(bad.shape, [nearest_pixel(centre) for centre in centres]) > half
     highest = (light == maximum_filter(light, 2 * math.ceil(width) + 1)) & ~bad
-    stars, masked, n_masked = list[Point](), np.zeros_like(bad), 0
+    stars, others = list[Point](), list[Point]()
     for row, column in np.argwhere(highest & (light > SIGNIFICANT * noise)).tolist():
         offsets = np.abs(np.array(centres) - (row, column))
         peaks = [light[nearest_pixel(centres[s])] for s in range(len(centres))]
@@ -234,25 +232,19 @@ def find_neighbours(
         except InputError:
             place, sigma = (row, column), width / FWHM
         is_there = math.dist(place, (row, column)) < width
-        if (
-            is_there
-            and abs(FWHM * sigma / width - 1.0) < ALIKE
-            and not _touches(bad | far, place, width)
-        ):
+        is_alike = abs(FWHM * sigma / width - 1.0) < ALIKE
+        is_new = all(math.dist(place, star) > width for star in stars)
+        if is_there and is_alike and is_new and not _touches(bad | far, place, width):
             stars.append(place)
         else:
-            masked |= np.hypot(y - row, x - column) < MASKED * width
-            n_masked += 1
-    if not (stars or n_masked):
-        return [], masked, []
-    return (
-        stars,
-        masked | far,
-        [
-            f"neighbours: {counted(len(stars), 'star')} not given, taken too; "
-            f"{counted(n_masked, 'other source')} masked"
-        ],
+            others.append((row, column))
+    if not (stars or others):
+        return [], far & False, []
+    line = (
+        f"neighbours: {counted(len(stars), 'star')} not given, taken too; "
+        f"{counted(len(others), 'other source')} masked"
     )
+    return stars, far | (distance(bad.shape, others) < MASKED * width), [line]
 
 
 def _touches(bad: Mask, place: Point, width: float) -> bool:
