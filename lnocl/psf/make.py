@@ -29,7 +29,7 @@ class StarPsf:
         Point spread function of unit sum, the star's centre at ``(k // 2, k // 2)``.
     scatter : ndarray of float64, shape (k, k), or None
         Standard deviation of the stars' own PSFs from it, weighted by flux, noise included. None
-        where it is made of one star.
+        where one star was given.
     shared_steps : tuple of str
         One line for each step that PSFs at all angles share, in order, with its numbers.
     own_steps : tuple of str
@@ -38,7 +38,8 @@ class StarPsf:
     flux : float
         Flux of the PSF before it was normalised, in the unit of the frame; that of all its stars.
     centres : tuple of tuple of float
-        Position of ``(k // 2, k // 2)`` in the frame for each star: (x, y), 0-based pixels.
+        Position of ``(k // 2, k // 2)`` in the frame for each star that was given or found by its
+        brightness, not for neighbours: (x, y), 0-based pixels.
     background : float
         The level that was subtracted, in the unit of the frame.
     frame : ndarray of float64, shape (ny, nx)
@@ -390,9 +391,10 @@ def _make(
     if len(centres) > 1 or others:
         hidden = masked | (unusable if len(centres) > 1 else unrepairable)
         stars = effective.combine(light, hidden, centres, far, len(middles))
-        centres = [(star.y, star.x) for star in stars.stars]
+        centres = [(star.y, star.x) for star in stars.stars[: len(middles)]]
         flux = sum(star.flux for star in stars.stars)
-        light, scatter, pixel, shift = flux * stars.psf, flux * stars.scatter, (far, far), None
+        light, pixel, shift = flux * stars.psf, (far, far), None
+        scatter = flux * stars.scatter if len(middles) > 1 else None
         combined = (*others, *effective.lines(stars))
     squares = [
         _make_square(light, pixel, shift, side, angle, level, clip_negative) for angle in angles

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from astropy.stats import sigma_clipped_stats
+from astropy.stats import mad_std, sigma_clipped_stats
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import maximum_filter
 
@@ -216,7 +216,7 @@ def find_neighbours(
     half : int
         Half the side of the windows.
     """
-    noise = float(sigma_clipped_stats(light[~bad])[2])
+    noise = float(mad_std(light[~bad]))
     far = _distance(bad.shape, [nearest_pixel(centre) for centre in centres]) > half
     highest = (light == maximum_filter(light, 2 * math.ceil(width) + 1)) & ~bad
     stars, others = list[Point](), list[Point]()

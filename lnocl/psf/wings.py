@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from astropy.stats import sigma_clipped_stats
+from astropy.stats import mad_std
 from scipy.spatial.distance import cdist
 
 from lnocl.psf.centring import Array, Mask, Point
@@ -73,11 +73,9 @@ def fit_sky(
         return None
     values, distances = pixels[tuple(used.T)], cdist(stars, used) / width
     parts = np.array_split(np.argsort(peaks @ distances**-3.0), PARTS)  # the darkest first
-    found = [sigma_clipped_stats(values[part], sigma=3.0) for part in parts]
-    means = np.array([mean for mean, _, _ in found])
-    errors = np.array(
-        [scatter / np.sqrt(part.size) for (*_, scatter), part in zip(found, parts, strict=True)]
-    )
+    found = [_clipped(values[part]) for part in parts]
+    means = np.array([each.mean() for each in found])
+    errors = np.array([each.std() / np.sqrt(each.size) for each in found])
     errors = np.maximum(errors, np.finfo(float).eps * abs(means).max() + np.finfo(float).tiny)
     best, least = None, np.inf
     for radius in RADII:
@@ -91,3 +89,8 @@ def fit_sky(
                 error = float(np.sqrt(np.linalg.pinv(design.T @ design)[0, 0]))
                 best, least = Sky(float(level), error, float(means[0] - level)), chi2
     return best
+
+
+def _clipped(values: Array) -> Array:
+    """Return the values within three standard deviations of their median."""
+    return values[abs(values - np.median(values)) <= 3.0 * mad_std(values)]

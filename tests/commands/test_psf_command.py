@@ -114,14 +114,15 @@ class TestWhatItMakes:
         )  # fmt: skip
         lines = []
         for j, (each, angle) in enumerate(zip(expected, (0, 45, 90, 135), strict=True), 1):
-            lines += [f"PSF {j} of 4, at {angle} degrees:", *each.steps[4:]]
+            lines += [f"PSF {j} of 4, at {angle} degrees:", *each.own_steps]
         assert capsys.readouterr().out.splitlines() == [
-            *expected[0].steps[:4],
+            *expected[0].shared_steps,
             *lines,
             "written to out.fits: 4 PSFs of 20 x 20 pixels, the star's centre at (10, 10)",
         ]
-        assert [line.partition(":")[0] for line in expected[0].steps[:4]] == [
-            "star", "background", "bad pixels", "centre",
+        assert [line.partition(":")[0] for line in expected[0].shared_steps] == [
+            "star", "background", "bad pixels", "centre", "neighbours", "star 1 of 2",
+            "star 2 of 2", "effective PSF",
         ]  # fmt: skip
 
     def test_without_a_size_all_angles_have_the_largest_common_one(self):
@@ -347,7 +348,7 @@ class TestMessages:
         assert line.endswith("its pixels stay as they are without recentring and rotation")
 
     def test_the_largest_crop_is_called_so(self, capsys):
-        assert run() == 0
+        assert run(frame="sharp.fits") == 0
         k = len(fits.getdata("out.fits"))
         crop = f"crop: {k} x {k} pixels, the largest square there is"
         assert crop in capsys.readouterr().out.splitlines()
