@@ -262,7 +262,7 @@ def deconvolve(
     takes it up. So PSFs are judged by short runs in a window round the stars. In these the
     extended source is smoothed near the stars as strongly as the PSFs' own error asks for, which
     the residuals at the stars show (`lnocl.scene.psf_misfit`, `lnocl.runs.guarded_runs`). Where
-    their chi squared exceeds its expectation by five standard deviations, or by two and the error
+    their chi squared exceeds its expectation by five standard deviations, or by three and the error
     is above 0.025, positions and PSFs are refined as far as they may be. They are used where they
     take two standard deviations or more, and leave less than half of the error, or nothing that
     noise does not explain. Free pixels, which may fit anything, are used where they leave less than

@@ -13,6 +13,8 @@ from lnocl.psf.centring import Array, Mask, Point
 # Wings are those of stars from so many widths on. They are measured in so many parts, of pixels as
 # far from the stars, with so many pixels each or more.
 FROM, PARTS, FEWEST = 3.0, 24, 16
+# Noise is no less than this share of the brightest peak.
+LEAST = 1e-9
 # Of more pixels every second one is looked at, and so on.
 MOST = 100_000
 # Wings are those of Moffat functions of these radii, in widths, and powers.
@@ -76,7 +78,7 @@ def fit_sky(
     found = [_clipped(values[part]) for part in parts]
     means = np.array([each.mean() for each in found])
     errors = np.array([each.std() / np.sqrt(each.size) for each in found])
-    errors = np.maximum(errors, np.finfo(float).eps * abs(means).max() + np.finfo(float).tiny)
+    errors = np.maximum(errors, LEAST * peaks.max())
     best, least = None, np.inf
     for radius in RADII:
         for power in POWERS:

@@ -42,8 +42,9 @@ MENDED, GONE = 0.5, 2.0
 FADED = 0.5
 # Wings without noise are to leave less than this share.
 CLEANED = 0.99
-# Free pixels, which may fit anything, are to leave less than this share of kappa.
-FITTED = 0.3
+# Free pixels, which may fit anything, are to leave less than this share of kappa. Where it is not
+# significant they are tried above this kappa.
+FITTED, FREED = 0.3, 0.1
 # Rounds of a search: each takes so many steps, and judges the PSFs. It ends where a round lowers
 # the misfit by less than so many of its standard deviations.
 ROUNDS, STEPS, IMPROVED = 4, 2, 0.3
@@ -161,7 +162,7 @@ def mend(
     if state.misfit.is_doubtful and families.parameters:
         tried, values = _fit(runs, families, state, moves is not False)
         state = tried if state.is_mended_by(tried) else state
-    if state.misfit.is_doubtful and "pixels" in names:
+    if state.misfit.is_doubtful and _shows_pixels(state.misfit) and "pixels" in names:
         loose = _loosen(runs, min(state, tried, key=lambda each: each.misfit.kappa))
         tried = _free_pixels(runs, observation.psf_scatter, loose, moves is not False)
         if _is_trusted(tried, loose, state.misfit.kappa):
@@ -193,6 +194,11 @@ def mend(
     observation = copy(observation)
     observation.psf_scatter = known if len(known) else allowance.scatter()
     return Mended(observation, state.moves, refinement, allowance.near_stars(setup.pad))
+
+
+def _shows_pixels(misfit: PsfMisfit) -> bool:
+    """Return whether a misfit is enough for free pixels, which else follow the noise."""
+    return misfit.is_significant or misfit.kappa > FREED
 
 
 def _move(runs: GuardedRuns, state: _State) -> _State:

@@ -33,7 +33,7 @@ SIGNIFICANT, SIGNIFICANT_IN_RING = 5.0, 2.0
 # A mend is tried from fewer on too where kappa is large: in few counts or pixels no error is
 # significant, and in many the smoothing of the extended source leaves as many standard deviations,
 # but little kappa.
-DOUBTFUL, LARGE = 2.0, 0.025
+DOUBTFUL, LARGE = 3.0, 0.025
 
 
 class PsfMisfit(NamedTuple):
@@ -70,7 +70,7 @@ class PsfMisfit(NamedTuple):
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether a mend is worth a trial: the excess is significant, or two and kappa large."""
+        """Whether a mend is worth a trial: the excess is significant, or three and kappa large."""
         return self.is_significant or (self.significance > DOUBTFUL and self.kappa > LARGE)
 
     @property
