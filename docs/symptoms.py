@@ -108,7 +108,7 @@ SYMPTOMS = {
 
 def draw(wrong, right):
     """Return residuals and extended source of what is wrong, and the source of what is right."""
-    figure = Figure((9.0, 3.3), layout="constrained")
+    figure = Figure((10.0, 3.0), layout="constrained")
     axes = figure.subplots(1, 3)
     rows, columns = slice(4, 84), slice(24, 104)
     top = np.percentile(right.extended[rows, columns], 99.5)
@@ -123,15 +123,19 @@ def draw(wrong, right):
             extent=(23.5, 103.5, 3.5, 83.5),
         )  # fmt: skip
         axis.set_title(title, fontsize=10)
-        axis.tick_params(labelsize=8)
-        figure.colorbar(shown, ax=axis, shrink=0.8).ax.tick_params(labelsize=8)
+        axis.set_xlabel("x (pixels)", fontsize=8)
+        axis.set_ylabel("y (pixels)", fontsize=8)
+        bar = figure.colorbar(shown, cax=axis.inset_axes((1.03, 0.0, 0.05, 1.0)))
+        bar.set_label("residual / noise" if low else "electrons per pixel", fontsize=8)
+        for each in (axis, bar.ax):
+            each.tick_params(labelsize=8)
     return figure
 
 
 def main(folder):
     """Draw all symptoms."""
     for name, make in SYMPTOMS.items():
-        draw(*make()).savefig(Path(folder) / f"{name}.png", dpi=80)
+        draw(*make()).savefig(Path(folder) / f"{name}.png", dpi=100)
 
 
 if __name__ == "__main__":

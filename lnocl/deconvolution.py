@@ -77,7 +77,7 @@ def deconvolve(
 
     .. math::
 
-       J = \sum_j \sum_n \left[ g_j \ln \frac{g_j}{m_j} + m_j - g_j \right]
+       J = \sum_j \sum_n \left[ g_j \, \ln \frac{g_j}{m_j} + m_j - g_j \right]
            + \frac{\mu}{2} \sum f^2
            + \lambda \sum \left[ \sqrt{(f - f')^2 + \delta^2} - \delta \right]
 

@@ -397,7 +397,7 @@ class Result:
         from astropy import units as u
         from astropy.table import QTable  # which takes its time to load
 
-        unit = u.electron / u.s if self._is_rate else u.electron
+        unit = u.Unit(self._unit)
         x, y = self.star_positions.T
         columns = {"x": x * u.pix, "y": y * u.pix, "flux": self.star_fluxes * unit}
         if np.isfinite(self.star_position_errors).any():
@@ -586,7 +586,6 @@ class Result:
         path = os.fspath(path)
         atomic.check_fits_output(path, overwrite)
         models, parts = self.models(), saved_parts(self)
-        unit = "electron/s" if self._is_rate else "electron"
         fitswrite.write_result(
             path,
             self.extended,
@@ -604,9 +603,9 @@ class Result:
                 *parts.pop("cards"),
             ],
             overwrite=overwrite,
-            unit=unit,
+            unit=self._unit,
             star_columns=fitswrite.error_columns(
-                self.star_position_errors, self.star_flux_errors, unit
+                self.star_position_errors, self.star_flux_errors, self._unit
             ),
             cubes={"MODELS": (models, "electron"), "RESIDUALS": (self._residuals(models), "")},
             **parts,
@@ -628,8 +627,8 @@ class Result:
         return html_card("lnocl.Result", rows, self.extended)
 
     @property
-    def _is_rate(self) -> bool:
-        return not (self._observation.exposure == 1.0).all()
+    def _unit(self) -> str:
+        return "electron" if (self._observation.exposure == 1.0).all() else "electron/s"
 
     def fit(self) -> Fit:
         """Return how well the model fits all good pixels.
@@ -738,7 +737,7 @@ def view_of(result: Result) -> ResultView:
         residuals=result._residuals(models),
         offsets=observation.offsets,
         doubtful=None if result.psf_refinement is None else result.doubtful,
-        unit="electron/s" if result._is_rate else "electron",
+        unit=result._unit,
         oversample=observation.oversample,
     )
 

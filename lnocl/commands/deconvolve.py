@@ -94,7 +94,8 @@ def _run(arguments: argparse.Namespace) -> None:
             result = dataclasses.replace(result, stop_reason="interrupt")
         with Progress(None, "", not arguments.quiet, "measuring errors", stays=False):
             at_stars = result.star_residuals()
-            view = _view(arguments, result, frames)
+            shown = arguments.models or arguments.residuals or arguments.plot
+            view = view_of(result) if shown else None
             overall = Fit.of(view.residuals, view.models) if view else result.fit()
             verdict = verdict_on(arguments, result, at_stars, overall, bool(warned))
             said = [*summarise(arguments, result, frames, at_stars, overall), *verdict]
@@ -116,14 +117,6 @@ def _run(arguments: argparse.Namespace) -> None:
             )
         if not arguments.quiet:
             messages.say(said)
-
-
-def _view(arguments: argparse.Namespace, result: Result, frames: Frames) -> ResultView | None:
-    """Return the images, models and residuals, where one of them is asked for."""
-    if not (arguments.models or arguments.residuals or arguments.plot):
-        return None
-    view = view_of(result)
-    return dataclasses.replace(view, extended=view.extended / frames.electrons, unit=frames.unit)
 
 
 def _write(
@@ -182,6 +175,7 @@ def _measured(result: Result, frames: Frames, overall: Fit, verdict: Sequence[st
     cards: list[Card] = [
         ("EXTFLUX", flux, "flux of the extended source"),
         ("EXTERROR", error, "its standard error"),
+        ("ONEUNIT", f"{float(frames.electrons)} {result._unit}", "what one BUNIT is"),
         ("RESIDRMS", overall.rms, "rms residual, 1 by noise"),
         ("VERDICT", "; ".join(verdict), ""),
     ]

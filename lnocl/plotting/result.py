@@ -24,8 +24,10 @@ MAX_SIGMA = 5.0
 # An extended source is shown down to this share of its brightest pixel, nearly logarithmically.
 FAINT_SHARE = 3e-3
 PANEL, CURVE_HEIGHT = 2.7, 2.3
+# Ticks of a colour bar are at least so far apart, as a share of its height.
+TICK_SHARE = 0.08
 # What red lines are.
-OUTLINED = "red: the PSF's error may be all there is"
+OUTLINED = "red: perhaps the PSF's error alone"
 
 Columns = Mapping[str, Array]
 
@@ -295,7 +297,14 @@ def _draw_region(
 
 
 def _add_bar(axis: Axes, shown: Any, label: str) -> None:
-    bar = axis.figure.colorbar(shown, ax=axis, shrink=0.85, pad=0.02)
+    """Draw a colour bar as high as its panel, without ticks that would hide each other."""
+    bar = axis.figure.colorbar(shown, cax=axis.inset_axes((1.03, 0.0, 0.05, 1.0)))
+    spread: list[float] = []
+    for value in sorted(bar.get_ticks(), reverse=True):
+        share = float(shown.norm(value))
+        if 0 <= share <= 1 and (not spread or shown.norm(spread[-1]) - share >= TICK_SHARE):
+            spread.append(value)
+    bar.set_ticks(spread)
     bar.set_label(label, fontsize=8)
     bar.ax.tick_params(labelsize=7)
     axis.tick_params(labelsize=7)
@@ -322,14 +331,16 @@ def _mark_stars(axis: Axes, view: ResultView, offset: Sequence[float] = (0.0, 0.
 
 def draw_choice(axis: Axes, view: ResultView) -> None:
     """Draw the error that held-out counts estimate for each smoothing, or the objective."""
+    from matplotlib.ticker import LogFormatter
+
     if view.held_out and len(view.held_out["iteration"]):
         table = view.held_out
         curves = {
-            f"{value:.2g}": (table["smoothing"] == value, table["error"])
+            f"{value:.2g}": (table["smoothing"] == value, 100 * table["error"])
             for value in np.unique(table["smoothing"])
         }
         axis.set_title("held-out counts: the last within a tenth of the least is taken", fontsize=9)
-        label = "estimated relative error"
+        label = "estimated error (%)"
     else:
         table = view.history
         curves = {"": (np.s_[:], table["objective"])} if table else {}
@@ -358,5 +369,8 @@ def draw_choice(axis: Axes, view: ResultView) -> None:
             color="0.4",
         )
     axis.set(xscale="log", yscale="log", xlabel="iteration")
+    for each in (axis.xaxis, axis.yaxis):
+        each.set_major_formatter(LogFormatter())
+        each.set_minor_formatter(LogFormatter())
     axis.set_ylabel(label, fontsize=9)
     axis.grid(alpha=0.3, which="both")

@@ -165,8 +165,11 @@ def view_of(saved: SavedResult) -> ResultView:
         np.where(abs(cube) < LARGEST, cube, np.nan)
         for cube in (saved.cubes.get(name, nothing) for name in ("MODELS", "RESIDUALS"))
     )
+    # Electrons, as images and models are, whatever the unit of the file.
+    alone = f"1 {saved.header.get('BUNIT', '')}"
+    factor, _, unit = str(saved.header.get("ONEUNIT", alone)).partition(" ")
     return ResultView(
-        extended=saved.extended,
+        extended=float(factor) * saved.extended,
         stars=saved.stars,
         star_fluxes=saved.star_fluxes,
         n_iter=int(saved.number("NITER") or 0),
@@ -177,7 +180,7 @@ def view_of(saved: SavedResult) -> ResultView:
         residuals=residuals,
         offsets=saved.offsets,
         doubtful=saved.doubtful,
-        unit=str(saved.header.get("BUNIT", "")),
+        unit=unit,
         oversample=q,
     )
 

@@ -15,6 +15,8 @@ from scenes import paper
 
 from lnocl.commands import cli
 from lnocl.io.frames import Calibration, read_frames
+from lnocl.io.saved_results import read_result
+from lnocl.studies.figures import view_of
 
 pytestmark = pytest.mark.usefixtures("command_folder")
 
@@ -166,6 +168,9 @@ class TestFrames:
             assert hdus["MODELS"].header["BUNIT"] == "electron"
             assert "BUNIT" not in hdus["RESIDUALS"].header
         assert header["BUNIT"] == "adu/s"
+        picture = view_of(read_result("out.fits"))  # all of it is in electrons
+        assert picture.unit == "electron/s"
+        np.testing.assert_allclose(picture.extended, 1.7 * fits.getdata("out.fits"))
         numbers = range(1, table["TFIELDS"] + 1)
         named = {table[f"TTYPE{i}"]: table.get(f"TUNIT{i}", "") for i in numbers}
         assert named == {

@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -133,7 +134,7 @@ def test_what_errors_of_the_psf_may_fake_is_outlined():
     doubtful = np.zeros((60, 70), bool)
     doubtful[15:25, 5:15] = True
     titles = [title for title, _ in panels(draw_result(make_view(p=1, doubtful=doubtful)))]
-    assert titles[3] == "extended source\nred: the PSF's error may be all there is"
+    assert titles[3] == "extended source\nred: perhaps the PSF's error alone"
 
 
 @pytest.mark.parametrize("shape", [(60, 70), (1, 70), (60, 1)])
@@ -156,9 +157,9 @@ def test_the_choice_is_that_of_held_out_counts_or_the_objective():
     table = {"smoothing": [0.0, 0.0, 3.0], "iteration": [1, 2, 1], "error": [0.5, 0.25, 0.4]}
     table = {key: np.array(column) for key, column in table.items()}
     name, found = curve(make_view(held_out=table))
-    assert name == "estimated relative error"
-    assert found["0"].tolist() == [0.5, 0.25]
-    assert found["3"].tolist() == [0.4]
+    assert name == "estimated error (%)"
+    assert found["0"].tolist() == [50.0, 25.0]
+    assert found["3"].tolist() == [40.0]
 
 
 @pytest.mark.parametrize("objectives", [[7.0], [7.0, np.nan], [7.0, -1.0], []])
@@ -201,3 +202,14 @@ def test_without_matplotlib_one_line_says_what_to_install(result, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(LnoclError, match=r"pip install matplotlib$"):
         result.plot()
+
+
+def test_colour_bars_are_as_high_as_their_panels_and_their_ticks_apart():
+    figure = draw_result(make_view(p=1))
+    figure.canvas.draw()
+    for axis in (axis for axis in figure.subfigs[0].axes if axis.images):
+        (bar,) = axis.child_axes
+        panel, beside = axis.get_window_extent(), bar.get_window_extent()
+        assert (panel.y0, panel.y1) == pytest.approx((beside.y0, beside.y1), abs=1)
+        labels = [each.get_window_extent() for each in bar.get_yticklabels() if each.get_text()]
+        assert all(low.y1 <= high.y0 for low, high in pairwise(sorted(labels, key=lambda b: b.y0)))
