@@ -2,6 +2,7 @@
 
 import pydoc
 from importlib.metadata import version as version_of
+from importlib.resources import files
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
@@ -30,7 +31,8 @@ suppress_warnings = ["myst.domains"]
 # rho' and rho'' have straight quotes.
 smartquotes = False
 
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "substitution"]
+myst_substitutions = {"version": version}
 myst_heading_anchors = 4
 
 default_role = "py:obj"
@@ -60,18 +62,26 @@ sphinx_gallery_conf = {
     "within_subsection_order": "FileNameSortKey",
 }
 
-# Browsers set MathML themselves, so that equations need no network.
+# Browsers set MathML themselves, so that equations need no network. The package ziamath ships the
+# font of mathematics that they need (STIX Two Math, SIL Open Font License).
 html_math_renderer = "mathml"
 html_theme = "pydata_sphinx_theme"
 html_title = f"lnocl {release}"
-html_static_path = ["_static"]
+html_static_path = ["_static", str(files("ziamath") / "fonts" / "STIXTwoMath-Regular.ttf")]
 html_css_files = ["lnocl.css"]
 html_show_sourcelink = False
+# These have no pages below them.
+html_sidebars = {"comparison": [], "glossary": []}
 html_theme_options = {
     "show_prev_next": True,
     "navigation_with_keys": False,
-    "header_links_before_dropdown": 8,
+    "header_links_before_dropdown": 7,
 }
+# Commands are copied without their prompts and outputs.
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
+copybutton_line_continuation_character = "\\"
+copybutton_selector = "div.highlight:not(.highlight-output *) pre"
 
 
 def name_without_page(app, env, node, contnode):
