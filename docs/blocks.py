@@ -1,29 +1,46 @@
 """Plugin of pytest that runs the code blocks of pages, as .ci/docs calls it.
 
 Blocks of a page run one after the other in one empty folder; those of Python share a namespace.
+A block ``output`` holds what the block before it prints; ``...`` stands for whatever is left out.
 A comment ``<!-- skip: next -->`` leaves the next block out.
 """
 
 import os
 import subprocess
-from contextlib import ExitStack, chdir
+from contextlib import ExitStack, chdir, redirect_stdout
+from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, OutputChecker
+from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from sybil import Sybil
-from sybil.parsers.myst import CodeBlockParser, PythonCodeBlockParser, SkipParser
+from sybil.evaluators.python import PythonEvaluator
+from sybil.parsers.myst import CodeBlockParser, SkipParser
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 
-class ShellBlockParser(CodeBlockParser):
-    """Finds blocks of shell, and runs them."""
+def run_python(example):
+    """Run a block of Python."""
+    with redirect_stdout(StringIO()) as printed:
+        PythonEvaluator()(example)
+    example.namespace["_printed"] = printed.getvalue()
 
-    language = "sh"
 
-    def evaluate(self, example):
-        """Run a block; the first command that fails ends it."""
-        subprocess.run(["bash", "-euo", "pipefail", "-c", example.parsed], check=True)
+def run_shell(example):
+    """Run a block of shell; the first command that fails ends it."""
+    command = ["bash", "-euo", "pipefail", "-c", example.parsed]
+    ended = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    example.namespace["_printed"] = ended.stdout
+    return f"it failed:\n{ended.stdout}" if ended.returncode else None
+
+
+def compare_output(example):
+    """Compare what a page shows with what was printed, but for white space."""
+    printed = example.namespace["_printed"]
+    flags = ELLIPSIS | NORMALIZE_WHITESPACE
+    same = OutputChecker().check_output(example.parsed, printed, flags)
+    return None if same else f"the block before it prints:\n{printed}"
 
 
 def enter_folder(namespace):
@@ -37,8 +54,10 @@ def leave_folder(namespace):
     namespace["_folder"].close()
 
 
+RUN = {"python": run_python, "sh": run_shell, "output": compare_output}
+
 pytest_collect_file = Sybil(
-    parsers=[PythonCodeBlockParser(), ShellBlockParser(), SkipParser()],
+    parsers=[*(CodeBlockParser(name, run) for name, run in RUN.items()), SkipParser()],
     patterns=["*.md"],
     path=str(Path(__file__).parents[1]),
     setup=enter_folder,
