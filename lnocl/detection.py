@@ -12,7 +12,7 @@ from lnocl.errors import InputError, LnoclError, counted, warn
 from lnocl.matched_filter import DARKER, PointSources, around, find_points, in_boxes, pixels_at
 from lnocl.process import ignored_warnings
 from lnocl.scene.arrays import numbers
-from lnocl.scene.cores import fwhm
+from lnocl.scene.cores import fwhm, peak
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -197,8 +197,7 @@ def _check_psf(psf: ArrayLike) -> Array:
 
 def _require_photutils() -> None:
     try:
-        import photutils.background
-        import photutils.morphology  # noqa: F401
+        import photutils.background  # noqa: F401
     except ImportError:
         raise LnoclError(
             "the sky under stars is found by photutils, which is not installed: pip install "
@@ -274,12 +273,12 @@ def _measured_psf(image: Array, threshold: float) -> Array:
 
 def _elongation(window: Array) -> float:
     """Return the length of what is above half the peak of a star, over its width."""
-    from photutils.morphology import data_properties
-
-    peak = window[window.shape[0] // 2, window.shape[1] // 2]
-    labels, _ = ndimage.label(window > peak / 2)
-    core = labels == labels[window.shape[0] // 2, window.shape[1] // 2]
-    return float(data_properties(window * core).elongation)
+    at = peak(window)
+    labels, _ = ndimage.label(window > window[at] / 2)
+    core = np.nonzero(labels == labels[at])
+    # Pixels have a variance of 1/12 of their own.
+    variances = np.linalg.eigvalsh(np.cov(core, aweights=window[core], ddof=0)) + 1.0 / 12.0
+    return float(np.sqrt(variances[1] / variances[0]))
 
 
 def _holes(light: Array) -> NDArray[np.bool_]:
@@ -332,7 +331,7 @@ def _compare_widths(stars: PointSources, width: float) -> None:
         )
 
 
-def _table(stars: PointSources, saturated: NDArray[np.bool_], peak: float) -> Table:
+def _table(stars: PointSources, saturated: NDArray[np.bool_], psf_peak: float) -> Table:
     """Return the stars, the saturated ones and then the brightest first."""
     from astropy.table import Table
 
@@ -345,7 +344,7 @@ def _table(stars: PointSources, saturated: NDArray[np.bool_], peak: float) -> Ta
     columns = {
         "x": stars.x,
         "y": stars.y,
-        "peak": stars.flux * peak,
+        "peak": stars.flux * psf_peak,
         "significance": stars.significance,
         "width": stars.width,
         "saturated": touched,

@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
-from scipy.signal import fftconvolve
 from scipy.spatial import KDTree
 
-from lnocl.scene.cores import centre, fwhm, peak
+from lnocl.scene.cores import centre, fwhm
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]
@@ -231,17 +230,25 @@ class _Search:
     def width(self, star: Array) -> float:
         """Return the width of a star's image without its neighbours; NaN where noise hides it.
 
-        It is that of the image smoothed by the PSF, over what the PSF itself would have, so that
-        there is little noise in it. Widths add up in squares.
+        The image is smoothed by the PSF, so that there is little noise in it, and compared with the
+        PSF smoothed likewise; squares of widths add up. What a Gaussian loses half a width from its
+        middle gives each.
         """
         x, y, flux = star[:3]
-        there = self.profile.window(x, y, self.left.shape)
-        expected = flux * self.profile.at(*there, x, y)[0]
-        core = expected[::-1, ::-1]
-        seen, own = (fftconvolve(each, core) for each in (self.left[there] + expected, expected))
-        if np.hypot(*np.subtract(peak(seen), peak(own))) > max(1.0, self.profile.width / 2):
-            return np.nan
-        square = fwhm(seen) ** 2 - fwhm(own) ** 2 + self.profile.width**2
+        there, step = self.profile.window(x, y, self.left.shape), self.profile.width / 2
+        moves = [(0.0, 0.0), (step, 0.0), (-step, 0.0), (0.0, step), (0.0, -step)]
+        cores = [self.profile.at(*there, x + dx, y + dy)[0] for dx, dy in moves]
+        own = [float((core * cores[0]).sum()) for core in cores]
+        seen = [
+            float((core * self.left[there]).sum()) + flux * at
+            for core, at in zip(cores, own, strict=True)
+        ]
+        squares = []
+        for middle, *beside in (seen, own):
+            if not 0 < np.mean(beside) < middle:
+                return np.nan
+            squares.append(4.0 * np.log(2.0) * step**2 / np.log(middle / np.mean(beside)))
+        square = squares[0] - squares[1] + self.profile.width**2
         return float(np.sqrt(square)) if square > 0 else np.nan
 
     def take_out_known(self, x: float, y: float) -> Array:
