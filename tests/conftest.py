@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 os.environ.setdefault(
     "POCL_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "kernels")
@@ -19,6 +20,17 @@ if size := os.environ.get("LNOCL_TEST_LOCAL_MEMORY"):
     import pyopencl as cl
 
     cl.Device.local_mem_size = property(lambda device: int(size))
+
+UNCHECKED = HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture
+for profile, examples in {"fast": 5, "exhaustive": 20}.items():
+    settings.register_profile(
+        profile, max_examples=examples, deadline=None, suppress_health_check=UNCHECKED
+    )
+
+
+def pytest_configure(config):
+    fast = "not exhaustive" in config.option.markexpr
+    settings.load_profile("fast" if fast else "exhaustive")
 
 
 @pytest.fixture(scope="module")

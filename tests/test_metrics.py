@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -67,7 +67,6 @@ def test_restoration_error_known_answer_near_star():
     assert error[rows] == pytest.approx(0.25)
 
 
-@settings(deadline=None)
 @given(planes, planes, st.floats(0.01, 100))
 def test_restoration_error_has_no_unit(found, truth, scale):
     truth[0, 0] = 1.0
@@ -76,7 +75,6 @@ def test_restoration_error_has_no_unit(found, truth, scale):
     )
 
 
-@settings(deadline=None)
 @given(planes)
 def test_restoration_error_of_truth_and_of_nothing(truth):
     truth[0, 0] = 1.0
@@ -109,7 +107,6 @@ def test_magnitude_by_hand():
     assert magnitude(0.0, 1e10) == math.inf
 
 
-@settings(deadline=None)
 @given(st.floats(-5, 30), st.floats(1e-3, 1e15))
 def test_magnitude_inverts_flux(mag, zero):
     assert magnitude(zero * 10 ** (-0.4 * mag), zero) == pytest.approx(mag, abs=1e-9)
@@ -145,7 +142,6 @@ def test_width_of_gaussian_known_answer():
     assert width_profile(image, math.exp(-8)).tolist() == [17, 43, 73]
 
 
-@settings(deadline=None)
 @given(planes, st.floats(0, 100))
 def test_width_and_mirror(image, threshold):
     width = width_profile(image, threshold)

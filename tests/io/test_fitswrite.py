@@ -8,7 +8,7 @@ import pytest
 from astropy.io import fits
 from astropy.io.fits.scripts import fitscheck
 from astropy.table import QTable
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lnocl.io import fitswrite
@@ -127,11 +127,6 @@ NAMES = st.text(
 
 
 class TestHistoryLines:
-    @settings(
-        max_examples=60,
-        deadline=None,
-        suppress_health_check=[HealthCheck.function_scoped_fixture],
-    )
     @given(words=st.lists(NAMES, min_size=1, max_size=6))
     def test_a_shell_reads_from_the_header_what_was_given(self, words):
         header = fits.Header()

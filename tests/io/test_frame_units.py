@@ -5,7 +5,7 @@ import pytest
 from astropy import units as u
 from astropy.io import fits
 from frame_files import IMAGES, notes, observe, read, save, save_images
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lnocl.errors import InputError, LnoclWarning
@@ -220,7 +220,6 @@ class TestUnits:
         assert isinstance(units.parse(unit), u.UnrecognizedUnit)
         assert units.count_of(units.parse(unit)) is None
 
-    @settings(max_examples=60, deadline=None)
     @given(text=st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=12))
     def test_no_text_of_a_header_breaks_it(self, text):
         unit = units.parse(text)
@@ -230,7 +229,6 @@ class TestUnits:
             counts = units.count_of(unit)
             assert counts is None or counts[0] > 0
 
-    @settings(max_examples=30, deadline=None)
     @given(
         unit=st.sampled_from(["electron", "ct", "adu", "electron / s", "ct / s", "adu / s"]),
         change=st.sampled_from([str.upper, str.lower, str.title]),

@@ -7,7 +7,7 @@ import pytest
 from astropy.io import fits
 from astropy.stats import sigma_clipped_stats
 from frame_files import IMAGES, MAP, NONE, SHAPE, notes, observe, read, save, save_images
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lnocl.errors import FileError, InputError, LnoclWarning, counted
@@ -530,11 +530,6 @@ class TestMask:
             observe(mask=["no.fits"])
 
     @pytest.mark.filterwarnings("ignore:.* % of image . are masked")
-    @settings(
-        max_examples=30,
-        deadline=None,
-        suppress_health_check=[HealthCheck.function_scoped_fixture],
-    )
     @given(data=st.data())
     def test_a_pixel_is_bad_for_any_reason(self, data):
         bits = st.lists(st.booleans(), min_size=12, max_size=12)

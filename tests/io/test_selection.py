@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 from astropy.io import fits
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lnocl.errors import InputError
@@ -159,7 +159,6 @@ def test_a_psf_as_the_detector_sees_it(tmp_path):
     np.testing.assert_array_equal(fitsread.read_stack([f"{path}[DET_SAMP]"]).data, OTHER[None])
 
 
-@settings(max_examples=200)
 @given(st.text("a[]0,. S", max_size=12))
 def test_any_name_has_a_file(name):
     found = parse_name(name)

@@ -10,7 +10,7 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.wcs import WCS
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lnocl.errors import FileError, InputError, LnoclWarning
@@ -70,14 +70,12 @@ def folder(tmp_path, monkeypatch):
 
 
 class TestOffsets:
-    @settings(max_examples=30, deadline=None)
     @given(dx=st.floats(-9, 9), dy=st.floats(-12, 12), angle=st.floats(0, 360))
     def test_another_reference_pixel_is_the_offset(self, dx, dy, angle):
         headers = [header(angle), header(angle, CRPIX1=6.0 + dx, CRPIX2=8.0 + dy)]
         found = sky.offsets(headers, ["a", "b"], SHAPE)
         np.testing.assert_allclose(found, [(0, 0), (dx, dy)], atol=1e-6)
 
-    @settings(max_examples=30, deadline=None)
     @given(dx=st.floats(-9, 9), dy=st.floats(-12, 12))
     def test_so_is_another_reference_value(self, dx, dy):
         # A telescope that points dx to the left in the image sees everything dx to the right.
@@ -152,7 +150,6 @@ class TestPositions:
     def test_no_positions(self):
         assert sky.to_sky(np.zeros((0, 2)), header()).shape == (0, 2)
 
-    @settings(max_examples=40, deadline=None)
     @given(ra=st.floats(0, 359.99), dec=st.floats(-89.99, 89.99), sep=st.sampled_from(": "))
     def test_degrees_and_sexagesimal_are_the_same(self, ra, dec, sep):
         position = SkyCoord(ra, dec, unit="deg")

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scenes import FEWER_ENGINES, blur, make_psfs, paper, worst
 
@@ -21,7 +21,6 @@ OBJECTIVE_ROUNDING = 1e-12
 
 every_engine = pytest.mark.parametrize("engine", FEWER_ENGINES)
 double_engines = pytest.mark.parametrize("engine", FEWER_ENGINES[:2])
-few_examples = settings(max_examples=20, deadline=None)
 
 
 def logarithmic(least, most):
@@ -61,7 +60,6 @@ def expose(counts, contrast, background, seed=0):
 
 
 @every_engine
-@few_examples
 @given(
     counts=logarithmic(-3, 12),
     contrast=logarithmic(0, 5),
@@ -84,7 +82,6 @@ def test_counts_contrast_background_and_mu(engine, counts, contrast, share, mu, 
 
 
 @double_engines
-@few_examples
 @given(counts=logarithmic(-3, 12), share=st.just(0.0) | logarithmic(-6, 6))
 @example(counts=1e-3, share=0.0)
 @example(counts=1e12, share=1e6)

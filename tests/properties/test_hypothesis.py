@@ -5,18 +5,12 @@ import warnings
 import numpy as np
 import pytest
 from astropy import units as u
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import paper
 
 import lnocl
 
-COMMON = {
-    "derandomize": True,
-    "deadline": None,
-    "database": None,
-    "suppress_health_check": [HealthCheck.too_slow, HealthCheck.data_too_large],
-}
 ODD = [np.nan, np.inf, -np.inf, -3.0, 0.0, 1e300, -1e300, 1e-300, 5e-324, 1e40, 1e155, 2.5]
 WORDS = [
     *(None, "auto", "", "nan", True, 1j, [], {}, object(), -1, 10**400, [[1.0], [2.0, 3.0]]),
@@ -68,6 +62,7 @@ FORMS = {
     "electrons": lambda array: array * u.electron,
 }
 form = st.sampled_from(sorted(FORMS))
+repeated = settings(derandomize=True, database=None)
 
 
 def deconvolve(observation, **keywords):
@@ -149,20 +144,20 @@ def answers(case, **engine):
     assert len(refusal) > 10
 
 
-@settings(max_examples=100, **COMMON)
+@repeated
 @given(anything())
 def test_anything_is_answered_or_refused(case):
     answers(case, engine="numpy")
 
 
 @pytest.mark.exhaustive
-@settings(max_examples=5000, **COMMON)
+@settings(repeated, max_examples=5000)
 @given(anything())
 def test_anything_is_answered_or_refused_more(case):
     answers(case, engine="numpy")
 
 
-@settings(max_examples=60, **COMMON)
+@repeated
 @given(form, form, st.integers(0, 99), st.sampled_from([(8, 8), (3, 5), (1, 6)]))
 def test_forms_of_the_same_numbers_give_the_same(images, psfs, seed, shape):
     rng = np.random.default_rng(seed)
@@ -186,7 +181,7 @@ def test_forms_of_the_same_numbers_give_the_same(images, psfs, seed, shape):
     assert np.array_equal(found.history, expected.history)
 
 
-@settings(max_examples=40, **COMMON)
+@repeated
 @given(st.integers(0, 99), st.sampled_from([1, 2, 4, 8, 16]), st.sampled_from([2, 8, 16]))
 def test_flux_is_conserved(seed, ny, nx):
     """On periodic images without background, and all of it observed."""
@@ -202,7 +197,7 @@ def test_flux_is_conserved(seed, ny, nx):
 @pytest.mark.parametrize(
     "precision", ["single", pytest.param("double", marks=pytest.mark.exhaustive)]
 )
-@settings(max_examples=40, **COMMON)
+@repeated
 @given(form, st.integers(0, 99), st.lists(st.sampled_from(ODD), max_size=3))
 def test_opencl_answers_or_refuses_as_the_reference_does(precision, form, seed, values):
     """Of one shape, so that one program is built for all."""

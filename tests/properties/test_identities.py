@@ -423,7 +423,7 @@ LAYOUTS = {
 DTYPES = [">f4", ">i2", ">u2", "<i2", "<u2", "u1", "f2", ">f8", "g", ">i8"]
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(derandomize=True)
 @given(
     shape=st.tuples(st.integers(1, 3), st.integers(1, 9), st.integers(1, 9)),
     dtype=st.sampled_from(DTYPES),

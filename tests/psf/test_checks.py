@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from star_frames import STAR, gaussian, quiet
 
@@ -99,7 +99,6 @@ FRAMES = st.one_of(
 )  # fmt: skip
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     frame=FRAMES,
     options=st.fixed_dictionaries(

@@ -31,10 +31,10 @@ def drizzled(image):
     return (image + np.roll(image, 1, 0) + np.roll(image, 1, 1) + np.roll(image, 1, (0, 1))) / 4
 
 
-@pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("level", [0.5, 60.0, 5e4])
-def test_nothing_is_said_of_counts(seed, level):
-    assert said(counts(seed, level), background=level) == []
+def test_nothing_is_said_of_counts(level):
+    heard = {seed: said(counts(seed, level), background=level) for seed in range(20)}
+    assert not any(heard.values()), heard
 
 
 @pytest.mark.parametrize("level", [1e-4, 2.5e-3, 0.02, 0.1])

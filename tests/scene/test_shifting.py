@@ -6,7 +6,7 @@ Tolerances are shares of the largest value, two to three times what was measured
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scenes import gaussian_interpolation, gaussian_variance, make_psfs, worst
 from scipy.special import erf, j1
@@ -37,7 +37,6 @@ sizes = st.integers(1, 12)
 positions = st.floats(-40.0, 40.0, allow_subnormal=False)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     shape=st.tuples(sizes, sizes),
     grid=st.tuples(sizes, sizes),
@@ -63,7 +62,6 @@ def test_whole_pixels_are_moved_bit_for_bit():
         np.testing.assert_array_equal(place(psf, GRID, x, y).values, psf)
 
 
-@settings(max_examples=60, deadline=None)
 @given(shape=st.tuples(sizes, sizes), grid=st.tuples(sizes, sizes), x=positions, y=positions)
 def test_small_grids_have_the_interpolant_of_the_whole_grid(shape, grid, x, y):
     """Odd and even, PSFs smaller and larger: no margins fit, so the grid's own period counts."""
@@ -196,7 +194,6 @@ def test_sharp_psfs_keep_their_centre(make, width):
         assert np.abs(offsets[0] - offsets[1]).max() <= 5e-3  # measured 2.0e-3
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     shape=st.tuples(sizes, sizes),
     x=positions,
@@ -212,7 +209,6 @@ def test_whole_pixels_more_roll_the_grid(shape, x, y, dx, dy):
     np.testing.assert_array_equal(place(psf, GRID, x + dx, y + dy).on_grid(GRID), expected)
 
 
-@settings(max_examples=60, deadline=None)
 @given(shape=st.tuples(sizes, sizes), grid=st.tuples(sizes, sizes), x=positions, y=positions)
 def test_the_sum_is_kept(shape, grid, x, y):
     psf = make_psfs(1, shape)[0]
@@ -291,7 +287,6 @@ class TestDerivative:
 
 
 class TestStamp:
-    @settings(max_examples=60, deadline=None)
     @given(
         shape=st.tuples(sizes, sizes),
         more=st.tuples(st.integers(0, 9), st.integers(0, 9)),

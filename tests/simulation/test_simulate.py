@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.io import fits
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.signal import resample
@@ -198,7 +198,6 @@ def test_photometry_documented():
 
 
 @given(st.floats(-5, 30), st.floats(0.1, 10), st.floats(0.1, 10))
-@settings(max_examples=25, deadline=None)
 def test_photometry_scales(mag, wider, coarser):
     args = (666.7 * u.Jy, H2)
     rate = photon_rate(mag * u.mag, *args, 0.02 * u.um)

@@ -10,7 +10,7 @@ import functools
 import numpy as np
 import pytest
 from explicit_matrix import Problem, problem_of, relative_error, unknowns
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scenes import FEWER_ENGINES, Recipe, blur, make_psfs, paper, same, worst
 from scipy.optimize import minimize
@@ -280,14 +280,12 @@ def small_scenes(share):
 
 
 @pytest.mark.filterwarnings("ignore:the star at .* lies on bad pixels")
-@settings(max_examples=60, deadline=None)
 @given(scene=small_scenes(st.just(0.0) | logarithmic(-3, 3)), mu=st.just(0.0) | logarithmic(-6, 1))
 def test_objective_never_rises_in_any_scene(scene, mu):
     result = solve(**scene, mu=mu, n_iter=50)
     assert falls(result)
 
 
-@settings(max_examples=10, deadline=None)
 @pytest.mark.filterwarnings("ignore:.*lies on bad pixels")
 @given(scene=small_scenes(logarithmic(-3, 3)), mu=logarithmic(-5, 1))
 def test_convergence_is_claimed_at_the_minimum_alone(scene, mu):
