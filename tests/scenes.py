@@ -23,11 +23,18 @@ ENGINES = [
     pytest.param({"engine": "opencl", "precision": "single"}, id="opencl-single"),
 ]
 
-# The same where a program is built for each scene, which takes seconds: CI tests double later.
-FEWER_ENGINES = [
-    pytest.param(*e.values, id=e.id, marks=[pytest.mark.exhaustive] if "double" in e.id else [])
-    for e in ENGINES
-]
+
+def _later(word):
+    return [
+        pytest.param(*e.values, id=e.id, marks=[pytest.mark.exhaustive] if word in e.id else [])
+        for e in ENGINES
+    ]
+
+
+# The same where a program is built for each scene, which takes seconds: CI tests double later; and
+# where scenes are such as no other test builds a program for, or the device is not the point.
+FEWER_ENGINES = _later("double")
+NUMPY_FIRST = _later("opencl")
 
 
 def make_psfs(n_images, shape):

@@ -80,6 +80,7 @@ def test_regions_are_said_before_stars_and_all_of_them(words, capsys, monkeypatc
     ]  # fmt: skip
 
 
+@pytest.mark.usefixtures("quick_figures")
 def test_profiles_are_drawn_with_their_errors(words, capsys):
     pytest.importorskip("matplotlib")
     Path("p.reg").write_text("image\nbox(30,34,40,6,10) # text={jet}\nbox(30,34,6,20,0)")
@@ -97,7 +98,7 @@ def test_profiles_are_drawn_with_their_errors(words, capsys):
     said = capsys.readouterr().out
     for k in (1, 2):
         assert f"drew figures/result_profile_{k}.png" in said
-        assert Path(f"figures/result_profile_{k}.png").stat().st_size > 1000
+        assert Path(f"figures/result_profile_{k}.png").exists()
     (flux, width) = [along[along["name"] == f"jet {kind}"] for kind in ("flux", "width")]
     figure = draw_bands("jet", flux, width, "electron")
     bands = figure.axes[0].collections

@@ -9,6 +9,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.time import Time
 from astropy.wcs import WCS
+from commandline import NUMPY
 
 from lnocl.commands import cli
 from lnocl.io.missions import calibrate
@@ -149,7 +150,8 @@ def write_stpsf():
 def test_photometry_and_noise(command_folder, capsys, make, kind):
     each, unit = make(kind)
     write_stpsf()
-    options = ["--psf", "stpsf.fits", "--star", f"{AT[0]},{AT[1]}", "--residuals", "-o", "o.fits"]
+    options = ["--psf", "stpsf.fits", "--star", f"{AT[0]},{AT[1]}", "--residuals", *NUMPY]
+    options += ["-o", "o.fits"]
     assert cli.main(["deconvolve", f"{kind}.fits", *options]) == 0
     said = capsys.readouterr().err
     if make is of_nircam:
@@ -194,7 +196,7 @@ def test_tables_of_stars(command_folder, capsys, kind):
         },
     }
     Table(columns[kind]).write("t.vot", format="votable")
-    options = ["--psf", "stpsf.fits", "--stars", "t.vot", "-o", "o.fits"]
+    options = ["--psf", "stpsf.fits", "--stars", "t.vot", *NUMPY, "-o", "o.fits"]
     assert cli.main(["deconvolve", "ir.fits", *options]) == 0
     with fits.open("o.fits") as file:
         stars = file["STARS"].data

@@ -144,6 +144,7 @@ def test_a_damaged_oversamp_is_one_line(result, tmp_path, value, capsys):
     assert f"OVERSAMP is {value:g}" in line
 
 
+@pytest.mark.usefixtures("quick_figures")
 def test_the_file_is_drawn_on_the_images_pixels(result, tmp_path):
     view = view_of(read_result(result))
     assert (view.oversample, view.shape, view.extended.shape) == (Q, (N, N), (Q * N, Q * N))

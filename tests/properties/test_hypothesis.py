@@ -200,7 +200,7 @@ def test_flux_is_conserved(seed, ny, nx):
 @repeated
 @given(form, st.integers(0, 99), st.lists(st.sampled_from(ODD), max_size=3))
 def test_opencl_answers_or_refuses_as_the_reference_does(precision, form, seed, values):
-    """Of one shape, so that one program is built for all."""
+    """Of one shape, so that all have the program of tests of other files."""
     rng = np.random.default_rng(seed)
     images = rng.integers(1, 200, (2, 16, 32)) * 1.0
     given = FORMS[form](images)
@@ -211,7 +211,7 @@ def test_opencl_answers_or_refuses_as_the_reference_does(precision, form, seed, 
     mask = np.zeros((16, 32), bool)
     mask[3, 4] = True
     observation = {"images": given, "psfs": np.ones((3, 3)), "background": 1.0, "mask": mask}
-    case = observation, {"stars": [(5, 6)], "n_iter": 3}
+    case = observation, {"stars": [(5, 6)], "n_iter": 3, "mu": 1e-6}
     answers(case, engine="opencl", precision=precision)
     if not values:
         plain = {**observation, "images": images}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import FEWER_ENGINES, Recipe, blur, make_psfs, paper, same, worst
+from scenes import FEWER_ENGINES, NUMPY_FIRST, Recipe, blur, make_psfs, paper, same, worst
 
 import lnocl
 from lnocl import reference
@@ -33,7 +33,7 @@ ROUNDING = {"double": (2.7e-15, 4.4e-16, 8e-16), "single": (1.7e-6, 2.5e-7, 1.2e
 SUM_ROUNDING = {"double": 8.5e-16, "single": 4.4e-7}
 
 every_engine = pytest.mark.parametrize("engine", FEWER_ENGINES)
-double_engines = pytest.mark.parametrize("engine", FEWER_ENGINES[:2])
+numpy_first = pytest.mark.parametrize("engine", NUMPY_FIRST)
 
 
 def adjoint(pixels, psf):
@@ -102,7 +102,7 @@ def test_dot_product(shape):
 # --- What is conserved, what stays as it is
 
 
-@every_engine
+@numpy_first
 def test_flux_is_conserved(engine):
     made = BARE.make()
     flux = made.images.sum() / BARE.n_images
@@ -116,7 +116,7 @@ def test_flux_is_conserved(engine):
     assert max(errors) <= SUM_ROUNDING[engine["precision"]]
 
 
-@every_engine
+@numpy_first
 def test_observed_flux_is_conserved_with_stars_and_masks(engine):
     made = MASKED.make()
     weights = ~made.mask
@@ -134,7 +134,7 @@ def test_observed_flux_is_conserved_with_stars_and_masks(engine):
     assert max(errors) <= SUM_ROUNDING[engine["precision"]]
 
 
-@every_engine
+@numpy_first
 def test_truth_is_a_fixed_point(engine):
     made = dataclasses.replace(MASKED, background="each").make()
     sky = made.initial_extended.copy()
@@ -150,7 +150,7 @@ def test_truth_is_a_fixed_point(engine):
     assert worst(result.star_fluxes, made.initial_star_fluxes) <= star_tolerance
 
 
-@every_engine
+@numpy_first
 def test_one_iteration_through_a_single_pixel_averages_the_images(engine):
     made = BARE.make()
     observation = lnocl.Observation(made.images, np.ones((1, 1)))
@@ -159,7 +159,7 @@ def test_one_iteration_through_a_single_pixel_averages_the_images(engine):
     assert worst(result.extended, made.images.mean(axis=0)) <= tolerance
 
 
-@every_engine
+@numpy_first
 @pytest.mark.filterwarnings("ignore:initial_extended has .* times the light of the images")
 def test_dark_images_give_a_dark_sky(engine):
     made = MASKED.make()
@@ -171,7 +171,7 @@ def test_dark_images_give_a_dark_sky(engine):
     assert after <= rounding * before
 
 
-@double_engines
+@numpy_first
 def test_faint_pixels_are_not_lost_in_a_floor(engine):
     # Nine orders of magnitude below the mean: nearly all that the transform leaves of double.
     image = 1.0 + np.arange(512.0).reshape(SHAPE) % 7
@@ -184,7 +184,7 @@ def test_faint_pixels_are_not_lost_in_a_floor(engine):
     np.testing.assert_allclose(extended, faint, rtol=6e-5)
 
 
-@every_engine
+@numpy_first
 def test_rounding_makes_nothing_negative(engine):
     # Far from the only bright pixel the correction is 0: what the transform leaves has any sign.
     image = np.zeros(SHAPE)
@@ -194,7 +194,7 @@ def test_rounding_makes_nothing_negative(engine):
     assert result.extended.min() == 0.0
 
 
-@pytest.mark.parametrize("recipe", [MASKED, FULL, PADDED], ids=["masked", "full", "padded"])
+@pytest.mark.parametrize("recipe", [FULL, PADDED], ids=["full", "padded"])
 @every_engine
 def test_estimates_are_finite_and_not_negative(engine, recipe):
     lowest = []
@@ -217,7 +217,7 @@ def test_estimates_are_finite_and_not_negative(engine, recipe):
     [BARE, dataclasses.replace(MASKED, background="each")],
     ids=["bare", "stars, mask, background"],
 )
-@double_engines
+@numpy_first
 def test_objective_never_rises(engine, recipe):
     objective = recipe.make().deconvolve(n_iter=300, **engine).history["objective"]
     assert (np.diff(objective) < 0).all()

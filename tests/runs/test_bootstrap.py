@@ -26,7 +26,10 @@ RECIPES = {
     "map of exposures": dataclasses.replace(BASE, exposure="map"),
 }
 pytestmark = pytest.mark.filterwarnings("ignore:psf . is sharper")
-ENGINES = [("numpy", "double"), ("opencl", "single")]
+ENGINES = [
+    ("numpy", "double"),
+    pytest.param("opencl", "single", marks=pytest.mark.exhaustive),
+]
 APERTURES = [Aperture("a", 4, 6, np.ones((12, 12))), Aperture("b", 20, 3, np.ones((2, 2)))]
 
 
@@ -188,7 +191,7 @@ def test_replicas_are_continued_bit_for_bit():
 
 def test_processes_give_the_replicas_bit_for_bit():
     pytest.importorskip("distributed", reason="Dask is not installed")
-    result = solved(engine="opencl")
+    result = solved()
     here, there = (result.bootstrap(10, parallel=parallel) for parallel in (False, 2))
     for name in ("errors", "of_psfs", "sums"):
         np.testing.assert_array_equal(getattr(here, name), getattr(there, name))

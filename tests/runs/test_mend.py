@@ -210,6 +210,7 @@ def test_noise_is_taken_from_wings_that_are_negative():
     np.testing.assert_array_equal(kept.psfs[0], noisy / noisy.sum())
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("stop", [None, "held-out"])
 def test_both_engines_agree(stop):
     options = {"n_iter": 60, "stop": stop, "refine_psfs": ()}

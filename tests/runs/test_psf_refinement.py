@@ -248,6 +248,7 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
     np.testing.assert_array_equal(found, [(3.0, 4.0)])
 
 
+@pytest.mark.exhaustive
 def test_both_engines_agree():
     images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
     reference = refine(images, PSF)

@@ -371,8 +371,8 @@ HIDDEN = ["one image of many", "short exposure", "short exposure, map"]
     [
         *(("numpy", case, "sgm") for case in HIDDEN),
         ("numpy", "short exposure, map", "sgp"),
-        ("opencl", "one image of many", "sgm"),
-        ("opencl", "short exposure", "sgp"),
+        pytest.param("opencl", "one image of many", "sgm", marks=pytest.mark.exhaustive),
+        pytest.param("opencl", "short exposure", "sgp", marks=pytest.mark.exhaustive),
     ],
 )
 def test_star_that_one_image_observed_is_found(engine, case, solver):
