@@ -110,7 +110,7 @@ class TestProcess:
 
     def test_a_library_s_bar_where_stderr_is_closed(self, monkeypatch):
         monkeypatch.setattr(sys, "stderr", None)
-        with Bar(1, progress=True) as bar:
+        with Bar(1, True) as bar:
             bar.show(1, lambda: "done", last=True)
 
     @pytest.mark.parametrize(
