@@ -16,8 +16,8 @@ look() {
 # Four images of a quasar (HST F814W). The PSF that comes with it is too wide, and mended; the sky
 # was subtracted, and its noise is 5.19 electrons.
 quasar=$data/hst-lensed-quasar
-lnocl stars "$quasar/quasar_F814W_sci.fits" --psf "$quasar/quasar_F814W_psf.fits" \
-    --threshold 50 -o "$out/stars.ecsv" --plot "$out/stars.png" --overwrite
+lnocl stars "$quasar/quasar_F814W_sci.fits" --threshold 50 \
+    -o "$out/stars.ecsv" --plot "$out/stars.png" --overwrite
 lnocl deconvolve "$quasar/quasar_F814W_sci.fits" --psf "$quasar/quasar_F814W_psf.fits" \
     --exposure "$quasar/quasar_F814W_exptime.fits" --background 0 --read-noise 5.187 \
     --stars "$out/stars.ecsv" --refine --refine-psfs jitter pixels \
