@@ -59,8 +59,9 @@ def test_progress_is_shown(cells):
         state for state in cells["widgets"].values()
         if state.get("_model_name", "").endswith("FloatProgressModel")
     ]  # fmt: skip
-    assert bars
-    assert all(bar["value"] > 0 for bar in bars)
+    counted = [bar for bar in bars if bar["max"] > 1]  # others have a clock alone
+    assert counted
+    assert all(bar["value"] > 0 for bar in counted)
 
 
 def test_the_picture_is_drawn(cells):
