@@ -20,13 +20,16 @@ SQUARED_LIGHT = 0.97
 # An extended source is what the PSF fits worse than the PSF smoothed by a Gaussian of so many of
 # its widths: less than this share of its peak is a point's.
 BROADER, POINT_SHARE = 0.4, 0.45
+# Two points explain what one does not only where they leave next to nothing to broader sources.
+SEVERAL_SHARE = 0.9
 # Maxima are those of the image smoothed by a Gaussian of so many PSF widths, each the brightest
 # within so many widths.
 SMOOTHING, SEPARATION = 0.35, 0.45
 # What lies in the wings of brighter stars must be brighter than this share of them: PSFs err.
 OF_WINGS = 0.5
-# So many of the brightest maxima within so many PSF widths may be fitted with one.
-NEIGHBOURS, NEAR = 4, 2.5
+# So many of the brightest maxima within so many PSF widths may be fitted with one. Without any it
+# may be two stars, so many widths apart to begin with, whose places are fitted in so many steps.
+NEIGHBOURS, NEAR, APART, STEPS = 4, 2.5, 0.9, 8
 # Sweeps over stars after new ones are found, and the farthest move in one, pixels.
 SWEEPS, FARTHEST = 2, 0.5
 # Noise that is lower by less than this share than before brings no new maxima.
@@ -209,7 +212,7 @@ class _Search:
         wings = np.abs(self.whole - signal)
         return ndimage.maximum_filter(wings, 2 * self.rough_within + 1)
 
-    def is_point(self, places: Array) -> bool:
+    def is_point(self, places: Array, least: float = POINT_SHARE) -> bool:
         """Return whether the first of these places has a point, given sources at the others.
 
         Each has the PSF and its smoothed version, as they fit best together.
@@ -225,7 +228,41 @@ class _Search:
         matrix = np.stack([*parts, np.ones(root.size)], axis=1) * root[:, np.newaxis]
         point, broad = np.linalg.lstsq(matrix, self.left[there].ravel() * root, rcond=1e-8)[0][:2]
         sharp, smooth_peak = point * parts[0].max(), max(broad * parts[1].max(), 0.0)
-        return bool(sharp > POINT_SHARE * (sharp + smooth_peak))
+        return bool(sharp > least * (sharp + smooth_peak))
+
+    def are_two(self, places: Array) -> bool:
+        """Return whether two points or more explain an image that one does not."""
+        second = np.roll(places, -1, axis=0)
+        return self.is_point(places, SEVERAL_SHARE) and self.is_point(second, SEVERAL_SHARE)
+
+    def split(self, place: Array) -> Array:
+        """Return two places along the longer axis of the light round one."""
+        there = self.profile.window(place[0], place[1], self.left.shape)
+        light = np.clip(self.left[there] - self.left[there].max() / 2.0, 0.0, None)
+        rows, columns = np.nonzero(light)
+        _, axes = np.linalg.eigh(np.cov(columns, rows, aweights=light[rows, columns], ddof=0))
+        return place + np.outer([0.5, -0.5], APART * self.profile.width * axes[:, 1])
+
+    def untangle(self, places: Array) -> tuple[Array, Array]:
+        """Return places and fluxes of stars at about these places, as they fit best together."""
+        x, y = places[0]
+        there = self.profile.window(x, y, self.left.shape)
+        root = np.sqrt(self.weights[there]).ravel()
+        places = places.copy()
+        fluxes: Array = np.zeros(len(places))
+        for step in range(STEPS):
+            parts = [self.profile.at(*there, *place) for place in places]
+            values = [value.ravel() for value, _, _ in parts]
+            slopes = [flux * each.ravel() for flux, part in zip(fluxes, parts, strict=True)
+                      for each in part[1:]]  # fmt: skip
+            matrix = np.stack([*values, np.ones(root.size), *(slopes if step else [])], axis=1)
+            matrix *= root[:, np.newaxis]
+            found = np.linalg.lstsq(matrix, self.left[there].ravel() * root, rcond=1e-8)[0]
+            fluxes = found[: len(places)]
+            moves = found[len(places) + 1 :].reshape(-1, 2)
+            if step:
+                places += np.clip(moves, -FARTHEST, FARTHEST)
+        return places, fluxes
 
     def width(self, star: Array) -> float:
         """Return the width of a star's image without its neighbours; NaN where noise hides it.
@@ -383,13 +420,13 @@ def find_points(
         if search.stars:  # what is left in a star's core is no star
             stars = KDTree([star[:2] for star in search.stars])
             kept &= stars.query(places)[0] > SEPARATION * search.profile.width
-        places, fluxes, signal = places[kept], fluxes[kept], signal[kept]
-        points, extended = _points_among(search, places, extended)
-        for i in points:
-            search.stars.append(np.array([*places[i], fluxes[i], signal[i]]))
-            search.take_out(search.stars[-1])
+        candidates = np.column_stack([places, fluxes, signal])[kept]
+        points, extended = _points_among(search, candidates, extended)
+        for star in points:
+            search.stars.append(star)
+            search.take_out(star)
         if points:
-            new = places[points]
+            new = np.array([star[:2] for star in points])
             search.refit(new)
             reach = 2 * search.profile.half
             distances = KDTree(new).query(np.reshape(extended, (-1, 2)))[0]
@@ -414,15 +451,16 @@ def find_points(
 
 
 def _points_among(
-    search: _Search, places: Array, extended: list[Array]
-) -> tuple[list[int], list[Array]]:
-    """Return which maxima are points, and the places of the extended ones.
+    search: _Search, candidates: Array, extended: list[Array]
+) -> tuple[list[Array], list[Array]]:
+    """Return the stars among maxima, and the places of the extended ones.
 
-    No point is within reach of a more significant one. What was extended before, with no new star
-    near it, is so still.
+    Each row of the maxima has place, flux and signal. No star is within reach of a more significant
+    one. What was extended before, with no new star near it, is so still.
     """
-    if not len(places):
+    if not len(candidates):
         return [], extended
+    places = candidates[:, :2]
     tree, points = KDTree(places), []
     was_extended = {tuple(np.round(each).astype(int)) for each in extended}
     taken = np.zeros(len(places), bool)
@@ -431,11 +469,20 @@ def _points_among(
             continue
         if taken[tree.query_ball_point(place, search.profile.half)].any():
             continue
-        near = sorted(tree.query_ball_point(place, NEAR * search.profile.width))
-        others = [j for j in near if j != i][:NEIGHBOURS]
-        if search.is_point(places[[i]]) or (others and search.is_point(places[[i, *others]])):
-            taken[i] = True
-            points.append(i)
-        else:
-            extended.append(place)
+        star = candidates[i].copy()
+        if not search.is_point(places[[i]]):
+            near = sorted(tree.query_ball_point(place, NEAR * search.profile.width))
+            others = [j for j in near if j != i][:NEIGHBOURS]
+            several, fluxes = search.untangle(
+                places[[i, *others]] if others else search.split(place)
+            )
+            order = np.argsort(-fluxes)
+            several, fluxes = several[order], fluxes[order]
+            is_near = np.hypot(*(several[0] - place)) < search.profile.width
+            if not (is_near and search.are_two(several)):
+                extended.append(place)
+                continue
+            star[:3] = *several[0], fluxes[0]
+        taken[i] = True
+        points.append(star)
     return points, extended
