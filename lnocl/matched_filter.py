@@ -417,7 +417,7 @@ def find_points(
         places, fluxes, signal = search.maxima()
         pixels = np.round(places).astype(int)
         kept = ~excluded[pixels[:, 1], pixels[:, 0]]
-        if search.stars:  # what is left in a star's core is no star
+        if search.stars:  # what a star leaves in its core is none
             stars = KDTree([star[:2] for star in search.stars])
             kept &= stars.query(places)[0] > SEPARATION * search.profile.width
         candidates = np.column_stack([places, fluxes, signal])[kept]

@@ -140,7 +140,7 @@ def _write(stars: Table, stream: IO[bytes], kind: str) -> None:
 
 
 def _told(stars: Table, n_extended: int) -> list[str]:
-    """Return how many stars there are, how many sources are none, and which are saturated."""
+    """Return how many stars there are, how many sources were left out, and which are saturated."""
     n = len(stars)
     wider = f"{counted(n_extended, 'source')} wider than the PSF left out"
     left_out = [wider] if n_extended else []

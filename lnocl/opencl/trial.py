@@ -29,7 +29,7 @@ from lnocl.opencl.unknown_cpu import POCL
 VARIABLES = ("PATH", "COMPILER_PATH", "LIBRARY_PATH", "TMPDIR", "TEMP", "TMP")
 LIMITS = ("RLIMIT_NOFILE", "RLIMIT_NPROC", "RLIMIT_AS", "RLIMIT_FSIZE")
 LIBRARIES = ("/usr/lib*/gcc/*/*", "/usr/lib*/crti.o", "/usr/lib*/*/crti.o")
-# A process that its driver ends does not come to the last line.
+# Where a driver ends the process, the last line is not printed.
 TRIAL = """
 try:
     import sys

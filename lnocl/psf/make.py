@@ -241,7 +241,8 @@ def make_psf(
 
     **Neighbours** are stars too: those not given that lie three widths or more from the given ones,
     with a twentieth of the peak of one of them or more, are found in the crop and taken with them.
-    Sources of another width are masked. So the PSF is the effective one wherever there are
+    What the brightest given star, moved and scaled, does not explain is masked: galaxies, and stars
+    too near to each other. So the PSF is the effective one wherever there are
     neighbours. This was measured with four stars of 3e4 to 2e5 electrons and FWHM 2.5. One had two
     bad pixels in its core and one a neighbour. Their PSF is right to 0.7 % of its peak, as noise
     allows.

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from astropy.stats import mad_std, sigma_clipped_stats
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import maximum_filter, shift
+from scipy.optimize import least_squares
 
 from lnocl.errors import InputError, counted, warn
 from lnocl.psf import resampling
@@ -30,8 +31,9 @@ BORDER = 1 / 16
 # Another star is a maximum so many widths from the given ones, above this share of the peak of one
 # that it is near, and so many times the noise: what is nearer or fainter may be rings and speckles.
 APART, BRIGHT, SIGNIFICANT = 3.0, 0.05, 5.0
-# It is a star where it is as wide, but for this share; else it is masked to so many widths.
-ALIKE, MASKED = 0.15, 2.0
+# It is a star where the brightest given one, moved there, leaves no more than this share of its
+# peak and so many times the noise (rms), to so many widths; else it is masked.
+WITHIN, ALIKE, NOISY, MASKED = 1.5, 0.05, 2.0, 2.0
 # Growth of negative pixels by shift and rotation that calls for a warning: a share of the flux on
 # top of a share of the negative flux before, since both change noise too.
 RINGING, OF_NOISE = 0.01, 0.2
@@ -203,22 +205,12 @@ def find_neighbours(
 ) -> tuple[list[Point], Mask, list[str]]:
     """Return other stars that the windows of these show, pixels of other sources, and a line.
 
-    Parameters
-    ----------
-    light : ndarray of float64, shape (ny, nx)
-        The frame above its background.
-    bad : ndarray of bool, shape (ny, nx)
-        True where a pixel is bad.
-    centres : list of tuple of float
-        Row and column of the stars.
-    width : float
-        Their FWHM, pixels.
-    half : int
-        Half the side of the windows.
+    The arguments are those of `lower_background`; windows reach `half` pixels from their star.
     """
     noise = float(mad_std(light[~bad]))
     far = _distance(bad.shape, [nearest_pixel(centre) for centre in centres]) > half
     highest = (light == maximum_filter(light, 2 * math.ceil(width) + 1)) & ~bad
+    brightest_given = max(centres, key=lambda centre: light[nearest_pixel(centre)])
     stars, others = list[Point](), list[Point]()
     for row, column in np.argwhere(highest & (light > SIGNIFICANT * noise)).tolist():
         offsets = np.abs(np.array(centres) - (row, column))
@@ -227,12 +219,9 @@ def find_neighbours(
         is_bright = light[row, column] > BRIGHT * np.array(peaks)
         if np.hypot(*offsets.T).min() < APART * width or not (is_near & is_bright).any():
             continue
-        try:
-            place, sigma = fit_gaussian(light, bad, (row, column), 0.0)
-        except InputError:
-            place, sigma = (row, column), width / FWHM
+        place, misfit = _fit_star(light, brightest_given, (row, column), width)
         is_there = math.dist(place, (row, column)) < width
-        is_alike = abs(FWHM * sigma / width - 1.0) < ALIKE
+        is_alike = misfit < math.hypot(ALIKE * light[row, column], NOISY * noise)
         is_new = all(math.dist(place, star) > width for star in stars)
         if is_there and is_alike and is_new and not _touches(bad | far, place, width):
             stars.append(place)
@@ -245,6 +234,22 @@ def find_neighbours(
         f"{counted(len(others), 'other source')} masked"
     )
     return stars, far | (distance(bad.shape, others) < MASKED * width), [line]
+
+
+def _fit_star(light: Array, star: Point, start: Pixel, width: float) -> tuple[Point, float]:
+    """Return where another star, scaled, explains the light at a pixel, and the rms of the rest."""
+    pixel, half = nearest_pixel(star), math.ceil(WITHIN * width)
+    square, found = cut_square(light, pixel, half + WINDOW // 2), cut_square(light, start, half)
+    scale = light[start] / light[pixel]
+
+    def residuals(parameters: Array) -> Array:
+        move = np.subtract(pixel, star) + parameters[1:]
+        moved = middle_square(shift(square, move, mode="nearest"), 2 * half + 1)
+        return np.asarray(parameters[0] * scale * moved - found).ravel()
+
+    fitted = least_squares(residuals, [1.0, 0.0, 0.0], method="lm")
+    place = float(start[0] + fitted.x[1]), float(start[1] + fitted.x[2])
+    return place, float(np.sqrt(np.mean(fitted.fun**2)))
 
 
 def _touches(bad: Mask, place: Point, width: float) -> bool:

@@ -13,7 +13,7 @@ from lnocl.psf.centring import Array, Mask, Point
 # Wings are those of stars from so many widths on. They are measured in so many parts, of pixels as
 # far from the stars, with so many pixels each or more.
 FROM, PARTS, FEWEST = 3.0, 24, 16
-# Noise is no less than this share of the brightest peak.
+# The noise is taken for this share of the brightest peak at least.
 LEAST = 1e-9
 # Of more pixels every second one is looked at, and so on.
 MOST = 100_000

@@ -17,7 +17,7 @@ LINE_INTERVAL, CLOCK_INTERVAL = 60.0, 1.0
 
 
 class Progress:
-    """The progress of one phase; its clock goes on where steps are long.
+    """The progress of one phase; its clock also ticks while a step takes long.
 
     Parameters
     ----------

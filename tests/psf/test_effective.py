@@ -89,6 +89,14 @@ def test_other_neighbours_are_taken_too(given):
     assert line(star, "neighbours").startswith("neighbours: 1 star not given, taken too; 0 ")
 
 
+@pytest.mark.parametrize("fwhm", [2.0, 4.0])
+def test_two_stars_in_one_are_masked_as_no_neighbour(fwhm):
+    other = np.array([PLACES[0]] * 2) + np.outer([6.0, 6.8], (fwhm, fwhm))
+    star = make_psf(a_frame(fwhm, [PLACES[0], *other], [1.0, 0.2, 0.1]), PLACES[0], SIZE)
+    assert line(star, "neighbours").endswith("0 stars not given, taken too; 1 other source masked")
+    assert error(star, fwhm) < 0.02
+
+
 @pytest.mark.parametrize(("n_given", "most"), [(9, 0.01), (1, 0.02)])
 def test_stars_packed_within_the_window_are_not_its_wings(n_given, most):
     rng = np.random.default_rng(1)
