@@ -23,7 +23,7 @@ DTYPES = {"s": np.float32, "d": np.float64}
 ON_GPU = "as on a GPU"
 DECONVOLUTION = "deconvolution"
 
-# As those of test_kernels.py, and smaller: grid, tuning, scene, precisions. Without a tuning the
+# As those of kernel_cases.py, and smaller: grid, tuning, scene, precisions. Without a tuning the
 # one for a CPU, of one work-item a group; in a group of several, all barriers count.
 CASES = {
     "smallest grid": ((2, 2), None, "two images, star, mu", "sD"),

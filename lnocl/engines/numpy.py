@@ -147,7 +147,7 @@ class ReferenceEngine:
         return -self._star_sums
 
     def step(self, alpha: float, share: float) -> tuple[float, Array]:
-        """Step from the base; return ``<gradient, d>`` and ``<reach_s, d>``."""
+        """Step from the base; return ``<gradient, d>`` and ``<c_s, d>``; see `step_rows`."""
         self._extended, self._row_spectrum, self._squares, slope, coupling = step_rows(
             self._previous,
             self._gradient,

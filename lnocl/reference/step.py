@@ -49,10 +49,11 @@ def step_rows(
     share: float,
     curvature: Array | float = 0.0,
 ) -> tuple[Array, ComplexArray, float, float, Array]:
-    """Return ``f + share d``, its row spectrum and squares, ``<gradient, d>`` and ``<reach_s, d>``.
+    """Return ``f + share d``, its row spectrum and squares, ``<gradient, d>`` and ``<c_s, d>``.
 
-    ``d = P(f - alpha D gradient) - f`` with P the projection on ``f >= 0`` and D as in
-    `gradient_rows`; Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002.
+    ``d = P(f - alpha D gradient) - f`` with P the projection on ``f >= 0``, D as in
+    `gradient_rows`, and c_s the cross information of star s; Bonettini, Zanella & Zanni (2009),
+    Inverse Problems 25, 015002.
     """
     scaling = _shifted_scaling(extended, shift, inverse_weight, mu + curvature)
     direction = np.maximum(extended - alpha * scaling * gradient, 0.0) - extended

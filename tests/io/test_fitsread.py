@@ -351,3 +351,10 @@ class TestCoordinates:
         assert len(caught) == 1
         assert "CTYPE1" not in cards
         assert cards["CTYPE1P"] == "x"
+
+
+def test_a_fault_of_lnocl_is_no_damage_of_a_file(tmp_path, monkeypatch):
+    path = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE))
+    monkeypatch.setattr(fitsread, "choose", lambda path: 0)
+    with pytest.raises(TypeError, match="takes 1 positional argument"):
+        fitsread.read_stack([path])
