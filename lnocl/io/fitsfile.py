@@ -9,7 +9,6 @@ import io
 import os
 import re
 import stat
-import traceback
 from collections.abc import Iterator
 from typing import IO, Any
 
@@ -18,7 +17,7 @@ from astropy.io import fits
 from astropy.utils.data import get_readable_fileobj
 from numpy.typing import NDArray
 
-from lnocl.errors import PACKAGE, FileError, LnoclError, warn
+from lnocl.errors import FileError, LnoclError, warn
 from lnocl.process import recorded_warnings
 
 # Keywords that say how many bytes of data follow. Of two with different values astropy takes one to
@@ -239,23 +238,14 @@ def open_fits(
                 content.seek(0)
                 with fits.open(content, memmap=False, disable_image_compression=True) as hdus:
                     yield FitsFile(path, stream, content, hdus, length)
-        except (LnoclError, MemoryError):
-            raise
+        except (LnoclError, MemoryError, AssertionError, ImportError, NameError):
+            raise  # no file can make the last three
         except Exception as error:
-            if _is_a_fault_of_lnocl(error):
-                raise
             # astropy may raise any error on a damaged file; its advice is for programmers.
             reason = str(error).partition(". ")[0] or "it ends too early"
             raise FileError(f"{path} {complaint}: {reason}") from error
     for warning in caught:
         warn(f"{path}: {warning.message}")
-
-
-def _is_a_fault_of_lnocl(error: Exception) -> bool:
-    """Return whether an error is of a name or call in lnocl itself, not of what a file holds."""
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    is_programming = isinstance(error, (NameError, TypeError, AssertionError))
-    return is_programming and frame.f_code.co_filename.startswith(PACKAGE)
 
 
 def _memory() -> float:
