@@ -11,6 +11,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from experiment import NEAR_STAR, width_profile, width_threshold
 
 import lnocl
 from lnocl import metrics
@@ -19,7 +20,6 @@ from lnocl.plotting.profiles import draw_bands
 from lnocl.runs.bootstrap import Bootstrap, Quantity
 from lnocl.runs.replicas import Replicas
 from lnocl.simulation import Experiment, hh34, simulate
-from lnocl.studies.experiment import NEAR_STAR, width_threshold
 
 # Rows of less light than this share of the brightest are not the jet's.
 FAINT = 0.01
@@ -42,7 +42,7 @@ def main():
     threshold = width_threshold(made.extended)
 
     def measure(sky):
-        return np.concatenate([metrics.flux_profile(sky), metrics.width_profile(sky, threshold)])
+        return np.concatenate([metrics.flux_profile(sky), width_profile(sky, threshold)])
 
     replicas, errors = Replicas(result._outcome, given.seed), []
     for k in range(given.replicas):

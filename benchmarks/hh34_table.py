@@ -4,8 +4,8 @@
 
 Each row is written to DIR as soon as it is done and is not computed again, so that the script
 can be stopped and started; a row of another scene or of other parameters is refused.
-DIR/table.ecsv has the table, and lnocl plot draws the rest:
-lnocl plot DIR/rlm_0.fits DIR/mc-rl_*.fits --truth DIR/truth.fits -o DIR. --quick is a small run.
+DIR/table.ecsv has the table. The paper's figures of these rows are DIR/objects.png, errors.png,
+magnitude.png, flux.png and width.png. --quick is a small run.
 """
 
 import argparse
@@ -14,15 +14,18 @@ import time
 from pathlib import Path
 
 import astropy.units as u
+import experiment
 import numpy as np
+import paper_figures
 from astropy.table import Table
+from paper_figures import Source
 
-from lnocl import metrics
+from lnocl import __version__, metrics
 from lnocl.errors import InputError, LnoclError
 from lnocl.io import atomic, fitswrite, saved_results
+from lnocl.plotting.figure import save_figure
 from lnocl.simulation import Experiment, load_target, simulate
 from lnocl.simulation.targets import SCENES
-from lnocl.studies import experiment, files
 
 # La Camera et al. (2012), Table 1: rho' and rho'' in percent, with their iterations.
 PAPER = {
@@ -64,14 +67,31 @@ def identity(scene, simulation, n_iter, every, patience):
     ]
 
 
-def compute(path, simulation, observation, method, mu, n_iter, every, patience, cards):
+def compute(path, simulation, method, mu, n_iter, every, patience, cards):
     """Compute one reconstruction and save it as a result that lnocl plot reads."""
     start = time.monotonic()
-    found = experiment.reconstruct(
-        simulation, observation, method, mu, n_iter, every, patience, progress=True
+    found = experiment.reconstruct(simulation, method, mu, n_iter, every, patience, progress=True)
+    stars = [] if method == "RLM" else simulation.stars
+    best, _ = found.best("rho_star")
+    fitswrite.write_result(
+        str(path),
+        found.extended,
+        stars,
+        [found.star_flux] if stars else [],
+        found.history[: best + 1],
+        cards=[
+            ("CREATOR", f"lnocl {__version__}", "program that wrote this file"),
+            ("METHOD", method, "star in the image, or a component"),
+            ("SOLVER", "sgm", "iteration"),
+            ("NITER", best, "iterations done, to the smallest rho''"),
+            ("MU", mu, "weight of the Tikhonov term, per electron"),
+            ("DEVICE", found.device, "device"),
+            ("PIXSCALE", float(simulation.experiment.pixel_scale.value), "mas per pixel"),
+            *cards,
+            ("MINUTES", (time.monotonic() - start) / 60, "that it took"),
+        ],
+        curve=found.curve,
     )
-    minutes = ("MINUTES", (time.monotonic() - start) / 60, "that it took")
-    files.write_reconstruction(str(path), simulation, found, [*cards, minutes])
 
 
 def read_row(path, method, mu, cards):
@@ -88,8 +108,8 @@ def read_row(path, method, mu, cards):
     return saved
 
 
-def row(simulation, saved):
-    """Return the table's row of a saved reconstruction."""
+def reconstruction(simulation, saved):
+    """Return a saved reconstruction as it was before."""
     method, mu = saved.header["METHOD"], saved.header["MU"]
     curve = np.zeros(len(saved.tables["CURVE"]["iteration"]), experiment.CURVE_DTYPE)
     for name, values in saved.tables["CURVE"].items():
@@ -97,25 +117,30 @@ def row(simulation, saved):
     if method == "MC-RL":
         flux = float(saved.star_fluxes[0])
     else:
-        flux = metrics.box_flux(saved.extended, simulation.stars[0])
-    found = experiment.Reconstruction(method, mu, curve, saved.extended, flux)
-    errors = experiment.profile_errors(simulation, found)
+        flux = experiment.box_flux(saved.extended, simulation.stars[0])
+    return experiment.Reconstruction(method, mu, curve, saved.extended, flux)
+
+
+def row(simulation, found, minutes):
+    """Return the table's row of a reconstruction."""
+    errors = experiment.profile_errors(simulation.extended, simulation.stars[0], found)
     at, rho = found.best("rho")
     at_star, rho_star = found.best("rho_star")
-    paper = PAPER.get((method, mu), (np.nan, 0, np.nan, 0))
+    paper = PAPER.get((found.method, found.mu), (np.nan, 0, np.nan, 0))
+    zero = experiment.zero_magnitude_flux(simulation)
     return (
-        method,
-        mu,
+        found.method,
+        found.mu,
         100 * rho,
         at,
         100 * rho_star,
         at_star,
-        metrics.magnitude(flux, simulation.zero_magnitude_flux),
+        metrics.magnitude(found.star_flux, zero),
         100 * errors["flux"],
         100 * errors["width"],
         paper[0],
         paper[2],
-        saved.header["MINUTES"],
+        minutes,
     )
 
 
@@ -128,10 +153,7 @@ def keep_truth(path, simulation):
             simulation.extended,
             simulation.stars,
             simulation.star_fluxes,
-            cards=[
-                ("MAGZERO", simulation.zero_magnitude_flux, "electrons of magnitude 0"),
-                ("PIXSCALE", scale, "mas per pixel"),
-            ],
+            cards=[("PIXSCALE", scale, "mas per pixel")],
         )
         return
     saved = saved_results.read_result(str(path))
@@ -143,6 +165,25 @@ def keep_truth(path, simulation):
     )
     if not same:
         raise InputError(f"{path} is the truth of another experiment; give another folder")
+
+
+def draw(folder, simulation, found):
+    """Draw the paper's figures."""
+    (star,), scale = simulation.stars, float(simulation.experiment.pixel_scale.value)
+    zero = experiment.zero_magnitude_flux(simulation)
+    true = metrics.magnitude(float(simulation.star_fluxes[0]), zero)
+    curves = {name: each.curve for name, each in found.items()}
+    truth = Source("truth", simulation.extended)
+    sources = [Source(name, each.extended, name == "RLM") for name, each in found.items()]
+    figures = {
+        "objects": paper_figures.draw_objects(truth, sources, star, scale),
+        "errors": paper_figures.draw_errors(curves),
+        "magnitude": paper_figures.draw_magnitudes(curves, true),
+        "flux": paper_figures.draw_profiles("flux", truth, sources, star, scale),
+        "width": paper_figures.draw_profiles("width", truth, sources, star, scale),
+    }
+    for name, figure in figures.items():
+        save_figure(figure, str(folder / f"{name}.png"), overwrite=True)
 
 
 def make_table():
@@ -166,7 +207,6 @@ def run(given):
     # The jet and the star at magnitude 13: any scene is brought to the paper's photometry.
     target = load_target(given.scene, given.size)
     simulation = simulate(target, Experiment(extended_magnitude=13 * u.mag))
-    observation = experiment.observe(simulation)
     atomic.check_folder(str(given.output), overwrite=True)
     keep_truth(given.output / "truth.fits", simulation)
     jobs = []
@@ -179,13 +219,17 @@ def run(given):
         jobs.append((path, method, mu, how, cards))
         if path.exists():  # refused now, not after hours of the rows before it
             read_row(path, method, mu, cards)
-    table = make_table()
+    table, found = make_table(), {}
     for path, method, mu, how, cards in jobs:
         if not path.exists():
-            compute(path, simulation, observation, method, mu, *how, cards)
-        table.add_row(row(simulation, read_row(path, method, mu, cards)))
+            compute(path, simulation, method, mu, *how, cards)
+        saved = read_row(path, method, mu, cards)
+        name = method if method == "RLM" else f"{method} mu={mu:g}"
+        found[name] = reconstruction(simulation, saved)
+        table.add_row(row(simulation, found[name], saved.header["MINUTES"]))
         table[-1:].pprint(max_width=-1)
     table.write(given.output / "table.ecsv", overwrite=True)
+    draw(given.output, simulation, found)
     print()
     table.pprint_all()
 

@@ -27,6 +27,7 @@ import astropy.units as u
 import numpy as np
 import sides
 from astropy.table import Table, vstack
+from experiment import observe
 from machine import bytes_moved, measure, operations
 
 from lnocl.opencl import program
@@ -34,7 +35,6 @@ from lnocl.opencl.device import choose, describe
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.simulation import Experiment, hh34, simulate
-from lnocl.studies.experiment import observe
 
 SIZES = (64, 128, 256, 512, 1024, 2048, 4096)
 IMAGES = (1, 2, 3, 4, 5, 6, 7, 8)

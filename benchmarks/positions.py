@@ -26,6 +26,7 @@ import contextlib
 from unittest.mock import patch
 
 import astropy.units as u
+import experiment
 import numpy as np
 import parts
 from astropy.table import Table
@@ -39,7 +40,6 @@ from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import recommend_smoothing
 from lnocl.scene.scene import Scene
 from lnocl.solvers.positions import StarFit, Stars
-from lnocl.studies import experiment
 
 SIZE, FRAMES, STARS = 128, 8, 25
 FLUXES = (1e4, 3e4, 1e5, 3e5, 1e6)

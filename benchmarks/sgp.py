@@ -31,6 +31,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import astropy.units as u
+import experiment
 import numpy as np
 import parts
 import sides
@@ -43,7 +44,7 @@ from lnocl.runs.thinning import split_counts
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.simulation import Experiment, Star, Target, hh34, load_target, simulate
-from lnocl.studies import experiment, files
+from lnocl.studies.files import write_simulation
 
 SGM_ITERATIONS = {"hh34": 8000, "hh211": 2000}
 STARTS = (0.01, 0.1, 0.5, 0.9)
@@ -344,7 +345,7 @@ def answer(data, device):
     best = sgm[np.argmin(sgm[:, 2])]
     n_sgp = int(follow(simulation, "sgp", 250, within=best[2], device=device)[-1, 0])
     with tempfile.TemporaryDirectory() as folder:
-        files.write_simulation(folder, "hh34", simulation)
+        write_simulation(folder, "hh34", simulation)
         images, psfs = (
             sorted(map(str, Path(folder).glob(f"{kind}_*.fits"))) for kind in ("image", "psf")
         )

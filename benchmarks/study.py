@@ -115,10 +115,9 @@ def measure(case):
             **{name: case[name] for name in ("solver", "mu", "n_iter")},
         )
     seconds = time.perf_counter() - began
-    truth, flux = simulation.extended.copy(), simulation.star_fluxes[0]
-    if is_plain:
-        truth[star[1], star[0]] += flux
-    found = metrics.box_flux(result.extended, star) if is_plain else result.star_fluxes[0]
+    truth, flux = simulation.extended, simulation.star_fluxes[0]
+    box = result.extended[star[1] - 1 : star[1] + 2, star[0] - 1 : star[0] + 2]
+    found = box.sum() if is_plain else result.star_fluxes[0]
     masked, rows = star if is_plain else None, metrics.star_rows(star, truth.shape)
     return case | {
         "rho": metrics.restoration_error(result.extended, truth, star=masked),

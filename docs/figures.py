@@ -60,9 +60,7 @@ RECIPES = {
     ),
     "experiment": Recipe(
         "2 h",
-        "python benchmarks/hh34_table.py --mu 8e-8 1e-6 -o $OUT/table && cd $OUT && lnocl plot "
-        "table/rlm_0.fits table/mc-rl_8e-08.fits table/mc-rl_1e-06.fits --truth table/truth.fits "
-        "-o .",
+        "python benchmarks/hh34_table.py --mu 8e-8 1e-6 -o $OUT",
         same("validation", "objects errors", "hh34_"),
     ),
     "psf_lbti": Recipe(

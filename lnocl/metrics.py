@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError
-from lnocl.scene.arrays import numbers, unmasked
+from lnocl.scene.arrays import unmasked
 
 Array = NDArray[np.float64]
 
@@ -155,44 +155,13 @@ def restoration_error(
     return deviation / norm
 
 
-def box_flux(image: ArrayLike, star: tuple[int, int]) -> float:
-    """Return the flux in the 3 x 3 pixels around the star, the paper's measure of its flux.
-
-    Parameters
-    ----------
-    image : array_like, shape (ny, nx)
-        Reconstruction that holds the star.
-    star : (x, y)
-        Position of the star, one pixel or more from the edge.
-
-    Returns
-    -------
-    float
-        In the unit of the image.
-
-    Raises
-    ------
-    InputError
-        The image is not a plane of finite, unmasked numbers, or the box leaves it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lnocl.metrics import box_flux
-    >>> box_flux(np.ones((4, 4)), (1, 2))
-    9.0
-    """
-    plane = _plane("image", image)
-    return float(plane[_box(star, plane.shape)].sum())
-
-
 def magnitude(flux: float, zero_magnitude_flux: float) -> float:
     """Return the magnitude of a flux, ``-2.5 log10(flux / zero_magnitude_flux)``.
 
     Parameters
     ----------
     flux : float
-        Zero or more: of the star component, or `box_flux`.
+        Zero or more.
     zero_magnitude_flux : float
         Flux of magnitude 0 in the same unit, positive.
 
@@ -252,88 +221,10 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
     array([6., 4.])
     """
     plane = _plane("image", image)
-    return _mask_rows(plane.sum(axis=1), star, plane.shape)
-
-
-def width_profile(image: ArrayLike, threshold: float, star: tuple[int, int] | None = None) -> Array:
-    """Return the width profile along the jet.
-
-    The width of a row is the number of pixels from the first to the last that are greater than the
-    threshold, both counted: ``last - first + 1``. It is 0 where all are below it.
-
-    Parameters
-    ----------
-    image : array_like, shape (ny, nx)
-        Source whose axis lies along y.
-    threshold : float
-        In the unit of the image, finite.
-    star : (x, y), optional
-        Position of the star in the image of both (RLM); the 3 rows around it are masked.
-
-    Returns
-    -------
-    ndarray of float64, shape (ny,)
-        Pixels; NaN where masked.
-
-    Raises
-    ------
-    InputError
-        The image is not a plane of finite, unmasked numbers, the threshold is not finite, or a
-        masked row lies outside the image.
-
-    References
-    ----------
-    La Camera et al. (2012), section 4, Fig. 7.
-
-    Examples
-    --------
-    >>> from lnocl.metrics import width_profile
-    >>> width_profile([[0, 5, 1, 5, 0], [0, 0, 2, 0, 0], [0, 0, 1, 0, 0]], threshold=1)
-    array([3., 1., 0.])
-    """
-    plane = _plane("image", image)
-    if not math.isfinite(threshold):
-        raise InputError(f"threshold must be finite; {threshold} was given")
-    above = plane > threshold
-    first = above.argmax(axis=1)
-    last = plane.shape[1] - 1 - above[:, ::-1].argmax(axis=1)
-    widths = np.where(above.any(axis=1), last - first + 1.0, 0.0)
-    return _mask_rows(widths, star, plane.shape)
-
-
-def relative_error(profile: ArrayLike, reference: ArrayLike) -> Array:
-    """Return the relative error of a profile, ``(profile - reference) / reference``.
-
-    Parameters
-    ----------
-    profile : array_like, shape (ny,)
-        Flux or width profile of a reconstruction.
-    reference : array_like, shape (ny,)
-        The same of the truth.
-
-    Returns
-    -------
-    ndarray of float64, shape (ny,)
-        Signed: positive where the profile is too high. NaN where either is masked, and where the
-        reference is 0, where a relative error is undefined.
-
-    Raises
-    ------
-    InputError
-        They are not two profiles of one length, of real numbers that are not masked.
-
-    Examples
-    --------
-    >>> from lnocl.metrics import relative_error
-    >>> relative_error([5.0, 9.0, 1.0], [4.0, 10.0, 0.0])
-    array([ 0.25, -0.1 ,   nan])
-    """
-    found, true = numbers("profile", profile), numbers("reference", reference)
-    if found.ndim != 1 or found.shape != true.shape:
-        raise InputError(f"the profile has shape {found.shape} and the reference {true.shape}")
-    error = np.full(found.shape, np.nan)
-    np.divide(found - true, true, out=error, where=true != 0)
-    return error
+    profile = plane.sum(axis=1)
+    if star is not None:
+        profile[_box(star, plane.shape)[0]] = np.nan
+    return profile
 
 
 def _plane(name: str, values: ArrayLike) -> Array:
@@ -361,9 +252,3 @@ def _box(star: tuple[int, int], shape: tuple[int, ...]) -> tuple[slice, slice]:
     if not (1 <= x < shape[1] - 1 and 1 <= y < shape[0] - 1):
         raise InputError(f"the 3 x 3 pixels around the star at ({x}, {y}) leave the image")
     return slice(y - 1, y + 2), slice(x - 1, x + 2)
-
-
-def _mask_rows(profile: Array, star: tuple[int, int] | None, shape: tuple[int, ...]) -> Array:
-    if star is not None:
-        profile[_box(star, shape)[0]] = np.nan
-    return profile

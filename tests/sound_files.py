@@ -26,7 +26,6 @@ PATIENCE = 10
 ROOM = 2 * 2**30
 RNG = np.random.default_rng(8)
 COUNTS = RNG.poisson(100.0, SHAPE)
-MAGZERO = ("MAGZERO", 1e9, "electrons of magnitude 0")
 
 
 def image(path):
@@ -74,9 +73,7 @@ def tiles(path):
 
 
 def truth(path):
-    fitswrite.write_result(
-        path, COUNTS, [(12.0, 13.0)], [1e5], cards=[MAGZERO, ("PIXSCALE", 2.5, "")]
-    )
+    fitswrite.write_result(path, COUNTS, [(12.0, 13.0)], [1e5], cards=[("PIXSCALE", 2.5, "")])
 
 
 def result(path):
@@ -140,7 +137,7 @@ def draw(sound, damaged, name):
     files[name.partition(".")[0]] = damaged
     # What matplotlib says of damaged numbers; that they are damaged is said by their DATASUM.
     warnings.filterwarnings("ignore", "Data has no positive values")
-    list(figures.draw(f"{damaged}.figures", [files["result"]], files["truth"], overwrite=True))
+    list(figures.draw(f"{damaged}.figures", list(files.values()), overwrite=True))
 
 
 def read_checkpoint(sound, damaged, name):

@@ -7,13 +7,12 @@ import argparse
 from lnocl.commands import messages, options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
+from lnocl.errors import InputError
 
+OF_IMAGES = [options.PSFS, options.BACKGROUND, options.READ_NOISE, options.STARS]
 OPTIONS = [
     options.IMAGES.but(nargs="*"),
-    options.PSFS,
-    options.BACKGROUND,
-    options.READ_NOISE,
-    options.STARS,
+    *OF_IMAGES,
     option(
         "--n-iter",
         type=int,
@@ -23,18 +22,11 @@ OPTIONS = [
         "(default: %(default)s)",
     ),
     option(
-        "--mu",
-        type=float,
-        help="weight of the Tikhonov term on the extended source, per electron (default: 0; "
-        "that of lnocl demo for its scene)",
-    ),
-    option(
         "--accuracy",
         type=float,
         default=1e-3,
         metavar="A",
-        help="deviation from double precision that the advice may have, and excess of the "
-        "objective over that of double precision that the table times (default: %(default)s)",
+        help="deviation from double precision that the advice may have (default: %(default)s)",
     ),
     option(
         "--size",
@@ -52,27 +44,31 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    from lnocl.io.frames import Calibration, read_frames
     from lnocl.opencl import device
     from lnocl.studies import bench
 
-    source = bench.choose_source(
-        arguments.images,
-        arguments.psfs,
-        arguments.background,
-        arguments.read_noise,
-        arguments.stars,
-        arguments.mu,
-        arguments.size,
-    )
-    for line in bench.run(
-        source,
-        arguments.n_iter,
-        arguments.accuracy,
-        device.spec_of(device.choose(arguments.device).device),
-        arguments.output,
-        arguments.overwrite,
-        progress=not arguments.quiet,
-    ):
+    images, psfs, size = arguments.images, arguments.psfs or [], arguments.size
+    strays = [each.flags[-1] for each in OF_IMAGES if getattr(arguments, each.name)]
+    if not images and strays:
+        raise InputError(
+            f"{strays[0]} goes with images, and none are given; the demo's scene has its own"
+        )
+    if images and not psfs:
+        raise InputError("images need their PSFs: give --psf")
+    if images and size is not None:
+        raise InputError("--size is of the demo's scene, and images are given; leave one out")
+    n_iter, accuracy, stem = arguments.n_iter, arguments.accuracy, arguments.output
+    bench.check(n_iter, accuracy, stem, arguments.overwrite, [*images, *psfs])
+    spec = device.spec_of(device.choose(arguments.device).device)
+    if images:
+        levels = arguments.background or [0.0], arguments.read_noise or [0.0]
+        read = read_frames(images, psfs, Calibration(*levels))
+        case = bench.Case(read.observation, arguments.stars, [*images, *psfs])
+    else:
+        case = bench.simulated_case(256 if size is None else size)
+    lines = bench.run(case, n_iter, accuracy, spec, stem, arguments.overwrite, not arguments.quiet)
+    for line in lines:
         messages.say([line])
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 
-from lnocl.commands import messages, options
+from lnocl.commands import deconvolve, messages, options, simulate
 from lnocl.commands.options import option, output_folder
-from lnocl.commands.parser import Command
+from lnocl.commands.parser import Command, Parser
 
 OPTIONS = [
     *output_folder("images, results and pictures", default="lnocl_demo"),
@@ -17,15 +18,14 @@ OPTIONS = [
         metavar="N",
         help="pixels along each side (default: %(default)s)",
     ),
-    option(
-        "--seed",
-        type=int,
-        default=0,
-        metavar="N",
-        help="seed of residual phases and noise (default: %(default)s)",
-    ),
     options.DEVICE,
 ]
+
+
+def _parse(command: Command, words: list[str]) -> argparse.Namespace:
+    parser = Parser(prog=shlex.join(words[:2]))
+    command.add_arguments(parser)
+    return parser.parse_args(words[2:])
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -34,16 +34,22 @@ def _run(arguments: argparse.Namespace) -> None:
 
     chosen = device.choose(arguments.device).device
     trial.check(chosen)  # before anything is written
-    spec = device.spec_of(chosen)
-    for line in demo.run(
-        arguments.output, arguments.size, arguments.seed, spec, arguments.overwrite
-    ):
+    more = ["--overwrite"] if arguments.overwrite else []
+    words = ["lnocl", "simulate", demo.SCENE, "--size", str(arguments.size), "-o"]
+    words += [arguments.output, *more]
+    found = simulate.write(_parse(simulate.COMMAND, words))
+    messages.say([shlex.join(words)])
+    for each in demo.commands(arguments.output, found):
+        words = [*each, *more, "--device", device.spec_of(chosen)]
+        messages.say([shlex.join(words)])
+        deconvolve.COMMAND.run(_parse(deconvolve.COMMAND, words))
+    for line in demo.compare(arguments.output, arguments.overwrite):
         messages.say([line])
 
 
 COMMAND = Command(
     "simulate a jet and its star, reconstruct them with and without the star as a component, "
-    "and show the difference in a table and pictures",
+    "and show the difference in a table and a picture",
     {"": OPTIONS},
     _run,
 )

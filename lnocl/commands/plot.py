@@ -13,25 +13,22 @@ OPTIONS = [
         "results",
         nargs="+",
         metavar="RESULT",
-        help="FITS file that lnocl deconvolve, lnocl demo or benchmarks/hh34_table.py has written",
+        help="FITS file that lnocl deconvolve or lnocl demo has written, or the truth.fits of "
+        "lnocl simulate",
     ),
     *output_folder("the figures, PNG files", required=True),
-    option("--truth", metavar="TRUTH", help="FITS file with the true source, of lnocl simulate"),
 ]
 
 
 def _run(arguments: argparse.Namespace) -> None:
     from lnocl.studies import figures
 
-    for line in figures.draw(
-        arguments.output, arguments.results, arguments.truth, arguments.overwrite
-    ):
+    for line in figures.draw(arguments.output, arguments.results, arguments.overwrite):
         messages.say([line])
 
 
 COMMAND = Command(
-    "draw a picture of each result, several beside each other, and the paper's figures where the "
-    "truth is given",
+    "draw a picture of each result, and several beside each other",
     {"": OPTIONS},
     _run,
 )

@@ -57,62 +57,38 @@ OPTIONS = [
         help="angle of the baseline in each image, from the x axis towards the y axis (default: "
         "0 45 90 135)",
     ),
-    option("--strehl", type=float, metavar="S", help="Strehl ratio in (0, 1] (default: 0.7)"),
-    option(
-        "--throughput",
-        type=float,
-        metavar="T",
-        help="electrons per photon that reaches the telescope, in (0, 1] (default: 0.3)",
-    ),
-    option(
-        "--sky",
-        type=float,
-        dest="sky_brightness",
-        metavar="MAG",
-        help="brightness of the sky, magnitude per square arcsecond (default: 13.5)",
-    ),
-    option(
-        "--read-noise",
-        type=float,
-        metavar="S",
-        help="standard deviation in electrons (default: 10)",
-    ),
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def write(arguments: argparse.Namespace) -> list[str]:
+    """Simulate, write the files, and return the words of the command that deconvolves them."""
     from astropy import units as u
 
     from lnocl.io import atomic
     from lnocl.simulation import Experiment, Star, load_target, simulate
-    from lnocl.simulation.photometry import MAG_PER_ARCSEC2
-    from lnocl.studies import files
+    from lnocl.studies.files import write_simulation
 
     stars = arguments.stars and [Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
     with messages.shown_log():
         target = load_target(arguments.scene, arguments.size, stars)
-    units = {
-        "angles": u.deg,
-        "extended_magnitude": u.mag,
-        "sky_brightness": MAG_PER_ARCSEC2,
-        "read_noise": u.electron,
-    }
-    names = (*units, "exposure_time", "strehl", "throughput", "seed")
-    given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
+    units = {"angles": u.deg, "extended_magnitude": u.mag, "exposure_time": 1, "seed": 1}
+    given = {name: getattr(arguments, name) for name in units}
     experiment = Experiment(
-        **{name: value * units[name] if name in units else value for name, value in given.items()}
+        **{name: value * units[name] for name, value in given.items() if value is not None}
     )
     atomic.check_folder(arguments.output, arguments.overwrite, make=False)
     simulation = simulate(target, experiment)
     atomic.check_folder(arguments.output, arguments.overwrite)
-    command = files.write_simulation(
-        arguments.output, arguments.scene, simulation, arguments.overwrite
-    )
+    return write_simulation(arguments.output, arguments.scene, simulation, arguments.overwrite)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    words = write(arguments)
     messages.say(
         [
-            f"{len(simulation.images)} images, as many PSFs, truth.fits and record.json written "
-            f"to {arguments.output}; to deconvolve them run",
-            shlex.join(command),
+            f"images, PSFs, truth.fits and record.json written to {arguments.output}; to "
+            "deconvolve them run",
+            shlex.join(words),
         ]
     )
 

@@ -90,12 +90,3 @@ def line_style(i: int) -> dict[str, Any]:
 def as_text(words: str) -> str:
     """Return words of a user or of a file, of which matplotlib draws each $ as one: no formula."""
     return words.replace("$", r"\$")
-
-
-def plain_ticks(axis: Any) -> None:
-    """Label a short logarithmic axis with plain numbers."""
-    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
-
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.set_major_formatter(ScalarFormatter())
-    axis.set_minor_formatter(NullFormatter())

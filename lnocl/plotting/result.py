@@ -154,10 +154,10 @@ def draw_result(view: ResultView) -> Figure:
     if has_images:
         for row, region in zip(axes, regions, strict=True):
             _draw_images(row[:3], view, region)
-            _draw_extended(row[3], view, region, "extended source")
+            draw_extended(row[3], view, region, "extended source")
     else:
         for axis, region in zip(axes.flat, regions, strict=False):
-            _draw_extended(axis, view, region, f"extended source, {region.name}")
+            draw_extended(axis, view, region, f"extended source, {region.name}")
         for axis in axes.flat[len(regions) :]:
             axis.set_axis_off()
     for axis in axes[-1]:
@@ -230,11 +230,14 @@ def _draw_images(axes: Sequence[Axes], view: ResultView, region: Region) -> None
             _mark_stars(axis, view, offset)
 
 
-def _draw_extended(axis: Axes, view: ResultView, region: Region, title: str) -> None:
+def draw_extended(
+    axis: Axes, view: ResultView, region: Region, title: str, top: float | None = None
+) -> None:
+    """Draw a region of the extended source on a stretch up to `top`, or to its brightest pixel."""
     from matplotlib.colors import AsinhNorm
 
     there = finer_slices(region.slices(view.shape), view.oversample)
-    top = brightest(view.extended[there])
+    top = brightest(view.extended[there]) if top is None else top
     norm = AsinhNorm(FAINT_SHARE * top, 0.0, top)
     shown = _draw_region(axis, view.extended, there, norm, COLOUR_MAP, view.oversample)
     if view.doubtful is not None and view.doubtful[there].any():

@@ -7,10 +7,9 @@ read noise.
 
 from lnocl.simulation.fizeau import fizeau_psf
 from lnocl.simulation.images import Simulation, simulate
-from lnocl.simulation.photometry import electrons, photon_rate, pixel_magnitude
 from lnocl.simulation.pupil import circular_pupil, fizeau_pupil
 from lnocl.simulation.targets import Star, Target, hh34, load_target
-from lnocl.simulation.telescope import Experiment, collecting_area
+from lnocl.simulation.telescope import Experiment
 
 __all__ = [
     "Experiment",
@@ -18,13 +17,9 @@ __all__ = [
     "Star",
     "Target",
     "circular_pupil",
-    "collecting_area",
-    "electrons",
     "fizeau_psf",
     "fizeau_pupil",
     "hh34",
     "load_target",
-    "photon_rate",
-    "pixel_magnitude",
     "simulate",
 ]

@@ -15,10 +15,6 @@ Array = NDArray[np.float64]
 
 MIN_SIZE = 32
 
-# Largest number of electrons in one image, of all sources and of the sky in a pixel: Poisson
-# deviates are 64-bit integers, and float64 counts one by one up to 9e15.
-MAX_ELECTRONS = 1e15
-
 
 def numbers(name: str, value: Any, unit: u.UnitBase) -> Array:
     """Return a quantity, or a text such as "30 min", as finite numbers in a unit."""
@@ -49,15 +45,6 @@ def positive(name: str, value: Any, unit: u.UnitBase) -> float:
     if value_in_unit <= 0:
         raise InputError(f"{name} must be positive; {value} was given")
     return value_in_unit
-
-
-def check_electrons(name: str, number: float) -> None:
-    """Refuse more electrons than can be simulated."""
-    if not number <= MAX_ELECTRONS:
-        raise InputError(
-            f"{name} would leave {number:.3g} electrons in one image; at most "
-            f"{MAX_ELECTRONS:.0e} can be simulated"
-        )
 
 
 def check_share(name: str, value: float) -> None:

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from astropy import units as u
-from astropy.utils.misc import JsonCustomEncoder
 from scipy import fft
 
-from lnocl.simulation.checks import Array, check_electrons
-from lnocl.simulation.fizeau import N_SCREENS, fizeau_psf
+from lnocl.errors import InputError
+from lnocl.simulation.checks import Array
+from lnocl.simulation.fizeau import fizeau_psf
 from lnocl.simulation.targets import Target
-from lnocl.simulation.telescope import (
-    APERTURE_DIAMETER,
-    BASELINE,
-    N_ACTUATORS,
-    OBSCURATION_DIAMETER,
-    Experiment,
-    collecting_area,
-)
+from lnocl.simulation.telescope import Experiment
+
+# Most electrons of all sources in an image and of sky and read noise in a pixel: Poisson deviates
+# are 64-bit integers, and float64 counts one by one up to 9e15.
+MAX_ELECTRONS = 1e15
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +38,6 @@ class Simulation:
         Positions in pixels, 0-based, x along columns.
     star_fluxes : ndarray of float64, shape (n,)
         The true fluxes, electrons.
-    zero_magnitude_flux : float
-        Electrons of a star of magnitude 0.
     experiment : Experiment
         How the images were taken.
 
@@ -72,46 +64,7 @@ class Simulation:
     extended: Array
     stars: list[tuple[int, int]]
     star_fluxes: Array
-    zero_magnitude_flux: float
     experiment: Experiment
-
-    def record(self) -> dict[str, Any]:
-        """Return every number that the simulation was made from, ready for `json.dump`.
-
-        Returns
-        -------
-        dict of str
-            Target, experiment, telescope and background. A quantity is its value and its unit.
-
-        Examples
-        --------
-        >>> from lnocl.simulation import Experiment, hh34, simulate
-        >>> record = simulate(hh34(64), Experiment(angles="0 deg", strehl=1.0)).record()
-        >>> record["telescope"]["baseline"]
-        {'value': 14.4, 'unit': 'm'}
-        """
-        record = {
-            "target": {
-                "shape": self.extended.shape,
-                "extended_electrons": self.extended.sum(),
-                "stars": [
-                    {"x": x, "y": y, "electrons": flux}
-                    for (x, y), flux in zip(self.stars, self.star_fluxes, strict=True)
-                ],
-            },
-            "experiment": vars(self.experiment),
-            "telescope": {
-                "baseline": BASELINE,
-                "aperture_diameter": APERTURE_DIAMETER,
-                "obscuration_diameter": OBSCURATION_DIAMETER,
-                "collecting_area": collecting_area(),
-                "n_actuators": N_ACTUATORS,
-                "n_screens": N_SCREENS,
-            },
-            "zero_magnitude_electrons": self.zero_magnitude_flux,
-            "sky_electrons_per_pixel": self.experiment.sky_electrons,
-        }
-        return dict(json.loads(json.dumps(record, cls=JsonCustomEncoder)))
 
 
 def simulate(target: Target, experiment: Experiment | None = None) -> Simulation:
@@ -136,8 +89,8 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
     Raises
     ------
     InputError
-        The pixels are too coarse for the wavelength. Or the light of all sources, and of the sky in
-        a pixel, adds up to more than 1e15 electrons.
+        The pixels are too coarse for the wavelength. Or the light of all sources, and sky and read
+        noise of a pixel, add up to more than 1e15 electrons.
 
     References
     ----------
@@ -155,11 +108,14 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
     experiment = Experiment() if experiment is None else experiment
     stars = [(star.x, star.y) for star in target.stars]
     star_fluxes = np.array([experiment.source_electrons(star.magnitude) for star in target.stars])
-    for star, flux in zip(target.stars, star_fluxes, strict=True):
-        check_electrons(f"the star at ({star.x}, {star.y})", float(flux))
     extended_flux = experiment.source_electrons(experiment.extended_magnitude)
-    total = float(star_fluxes.sum()) + extended_flux + experiment.sky_electrons
-    check_electrons("all light together", total)
+    read_noise = float(experiment.read_noise.value)
+    total = float(star_fluxes.sum()) + extended_flux + experiment.sky_electrons + read_noise
+    if not total <= MAX_ELECTRONS:
+        raise InputError(
+            f"all light together and the read noise would leave {total:.3g} electrons in one "
+            f"image; at most {MAX_ELECTRONS:.0e} can be simulated"
+        )
     *psf_seeds, noise_seed = np.random.SeedSequence(experiment.seed).spawn(
         len(experiment.angles) + 1
     )
@@ -178,7 +134,6 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
     )
     extended = target.extended * extended_flux
     background = np.full(len(psfs), experiment.sky_electrons)
-    read_noise = float(experiment.read_noise.value)
     expected = _expected_images(psfs, extended, stars, star_fluxes) + background[:, None, None]
     rng = np.random.default_rng(noise_seed)
     images = rng.poisson(expected) + rng.normal(0.0, read_noise, expected.shape)
@@ -190,7 +145,6 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
         extended=extended,
         stars=stars,
         star_fluxes=star_fluxes,
-        zero_magnitude_flux=experiment.source_electrons(0 * u.mag),
         experiment=experiment,
     )
 

@@ -1,1 +1,1 @@
-"""The paper's experiment, the demo, and benchmarks of speed against accuracy."""
+"""The demo, the benchmark of speed against accuracy, and pictures of files."""

@@ -1,167 +1,109 @@
-"""The work of ``lnocl bench``: from a scene or files to a table, its file and its figure."""
+"""The work of ``lnocl bench``: settings are timed, and measured against double precision."""
 
 from __future__ import annotations
 
 import io
+import math
 import os
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+import time
+import warnings
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from astropy.table import Table
 
-from lnocl import __version__
-from lnocl.errors import InputError, LnoclError
-from lnocl.io import atomic, frames
-from lnocl.io.frames import Calibration, Word
+from lnocl import __version__, metrics
+from lnocl.deconvolution import deconvolve
+from lnocl.errors import InputError, LnoclError, LnoclWarning
+from lnocl.io import atomic
+from lnocl.opencl.device import choose, describe
 from lnocl.plotting.curves import draw_costs
 from lnocl.plotting.figure import check_matplotlib, save_figure
-from lnocl.scene.observation import Observation
-from lnocl.simulation import Simulation, load_target, simulate
-from lnocl.studies import demo, experiment, trade
+from lnocl.result import Estimate, Result
+from lnocl.runs.options import PAPER
+from lnocl.scene.observation import Array, Observation
+from lnocl.simulation import hh34, simulate
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+# Estimates are measured after an eighth, a quarter, half and all of the iterations.
+PARTS = (8, 4, 2, 1)
 
-# Columns whose descriptions are printed below the table.
-DESCRIBED = ("ms", "to_goal", "deviation", "near_star", "flux", "rho", "front")
+# Columns of the table: unit, width and format on the terminal, and description.
+COLUMNS = {
+    "precision": (None, "<9", "precision of the arithmetic"),
+    "pad": ("pix", ">4", "least unobserved pixels round the images"),
+    "iterations": (None, ">10", "iterations done"),
+    "ms": ("ms", ">8.3g", "time of an iteration, mean over the run from its second one on"),
+    "seconds": ("s", ">8.3g", "time of all iterations"),
+    "deviation": (None, ">9.1e", "deviation of the extended source from that in double precision"),
+    "error": (None, ">8.2%", "error of the extended source against the truth of the scene"),
+}
 
 
-class BenchmarkInput(NamedTuple):
-    """An observation, and the arguments of its deconvolution.
+class Case(NamedTuple):
+    """What settings are compared on.
 
     Attributes
     ----------
     observation : Observation
         The images and their PSFs.
     stars : sequence of (x, y)
-        Positions in pixels, 0-based.
-    mu : float
-        Weight of the Tikhonov term, per electron.
-    inputs : dict
-        Scene and seed, or files and their checksums, for the record.
-    simulation : Simulation or None
-        The simulation, where `observation` is one.
+        Positions in pixels, 0-based. The 24 rows around the first count, where they fit in the
+        image, else all rows.
+    inputs : list of str
+        The scene or the files, for the record.
+    truth : ndarray of float64, shape (ny, nx), optional
+        The true extended source, electrons per pixel.
     """
 
     observation: Observation
     stars: Sequence[tuple[float, float]]
-    mu: float
-    inputs: dict[str, Any]
-    simulation: Simulation | None = None
-
-
-class InputSource(Protocol):
-    """A source of benchmark input: the demo's scene, or files."""
+    inputs: Sequence[str]
+    truth: Array | None = None
 
     @property
-    def paths(self) -> list[str]:
-        """Paths of its files."""
-
-    def load(self) -> BenchmarkInput:
-        """Return the input."""
-
-
-class DemoScene(NamedTuple):
-    """The demo's scene as a source.
-
-    Attributes
-    ----------
-    size : int
-        Pixels along each side.
-    mu : float
-        Weight of the Tikhonov term, per electron.
-    """
-
-    size: int
-    mu: float
-
-    @property
-    def paths(self) -> list[str]:
-        """An empty list: the scene is simulated."""
-        return []
-
-    def load(self) -> BenchmarkInput:
-        """Simulate the scene."""
-        simulation = simulate(load_target(demo.SCENE, self.size))
-        inputs = {"scene": demo.SCENE, "size": self.size, "seed": simulation.experiment.seed}
-        observation = experiment.observe(simulation)
-        return BenchmarkInput(observation, simulation.stars, self.mu, inputs, simulation)
+    def rows(self) -> slice:
+        """The rows that count."""
+        try:
+            x, y = self.stars[0]
+            return metrics.star_rows((round(x), round(y)), self.observation.shape)
+        except (IndexError, InputError):
+            return slice(None)
 
 
-class FitsFiles(NamedTuple):
-    """FITS files as a source, with arguments of `lnocl.Observation` and `lnocl.deconvolve`."""
-
-    images: Sequence[str]
-    psfs: Sequence[str]
-    background: Sequence[Word]
-    read_noise: Sequence[Word]
-    stars: Sequence[tuple[float, float]]
-    mu: float
-
-    @property
-    def paths(self) -> list[str]:
-        """Paths of the images and PSFs."""
-        return [*self.images, *self.psfs]
-
-    def load(self) -> BenchmarkInput:
-        """Read the files."""
-        calibration = Calibration(self.background, self.read_noise)
-        read = frames.read_frames(self.images, self.psfs, calibration)
-        inputs = {
-            "images": dict(zip(self.images, read.sha256["images"], strict=True)),
-            "psfs": dict(zip(self.psfs, read.sha256["psfs"], strict=True)),
-            "background": read.background,
-            "read_noise": list(self.read_noise),
-        }
-        return BenchmarkInput(read.observation, self.stars, self.mu, inputs)
+def simulated_case(size: int) -> Case:
+    """Return the demo's scene, with so many pixels along each side."""
+    made = simulate(hh34(size))
+    background, read_noise = made.background, made.read_noise
+    observation = Observation(made.images, made.psfs, background=background, read_noise=read_noise)
+    return Case(observation, made.stars, [f"hh34, {size} x {size}"], made.extended)
 
 
-def choose_source(
-    images: Sequence[str],
-    psfs: Sequence[str] | None,
-    background: Sequence[Word] | None,
-    read_noise: Sequence[Word] | None,
-    stars: Sequence[tuple[float, float]],
-    mu: float | None,
-    size: int | None,
-) -> InputSource:
-    """Return the files as a source, or the demo's scene if no image is given.
-
-    Parameters
-    ----------
-    images, psfs : sequence of str
-        Paths of FITS files.
-    background, read_noise : sequence of float or str, optional
-        As for `frames.Calibration`; by default 0.
-    stars : sequence of (x, y)
-        Positions in pixels, 0-based.
-    mu : float, optional
-        Weight of the Tikhonov term, per electron; by default 0, or that of the demo.
-    size : int, optional
-        Pixels along each side of the demo's scene; by default 256.
+def check(
+    n_iter: int, accuracy: float, stem: str | None, overwrite: bool, inputs: Sequence[str]
+) -> None:
+    """Check the parameters of `run` before any work is done.
 
     Raises
     ------
     InputError
-        Arguments of images are given without images, a size with them, or images without PSFs.
+        `n_iter` is less than 8, `accuracy` is not positive and finite, or `stem` names no file.
+    FileError
+        A file exists and must not be overwritten, or cannot be written.
     """
-    if not images:
-        given = {"psf": psfs, "background": background, "read-noise": read_noise, "star": stars}
-        if strays := [f"--{name}" for name, value in given.items() if value]:
-            raise InputError(
-                f"{strays[0]} goes with images, and none are given; the demo's scene has its own"
-            )
-        return DemoScene(256 if size is None else size, demo.MU if mu is None else mu)
-    if not psfs:
-        raise InputError("images need their PSFs: give --psf")
-    if size is not None:
-        raise InputError("--size is of the demo's scene, and images are given; leave one out")
-    return FitsFiles(images, psfs, background or [0.0], read_noise or [0.0], stars, mu or 0.0)
+    if n_iter < PARTS[0]:
+        raise InputError(f"n_iter must be a whole number, {PARTS[0]} or more; {n_iter} was given")
+    if not (math.isfinite(accuracy) and accuracy > 0):
+        raise InputError(f"accuracy must be positive and finite; {accuracy} was given")
+    if stem is not None:
+        if not os.path.basename(stem):
+            raise InputError(f"the output {stem!r} names no file; give a path without its ending")
+        for ending in (".ecsv", ".png"):
+            atomic.check_output(stem + ending, overwrite, inputs)
 
 
 def run(
-    source: InputSource,
+    case: Case,
     n_iter: int = 400,
     accuracy: float = 1e-3,
     device: str | None = None,
@@ -169,16 +111,14 @@ def run(
     overwrite: bool = False,
     progress: bool = False,
 ) -> Iterator[str]:
-    """Compare the cost and accuracy of settings, and write a table and a figure.
-
-    An interrupted comparison reports the runs that are complete, then raises KeyboardInterrupt.
+    """Compare settings, say which to take, and write a table and a figure.
 
     Parameters
     ----------
-    source : InputSource
-        Source of `choose_source`.
-    n_iter, accuracy, device, progress
-        As for `lnocl.studies.trade.compare`.
+    case, n_iter, device, progress
+        As for `compare`.
+    accuracy : float
+        Deviation that the advice may have, positive.
     stem : str, optional
         Path without its ending of the files ``.ecsv`` and ``.png``.
     overwrite : bool, optional
@@ -187,73 +127,158 @@ def run(
     Yields
     ------
     str
-        Lines for the terminal.
+        Lines for the terminal, each as soon as it is known.
+
+    Raises
+    ------
+    InputError, DeviceError
+        As for `compare`.
+    FileError
+        A file cannot be written.
+    """
+    name = describe(choose(device).device)
+    measure = "all rows" if case.rows == slice(None) else "24 rows around the star"
+    yield f"{measure}, against {n_iter} iterations in double precision without padding, on {name}"
+    table: list[dict[str, Any]] = []
+    for row in compare(case, n_iter, device, progress):
+        if not table:
+            yield " ".join(format(key, COLUMNS[key][1].split(".")[0]) for key in row)
+        table.append(row)
+        yield " ".join(format(value, COLUMNS[key][1]) for key, value in row.items())
+    yield from (f"{key}: {COLUMNS[key][2]}" for key in list(table[0])[3:])
+    if stem is not None:
+        meta = {"version": __version__, "device": name, "measure": measure, "n_iter": n_iter}
+        meta |= {"inputs": list(case.inputs), "stars": [list(star) for star in case.stars]}
+        yield from _write(table, meta, stem, overwrite)
+    yield advice(table, accuracy)
+
+
+def compare(
+    case: Case, n_iter: int, device: str | None = None, progress: bool = False
+) -> Iterator[dict[str, Any]]:
+    """Time settings of `lnocl.deconvolve`, and measure each against double precision.
+
+    The reference is the estimate in double precision, without padding, after `n_iter` iterations.
+    Both precisions are compared with it, without padding and with half the PSF's larger axis.
+
+    Parameters
+    ----------
+    case : Case
+        What they are compared on.
+    n_iter : int
+        Iterations of the paper's method, 8 or more.
+    device : str, optional
+        As for `lnocl.deconvolve`.
+    progress : bool, optional
+        Whether progress bars are shown on stderr, where that is a terminal.
+
+    Yields
+    ------
+    dict
+        The `COLUMNS` of a setting; ``error`` where the truth is known.
 
     Raises
     ------
     InputError
-        A parameter or an image cannot be used.
+        `lnocl.deconvolve` refuses a value, or the reference is 0 everywhere.
     DeviceError
-        No OpenCL device was found, or the device failed.
-    FileError
-        A file cannot be read or written, or exists and must not be overwritten.
+        The device has no double precision, or too little memory for the padding.
+
+    Warns
+    -----
+    LnoclWarning
+        As for `lnocl.deconvolve`, once.
     """
-    trade.check(n_iter, accuracy)
-    if stem is not None:
-        _check_files(stem, overwrite, source.paths)
-    given = source.load()
-    table = None
-    interrupt = None
-    try:
-        for so_far in trade.compare(
-            given.observation,
-            given.stars,
-            given.mu,
-            n_iter,
-            accuracy,
-            given.simulation,
-            device,
-            progress,
-        ):
-            table = so_far
-    except KeyboardInterrupt as error:
-        interrupt = error
-    if table is not None:
-        yield from _report(table, given, accuracy, stem, overwrite)
-    if interrupt is not None:
-        raise interrupt
+    half = max(case.observation.psfs.shape[1:]) // 2
+    settings = [
+        {"precision": precision, "pad": pad}
+        for pad in dict.fromkeys((0, half))
+        for precision in ("double", "single")
+    ]
+
+    def reconstruct(setting: dict[str, Any], n_iter: int, **more: Any) -> Result:
+        given = PAPER | setting | {"n_iter": n_iter, "device": device} | more
+        return deconvolve(case.observation, case.stars, **given)
+
+    reconstruct(settings[0], 1)  # whose warnings are shown
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LnoclWarning)
+        for setting in settings:  # compiled, and with their errors raised, before the work
+            reconstruct(setting, 1)
+    reference = None
+    for setting in settings:
+        timer = IterationTimer({n_iter // part for part in PARTS})
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LnoclWarning)
+            result = reconstruct(setting, n_iter, callback=timer, progress=progress)
+        reference = result.extended if reference is None else reference
+        if not reference[case.rows].any():
+            raise InputError("the images hold no light above their background to measure")
+        each = timer.seconds / (n_iter - 1)
+        for iterations, extended in timer.estimates.items():
+            row = {**setting, "iterations": iterations, "ms": 1e3 * each}
+            row |= {"seconds": each * iterations}
+            row["deviation"] = metrics.restoration_error(extended, reference, case.rows)
+            if case.truth is not None:
+                row["error"] = metrics.restoration_error(extended, case.truth, case.rows)
+            yield row
 
 
-def _report(
-    table: Table, given: BenchmarkInput, accuracy: float, stem: str | None, overwrite: bool
-) -> Iterator[str]:
-    table.meta |= {
-        "version": __version__,
-        "inputs": given.inputs,
-        "stars": [list(star) for star in given.stars],
-        "mu": given.mu,
-    }
-    yield f"deviations from {_reference(table)}, on {table.meta['device']}"
-    yield from _lines(table)
-    yield from (
-        f"{name}: {table[name].description}" for name in DESCRIBED if name in table.colnames
+class IterationTimer:
+    """A callback that times iterations, and stores the estimates at some of them.
+
+    The clock starts after the first iteration, and so holds neither compilation nor start-up. It
+    holds the few copies of an estimate from the device, and stands while it is stored.
+
+    Parameters
+    ----------
+    iterations : collection of int
+        Iterations whose estimate is stored.
+
+    Attributes
+    ----------
+    estimates : dict of int to ndarray
+        Extended source, shape (ny, nx), electrons, by iteration.
+    seconds : float
+        Time of the iterations after the first.
+    """
+
+    def __init__(self, iterations: Collection[int]) -> None:
+        self.estimates: dict[int, Array] = {}
+        self.seconds = 0.0
+        self._iterations, self._resumed = iterations, math.nan
+
+    def __call__(self, iteration: int, estimate: Estimate) -> None:
+        """Store the estimate if this iteration is one of them."""
+        if iteration == 1 or iteration in self._iterations:
+            extended = estimate.extended  # which waits for the device
+            if iteration > 1:
+                self.seconds += time.perf_counter() - self._resumed
+            if iteration in self._iterations:
+                self.estimates[iteration] = extended
+            self._resumed = time.perf_counter()
+
+
+def advice(table: Sequence[dict[str, Any]], accuracy: float) -> str:
+    """Return a sentence that names the fastest setting within an accuracy, if there is one."""
+    good = [row for row in table if row["deviation"] <= accuracy]
+    if not good:
+        return f"for an accuracy of {accuracy:g}: no setting is so close to the reference"
+    best = min(good, key=lambda row: row["seconds"])
+    padding = f"{best['pad']} pixels of padding" if best["pad"] else "no padding"
+    return (
+        f"for an accuracy of {accuracy:g}: {best['precision']} precision, {padding}, "
+        f"{best['iterations']} iterations: {best['seconds']:.2g} s, "
+        f"deviation {best['deviation']:.1e}"
     )
-    if stem is not None:
-        yield from _write(table, stem, overwrite)
-    yield trade.advice(table, accuracy)
 
 
-def _reference(table: Table) -> str:
-    return f"double precision, no padding, {table.meta['n_iter']} iterations"
-
-
-def _lines(table: Table) -> list[str]:
-    # The first column is left-aligned: the command line strips what it prints.
-    align = ["<", *(">" for _ in table.colnames[1:])]
-    return table.pformat(max_lines=-1, max_width=-1, show_unit=True, align=align)
-
-
-def _write(table: Table, stem: str, overwrite: bool) -> Iterator[str]:
+def _write(
+    rows: list[dict[str, Any]], meta: dict[str, Any], stem: str, overwrite: bool
+) -> Iterator[str]:
+    table = Table(rows, meta=meta)
+    for key in table.colnames:
+        table[key].unit, _, table[key].description = COLUMNS[key]
     text = io.StringIO()
     table.write(text, format="ascii.ecsv")
     atomic.write_text(f"{stem}.ecsv", text.getvalue(), overwrite)
@@ -263,25 +288,10 @@ def _write(table: Table, stem: str, overwrite: bool) -> Iterator[str]:
     except LnoclError as error:
         yield f"no picture: {error}"
         return
-    save_figure(_figure(table), f"{stem}.png", overwrite)
+    curves = {}
+    for part in table.group_by(["pad", "precision"]).groups:
+        pad = f"pad {part['pad'][0]}" if part["pad"][0] else "no padding"
+        name = f"{part['precision'][0]}, {pad}"
+        curves[name] = np.array(part["seconds"]), np.array(part["deviation"])
+    save_figure(draw_costs(curves, meta["measure"]), f"{stem}.png", overwrite)
     yield f"drew {stem}.png"
-
-
-def _figure(table: Table) -> Figure:
-    column = trade.deviation_column(table)
-    settings = {}
-    for precision, pad in dict.fromkeys(zip(table["precision"], table["pad"], strict=True)):
-        rows = table[(table["precision"] == precision) & (table["pad"] == pad)]
-        settings[f"{precision}, {f'pad {pad}' if pad else 'no padding'}"] = {
-            "seconds": np.array(rows["seconds"]),
-            "deviation": np.array(rows[column]),
-            "front": np.array(rows["front"]),
-        }
-    return draw_costs(settings, "all rows" if column == "deviation" else "rows around the star")
-
-
-def _check_files(stem: str, overwrite: bool, inputs: Sequence[str]) -> None:
-    if not os.path.basename(stem):
-        raise InputError(f"the output {stem!r} names no file; give a path without its ending")
-    for ending in (".ecsv", ".png"):
-        atomic.check_output(stem + ending, overwrite, inputs)

@@ -10,8 +10,9 @@ from astropy.io import fits
 import lnocl
 from lnocl.commands import cli
 from lnocl.io.saved_results import read_result
-from lnocl.plotting.sources import Frame, Source, draw_objects
+from lnocl.plotting.overview import draw_beside
 from lnocl.scene.psf_families import PsfFamilies
+from lnocl.studies.figures import view_of
 
 N, STAR = 32, (15, 12)
 Y, X = np.indices((N, N))
@@ -118,10 +119,9 @@ def test_doubtful_pixels_are_outlined_and_said(capsys):
     fits.writeto("scatter.fits", 0.05 * PSF)
     assert run("--psf-scatter", "scatter.fits") == 0
     assert cli.main(["plot", "out.fits", "--output", "figures"]) == 0
-    doubtful = read_result("out.fits").doubtful
-    np.testing.assert_array_equal(doubtful, fits.getdata("out.fits", "DOUBTFUL") == 1)
-    source = Source("found", fits.getdata("out.fits"), doubtful=doubtful)
-    figure = draw_objects(None, [source], Frame())
+    saved = read_result("out.fits")
+    np.testing.assert_array_equal(saved.doubtful, fits.getdata("out.fits", "DOUBTFUL") == 1)
+    figure = draw_beside({"found": view_of(saved)})
     lines = [type(artist).__name__ for axis in figure.axes[:2] for artist in axis.collections]
     assert lines == 2 * ["QuadContourSet"]
 

@@ -4,37 +4,19 @@ import sys
 
 import numpy as np
 import pytest
+from result_views import make_view
 
 from lnocl.errors import LnoclError
-from lnocl.plotting.curves import draw_costs, draw_errors, draw_magnitudes
+from lnocl.plotting.curves import draw_costs
 from lnocl.plotting.figure import save_figure
-from lnocl.plotting.overview import draw_overview
-from lnocl.plotting.profiles import draw_bands, draw_profiles
+from lnocl.plotting.overview import draw_beside, draw_overview
+from lnocl.plotting.profiles import draw_bands
 from lnocl.plotting.psf import PSF_FLOOR, draw_star_psf
-from lnocl.plotting.sources import Frame, Source, draw_objects
+from lnocl.plotting.result import Region
 
 pytest.importorskip("matplotlib")
 
-STAR = (20, 24)
-FRAME = Frame(STAR, 5.0)
-
-
-def jet(scale=1.0):
-    """Return a jet that starts at the star and goes up, shape (64, 48)."""
-    y, x = np.mgrid[:64, :48]
-    return scale * 1e3 * np.exp(-0.5 * ((x - STAR[0]) / 3.0) ** 2) / (1 + np.exp(STAR[1] - y))
-
-
-TRUTH = Source("truth", jet())
-WITH_STAR = jet(0.8)
-WITH_STAR[STAR[1], STAR[0]] += 1e7
-FOUND = [Source("RLM", WITH_STAR, holds_star=True), Source("MC-RL", jet(1.1))]
-CURVE = {
-    "iteration": np.array([10.0, 20.0, 30.0]),
-    "rho": np.array([0.5, 0.2, 0.3]),
-    "rho_star": np.array([0.6, 0.5, 0.4]),
-    "magnitude": np.array([13.2, 13.1, 13.0]),
-}
+COSTS = np.array([1.0, 4.0]), np.array([0.1, 0.0])
 
 
 def lines(axis):
@@ -46,98 +28,62 @@ def panels(figure):
     return [axis.images[0] for axis in figure.axes if axis.images]
 
 
-def test_objects_are_shown_on_the_stretch_of_the_truth():
-    shown = panels(draw_objects(TRUTH, FOUND, FRAME))
-    assert len(shown) == 6
-    assert {image.norm.vmax for image in shown} == {TRUTH.extended.max()}
-    titles = [image.axes.get_title() for image in shown]
-    assert titles == ["truth", "RLM", "MC-RL"] * 2
-    np.testing.assert_array_equal(shown[1].get_array(), WITH_STAR)
+def views():
+    """Return two results of one star, which is a part of the first as its brightest pixel."""
+    with_star = make_view(p=0, stars=[], star_fluxes=np.zeros(0))
+    with_star.extended[20, 10] = 1e7
+    return {"RLM": with_star, "MC-RL": make_view(p=0)}
 
 
-def test_the_star_does_not_set_the_stretch_where_there_is_no_truth():
-    shown = panels(draw_objects(None, FOUND, FRAME))
-    assert shown[0].norm.vmax == pytest.approx(1.1e3)
+def test_results_are_shown_on_one_stretch_whole_and_round_the_star():
+    both = views()
+    shown = panels(draw_beside(both))
+    assert [image.axes.get_title() for image in shown] == 2 * ["RLM", "MC-RL"]
+    np.testing.assert_array_equal(shown[0].get_array(), both["RLM"].extended)
+    # The star at (10, 20), and 16 pixels round it, cut at the frame.
+    np.testing.assert_array_equal(shown[2].get_array(), both["RLM"].extended[4:37, :27])
+    # The star in one of them does not set the stretch.
+    tops = [image.norm.vmax for image in shown]
+    whole, near = both["MC-RL"].extended.max(), both["MC-RL"].extended[4:37, :27].max()
+    assert tops == [whole, whole, near, near]
 
 
-def test_axes_are_in_mas_from_the_star_or_in_pixels():
-    near = panels(draw_objects(TRUTH, FOUND, FRAME))[-1].axes
-    assert near.get_xlabel() == "x from star (mas)"
-    assert near.get_ylim() == (-80, 160)
-    # The pixel of the star is centred on 0.
-    left, right, bottom, top = near.images[0].get_extent()
-    assert (left, right, bottom, top) == (-102.5, 137.5, -122.5, 197.5)
-    whole = panels(draw_objects(TRUTH, FOUND[1:], Frame()))[-1].axes
-    assert whole.get_xlabel() == "x (pixels)"
-    assert whole.get_xlim() == (-0.5, 47.5)
+def test_results_without_stars_or_light_are_shown_whole():
+    dark = make_view(p=0, stars=[], star_fluxes=np.zeros(0), extended=np.zeros((60, 70)))
+    shown = panels(draw_beside({"a": dark, "b": dark}))
+    assert len(shown) == 2
 
 
-def test_errors_are_in_percent_with_their_minimum_marked():
-    left, right = draw_errors({"MC-RL": CURVE}).axes
-    np.testing.assert_allclose(lines(left)["MC-RL"][1], [50, 20, 30])
-    np.testing.assert_allclose(lines(right)["MC-RL"][1], [60, 50, 40])
-    (x, y) = left.lines[1].get_data()
-    assert (x.tolist(), y.tolist()) == ([20.0], [20.0])
-
-
-def test_magnitudes_are_bright_upwards():
-    (axis,) = draw_magnitudes({"RLM": CURVE}, 13.0).axes
-    assert axis.yaxis_inverted()
-    assert set(lines(axis)) == {"RLM", "truth"}
-    (axis,) = draw_magnitudes({"RLM": CURVE}, None).axes
-    assert set(lines(axis)) == {"RLM"}
-
-
-@pytest.mark.parametrize(("kind", "expected"), [("flux", 10.0), ("width", 0.0)])
-def test_profiles_and_their_errors(kind, expected):
-    # So low a threshold that both jets are as wide.
-    figure = draw_profiles(kind, TRUTH, FOUND, FRAME, near=20, threshold=1e-12)
-    near, rest, near_error, rest_error = figure.axes
-    np.testing.assert_array_equal(lines(near)["MC-RL"][0], 5.0 * np.arange(-20, 20))
-    for axis in (near_error, rest_error):
-        values = lines(axis)["MC-RL"][1]
-        np.testing.assert_allclose(values[np.isfinite(values)], expected, atol=1e-9)
-    masked = np.isnan(lines(near)["RLM"][1])
-    assert np.flatnonzero(masked).tolist() == [19, 20, 21]
-    assert lines(rest)["RLM"][0][0] == 5.0 * 20
-
-
-@pytest.mark.parametrize("kind", ["flux", "width"])
-@pytest.mark.parametrize("star", [(20, 4), (20, 62)])
-def test_profiles_of_a_star_in_the_dark_or_at_the_edge(kind, star):
-    light = jet()
-    light[:30] = 0.0
-    dark = Source("truth", light)
-    figure = draw_profiles(kind, dark, FOUND, Frame(star), near=20, threshold=1.0)
-    assert all(len(lines(axis)["MC-RL"][0]) for axis in figure.axes)
-
-
-def test_the_overview_has_a_panel_for_each_and_two_profiles(tmp_path):
-    figure = draw_overview(TRUTH, Source("image", jet()), FOUND, FRAME, 20)
-    assert len(panels(figure)) == 4
+def test_the_overview_has_a_panel_for_each_and_profiles_in_percent(tmp_path):
+    true = np.array([1.0, 50.0, 100.0, 200.0])
+    profiles = {"truth": true, "RLM": 1.5 * true, "MC-RL": 0.9 * true}
+    figure = draw_overview(views(), Region("", (10.0, 20.0), 8), profiles, 2)
+    above, below = figure.subfigs
+    assert [axis.images[0].get_array().shape for axis in above.axes] == [(17, 17), (17, 17)]
+    flux, error = below.axes
+    np.testing.assert_array_equal(lines(flux)["MC-RL"], [[-2, -1, 0, 1], 0.9 * true])
+    # The first row is too faint for an error.
+    np.testing.assert_allclose(error.lines[0].get_ydata(), [np.nan, 50, 50, 50])
+    np.testing.assert_allclose(error.lines[1].get_ydata(), [np.nan, -10, -10, -10])
     save_figure(figure, str(tmp_path / "overview.png"))
-    raw = (tmp_path / "overview.png").read_bytes()
-    assert raw.startswith(b"\x89PNG")
-    assert len(raw) < 200_000
+    assert (tmp_path / "overview.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.exhaustive
-def test_more_results_than_colours_are_drawn(tmp_path):
-    many = [Source(f"MC-RL mu={i}", jet()) for i in range(8)]
-    assert len(draw_profiles("flux", TRUTH, many, FRAME, 20, 100.0).axes) == 4
-    save_figure(draw_objects(TRUTH, many, FRAME), str(tmp_path / "objects.png"))
-    assert (tmp_path / "objects.png").stat().st_size < 200_000
+def test_costs_are_shown_but_for_the_reference():
+    (axis,) = draw_costs({"double": COSTS}, "all rows").axes
+    np.testing.assert_array_equal(lines(axis)["double"], [[1.0], [0.1]])
+    assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
 
 
 def test_pyplot_is_left_alone():
-    draw_objects(TRUTH, FOUND, FRAME)
+    draw_costs({"double": COSTS}, "all rows")
     assert "matplotlib.pyplot" not in sys.modules
 
 
 def test_without_matplotlib_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(LnoclError, match=r"pip install matplotlib$"):
-        draw_errors({"RLM": CURVE})
+        draw_costs({"double": COSTS}, "all rows")
 
 
 @pytest.mark.parametrize("angle", [0.0, 30.0])
@@ -184,16 +130,11 @@ BAND = {name: [1.0, 2.0] for name in ("at", "value", "bias", "low68", "high68", 
 @pytest.mark.parametrize(
     "draw",
     [
-        lambda: draw_objects(TRUTH, [Source(BAD, jet(), note=BAD)], FRAME),
-        lambda: draw_profiles("flux", TRUTH, [Source(BAD, jet())], FRAME, 8, 0.1),
-        lambda: draw_errors({BAD: CURVE}),
-        lambda: draw_magnitudes({BAD: CURVE}, None),
-        lambda: draw_costs(
-            {BAD: {name: np.ones(2) for name in ("seconds", "deviation", "front")}}, "all rows"
-        ),
+        lambda: draw_beside({BAD: make_view(p=0)}),
+        lambda: draw_overview(views(), Region(""), {"truth": np.ones(3), BAD: np.ones(3)}, 1),
         lambda: draw_bands(BAD, BAND, BAND, BAD),
     ],
-    ids=["objects", "profiles", "errors", "magnitudes", "costs", "bands"],
+    ids=["beside", "overview", "bands"],
 )
 def test_words_of_users_and_files_are_no_formulas(draw):
     from matplotlib.text import Text

@@ -240,9 +240,8 @@ def test_errors_of_ours_are_not_taken_for_the_file_s(sound, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"MU": "large"}, "MU of {} is 'large', not a finite number"),
-        ({"PIXSCALE": "wide", "OF": "truth"}, "PIXSCALE of {} is 'wide', not a finite number"),
-        ({"OF": "truth", "MAGZERO": "bright"}, "MAGZERO of {} is 'bright', not a finite number"),
+        ({"NITER": "many"}, "NITER of {} is 'many', not a finite number"),
+        ({"OF": "truth", "NITER": "many"}, "NITER of {} is 'many', not a finite number"),
     ],
 )
 def test_what_should_be_numbers_in_a_header(sound, tmp_path, quick_figures, changes, message):
@@ -255,7 +254,7 @@ def test_what_should_be_numbers_in_a_header(sound, tmp_path, quick_figures, chan
         draw(sound, str(path), name)
 
 
-@pytest.mark.parametrize("position", [(1e300, 3.0), (3.0, np.nan), (-1.0, 3.0), (3.0, 32.0)])
+@pytest.mark.parametrize("position", [(1e300, 3.0), (3.0, np.nan), (-4.0, 3.0), (3.0, 35.0)])
 def test_a_star_outside_its_image_is_not_drawn(sound, tmp_path, quick_figures, position):
     path = tmp_path / "damaged"
     fitswrite.write_result(str(path), COUNTS, [position], [1e5])

@@ -1,8 +1,8 @@
 """The simulation against theory: PSF, photometry, noise and scenes."""
 
-import json
 import math
 import runpy
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +20,9 @@ from lnocl.simulation import (
     Experiment,
     Star,
     Target,
-    collecting_area,
-    electrons,
     fizeau_psf,
     hh34,
     load_target,
-    photon_rate,
-    pixel_magnitude,
     simulate,
 )
 
@@ -183,7 +179,6 @@ def test_photometry_by_hand():
     assert sky == pytest.approx(558.8, rel=2e-4)
 
     experiment = Experiment()
-    assert collecting_area().to_value(u.m**2) == pytest.approx(area)
     assert experiment.source_electrons(13 * u.mag) == pytest.approx(star, rel=1e-5)
     assert experiment.source_electrons(experiment.extended_magnitude) == pytest.approx(
         star, rel=1e-5
@@ -197,20 +192,17 @@ def test_photometry_documented():
         assert number in text
 
 
-@given(st.floats(-5, 30), st.floats(0.1, 10), st.floats(0.1, 10))
+@given(st.floats(-5, 30), st.floats(0.1, 10), st.floats(0.1, 1.9))
 def test_photometry_scales(mag, wider, coarser):
-    args = (666.7 * u.Jy, H2)
-    rate = photon_rate(mag * u.mag, *args, 0.02 * u.um)
-    fainter = photon_rate((mag + 5) * u.mag, *args, 0.02 * u.um)
-    assert (rate / fainter).value == pytest.approx(100)
-    broad = photon_rate(mag * u.mag, *args, 0.02 * wider * u.um)
-    assert (broad / rate).value == pytest.approx(wider)
-    counts = electrons(rate, 10 * u.m**2, 0.5, 1 * u.min)
-    assert counts.value == pytest.approx(rate.value * 300)
-    sky = mag * u.mag / u.arcsec**2
-    assert pixel_magnitude(sky, 1 * u.arcsec).value == pytest.approx(mag)
-    difference = pixel_magnitude(sky, 5 * u.mas) - pixel_magnitude(sky, 5 * coarser * u.mas)
-    assert difference.value == pytest.approx(5 * math.log10(coarser), abs=1e-9)
+    plain = Experiment().source_electrons(mag * u.mag)
+    assert plain / Experiment().source_electrons((mag + 5) * u.mag) == pytest.approx(100)
+    changed = Experiment(
+        bandwidth=0.02 * wider * u.um, throughput=0.15, exposure_time="1 min",
+        pixel_scale=5 * coarser * u.mas, sky_brightness=f"{mag} mag/arcsec2",
+    )  # fmt: skip
+    assert changed.source_electrons(mag * u.mag) == pytest.approx(plain * wider / 60)
+    per_arcsec2 = changed.sky_electrons / (0.005 * coarser) ** 2
+    assert per_arcsec2 == pytest.approx(changed.source_electrons(mag * u.mag))
 
 
 @pytest.mark.usefixtures("few_screens")
@@ -231,7 +223,6 @@ def test_images_are_a_periodic_convolution_with_noise():
     fluxes = simulation.star_fluxes
     assert fluxes[0] / fluxes[1] == pytest.approx(10**0.8)
     assert simulation.extended.sum() == pytest.approx(3.542e7, rel=2e-4)
-    assert simulation.zero_magnitude_flux == pytest.approx(fluxes[0] * 10**5.2)
 
 
 @pytest.mark.usefixtures("few_screens")
@@ -254,30 +245,6 @@ def test_simulation_follows_its_seed():
     assert (first.psfs == again.psfs).all()
     assert (first.psfs != other.psfs).any()
     assert not np.allclose(first.psfs[0], first.psfs[1].T, rtol=1e-3)
-
-
-@pytest.mark.usefixtures("few_screens")
-def test_record_is_complete_json():
-    experiment = Experiment(angles=[10, 55] * u.deg, seed=np.int64(7))
-    simulation = simulate(hh34(64), experiment)
-    record = json.loads(json.dumps(simulation.record()))
-    assert record["experiment"]["angles"] == {"value": [10.0, 55.0], "unit": "deg"}
-    assert set(record["experiment"]) == set(vars(experiment))
-    assert record["target"]["stars"][0] == {
-        "x": 32,
-        "y": 16,
-        "electrons": pytest.approx(simulation.star_fluxes[0]),
-    }
-    assert record["target"]["shape"] == [64, 64]
-    assert record["sky_electrons_per_pixel"] == simulation.background[0]
-    # The record is enough to repeat the experiment.
-    again = Experiment(
-        **{
-            name: u.Quantity(value["value"], value["unit"]) if isinstance(value, dict) else value
-            for name, value in record["experiment"].items()
-        }
-    )
-    assert (simulate(hh34(64), again).images == simulation.images).all()
 
 
 @pytest.mark.parametrize("size", [64, 250, 512, 1024])
@@ -416,15 +383,16 @@ def flat(**pixels):
         (lambda: Experiment(zero_point=0 * u.Jy), "zero_point"),
         (lambda: Experiment(sky_brightness=13 * u.mag), "sky_brightness"),
         (lambda: Experiment(seed=-1), "seed"),
-        (lambda: Experiment(exposure_time="1e300 min"), "the extended source would leave"),
-        (
-            lambda: Experiment(exposure_time="1e307 min"),
-            "exposure_time must be finite|infinitely|would leave",
+        *(
+            (partial(simulate, Target(flat()), Experiment(**extreme)), "all light together")
+            for extreme in (
+                {"exposure_time": "1e300 min"},
+                {"exposure_time": "1e308 min"},
+                {"sky_brightness": "-1000 mag/arcsec2"},
+                {"extended_magnitude": "-1000 mag"},
+                {"read_noise": "1e300 electron"},
+            )
         ),
-        (lambda: Experiment(sky_brightness=-1000 * u.mag / u.arcsec**2), "too bright"),
-        (lambda: Experiment(sky_brightness=-50 * u.mag / u.arcsec**2), "the sky in a pixel"),
-        (lambda: Experiment(read_noise=1e300 * u.electron), "read_noise would leave"),
-        (lambda: simulate(Target(flat(), [Star(1, 2, -40 * u.mag)])), r"star at \(1, 2\) would"),
         (lambda: simulate(Target(flat(), [Star(1, 2, -5.5 * u.mag)] * 3)), "all light together"),
         (lambda: psf_of(64, pixel=10 * u.mas), "pixel_scale must be at most 9.59 mas"),
         (lambda: psf_of(64, pixel=0.1 * u.mas), "coarser pixels"),
