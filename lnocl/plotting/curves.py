@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import MARKERS, Array, line_style, new_figure
+from lnocl.plotting.figure import Array, line_style, new_figure
 
 
 def draw_costs(settings: Mapping[str, tuple[Array, Array]], measure: str) -> Figure:
@@ -36,13 +36,7 @@ def draw_costs(settings: Mapping[str, tuple[Array, Array]], measure: str) -> Fig
     axis = figure.subplots()
     for i, (name, (seconds, deviation)) in enumerate(settings.items()):
         shown = deviation > 0
-        axis.plot(
-            seconds[shown],
-            deviation[shown],
-            marker=MARKERS[i % len(MARKERS)],
-            **line_style(i),
-            label=name,
-        )
+        axis.plot(seconds[shown], deviation[shown], **line_style(i), marker="o", label=name)
     axis.set(xscale="log", yscale="log", xlabel="time (s)", ylabel=f"deviation, {measure}")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=9)

@@ -21,7 +21,6 @@ DPI = 110
 # The palette of M. Okabe and K. Ito, "Color Universal Design" (2008), for colour-blind readers.
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 STYLES = ("-", "--", "-.", ":")
-MARKERS = ("o", "s", "^", "D")
 COLOUR_MAP = "viridis"
 
 

@@ -116,20 +116,14 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
             f"all light together and the read noise would leave {total:.3g} electrons in one "
             f"image; at most {MAX_ELECTRONS:.0e} can be simulated"
         )
-    *psf_seeds, noise_seed = np.random.SeedSequence(experiment.seed).spawn(
-        len(experiment.angles) + 1
-    )
+    p = len(experiment.angles)
+    *seeds, noise_seed = np.random.SeedSequence(experiment.seed).spawn(p + 1)
+    how = experiment.wavelength, experiment.pixel_scale, experiment.strehl
+    shape = target.extended.shape
     psfs = np.stack(
         [
-            fizeau_psf(
-                target.extended.shape,
-                angle,
-                experiment.wavelength,
-                experiment.pixel_scale,
-                experiment.strehl,
-                seed,
-            )
-            for angle, seed in zip(experiment.angles, psf_seeds, strict=True)
+            fizeau_psf(shape, angle, *how, seed)
+            for angle, seed in zip(experiment.angles, seeds, strict=True)
         ]
     )
     extended = target.extended * extended_flux
@@ -138,14 +132,7 @@ def simulate(target: Target, experiment: Experiment | None = None) -> Simulation
     rng = np.random.default_rng(noise_seed)
     images = rng.poisson(expected) + rng.normal(0.0, read_noise, expected.shape)
     return Simulation(
-        images=images,
-        psfs=psfs,
-        background=background,
-        read_noise=read_noise,
-        extended=extended,
-        stars=stars,
-        star_fluxes=star_fluxes,
-        experiment=experiment,
+        images, psfs, background, read_noise, extended, stars, star_fluxes, experiment
     )
 
 

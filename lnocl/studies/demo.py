@@ -9,9 +9,8 @@ from dataclasses import replace
 from lnocl import metrics
 from lnocl.errors import LnoclError
 from lnocl.io.saved_results import read_result
+from lnocl.plotting.beside import draw_beside
 from lnocl.plotting.figure import check_matplotlib
-from lnocl.plotting.overview import draw_overview
-from lnocl.plotting.result import Region
 from lnocl.studies.figures import save, view_of
 
 SCENE = "hh34"
@@ -20,9 +19,6 @@ SCENE = "hh34"
 N_ITER = 2000
 PAPER = ("--solver", "sgm", "--stop", "none", "--smoothing", "0")
 METHODS = {"RLM": "0", "MC-RL": "3e-8"}
-# Rows of the profiles on either side of the star; half the side of the region that is shown, whose
-# middle lies so many rows along the jet.
-NEAR, HALF, ALONG = 20, 24, 8
 
 
 def commands(folder: str, words: list[str]) -> Iterator[list[str]]:
@@ -55,12 +51,13 @@ def compare(folder: str, overwrite: bool) -> Iterator[str]:
     ((x, y),) = truth.stars
     star = round(x), round(y)
     rows = metrics.star_rows(star, truth.extended.shape)
-    masked = {method: None if each.stars else star for method, each in found.items()}
     near = {}
     yield f"{'method':<6} {'rho':>8}' {'rho':>7}'' {'star':>9}"
     for method, each in found.items():
         rho, near[method] = (
-            metrics.restoration_error(each.extended, truth.extended, where, masked[method])
+            metrics.restoration_error(
+                each.extended, truth.extended, where, None if each.stars else star
+            )
             for where in (None, rows)
         )
         flux = f"{each.star_fluxes[0] / truth.star_fluxes[0] - 1.0:+.2%}" if each.stars else ""
@@ -83,12 +80,7 @@ def compare(folder: str, overwrite: bool) -> Iterator[str]:
         **{f"{method}, error {near[method]:.0%}": each.extended for method, each in found.items()},
     }
     views = {name: replace(view, extended=each) for name, each in shown.items()}
-    first = max(star[1] - NEAR, 0)
-    profiles = {"truth": metrics.flux_profile(truth.extended)}
-    profiles |= {m: metrics.flux_profile(each.extended, masked[m]) for m, each in found.items()}
-    near_star = {name: each[first : star[1] + NEAR] for name, each in profiles.items()}
-    figure = draw_overview(views, Region("", (x, y + ALONG), HALF), near_star, star[1] - first)
-    yield save(folder, "demo", figure, overwrite)
+    yield save(folder, "demo", draw_beside(views), overwrite)
 
 
 def _path(folder: str, name: str) -> str:

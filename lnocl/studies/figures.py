@@ -12,8 +12,8 @@ from lnocl.errors import InputError
 from lnocl.io import atomic
 from lnocl.io.fitserrors import read_errors
 from lnocl.io.saved_results import SavedResult, read_result
+from lnocl.plotting.beside import draw_beside
 from lnocl.plotting.figure import check_matplotlib, save_figure
-from lnocl.plotting.overview import draw_beside
 from lnocl.plotting.profiles import draw_bands
 from lnocl.plotting.report import make_report
 from lnocl.plotting.result import ResultView, draw_result

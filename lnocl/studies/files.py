@@ -45,7 +45,7 @@ def write_simulation(
     for j, (image, psf, angle) in enumerate(
         zip(simulation.images, simulation.psfs, angles, strict=True), 1
     ):
-        common: list[fitswrite.Card] = [
+        both: list[fitswrite.Card] = [
             creator,
             scale,
             ("ANGLE", angle, "of the baseline, degrees"),
@@ -56,8 +56,8 @@ def write_simulation(
             ("BKG", float(simulation.background[j - 1]), "background, electrons"),
             ("RON", simulation.read_noise, "read noise, electrons"),
         ]
-        fitswrite.write_image(path_in(folder, f"image_{j}"), image, [*common, *taken], overwrite)
-        fitswrite.write_image(path_in(folder, f"psf_{j}"), psf, common, overwrite)
+        fitswrite.write_image(path_in(folder, f"image_{j}"), image, [*both, *taken], overwrite)
+        fitswrite.write_image(path_in(folder, f"psf_{j}"), psf, both, overwrite)
     fitswrite.write_result(
         path_in(folder, "truth"),
         simulation.extended,

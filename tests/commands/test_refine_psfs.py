@@ -10,7 +10,7 @@ from astropy.io import fits
 import lnocl
 from lnocl.commands import cli
 from lnocl.io.saved_results import read_result
-from lnocl.plotting.overview import draw_beside
+from lnocl.plotting.beside import draw_beside
 from lnocl.scene.psf_families import PsfFamilies
 from lnocl.studies.figures import view_of
 

@@ -7,12 +7,10 @@ import pytest
 from result_views import make_view
 
 from lnocl.errors import LnoclError
+from lnocl.plotting.beside import draw_beside
 from lnocl.plotting.curves import draw_costs
-from lnocl.plotting.figure import save_figure
-from lnocl.plotting.overview import draw_beside, draw_overview
 from lnocl.plotting.profiles import draw_bands
 from lnocl.plotting.psf import PSF_FLOOR, draw_star_psf
-from lnocl.plotting.result import Region
 
 pytest.importorskip("matplotlib")
 
@@ -52,21 +50,6 @@ def test_results_without_stars_or_light_are_shown_whole():
     dark = make_view(p=0, stars=[], star_fluxes=np.zeros(0), extended=np.zeros((60, 70)))
     shown = panels(draw_beside({"a": dark, "b": dark}))
     assert len(shown) == 2
-
-
-def test_the_overview_has_a_panel_for_each_and_profiles_in_percent(tmp_path):
-    true = np.array([1.0, 50.0, 100.0, 200.0])
-    profiles = {"truth": true, "RLM": 1.5 * true, "MC-RL": 0.9 * true}
-    figure = draw_overview(views(), Region("", (10.0, 20.0), 8), profiles, 2)
-    above, below = figure.subfigs
-    assert [axis.images[0].get_array().shape for axis in above.axes] == [(17, 17), (17, 17)]
-    flux, error = below.axes
-    np.testing.assert_array_equal(lines(flux)["MC-RL"], [[-2, -1, 0, 1], 0.9 * true])
-    # The first row is too faint for an error.
-    np.testing.assert_allclose(error.lines[0].get_ydata(), [np.nan, 50, 50, 50])
-    np.testing.assert_allclose(error.lines[1].get_ydata(), [np.nan, -10, -10, -10])
-    save_figure(figure, str(tmp_path / "overview.png"))
-    assert (tmp_path / "overview.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_costs_are_shown_but_for_the_reference():
@@ -131,10 +114,9 @@ BAND = {name: [1.0, 2.0] for name in ("at", "value", "bias", "low68", "high68", 
     "draw",
     [
         lambda: draw_beside({BAD: make_view(p=0)}),
-        lambda: draw_overview(views(), Region(""), {"truth": np.ones(3), BAD: np.ones(3)}, 1),
         lambda: draw_bands(BAD, BAND, BAND, BAD),
     ],
-    ids=["beside", "overview", "bands"],
+    ids=["beside", "bands"],
 )
 def test_words_of_users_and_files_are_no_formulas(draw):
     from matplotlib.text import Text
