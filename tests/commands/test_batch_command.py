@@ -189,11 +189,18 @@ def test_job_arrays_share_the_targets():
     assert {each["status"] for each in summary().values()} == {"done"}
 
 
-@pytest.mark.parametrize("part", ["0/3", "4/3", "1", "a/b", "1/0"])
-def test_parts_that_are_none_are_refused(part, capsys):
+@pytest.mark.parametrize(
+    ("option", "values", "message"),
+    [
+        ("--array", ["0/3", "4/3", "1", "a/b", "1/0"], "is not I/N with 1 <= I <= N"),
+        ("--parallel", ["0", "-2", "many", "1.5"], "is neither a number of processes"),
+    ],
+)
+def test_parts_and_processes_that_are_none_are_refused(option, values, message, capsys):
     write_targets(*GOOD)
-    assert batch("--array", part) == 2
-    assert f"'{part}' is not I/N with 1 <= I <= N" in one_complaint(capsys.readouterr())
+    for value in values:
+        assert batch(option, value) == 2
+        assert f"'{value}' {message}" in one_complaint(capsys.readouterr())
 
 
 @pytest.mark.parametrize("ending", ["ecsv", "csv", "fits"])
@@ -280,18 +287,6 @@ def test_an_interrupt_ends_it_and_the_next_call_goes_on():
     write_targets(GOOD[0], 'long,cube.fits,psfs.fits,"7,5",2', GOOD[1])
     assert batch("--quiet") == 0
     assert [each["n_iter"] for each in summary().values()] == [3, 2, 2]
-
-
-def test_sigterm_ends_it_with_its_status():
-    write_targets('long,cube.fits,psfs.fits,"7,5",1000000')
-    words = [sys.executable, "-m", "lnocl", "batch", "targets.csv", "-o", "out"]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
-        while not os.path.exists("out/long.json"):
-            time.sleep(0.01)
-        time.sleep(0.5)
-        process.send_signal(signal.SIGTERM)
-        assert process.stderr.read().splitlines()[-1] == "lnocl: error: terminated"
-    assert process.returncode == 143
 
 
 @pytest.mark.parametrize("error", [ValueError("odd"), RecursionError("deep"), KeyError("k")])
@@ -383,10 +378,3 @@ def test_without_dask_it_works_but_in_parallel(monkeypatch, capsys):
         "parallel needs Dask; install it with: pip install distributed"
     )
     assert batch("--quiet") == 0
-
-
-@pytest.mark.parametrize("wrong", ["0", "-2", "many", "1.5"])
-def test_processes_that_are_none_are_refused(wrong, capsys):
-    write_targets(*GOOD)
-    assert batch("--parallel", wrong) == 2
-    assert f"'{wrong}' is neither a number of processes" in one_complaint(capsys.readouterr())

@@ -267,13 +267,3 @@ class TestFrames:
         columns = ["x", "y", "flux", "flux_error", "mag"]
         assert list(found["STARS"]) == [*columns, "core_rms", "wings_rms", "halo"]
         assert found["MODELS"].shape == (2, *SHAPE)
-
-    @pytest.mark.usefixtures("quick_figures")
-    def test_the_result_is_plotted(self, capsys):
-        pytest.importorskip("matplotlib")
-        assert self.run(*self.OPTIONS, *self.sky_option) == 0
-        capsys.readouterr()
-        assert cli.main(["plot", "out.fits", "-o", "figures"]) == 0
-        written = capsys.readouterr().out
-        assert "figures/result.png" in written
-        assert Path("figures/result.png").exists()

@@ -254,27 +254,6 @@ class TestWhatIsGiven:
         assert calibrate("other.fits", {}) == {}
         assert calibrate("a.fits", {}) == {}
 
-    def test_flags_of_another_shape_are_refused(self, capsys):
-        of_nircam("cal")
-        with fits.open("cal.fits", mode="update") as file:
-            file["DQ"].data = file["DQ"].data[:30, :30]
-        write_stpsf()
-        fits.writeto("m.fits", np.zeros((N, N)))
-        command = ["deconvolve", "cal.fits", "--psf", "stpsf.fits", "--mask", "m.fits"]
-        assert cli.main([*command, "-o", "o.fits"]) == 2
-        assert "the extension DQ of cal.fits has the shape (30, 30)" in capsys.readouterr().err
-
-    def test_flags_that_are_no_numbers_are_refused(self, capsys):
-        of_acs("flt")
-        with fits.open("flt.fits") as file:
-            flags = file["DQ"].data.astype("f4")
-            flags[3, 3] = np.nan
-            planes = [file[0].copy(), file["SCI"].copy(), fits.ImageHDU(flags, name="DQ")]
-            fits.HDUList(planes).writeto("flags.fits")
-        write_stpsf()
-        assert cli.main(["deconvolve", "flags.fits", "--psf", "stpsf.fits", "-o", "o.fits"]) == 2
-        assert "does not hold whole numbers" in capsys.readouterr().err
-
     def test_variances_that_tell_no_gain(self, capsys):
         of_nircam("cal")
         with fits.open("cal.fits", mode="update") as file:

@@ -38,12 +38,6 @@ class TestProcess:
         *NUMPY,
     )
 
-    def test_an_error_is_one_line_and_no_traceback(self):
-        done = outside(*self.ARGUMENTS, "--mu", "-1", "-o", "out.fits")
-        assert done.returncode == 2
-        assert done.stderr.count("\n") == 1
-        assert done.stderr.startswith("lnocl: error: --mu must be")
-
     def test_version_and_help_load_nothing_heavy(self):
         for option in ("--version", "--help"):
             script = (
@@ -137,11 +131,6 @@ class TestProcess:
         assert list(kernels.iterdir()) == []
         assert not Path("out.fits").exists()
 
-    def test_signals_do_again_what_they_did(self):
-        before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-        assert run() == 0
-        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-
     def test_it_runs_in_a_thread_which_hears_no_signals(self):
         statuses = []
         thread = threading.Thread(target=lambda: statuses.append(run("--quiet")))
@@ -153,9 +142,6 @@ class TestProcess:
         done = outside(*self.ARGUMENTS, "-o", "naïve.fits", PYTHONIOENCODING="ascii")
         assert done.stderr == ""
         assert done.stdout.endswith("written to na\\xefve.fits\n")
-
-    def test_a_progress_bar_stays_off_a_stderr_that_is_no_terminal(self):
-        assert outside(*self.ARGUMENTS, "-o", "out.fits").stderr == ""
 
 
 @pytest.mark.parametrize("way", ["script", "module", "library"])
