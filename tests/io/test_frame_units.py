@@ -167,18 +167,6 @@ class TestUnits:
         found = observe("1.fits", error=["err.fits"])
         assert np.median(found.background) < 1.0
 
-    @pytest.mark.parametrize("unit", DIGITAL_RATES)
-    def test_adu_per_second_need_the_exposure_too(self, unit):
-        save_images(BUNIT=unit)
-        with pytest.raises(InputError, match="holds counts per time"):
-            observe(gain=2.0)
-
-    @pytest.mark.parametrize("unit", ["count/min", "ADU/min"])
-    def test_a_minute_is_sixty_seconds(self, unit):
-        save_images(BUNIT=unit)
-        found = observe(exposure=[120.0], gain=1.5).images
-        np.testing.assert_allclose(found, 3.0 * IMAGES, rtol=1e-14)
-
     def test_images_in_several_units_are_refused(self):
         save("1.fits", IMAGES[0], BUNIT="electron")
         save("2.fits", IMAGES[1], BUNIT="ADU")
@@ -209,12 +197,6 @@ class TestUnits:
         with pytest.raises(InputError, match=f"1.fits is in {unit}, not in counts; give gain"):
             observe(exposure=[1.0])
 
-    @pytest.mark.parametrize("gain", [0.0, -1.0, np.nan, np.inf])
-    def test_a_gain_out_of_range(self, gain):
-        save_images()
-        with pytest.raises(InputError, match=f"gain must be more than 0; {gain:g} "):
-            observe(gain=gain)
-
     @pytest.mark.parametrize("unit", ["-1", "1e400 ct", "4t448", "2u14", "1,", "mag(ct)"])
     def test_text_that_is_not_a_unit(self, unit):
         assert isinstance(units.parse(unit), u.UnrecognizedUnit)
@@ -228,10 +210,3 @@ class TestUnits:
             assert isinstance(unit, u.UnitBase)
             counts = units.count_of(unit)
             assert counts is None or counts[0] > 0
-
-    @given(
-        unit=st.sampled_from(["electron", "ct", "adu", "electron / s", "ct / s", "adu / s"]),
-        change=st.sampled_from([str.upper, str.lower, str.title]),
-    )
-    def test_case_does_not_matter(self, unit, change):
-        assert units.parse(change(unit)) == u.Unit(unit)

@@ -10,7 +10,7 @@ from frame_files import IMAGES, MAP, NONE, SHAPE, notes, observe, read, save, sa
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lnocl.errors import FileError, InputError, LnoclWarning, counted
+from lnocl.errors import InputError, LnoclWarning, counted
 from lnocl.scene.noise_check import warn_of_noise
 
 pytestmark = pytest.mark.usefixtures("frame_folder")
@@ -26,11 +26,6 @@ class TestExposure:
         mixed = observe(exposure=["map.fits", 5.0]).exposure
         np.testing.assert_array_equal(mixed, [MAP, np.full(SHAPE, 5.0)])
 
-    def test_rates_are_times_a_map(self):
-        save_images(BUNIT="e-/s")
-        save("map.fits", MAP)
-        np.testing.assert_array_equal(observe(exposure=["map.fits"]).images, IMAGES * MAP)
-
     def test_where_there_is_none_pixels_are_bad(self, log):
         save_images(BUNIT="e-/s")
         exposure = MAP.copy()
@@ -38,6 +33,8 @@ class TestExposure:
         save("map.fits", exposure)
         observation = observe(exposure=["map.fits"])
         np.testing.assert_array_equal(observation.mask, [exposure == 0] * 2)
+        good = exposure > 0
+        np.testing.assert_array_equal(observation.images[:, good], (IMAGES * exposure)[:, good])
         assert "image 1: 2 pixels masked without exposure" in notes(log)
 
     def test_a_keyword_of_each_header(self, log):
@@ -54,14 +51,20 @@ class TestExposure:
         save("2.fits", IMAGES[1])
         save("map.fits", MAP)
         np.testing.assert_array_equal(observe(exposure=["EXPTIME", 2.0]).exposure, [100.0, 2.0])
+        save("cube.fits", IMAGES, EXPTIME=3.0)  # which holds for all its images
+        found = observe("cube.fits", exposure=["EXPTIME"]).exposure
+        np.testing.assert_array_equal(found, [3.0, 3.0])
         mixed = observe(exposure=["EXPTIME", "map.fits"]).exposure
         np.testing.assert_array_equal(mixed, [np.full(SHAPE, 100.0), MAP])
 
     def test_a_keyword_of_the_primary_header_where_the_image_is_an_extension(self):
         for path, image, time in zip(("1.fits", "2.fits"), IMAGES, (30.0, 40.0), strict=True):
-            primary = fits.PrimaryHDU(header=fits.Header({"EXPTIME": time}))
+            cards = {"EXPTIME": time, "BUNIT": "ELECTRONS/S"}
+            primary = fits.PrimaryHDU(header=fits.Header(cards))
             fits.HDUList([primary, fits.ImageHDU(image)]).writeto(path)
-        np.testing.assert_array_equal(observe(exposure=["EXPTIME"]).exposure, [30.0, 40.0])
+        found = observe(exposure=["EXPTIME"])
+        np.testing.assert_array_equal(found.exposure, [30.0, 40.0])
+        np.testing.assert_array_equal(found.images, IMAGES * np.reshape([30.0, 40.0], (2, 1, 1)))
 
     @pytest.mark.parametrize(
         ("name", "right", "wrong"),
@@ -81,17 +84,6 @@ class TestExposure:
             save("map.fits", MAP, BUNIT=unit)
             with pytest.raises(InputError, match=rf"{name} map\.fits is in {unit}, and taken in "):
                 observe(**{name: ["map.fits"]})
-
-    def test_a_unit_of_the_primary_header_where_the_image_is_an_extension(self):
-        for path, image in zip(("1.fits", "2.fits"), IMAGES, strict=True):
-            primary = fits.PrimaryHDU(header=fits.Header({"BUNIT": "ELECTRONS/S"}))
-            fits.HDUList([primary, fits.ImageHDU(image)]).writeto(path)
-        np.testing.assert_array_equal(observe(exposure=[20.0]).images, 20.0 * IMAGES)
-
-    def test_a_keyword_of_a_cube_holds_for_all_its_images(self):
-        save("cube.fits", IMAGES, EXPTIME=3.0)
-        exposure = observe("cube.fits", exposure=["EXPTIME"]).exposure
-        np.testing.assert_array_equal(exposure, [3.0, 3.0])
 
     @pytest.mark.parametrize(
         ("cards", "exposure", "message"),
@@ -144,14 +136,6 @@ class TestBackground:
                 f"image {j}: background {median:.6g} electrons per pixel, scatter {scatter:.3g} "
                 "(sigma-clipped median)"
             ) in notes(log)
-
-    def test_auto_with_numbers_and_maps(self):
-        save_images()
-        save("map.fits", MAP)
-        median = sigma_clipped_stats(IMAGES[1])[1]
-        assert read(background=[3.0, "auto"]).background == [3.0, median]
-        found = read(background=["map.fits", "auto"]).observation.background
-        np.testing.assert_array_equal(found, [MAP, np.full(SHAPE, median)])
 
     @pytest.mark.filterwarnings("ignore:.* % of image . are masked")
     def test_auto_leaves_bad_pixels_out(self):
@@ -351,25 +335,6 @@ class TestNoise:
         with pytest.raises(InputError, match=r"^give variance, or give rms: each is all there"):
             observe(rms=["map.fits"], variance=["map.fits"])
 
-    def test_where_it_is_0_or_nan_pixels_are_bad(self, log):
-        save_images()
-        inverse = 1.0 / MAP
-        inverse[0, 1], inverse[2, 3], inverse[4, 5] = 0.0, np.nan, np.inf
-        save("inverse.fits", inverse)
-        save("mask.fits", (np.arange(MAP.size) == 1).reshape(SHAPE).astype(int))
-        observation = observe(inverse_variance=["inverse.fits"], mask=["mask.fits"])
-        bad = (inverse == 0) | ~np.isfinite(inverse)
-        np.testing.assert_array_equal(observation.mask, [bad, bad])
-        np.testing.assert_allclose(observation.background[0][~bad], MAP[~bad], rtol=1e-14)
-        assert "image 0: 1 pixel masked by the mask" in notes(log)
-        assert "image 0: 2 pixels masked without inverse variance" in notes(log)
-
-    def test_one_for_each(self):
-        save_images()
-        save("cube.fits", [1.0 / MAP, 2.0 / MAP])
-        observation = observe(inverse_variance=["cube.fits"])
-        np.testing.assert_allclose(observation.background, [MAP, MAP / 2.0], rtol=1e-14)
-
     def test_refusals(self):
         save_images()
         save("inverse.fits", MAP - 1.5)
@@ -521,14 +486,6 @@ class TestMask:
         assert not observe().mask.any()
         assert notes(log) == []
 
-    def test_wrong_shape_and_missing_file(self):
-        save_images()
-        save("mask.fits", np.zeros((3, *SHAPE)))
-        with pytest.raises(InputError, match=r"mask mask\.fits has the shape \(3, 10, 12\) and"):
-            observe(mask=["mask.fits"])
-        with pytest.raises(FileError, match=r"no\.fits cannot be opened"):
-            observe(mask=["no.fits"])
-
     @pytest.mark.filterwarnings("ignore:.* % of image . are masked")
     @given(data=st.data())
     def test_a_pixel_is_bad_for_any_reason(self, data):
@@ -593,19 +550,6 @@ class TestOffsets:
             "cube.fits is a cube, with one WCS for all its images; to align them give a file for "
             "each"
         )
-
-
-def test_checksums_are_kept_by_what_the_files_are():
-    save_images()
-    save("map.fits", MAP)
-    found = read(background=["map.fits"], exposure=["map.fits"], read_noise=["map.fits"])
-    assert {name: len(sums) for name, sums in found.sha256.items()} == {
-        "images": 2,
-        "psfs": 1,
-        "background": 1,
-        "exposure": 1,
-        "read_noise": 1,
-    }
 
 
 # Pixels of 0.05 arcsec.

@@ -54,11 +54,6 @@ def test_regions_may_be_given_themselves():
     assert found.n_pixels == pytest.approx(np.pi * 6.25)
 
 
-def test_a_region_may_touch_the_edge(tmp_path):
-    (found,) = read("image\nbox(25.5,20.5,50,40,0)", tmp_path)
-    assert found.flux(np.ones(SHAPE)) == pytest.approx(2000.0)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -97,12 +97,6 @@ class TestOffsets:
         found = sky.offsets(headers, ["a", "b"], SHAPE)
         np.testing.assert_allclose(found[1], moved.mean(axis=(1, 2)), atol=1e-3)
 
-    def test_several_and_one(self):
-        headers = [header(), header(CRPIX1=7.0), header(CRPIX2=5.0)]
-        found = sky.offsets(headers, ["a", "b", "c"], SHAPE)
-        np.testing.assert_allclose(found, [(0, 0), (1, 0), (0, -3)], atol=1e-6)
-        np.testing.assert_array_equal(sky.offsets(headers[:1], ["a"], SHAPE), [(0, 0)])
-
     def test_a_little_turn_is_allowed(self):
         # 0.5 degrees move the corners by 7.5 pixels times 0.0087.
         found = sky.offsets([header(), header(angle=0.5)], ["a", "b"], SHAPE)
@@ -146,9 +140,6 @@ class TestPositions:
         texts = [f"{ra!r},{dec!r}" for ra, dec in degrees.tolist()]
         found = sky.to_pixels(sky.parse_sky(texts), wcs, "a.fits")
         np.testing.assert_allclose(found, positions, atol=1e-6)
-
-    def test_no_positions(self):
-        assert sky.to_sky(np.zeros((0, 2)), header()).shape == (0, 2)
 
     @given(ra=st.floats(0, 359.99), dec=st.floats(-89.99, 89.99), sep=st.sampled_from(": "))
     def test_degrees_and_sexagesimal_are_the_same(self, ra, dec, sep):
@@ -360,14 +351,6 @@ class TestTables:
         fits.BinTableHDU.from_columns(columns).writeto("t.fits")
         np.testing.assert_array_equal(stars("t.fits"), [(1, 2)])
 
-    @pytest.mark.parametrize("names", ["x,y", "ra,dec"])
-    def test_an_empty_table_is_refused(self, names):
-        with pytest.raises(InputError) as caught:
-            stars(save("t.csv", f"{names}\n"))
-        assert str(caught.value) == (
-            "t.csv has no row; give one a star, or leave --stars out for none"
-        )
-
     @pytest.mark.parametrize("name", ["t.ecsv", "t.fits", "t.csv"])
     @pytest.mark.parametrize("kind", [float, int])
     def test_rows_without_a_number(self, name, kind):
@@ -378,14 +361,6 @@ class TestTables:
         with pytest.raises(InputError) as caught:
             stars(name)
         assert str(caught.value) == f"column x of {name} has rows without a number"
-
-    def test_masked_quantities(self):
-        from astropy.utils.masked import Masked
-
-        table = QTable({"x": Masked([1.0, 2.0] * u.pix, mask=[False, True]), "y": [1, 2] * u.pix})
-        table.write("t.ecsv")
-        with pytest.raises(InputError, match=r"column x of t\.ecsv has rows without a number"):
-            stars("t.ecsv")
 
     @pytest.mark.parametrize(
         ("text", "message"),
@@ -404,6 +379,7 @@ class TestTables:
             ("x,y\n2,inf\n", "column y of t.csv has rows without a number"),
             ("ra,dec\n10,95\n", "column dec of t.csv has rows beyond 90 degrees"),
             ("ra,dec\n330,-30\n", "the star at RA, Dec 330.00000 -30.00000 lies in another part"),
+            ("x,y\n", "t.csv has no row; give one a star, or leave --stars out for none"),
         ],
     )
     def test_tables_that_hold_no_stars(self, text, message):
@@ -411,14 +387,16 @@ class TestTables:
             stars(save("t.csv", text))
         assert message in str(caught.value)
 
-    def test_units_that_are_no_pixels_or_angles(self):
-        Table({"x": [1.0] * u.arcsec, "y": [1.0] * u.arcsec}).write("t.ecsv")
-        with pytest.raises(InputError, match=r"column x of t\.ecsv is not a position: 'arcsec'"):
-            stars("t.ecsv")
-
-    def test_columns_of_vectors(self):
-        Table({"x": np.ones((1, 2)), "y": np.ones((1, 2))}).write("t.ecsv")
-        with pytest.raises(InputError, match=r"column x of t\.ecsv has several numbers in a row"):
+    @pytest.mark.parametrize(
+        ("column", "message"),
+        [
+            ([1.0] * u.arcsec, "is not a position: 'arcsec'"),
+            (np.ones((1, 2)), "has several numbers in a row"),
+        ],
+    )
+    def test_columns_that_are_no_positions(self, column, message):
+        Table({"x": column, "y": column}).write("t.ecsv")
+        with pytest.raises(InputError, match=rf"column x of t\.ecsv {message}"):
             stars("t.ecsv")
 
     def test_the_sky_of_an_image_without_any(self):
