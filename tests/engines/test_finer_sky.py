@@ -111,23 +111,6 @@ def test_steps_lower_the_objective_to_one_minimum(engine):
 
 
 @pytest.mark.parametrize("engine", FEWER_ENGINES)
-def test_power_of_two_scales_bit_for_bit(engine):
-    made = MADE[2]
-    for solver in ("sgm", "sgp"):
-        result = made.deconvolve(n_iter=20, solver=solver, **engine)
-        scaled = made.deconvolve(
-            made.observation(images=4.0 * made.images, background=4.0 * made.background),
-            n_iter=20,
-            solver=solver,
-            initial_extended=4.0 * made.start,
-            initial_star_fluxes=4.0 * FLUXES,
-            **engine,
-        )
-        np.testing.assert_array_equal(scaled.extended, 4.0 * result.extended)
-        np.testing.assert_array_equal(scaled.star_fluxes, 4.0 * result.star_fluxes)
-
-
-@pytest.mark.parametrize("engine", FEWER_ENGINES)
 def test_a_run_resumes_bit_for_bit(engine, tmp_path):
     made, path = MADE[2], tmp_path / "run.fits"
     given = {"n_iter": 12, "solver": "sgp", "refine_positions": True, **engine}

@@ -114,12 +114,14 @@ IMAGES = {
 
 
 @every_engine
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
 @pytest.mark.parametrize("background", [0.0, 1.0])
 @pytest.mark.parametrize("images", IMAGES.values(), ids=IMAGES)
-def test_images(engine, images, background):
+def test_images(engine, solver, images, background):
     mean = images.mean()
     mu = 1e-3 / max(mean, 1e-20)  # of any size, so that it is one program
-    deconvolve(engine, images, mask=MASK, background=background * mean, mu=mu)
+    level = background * mean
+    deconvolve(engine, images, mask=MASK, background=level, mu=mu, solver=solver)
 
 
 def test_the_brightest_images_are_fitted_and_written(tmp_path):

@@ -234,46 +234,6 @@ def test_scatter_is_what_the_errors_say():
     assert (abs((pulls**2).mean(axis=0) - 1.0) <= 4.0 * np.sqrt(2.0 / n)).all()
 
 
-def test_errors_are_those_of_theory():
-    """From sums over the pixels; a star alone has sqrt(N) in flux, sigma / sqrt(N) in position."""
-    flux = 1e4
-    for level, seed in ((0.5, 0), (1e4, 1)):
-        _, errors = fitted(flat_sky(15.3, 16.4, flux, level, seed), (15, 16), level, flux)
-        star, h = gaussian(15.3, 16.4), 1e-4
-        slope = flux * (gaussian(15.3 + h, 16.4) - gaussian(15.3 - h, 16.4)) / (2 * h)
-        mean = flux * star + level
-        expected = [((d**2 / mean).sum()) ** -0.5 for d in (star, slope, slope)]
-        np.testing.assert_allclose(errors, expected, rtol=0.03)
-        if level < 1:
-            np.testing.assert_allclose(errors, np.array([flux, SIGMA, SIGMA]) / flux**0.5, rtol=0.1)
-    assert expected[1] > 3 * SIGMA / np.sqrt(flux)
-
-
-@pytest.mark.parametrize("factor", [4.0, 100.0])
-def test_errors_fall_as_the_root_of_the_counts(factor):
-    """The very same image, of more counts: and exposure for counts."""
-    mean = 500.0 * gaussian(15.3, 16.4) + 2.0
-    start = {"stars": [(15, 16)], "initial_star_fluxes": [500.0], "n_iter": 1}
-
-    def errors(images, **known):
-        return paper(
-            lnocl.Observation(images, PSF, background=2.0 * images.sum() / mean.sum(), **known),
-            refine_positions=True, initial_extended=np.full(SHAPE, 1e-9), **start, **numpy_alone,
-        )  # fmt: skip
-
-    one, more = errors(mean), errors(factor * mean)
-    exposed = errors(factor * mean, exposure=factor)
-    for result in (more, exposed):
-        np.testing.assert_allclose(
-            result.star_position_errors * np.sqrt(factor), one.star_position_errors, rtol=1e-3
-        )
-    scale = more.star_flux_errors / np.sqrt(factor)
-    np.testing.assert_allclose(scale, one.star_flux_errors, rtol=1e-3)
-    np.testing.assert_allclose(
-        exposed.star_flux_errors * np.sqrt(factor), one.star_flux_errors, rtol=1e-3
-    )
-
-
 def test_a_star_keeps_within_its_radius():
     observation = flat_sky(15.0, 16.0, 5000.0, 5.0, 0)
     for given, away in (((20, 16), 5.0), ((12.0, 12.0), 5.0), ((17.5, 16), 0.0)):
@@ -421,39 +381,6 @@ def test_engines_agree(engine, solver):
         "single": (9e-5, 2.8e-6, 7e-6, 2.5e-5, 1.1e-5, 7e-7),
     }[engine["precision"]]
     assert (np.array(list(found.values())) <= tolerances).all(), found
-
-
-@pytest.mark.parametrize("solver", ["sgm", "sgp"])
-@pytest.mark.parametrize("exponent", [-30, 30])
-def test_scaling_by_a_power_of_two_is_bit_for_bit(solver, exponent):
-    made, factor = RUN.make(), 2.0**exponent
-    expected = reference_run(solver)
-    result = made.deconvolve(
-        made.observation(images=factor * made.images, background=factor * made.background),
-        stars=made.stars + OFF,
-        n_iter=13,
-        solver=solver,
-        mu=made.recipe.mu / factor,
-        initial_extended=factor * made.initial_extended,
-        initial_star_fluxes=factor * made.initial_star_fluxes,
-        refine_positions=True,
-        **numpy_alone,
-    )
-    np.testing.assert_array_equal(result.star_positions, expected.star_positions)
-    np.testing.assert_array_equal(result.extended, factor * expected.extended)
-    np.testing.assert_array_equal(result.star_fluxes, factor * expected.star_fluxes)
-
-
-@pytest.mark.parametrize("solver", ["sgm", "sgp"])
-def test_without_stars_there_is_nothing_to_refine(solver):
-    made = dataclasses.replace(RUN, n_stars=0).make()
-    results = [
-        made.deconvolve(n_iter=13, solver=solver, refine_positions=refined, **numpy_alone)
-        for refined in (False, True)
-    ]
-    np.testing.assert_array_equal(results[1].extended, results[0].extended)
-    np.testing.assert_array_equal(results[1].history, results[0].history)
-    assert results[1].star_positions.shape == results[1].star_position_errors.shape == (0, 2)
 
 
 # --- With the rules
