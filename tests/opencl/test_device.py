@@ -79,12 +79,6 @@ def test_numbers_of_threads_that_end_pocl_are_refused_before_it_is_loaded(monkey
     )
 
 
-@pytest.mark.parametrize("threads", ["1", "4096", " 2 ", ""])
-def test_other_numbers_of_threads_are_taken(machine, monkeypatch, threads):
-    monkeypatch.setenv("POCL_MAX_PTHREAD_COUNT", threads)
-    assert device.choose().device is GPU
-
-
 @pytest.mark.parametrize("spec", ["2", "0:2", "nosuch", "vendor:cpu", "", ":0"])
 def test_unknown_device_is_refused_with_what_there_is(machine, spec):
     with pytest.raises(
@@ -211,27 +205,6 @@ def test_memory_estimate_is_what_the_buffers_hold(shape, tuning, caplog):
     assert message.startswith(start)
 
 
-@pytest.mark.parametrize(("p", "n"), [(1, 256), (4, 256), (1, 1024), (4, 1024)])
-@pytest.mark.parametrize("precision", ["single", "double"])
-def test_memory_is_little_more_than_what_must_be_held(monkeypatch, p, n, precision):
-    """Images, OTFs, one set of spectra, the estimate."""
-    monkeypatch.setattr(opencl.Memory, "allocate", lambda *_, **__: None)
-    monkeypatch.setattr(opencl.OpenCLEngine, "_bind_iteration", lambda *_: None)
-    monkeypatch.setattr(opencl.OpenCLEngine, "_upload_scene", lambda *_: None)
-    nothing = SimpleNamespace(kernel_names=(), store=lambda: None)
-    monkeypatch.setattr(program, "_build", lambda *_: nothing)
-    engine = opencl.OpenCLEngine(scene(p, (n, n)), precision, None, 1000)
-    must = (3 * p + 1) * n * n * engine.program.dtype.itemsize
-    assert must < engine.bytes_needed <= 1.04 * must
-
-
-def test_failing_compiler_is_named(monkeypatch):
-    monkeypatch.setattr(program, "source", lambda: "this is no OpenCL")
-    with pytest.raises(lnocl.DeviceError, match="the kernels do not build on") as error:
-        opencl.OpenCLEngine(scene(1, (8, 8)), "single", None, 1)
-    assert "\n" not in str(error.value)
-
-
 def test_the_reference_engine_needs_no_opencl():
     code = (
         "import sys; sys.modules['pyopencl'] = None\n"
@@ -241,13 +214,6 @@ def test_the_reference_engine_needs_no_opencl():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "numpy\n"
-
-
-def test_build_options_are_recorded_and_kernels_fetched_once():
-    engine = opencl.OpenCLEngine(scene(1, (16, 32)), "single", None, 1)
-    assert "-DREAL=float" in engine.program.options
-    assert "-DNX=32" in engine.program.options
-    assert engine.program.kernel("scale_rows") is engine.program.kernel("scale_rows")
 
 
 def test_values_too_large_for_single_precision_are_refused():
@@ -269,13 +235,3 @@ def test_objective_is_finite_where_the_model_is_negative_and_there_are_counts(en
     assert result.history["objective"][0] == pytest.approx(expected, rel=1e-6)
     assert np.isfinite(result.history["objective"]).all()
     assert np.isfinite(result.extended).all()
-
-
-@pytest.mark.parametrize("engine", ["numpy", "opencl"])
-@pytest.mark.filterwarnings("ignore:.*psf pixels are negative")
-def test_star_fluxes_stay_at_zero_or_above_under_negative_psf_pixels(engine):
-    images = np.full((16, 32), 0.5)
-    images[4, 3] = 1e4
-    observation = lnocl.Observation(images, [[-2.0, 5.0, -2.0]], background=1.0)
-    result = paper(observation, stars=[(4, 4)], n_iter=3, engine=engine)
-    assert (result.star_fluxes >= 0).all()

@@ -10,7 +10,7 @@ import pyopencl as cl
 import pytest
 from processes import run_python
 from runtimes import on_pocl
-from scenes import make_smooth_psfs, paper
+from scenes import paper
 
 import lnocl
 from lnocl.engines import opencl
@@ -243,20 +243,6 @@ print(deconvolve())
     assert one == other
 
 
-@pytest.mark.system
-def test_a_fork_after_opencl_may_use_the_reference():
-    code = """
-deconvolve()
-process = os.fork()
-if process == 0:
-    paper(observation, n_iter=1, engine="numpy")
-    os._exit(0)
-assert os.waitpid(process, 0)[1] == 0
-"""
-    done = run_python(code)
-    assert done.returncode == 0, done.stderr
-
-
 # An objective that is not finite.
 
 
@@ -334,37 +320,6 @@ def test_a_run_ends_before_the_objective_is_not_finite(engine, solver, what, at,
         assert np.array_equal(result.star_fluxes, expected.star_fluxes)
         assert np.array_equal(result.history, expected.history)
     assert np.isfinite(result.models()).all()
-
-
-@pytest.mark.parametrize(
-    ("engine", "solver"),
-    [
-        ("numpy", "sgm"),
-        ("numpy", "sgp"),
-        ("opencl", "sgp"),
-        pytest.param("opencl", "sgm", marks=pytest.mark.exhaustive),
-    ],
-)
-@pytest.mark.parametrize("at", [6, 9])
-def test_a_run_that_moves_stars_ends_before_the_objective_is_not_finite(engine, solver, at):
-    """Stars have moved by then; with 6, they would next."""
-    keywords = {"solver": solver, "engine": engine, "stars": [(5, 6)], "refine_positions": True}
-    (psf,) = make_smooth_psfs(1, (16, 32))
-    image = 40.0 + 200.0 * np.roll(psf, (-1, -10), (0, 1))
-    rng = np.random.default_rng(3)
-    observation = lnocl.Observation(rng.poisson(image), psf, background=1.0)
-
-    def callback(iteration, estimate):
-        if iteration == at:
-            poison(estimate._run.engine, "extended")
-
-    with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
-        result = paper(observation, n_iter=20, callback=callback, **keywords)
-    assert result.stop_reason == "not finite"
-    assert at - 1 <= result.n_iter <= at
-    assert len(result.history) == result.n_iter + 1
-    assert np.isfinite(result.history["objective"]).all()
-    assert np.isfinite(result.extended).all()
 
 
 @pytest.mark.parametrize("engine", ["numpy", "opencl"])

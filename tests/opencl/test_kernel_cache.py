@@ -159,9 +159,6 @@ class TestStrangers:
         kernel_cache.write(tmp_path / "a.kernels", b"content")
         return tmp_path / "a.kernels"
 
-    def test_a_file_of_ones_own_is_read(self, file):
-        assert kernel_cache.read(file) == b"content"
-
     @pytest.mark.parametrize("mode", [0o620, 0o602, 0o666])
     def test_a_file_that_others_may_write_to_is_not(self, file, mode):
         file.chmod(mode)

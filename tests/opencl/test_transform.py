@@ -8,9 +8,6 @@ import pytest
 import scipy.fft
 
 from lnocl.opencl.device import choose
-from lnocl.opencl.launch import roots
-from lnocl.opencl.layout import reversed_order
-from lnocl.opencl.program import radices
 from lnocl.opencl.transform import Transform
 
 POWERS = [(n, n) for n in (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)]
@@ -122,35 +119,6 @@ class TestIdentities:
         pixels[0, 0] = 1.0
         assert (transform(grid, dtype).rfft2(pixels) == 1.0).all()
 
-    def test_impulse_anywhere(self, grid, dtype):
-        pixels = np.zeros(grid)
-        pixels[grid[0] - 1, grid[1] // 2] = 1.0
-        assert_accurate(
-            transform(grid, dtype).rfft2(pixels), np.fft.rfft2(pixels), dtype, pixels.size
-        )
-
-    def test_linearity(self, grid, dtype):
-        t = transform(grid, dtype)
-        a, b = rounded(np.random.default_rng(5).normal(size=(2, *grid)), dtype)
-        combined = rounded(2.0 * a - 0.5 * b, dtype)
-        expected = 2.0 * t.rfft2(a) - 0.5 * t.rfft2(b)
-        assert l2(t.rfft2(combined), expected) < ACCURATE_L2[dtype]
-
-    @pytest.mark.parametrize("axis", [0, 1])
-    def test_shift_is_a_phase(self, grid, dtype, axis):
-        t = transform(grid, dtype)
-        pixels = rounded(np.random.default_rng(6).normal(size=grid), dtype)
-        frequency = np.fft.fftfreq(grid[0])[:, None] if axis == 0 else np.fft.rfftfreq(grid[1])
-        expected = t.rfft2(pixels) * np.exp(-2j * np.pi * frequency)
-        assert l2(t.rfft2(np.roll(pixels, 1, axis)), expected) < ACCURATE_L2[dtype]
-
-    def test_parseval(self, grid, dtype):
-        pixels = rounded(np.random.default_rng(7).normal(size=grid), dtype)
-        power = np.abs(transform(grid, dtype).rfft2(pixels)) ** 2
-        power[:, 1:-1] *= 2.0
-        energy = (pixels**2).sum() * pixels.size
-        assert power.sum() == pytest.approx(energy, rel=2 * ACCURATE_L2[dtype])
-
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -181,41 +149,3 @@ def test_window_is_the_shortest_run_of_blocks_round_the_edge(rows, count):
     first, found = layout.window(held)
     assert found == count
     assert held[layout.rows_of(first, count)].sum() == held.sum()
-
-
-@pytest.mark.parametrize(
-    ("n", "order"),
-    [
-        (8, [0, 4, 2, 6, 1, 5, 3, 7]),
-        (12, [0, 6, 3, 9, 1, 7, 4, 10, 2, 8, 5, 11]),
-        (5, [0, 1, 2, 3, 4]),
-    ],
-)
-def test_reversed_order(n, order):
-    assert reversed_order(n).tolist() == order
-
-
-@pytest.mark.parametrize(
-    ("n", "passes"),
-    [
-        (2, (1, 2, 1)),
-        (4, (1, 4, 1)),
-        (16, (1, 4, 4)),
-        (32, (1, 8, 4)),
-        (512, (1, 8, 8)),
-        (1024, (1, 4, 4)),
-        (48, (3, 3, 2)),
-        (160, (5, 5, 4)),
-        (1152, (9, 9, 2)),
-        (7168, (7, 7, 2)),
-    ],
-)
-def test_radices_and_their_roots(n, passes):
-    assert radices(n) == passes
-    odd, outer, last = passes
-    table = roots(n, *passes).reshape(-1, 2)
-    count, length = n // outer * (outer - 1) + (odd if odd > 1 else 0), n // outer
-    while length > last:
-        count, length = count + length // 8 * 7, length // 8
-    assert len(table) == count
-    np.testing.assert_allclose(np.hypot(*table.T), 1.0, rtol=1e-15)

@@ -112,16 +112,6 @@ def test_an_interrupted_trial_leaves_nothing(monkeypatch):
     assert [os.path.exists(folder) for folder in folders] == [False]
 
 
-def test_it_is_tried_again_where_the_linker_went(tmp_path, monkeypatch):
-    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
-    chosen = device.choose().device
-    trial.check.__wrapped__(chosen)
-    monkeypatch.setattr(trial, "_try", lambda *_: pytest.fail("tried again"))
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    with pytest.raises(pytest.fail.Exception, match="tried again"):
-        trial.check.__wrapped__(chosen)
-
-
 def test_the_trial_runs_no_code_of_the_current_folder(tmp_path, monkeypatch):
     (tmp_path / "numpy.py").write_text("open('planted', 'w'); raise SystemExit(3)")
     monkeypatch.chdir(tmp_path)
@@ -211,8 +201,3 @@ def test_no_usable_folder_for_temporary_files_is_said(tmp_path, monkeypatch):
 
     monkeypatch.setattr("tempfile.gettempdir", nowhere)
     assert kernel_cache._Folder().path.parent == tmp_path
-
-
-def test_names_in_other_encodings_are_taken(monkeypatch):
-    monkeypatch.setenv("PATH", "/caf\udce9")
-    assert kernel_cache.file_of(trial._environment(device.choose().device)).name

@@ -66,14 +66,6 @@ def test_it_has_the_noise_of_all_stars_together():
     assert alone / several > 0.8 * noise[1] / noise[0]
 
 
-def test_the_order_of_the_stars_does_not_matter():
-    frame = np.random.default_rng(4).poisson(a_frame(2.5) + 9.0) - 9.0
-    once = make_psf(frame, PLACES, SIZE, background=0.0)
-    again = make_psf(frame, PLACES[::-1], SIZE, background=0.0)
-    np.testing.assert_allclose(again.psf, once.psf, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(again.scatter, once.scatter, rtol=0, atol=1e-12)
-
-
 def test_neighbours_that_are_given_are_modelled():
     places = [*PLACES, (38.2, 33.4)]
     frame = a_frame(2.5, places, [*FLUXES, 0.4])

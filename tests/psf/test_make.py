@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from star_frames import STAR, fizeau, gaussian, line, quiet
+from star_frames import STAR, gaussian, line, quiet
 
 from lnocl.errors import InputError
 from lnocl.psf.make import make_psf, make_psfs
@@ -20,11 +20,6 @@ def test_a_centred_psf_comes_out_as_it_is(shape):
     expected = psf[first[0] : first[0] + k, first[1] : first[1] + k]
     assert found.shape == expected.shape
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
-
-
-def test_a_centred_fizeau_psf_comes_out_as_it_is():
-    psf = fizeau(30, 128)
-    np.testing.assert_allclose(make_psf(psf, background=0.0).psf, psf, rtol=0, atol=3e-8)
 
 
 def test_pixels_are_kept_as_they_are_where_nothing_is_asked_for():

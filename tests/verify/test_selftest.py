@@ -103,42 +103,6 @@ def test_the_cases_have_every_option():
     }
 
 
-@pytest.mark.skipif(not device.has_double(CHOSEN), reason="no double precision here")
-def test_what_is_tried(monkeypatch):
-    """All cases in each precision, then all deconvolutions, on the device that was chosen."""
-    rigs, runs = [], []
-
-    def deconvolve(observation, **how):
-        runs.append(how)
-        history = np.ones(1, [("objective", float)])
-        return SimpleNamespace(extended=np.ones(4), star_fluxes=np.ones(2), history=history)
-
-    monkeypatch.setattr(
-        selftest, "KernelHarness", lambda *given, **scene: rigs.append((*given, scene))
-    )
-    monkeypatch.setattr(selftest, "inputs", lambda _: None)
-    monkeypatch.setattr(selftest, "deviation", lambda *_: 0.0)
-    monkeypatch.setattr(selftest, "deconvolve", deconvolve)
-    rows = selftest.run(CHOSEN)
-    assert all(context.devices == [CHOSEN] for context, *_ in rigs)
-    assert [given for _, *given in rigs] == [
-        *([grid, np.float32, harness.SCENES[scene]] for grid, scene in selftest.CASES),
-        *([grid[::-1], np.float64, harness.SCENES[scene]] for grid, scene in selftest.CASES),
-    ]
-    tried = sum(len(comparison.kernels_of(harness.SCENES[scene])) for _, scene in selftest.CASES)
-    assert len(rows) == 2 * tried + 4
-    assert {row.allowed for row in rows[:-4]} == {1e-6, 3.7e-15}
-    spec = device.spec_of(CHOSEN)
-    on_the_device = [{"precision": p, "device": spec} for p in ("single", "double")]
-    assert all({"stop": None, "smoothing": 0.0, "pad": 0}.items() <= how.items() for how in runs)
-    runs = [{k: v for k, v in how.items() if k not in ("stop", "smoothing", "pad")} for how in runs]
-    assert [(how.pop("solver"), how.pop("n_iter"), len(how.pop("stars")), how) for how in runs] == [
-        (solver, n_iter, 2, how)
-        for solver, n_iter in (("sgm", 30), ("sgp", 10))
-        for how in ({"engine": "numpy"}, *on_the_device)
-    ]
-
-
 def test_what_is_deconvolved_has_built_its_kernels_before():
     observation, stars = selftest._observe()
     ((grid, scene),) = (case for case in selftest.CASES if case[1] == harness.THREE_IMAGES)
