@@ -81,6 +81,13 @@ def small_command(tmp_path, monkeypatch):
     ]
 
 
+def gaussian(n, x, y, sigma=1.5):
+    """Return a Gaussian of unit sum on n x n pixels."""
+    rows, columns = np.indices((n, n))
+    light = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2.0 * sigma**2))
+    return light / light.sum()
+
+
 def run(*arguments, image="a.fits", psf="k1.fits", engine=NUMPY, output="out.fits"):
     """Deconvolve for one iteration unless the arguments say otherwise."""
     images = [image] if isinstance(image, str) else image

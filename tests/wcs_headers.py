@@ -1,5 +1,15 @@
 """Cards of coordinate systems that several tests share."""
 
+PLAIN = {
+    "CTYPE1": "RA---TAN",
+    "CTYPE2": "DEC--TAN",
+    "CRPIX1": 6.0,
+    "CRPIX2": 8.0,
+    "CRVAL1": 150.0,
+    "CRVAL2": 30.0,
+}
+# Pixels of 0.036 arcsec, north up.
+NORTH_UP = PLAIN | {"CDELT1": -1e-5, "CDELT2": 1e-5}
 LINEAR = {
     "CTYPE1": "RA---TAN",
     "CTYPE2": "DEC--TAN",
@@ -12,7 +22,7 @@ LINEAR = {
     "CD2_1": 2.2e-6,
     "CD2_2": 1.2e-5,
 }
-SIP = LINEAR | {
+SIP_TERMS = {
     "CTYPE1": "RA---TAN-SIP",
     "CTYPE2": "DEC--TAN-SIP",
     "A_ORDER": 2,
@@ -20,6 +30,7 @@ SIP = LINEAR | {
     "B_ORDER": 2,
     "B_0_2": -2e-3,
 }
+SIP = LINEAR | SIP_TERMS
 TPV = LINEAR | {
     "CTYPE1": "RA---TPV",
     "CTYPE2": "DEC--TPV",

@@ -12,6 +12,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from commandline import NUMPY, SHAPE, one_complaint, outcome
 from scenes import paper
+from wcs_headers import NORTH_UP
 
 from lnocl.commands import cli
 from lnocl.io.frames import Calibration, read_frames
@@ -24,19 +25,7 @@ pytestmark = pytest.mark.usefixtures("command_folder")
 class TestFrames:
     """Two frames as a telescope leaves them: adu per second, an offset, bad pixels."""
 
-    WCS = fits.Header(
-        {
-            "CTYPE1": "RA---TAN",
-            "CTYPE2": "DEC--TAN",
-            "CRPIX1": 6.0,
-            "CRPIX2": 8.0,
-            "CRVAL1": 150.0,
-            "CRVAL2": 30.0,
-            "CDELT1": -1e-5,
-            "CDELT2": 1e-5,
-            "BUNIT": "ADU/s",
-        }
-    )
+    WCS = fits.Header(NORTH_UP | {"BUNIT": "ADU/s"})
     INPUTS = ("f1.fits", "f2.fits", "--psf", "psfs.fits")
     OPTIONS = (
         *("--background", "auto", "level.fits", "--exposure", "EXPTIME", "--gain", "1.7"),

@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.time import Time
 from astropy.wcs import WCS
-from commandline import NUMPY
+from commandline import NUMPY, gaussian
 
 from lnocl.commands import cli
 from lnocl.io.missions import calibrate
@@ -21,14 +21,8 @@ SKY, STAR = 400.0, 2.0e5
 GOOD = (np.hypot(X - AT[0], Y - AT[1]) > 12) & (X > 8) & (Y > 8) & (X < N - 8) & (Y < N - 8)
 
 
-def gaussian(n, x, y, width=1.6):
-    y0, x0 = np.indices((n, n))
-    psf = np.exp(-((x0 - x) ** 2 + (y0 - y) ** 2) / (2.0 * width**2))
-    return psf / psf.sum()
-
-
 def electrons(seed, sky=SKY):
-    means = STAR * gaussian(N, *AT) + sky
+    means = STAR * gaussian(N, *AT, 1.6) + sky
     return np.random.default_rng(seed).poisson(means).astype(float)
 
 
@@ -127,7 +121,7 @@ def write_plainly(path, primary, cards, **extensions):
 
 def write_stpsf():
     """Write a PSF in the four extensions that STPSF has."""
-    detected, finer = gaussian(33, 16, 16), gaussian(132, 65.5, 65.5, 6.4)
+    detected, finer = gaussian(33, 16, 16, 1.6), gaussian(132, 65.5, 65.5, 6.4)
     hdus = [fits.PrimaryHDU(finer)]
     for name, psf in (("DET_SAMP", detected), ("OVERDIST", finer), ("DET_DIST", detected)):
         hdus.append(fits.ImageHDU(psf, name=name))

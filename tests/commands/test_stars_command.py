@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from commandline import gaussian
 
 from lnocl.commands import cli
 
@@ -16,12 +17,6 @@ pytest.importorskip("photutils", reason="photutils is not installed")
 N = 64
 WCS = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 15.25, "CRVAL2": -3.0,
        "CRPIX1": 32.0, "CRPIX2": 32.0, "CDELT1": -1e-4, "CDELT2": 1e-4}  # fmt: skip
-
-
-def gaussian(n, x, y):
-    rows, columns = np.indices((n, n))
-    light = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 4.5)
-    return light / light.sum()
 
 
 @pytest.fixture(autouse=True)

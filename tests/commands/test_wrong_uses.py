@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from commandline import gaussian
 
 from lnocl.commands import cli
 
@@ -23,12 +24,6 @@ USES = re.findall(
 N = 64
 WCS = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 65.0, "CRVAL2": 19.5,
        "CRPIX1": 32.0, "CRPIX2": 32.0, "CDELT1": -2e-5, "CDELT2": 2e-5}  # fmt: skip
-
-
-def gaussian(n, x, y, sigma=1.5):
-    rows, columns = np.indices((n, n))
-    light = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2.0 * sigma**2))
-    return light / light.sum()
 
 
 def save(name, data, **cards):

@@ -9,6 +9,7 @@ from astropy.stats import sigma_clipped_stats
 from frame_files import IMAGES, MAP, NONE, SHAPE, notes, observe, read, save, save_images
 from hypothesis import given
 from hypothesis import strategies as st
+from wcs_headers import NORTH_UP
 
 from lnocl.errors import InputError, LnoclWarning, counted
 from lnocl.scene.noise_check import warn_of_noise
@@ -92,11 +93,8 @@ class TestExposure:
             ([{}, {"EXPTIME": 1.0}], ["EXPTIME"], "image 0 has no EXPTIME; give exposure as nu"),
             ([{"EXPTIME": 1.0}, {"EXPTIME": "long"}], ["EXPTIME"],
              "EXPTIME of 2.fits is 'long', not a number"),
-            ([{"EXPTIME": True}, {"EXPTIME": 1.0}], ["EXPTIME"],
-             "EXPTIME of 1.fits is True, not a number"),
             ([{}, {}], ["EXPTIME"],
              "exposure 'EXPTIME' is not a number, a keyword of the images' headers, or a file"),
-            ([{}, {"EXPTIME": 1.0}], ["EXPTIME", 2.0], "exposure 'EXPTIME' is not a number, a key"),
             ([{"EXPTIME": 1.0}] * 2, ["EXPTIME", 2.0, 3.0],
              "exposure has 3 values for 2 images; give one, or one for each"),
             ([{"EXPTIME": 0.0}] * 2, ["EXPTIME"], "exposure must be finite and more than zero; 0"),
@@ -182,7 +180,6 @@ class TestBackground:
         ("background", "message"),
         [
             (["auto"] * 3, "background has 3 values for 2 images; give one, or one for each"),
-            (["map.fits", 1.0, 2.0], "background has 3 values for 2 images"),
             (["Auto"], "background 'Auto' is not a number, auto, or a file that exists"),
             (["cube.fits", 1.0], "background cube.fits has the shape (2, 10, 12) and the images"),
             (["oblong.fits"], "background oblong.fits has the shape (1, 12, 10) and the images "
@@ -513,37 +510,24 @@ class TestMask:
             np.testing.assert_array_equal(observation.background[~bad], 4.0)
 
 
-WCS = {
-    "CTYPE1": "RA---TAN",
-    "CTYPE2": "DEC--TAN",
-    "CRPIX1": 6.0,
-    "CRPIX2": 5.0,
-    "CRVAL1": 150.0,
-    "CRVAL2": 30.0,
-    "CDELT1": -1e-5,
-    "CDELT2": 1e-5,
-}
-
-
 class TestOffsets:
     def test_by_the_wcs(self, log):
-        save("1.fits", IMAGES[0], **WCS)
-        save("2.fits", IMAGES[1], **(WCS | {"CRPIX1": 7.25, "CRPIX2": 4.5}))
+        save("1.fits", IMAGES[0], **NORTH_UP)
+        save("2.fits", IMAGES[1], **(NORTH_UP | {"CRPIX1": 7.25, "CRPIX2": 7.5}))
         with pytest.warns(LnoclWarning, match=r"2.fits lies \(1.25, -0.50\) .*: give align wcs"):
             np.testing.assert_array_equal(observe().offsets, 0.0)
         np.testing.assert_allclose(observe(align="wcs").offsets, [(0, 0), (1.25, -0.5)], atol=1e-6)
         assert notes(log) == ["image 1: offset 1.250, -0.500 pixels in x, y, from the WCS"]
 
     def test_turned_images_are_warned_of(self):
-        save("1.fits", IMAGES[0], **WCS)
-        save(
-            "2.fits", IMAGES[1], **(WCS | {"PC1_1": 0.8, "PC1_2": 0.6, "PC2_1": -0.6, "PC2_2": 0.8})
-        )
+        save("1.fits", IMAGES[0], **NORTH_UP)
+        turned = {"PC1_1": 0.8, "PC1_2": 0.6, "PC2_1": -0.6, "PC2_2": 0.8}
+        save("2.fits", IMAGES[1], **NORTH_UP, **turned)
         with pytest.warns(LnoclWarning, match="2.fits is rotated by .* relative to 1.fits"):
             observe()
 
     def test_a_cube_has_one_wcs(self):
-        save("cube.fits", IMAGES, **WCS)
+        save("cube.fits", IMAGES, **NORTH_UP)
         with pytest.raises(InputError) as caught:
             observe("cube.fits", align="wcs")
         assert str(caught.value) == (

@@ -12,6 +12,7 @@ from astropy.table import MaskedColumn, QTable, Table
 from astropy.wcs import WCS
 from hypothesis import given
 from hypothesis import strategies as st
+from wcs_headers import PLAIN, SIP_TERMS
 
 from lnocl.errors import FileError, InputError, LnoclWarning
 from lnocl.io import sky
@@ -19,14 +20,6 @@ from lnocl.io.headers import make_wcs
 
 SHAPE = (16, 12)
 SCALE = 1e-5
-PLAIN = {
-    "CTYPE1": "RA---TAN",
-    "CTYPE2": "DEC--TAN",
-    "CRPIX1": 6.0,
-    "CRPIX2": 8.0,
-    "CRVAL1": 150.0,
-    "CRVAL2": 30.0,
-}
 
 
 def header(angle=0.0, scale=SCALE, mirror=False, **changes):
@@ -39,17 +32,7 @@ def header(angle=0.0, scale=SCALE, mirror=False, **changes):
 
 
 def with_sip(**changes):
-    return header(
-        **{
-            "CTYPE1": "RA---TAN-SIP",
-            "CTYPE2": "DEC--TAN-SIP",
-            "A_ORDER": 2,
-            "A_2_0": 1e-3,
-            "B_ORDER": 2,
-            "B_0_2": -2e-3,
-        }
-        | changes
-    )
+    return header(**(SIP_TERMS | changes))
 
 
 GALACTIC = {"CTYPE1": "GLON-TAN", "CTYPE2": "GLAT-TAN"}

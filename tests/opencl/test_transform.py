@@ -22,19 +22,13 @@ OBLONGS = [
     (4608, 4),
     (2, 4096),
     (4, 8192),
-    (16, 2),
     (64, 8),
     (8, 1024),
-    (512, 32),
-    (32, 256),
     (1024, 128),
     (7168, 2),
-    (2, 7168),
     (16, 4608),
-    (48, 256),
     (256, 1792),
     (2560, 144),
-    (80, 144),
 ]
 GRIDS = SQUARES + OBLONGS
 # Columns are the transform in one dimension; these grids have every power of two from 2 to 8192.

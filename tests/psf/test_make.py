@@ -90,12 +90,6 @@ def test_several_angles_share_what_does_not_depend_on_them(options):
         assert star.own_steps == alone.own_steps
 
 
-def test_the_background_of_several_angles_is_outside_all_crops():
-    stars = make_psfs(STAR, [0, 45], size=21)
-    alone = make_psf(STAR, size=21, rotate=45)
-    assert stars[0].steps[1] == alone.steps[1]
-
-
 def test_several_angles_warn_once_of_the_worst():
     frame = gaussian(1.0, 32.4, 32.4)
     with warnings.catch_warnings(record=True) as caught:

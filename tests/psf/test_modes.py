@@ -94,11 +94,6 @@ class TestInTheShell:
                 np.linalg.norm(scatter) / norm, rel=0.1
             )
 
-    def test_it_can_be_repeated(self, capsys):
-        assert cli.main(["psf", "frames.fits", "--size", "15", "--modes", "1", "-o", "a.fits"]) == 0
-        history = "\n".join(fits.getheader("a.fits")["HISTORY"])
-        assert "--modes 1" in history
-
     @pytest.mark.parametrize(
         ("options", "message"),
         [

@@ -27,15 +27,6 @@ def test_the_background_is_measured(size, where, n_sky):
     assert scatter == pytest.approx(10, rel=0.1)
 
 
-def test_the_background_is_the_median():
-    frame = np.full((61, 61), 100.0)
-    frame[::3] = 101.0
-    frame += 1e4 * np.where(
-        gaussian(3.0, 30, 30, (61, 61)) > 1e-6, gaussian(3.0, 30, 30, (61, 61)), 0
-    )
-    assert make_psf(frame, size=21).background == 100.0
-
-
 def test_the_ring_lies_outside_the_crop():
     frame = np.full((61, 61), 7.0)
     frame[20:41, 20:41] += 100 + gaussian(3.0, 10, 10, (21, 21)) * 1e4

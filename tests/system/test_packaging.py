@@ -9,9 +9,7 @@ import venv
 import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
-from astropy.io import fits
 from packaging.metadata import Metadata
 
 pytestmark = pytest.mark.system
@@ -190,19 +188,6 @@ def test_pocl_is_required_where_its_wheel_exists(built, system, machine, pocl):
         if one.name == "pyopencl" and (one.marker is None or one.marker.evaluate(place))
     ]
     assert extras == ([set(), {"pocl"}] if pocl else [set()])
-
-
-def test_it_runs_without_the_functions_that_windows_lacks(tmp_path):
-    fits.writeto(tmp_path / "image.fits", np.ones((8, 8)))
-    code = (
-        "import os, sys\n"
-        "del os.fork, os.register_at_fork, os.sysconf\n"
-        "from lnocl.commands import cli\n"
-        "sys.exit(cli.main(sys.argv[1:]))"
-    )
-    command = "deconvolve image.fits --psf image.fits --engine numpy --n-iter 2 -o out.fits"
-    run(sys.executable, "-c", code, *command.split(), cwd=tmp_path)
-    assert fits.getdata(tmp_path / "out.fits").shape == (8, 8)
 
 
 def test_the_citation_has_the_version():
