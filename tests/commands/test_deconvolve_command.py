@@ -22,17 +22,8 @@ pytestmark = pytest.mark.usefixtures("command_folder")
 
 class TestDeconvolve:
     ARGUMENTS = (
-        *(
-            "--background",
-            "2.5",
-            "3.0000000000000004",
-            "--read-noise",
-            "1",
-            "--star",
-            "7,5",
-            "--star",
-            "2,9",
-        ),
+        *("--background", "2.5", "3.0000000000000004", "--read-noise", "1"),
+        *("--star", "7,5", "--star", "2,9"),
         *PAPER,
         *GIVEN,
         *("--mu", "1e-3", "--smoothing", "0.02", "--n-iter", "7", "--pad", "3"),

@@ -27,15 +27,8 @@ pytestmark = pytest.mark.usefixtures("command_folder")
 @pytest.mark.system
 class TestProcess:
     ARGUMENTS = (
-        "deconvolve",
-        "a.fits",
-        "--psf",
-        "k1.fits",
-        "--n-iter",
-        "1",
-        *PAPER,
-        *GIVEN,
-        *NUMPY,
+        *("deconvolve", "a.fits", "--psf", "k1.fits", "--n-iter", "1"),
+        *(*PAPER, *GIVEN, *NUMPY),
     )
 
     def test_version_and_help_load_nothing_heavy(self):
