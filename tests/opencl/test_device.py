@@ -79,6 +79,12 @@ def test_numbers_of_threads_that_end_pocl_are_refused_before_it_is_loaded(monkey
     )
 
 
+@pytest.mark.parametrize("threads", ["1", "4096", " 2 ", ""])
+def test_other_numbers_of_threads_are_taken(machine, monkeypatch, threads):
+    monkeypatch.setenv("POCL_MAX_PTHREAD_COUNT", threads)
+    assert device.choose().device is GPU
+
+
 @pytest.mark.parametrize("spec", ["2", "0:2", "nosuch", "vendor:cpu", "", ":0"])
 def test_unknown_device_is_refused_with_what_there_is(machine, spec):
     with pytest.raises(

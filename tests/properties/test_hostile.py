@@ -26,7 +26,7 @@ from sound_files import (
 from wcs_headers import SIP
 
 from lnocl.errors import FileError, InputError, LnoclWarning
-from lnocl.io import fitsread, fitswrite, sky
+from lnocl.io import fitsread, fitswrite, saved_results, sky
 from lnocl.process import ignored_warnings
 
 BLOCK = 2880
@@ -83,6 +83,14 @@ def test_data_of_two_sizes_are_refused(tmp_path, keyword, compress):
     path.write_bytes(compress(header.tostring().encode() + bytes(BLOCK)))
     with pytest.raises(FileError, match=rf"damaged: {keyword} is both \d+ and -99999999999; del"):
         fitsread.read_stack([str(path)])
+
+
+def test_a_size_that_is_given_twice_alike_is_read(tmp_path):
+    header = fits.PrimaryHDU(COUNTS.astype("i2")).header
+    header.append(("NAXIS1", header["NAXIS1"]))
+    path = tmp_path / "a.fits"
+    path.write_bytes(header.tostring().encode() + bytes(BLOCK))
+    assert fitsread.read_stack([str(path)]).data.shape[1:] == COUNTS.shape
 
 
 @pytest.mark.usefixtures("limits")
@@ -252,3 +260,22 @@ def test_a_star_outside_its_image_is_not_drawn(sound, tmp_path, quick_figures, p
     fitswrite.write_result(str(path), COUNTS, [position], [1e5])
     with pytest.raises(InputError, match=rf"{path} has a star at \(.*\), outside its image"):
         draw(sound, str(path), "result.dat")
+
+
+def test_a_table_that_does_not_match_its_datasum_is_announced(sound, tmp_path):
+    content = bytearray(sound["truth.dat"].read_bytes())
+    start = content.index(b"XTENSION= 'BINTABLE'")
+    content[content.index(b"END ", start) // BLOCK * BLOCK + BLOCK + 7] ^= 1
+    path = tmp_path / "damaged"
+    path.write_bytes(content)
+    with pytest.warns(LnoclWarning, match="the data do not match their DATASUM"):
+        saved_results.read_result(str(path))
+
+
+def test_a_column_with_several_numbers_in_a_row(tmp_path):
+    columns = [fits.Column(name, "2D", array=np.ones((1, 2))) for name in ("x", "y", "flux")]
+    path = tmp_path / "a.fits"
+    table = fits.BinTableHDU.from_columns(columns, name="STARS")
+    fits.HDUList([fits.PrimaryHDU(COUNTS), table]).writeto(path)
+    with pytest.raises(FileError, match=r"several numbers in a row of column x of STARS"):
+        saved_results.read_result(str(path))
