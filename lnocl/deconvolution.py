@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from copy import copy
 from dataclasses import replace
 from functools import partial
 from os import PathLike
@@ -320,7 +319,6 @@ def deconvolve(
     (3, 'callback')
     """
     check_observation(observation)
-    observation = copy(observation)  # its arrays are read-only, but its attributes may be replaced
     check_choices(solver, precision, engine, device)
     check_length(n_iter, stop)
     check_types(callback, progress=progress)

@@ -136,6 +136,11 @@ class _Span(NamedTuple):
     size: int
     margin: int
 
+    @property
+    def seen(self) -> slice:
+        """The window as an index."""
+        return slice(self.window.start, self.window.stop)
+
     def weights(self, oversample: int) -> Array:
         """Return the weights of the window's pixels, which fall across half of each margin.
 
@@ -296,8 +301,12 @@ def deconvolve_tiles(
     positions = check_positions(stars, observation)
     penalties = read_penalties(mu, smoothing, stop, observation)
     pad = _pad(observation, options.get("pad", "auto"))
-    tiles = _lay(observation, positions, tile, pad)
-    observed = [each for each in tiles if not each.observation.mask.all()]
+    tiles = _lay(observation, tile, pad)
+    observed = [
+        _cut(observation, positions, (y, x))
+        for y, x in tiles
+        if not observation.mask[:, y.seen, x.seen].all()
+    ]
     _refuse_unowned(positions, observed)
     if len(tiles) > 1:
         options["pad"] = pad
@@ -343,8 +352,8 @@ def _pad(observation: Observation, pad: Any) -> int:
     return int(pad)
 
 
-def _lay(observation: Observation, positions: Array, tile: int | None, pad: int) -> list[_Tile]:
-    """Return the tiles of the images, row by row."""
+def _lay(observation: Observation, tile: int | None, pad: int) -> list[tuple[_Span, _Span]]:
+    """Return the tiles of the images along y and x, row by row."""
     sides = [-(-k // observation.oversample) for k in observation.psfs.shape[1:]]
     # An image that is shifted shows the core of a tile beside it.
     shifts = np.ceil(abs(observation.offsets).max(axis=0)).astype(int).tolist()[::-1]
@@ -361,7 +370,7 @@ def _lay(observation: Observation, positions: Array, tile: int | None, pad: int)
         _divide(size, int(tile) - 2 * pad, margin)
         for size, margin in zip(observation.shape, margins, strict=True)
     )
-    return [_cut(observation, positions, (y, x)) for y in rows for x in columns]
+    return list(itertools.product(rows, columns))
 
 
 def _divide(size: int, window: int, margin: int) -> list[_Span]:
@@ -381,10 +390,8 @@ def _divide(size: int, window: int, margin: int) -> list[_Span]:
 def _cut(observation: Observation, positions: Array, spans: tuple[_Span, _Span]) -> _Tile:
     rows, columns = (span.window for span in spans)
     moved = positions - (columns.start, rows.start)
-    part = observation.window(rows, columns)
-    if part.psf_fields:  # those of the middle of the core, not of the window
-        y, x = ((each.core.start + each.core.stop - 1) / 2.0 - each.window.start for each in spans)
-        part.psfs = np.array([field.at(x, y) for field in part.psf_fields])
+    y, x = ((each.core.start + each.core.stop - 1) / 2.0 - each.window.start for each in spans)
+    part = observation.window(rows, columns, (x, y))
     ny, nx = part.shape
     x, y = (moved[:, None] + part.offsets).transpose(2, 0, 1)
     is_seen = ((x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)).any(axis=1)

@@ -143,7 +143,8 @@ def test_models_are_those_of_the_images_that_were_given():
     models, residuals = result.models(), result.residuals()
     images += 100.0
     stars[0][0] = 6.0
-    observation.images, observation.background = images, np.array([50.0])
+    with pytest.raises(AttributeError, match=r"replace\(images=...\) returns another"):
+        observation.images = images
     np.testing.assert_array_equal(result.models(), models)
     np.testing.assert_array_equal(result.residuals(), residuals)
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,7 +24,7 @@ from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_model, make_start
 from lnocl.scene.forward_model import Model
 from lnocl.scene.noise_check import with_noise_shown
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.observation import OF_PSFS, Array, Observation
 from lnocl.scene.padding import choose_pad
 from lnocl.scene.penalty import Penalty, recommend_smoothing
 from lnocl.scene.psf_misfit import PsfMisfit, measure_misfit, smoothing_near_stars
@@ -103,7 +102,8 @@ class GuardedRuns:
     ) -> None:
         self._tick = tick
         self.all_stars = setup.stars
-        shown = with_noise_shown(observation)
+        # PSFs that are cut to the window go without what has the shape of whole ones.
+        shown = with_noise_shown(observation).replace(**dict.fromkeys((*OF_PSFS, "psf_modes")))
         self.observation, self.stars, self.held = find_window(setup, shown)
         # One grid for all PSFs that are tried.
         pad = choose_pad(observation) if setup.pad == "auto" else setup.pad
@@ -133,7 +133,7 @@ class GuardedRuns:
         guard : float
             How strongly the extended source is kept from the stars, as `GUARD`.
         """
-        observation = with_psfs(self.observation, self.cut(psfs))
+        observation = self.observation.replace(psfs=self.cut(psfs))
         setup = replace(self._setup, stars=stars, refine_positions=moves)
         with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
             start = make_start(setup, observation, Penalty())
@@ -177,7 +177,7 @@ class GuardedRuns:
     def moved(self, estimate: Estimate, psfs: Array, fluxes: Array, stars: Array) -> Estimate:
         """Return an estimate with other PSFs and stars, whose misfit is that of before."""
         ny, nx = self.observation.shape
-        observation = with_psfs(self.observation, self.cut(psfs))
+        observation = self.observation.replace(psfs=self.cut(psfs))
         with ignored_warnings():
             scene = Scene(observation, stars.clip(0, (nx - 1, ny - 1)), pad=self._setup.pad)
         return Estimate(scene, estimate.extended, fluxes, estimate.misfit)
@@ -210,12 +210,8 @@ def find_window(setup: Setup, observation: Observation) -> tuple[Observation, Ar
     best = int(np.argmax(_count_in_windows(setup.stars, firsts, size, observation.shape)))
     low = firsts[best] - 0.5
     held = np.all((setup.stars >= low) & (setup.stars < low + size), axis=1)
-    x, y = (slice(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
-    cut = copy(observation)
-    for name in ("images", "mask", "background", "exposure"):
-        values = getattr(observation, name)
-        setattr(cut, name, values[:, y, x] if values.ndim == 3 else values)
-    return cut, setup.stars[held] - firsts[best], held
+    x, y = (range(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
+    return observation.window(y, x), setup.stars[held] - firsts[best], held
 
 
 def _count_in_windows(
@@ -230,13 +226,6 @@ def _count_in_windows(
     (left, top), (right, bottom) = firsts.T, (firsts + size).T
     counts = before[bottom, right] - before[top, right] - before[bottom, left] + before[top, left]
     return np.asarray(counts)
-
-
-def with_psfs(observation: Observation, psfs: Array) -> Observation:
-    """Return an observation with other PSFs, as they are."""
-    other = copy(observation)
-    other.psfs = psfs
-    return other
 
 
 def estimate_scatter(psfs: Array, in_rings: Array, oversample: int) -> Array:

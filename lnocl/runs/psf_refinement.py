@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,7 +21,6 @@ from lnocl.runs.guarded_runs import (
     Estimate,
     GuardedRuns,
     estimate_scatter,
-    with_psfs,
 )
 from lnocl.runs.outcome import PsfRefinement
 from lnocl.runs.psf_allowance import STRENGTH, Allowance
@@ -156,7 +154,7 @@ def mend(
     if state.misfit.is_doubtful and names and (observation.psfs < 0).any():
         state = _clean(runs, state)
     families = PsfFamilies(
-        [name for name in names if name != "pixels"], with_psfs(observation, state.psfs)
+        [name for name in names if name != "pixels"], observation.replace(psfs=state.psfs)
     )
     values, tried, left = np.zeros((observation.n_images, len(families.prior))), state, None
     if state.misfit.is_doubtful and families.parameters:
@@ -169,7 +167,7 @@ def mend(
             left, state = state.misfit, tried
     is_accepted = state.psfs is not observation.psfs
     if is_accepted:
-        observation = with_psfs(observation, state.psfs)
+        observation = observation.replace(psfs=state.psfs)
     known = observation.psf_scatter
     is_told = state is not given or given.misfit.is_significant
     if not (is_asked or len(known) or is_told):
@@ -191,8 +189,8 @@ def mend(
     )
     _warn(refinement)
     # Replicas draw PSFs from it, so that the errors of regions contain that of the PSFs.
-    observation = copy(observation)
-    observation.psf_scatter = known if len(known) else allowance.scatter()
+    if not len(known):
+        observation = observation.replace(psf_scatter=allowance.scatter())
     return Mended(observation, state.moves, refinement, allowance.near_stars(setup.pad))
 
 
@@ -244,7 +242,7 @@ def _loosen(runs: GuardedRuns, state: _State) -> _State:
 
 def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) -> _State:
     """Return the state with PSFs whose pixels are free, as far as scatter or residuals show."""
-    observation = with_psfs(runs.observation, runs.cut(state.psfs))
+    observation = runs.observation.replace(psfs=runs.cut(state.psfs))
     scatter = runs.cut(scatter)
     if not len(scatter):
         rings = state.misfit.in_rings

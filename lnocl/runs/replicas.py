@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from copy import copy
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -115,8 +114,7 @@ class Replicas:
 
     def _find(self, counts: Array) -> Sky:
         """Return what is found of an observation with these counts."""
-        observation, run = copy(self._outcome.scene.observation), self._run
-        observation.images = np.where(observation.mask, 0.0, counts)
+        observation, run = self._outcome.scene.observation.replace(images=counts), self._run
         run.repeat(self._start, observation)
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in run:

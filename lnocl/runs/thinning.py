@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from copy import copy
-
 import numpy as np
 
 from lnocl.errors import InputError
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.observation import Observation
 
 # Binomial samples are drawn as 64-bit integers.
 MAX_COUNTS = 2.0**62
@@ -40,11 +38,8 @@ def split_counts(observation: Observation) -> tuple[Observation, Observation]:
         whole = np.floor(image)
         half[:] = rng.binomial(whole.astype(np.int64), 0.5)
         half += (image - whole) * rng.integers(0, 2, image.shape)
-    return _half(observation, first), _half(observation, images - first)
-
-
-def _half(observation: Observation, images: Array) -> Observation:
-    """Return the observation with half of its counts."""
-    half = copy(observation)
-    half.images, half.background = images, observation.background / 2.0
-    return half
+    background = observation.background / 2.0
+    return (
+        observation.replace(images=first, background=background),
+        observation.replace(images=images - first, background=background),
+    )

@@ -52,9 +52,9 @@ def refuse_masked(name: str, masked: NDArray[np.bool_]) -> None:
         )
 
 
-def numbers(name: str, values: ArrayLike) -> Array:
-    """Return a float64 copy of real numbers, none of them masked."""
+def numbers(name: str, values: ArrayLike, copy: bool = True) -> Array:
+    """Return real numbers as float64, none of them masked; a copy unless that is not asked for."""
     array = unmasked(name, values)
     if array.dtype.kind not in "biuf":
         raise InputError(f"{name} holds {array.dtype}; give real numbers")
-    return array.astype(np.float64)
+    return array.astype(np.float64, copy=copy)

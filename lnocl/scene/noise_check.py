@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -107,13 +106,11 @@ def with_noise_shown(observation: Observation) -> Observation:
                 shares[j] = more / noise.level
     if not shares.any():
         return observation
-    other = copy(observation)
     background = observation.background
     excess = background * shares.reshape(-1, *[1] * (background.ndim - 1))
     each = excess if excess.ndim == 3 else excess[:, None, None]
-    other.background = background - excess
-    other.images = np.where(observation.mask, 0.0, observation.images - each).clip(0.0)
-    return other
+    images = (observation.images - each).clip(0.0)
+    return observation.replace(images=images, background=background - excess)
 
 
 def _some_rows(pixels: Array) -> Array:

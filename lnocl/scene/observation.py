@@ -36,6 +36,13 @@ OVERSAMPLES = 1, 2, 4
 # second on it is refused.
 LITTLE_OFF_CENTRE, FAR_OFF_CENTRE = 0.25, 0.8
 
+# Attributes that hold a number for each image or for each pixel, and a number for each pixel of
+# PSFs that may be left out.
+MAPS = "background", "read_noise", "exposure"
+OF_PSFS = "ideal_psfs", "pupils", "psf_scatter"
+# Those that may be below 0.
+SIGNED = "psfs", "ideal_psfs", "psf_modes"
+
 
 class Observation:
     """Images of one sky, each with its point spread function, background and bad pixels.
@@ -193,9 +200,7 @@ class Observation:
         psf_scatter: ArrayLike | None = None,
     ) -> None:
         self.oversample = _check_oversample(oversample)
-        if not isinstance(effective_psfs, (bool, np.bool_)):
-            raise InputError(f"effective_psfs must be True or False; {effective_psfs!r} was given")
-        self.effective_psfs = bool(effective_psfs)
+        self.effective_psfs = _check_effective(effective_psfs)
         has_exposure = exposure is not None
         counts, are_rates = containers.counts("images", images, has_exposure)
         given, masked = values_and_mask("images", counts)
@@ -207,7 +212,8 @@ class Observation:
             for field in fields
         )
         if fields:
-            self._take_psfs_of_the_middle()
+            y, x = (np.array(self.shape) - 1) / 2.0
+            self.psfs = np.array([field.at(x, y) for field in self.psf_fields])
         else:
             self.psfs = _check_psfs(containers.bare("psfs", psfs), self.n_images, psf_centre)
         self.pupils = check_pixels("pupils", pupils, self.psfs)
@@ -228,6 +234,14 @@ class Observation:
         self._clip_negative()
         for values in self._arrays().values():
             values.flags.writeable = False
+        self._is_checked = True
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if "_is_checked" in vars(self):
+            raise AttributeError(
+                f"an observation does not change; replace({name}=...) returns another"
+            )
+        super().__setattr__(name, value)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes; one PSF for all images stays one where pickle would copy it."""
@@ -236,7 +250,7 @@ class Observation:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self.psfs = np.broadcast_to(self.psfs, (self.n_images, *self.psfs.shape[1:]))
+        vars(self)["psfs"] = np.broadcast_to(self.psfs, (self.n_images, *self.psfs.shape[1:]))
 
     @property
     def n_images(self) -> int:
@@ -277,24 +291,101 @@ class Observation:
         """
         return self.oversample * self.shape[0], self.oversample * self.shape[1]
 
-    def window(self, rows: range, columns: range) -> Observation:
-        """Return what is in some rows and columns of the images; positions begin at its corner."""
-        part = copy(self)
-        inside = np.s_[:, rows.start : rows.stop, columns.start : columns.stop]
-        for name in ("images", "mask", "background", "read_noise", "exposure"):
-            values = getattr(self, name)
-            if values.ndim == 3:
-                setattr(part, name, values[inside])
-        part.psf_fields = tuple(
-            field.moved(-columns.start, -rows.start) for field in self.psf_fields
-        )
-        if part.psf_fields:
-            part._take_psfs_of_the_middle()
-        return part
+    def replace(self, **changes: Any) -> Observation:
+        """Return an observation with other values of some attributes; the rest is shared.
 
-    def _take_psfs_of_the_middle(self) -> None:
-        y, x = (np.array(self.shape) - 1) / 2.0
-        self.psfs = np.array([field.at(x, y) for field in self.psf_fields])
+        The values are those of the attributes: the square of the read noise is in images and
+        background, and PSFs are neither normalised nor moved. Images become 0 where a pixel is bad.
+
+        Parameters
+        ----------
+        **changes : array_like, int, bool or None
+            Values by the name of their attribute. Arrays of the attribute's type are not copied, so
+            leave them as they are. New `psfs` are the same all over the images. None stands for no
+            `ideal_psfs`, `pupils`, `psf_modes` or `psf_scatter`.
+
+        Returns
+        -------
+        Observation
+            Another observation.
+
+        Raises
+        ------
+        InputError
+            - A name is not that of an attribute.
+            - An array has the wrong shape or type, or holds masked values or ones out of range.
+            - The sum of a PSF is not positive, or no good pixel is left.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> obs = lnocl.Observation(np.full((2, 8, 8), 5.0), np.ones((3, 3)))
+        >>> other = obs.replace(psfs=np.ones((2, 1, 1)))
+        >>> other.psfs.shape, obs.psfs.shape, np.shares_memory(other.images, obs.images)
+        ((2, 1, 1), (2, 3, 3), True)
+        """
+        other = copy(self)
+        held = vars(other)
+        if unknown := sorted(changes.keys() - (held.keys() - {"_is_checked"})):
+            raise InputError(f"{unknown[0]} is no attribute of an observation; leave it out")
+        if "psfs" in changes:
+            changes = {"psf_fields": (), **changes}
+        held |= {name: _read(name, values) for name, values in changes.items()}
+        other._refuse_other_shapes()
+        for name in changes.keys() - {"mask", "offsets"}:
+            if isinstance(held[name], np.ndarray):
+                _refuse_out_of_range(name, held[name])
+        if not (other.psfs.sum(axis=(1, 2)) > 0).all():
+            raise InputError("psfs must have positive sums; give others")
+        if "offsets" in changes:
+            other._check_offsets(other.offsets)
+        other._refuse_overflow()
+        if other.mask.all() or other.images[other.mask].any():
+            held["images"] = other.images.copy()
+            other._refuse_all_masked()
+            held["images"].flags.writeable = False
+        return other
+
+    def _refuse_other_shapes(self) -> None:
+        """Refuse attributes whose shape is not that of the images or the PSFs."""
+        images, n, psf = self.images.shape, self.n_images, self.psfs.shape[1:]
+        for name in OF_PSFS:  # of which there are none
+            if not len(getattr(self, name)):
+                vars(self)[name] = np.zeros((0, *psf))
+        if not self.psf_modes.size:
+            vars(self)["psf_modes"] = np.zeros((n, 0, *psf))
+        shapes = {
+            "images": [(n, *images[-2:])],
+            "mask": [images],
+            **{name: [images, (n,)] for name in MAPS},
+            "psfs": [(n, *self.psfs.shape[-2:])],
+            **{name: [(n, *psf), (0, *psf)] for name in OF_PSFS},
+            "psf_modes": [(n, *self.psf_modes.shape[1:2], *psf)],
+        }
+        for name, known in shapes.items():
+            shape = getattr(self, name).shape
+            if shape not in known:
+                raise InputError(
+                    f"{name} has shape {shape}, beside images of {images} and PSFs of {psf}; "
+                    "replace those that belong together at once"
+                )
+
+    def window(
+        self, rows: range, columns: range, middle: tuple[float, float] | None = None
+    ) -> Observation:
+        """Return what is in some rows and columns of the images; positions begin at its corner.
+
+        PSFs that vary are those of a place (x, y) there, by default of its middle.
+        """
+        inside = np.s_[:, rows.start : rows.stop, columns.start : columns.stop]
+        held = {name: getattr(self, name) for name in ("images", "mask", *MAPS)}
+        changes: dict[str, Any] = {k: each[inside] for k, each in held.items() if each.ndim == 3}
+        if self.psf_fields:
+            fields = [field.moved(-columns.start, -rows.start) for field in self.psf_fields]
+            x, y = middle or ((len(columns) - 1) / 2.0, (len(rows) - 1) / 2.0)
+            changes |= {"psfs": [field.at(x, y) for field in fields], "psf_fields": fields}
+        return self.replace(**changes)
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {name: each for name, each in vars(self).items() if isinstance(each, np.ndarray)}
@@ -339,11 +430,7 @@ class Observation:
 
     def _apply_mask(self, mask: ArrayLike | None) -> None:
         if mask is not None:
-            given = unmasked("mask", mask)
-            if given.dtype != np.bool_:
-                raise InputError(
-                    f"mask is of type {given.dtype}; give booleans, True where a pixel is bad"
-                )
+            given = _booleans(mask)
             if given.shape not in (self.images.shape, self.shape):
                 raise InputError(
                     f"mask has shape {given.shape}; the images have {self.images.shape}"
@@ -365,17 +452,15 @@ class Observation:
     def _check_exposure(self, exposure: ArrayLike) -> Array:
         """Return the exposures, and mask pixels of no exposure."""
         values = self._one_or_map("exposure", containers.seconds(exposure), 1.0)
-        if values.ndim == 1:
-            _refuse_unless("exposure", values, "finite and more than zero", values > 0)
-            return values
-        _refuse_unless("exposure", values, "finite and not negative", values >= 0)
-        self.mask |= values == 0
+        _refuse_out_of_range("exposure", values)
+        if values.ndim == 3:
+            self.mask |= values == 0
         return values
 
     def _check_background(self, background: ArrayLike, has_exposure: bool) -> Array:
         given, are_rates = containers.counts("background", background, has_exposure)
         values = self._one_or_map("background", given, 0.0)
-        _refuse_unless("background", values, "finite and not negative", values >= 0)
+        _refuse_out_of_range("background", values)
         if not are_rates:
             return values
         if values.ndim < self.exposure.ndim:
@@ -384,7 +469,7 @@ class Observation:
 
     def _check_read_noise(self, read_noise: ArrayLike) -> Array:
         sigma = self._one_or_map("read_noise", containers.counts("read_noise", read_noise)[0], 0.0)
-        _refuse_unless("read_noise", sigma, "finite and not negative", sigma >= 0)
+        _refuse_out_of_range("read_noise", sigma)
         return sigma
 
     def _add_read_noise(self) -> None:
@@ -459,6 +544,32 @@ def _check_oversample(oversample: object) -> int:
     raise InputError(f"oversample must be 1, 2 or 4; {oversample} was given")
 
 
+def _check_effective(effective_psfs: object) -> bool:
+    if isinstance(effective_psfs, (bool, np.bool_)):
+        return bool(effective_psfs)
+    raise InputError(f"effective_psfs must be True or False; {effective_psfs!r} was given")
+
+
+def _read(name: str, values: Any) -> Any:
+    """Return the value of an attribute as it is held, in a read-only array that is no copy."""
+    if name in ("oversample", "effective_psfs"):
+        return (_check_oversample if name == "oversample" else _check_effective)(values)
+    if name == "psf_fields":
+        return tuple(values)
+    if values is None and name in (*OF_PSFS, "psf_modes"):
+        return np.zeros(0)
+    array = (_booleans(values) if name == "mask" else numbers(name, values, copy=False)).view()
+    array.flags.writeable = False
+    return array
+
+
+def _booleans(mask: ArrayLike) -> NDArray[np.bool_]:
+    given = unmasked("mask", mask)
+    if given.dtype != np.bool_:
+        raise InputError(f"mask is of type {given.dtype}; give booleans, True where a pixel is bad")
+    return given
+
+
 def _range(values: Array) -> str:
     low, high = float(values.min()), float(values.max())
     return f"{low:.5g}" if low == high else f"{low:.5g} to {high:.5g}"
@@ -505,6 +616,15 @@ def _refuse_unless(name: str, values: Array, requirement: str, holds: NDArray[np
     good = holds & np.isfinite(values)
     if not good.all():
         raise InputError(f"{name} must be {requirement}; {values[~good].flat[0]:g} was given")
+
+
+def _refuse_out_of_range(name: str, values: Array) -> None:
+    if name in SIGNED:
+        _refuse_unless(name, values, "finite", np.isfinite(values))
+    elif name == "exposure" and values.ndim == 1:
+        _refuse_unless(name, values, "finite and more than zero", values > 0)
+    else:
+        _refuse_unless(name, values, "finite and not negative", values >= 0)
 
 
 def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:

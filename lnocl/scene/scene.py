@@ -191,8 +191,7 @@ class Scene:
     def seen_through(self, psfs: Array) -> Scene:
         """Return this scene with other PSFs, shape (p, ky, kx), as they are."""
         other = copy(self)
-        other.observation = copy(self.observation)
-        other.observation.psfs, other.observation.psf_fields = psfs, ()
+        other.observation = self.observation.replace(psfs=psfs)
         other._psfs = movable_psfs(other.scaled_psfs(), other.observation, self.image_grid)
         other._field = other._place_stars(self.stars)
         return other

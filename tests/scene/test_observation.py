@@ -1,5 +1,6 @@
 """The door: what an observation makes of its input, what it refuses and what it announces."""
 
+import pickle
 import warnings
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from scenes import paper
 
 import lnocl
+from lnocl.errors import InputError
 
 PSF = np.array([[0.0, 1.0, 0.0], [1.0, 4.0, 2.0]])
 IMAGES = np.arange(1.0, 49.0).reshape(3, 4, 4)
@@ -637,3 +639,97 @@ def test_ideal_psfs_are_those_of_the_pupils():
 def test_one_scatter_serves_all_images():
     scatter = observe(psf_scatter=0.1 * PSF).psf_scatter
     np.testing.assert_array_equal(scatter, [0.1 * PSF] * len(IMAGES))
+
+
+# --- Another observation, checked
+
+
+def two_images(**known):
+    images = np.full((2, 8, 9), 5.0)
+    return lnocl.Observation(images, np.ones((3, 3)), background=1.0, read_noise=2.0, **known)
+
+
+def test_replace_shares_all_else_and_takes_values_as_they_are():
+    given = two_images(psf_scatter=np.ones((3, 3)))
+    images, psfs = np.full((2, 8, 9), 7.0), np.full((2, 3, 3), 0.2)
+    other = given.replace(images=images, psfs=psfs)
+    for name in ("images", "psfs"):
+        assert np.shares_memory(getattr(other, name), {"images": images, "psfs": psfs}[name])
+        assert not getattr(other, name).flags.writeable
+    assert images.flags.writeable
+    np.testing.assert_array_equal(other.psfs, psfs)
+    for name in ("mask", "background", "read_noise", "exposure", "offsets", "psf_scatter"):
+        assert getattr(other, name) is getattr(given, name)
+    np.testing.assert_array_equal(given.images, 9.0)  # 5 and the square of the read noise
+
+
+def test_replace_leaves_nothing_in_bad_pixels():
+    mask = np.zeros((2, 8, 9), bool)
+    mask[1, 2, 3] = True
+    given = two_images()
+    other = given.replace(mask=mask)
+    np.testing.assert_array_equal(other.images, np.where(mask, 0.0, 9.0))
+    np.testing.assert_array_equal(given.images, 9.0)
+
+
+def test_replace_keeps_one_psf_for_all_images_in_one():
+    other = two_images().replace(background=np.array([1.0, 2.0]))
+    assert other.psfs.strides[0] == 0
+    assert pickle.loads(pickle.dumps(other)).psfs.shape == (2, 3, 3)
+
+
+def test_replace_of_psfs_of_another_shape_takes_what_goes_with_them():
+    given = two_images(psf_scatter=np.ones((3, 3)), pupils=np.ones((3, 3)))
+    with pytest.raises(InputError, match=r"^ideal_psfs has shape \(2, 3, 3\), beside images of"):
+        given.replace(psfs=np.ones((2, 5, 5)))
+    other = given.replace(psfs=np.ones((2, 5, 5)), ideal_psfs=None, pupils=None, psf_scatter=None)
+    assert other.pupils.shape == other.psf_scatter.shape == (0, 5, 5)
+    assert other.psf_modes.shape == (2, 0, 5, 5)
+
+
+def test_replaced_psfs_are_the_same_all_over():
+    field = lnocl.PsfField(np.ones((2, 3, 3)), [(0, 0), (8, 0)])
+    given = lnocl.Observation(np.ones((8, 9)), field)
+    assert given.replace(background=np.array([2.0])).psf_fields
+    assert not given.replace(psfs=given.psfs).psf_fields
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"image": 1.0}, "image is no attribute"),
+        ({"_is_checked": True}, "_is_checked is no attribute"),
+        ({"images": np.ones((2, 8, 8))}, "mask has shape"),
+        ({"images": np.ones((8, 9))}, "images has shape"),
+        ({"images": np.full((2, 8, 9), -1.0)}, "images must be finite and not negative; -1 was"),
+        ({"images": np.full((2, 8, 9), np.nan)}, "images must be finite and not negative; nan"),
+        ({"images": np.full((2, 8, 9), 1e31)}, "the images, with exposure"),
+        ({"images": np.ma.masked_all((2, 8, 9))}, "images has 144 masked values"),
+        ({"images": np.ones((2, 8, 9), complex)}, "images holds complex128"),
+        ({"background": np.array([1.0, -2.0])}, "background must be finite and not negative; -2"),
+        ({"background": np.array([1e31, 1.0])}, "the background, with exposure"),
+        ({"background": 1.0}, r"background has shape \(\)"),
+        ({"read_noise": np.full(2, np.inf)}, "read_noise must be finite"),
+        ({"exposure": np.array([1.0, 0.0])}, "exposure must be finite and more than zero; 0 was"),
+        ({"mask": np.ones((2, 8, 9))}, "mask is of type float64"),
+        ({"mask": np.ones((2, 8, 9), bool)}, "all pixels are masked"),
+        ({"offsets": np.array([(0, 0), (9, 0)])}, "offsets must be finite, and less than"),
+        ({"psfs": np.ones((3, 3))}, "psfs has shape"),
+        ({"psfs": np.full((2, 3, 3), np.nan)}, "psfs must be finite; nan was given"),
+        ({"psfs": np.zeros((2, 3, 3))}, "psfs must have positive sums"),
+        ({"psf_scatter": -np.ones((2, 3, 3))}, "psf_scatter must be finite and not negative; -1"),
+        ({"psf_modes": np.ones((2, 4, 5, 5))}, "psf_modes has shape"),
+        ({"psf_modes": np.ones(3)}, "psf_modes has shape"),
+        ({"oversample": 3}, "oversample must be 1, 2 or 4"),
+        ({"effective_psfs": 1}, "effective_psfs must be True or False"),
+    ],
+)
+def test_replace_refuses(changes, message):
+    with pytest.raises(InputError, match=f"^{message}"):
+        two_images().replace(**changes)
+
+
+def test_attributes_cannot_be_set():
+    observation = two_images()
+    with pytest.raises(AttributeError, match=r"replace\(psfs=\.\.\.\) returns another"):
+        observation.psfs = np.ones((2, 3, 3))

@@ -1,7 +1,5 @@
 """A step for PSFs and stars: its slopes by differences, the step by an explicit matrix."""
 
-from copy import copy
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -41,13 +39,11 @@ def a_scene(psfs=PSFS, stars=STARS, **known):
     observation = lnocl.Observation(
         counts, PSFS, background=30.0, ideal_psfs=IDEALS, psf_modes=MODES, pupils=PUPIL, **known
     )
-    observation.psfs = psfs
-    return Scene(observation, stars)
+    return Scene(observation.replace(psfs=psfs), stars)
 
 
 def families(scene, names=NAMES):
-    given = copy(scene.observation)
-    given.psfs = PSFS
+    given = scene.observation.replace(psfs=PSFS)
     return PsfFamilies(names, given, 0.1 * PSFS)
 
 
