@@ -18,7 +18,7 @@ from lnocl.io.fitsread import read_contents, read_extension, read_keyword, read_
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
 from lnocl.io.levels import is_rate, sky_level, sky_noise
 from lnocl.io.maps import Maps, Word
-from lnocl.io.noise import VARIANCES, WITH_SOURCE, NoiseMap, electrons_by_variance, read_noise_map
+from lnocl.io.noise import CLASSES, WITH_SOURCE, NoiseMap, electrons_by_variance, read_noise_map
 from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.observation import OVERSAMPLES, Array, Observation, PsfCentre
@@ -439,7 +439,7 @@ class _Reader:
 
     @cached_property
     def _noise_map(self) -> NoiseMap | None:
-        given = {kind: getattr(self._calibration, kind) for kind in VARIANCES}
+        given = {kind: getattr(self._calibration, kind) for kind in CLASSES}
         found = read_noise_map(given, self._maps, lambda: self._extensions("ERR", "error"))
         if found is not None and any(self._calibration.read_noise):
             raise InputError(f"give read_noise, or give {found.kind}, which includes it, not both")

@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError, counted
+from lnocl.errors import InputError
 from lnocl.io.levels import clipped_sky
 from lnocl.io.maps import Maps
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
+from lnocl.scene.uncertainties import variance_of, without_source
 
-log = logging.getLogger("lnocl")
-
-# The variance of each kind of map, in units of the images squared.
-VARIANCES: Mapping[str, Callable[[Array], Array]] = {
-    "inverse_variance": lambda values: 1.0 / values,
-    "variance": lambda values: values,
-    "rms": np.square,
-    "error": np.square,
+# The class of astropy.nddata for each kind of map.
+CLASSES = {
+    "inverse_variance": "InverseVariance",
+    "variance": "VarianceUncertainty",
+    "rms": "StdDevUncertainty",
+    "error": "StdDevUncertainty",
 }
 # No image has so many times the noise that its sky shows.
 TOO_NOISY = 5.0
-# A gain that follows from the errors leaves them below the noise of the counts by so much.
-ROUNDING = 0.05
 # The share of pixels that are the brightest.
 BRIGHT = 0.01
 # The flags DO_NOT_USE, SATURATED and JUMP_DET of JWST: the counts of such a pixel were not summed
@@ -42,7 +38,7 @@ class NoiseMap(NamedTuple):
     Attributes
     ----------
     kind : str
-        Of `VARIANCES`.
+        Of `CLASSES`.
     variance : ndarray of float64, shape (p, ny, nx)
         In units of the images squared; 0 where a pixel is bad.
     """
@@ -72,24 +68,7 @@ class NoiseMap(NamedTuple):
         self._refuse_other_kinds(counts, variance, mask)
         if self.kind != WITH_SOURCE:
             return np.asarray(np.sqrt(variance))
-        variance -= np.where(mask, 0.0, counts.clip(0.0))
-        for j, (left, bad) in enumerate(zip(variance, mask, strict=True)):
-            n_below = int((left < -ROUNDING * counts[j].clip(0.0)).sum())
-            if n_below > 0.5 * (~bad).sum():
-                raise InputError(
-                    f"error of image {j} is less than the noise of its counts in most pixels; see "
-                    "to gain and exposure, or give it as rms if it leaves the source out"
-                )
-            median = np.sqrt(np.median(left[~bad].clip(0.0))) if not bad.all() else 0.0
-            log.info(
-                "image %d: noise apart from that of its counts %.3g electrons in the median; %s "
-                "whose error is less than the noise of its counts %s none",
-                j,
-                median,
-                counted(n_below, "pixel"),
-                "has" if n_below == 1 else "have",
-            )
-        return np.asarray(np.sqrt(variance.clip(0.0)))
+        return without_source(variance, counts, mask, (WITH_SOURCE, "rms"))
 
     def _refuse_other_kinds(self, counts: Array, variance: Array, mask: NDArray[np.bool_]) -> None:
         """Refuse a map of another kind than it is given as: its noise is not in the image."""
@@ -99,7 +78,7 @@ class NoiseMap(NamedTuple):
             noise = float(np.sqrt(np.median(variance[j][~bad])))
             _, scatter = clipped_sky(j, counts[j], bad)
             if noise > TOO_NOISY * scatter > 0:
-                others = ", ".join(kind for kind in VARIANCES if kind != self.kind)
+                others = ", ".join(kind for kind in CLASSES if kind != self.kind)
                 raise InputError(
                     f"{self.kind} says that the noise of image {j} is {noise:.3g} electrons, and "
                     f"its sky scatters by {scatter:.3g}: see to its unit, or give it as what it is "
@@ -172,7 +151,7 @@ def read_noise_map(
     FileError, InputError
         As `Maps.read`; several kinds; negative values.
     """
-    kinds = [kind for kind in VARIANCES if given.get(kind)]
+    kinds = [kind for kind in CLASSES if given.get(kind)]
     if not kinds:
         return None
     if len(kinds) > 1:
@@ -185,6 +164,6 @@ def read_noise_map(
             f"{kind} {given[kind][0]} has negative pixels; they must be 0 or more, and 0 where a "
             "pixel is bad"
         )
-    with np.errstate(divide="ignore", over="ignore"):
-        variance = VARIANCES[kind](values)
-    return NoiseMap(kind, np.where(np.isfinite(values) & np.isfinite(variance), variance, 0.0))
+    from astropy import nddata  # which takes its time to load
+
+    return NoiseMap(kind, variance_of(kind, getattr(nddata, CLASSES[kind])(values))[0])

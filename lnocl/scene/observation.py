@@ -16,6 +16,7 @@ from lnocl.scene.arrays import numbers, refuse_masked, unmasked, values_and_mask
 from lnocl.scene.cores import centre, off_centre, peak
 from lnocl.scene.psf_errors import check_modes, check_pixels
 from lnocl.scene.psf_field import PsfField, read_fields
+from lnocl.scene.uncertainties import is_uncertainty, without_source
 
 Array = NDArray[np.float64]
 PsfCentre = Literal["check", "fit", "given"]
@@ -60,9 +61,10 @@ class Observation:
         Counts in electrons per pixel. A pixel counts as bad where it is not finite, or masked in a
         `numpy.ma` array. The square of the read noise is added; counts that are negative then are
         set to zero, with a warning. An `astropy.units.Quantity`, an `astropy.nddata.NDData` such as
-        a CCDData, or a sequence of these is taken with its unit and mask. Counts per time are
-        multiplied by the exposure. Uncertainties are not used. Maps may be masked where the images
-        are; nothing else may hold masked values.
+        a CCDData, or a sequence of these is taken with its unit, mask and uncertainty. The latter
+        is that of all noise, the source's counts included: what is left without these is the read
+        noise. Pixels are bad where it is 0 or not finite. Counts per time are multiplied by the
+        exposure. Maps may be masked where the images are; nothing else may hold masked values.
     psfs : array_like, shape (p, ky, kx) or (ky, kx), or PsfField
         Point spread functions, with their centres at ``(ky // 2, kx // 2)``. One serves all images.
         Their sums are positive and are normalised to 1. Negative pixels stay, with a warning. A
@@ -73,8 +75,9 @@ class Observation:
         Known background, electrons per pixel, zero or more. A Quantity may be per time.
     read_noise : float or array_like, shape (p,) or (p, ny, nx), optional
         Standard deviation of the read noise, electrons per pixel, zero or more. Its square is added
-        to images and background (Snyder's approximation of Gaussian noise by Poisson noise). For a
-        survey's inverse variance of sky and read noise together, give one over its square root.
+        to images and background (Snyder's approximation of Gaussian noise by Poisson noise). A
+        `StdDevUncertainty`, `VarianceUncertainty` or `InverseVariance` of `astropy.nddata` may be
+        of sky and read noise together. Pixels are bad where such a map is 0 or not finite.
     mask : array_like of bool, shape (p, ny, nx) or (ny, nx), optional
         True where a pixel is bad, as in `numpy.ma`. One serves all images.
     exposure : float or array_like, shape (p,), (p, ny, nx) or (ny, nx), optional
@@ -146,6 +149,8 @@ class Observation:
         - `oversample` is not 1, 2 or 4, or `effective_psfs` is not True or False.
         - An array has the wrong shape, type or unit, is empty, or holds values out of range.
         - An array other than `images` holds masked values.
+        - Images have an uncertainty that is below the noise of their counts in most pixels, of a
+          class without a variance, or beside read noise.
         - A PSF or its sum is not finite, its sum is not positive, or its core is off its centre.
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
@@ -206,6 +211,14 @@ class Observation:
         given, masked = values_and_mask("images", counts)
         self.images = _stack("images", given)
         self.mask = masked.copy().reshape(self.images.shape)
+        variances = containers.variances("images", images, are_rates)
+        if variances is not None:
+            variances = variances.reshape(self.images.shape)
+            self.mask |= variances == 0
+        if is_uncertainty(read_noise):
+            read_noise = containers.deviations("read_noise", read_noise)
+            if np.shape(read_noise) in (self.images.shape, self.shape):
+                self.mask |= np.equal(read_noise, 0)
         fields = read_fields(psfs, self.n_images, self.oversample, self.effective_psfs)
         self.psf_fields = tuple(
             field.mapped(lambda stack: np.array(_check_psfs(stack, len(stack), psf_centre)))
@@ -229,6 +242,10 @@ class Observation:
                 self.images *= _each_pixel(self.exposure)
             self.background = self._check_background(background, has_exposure)
             self.read_noise = self._check_read_noise(read_noise)
+            if variances is not None:
+                self.read_noise = self._read_noise_of(
+                    variances * _each_pixel(self.exposure) ** 2 if are_rates else variances
+                )
             self._add_read_noise()
         self._refuse_overflow()
         self._clip_negative()
@@ -471,6 +488,14 @@ class Observation:
         sigma = self._one_or_map("read_noise", containers.counts("read_noise", read_noise)[0], 0.0)
         _refuse_out_of_range("read_noise", sigma)
         return sigma
+
+    def _read_noise_of(self, variances: Array) -> Array:
+        """Return what the uncertainty of images has beyond the noise of their counts."""
+        if self.read_noise.any():
+            raise InputError(
+                "give read_noise, or images with their uncertainty, which includes it, not both"
+            )
+        return without_source(variances, self.images, self.mask)
 
     def _add_read_noise(self) -> None:
         variance = self.read_noise**2

@@ -5,7 +5,14 @@ import warnings
 import numpy as np
 import pytest
 from astropy import units as u
-from astropy.nddata import CCDData, NDData, StdDevUncertainty
+from astropy.nddata import (
+    CCDData,
+    InverseVariance,
+    NDData,
+    StdDevUncertainty,
+    UnknownUncertainty,
+    VarianceUncertainty,
+)
 from astropy.utils.masked import Masked
 
 import lnocl
@@ -137,9 +144,115 @@ def test_nddata_without_a_mask_and_with_one_for_all():
     np.testing.assert_array_equal(observe(images=dead).mask, [MASK[0] & False, MASK[0] | True])
 
 
-def test_uncertainties_are_not_used():
-    image = CCDData(IMAGES[0], unit="electron", uncertainty=StdDevUncertainty(IMAGES[0]))
-    assert_same(observe(images=image), observe(images=IMAGES[0]))
+# --- Uncertainties
+
+# Of all noise: the counts, and a read noise that differs from pixel to pixel.
+READ_NOISE = 1.0 + IMAGES % 3
+VARIANCE = IMAGES + READ_NOISE**2
+BY_CLASS = {
+    StdDevUncertainty: np.sqrt,
+    VarianceUncertainty: np.array,
+    InverseVariance: np.reciprocal,
+}
+
+
+def assert_nearly_same(found, expected):
+    for name in ("images", "background", "read_noise", "exposure"):
+        values = getattr(found, name), getattr(expected, name)
+        np.testing.assert_allclose(*values, rtol=1e-12, atol=0)
+    np.testing.assert_array_equal(found.mask, expected.mask)
+
+
+@pytest.mark.parametrize(("kind", "of_variance"), BY_CLASS.items())
+class TestUncertainties:
+    def test_of_images_have_the_noise_of_the_counts(self, kind, of_variance):
+        image = CCDData(IMAGES, unit="electron", uncertainty=kind(of_variance(VARIANCE)))
+        assert_nearly_same(observe(images=image), observe(read_noise=READ_NOISE))
+
+    def test_follow_the_unit_and_the_exposure(self, kind, of_variance):
+        unit = 4 * u.electron / u.s
+        per_unit = 4.0 * TIMES[:, None, None]
+        images = [
+            CCDData(i, unit=unit, uncertainty=kind(of_variance(v)))
+            for i, v in zip(IMAGES / per_unit, VARIANCE / per_unit**2, strict=True)
+        ]
+        found = observe(images=images, exposure=TIMES)
+        assert_nearly_same(found, observe(read_noise=READ_NOISE, exposure=TIMES))
+
+    def test_of_another_unit_are_converted(self, kind, of_variance):
+        power = {StdDevUncertainty: 1, VarianceUncertainty: 2, InverseVariance: -2}[kind]
+        unit = (2 * u.electron) ** power
+        noise = kind(of_variance(VARIANCE / 4.0), unit=unit)
+        image = NDData(IMAGES, unit="electron", uncertainty=noise)
+        assert_nearly_same(observe(images=image), observe(read_noise=READ_NOISE))
+
+    def test_of_read_noise_leave_the_counts_out(self, kind, of_variance):
+        noise = kind(of_variance(READ_NOISE**2))
+        assert_nearly_same(observe(read_noise=noise), observe(read_noise=READ_NOISE))
+
+    @pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+    def test_mark_bad_pixels(self, kind, of_variance, value):
+        bad = IMAGES % 7 == 0
+        uncertain = np.where(bad, value, of_variance(VARIANCE))
+        image = NDData(IMAGES, uncertainty=kind(uncertain))
+        assert_nearly_same(observe(images=image), observe(read_noise=READ_NOISE, mask=bad))
+        known = kind(np.where(bad, value, of_variance(READ_NOISE**2)))
+        expected = observe(read_noise=READ_NOISE, mask=bad)
+        assert_nearly_same(observe(read_noise=known), expected)
+
+    def test_are_never_modified(self, kind, of_variance):
+        given = of_variance(VARIANCE)
+        image = NDData(IMAGES, uncertainty=kind(given.copy()))
+        observe(images=image)
+        np.testing.assert_array_equal(image.uncertainty.array, given)
+
+
+def test_uncertainties_below_the_noise_of_the_counts_leave_none():
+    variance = np.where(IMAGES == 9, 0.9 * IMAGES, VARIANCE)
+    image = NDData(IMAGES, uncertainty=VarianceUncertainty(variance))
+    assert_nearly_same(observe(images=image), observe(read_noise=READ_NOISE * (IMAGES != 9)))
+
+
+STDDEV = StdDevUncertainty(np.sqrt(VARIANCE))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"images": NDData(IMAGES, uncertainty=StdDevUncertainty(READ_NOISE / 9))},
+            "the uncertainty of image 0 is less than the noise of its counts in most pixels",
+        ),
+        ({"images": NDData(IMAGES, uncertainty=STDDEV), "read_noise": 1.0}, "give read_noise, or"),
+        (
+            {"images": NDData(IMAGES, uncertainty=UnknownUncertainty(VARIANCE))},
+            "images has an uncertainty of the class UnknownUncertainty; make it",
+        ),
+        (
+            {"images": [NDData(IMAGES[0], uncertainty=StdDevUncertainty(IMAGES[0])), IMAGES[1]]},
+            "some of images have an uncertainty",
+        ),
+        (
+            {"images": NDData(IMAGES, uncertainty=StdDevUncertainty(-VARIANCE))},
+            "the uncertainty of images has negative values",
+        ),
+        (
+            {"images": NDData(IMAGES, uncertainty=StdDevUncertainty(VARIANCE[0]))},
+            r"images have an uncertainty of shape \(4, 4\)",
+        ),
+        (
+            {"read_noise": StdDevUncertainty(READ_NOISE, unit="adu")},
+            "the uncertainty of read_noise is in adu; give it in counts",
+        ),
+        (
+            {"read_noise": StdDevUncertainty(READ_NOISE, unit="electron / s"), "exposure": TIMES},
+            "the uncertainty of read_noise is in electron / s; give it in counts",
+        ),
+    ],
+)
+def test_uncertainties_that_are_refused(given, message):
+    with pytest.raises(lnocl.InputError, match=f"^{message}"):
+        observe(**given)
 
 
 def test_nddata_are_never_modified():
