@@ -350,8 +350,8 @@ class Observation:
             changes = {"psf_fields": (), **changes}
         held |= {name: _read(name, values) for name, values in changes.items()}
         other._refuse_other_shapes()
-        for name in changes.keys() - {"mask", "offsets"}:
-            if isinstance(held[name], np.ndarray):
+        for name in changes:
+            if isinstance(held[name], np.ndarray) and name not in ("mask", "offsets"):
                 _refuse_out_of_range(name, held[name])
         if not (other.psfs.sum(axis=(1, 2)) > 0).all():
             raise InputError("psfs must have positive sums; give others")
