@@ -134,7 +134,7 @@ class GuardedRuns:
             How strongly the extended source is kept from the stars, as `GUARD`.
         """
         observation = self.observation.replace(psfs=self.cut(psfs))
-        setup = replace(self._setup, stars=stars, refine_positions=moves)
+        setup = replace(self._setup, stars=self._inside(stars), refine_positions=moves)
         with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
             start = make_start(setup, observation, Penalty())
             found = Estimate(start.scene, start.extended, start.star_fluxes, _unknown(error))
@@ -154,7 +154,7 @@ class GuardedRuns:
         ny, nx = found.scene.observation.sky_shape
         unit = found.scene.unit
         start = make_start(
-            replace(setup, stars=found.scene.stars),
+            replace(setup, stars=self._inside(found.scene.stars)),
             found.scene.observation,
             penalty,
             np.maximum(found.extended[:ny, :nx], 0.0) * unit,
@@ -181,6 +181,14 @@ class GuardedRuns:
         with ignored_warnings():
             scene = Scene(observation, stars.clip(0, (nx - 1, ny - 1)), pad=self._setup.pad)
         return Estimate(scene, estimate.extended, fluxes, estimate.misfit)
+
+    def _inside(self, stars: Array) -> Array:
+        """Return stars, those at an edge that have moved out of all images."""
+        size = np.array(self.observation.shape[::-1])
+        places = stars[:, None] + self.observation.offsets
+        are_within = np.all((places >= -0.5) & (places < size - 0.5), axis=2)
+        are_inside = np.any(are_within, axis=1)
+        return np.where(are_inside[:, None], stars, stars.clip(0, size - 1))
 
     def cut(self, psfs: Array) -> Array:
         """Return PSFs as far as the window may show them."""

@@ -249,6 +249,19 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
 
 
 @pytest.mark.exhaustive
+def test_a_star_may_leave_the_images_while_psfs_are_judged():
+    y, x = np.indices((17, 17)) - 8.0
+    y_image, x_image = np.indices((40, 40))
+    star = np.exp(-((x_image - 20.3) ** 2 + (y_image + 0.9) ** 2) / 5.12) / 16.1
+    counts = np.random.default_rng(0).poisson(20.0 + 3e4 * star)
+    observation = lnocl.Observation(counts, np.exp(-(x**2 + y**2) / 7.22), background=20.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LnoclWarning)
+        result = lnocl.deconvolve(observation, [(20, 0)], n_iter=20, engine="numpy", pad=0)
+    assert result.star_positions[0, 1] < -0.5
+    assert abs(result.star_positions[0, 0] - 20.3) < 0.1
+
+
 def test_both_engines_agree():
     images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
     reference = refine(images, PSF)
