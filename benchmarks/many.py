@@ -33,8 +33,8 @@ def main():
     stars = rng.uniform(5, N - 6, (arguments.stars, 2))
     image, movable = np.full((N, N), 50.0), MovablePsf(psf, (N, N))
     for star, flux in zip(stars, 10 ** rng.uniform(3, 5, len(stars)), strict=True):
-        stamp = movable.at(*star)
-        image[stamp.window((N, N))] += flux * stamp.values
+        cutout = movable.at(*star)
+        image[cutout.window((N, N))] += flux * cutout.values
     images = rng.poisson(image.clip(0), (arguments.images, N, N))
     said = []
     handler = logging.Handler()

@@ -400,7 +400,7 @@ def basin(device):
                 left, plain = [], []
                 for turn in turns:
                     given = star + distance * np.array([np.cos(turn), np.sin(turn)])
-                    scene = Scene(observation, [given], leeway=3.0)
+                    scene = Scene(observation, [given], max_shift=3.0)
                     extended, fluxes = scene.start(None, None)
                     fit = StarFit(scene, Model(scene), extended, scene.stars)
                     given = Stars(fluxes, scene.stars)

@@ -143,8 +143,8 @@ def observe(size, seed, n_stars, field):
     fluxes = 10.0 ** rng.uniform(3.5, 5.5, n_stars)
     image = see(sky, field, 33) + 10.0
     for (x, y), flux in zip(stars, fluxes, strict=True):
-        stamp = MovablePsf(field.at(x, y), (size, size)).at(x, y)
-        stamp.add_to(image, range(size), range(size), (size, size), flux)
+        cutout = MovablePsf(field.at(x, y), (size, size)).at(x, y)
+        cutout.add_to(image, range(size), range(size), (size, size), flux)
     return rng.poisson(np.maximum(image, 0.0)).astype(float), sky, stars, fluxes
 
 

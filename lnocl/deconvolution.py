@@ -430,7 +430,7 @@ def _complete(
         return "not finite"
     except DivergedError as error:
         checkpointer.return_to_best(run)
-        warn(f"{error}; the result is that of iteration {run.done}, where it was least")
+        warn(f"{error.message}; the result is that of iteration {run.done}, where it was least")
         return "diverged"
 
 

@@ -155,14 +155,14 @@ def _check(
     if pixels.ndim != 2:
         raise InputError(f"image has {counted(pixels.ndim, 'dimension')}; give one image")
     if not threshold > 0:
-        raise InputError(f"threshold must be more than 0; {threshold:g} was given")
+        raise InputError(f"`threshold` must be more than 0; {threshold:g} was given")
     bad = ~np.isfinite(pixels) | _outside(pixels)
     if mask is not None:
         given = np.asarray(mask)
         if given.dtype != np.bool_ or given.shape != pixels.shape:
             raise InputError(
-                f"mask of type {given.dtype} and shape {given.shape} must be booleans of the shape "
-                f"of image, {pixels.shape}"
+                f"`mask` of type {given.dtype} and shape {given.shape} must be booleans of the "
+                f"shape of image, {pixels.shape}"
             )
         bad |= given
     if bad.all():
@@ -190,7 +190,7 @@ def _check_psf(psf: ArrayLike) -> Array:
     light = numbers("psf", psf)
     if light.ndim != 2 or not np.isfinite(light).all() or not light.sum() > 0:
         raise InputError(
-            f"psf of shape {light.shape} must be one image of finite numbers with a positive sum"
+            f"`psf` of shape {light.shape} must be one image of finite numbers with a positive sum"
         )
     return light / light.sum()
 

@@ -1,12 +1,32 @@
-"""The errors that lnocl raises, its warning, and the one way to warn."""
+"""The errors that lnocl raises, its warning, and the ways to warn and to note.
 
+Messages name parameters between grave accents, and images and PSFs by their index, as in
+`` `n_iter` `` and `` `psfs[0]` ``: so the shell knows what is a flag there, and counts from 1.
+"""
+
+import logging
 import math
 import os
+import re
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 PACKAGE = str(Path(__file__).parent) + os.sep
+NAMED = re.compile(r"`([\w ]+?)(?:\[(\d+)\])?`")
+LOG = logging.getLogger("lnocl")
+
+
+def with_names(message: str, named: Callable[[str], str] = str, first: int = 0) -> str:
+    """Return a message with a name for each parameter, and images and PSFs counted from `first`."""
+
+    def replace(found: re.Match[str]) -> str:
+        name, index = found.groups()
+        return f"{name.removesuffix('s')} {int(index) + first}" if index else named(name)
+
+    return NAMED.sub(replace, message)
 
 
 class LnoclError(Exception):
@@ -23,6 +43,8 @@ class LnoclError(Exception):
     ----------
     exit_status : int
         Exit status of the command line after this error: 1 for a failure, 2 for wrong use.
+    message : str
+        The text with the names of parameters between grave accents.
 
     Examples
     --------
@@ -38,7 +60,8 @@ class LnoclError(Exception):
     exit_status = 1
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.split()))
+        self.message = " ".join(message.split())
+        super().__init__(with_names(self.message))
 
 
 class InputError(LnoclError, ValueError):
@@ -180,10 +203,20 @@ class LnoclWarning(UserWarning):
     True
     """
 
+    def __init__(self, message: str) -> None:
+        self.message = message
+        super().__init__(with_names(message))
+
 
 def warn(message: str) -> None:
     """Warn with an `LnoclWarning` that points to the caller's line, the nearest outside lnocl."""
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(PACKAGE):
         level, frame = level + 1, frame.f_back
-    warnings.warn(message, LnoclWarning, stacklevel=level)
+    warnings.warn(LnoclWarning(message), stacklevel=level)
+
+
+def note(message: str, *values: Any) -> None:
+    """Log what was found or done, at the level of information; `values` are as for %."""
+    whole = message % values if values else message
+    LOG.info("%s", with_names(whole), extra={"named": whole})

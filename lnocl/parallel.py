@@ -22,7 +22,7 @@ Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 # Returns the function that does a task; each process calls it once, and holds what it returns.
 Maker = Callable[[], Callable[[Task], Answer]]
-Said = list[tuple[type[Warning], str]]
+Warned = list[tuple[type[Warning], str]]
 
 CURRENT = "current-scheduler"
 Parallel = bool | int | Literal["current-scheduler"]
@@ -60,7 +60,7 @@ def check_parallel(parallel: object) -> None:
     is_number = isinstance(parallel, int) and (isinstance(parallel, bool) or parallel >= 1)
     if not (is_number or (isinstance(parallel, str) and parallel == CURRENT)):
         raise InputError(
-            f"parallel must be True, False, a number of processes or {CURRENT!r}; {parallel!r} "
+            f"`parallel` must be True, False, a number of processes or {CURRENT!r}; {parallel!r} "
             "was given"
         )
     if parallel is False:
@@ -68,7 +68,9 @@ def check_parallel(parallel: object) -> None:
     try:
         import distributed  # noqa: F401
     except ImportError:
-        raise LnoclError("parallel needs Dask; install it with: pip install distributed") from None
+        raise LnoclError(
+            "`parallel` needs Dask; install it with: pip install distributed"
+        ) from None
 
 
 def work(
@@ -126,7 +128,7 @@ def _client_of(parallel: Parallel) -> Iterator[Client]:
             client = distributed.get_client()
         except (ValueError, OSError) as error:
             raise LnoclError(
-                f"parallel {CURRENT!r} finds no scheduler ({error}): make a client first, as by "
+                f"`parallel` {CURRENT!r} finds no scheduler ({error}): make a client first, as by "
                 "dask.distributed.Client(ADDRESS), or set DASK_SCHEDULER_ADDRESS"
             ) from None
         yield client
@@ -179,7 +181,7 @@ def _refuse_inside_a_task() -> None:
         distributed.get_worker()
     except ValueError:
         return
-    raise InputError("parallel inside a task of Dask would wait for itself; leave it out there")
+    raise InputError("`parallel` inside a task of Dask would wait for itself; leave it out there")
 
 
 class _Ended(NamedTuple):
@@ -196,7 +198,7 @@ def _answers(
 ) -> Generator[tuple[int, Answer]]:
     """Yield the place of each task and its answer, as they are done; send what was lost anew."""
     waiting = dict(enumerate(tasks))
-    said: set[tuple[type[Warning], str]] = set()
+    shown: set[tuple[type[Warning], str]] = set()
     n_fruitless = 0
     while waiting:
         n_before, suspects = len(waiting), []
@@ -205,13 +207,13 @@ def _answers(
                 suspects.append(k)
                 continue
             del waiting[k]
-            yield k, _heard(found, said)
+            yield k, _pass_on(found, shown)
         # Another task may have ended the workers that these waited for.
         for suspect in suspects:
             for k, found in _round(client, make, {suspect: waiting[suspect]}):
                 task = waiting.pop(k)
                 if not isinstance(found, _Ended):
-                    yield k, _heard(found, said)
+                    yield k, _pass_on(found, shown)
                 elif instead is None:
                     raise LnoclError(f"{found.why}; see what their logs say")
                 else:
@@ -224,19 +226,19 @@ def _answers(
             )
 
 
-def _heard(found: tuple[Answer, Said], said: set[tuple[type[Warning], str]]) -> Answer:
-    """Return the answer of a worker; give its warnings but for those that were said."""
+def _pass_on(found: tuple[Answer, Warned], shown: set[tuple[type[Warning], str]]) -> Answer:
+    """Return the answer of a worker; give its warnings but for those that were shown."""
     answer, warned = found
     for category, message in warned:
-        if (category, message) not in said:
-            said.add((category, message))
-            warnings.warn(message, category, stacklevel=5)
+        if (category, message) not in shown:
+            shown.add((category, message))
+            warnings.warn(category(message), stacklevel=5)
     return answer
 
 
 def _round(
     client: Client, make: Maker[Task, Answer], waiting: Mapping[int, Task]
-) -> Iterator[tuple[int, tuple[Answer, Said] | _Ended]]:
+) -> Iterator[tuple[int, tuple[Answer, Warned] | _Ended]]:
     """Yield what workers found for tasks that are waiting, but for those that are lost."""
     import dask
     from distributed.client import FutureCancelledError
@@ -317,7 +319,7 @@ def _same(make: Maker[Task, Answer]) -> Maker[Task, Answer]:
     return make
 
 
-def _do(token: str, make: Maker[Task, Answer], task: Task) -> tuple[Answer, Said]:
+def _do(token: str, make: Maker[Task, Answer], task: Task) -> tuple[Answer, Warned]:
     """Do a task in a worker, which holds what `make` returned until other work comes."""
     with _LOCK, process.recorded_warnings() as recorded:
         process.is_worker = True
@@ -325,4 +327,6 @@ def _do(token: str, make: Maker[Task, Answer], task: Task) -> tuple[Answer, Said
             _held.clear()
             _held[token] = make()
         answer: Answer = _held[token](task)
-    return answer, [(each.category, str(each.message)) for each in recorded]
+    return answer, [
+        (each.category, getattr(each.message, "message", str(each.message))) for each in recorded
+    ]

@@ -17,7 +17,7 @@ from lnocl.scene.scene import Scene
 # The core of a star is where its PSF is above this share of its peak; its wings go on to the other.
 CORE, WINGS = 0.5, 1e-3
 # Light round a star is looked for as far as so many widths of its PSF, in so many sectors, and is
-# worth a word from these shares of the star's flux, and of all light there, on
+# reported from these shares of the star's flux, and of all light there, on
 # (docs/validation/psf.md).
 REACH, SECTORS = 12.0, 8
 MUCH_HALO, MUCH_SHARE = 0.1, 0.05
@@ -204,20 +204,20 @@ def _fits_at(
 
     observation = scene.observation
     y, x = np.nonzero(psf > WINGS * psf.max())
-    lit = psf[y.min() : y.max() + 1, x.min() : x.max() + 1]
-    # The middle of what is lit, where the PSF's is at the star.
+    bright = psf[y.min() : y.max() + 1, x.min() : x.max() + 1]
+    # The middle of these pixels, where the PSF's is at the star.
     middle = [
         round(at) - n // 2 + low + size // 2
         for at, n, low, size in zip(
             (position + observation.offsets[j])[::-1],
             psf.shape,
             (y.min(), x.min()),
-            lit.shape,
+            bright.shape,
             strict=True,
         )
     ]
     try:
-        there, of_psf = overlap_slices(observation.shape, lit.shape, middle)
+        there, of_psf = overlap_slices(observation.shape, bright.shape, middle)
     except NoOverlapError:  # the star is in other images alone
         return Fit(), Fit()
     model = np.array(background[there])
@@ -227,7 +227,7 @@ def _fits_at(
         model *= scene.weights[j][there]
     model *= scene.scale
     values = residuals(observation.images[j][there], observation.mask[j][there], model)
-    share = lit[of_psf] / psf.max()
+    share = bright[of_psf] / psf.max()
     is_core, is_wing = share > CORE, (share > WINGS) & (share <= CORE)
     return Fit.of(values[is_core], model[is_core]), Fit.of(values[is_wing], model[is_wing])
 

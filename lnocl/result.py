@@ -33,7 +33,7 @@ HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
 
 class Iterating(Protocol):
-    """What has an estimate: a run, or both halves of held-out counts."""
+    """A run, or the two runs of held-out counts: both have an estimate."""
 
     def extended(self) -> Array:
         """Return the extended source, electrons per pixel, shape (ny, nx)."""

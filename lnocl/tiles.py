@@ -348,7 +348,7 @@ def _pad(observation: Observation, pad: Any) -> int:
     if isinstance(pad, str) and pad == "auto":
         return max(recommend_pad(observation), int(np.ceil(abs(observation.offsets).max())))
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
-        raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
+        raise InputError(f"`pad` must be a whole number, 0 or more, or auto; {pad} was given")
     return int(pad)
 
 
@@ -363,8 +363,9 @@ def _lay(observation: Observation, tile: int | None, pad: int) -> list[tuple[_Sp
     least = 2 * (max(margins) + pad) + 16
     if not (isinstance(tile, (int, np.integer)) and tile >= least):
         raise InputError(
-            f"tile must be a whole number of {least} pixels or more, for margins of half a PSF and "
-            f"the offsets, {max(margins)} pixels, and a pad of {pad} on each side; {tile} was given"
+            f"`tile` must be a whole number of {least} pixels or more, for margins of half a PSF "
+            f"and the offsets, {max(margins)} pixels, and a pad of {pad} on each side; {tile} was "
+            "given"
         )
     rows, columns = (
         _divide(size, int(tile) - 2 * pad, margin)
@@ -491,7 +492,7 @@ class _Solving:
             try:
                 result = deconvolve(tile.observation, tile.stars, **self._options)
             except InputError as error:
-                raise InputError(f"{begins}: {error}") from error
+                raise InputError(f"{begins}: {error.message}") from error
             stars = (
                 result.star_positions,
                 result.star_fluxes,
@@ -513,7 +514,7 @@ class _Solving:
             result.stop_reason,
             result.device,
             [
-                f"{begins}: {each.message}"
+                f"{begins}: {getattr(each.message, 'message', each.message)}"
                 for each in recorded
                 if issubclass(each.category, LnoclWarning)
             ],

@@ -156,8 +156,8 @@ def test_a_worker_that_is_killed_and_a_connection_that_is_cut_cost_no_task(clien
 def test_warnings_of_workers_are_given_once(client):
     with pytest.warns(LnoclWarning) as given:
         assert list(work(make_warner, range(8), CURRENT)) == list(range(8))
-    said = [str(each.message) for each in given if each.category is LnoclWarning]
-    assert sorted(said) == ["numbers are even", "numbers are odd"]
+    shown = [str(each.message) for each in given if each.category is LnoclWarning]
+    assert sorted(shown) == ["numbers are even", "numbers are odd"]
 
 
 def test_an_error_of_a_task_is_raised(client):

@@ -241,7 +241,7 @@ def make_frame(seed=0, n_images=1, psf=None, n_stars=9, size=N):
 @pytest.mark.parametrize(
     ("run", "n_stars", "middle", "blends"),
     [
-        # With stars the fluxes that "sgm" starts from, and hangs on, differ.
+        # With stars the fluxes that "sgm" starts from, and depends on, differ.
         ({"solver": "sgm", "n_iter": 60, "smoothing": 0.0}, 0, 1e-3, 1e-2),
         ({"solver": "sgp", "n_iter": 400, "smoothing": 0.02}, 9, 6e-4, 1e-3),
     ],

@@ -172,7 +172,7 @@ class Folder:
 
 
 def _make_worker(folder: Folder, start: str) -> Callable[[Target], Record]:
-    """Return what does a target; `start` is the folder in which its command is run."""
+    """Return the function of a target; `start` is the folder in which its command is run."""
     environment.prepare()
     return partial(_do, folder, start)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import logging
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lnocl.commands.options import option
+from lnocl.errors import note
 from lnocl.scene.apertures import Aperture
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from lnocl.result import Result
     from lnocl.runs.bootstrap import Bootstrap, Part
 
-log = logging.getLogger("lnocl")
 
 DEFAULT = 50
 # Seconds between two writings of the replicas so far.
@@ -79,11 +78,11 @@ def check(arguments: argparse.Namespace) -> None:
     if arguments.bootstrap is None:
         if any(getattr(arguments, name) is not None for name in ("regions", "profiles", "seed")):
             raise InputError(
-                "regions, profiles and seed are for replicas: give --bootstrap 50 with them"
+                "`regions`, `profiles` and `seed` are for replicas: give --bootstrap 50 with them"
             )
         return
     if arguments.tile is not None:
-        raise InputError("replicas are of one run, not of tiles; leave tile out, or bootstrap")
+        raise InputError("replicas are of one run, not of tiles; leave `tile` out, or bootstrap")
     check_number(arguments.bootstrap, arguments.seed or 0)
 
 
@@ -96,8 +95,8 @@ def read(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
 
     oversample = frames.observation.oversample
     if oversample > 1:
-        log.info(
-            "regions in pixels are in those of the extended source, %d to one of the images",
+        note(
+            "`regions` in pixels are in those of the extended source, %d to one of the images",
             oversample,
         )
     where = sky_header(frames.header, oversample), frames.observation.sky_shape
@@ -180,8 +179,8 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
     )
     if not is_same:
         raise InputError(
-            f"{path} has replicas of other regions or another seed: give those, or take overwrite "
-            "to begin anew"
+            f"{path} has replicas of other regions or another seed: give those, or take "
+            "`overwrite` to begin anew"
         )
     return dataclasses.replace(expected, errors=held.errors, of_psfs=held.of_psfs, sums=held.sums)
 

@@ -66,10 +66,10 @@ def _solve_tiles(
     from lnocl.tiles import deconvolve_tiles
 
     if arguments.bootstrap is not None:
-        raise InputError("replicas are of one run, not of tiles; leave bootstrap out")
+        raise InputError("replicas are of one run, not of tiles; leave `bootstrap` out")
     for name in ("checkpoint", "checkpoint_every", "resume", "refine_psfs"):
         if parameters.pop(name, PARAMETERS[name]) not in (PARAMETERS[name], []):
-            raise InputError(f"{name} is not for tiles; leave it out")
+            raise InputError(f"`{name}` is not for tiles; leave it out")
     return deconvolve_tiles(
         observation, tile=arguments.tile, parallel=arguments.parallel, **parameters
     )
@@ -98,25 +98,25 @@ def _run(arguments: argparse.Namespace) -> None:
             view = view_of(result) if shown else None
             overall = Fit.of(view.residuals, view.models) if view else result.fit()
             verdict = verdict_on(arguments, result, at_stars, overall, bool(warned))
-            said = [*summarise(arguments, result, frames, at_stars, overall), *verdict]
+            lines = [*summarise(arguments, result, frames, at_stars, overall), *verdict]
             measured = _measured(result, frames, overall, verdict)
         wcs = fitsread.wcs_cards(frames.header)
-        _write(arguments, result, frames, given, at_stars, view, wcs, measured, [*warned, *said])
-        said.append(f"written to {arguments.output}")
+        _write(arguments, result, frames, given, at_stars, view, wcs, measured, [*warned, *lines])
+        lines.append(f"written to {arguments.output}")
         if arguments.plot is not None and view is not None:
             from lnocl.plotting.result import draw_result
 
-            said.append(pictures.draw(arguments, draw_result(view)))
+            lines.append(pictures.draw(arguments, draw_result(view)))
         if not arguments.quiet:
-            messages.say(said)
+            messages.say(lines)
     interrupts.explain(arguments, result)
     if arguments.bootstrap is not None:
         with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
-            said = bootstrap.add_errors(
+            lines = bootstrap.add_errors(
                 arguments, result, frames, parts, arguments.output, continues=False
             )
         if not arguments.quiet:
-            messages.say(said)
+            messages.say(lines)
 
 
 def _write(
@@ -128,7 +128,7 @@ def _write(
     view: ResultView | None,
     wcs: fits.Header,
     measured: Sequence[Card],
-    said: Sequence[str],
+    lines: Sequence[str],
 ) -> None:
     """Write the result with the command that repeats it."""
     from lnocl.io import fitsread, fitswrite
@@ -164,7 +164,7 @@ def _write(
             **({"MODELS": (view.models, "electron")} if arguments.models and view else {}),
             **({"RESIDUALS": (view.residuals, "")} if arguments.residuals and view else {}),
         },
-        said=said,
+        messages=lines,
         **parts,
     )
 

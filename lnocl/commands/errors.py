@@ -66,7 +66,7 @@ def _run(arguments: argparse.Namespace) -> None:
     bootstrap.check(run)
     try:
         there = contextlib.chdir(folder)
-        # What the run has to say it has said.
+        # What the run has to say it has lines.
         progress = messages.shown_log(run.quiet, name=messages.PROGRESS)
         with there, progress, ignored_warnings(), checkpoints.Interrupts() as interrupts:
             solved = deconvolve.solve(run, interrupts)
@@ -93,9 +93,11 @@ def _run(arguments: argparse.Namespace) -> None:
             "have changed; deconvolve again"
         )
     with messages.shown_log(run.quiet, name=messages.PROGRESS):
-        said = bootstrap.add_errors(run, found, frames, solved.parts, path, not arguments.overwrite)
+        lines = bootstrap.add_errors(
+            run, found, frames, solved.parts, path, not arguments.overwrite
+        )
     if not arguments.quiet:
-        messages.say([*said, f"added to {arguments.result}"])
+        messages.say([*lines, f"added to {arguments.result}"])
 
 
 def _run_of(saved: SavedResult) -> tuple[str, argparse.Namespace]:

@@ -11,10 +11,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TextIO
 
-# A parameter whose name is an ordinary word, such as pad, is meant where it begins a message or
-# follows one of these.
-BEFORE_NAMES = ("as", "give", "leave", "take", "with")
-
+from lnocl.errors import LnoclWarning, with_names
 
 # The logger of lines of progress.
 PROGRESS = "lnocl.progress"
@@ -57,24 +54,12 @@ def in_shell(message: str, flags: Mapping[str, str]) -> str:
     Parameters
     ----------
     message : str
-        It names parameters, such as ``n_iter``.
+        It names parameters between grave accents, such as `` `n_iter` `` and `` `images[0]` ``.
     flags : mapping of str to str
-        The flag of each parameter, such as ``--n-iter``. A name that is a plural, such as psfs,
-        stays as it is.
+        The flag of each parameter, such as ``--n-iter``. Others keep their name.
     """
-    ordinary = [name for name, flag in flags.items() if flag == f"--{name}"]
-    special = [name for name in flags if "_" in name]
-    place = "|".join(["^", *(rf"(?<=\b{word} )" for word in BEFORE_NAMES)])
-    name = rf"(?:{'|'.join(ordinary + special)})\b(?![./'-])"
-    for pattern in flags and (
-        rf"(?:{place}){name}(?:(?:, | and ){name})*",
-        rf"(?<![\w./'-])(?:{'|'.join(special)})(?![\w./'-])",
-    ):
-        message = re.sub(
-            pattern, lambda found: re.sub(name, lambda each: flags[each[0]], found[0]), message
-        )
-    message = re.sub(r"\b(image|psf) (\d+)\b", lambda m: f"{m[1]} {int(m[2]) + 1}", message)
-    return re.sub(r"(--[\w-]+)=", r"\1 ", message)
+    typed = with_names(message, lambda name: flags.get(name, name), first=1)
+    return re.sub(r"(--[\w-]+)=", r"\1 ", typed)
 
 
 def show_warning(
@@ -87,7 +72,11 @@ def show_warning(
     line: str | None = None,
 ) -> None:
     """Write a warning to stderr, with `in_shell`, in place of `warnings.showwarning`."""
-    _complain("warning", in_shell(str(message), flags))
+    _complain("warning", in_shell(_message_of(message), flags))
+
+
+def _message_of(warning: Warning | str) -> str:
+    return warning.message if isinstance(warning, LnoclWarning) else str(warning)
 
 
 @contextlib.contextmanager
@@ -97,7 +86,7 @@ def recorded_warnings(flags: Mapping[str, str]) -> Iterator[list[str]]:
     show = warnings.showwarning
 
     def record(message: Warning | str, *where: Any, **more: Any) -> None:
-        lines.append(f"warning: {in_shell(str(message), flags)}")
+        lines.append(f"warning: {in_shell(_message_of(message), flags)}")
         show(message, *where, **more)
 
     warnings.showwarning = record
@@ -152,7 +141,7 @@ class _Notes(logging.Handler):
         self._shown: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        message = in_shell(record.getMessage(), self._flags)
+        message = in_shell(getattr(record, "named", record.getMessage()), self._flags)
         if message not in self._shown:
             self._shown.add(message)
             _note(message)

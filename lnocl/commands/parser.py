@@ -43,20 +43,10 @@ class Command(NamedTuple):
             for each in options:
                 group.add_argument(*each.flags, **each.keywords)
 
-    def flags(self, words: Sequence[str] = ()) -> dict[str, str]:
-        """Return the flag of each parameter that an option stands for, the first of several.
-
-        Parameters
-        ----------
-        words : sequence of str, optional
-            The command line; a name in it may be that of a file, and is left out.
-        """
+    def flags(self) -> dict[str, str]:
+        """Return the flag of each parameter that an option stands for, the first of several."""
         options = [each for group in self.options.values() for each in group]
-        return {
-            each.name: each.flags[-1]
-            for each in reversed(options)
-            if not each.is_positional and each.name not in words
-        }
+        return {each.name: each.flags[-1] for each in reversed(options) if not each.is_positional}
 
 
 class Parser(argparse.ArgumentParser):

@@ -36,7 +36,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 COMMAND = Command(
-    "write a result as one page of HTML: images to blink and stretch, tables, what the run said",
+    "write a result as one page of HTML: images to blink and stretch, tables, messages of the run",
     {"": OPTIONS},
     _run,
 )

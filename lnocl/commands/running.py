@@ -10,7 +10,7 @@ from lnocl import __version__
 from lnocl.commands import messages
 from lnocl.commands.parser import Command, Parser
 from lnocl.commands.signals import ENDING, Terminated, first_handled, terminate
-from lnocl.errors import InputError, LnoclError, LnoclWarning
+from lnocl.errors import LnoclError, LnoclWarning
 
 FAILED = 1
 INTERRUPTED = 130
@@ -32,12 +32,10 @@ def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
             warnings.simplefilter("always", LnoclWarning)
             warnings.showwarning = partial(messages.show_warning, flags)
             parsed = make_parser(commands).parse_args(words)
-            flags |= parsed.command.flags(words)
+            flags |= parsed.command.flags()
             parsed.command.run(parsed)
-    except InputError as error:
-        return messages.fail(messages.in_shell(str(error), flags), error.exit_status)
     except LnoclError as error:
-        return messages.fail(str(error), error.exit_status)
+        return messages.fail(messages.in_shell(error.message, flags), error.exit_status)
     except MemoryError:
         return messages.fail("not enough memory; cut the images, or give fewer at a time", FAILED)
     except Terminated as error:

@@ -98,13 +98,13 @@ def _run(arguments: argparse.Namespace) -> None:
         stars[name].format = ".5g"
     with atomic.whole_file(arguments.output, arguments.overwrite) as stream:
         _write(stars, stream, FORMATS[ending])
-    said = [*_told(stars, n_extended), f"written to {arguments.output}"]
+    lines = [*_told(stars, n_extended), f"written to {arguments.output}"]
     if arguments.plot is not None:
         from lnocl.plotting.stars import draw_stars
 
-        said.append(pictures.draw(arguments, draw_stars(image, stars)))
+        lines.append(pictures.draw(arguments, draw_stars(image, stars)))
     if not arguments.quiet:
-        messages.say(said)
+        messages.say(lines)
 
 
 def _mask(arguments: argparse.Namespace) -> NDArray[np.bool_] | None:
@@ -120,8 +120,8 @@ def _mask(arguments: argparse.Namespace) -> NDArray[np.bool_] | None:
     values = fitsread.read_extension(arguments.image, word.upper())
     if values is None:
         raise InputError(
-            f"{arguments.image} has no extension {word.upper()}; give mask as a file, or leave it "
-            "out"
+            f"{arguments.image} has no extension {word.upper()}; give `mask` as a file, or leave "
+            "it out"
         )
     if word == "wht":
         return values == 0

@@ -53,8 +53,8 @@ class ReferenceEngine:
     def set_scaling(self, scaling: Scaling) -> None:
         """Measure steps with this from now on."""
         self.scaling, self._shift = scaling, scaling.shift
-        stamps = [stamp.on_grid(self.scene.grid) for stamp in scaling.cross_information]
-        self._cross_information = np.array(stamps).reshape(len(stamps), *self.scene.grid)
+        cutouts = [cutout.on_grid(self.scene.grid) for cutout in scaling.cross_information]
+        self._cross_information = np.array(cutouts).reshape(len(cutouts), *self.scene.grid)
 
     def move_stars(self) -> None:
         """Put the stars where the scene has them now."""

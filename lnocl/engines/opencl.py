@@ -19,7 +19,7 @@ from lnocl.opencl.tuning import Tuning, describe_tuning
 from lnocl.opencl.windows import StarWindows
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
-from lnocl.scene.stars import lit_box
+from lnocl.scene.stars import covered_box
 from lnocl.solvers.engine import State
 from lnocl.solvers.scaling import Scaling
 
@@ -156,8 +156,10 @@ class OpenCLEngine:
         return counts + 2 * SNAPSHOTS * math.prod(self.scene.grid) * self.program.dtype.itemsize
 
     def _cross_windows(self) -> StarWindows:
-        stamps = self.scaling.cross_information if self.scaling is not None else []
-        return StarWindows(self.layout, [lit_box([stamp], self.scene.grid) for stamp in stamps])
+        cutouts = self.scaling.cross_information if self.scaling is not None else []
+        return StarWindows(
+            self.layout, [covered_box([cutout], self.scene.grid) for cutout in cutouts]
+        )
 
     def _sizes(self, n_iter: int) -> dict[str, int]:
         """Return the bytes of each buffer, by the name that the kernels have for it."""
@@ -300,7 +302,7 @@ class OpenCLEngine:
         self._memory.upload_pixels(
             "star_images",
             (
-                self._stars.cut(s, scene.star_stamp(j, s))
+                self._stars.cut(s, scene.star_cutout(j, s))
                 for s in range(scene.n_stars)
                 for j in range(scene.n_images)
             ),

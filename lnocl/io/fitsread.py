@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,14 +10,12 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from lnocl.errors import FileError, InputError, counted, warn
+from lnocl.errors import FileError, InputError, counted, note, warn
 from lnocl.io.fitsfile import open_fits
 from lnocl.io.headers import finer_cards, make_wcs, quiet_log, readable
 from lnocl.io.names import parse_name
 from lnocl.io.selection import choose, describe, find, has_pixels, name_of, only
 from lnocl.process import ignored_warnings
-
-log = logging.getLogger("lnocl")
 
 # A last axis that is so short, with longer ones before it, is none of pixels.
 MAX_CHANNELS = 4
@@ -257,7 +254,7 @@ def _read_file(
         if index is None:
             raise _NoImageError(f"{path} holds no image")
         if index and extension is None:
-            log.info("%s: the image is %s", path, describe(index, hdus[index]))
+            note("%s: the image is %s", path, describe(index, hdus[index]))
         hdu = hdus[index]
         checksum = file.sha256() if extension is None else ""  # which reads all of the file
         pixels = file.pixels(hdu)

@@ -53,7 +53,7 @@ def write_result(
     psfs: ArrayLike | None = None,
     psf_errors: NDArray[np.void] | None = None,
     doubtful: ArrayLike | None = None,
-    said: Sequence[str] = (),
+    messages: Sequence[str] = (),
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
@@ -105,8 +105,8 @@ def write_result(
         The relative error of the PSFs in rings round a star.
     doubtful : array_like of bool, shape (ny, nx), optional
         Pixels in which errors of the PSFs may have faked all there is.
-    said : sequence of str, optional
-        What the run said, a line each: the table ``MESSAGES``.
+    messages : sequence of str, optional
+        The messages of the run, a line each: the table ``MESSAGES``.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def write_result(
             *([] if psfs is None else [fits.ImageHDU(np.asarray(psfs, np.float64), name="PSFS")]),
             *([] if psf_errors is None else [_table("PSFERRORS", psf_errors)]),
             *([] if doubtful is None else [_flags("DOUBTFUL", doubtful, of_sky)]),
-            *([_lines("MESSAGES", "message", said)] if said else []),
+            *([_lines("MESSAGES", "message", messages)] if messages else []),
         ]
     )
     with whole_file(path, overwrite) as stream:

@@ -78,7 +78,7 @@ def bad_pixels(flags: NDArray[Any], good_bits: str, path: str) -> NDArray[np.boo
     sums = np.array(flags).astype(np.int64) if are_whole else None
     if sums is None:
         raise InputError(
-            f"the extension DQ of {path} does not hold whole numbers; give mask as a file"
+            f"the extension DQ of {path} does not hold whole numbers; give `mask` as a file"
         )
     try:
         good = None if "-" in good_bits else interpret_bit_flags(good_bits)
@@ -86,7 +86,7 @@ def bad_pixels(flags: NDArray[Any], good_bits: str, path: str) -> NDArray[np.boo
         good = None
     if good is None:
         raise InputError(
-            f"good_bits {good_bits!r} are no flags; give powers of 2, such as 16,64, or ~1 for all "
-            "but 1"
+            f"`good_bits` {good_bits!r} are no flags; give powers of 2, such as 16,64, or ~1 for "
+            "all but 1"
         )
     return np.asarray(bitfield_to_boolean_mask(sums, ignore_flags=good), bool)

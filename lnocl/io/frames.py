@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -12,7 +11,7 @@ from astropy.io import fits
 from astropy.units import dimensionless_unscaled
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError, counted, warn
+from lnocl.errors import InputError, counted, note, warn
 from lnocl.io import sky
 from lnocl.io.fitsread import read_contents, read_extension, read_keyword, read_stack
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
@@ -22,8 +21,6 @@ from lnocl.io.noise import CLASSES, WITH_SOURCE, NoiseMap, electrons_by_variance
 from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.observation import OVERSAMPLES, Array, Observation, PsfCentre
-
-log = logging.getLogger("lnocl")
 
 Mask = NDArray[np.bool_]
 
@@ -183,7 +180,7 @@ class _Reader:
         factor, are_rates = self._electrons(exposure)
         if are_rates and exposure is None:
             raise InputError(
-                f"{self._paths[0]} holds counts per time; give exposure, in seconds: a number, a "
+                f"{self._paths[0]} holds counts per time; give `exposure`, in seconds: a number, a "
                 "map, or a keyword of the header such as EXPTIME"
             )
         # Electrons in each unit of the images.
@@ -261,8 +258,8 @@ class _Reader:
             finer = sky.oversampling(header) if scales[j] is None else None
             if finer is not None and finer != oversample:
                 warn(
-                    f"psf {j} is sampled {finer:g} times finer than the detector, by OVERSAMP in "
-                    f"its header: give oversample {finer:g}, or bin it to "
+                    f"`psfs[{j}]` is sampled {finer:g} times finer than the detector, by OVERSAMP "
+                    f"in its header: give `oversample` {finer:g}, or bin it to "
                     + ("the image's pixels" if oversample == 1 else f"{oversample} times finer")
                 )
                 return
@@ -279,7 +276,7 @@ class _Reader:
                 words = f"give oversample {finer_by}, or " if exact else ""
                 pixels = "the image's pixels" if oversample == 1 else f"{wanted:.4g} arcsec"
                 warn(
-                    f"the pixels of psf {j} are of {of_psf:.4g} arcsec, those of its image of "
+                    f"the pixels of `psfs[{j}]` are of {of_psf:.4g} arcsec, those of its image of "
                     f"{of_image:.4g}: {words}rebin it to {pixels}, by {wanted / of_psf:.3g}"
                 )
                 return
@@ -290,11 +287,11 @@ class _Reader:
             return 1.0, True
         gain, counts = self._gain, self._counts(("adu",))
         if gain is not None and not (np.isfinite(gain) and gain > 0):
-            raise InputError(f"gain must be more than 0; {gain:g} was given")
+            raise InputError(f"`gain` must be more than 0; {gain:g} was given")
         if gain is None and self._counts() is None:
             raise InputError(
-                f"{self._paths[0]} is in {self._bunit(0)}, not in counts; give gain, the electrons "
-                "in one of these units: a number, "
+                f"{self._paths[0]} is in {self._bunit(0)}, not in counts; give `gain`, the "
+                "electrons in one of these units: a number, "
                 + (
                     "or a keyword of its header such as GAIN"
                     if counts or not units.is_known(self._unit())
@@ -311,7 +308,7 @@ class _Reader:
                     for j, image in enumerate(self._images.data)
                 )
             name = "electrons" if gain is None else "counts"
-            log.info(
+            note(
                 "%s has %s: %s",
                 self._paths[0],
                 f"BUNIT {self._bunit(0)}" if self._bunit(0) else "no BUNIT",
@@ -322,7 +319,7 @@ class _Reader:
         elif units.count_of(self._unit(), ("electron",)) and gain not in (None, 1.0):
             warn(
                 f"{self._paths[0]} is in {self._bunit(0)} by BUNIT, and is taken times gain "
-                f"{gain:g}: leave gain out, unless BUNIT is wrong"
+                f"{gain:g}: leave `gain` out, unless BUNIT is wrong"
             )
         return factor, are_rates
 
@@ -371,7 +368,7 @@ class _Reader:
             for j, (image, variance, sums) in enumerate(planes)
         ]
         for j, electrons in enumerate(found):
-            log.info("image %d: %.4g electrons in its unit, by %s", j, electrons, word)
+            note("`images[%d]`: %.4g electrons in its unit, by %s", j, electrons, word)
         return np.array(found)
 
     @cached_property
@@ -385,7 +382,8 @@ class _Reader:
         for path, gain in zip(self._paths, found, strict=True):
             if gain is None:
                 raise InputError(
-                    f"{path} has no {word} in its header; give gain as a number or another keyword"
+                    f"{path} has no {word} in its header; give `gain` as a number or another "
+                    "keyword"
                 )
             if gain != found[0]:
                 raise InputError(
@@ -412,7 +410,7 @@ class _Reader:
         words = self._calibration.exposure
         if self._electrons_in_units is not None:
             if words:
-                log.info("exposure is left out: the electrons in the unit have it")
+                note("`exposure` is left out: the electrons in the unit have it")
             return self._electrons_in_units
         if not words:
             return None
@@ -431,10 +429,10 @@ class _Reader:
             return None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise InputError(
-                f"{keyword} of {path} is {value!r}, not a number; give {name} as a number"
+                f"{keyword} of {path} is {value!r}, not a number; give `{name}` as a number"
             )
         noted = name.replace("_", " ")
-        log.info("image %d: %s %g%s, from %s", j, noted, value, unit, keyword)
+        note("`images[%d]`: %s %g%s, from %s", j, noted, value, unit, keyword)
         return float(value)
 
     @cached_property
@@ -442,7 +440,9 @@ class _Reader:
         given = {kind: getattr(self._calibration, kind) for kind in CLASSES}
         found = read_noise_map(given, self._maps, lambda: self._extensions("ERR", "error"))
         if found is not None and any(self._calibration.read_noise):
-            raise InputError(f"give read_noise, or give {found.kind}, which includes it, not both")
+            raise InputError(
+                f"give `read_noise`, or give `{found.kind}`, which includes it, not both"
+            )
         return found
 
     def _mask(self, exposure: Array | None, noise: NoiseMap | None) -> Mask:
@@ -450,13 +450,13 @@ class _Reader:
         masked = np.zeros(self._images.data.shape, bool)
         for why, bad in self._bad_pixels(exposure, noise):
             for j, count in enumerate((bad & ~masked).sum(axis=(1, 2))):
-                log.info("image %d: %s masked %s", j, counted(count, "pixel"), why)
+                note("`images[%d]`: %s masked %s", j, counted(count, "pixel"), why)
             masked |= bad
         for j, share in enumerate(masked.mean(axis=(1, 2))):
             if share > MUCH_MASKED:
                 warn(
-                    f"{100 * share:.0f} % of image {j} are masked: look at why, above; leave mask "
-                    "out, or give other good_bits, if they are good"
+                    f"{100 * share:.0f} % of `images[{j}]` are masked: look at why, above; leave "
+                    "`mask` out, or give other `good_bits`, if they are good"
                 )
         return masked
 
@@ -468,7 +468,7 @@ class _Reader:
         if "dq" in self._calibration.mask:
             yield "by the extension DQ", self._data_quality()
         elif self._calibration.good_bits is not None:
-            raise InputError("good_bits are flags of the extension DQ; give mask dq too")
+            raise InputError("`good_bits` are flags of the extension DQ; give `mask` dq too")
         if "wht" in self._calibration.mask:
             yield "without weight", self._extensions("WHT", "mask") == 0
         level = self._calibration.saturation
@@ -491,12 +491,12 @@ class _Reader:
                 )
                 good_bits = good_bits_of(*words)
             if good_bits != NO_BITS:
-                log.info("%s: of the flags in DQ %s are no fault", path, good_bits)
+                note("%s: of the flags in DQ %s are no fault", path, good_bits)
             of_file = slice(None) if len(self._paths) == 1 else slice(j, j + 1)
             flagged[of_file] = bad_pixels(sums[of_file], good_bits, path)
             flag, n = most_common_flag(sums[of_file][flagged[of_file]])
             if n:
-                log.info("%s: %s the flag %d of DQ", path, _have(n), flag)
+                note("%s: %s the flag %d of DQ", path, _have(n), flag)
         return flagged
 
     def _extensions(self, name: str, instead: str) -> Array:
@@ -509,12 +509,12 @@ class _Reader:
             values = read_extension(path, name)
             if values is None:
                 raise InputError(
-                    f"{path} has no extension {name}; give {instead} as a file, or leave it out"
+                    f"{path} has no extension {name}; give `{instead}` as a file, or leave it out"
                 )
             if values.shape not in shapes:
                 raise InputError(
                     f"the extension {name} of {path} has the shape {values.shape}, its image "
-                    f"{shapes[-1]}; give {instead} as a file"
+                    f"{shapes[-1]}; give `{instead}` as a file"
                 )
             found.append(values)
         return np.broadcast_to(np.array(found).reshape(-1, *images.shape[1:]), images.shape)
@@ -544,7 +544,7 @@ class _Reader:
         words = list(self._calibration.read_noise)
         is_subtracted = (counts < 0)[~mask].mean() > SUBTRACTED if not mask.all() else False
         if is_subtracted and not any(words) and self._noise_map is None:
-            log.info("the sky of the images was subtracted: its noise is measured as read noise")
+            note("the sky of the images was subtracted: its noise is measured as read noise")
             words = ["auto"]
         if not any(isinstance(word, str) for word in words):
             return words
@@ -569,7 +569,7 @@ class _Reader:
             )
         found = sky.offsets(headers, self._paths, images.shape[1:])
         for j, (dx, dy) in enumerate(found[1:], 1):
-            log.info("image %d: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
+            note("`images[%d]`: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
         return found
 
     def _warn_of_offsets(self) -> None:
@@ -577,13 +577,13 @@ class _Reader:
         try:
             found = sky.offsets(self._images.headers, self._paths, self._images.data.shape[1:])
         except InputError as error:
-            warn(str(error))
+            warn(error.message)
             return
         for path, (dx, dy) in zip(self._paths, found, strict=True):
             if max(abs(dx), abs(dy)) > sky.MAX_OFFSET_VARIATION:
                 warn(
                     f"{path} lies ({dx:.2f}, {dy:.2f}) pixels off {self._paths[0]}, by their sky "
-                    "coordinates: give align wcs, unless their pixels were registered"
+                    "coordinates: give `align` wcs, unless their pixels were registered"
                 )
                 return
 

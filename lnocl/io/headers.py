@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import math
 import re
 from collections.abc import Iterator
@@ -12,13 +11,12 @@ from typing import TYPE_CHECKING
 import astropy
 from astropy.io import fits
 
-from lnocl.errors import InputError, warn
+from lnocl.errors import InputError, note, warn
 from lnocl.process import ignored_warnings
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
-log = logging.getLogger("lnocl")
 
 # Counts that astropy allocates memory for, and the largest that FITS and SIP allow: with an A_ORDER
 # of 3000 it takes half a minute.
@@ -140,7 +138,7 @@ def make_wcs(header: fits.Header, key: str = " ") -> WCS:
             if pattern.fullmatch(keyword) and not 0 <= header[keyword] <= largest:
                 raise InputError(f"{keyword} is {header[keyword]}; at most {largest} is allowed")
     if any("LOOKUP" in str(header.get(f"{name}1", "")).upper() for name in ("CPDIS", "D2IMDIS")):
-        log.info("distortions in tables, which are below 0.1 pixel, are left out of coordinates")
+        note("distortions in tables, which are below 0.1 pixel, are left out of coordinates")
         header = header.copy()
         for keyword in [word for word in header if _TABLED.fullmatch(word)]:
             header.remove(keyword, ignore_missing=True, remove_all=True)

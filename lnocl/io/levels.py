@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, note
 from lnocl.scene.noise_check import noise_of
 from lnocl.scene.observation import Array
-
-log = logging.getLogger("lnocl")
 
 Mask = NDArray[np.bool_]
 
@@ -30,14 +26,14 @@ def sky_level(j: int, counts: Array, mask: Mask) -> float:
         No pixel is good.
     """
     median, scatter = clipped_sky(j, counts, mask)
-    log.info(
-        "image %d: background %.6g electrons per pixel, scatter %.3g (sigma-clipped median)",
+    note(
+        "`images[%d]`: background %.6g electrons per pixel, scatter %.3g (sigma-clipped median)",
         j,
         median,
         scatter,
     )
     if median < 0:
-        log.info("image %d: its sky was subtracted; %.6g electrons are added again", j, -median)
+        note("`images[%d]`: its sky was subtracted; %.6g electrons are added again", j, -median)
     return median
 
 
@@ -51,7 +47,7 @@ def sky_noise(j: int, counts: Array, mask: Mask) -> float:
     """
     median, scatter = clipped_sky(j, counts, mask)
     noise = float(np.sqrt(max(scatter**2 - max(median, 0.0), 0.0)))
-    log.info("image %d: read noise %.4g electrons (sigma-clipped scatter)", j, noise)
+    note("`images[%d]`: read noise %.4g electrons (sigma-clipped scatter)", j, noise)
     return noise
 
 
@@ -70,8 +66,8 @@ def clipped_sky(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
     good = counts[~mask & np.isfinite(counts)]
     if good.size == 0:
         raise InputError(
-            f"image {j} has no good pixel to measure its sky; leave the image out, or give "
-            "background and read_noise as numbers"
+            f"`images[{j}]` has no good pixel to measure its sky; leave the image out, or give "
+            "`background` and `read_noise` as numbers"
         )
     _, median, scatter = sigma_clipped_stats(good)
     dark = noise_of(counts, mask | ~np.isfinite(counts), 0.0)

@@ -72,7 +72,7 @@ class Maps:
         are_numbers = [isinstance(word, float) for word in filled]
         if any(are_numbers) and not all(are_numbers):
             raise InputError(
-                f"image {are_numbers.index(False)} has no {words[0]}; give {name} as numbers"
+                f"`images[{are_numbers.index(False)}]` has no {words[0]}; give `{name}` as numbers"
             )
         return filled if all(are_numbers) else list(words)
 
@@ -89,7 +89,7 @@ class Maps:
         for word in words:
             if isinstance(word, str) and not os.path.exists(file_of(word)):
                 raise InputError(
-                    f"{name} {word!r} is not a number, {OTHER_WORDS.get(name, '')}or a file that "
+                    f"`{name}` {word!r} is not a number, {OTHER_WORDS.get(name, '')}or a file that "
                     "exists"
                 )
         self._check_count(name, words)
@@ -101,8 +101,8 @@ class Maps:
         """Refuse several words, not all of them numbers, that are not one for each image."""
         if len(words) not in (1, self._shape[0]) and any(isinstance(word, str) for word in words):
             raise InputError(
-                f"{name} has {len(words)} values for {counted(self._shape[0], 'image')}; give one, "
-                "or one for each"
+                f"`{name}` has {len(words)} values for {counted(self._shape[0], 'image')}; give "
+                "one, or one for each"
             )
 
     def _spread(self, name: str, word: Word) -> Array:
@@ -126,7 +126,7 @@ class Maps:
         n, *shape = stack.data.shape
         if tuple(shape) != self._shape[1:] or n not in numbers:
             raise InputError(
-                f"{name} {paths[0]} has the shape {stack.data.shape} and the images "
+                f"`{name}` {paths[0]} has the shape {stack.data.shape} and the images "
                 f"{self._shape}; give one map that fits all images, or one for each"
             )
         self.sha256.setdefault(name, []).extend(stack.sha256)
@@ -142,7 +142,7 @@ def _refuse_other_unit(name: str, path: str, bunit: str) -> None:
         return
     if units.count_of(unit, UNITS[name]) != (1.0, False):
         raise InputError(
-            f"{name} {path} is in {bunit}, and taken in {UNITS[name][0]}s: convert it, or leave "
+            f"`{name}` {path} is in {bunit}, and taken in {UNITS[name][0]}s: convert it, or leave "
             "BUNIT out of its header"
         )
 

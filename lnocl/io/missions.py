@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from typing import Any
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, note
 from lnocl.io.fitsread import Contents, read_contents
 from lnocl.scene import units
-
-log = logging.getLogger("lnocl")
 
 # Those whose files are known.
 TELESCOPES = ("HST", "JWST")
@@ -60,7 +57,7 @@ def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
         found |= _electrons(path, contents)
     for name, value in found.items():
         words = value if isinstance(value, str) else " ".join(value)
-        log.info("%s: with %s %s, as for images of %s", path, name, words, telescope)
+        note("%s: with %s %s, as for images of %s", path, name, words, telescope)
     return found
 
 
@@ -76,7 +73,7 @@ def _electrons(path: str, contents: Contents) -> dict[str, Any]:
     unit = contents.value("BUNIT")
     if unit.upper().startswith("COUNT") and contents.value("DETECTOR") not in PHOTON_COUNTING:
         raise InputError(
-            f"{path} is in counts of its converter; give gain, a number or a keyword of its "
+            f"{path} is in counts of its converter; give `gain`, a number or a keyword of its "
             "header, such as ATODGAIN"
         )
     counts = units.count_of(units.parse(unit))

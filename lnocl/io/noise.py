@@ -47,7 +47,7 @@ class NoiseMap(NamedTuple):
     variance: Array
 
     def read_noise(self, counts: Array, each: Array | float, mask: NDArray[np.bool_]) -> Array:
-        """Return what has the variance of all noise but that of the source's counts, electrons.
+        """Return the read noise that stands for all noise but that of counts, electrons.
 
         Parameters
         ----------
@@ -68,7 +68,7 @@ class NoiseMap(NamedTuple):
         self._refuse_other_kinds(counts, variance, mask)
         if self.kind != WITH_SOURCE:
             return np.asarray(np.sqrt(variance))
-        return without_source(variance, counts, mask, (WITH_SOURCE, "rms"))
+        return without_source(variance, counts, mask, (f"`{WITH_SOURCE}`", "`rms`"))
 
     def _refuse_other_kinds(self, counts: Array, variance: Array, mask: NDArray[np.bool_]) -> None:
         """Refuse a map of another kind than it is given as: its noise is not in the image."""
@@ -78,11 +78,11 @@ class NoiseMap(NamedTuple):
             noise = float(np.sqrt(np.median(variance[j][~bad])))
             _, scatter = clipped_sky(j, counts[j], bad)
             if noise > TOO_NOISY * scatter > 0:
-                others = ", ".join(kind for kind in CLASSES if kind != self.kind)
+                others = ", ".join(f"`{kind}`" for kind in CLASSES if kind != self.kind)
                 raise InputError(
-                    f"{self.kind} says that the noise of image {j} is {noise:.3g} electrons, and "
-                    f"its sky scatters by {scatter:.3g}: see to its unit, or give it as what it is "
-                    f"({others})"
+                    f"`{self.kind}` says that the noise of `images[{j}]` is {noise:.3g} electrons, "
+                    f"and its sky scatters by {scatter:.3g}: see to its unit, or give it as what "
+                    f"it is ({others})"
                 )
 
 
@@ -126,7 +126,7 @@ def electrons_by_variance(
         electrons = (values[bright].mean() - values[middle].mean()) / rise if rise > 0 else 0.0
     if not 0.0 < electrons < np.inf:
         raise InputError(
-            f"the variance of the counts of {path} does not grow with its image; give gain as a "
+            f"the variance of the counts of {path} does not grow with its image; give `gain` as a "
             "number, the electrons in its unit"
         )
     return float(electrons)
@@ -155,13 +155,13 @@ def read_noise_map(
     if not kinds:
         return None
     if len(kinds) > 1:
-        raise InputError(f"give {kinds[0]}, or give {kinds[1]}: each is all there is of noise")
+        raise InputError(f"give `{kinds[0]}`, or give `{kinds[1]}`: each is all there is of noise")
     (kind,) = kinds
     is_extension = kind == WITH_SOURCE and list(given[kind]) == ["err"]
     values = errors() if is_extension else maps.read(kind, given[kind])
     if (values < 0).any():
         raise InputError(
-            f"{kind} {given[kind][0]} has negative pixels; they must be 0 or more, and 0 where a "
+            f"`{kind}` {given[kind][0]} has negative pixels; they must be 0 or more, and 0 where a "
             "pixel is bad"
         )
     from astropy import nddata  # which takes its time to load

@@ -46,7 +46,8 @@ def read_apertures(
         A region that encloses nothing, lies outside the image, or on the sky without coordinates.
     """
     return [
-        _aperture(each.name, each.said, each.region, shape) for each in _in_pixels(given, header)
+        _aperture(each.name, each.described, each.region, shape)
+        for each in _in_pixels(given, header)
     ]
 
 
@@ -69,7 +70,7 @@ def read_profiles(
     for each in found:
         if not isinstance(each.region, _regions().RectanglePixelRegion):
             raise InputError(
-                f"{each.said} is not a box: a profile is along the longer side of a box"
+                f"{each.described} is not a box: a profile is along the longer side of a box"
             )
     return [_profile(each, shape) for each in found]
 
@@ -79,7 +80,7 @@ class _Found(NamedTuple):
 
     region: Any
     name: str
-    said: str
+    described: str
 
 
 def _in_pixels(given: Given, header: fits.Header | None) -> list[_Found]:
@@ -104,7 +105,9 @@ def _regions() -> Any:
     try:
         import regions
     except ImportError as error:
-        raise LnoclError("regions are read by the package regions: pip install regions") from error
+        raise LnoclError(
+            "`regions` are read by the package regions: pip install regions"
+        ) from error
     return regions
 
 
@@ -124,19 +127,21 @@ def _read(path: str) -> list[Any]:
 def _one_in_pixels(region: Any, number: int, path: str, header: fits.Header | None) -> _Found:
     regions = _regions()
     if not isinstance(region, regions.Region):
-        raise InputError(f"regions must be those of the package regions; {region!r} was given")
+        raise InputError(f"`regions` must be those of the package regions; {region!r} was given")
     named = region.meta.get("text") or region.meta.get("label") or ""
     name = str(named).strip() or f"region {number}"
     kind = type(region).__name__.replace("PixelRegion", "").replace("SkyRegion", "").lower()
-    said = f"{name} of {path} ({kind})" if name != f"region {number}" else f"{name} ({kind})"
+    described = f"{name} of {path} ({kind})" if name != f"region {number}" else f"{name} ({kind})"
     if not region.meta.get("include", True):
-        raise InputError(f"{said} is to be left out of others: draw what is to be summed instead")
+        raise InputError(
+            f"{described} is to be left out of others: draw what is to be summed instead"
+        )
     if isinstance(region, regions.SkyRegion):
         if header is None:
-            raise InputError(f"{said} is on the sky, and the image has no header: give pixels")
+            raise InputError(f"{described} is on the sky, and the image has no header: give pixels")
         wcs = celestial_wcs(header, "the image", "give regions in image coordinates")
         region = region.to_pixel(wcs)
-    return _Found(region, name, said)
+    return _Found(region, name, described)
 
 
 def _profile(found: _Found, shape: tuple[int, int]) -> Profile:
@@ -154,7 +159,7 @@ def _profile(found: _Found, shape: tuple[int, int]) -> Profile:
         x, y = box.center.x + distance * along[0], box.center.y + distance * along[1]
         sides = (length / n, breadth) if is_wide else (breadth, length / n)
         part = regions.RectanglePixelRegion(regions.PixCoord(x, y), *sides, angle=box.angle)
-        slices.append(_aperture(found.name, found.said, part, shape))
+        slices.append(_aperture(found.name, found.described, part, shape))
     distances = []
     for each in slices:
         y, x = each.places
@@ -162,7 +167,7 @@ def _profile(found: _Found, shape: tuple[int, int]) -> Profile:
     return Profile(found.name, at.tolist(), slices, distances)
 
 
-def _refuse_outside(said: str, region: Any, shape: tuple[int, int]) -> None:
+def _refuse_outside(described: str, region: Any, shape: tuple[int, int]) -> None:
     """Refuse a region of which a mask would be larger than the image, or none can be made."""
     try:
         box = region.bounding_box
@@ -174,26 +179,26 @@ def _refuse_outside(said: str, region: Any, shape: tuple[int, int]) -> None:
     if box is None or not (
         -2 <= box.ixmin <= box.ixmax <= nx + 2 and -2 <= box.iymin <= box.iymax <= ny + 2
     ):
-        raise InputError(f"{said} lies outside the image of {nx} x {ny} pixels, or partly")
+        raise InputError(f"{described} lies outside the image of {nx} x {ny} pixels, or partly")
 
 
-def _aperture(name: str, said: str, region: Any, shape: tuple[int, int]) -> Aperture:
-    _refuse_outside(said, region, shape)
+def _aperture(name: str, described: str, region: Any, shape: tuple[int, int]) -> Aperture:
+    _refuse_outside(described, region, shape)
     try:
         mask = region.to_mask(mode="exact")
     except NotImplementedError as error:
         raise InputError(
-            f"{said} cannot be summed over: give circles, ellipses, boxes or polygons"
+            f"{described} cannot be summed over: give circles, ellipses, boxes or polygons"
         ) from error
     weights = np.asarray(mask.data, np.float64)
     inside = mask.cutout(np.ones(shape), fill_value=0.0)
     total = weights.sum()
     if inside is None or (weights * (inside == 0)).sum() > ROUNDING * total:
         raise InputError(
-            f"{said} lies outside the image of {shape[1]} x {shape[0]} pixels, or partly"
+            f"{described} lies outside the image of {shape[1]} x {shape[0]} pixels, or partly"
         )
     if total == 0:
-        raise InputError(f"{said} encloses no part of a pixel")
+        raise InputError(f"{described} encloses no part of a pixel")
     rows, columns = np.flatnonzero(weights.any(axis=1)), np.flatnonzero(weights.any(axis=0))
     trimmed = weights[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     y, x = mask.bbox.iymin + int(rows[0]), mask.bbox.ixmin + int(columns[0])

@@ -56,7 +56,7 @@ class SavedResult:
     doubtful : ndarray of bool, shape (ny, nx), or None
         The image ``DOUBTFUL``, where it is there.
     messages : list of str
-        The table ``MESSAGES``: what the run said.
+        The table ``MESSAGES``: messages of the run.
     """
 
     path: str

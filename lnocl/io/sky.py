@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import logging
 import math
 from codecs import BOM_UTF8
 from collections.abc import Callable, Sequence
@@ -22,14 +21,12 @@ from astropy.wcs import WCS
 from astropy.wcs.utils import pixel_to_pixel
 from numpy.typing import NDArray
 
-from lnocl.errors import FileError, InputError, LnoclError, counted, warn
+from lnocl.errors import FileError, InputError, LnoclError, counted, note, warn
 from lnocl.io.fitsfile import open_fits, open_regular
 from lnocl.io.fitsread import read_keyword
 from lnocl.io.headers import make_wcs, quiet_log
 from lnocl.process import ignored_warnings
 from lnocl.scene import star_tables
-
-log = logging.getLogger("lnocl")
 
 # Largest variation of the offset between two images over them, in pixels, from rotation, scale and
 # distortion.
@@ -211,7 +208,7 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
     if not len(found):
         raise InputError(f"{path} has no row; give one a star, or leave --stars out for none")
     origin = ", the first pixel 1" if columns is not None and columns.origin else ""
-    log.info("%s: %s, by %s%s", path, counted(len(found), "star"), " and ".join(names), origin)
+    note("%s: %s, by %s%s", path, counted(len(found), "star"), " and ".join(names), origin)
     return _within(path, found, header, image)
 
 
@@ -269,7 +266,7 @@ def _moved(path: str, of_sky: SkyCoord, table: Table, date: Time | None) -> SkyC
     of_epoch = star_tables.spelled(table.colnames, "ref_epoch")
     if date is None or of_epoch is None:
         lacking = "the image has no date" if date is None else "there is no column ref_epoch"
-        log.info("%s: its proper motions are not heeded, as %s", path, lacking)
+        note("%s: its proper motions are not heeded, as %s", path, lacking)
         return of_sky
     motions: list[NDArray[np.float64]] = [
         np.nan_to_num(np.ma.filled(np.ma.asarray(table[name], float), 0.0)) for name in names
@@ -284,9 +281,7 @@ def _moved(path: str, of_sky: SkyCoord, table: Table, date: Time | None) -> SkyC
             obstime=Time(epoch, format="jyear"),
         ).apply_space_motion(new_obstime=date)
     farthest = of_sky.separation(now).arcsec.max(initial=0.0)
-    log.info(
-        "%s: moved by proper motions to %.2f, by %.3g arcsec at most", path, date.jyear, farthest
-    )
+    note("%s: moved by proper motions to %.2f, by %.3g arcsec at most", path, date.jyear, farthest)
     return SkyCoord(now.ra, now.dec)
 
 

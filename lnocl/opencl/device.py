@@ -67,7 +67,7 @@ def choose(spec: str | None = None) -> Choice:
     """
     devices = find_devices()
     if spec is not None:
-        return Choice(_by_spec(spec, "device"), f"asked for as {spec!r}")
+        return Choice(_by_spec(spec, "`device`"), f"asked for as {spec!r}")
     if environment := os.environ.get("PYOPENCL_CTX"):
         return Choice(_by_spec(environment, "PYOPENCL_CTX"), f"PYOPENCL_CTX is {environment!r}")
     gpus = [device for device in devices if device.type & cl.device_type.GPU]

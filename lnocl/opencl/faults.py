@@ -100,11 +100,12 @@ def _explain(error: Exception, engine: OnDevice) -> str:
     if no_memory and not engine.is_proven:
         return (
             f"{engine.name} has too little memory free: {needs}; take fewer or smaller images, "
-            f"fewer stars, precision single, or another device ({cause})"
+            f"fewer stars, `precision` single, or another `device` ({cause})"
         )
     return (
         f"{engine.name} failed ({cause}), and the state of the run is lost; {needs}: run again, "
-        "from the checkpoint if there is one, see what lnocl selftest says, or take another device"
+        "from the checkpoint if there is one, see what lnocl selftest says, or take another "
+        "`device`"
     )
 
 
@@ -123,5 +124,5 @@ def build_failure(name: str, error: Exception) -> DeviceError:
         saved = f"all it said is in {log.name}"
     return DeviceError(
         f"the kernels do not build on {name}: {first[:200]}; {saved}; "
-        "update the driver, or take another device"
+        "update the driver, or take another `device`"
     )

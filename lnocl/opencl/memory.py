@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -11,13 +10,11 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from lnocl.errors import DeviceError, InputError
+from lnocl.errors import DeviceError, InputError, note
 from lnocl.opencl.device import describe
 from lnocl.opencl.launch import READ_WRITE
 from lnocl.opencl.layout import Layout
 from lnocl.scene.observation import Array
-
-log = logging.getLogger("lnocl")
 
 # Bytes of pixels that are converted and copied at once, lest a second array of all is needed.
 MAX_COPIED = 16 * 2**20
@@ -183,7 +180,7 @@ class Memory:
         if not np.isfinite(rounded).all():
             raise InputError(
                 f"{name.replace('_', ' ')} as large as {np.abs(values).max() * self._scale:g} "
-                f"cannot be held in {dtype}: scale the scene, or take precision double"
+                f"cannot be held in {dtype}: scale the scene, or take `precision` double"
             )
         return rounded
 
@@ -212,7 +209,7 @@ def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int], count: int)
             f"the scene needs {count * total / 2**20:.0f} MiB, {sizes[largest] / 2**20:.0f} MiB of "
             f"it for {largest}; {describe(device)} has {device.global_mem_size / 2**20:.0f} MiB "
             f"and gives {device.max_mem_alloc_size / 2**20:.0f} MiB at once: take fewer or "
-            "smaller images, fewer stars, precision single, or another device"
+            "smaller images, fewer stars, `precision` single, or another `device`"
         )
     return total
 
@@ -239,7 +236,7 @@ def held_bytes() -> tuple[int, int]:
 
 def announce(device: cl.Device, device_bytes: int, host_bytes: int, tuned: str) -> None:
     """Log what a scene takes on a device and on the host, and the tuning of the device."""
-    log.info(
+    note(
         "%s: the scene takes %.1f MiB there, and up to %.0f MiB of the host's memory; %s",
         describe(device),
         device_bytes / 2**20,

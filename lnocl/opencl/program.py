@@ -133,7 +133,7 @@ class Program:
         self.context, self.grid, self.dtype = context, grid, dtype
         if dtype == np.float64 and not has_double(device):
             raise DeviceError(
-                f"{describe(device)} has no double precision; take precision single, or another "
+                f"{describe(device)} has no double precision; take `precision` single, or another "
                 "device"
             )
         self.tuning = tuning or tune(device, dtype, grid, oversample)
@@ -225,7 +225,7 @@ def _room_for(n_stars: int) -> int:
             return room
     raise DeviceError(
         f"{n_stars} stars are too many for the kernels, which have room for {STAR_ROOMS[-1]}: "
-        "give fewer stars, or take engine numpy"
+        "give fewer stars, or take `engine` numpy"
     )
 
 
@@ -339,7 +339,7 @@ def _need_room(device: cl.Device) -> None:
     except OSError as error:
         raise DeviceError(
             f"PoCL needs {ROOM // 2**20} MiB of addresses more than this process may have: raise "
-            "the limit of memory (ulimit -v), or take engine numpy"
+            "the limit of memory (ulimit -v), or take `engine` numpy"
         ) from error
 
 

@@ -30,7 +30,7 @@ def claim(n: int) -> int:
             number += 1
     except OSError as error:
         raise DeviceError(
-            f"devices cannot be shared among processes: {folder}: {error.strerror}; give device"
+            f"devices cannot be shared among processes: {folder}: {error.strerror}; give `device`"
         ) from error
     return number % n
 

@@ -25,7 +25,7 @@ from lnocl.opencl import kernel_cache
 from lnocl.opencl.device import describe
 from lnocl.opencl.unknown_cpu import POCL
 
-# What the outcome may hang on, besides the device.
+# What the outcome may depend on, besides the device.
 VARIABLES = ("PATH", "COMPILER_PATH", "LIBRARY_PATH", "TMPDIR", "TEMP", "TMP")
 LIMITS = ("RLIMIT_NOFILE", "RLIMIT_NPROC", "RLIMIT_AS", "RLIMIT_FSIZE")
 LIBRARIES = ("/usr/lib*/gcc/*/*", "/usr/lib*/crti.o", "/usr/lib*/*/crti.o")
@@ -112,7 +112,7 @@ def _compile(device: cl.Device) -> bytes:
     if failure := _try(device, KERNELS):
         raise DeviceError(
             f"the driver of {describe(device)} ends the process as it compiles kernels "
-            f"({failure}): update the driver, take another device, or engine numpy"
+            f"({failure}): update the driver, take another `device`, or `engine` numpy"
         )
     return b"lives"
 

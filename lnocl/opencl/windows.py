@@ -8,8 +8,8 @@ import numpy as np
 
 from lnocl.opencl.layout import PixelLayout, shortest_arc
 from lnocl.scene.observation import Array
-from lnocl.scene.shifting import Stamp
-from lnocl.scene.stars import Lit
+from lnocl.scene.shifting import Cutout
+from lnocl.scene.stars import Covered
 
 
 class StarWindows:
@@ -19,11 +19,11 @@ class StarWindows:
     ----------
     layout : PixelLayout
         Of the arrays.
-    boxes : sequence of Lit
+    boxes : sequence of Covered
         For each star the rows and columns that its arrays may reach into.
     """
 
-    def __init__(self, layout: PixelLayout, boxes: Sequence[Lit]) -> None:
+    def __init__(self, layout: PixelLayout, boxes: Sequence[Covered]) -> None:
         blocks = [layout.window(box.rows) for box in boxes]
         columns = [shortest_arc(box.columns) for box in boxes]
         self._layout = layout
@@ -44,16 +44,16 @@ class StarWindows:
         width = self._layout.grid[1]
         return self.n_blocks_of_all * self._layout.block_bytes // width * self.n_columns
 
-    def cut(self, s: int, stamp: Stamp) -> Array:
-        """Return the pixels of a star's window, with a stamp in them."""
+    def cut(self, s: int, cutout: Cutout) -> Array:
+        """Return the pixels of a star's window, with a cutout in them."""
         grid = self._layout.grid
         block, column = self.corners[s]
         first = self._layout.rows_of(int(block), 1)[0]
         window = np.zeros((self._layout.rows_of(0, self.n_blocks).size, self.n_columns))
-        rows = (stamp.rows(grid) - first) % grid[0]
-        columns = (stamp.columns(grid) - column) % grid[1]
+        rows = (cutout.rows(grid) - first) % grid[0]
+        columns = (cutout.columns(grid) - column) % grid[1]
         row_in, column_in = rows < window.shape[0], columns < window.shape[1]
-        values = stamp.values
+        values = cutout.values
         if not (row_in.all() and column_in.all()):
             values = values[np.ix_(row_in, column_in)]
         window[rows[row_in][:, None], columns[column_in]] = values

@@ -47,7 +47,7 @@ def make_report(
     cards: Sequence[tuple[str, Any, str]] = (),
     commands: str = "",
 ) -> str:
-    """Return a page with images to blink and stretch, what the run said, tables and the command.
+    """Return a page with images to blink and stretch, messages of the run, tables and the command.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def make_report(
     title : str
         Its heading.
     messages : sequence of str, optional
-        What the run said; lines that begin with "warning: " stand out.
+        The messages of the run; lines that begin with "warning: " stand out.
     stars : mapping of str to sequence of float, optional
         Columns of the table of stars.
     cards : sequence of (keyword, value, comment), optional

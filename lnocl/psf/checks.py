@@ -29,10 +29,10 @@ def read_frame(frame: ArrayLike, mask: ArrayLike | None) -> tuple[Array, Mask]:
         more = unmasked("mask", mask)
         if more.dtype != np.bool_:
             raise InputError(
-                f"mask is of type {more.dtype}; give booleans, True where a pixel is bad"
+                f"`mask` is of type {more.dtype}; give booleans, True where a pixel is bad"
             )
         if more.shape != pixels.shape:
-            raise InputError(f"mask has shape {more.shape}; the frame has {pixels.shape}")
+            raise InputError(f"`mask` has shape {more.shape}; the frame has {pixels.shape}")
         bad |= more
     pixels[bad] = np.nan
     if (np.abs(pixels) > LARGEST).any():
@@ -44,7 +44,7 @@ def one_number(name: str, value: object) -> float:
     """Return one finite number."""
     array = numbers(name, value)  # type: ignore[arg-type]
     if array.ndim or not np.isfinite(array):
-        raise InputError(f"{name} is {value!r}; give one finite number")
+        raise InputError(f"`{name}` is {value!r}; give one finite number")
     return float(array)
 
 
@@ -54,7 +54,7 @@ def saturation_level(saturation: float | None) -> float:
         return math.inf
     level = one_number("saturation", saturation)
     if level <= 0:
-        raise InputError(f"saturation must be positive; {level:g} was given")
+        raise InputError(f"`saturation` must be positive; {level:g} was given")
     return level
 
 
@@ -67,7 +67,7 @@ def whole_size(size: int | None) -> int | None:
     except TypeError:
         side = 0
     if side < MIN_SIZE or isinstance(size, bool | np.bool_):
-        raise InputError(f"size must be a whole number of {MIN_SIZE} or more; {size!r} was given")
+        raise InputError(f"`size` must be a whole number of {MIN_SIZE} or more; {size!r} was given")
     return side
 
 
@@ -75,7 +75,7 @@ def wrapped_angles(rotate: Sequence[float]) -> list[float]:
     """Return the angles in [-180, 180], degrees."""
     angles = [math.remainder(one_number("rotate", angle), 360) for angle in rotate]
     if not angles:
-        raise InputError("rotate holds no angle; give one or more")
+        raise InputError("`rotate` holds no angle; give one or more")
     return angles
 
 
@@ -83,4 +83,4 @@ def refuse_unless_bool(**flags: object) -> None:
     """Refuse flags that are neither True nor False."""
     for name, flag in flags.items():
         if not isinstance(flag, bool | np.bool_):
-            raise InputError(f"{name} is {flag!r}; give True or False")
+            raise InputError(f"`{name}` is {flag!r}; give True or False")

@@ -14,7 +14,7 @@ from lnocl.errors import InputError, counted
 from lnocl.psf.centring import Array, Mask, Point, brightest
 from lnocl.psf.repair import repair
 from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
-from lnocl.scene.shifting import MovablePsf, Stamp
+from lnocl.scene.shifting import Cutout, MovablePsf
 
 # Rounds of fitting the stars and adding what is left of them to the PSF.
 ROUNDS = 20
@@ -273,9 +273,9 @@ class _Stars:
         steps = np.zeros((len(self._places), 2))
         core = psf > CORE * psf.max()
         for s, c in enumerate(self._fluxes):
-            stamp, parts = movable.with_slopes(*self._middle(s))
+            cutout, parts = movable.with_slopes(*self._middle(s))
             columns = [
-                Stamp(part, stamp.y, stamp.x).on_grid(psf.shape)
+                Cutout(part, cutout.y, cutout.x).on_grid(psf.shape)
                 for part in (parts[0], c * parts[2], c * parts[1])
             ]
             used = core & self._good[self._window(s)]

@@ -96,7 +96,7 @@ def find_modes(psfs: ArrayLike, n_modes: int) -> PsfModes:
         raise InputError(f"psfs have shape {given.shape}; give a cube of finite numbers")
     sums = given.sum(axis=(1, 2), keepdims=True)
     if (sums <= 0).any():
-        raise InputError(f"psf {int(np.argmax(sums <= 0))} has no positive sum")
+        raise InputError(f"`psfs[{int(np.argmax(sums <= 0))}]` has no positive sum")
     if not 1 <= n_modes < len(given):
         raise InputError(
             f"{counted(n_modes, 'mode')} of {counted(len(given), 'PSF')}; give 1 mode or more, and "

@@ -17,7 +17,7 @@ from lnocl.scene.observation import FAR_OFF_CENTRE, LITTLE_OFF_CENTRE
 WINGS, BORDER = (0.55, 0.7), (0.85, 1.0)
 # A PSF with fewer pixels in its FWHM is undersampled.
 SAMPLED = 2.0
-# Shares of the light from which on it is worth a word; wings that fall more slowly than this power
+# Shares of the light from which on it is reported; wings that fall more slowly than this power
 # of the radius look like a background. PSFs of eight public sets that are in order have at most
 # 0.3 %, 1.6 % and 2.2 %.
 MUCH_NEGATIVE, MUCH_NOISE, MUCH_AT_BORDER, BACKGROUND_FALL = 0.01, 0.05, 0.05, 1.0
@@ -163,7 +163,7 @@ def examine(psf: ArrayLike) -> PsfReport:
     light = numbers("psf", psf)
     if light.ndim != 2 or not light.size or not np.isfinite(light).all() or not light.sum() > 0:
         raise InputError(
-            f"psf of shape {light.shape} must be one image of finite numbers with a positive sum"
+            f"`psf` of shape {light.shape} must be one image of finite numbers with a positive sum"
         )
     light = light / light.sum()
     y, x = (

@@ -90,7 +90,7 @@ def measure_background(
         level = one_number("background", background)
         return level, f"background: {level:g}, as given, subtracted"
     if background != "auto":
-        raise InputError(f'background is {background!r}; give a number or "auto"')
+        raise InputError(f'`background` is {background!r}; give a number or "auto"')
     distance = _distance(pixels.shape, starts)
     sky, where = np.zeros_like(bad), "around the crop"
     if half is not None:
@@ -146,7 +146,7 @@ def lower_background(
         if share > MUCH:
             warn(
                 f"the wings of the star reach beyond the frame: up to about {_percent(share, 0)} "
-                "of its light is taken for background; give background as a number, or a smaller "
+                "of its light is taken for background; give `background` as a number, or a smaller "
                 "size"
             )
         return level, []

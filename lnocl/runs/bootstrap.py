@@ -21,7 +21,7 @@ from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
-from lnocl.scene.shifting import Stamp
+from lnocl.scene.shifting import Cutout
 from lnocl.scene.texture import CORE, resolution
 
 if TYPE_CHECKING:
@@ -340,11 +340,11 @@ def check_number(n: object, seed: object) -> None:
     """
     if not (isinstance(n, (int, np.integer)) and n >= MIN_REPLICAS):
         raise InputError(
-            f"bootstrap takes a whole number of replicas, {MIN_REPLICAS} or more, such as 50; "
+            f"`bootstrap` takes a whole number of replicas, {MIN_REPLICAS} or more, such as 50; "
             f"{n} was given"
         )
     if not (isinstance(seed, (int, np.integer)) and seed >= 0):
-        raise InputError(f"seed must be a whole number, 0 or more; {seed} was given")
+        raise InputError(f"`seed` must be a whole number, 0 or more; {seed} was given")
 
 
 class _Measured(NamedTuple):
@@ -422,25 +422,25 @@ def _shares(outcome: Outcome, parts: Sequence[Part], n_quantities: int) -> Array
     shares = np.zeros((n_quantities, scene.n_stars))
     for s in range(scene.n_stars):
         shares[s, s] = 1.0
-        stamps = [scene.psf_on_sky(j, s) for j in range(scene.n_images)]
+        cutouts = [scene.psf_on_sky(j, s) for j in range(scene.n_images)]
         k = scene.n_stars if outcome.given_stars is None else 3 * scene.n_stars
         for part in parts:
             slices = part.slices if isinstance(part, Profile) else [part]
             shares[k : k + len(slices), s] = [
-                _light_within(each, stamps, scene.grid) for each in slices
+                _light_within(each, cutouts, scene.grid) for each in slices
             ]
             k += len(part.labels())  # widths hold no light
     return shares
 
 
-def _light_within(aperture: Aperture, stamps: Sequence[Stamp], grid: tuple[int, int]) -> float:
-    """Return the mean light of stamps on the periodic grid within an aperture."""
+def _light_within(aperture: Aperture, cutouts: Sequence[Cutout], grid: tuple[int, int]) -> float:
+    """Return the mean light of cutouts on the periodic grid within an aperture."""
     light = np.zeros(aperture.weights.shape)
     height, width = aperture.weights.shape
     rows = range(aperture.y, aperture.y + height)
     columns = range(aperture.x, aperture.x + width)
-    for stamp in stamps:
-        stamp.add_to(light, rows, columns, grid, 1.0 / len(stamps))
+    for cutout in cutouts:
+        cutout.add_to(light, rows, columns, grid, 1.0 / len(cutouts))
     return float((aperture.weights * light).sum())
 
 

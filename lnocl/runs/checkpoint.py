@@ -222,7 +222,7 @@ class Checkpointer:
         self._saved_at = time.monotonic() if path is None else -math.inf
         self._best: State = {}
         if not (isinstance(every, Real) and cast(float, every) >= 0):
-            raise InputError(f"checkpoint_every must be seconds, 0 or more; {every!r} was given")
+            raise InputError(f"`checkpoint_every` must be seconds, 0 or more; {every!r} was given")
         self._every = cast(float, every)
         resumed = None if source is None else read(source, most_bytes())
         self._may_replace = False
@@ -351,7 +351,7 @@ def _file_name(name: str, file: object) -> str | None:
     if file is None:
         return None
     if not isinstance(file, (str, os.PathLike)) or not isinstance(os.fspath(file), str):
-        raise InputError(f"{name} must be the name of a file; {file!r} was given")
+        raise InputError(f"`{name}` must be the name of a file; {file!r} was given")
     return cast(str, os.fspath(file))
 
 

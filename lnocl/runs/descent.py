@@ -85,7 +85,11 @@ def _negative_pixels(psfs: Array) -> list[str]:
     if shares[j] == 0:
         return []
     n_negative = int((psfs[j] < 0).sum())
-    pixels = "1 pixel of psf {} is" if n_negative == 1 else f"{n_negative} pixels of psf {{}} are"
+    pixels = (
+        "1 pixel of `psfs[{}]` is"
+        if n_negative == 1
+        else f"{n_negative} pixels of `psfs[{{}}]` are"
+    )
     return [f"{pixels.format(j)} negative, {100 * shares[j]:.3g} % of its sum"]
 
 
@@ -94,7 +98,7 @@ def _off_centre(psfs: Array) -> list[str]:
     for j, psf in enumerate(psfs):
         dx, dy = off_centre(psf)
         if math.hypot(dx, dy) > MAX_OFF_CENTRE:
-            return [f"the core of psf {j} lies ({dx:z.1f}, {dy:z.1f}) pixels off its centre"]
+            return [f"the core of `psfs[{j}]` lies ({dx:z.1f}, {dy:z.1f}) pixels off its centre"]
     return []
 
 
@@ -108,5 +112,5 @@ def _level(psfs: Array) -> list[str]:
         noise = 1.25 * border.std() / math.sqrt(border.size)
         share = level * psf.size  # of a unit sum
         if abs(share) > MAX_LEVEL_SHARE and abs(level) > MIN_LEVEL_SIGNIFICANCE * noise:
-            return [f"psf {j} lies on a background that makes {100 * share:.3g} % of its sum"]
+            return [f"`psfs[{j}]` lies on a background that makes {100 * share:.3g} % of its sum"]
     return []

@@ -8,7 +8,6 @@ The sum of their estimates is a reconstruction from all counts: the result, wher
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -18,7 +17,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError, warn
+from lnocl.errors import InputError, note, warn
 from lnocl.process import ignored_notes
 from lnocl.runs.assessment import assess
 from lnocl.runs.halves import Halves, Snapshot, next_snapshot, pack, take
@@ -31,8 +30,6 @@ from lnocl.runs.thinning import split_counts
 from lnocl.scene.observation import Array
 from lnocl.scene.penalty import Penalty
 from lnocl.solvers.engine import State
-
-log = logging.getLogger("lnocl")
 
 # The halves run to this multiple of the chosen iteration, so that the references are resolved.
 LENGTH_RATIO = 2
@@ -132,12 +129,12 @@ class HeldOutCounts:
         if LEAST_RATIO * first.n_iter > self._n_iter:
             warn(
                 f"held-out counts have chosen iteration {first.n_iter} of {self._n_iter}, too near "
-                f"the end to be sure: give n_iter {MORE * self._n_iter}, of which they do as many "
-                "as they need; if that is too near too, PSF or noise are wrong"
+                f"the end to be sure: give `n_iter` {MORE * self._n_iter}, of which they do as "
+                "many as they need; if that is too near too, PSF or noise are wrong"
             )
         penalty = self._penalties[best.trial]
         if len(self._penalties) > 1:
-            log.info("smoothing chosen: %.3g, by held-out counts", penalty.smoothing)
+            note("`smoothing` chosen: %.3g, by held-out counts", penalty.smoothing)
         outcome = self._outcome(best.chosen, penalty, best.objectives, "held-out")
         return replace(outcome, curve=np.concatenate(self._curves))
 
@@ -173,8 +170,8 @@ class HeldOutCounts:
         snapshots, trial = halves.snapshots, len(self._curves)
         if not snapshots:
             raise InputError(
-                "half of the counts is too little: no iteration betters the start; give n_iter "
-                "and stop None"
+                "half of the counts is too little: no iteration betters the start; give `n_iter` "
+                "and `stop` None"
             )
         reference = snapshots[-1] if self._first is None else self._first.reference
         found = assess(snapshots, reference, self._shape)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable
 from numbers import Real
 from typing import Any, Literal, cast, get_args
@@ -10,14 +9,12 @@ from typing import Any, Literal, cast, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lnocl.errors import InputError, warn
+from lnocl.errors import InputError, note, warn
 from lnocl.scene.containers import counts
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.penalty import Penalty, recommend_smoothing
 from lnocl.scene.psf_families import FAMILIES
 from lnocl.solvers import SOLVERS
-
-log = logging.getLogger("lnocl")
 
 # The iteration of La Camera et al. (2012), whatever the defaults; mu and n_iter are given too.
 PAPER: dict[str, Any] = {"solver": "sgm", "stop": None, "smoothing": 0.0, "pad": 0}
@@ -80,11 +77,11 @@ def check_choices(solver: str, precision: str, engine: str, device: object) -> N
     }
     for name, (value, known) in choices.items():
         if not (isinstance(value, str) and value in known):
-            raise InputError(f"{name} {value!r} is not known; choose from {', '.join(known)}")
+            raise InputError(f"`{name}` {value!r} is not known; choose from {', '.join(known)}")
     if not (device is None or isinstance(device, str)):
-        raise InputError(f"device must be text, PLATFORM[:DEVICE]; {device!r} was given")
+        raise InputError(f"`device` must be text, PLATFORM[:DEVICE]; {device!r} was given")
     if engine == "numpy" and device is not None:
-        raise InputError(f"engine numpy uses no device; leave device {device!r} out")
+        raise InputError(f"`engine` numpy uses no device; leave `device` {device!r} out")
 
 
 def read_refine_positions(value: object) -> bool | Literal["auto"]:
@@ -99,7 +96,7 @@ def read_refine_positions(value: object) -> bool | Literal["auto"]:
         return bool(value)
     if isinstance(value, str) and value == "auto":
         return "auto"
-    raise InputError(f"refine_positions must be True, False or auto; {value!r} was given")
+    raise InputError(f"`refine_positions` must be True, False or auto; {value!r} was given")
 
 
 def check_families(
@@ -122,28 +119,30 @@ def check_families(
     """
     if len(observation.psf_scatter) and not len(positions):
         raise InputError(
-            "psf_scatter is the error of PSFs at stars; give stars, or leave psf_scatter out"
+            "`psf_scatter` is the error of PSFs at stars; give stars, or leave `psf_scatter` out"
         )
     if isinstance(names, str) and names == "auto":
         names = automatic_families(observation) if is_auto else ()
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise InputError(
-            f"refine_psfs is {names!r}; give auto, or a sequence of {', '.join(FAMILIES)}"
+            f"`refine_psfs` is {names!r}; give auto, or a sequence of {', '.join(FAMILIES)}"
         )
     found = tuple(names)
     for name in found:
         if not (isinstance(name, str) and name in FAMILIES):
-            raise InputError(f"refine_psfs {name!r} is not known; give {', '.join(FAMILIES)}")
+            raise InputError(f"`refine_psfs` {name!r} is not known; give {', '.join(FAMILIES)}")
     if observation.psf_fields and (found or len(observation.psf_scatter)):
         raise InputError(
-            "refine_psfs and psf_scatter are for PSFs that are the same all over the images; leave "
-            "them out where PSFs vary over the field"
+            "`refine_psfs` and `psf_scatter` are for PSFs that are the same all over the images; "
+            "leave them out where PSFs vary over the field"
         )
     if found and not len(positions):
-        raise InputError("refine_psfs needs a star, whose image shows the PSF; give stars")
+        raise InputError("`refine_psfs` needs a star, whose image shows the PSF; give stars")
     for name, needed in NEEDS.items():
         if name in found and not getattr(observation, needed).size:
-            raise InputError(f"refine_psfs {name} needs {needed}; give them, or leave {name} out")
+            raise InputError(
+                f"`refine_psfs` {name} needs `{needed}`; give them, or leave {name} out"
+            )
     if "pupil" in found:
         from lnocl.scene.pupils import Pupil  # which loads scipy
 
@@ -151,8 +150,8 @@ def check_families(
             raise InputError("pupils differ in their number of apertures; give as many in each")
     if "shift" in found and refine_positions is True and observation.n_images == 1:
         raise InputError(
-            "refine_psfs shift of one image is told from nothing but the stars' places; leave it "
-            "out, or refine_positions"
+            "`refine_psfs` shift of one image is told from nothing but the stars' places; leave it "
+            "out, or `refine_positions`"
         )
     return found
 
@@ -174,13 +173,13 @@ def check_length(n_iter: object, stop: object) -> None:
         number between 0 and 1.
     """
     if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
-        raise InputError(f"n_iter must be a whole number, 1 or more; {n_iter} was given")
+        raise InputError(f"`n_iter` must be a whole number, 1 or more; {n_iter} was given")
     if n_iter > MAX_ITERATIONS:
-        raise InputError(f"n_iter must be {MAX_ITERATIONS} at most; {n_iter} was given")
+        raise InputError(f"`n_iter` must be {MAX_ITERATIONS} at most; {n_iter} was given")
     is_change = isinstance(stop, Real) and 0 < cast(float, stop) < 1
     if not (stop is None or is_change or (isinstance(stop, str) and stop in STOPS)):
         raise InputError(
-            f"stop {stop!r} is not known; give {', '.join(STOPS)}, none, or a number between 0 "
+            f"`stop` {stop!r} is not known; give {', '.join(STOPS)}, none, or a number between 0 "
             "and 1"
         )
 
@@ -197,7 +196,7 @@ def check_types(callback: object, **flags: object) -> None:
         raise InputError(f"callback must be a function or None; {callback!r} was given")
     for name, flag in flags.items():
         if not isinstance(flag, (bool, np.bool_)):
-            raise InputError(f"{name} must be True or False; {flag!r} was given")
+            raise InputError(f"`{name}` must be True or False; {flag!r} was given")
 
 
 def read_start(
@@ -225,13 +224,13 @@ def read_start(
         fluxes = numbers("initial_star_fluxes", given)
     if extended is not None and not extended.any():
         raise InputError(
-            "initial_extended is 0 everywhere, which no iteration can leave; give it values above "
-            "0, or leave it out"
+            "`initial_extended` is 0 everywhere, which no iteration can leave; give it values "
+            "above 0, or leave it out"
         )
     if fluxes is not None and not fits_stars and (n_dark := int((fluxes == 0).sum())):
         raise InputError(
-            f"initial_star_fluxes holds {n_dark} of 0, which solver sgm multiplies and never "
-            "leaves; give values above 0, leave those stars out, or take solver sgp"
+            f"`initial_star_fluxes` holds {n_dark} of 0, which solver sgm multiplies and never "
+            "leaves; give values above 0, leave those stars out, or take `solver` sgp"
         )
     return extended, fluxes
 
@@ -258,18 +257,18 @@ def read_penalties(
     if not isinstance(smoothing, str):
         return [Penalty(mu, smoothing)]
     if smoothing != "auto":
-        raise InputError(f"smoothing {smoothing!r} is not known; give a number or auto")
+        raise InputError(f"`smoothing` {smoothing!r} is not known; give a number or auto")
     recommended = recommend_smoothing(observation)
     if near_stars is not None:
         weight = WRONG_PSFS * recommended
-        log.info(
-            f"smoothing chosen: {weight:.3g}, and up to {near_stars.max():.3g} more at the stars, "
-            "by the error of the PSFs"
+        note(
+            f"`smoothing` chosen: {weight:.3g}, and up to {near_stars.max():.3g} more at the "
+            "stars, by the error of the PSFs"
         )
         return [Penalty(mu, weight, near_stars=near_stars)]
     if stop == "held-out":
         return [Penalty(mu, multiple * recommended) for multiple in (0.0, *MULTIPLES)]
-    log.info("smoothing chosen: %.3g, by the noise of the counts", recommended)
+    note("`smoothing` chosen: %.3g, by the noise of the counts", recommended)
     return [Penalty(mu, recommended)]
 
 
@@ -285,5 +284,6 @@ def warn_of_rounding(n_iter: int) -> None:
     if difference > ROUNDING_WORTH_A_WARNING:
         warn(
             f"single precision is expected to stray from double by {difference:.1g} of the "
-            f"extended source after {n_iter} iterations; take precision double, or fewer iterations"
+            f"extended source after {n_iter} iterations; take `precision` double, or fewer "
+            "iterations"
         )

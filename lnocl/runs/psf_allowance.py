@@ -92,8 +92,8 @@ class Allowance:
         light = np.zeros(scene.grid)
         for j in range(scene.n_images):
             for s, flux in enumerate(fluxes):
-                stamp = scene.psf_on_sky(j, s)
-                light[stamp.window(scene.grid)] += flux * scene.unit * stamp.values
+                cutout = scene.psf_on_sky(j, s)
+                light[cutout.window(scene.grid)] += flux * scene.unit * cutout.values
         number = Rings((ny, nx), on_sky(scene.stars, scene.oversample), scene.oversample).number
         kappa = self.in_rings[np.minimum(number, len(self.in_rings) - 1)]
         return np.asarray(kappa * light[:ny, :nx] / scene.n_images**1.5)

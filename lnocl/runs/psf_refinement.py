@@ -7,14 +7,13 @@ extended source is smoothed near the stars because of what could not be mended.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from lnocl.errors import counted, warn
+from lnocl.errors import counted, note, warn
 from lnocl.runs.guarded_runs import (
     FIRST_ERROR,
     GUARD,
@@ -30,8 +29,6 @@ from lnocl.scene.psf_families import PsfFamilies, PsfParameters
 from lnocl.scene.psf_misfit import PsfMisfit
 from lnocl.scene.psf_wings import without_noise
 from lnocl.solvers.psf_fit import step
-
-log = logging.getLogger("lnocl")
 
 # A mend is taken where it leaves less than this share of kappa, or nothing to doubt, and a misfit
 # that is less by so many of its standard deviations.
@@ -143,7 +140,7 @@ def mend(
     runs = GuardedRuns(setup, observation, tick)
     if len(runs.stars) > MOST_STARS and not (is_asked or len(observation.psf_scatter)):
         number = counted(len(runs.stars), "star")
-        log.info(f"PSFs are not judged: {number} in the window; name refine_psfs to judge them")
+        note(f"PSFs are not judged: {number} in the window; name `refine_psfs` to judge them")
         return Mended(observation, moves is True, None, None, is_judged=False)
     given = _State(
         observation.psfs, runs.fit(observation.psfs, runs.stars, moves is True), moves is True
@@ -322,22 +319,22 @@ def _tell(given: _State, state: _State, tried: _State, is_accepted: bool) -> Non
     """Say in a line what was done."""
     before, after, found = (each.misfit.reduced for each in (given, state, tried))
     if is_accepted:
-        log.info(
+        note(
             f"PSFs refined: their misfit is {after:.3g} instead of {before:.3g}, "
             "where noise gives 1"
         )
     elif state.moves and not given.moves:
-        log.info(
+        note(
             f"positions refined: the misfit of the stars is {after:.3g} instead of {before:.3g}, "
             "where noise gives 1"
         )
     elif tried is not given:
-        log.info(
+        note(
             f"PSFs left as given: their misfit is {before:.3g}, refined {found:.3g}, "
             "where noise gives 1"
         )
     else:
-        log.info(f"the misfit of the PSFs is {before:.3g}, where noise gives 1")
+        note(f"the misfit of the PSFs is {before:.3g}, where noise gives 1")
 
 
 def _warn(refinement: PsfRefinement) -> None:

@@ -66,7 +66,7 @@ class Replicas:
     outcome : Outcome
         The answer.
     seed : int
-        Replica k hangs on this and k alone.
+        Replica k depends on this and k alone.
     """
 
     def __init__(self, outcome: Outcome, seed: int) -> None:

@@ -115,12 +115,12 @@ def make_start(
     InputError
         As `deconvolve`.
     """
-    leeway = 0.0
+    max_shift = 0.0
     if setup.refine_positions:
         from lnocl.solvers.positions import RADIUS
 
-        leeway = RADIUS
-    scene = Scene(observation, setup.stars, penalty, setup.pad, leeway)
+        max_shift = RADIUS
+    scene = Scene(observation, setup.stars, penalty, setup.pad, max_shift)
     given = scene.stars
     extended, star_fluxes = scene.start(initial_extended, initial_star_fluxes)
     refines = setup.refine_positions and scene.n_stars > 0

@@ -140,7 +140,7 @@ class Discrepancy:
         warn(
             f"the discrepancy was not reached: after {run.done} iterations it is "
             f"{self._discrepancy(run):.3g}, where noise gives 1; see to PSFs and noise, or raise "
-            "n_iter"
+            "`n_iter`"
         )
 
     def quantity(self, run: Run) -> str:

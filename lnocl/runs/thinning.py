@@ -26,11 +26,11 @@ def split_counts(observation: Observation) -> tuple[Observation, Observation]:
     """
     images = observation.images
     if not images.any():
-        raise InputError("the images hold no counts to hold out; give n_iter and stop None")
+        raise InputError("the images hold no counts to hold out; give `n_iter` and `stop` None")
     if images.max() > MAX_COUNTS:
         raise InputError(
-            f"a pixel of {images.max():.3g} electrons is too bright to be split; give n_iter and "
-            "stop None"
+            f"a pixel of {images.max():.3g} electrons is too bright to be split; give `n_iter` and "
+            "`stop` None"
         )
     rng = np.random.default_rng(SEED)
     first = np.empty_like(images)

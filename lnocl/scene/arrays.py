@@ -12,9 +12,9 @@ Array = NDArray[np.float64]
 # The advice where these have masked values, which only images and frames of stars may have.
 UNMASK = {
     "psfs": "repair {them} first, as lnocl.psf.make_psf does",
-    "background": "fill {them} and add {their} mask to mask",
-    "read_noise": "fill {them} and add {their} mask to mask",
-    "exposure": "fill {them} and add {their} mask to mask",
+    "background": "fill {them} and add {their} mask to `mask`",
+    "read_noise": "fill {them} and add {their} mask to `mask`",
+    "exposure": "fill {them} and add {their} mask to `mask`",
 }
 
 
@@ -24,13 +24,13 @@ def values_and_mask(name: str, values: ArrayLike) -> tuple[NDArray, NDArray[np.b
         array: NDArray = np.ma.asanyarray(values)
     except (TypeError, ValueError) as error:
         if "inhomogeneous" not in str(error):
-            raise InputError(f"{name} cannot be read as an array: {error}") from error
-        raise InputError(f"{name} cannot be read as an array: its rows differ") from None
+            raise InputError(f"`{name}` cannot be read as an array: {error}") from error
+        raise InputError(f"`{name}` cannot be read as an array: its rows differ") from None
     except MemoryError:
         raise
     except Exception as error:  # the caller's own __array__ may raise any
         words = f"{type(error).__name__}: {error}"
-        raise InputError(f"{name} cannot be read as an array: {words}") from error
+        raise InputError(f"`{name}` cannot be read as an array: {words}") from error
     return np.ma.getdata(array, subok=False), np.ma.getmaskarray(array)
 
 
@@ -47,7 +47,7 @@ def refuse_masked(name: str, masked: NDArray[np.bool_]) -> None:
         them, their = ("it", "its") if n_masked == 1 else ("them", "their")
         advice = UNMASK.get(name, "fill {them} or leave {them} out")
         raise InputError(
-            f"{name} has {counted(n_masked, 'masked value')}; "
+            f"`{name}` has {counted(n_masked, 'masked value')}; "
             f"{advice.format(them=them, their=their)}"
         )
 
@@ -56,5 +56,5 @@ def numbers(name: str, values: ArrayLike, copy: bool = True) -> Array:
     """Return real numbers as float64, none of them masked; a copy unless that is not asked for."""
     array = unmasked(name, values)
     if array.dtype.kind not in "biuf":
-        raise InputError(f"{name} holds {array.dtype}; give real numbers")
+        raise InputError(f"`{name}` holds {array.dtype}; give real numbers")
     return array.astype(np.float64, copy=copy)

@@ -36,10 +36,10 @@ def _gather(name: str, values: Any, depth: int = 0) -> Any:
         return values
     units = {str(getattr(part, "unit", None)): getattr(part, "unit", None) for part in parts}
     if len(units) > 1:
-        raise InputError(f"{name} come in several units ({', '.join(units)}); give them in one")
+        raise InputError(f"`{name}` come in several units ({', '.join(units)}); give them in one")
     stack = [np.ma.asanyarray(getattr(part, "value", part)) for part in parts]
     if len({part.shape for part in stack}) > 1:
-        raise InputError(f"{name} cannot be read as an array: their shapes differ")
+        raise InputError(f"`{name}` cannot be read as an array: their shapes differ")
     return _Numbers(np.ma.stack(stack), *units.values())
 
 
@@ -61,7 +61,7 @@ def _masked(name: str, values: Any) -> Any:
         return data
     if np.shape(values.mask) not in ((), data.shape):
         raise InputError(
-            f"{name} have a mask of shape {np.shape(values.mask)}; their data have {data.shape}"
+            f"`{name}` have a mask of shape {np.shape(values.mask)}; their data have {data.shape}"
         )
     return np.ma.array(data, mask=np.asarray(values.mask, bool))
 
@@ -81,7 +81,7 @@ def _refuse_logarithms(name: str, unit: Any) -> None:
 
     if not (unit is None or isinstance(unit, u.UnitBase)):
         raise InputError(
-            f"{name} in {unit} are not linear; give them in linear units, as physical does of a "
+            f"`{name}` in {unit} are not linear; give them in linear units, as physical does of a "
             "Magnitude"
         )
 
@@ -124,11 +124,11 @@ def counts(
 
         digital = {u.adu, u.DN} & set(unit.decompose().bases)
         advice = "multiply by the gain (electrons per adu)" if digital else "give electrons"
-        raise InputError(f"{name} must be {kind}, not {unit}; {advice}")
+        raise InputError(f"`{name}` must be {kind}, not {unit}; {advice}")
     factor, is_rate = known
     if is_rate and not has_exposure:
-        advice = "electrons" if has_exposure is None else "exposure in seconds with them"
-        raise InputError(f"{name} in {unit} are counts per time; give {advice}")
+        advice = "electrons" if has_exposure is None else "`exposure` in seconds with them"
+        raise InputError(f"`{name}` in {unit} are counts per time; give {advice}")
     return numbers * factor, is_rate
 
 
@@ -160,13 +160,13 @@ def variances(name: str, values: Any, are_rates: bool) -> Any:
     if not any(is_uncertainty(each) for each in given):
         return None
     if not all(is_uncertainty(each) for each in given):
-        raise InputError(f"some of {name} have an uncertainty; give all of them one, or none")
+        raise InputError(f"some of `{name}` have an uncertainty; give all of them one, or none")
     found = []
     for part, each in zip(parts, given, strict=True):
         variance, factor = _squared_counts(name, each, are_rates)
         if variance.shape not in ((), part.data.shape):
             raise InputError(
-                f"{name} have an uncertainty of shape {variance.shape}; their data have "
+                f"`{name}` have an uncertainty of shape {variance.shape}; their data have "
                 f"{part.data.shape}"
             )
         found.append(np.broadcast_to(factor * variance, part.data.shape))
@@ -191,7 +191,7 @@ def _squared_counts(name: str, uncertainty: Any, are_rates: bool) -> tuple[Any, 
     known = (1.0, are_rates) if unit is None else count_of(unit**0.5)
     if known is None or known[1] != are_rates:
         raise InputError(
-            f"the uncertainty of {name} is in {uncertainty.unit}; give it in counts, as {name}"
+            f"the uncertainty of `{name}` is in {uncertainty.unit}; give it in counts, as `{name}`"
         )
     return variance, known[0] ** 2
 
@@ -208,7 +208,7 @@ def seconds(values: Any) -> Any:
     if unit is None or unit.physical_type == "dimensionless":
         return numbers if unit is None else numbers * unit.to("")
     if unit.physical_type != "time":
-        raise InputError(f"exposure must be in seconds or numbers without unit, not in {unit}")
+        raise InputError(f"`exposure` must be in seconds or numbers without unit, not in {unit}")
     return numbers * unit.to("s")
 
 
@@ -225,7 +225,7 @@ def pixels(name: str, values: Any) -> Any:
         return numbers if unit is None else numbers * unit.to("")
     if not unit.is_equivalent("pix"):
         raise InputError(
-            f"{name} must be in pixels, not in {unit}; convert them with the WCS of the images"
+            f"`{name}` must be in pixels, not in {unit}; convert them with the WCS of the images"
         )
     return numbers * unit.to("pix")
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.scene.observation import Array, Observation
-from lnocl.scene.shifting import MovablePsf, Stamp
+from lnocl.scene.shifting import Cutout, MovablePsf
 
 
 def movable_psfs(
@@ -96,46 +96,46 @@ class DetectorPsf:
         self._half = (oversample - 1) / 2.0
         self._lag = self._half if is_effective else 0.0
 
-    def response(self, x: float, y: float) -> Stamp:
+    def response(self, x: float, y: float) -> Cutout:
         """Return h on the fine grid, the sky moved by so many pixels of the image."""
-        stamp = self.fine.at(self._q * x - self._lag, self._q * y - self._lag)
-        return self._seen(stamp, stamp.values)[0]
+        cutout = self.fine.at(self._q * x - self._lag, self._q * y - self._lag)
+        return self._seen(cutout, cutout.values)[0]
 
-    def on_sky(self, x: float, y: float) -> Stamp:
+    def on_sky(self, x: float, y: float) -> Cutout:
         """Return what pixels that begin at each fine pixel see of a star at a position, pixels."""
-        stamp = self.fine.at(*self._on_fine_pixels(x, y))
-        return self._seen(stamp, stamp.values)[0]
+        cutout = self.fine.at(*self._on_fine_pixels(x, y))
+        return self._seen(cutout, cutout.values)[0]
 
-    def at(self, x: float, y: float, axis: int | None = None) -> Stamp:
+    def at(self, x: float, y: float, axis: int | None = None) -> Cutout:
         """Return the image of a star at a position, pixels, or a derivative, as `place` does."""
-        stamp = self.fine.at(*self._on_fine_pixels(x, y), axis)
+        cutout = self.fine.at(*self._on_fine_pixels(x, y), axis)
         per_pixel = 1.0 if axis is None else float(self._q)
-        return self._sampled(*self._seen(stamp, per_pixel * stamp.values))[0]
+        return self._sampled(*self._seen(cutout, per_pixel * cutout.values))[0]
 
-    def with_slopes(self, x: float, y: float) -> tuple[Stamp, Array]:
+    def with_slopes(self, x: float, y: float) -> tuple[Cutout, Array]:
         """Return the image of a star, and it and its derivatives along x and y, (3, h, w)."""
-        stamp, values = self.fine.with_slopes(*self._on_fine_pixels(x, y))
+        cutout, values = self.fine.with_slopes(*self._on_fine_pixels(x, y))
         per_pixel = np.array([1.0, self._q, self._q])[:, None, None]
-        return self._sampled(*self._seen(stamp, per_pixel * values))
+        return self._sampled(*self._seen(cutout, per_pixel * values))
 
     def _on_fine_pixels(self, x: float, y: float) -> tuple[float, float]:
         shift = self._half - self._lag
         return self._q * x + shift, self._q * y + shift
 
-    def _seen(self, stamp: Stamp, values: Array) -> tuple[Stamp, Array]:
+    def _seen(self, cutout: Cutout, values: Array) -> tuple[Cutout, Array]:
         """Return what pixels that begin at each fine pixel see, for values (..., h, w) there."""
         if self._is_effective:
             values = self._q**2 * values
-            return Stamp(_first(values), stamp.y, stamp.x), values
-        y, values = _sum_ahead(values, stamp.y, self._q, self._fine_grid[0], -2)
-        x, values = _sum_ahead(values, stamp.x, self._q, self._fine_grid[1], -1)
-        return Stamp(_first(values), y, x), values
+            return Cutout(_first(values), cutout.y, cutout.x), values
+        y, values = _sum_ahead(values, cutout.y, self._q, self._fine_grid[0], -2)
+        x, values = _sum_ahead(values, cutout.x, self._q, self._fine_grid[1], -1)
+        return Cutout(_first(values), y, x), values
 
-    def _sampled(self, stamp: Stamp, values: Array) -> tuple[Stamp, Array]:
+    def _sampled(self, cutout: Cutout, values: Array) -> tuple[Cutout, Array]:
         """Return what the pixels of the image see."""
-        y, x = -(-stamp.y // self._q), -(-stamp.x // self._q)
-        values = values[..., self._q * y - stamp.y :: self._q, self._q * x - stamp.x :: self._q]
-        return Stamp(_first(values), y, x), values
+        y, x = -(-cutout.y // self._q), -(-cutout.x // self._q)
+        values = values[..., self._q * y - cutout.y :: self._q, self._q * x - cutout.x :: self._q]
+        return Cutout(_first(values), y, x), values
 
 
 def _first(values: Array) -> Array:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
-from lnocl.scene.shifting import MARGIN, Stamp
+from lnocl.scene.shifting import MARGIN, Cutout
 
 # Rows and columns of the grid.
 Box = tuple[slice, slice]
@@ -56,7 +56,7 @@ class Model:
         self.shape = (scene.n_images, *scene.image_grid)
         self.grid, self.oversample = scene.grid, scene.oversample
         self._window_otfs: dict[Any, NDArray[np.complex128]] = {}
-        self._psfs = [scene.psf_stamp(j) for j in range(scene.n_images)]
+        self._psfs = [scene.psf_cutout(j) for j in range(scene.n_images)]
         self.sums = np.array([psf.values.sum() for psf in self._psfs])
         self._back_sums = self.sums / scene.oversample**2
         weights = np.ones((1, 1, 1)) if scene.weights is None else scene.weights
@@ -125,27 +125,27 @@ class Model:
             mixed[psf.window(mixed.shape)] += share * psf.values
         return np.asarray(scipy.fft.rfft2(mixed, workers=-1))
 
-    def adjoint_of_stamps(self, stamps: Sequence[Stamp]) -> Stamp:
-        """Return ``sum_j A_j^T x_j`` of images x_j that are 0 beyond a stamp, one an image.
+    def adjoint_of_cutouts(self, cutouts: Sequence[Cutout]) -> Cutout:
+        """Return ``sum_j A_j^T x_j`` of images x_j that are 0 beyond a cutout, one an image.
 
         It is computed in the window that it lies in, where that is smaller than the grid. Outer
         rows and columns below the rounding of its largest value are cut off.
         """
-        given, q = stamps, self.oversample
-        stamps = [Stamp(spread(each.values, q), q * each.y, q * each.x) for each in given]
-        first, size = _window_of_correlations(stamps, self._psfs)
+        given, q = cutouts, self.oversample
+        cutouts = [Cutout(spread(each.values, q), q * each.y, q * each.x) for each in given]
+        first, size = _window_of_correlations(cutouts, self._psfs)
         if (size >= self.grid).any():
-            total = self.adjoint(stamp.on_grid(self.shape[1:]) for stamp in given)
-            return _without_rounding(Stamp(total, 0, 0))
+            total = self.adjoint(cutout.on_grid(self.shape[1:]) for cutout in given)
+            return _without_rounding(Cutout(total, 0, 0))
         shape = tuple(scipy.fft.next_fast_len(int(n), real=True) for n in size)
         spectrum: Any = 0.0
-        for j, (stamp, psf) in enumerate(zip(stamps, self._psfs, strict=True)):
+        for j, (cutout, psf) in enumerate(zip(cutouts, self._psfs, strict=True)):
             laid = np.zeros(shape)
-            y, x = stamp.y - psf.y - first[0], stamp.x - psf.x - first[1]
-            laid[y : y + stamp.values.shape[0], x : x + stamp.values.shape[1]] = stamp.values
+            y, x = cutout.y - psf.y - first[0], cutout.x - psf.x - first[1]
+            laid[y : y + cutout.values.shape[0], x : x + cutout.values.shape[1]] = cutout.values
             spectrum = spectrum + self._window_otf(j, shape).conj() * scipy.fft.rfft2(laid)
         total = scipy.fft.irfft2(spectrum, shape)[: size[0], : size[1]]
-        return _without_rounding(Stamp(total, int(first[0]), int(first[1])))
+        return _without_rounding(Cutout(total, int(first[0]), int(first[1])))
 
     def _window_otf(self, j: int, shape: tuple[int, ...]) -> NDArray[np.complex128]:
         if (j, shape) not in self._window_otfs:
@@ -230,7 +230,7 @@ def spread(image: Array, oversample: int) -> Array:
 
 
 def convolve_at(
-    extended: Array, psf: Stamp, rows: range, columns: range, oversample: int = 1
+    extended: Array, psf: Cutout, rows: range, columns: range, oversample: int = 1
 ) -> Array:
     """Return ``A_j f`` in some rows and columns of the images' grid, round its edges."""
     if oversample > 1:
@@ -270,7 +270,7 @@ def images_of_sky(scene: Scene, extended: Array) -> Iterator[Array]:
     """Yield the ``A_j f``, as `Model.forward` returns them; nothing but one of them is held."""
     if is_flat(extended):
         for j in range(scene.n_images):
-            yield np.full(scene.image_grid, extended[0, 0] * scene.psf_stamp(j).values.sum())
+            yield np.full(scene.image_grid, extended[0, 0] * scene.psf_cutout(j).values.sum())
         return
     spectrum = scipy.fft.rfft2(extended, workers=-1)
     for j in range(scene.n_images):
@@ -299,11 +299,11 @@ def add_to_window(
         Row and column of the first pixel of the window.
     """
     rows, columns = (range(at, at + n) for at, n in zip(first, image.shape, strict=True))
-    seen = convolve_at(sky, scene.psf_stamp(j), rows, columns, scene.oversample)
+    seen = convolve_at(sky, scene.psf_cutout(j), rows, columns, scene.oversample)
     image += seen / scene.unit
-    stamps = scene.star_field.stamps[j]
+    cutouts = scene.star_field.cutouts[j]
     for s in scene.star_field.reaching(j, first, image.shape):
-        stamps[s].add_to(image, rows, columns, scene.image_grid, star_fluxes[s] / scene.unit)
+        cutouts[s].add_to(image, rows, columns, scene.image_grid, star_fluxes[s] / scene.unit)
 
 
 def _illuminate(image: Array, background: Array | float, starlight: Array) -> None:
@@ -314,24 +314,24 @@ def _illuminate(image: Array, background: Array | float, starlight: Array) -> No
 
 
 def _window_of_correlations(
-    stamps: Sequence[Stamp], psfs: Sequence[Stamp]
+    cutouts: Sequence[Cutout], psfs: Sequence[Cutout]
 ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-    """Return first pixel and shape of the window that correlations of stamps with PSFs lie in."""
+    """Return first pixel and shape of the window that correlations of cutouts with PSFs lie in."""
     first, last = [], []
-    for stamp, psf in zip(stamps, psfs, strict=True):
-        corner = np.array([stamp.y - psf.y, stamp.x - psf.x])
+    for cutout, psf in zip(cutouts, psfs, strict=True):
+        corner = np.array([cutout.y - psf.y, cutout.x - psf.x])
         first.append(corner - psf.values.shape + 1)
-        last.append(corner + stamp.values.shape)
+        last.append(corner + cutout.values.shape)
     start = np.min(first, axis=0)
     return start, np.max(last, axis=0) - start
 
 
 def largest_window(scene: Scene) -> tuple[int, int]:
-    """Return the largest shape of `Model.adjoint_of_stamps` of star images, wherever these lie."""
+    """Return the largest shape of `Model.adjoint_of_cutouts` of star images, wherever these lie."""
     grid, psf_shape = scene.grid, scene.observation.psfs.shape[1:]
     height, width = (2 * (k + 2 * MARGIN + 2 * (scene.oversample - 1)) for k in psf_shape)
     return grid if height >= grid[0] or width >= grid[1] else (height, width)
 
 
-def _without_rounding(stamp: Stamp) -> Stamp:
-    return stamp.trimmed(ROUNDING * float(abs(stamp.values).max()))
+def _without_rounding(cutout: Cutout) -> Cutout:
+    return cutout.trimmed(ROUNDING * float(abs(cutout.values).max()))

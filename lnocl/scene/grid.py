@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, note
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import choose_pad
-
-log = logging.getLogger("lnocl")
 
 MAX_AXIS = 8192
 # Odd factors of an axis, and the least power of two beside them: a transform takes blocks of 8
@@ -41,10 +37,10 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
     if isinstance(pad, str) and pad == "auto":
         pad = choose_pad(observation)
         reason = "light runs" if pad else "no light runs"
-        log.info("pad chosen: %d pixels, as %s over the edge of the images", pad, reason)
+        note("`pad` chosen: %d pixels, as %s over the edge of the images", pad, reason)
     shape = observation.shape
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
-        raise InputError(f"pad must be a whole number, 0 or more, or auto; {pad} was given")
+        raise InputError(f"`pad` must be a whole number, 0 or more, or auto; {pad} was given")
     # Light that is farther from its source than the images are wide reaches none of them.
     most = MAX_AXIS // observation.oversample
     sizes = (-(-k // observation.oversample) for k in observation.psfs.shape[1:])
@@ -53,7 +49,7 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
     if max(ny, nx) > most:
         finer = f" and oversample={observation.oversample}" if observation.oversample > 1 else ""
         raise InputError(
-            f"images of {shape} with pad={pad}{finer} need a grid of {(ny, nx)}; "
+            f"images of {shape} with `pad`={pad}{finer} need a grid of {(ny, nx)}; "
             f"the largest axis is {most}: cut the images or pad less"
         )
     return length_for(ny), length_for(nx)

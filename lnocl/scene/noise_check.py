@@ -150,15 +150,15 @@ def warn_of_noise(observation: Observation) -> None:
     for j, noise in measured:
         if noise.is_darker_than(noise.level, noise.level):
             warn(
-                f"the background of image {j} is too high: it is {noise.level:.6g} electrons per "
-                f"pixel where the darker half of the image has {noise.mean:.6g}"
+                f"the background of `images[{j}]` is too high: it is {noise.level:.6g} electrons "
+                f"per pixel where the darker half of the image has {noise.mean:.6g}"
             )
             return
     found = [(abs(noise.log_factor()), j, noise) for j, noise in measured if noise.is_white()]
     size, j, noise = max(found, default=(0.0, 0, Noise(1.0, 1.0, 1.0, 1.0)))
     if size >= np.log(MAX_FACTOR):
         warn(
-            f"the noise of image {j} is not that of its counts: where it is darkest the variance "
-            f"is {noise.variance:.3g} and the mean {noise.mean:.3g} electrons; see to gain, "
-            "background (a sky that was subtracted is added again) and read noise"
+            f"the noise of `images[{j}]` is not that of its counts: where it is darkest the "
+            f"variance is {noise.variance:.3g} and the mean {noise.mean:.3g} electrons; see to "
+            "gain, background (a sky that was subtracted is added again) and read noise"
         )

@@ -384,7 +384,7 @@ class Observation:
             shape = getattr(self, name).shape
             if shape not in known:
                 raise InputError(
-                    f"{name} has shape {shape}, beside images of {images} and PSFs of {psf}; "
+                    f"`{name}` has shape {shape}, beside images of {images} and PSFs of {psf}; "
                     "replace those that belong together at once"
                 )
 
@@ -440,8 +440,8 @@ class Observation:
         checked = _check_psfs(containers.bare("ideal_psfs", ideals), self.n_images, psf_centre)
         if checked.shape != self.psfs.shape:
             raise InputError(
-                f"ideal_psfs has PSFs of shape {checked.shape[1:]}, psfs of {self.psfs.shape[1:]}; "
-                "give them in one shape"
+                f"`ideal_psfs` has PSFs of shape {checked.shape[1:]}, psfs of "
+                f"{self.psfs.shape[1:]}; give them in one shape"
             )
         return checked
 
@@ -450,7 +450,7 @@ class Observation:
             given = _booleans(mask)
             if given.shape not in (self.images.shape, self.shape):
                 raise InputError(
-                    f"mask has shape {given.shape}; the images have {self.images.shape}"
+                    f"`mask` has shape {given.shape}; the images have {self.images.shape}"
                 )
             self.mask |= given
         non_finite = ~np.isfinite(self.images) & ~self.mask
@@ -493,13 +493,13 @@ class Observation:
         """Return what the uncertainty of images has beyond the noise of their counts."""
         if self.read_noise.any():
             raise InputError(
-                "give read_noise, or images with their uncertainty, which includes it, not both"
+                "give `read_noise`, or images with their uncertainty, which includes it, not both"
             )
         return without_source(variances, self.images, self.mask)
 
     def _add_read_noise(self) -> None:
         variance = self.read_noise**2
-        _refuse_unless("the square of read_noise", variance, "finite", variance >= 0)
+        _refuse_unless("the square of `read_noise`", variance, "finite", variance >= 0)
         if variance.any():
             np.add(self.images, _each_pixel(variance), out=self.images, where=~self.mask)
         if variance.ndim != self.background.ndim:
@@ -510,8 +510,8 @@ class Observation:
         for name, values in (("images", self.images), ("background", self.background)):
             if not (values <= MAX_COUNTS).all():
                 raise InputError(
-                    f"the {name}, with exposure and the square of read_noise, must be at most "
-                    f"{MAX_COUNTS:g} electrons per pixel: divide the counts and read_noise by a "
+                    f"the {name}, with `exposure` and the square of `read_noise`, must be at most "
+                    f"{MAX_COUNTS:g} electrons per pixel: divide the counts and `read_noise` by a "
                     "constant"
                 )
 
@@ -527,7 +527,7 @@ class Observation:
             return _one_each(name, values, self.n_images)
         if values.shape not in (self.images.shape, self.shape):
             raise InputError(
-                f"{name} has shape {values.shape}; the images have {self.images.shape}"
+                f"`{name}` has shape {values.shape}; the images have {self.images.shape}"
             )
         return np.where(self.mask, masked, values)
 
@@ -542,7 +542,7 @@ class Observation:
             )
         size = np.array(self.shape[::-1])
         _refuse_unless(
-            "offsets",
+            "`offsets`",
             values,
             f"finite, and less than the images' {size[0]} by {size[1]} pixels",
             abs(values) < size,
@@ -555,24 +555,24 @@ class Observation:
             self.images[negative] = 0.0
             words = _pixels(n_negative, "image", "negative", "set to 0")
             if self.read_noise.any():
-                warn(f"{words}, with the square of read_noise added")
+                warn(f"{words}, with the square of `read_noise` added")
                 return
             warn(
-                f"{words}; if the sky was subtracted, give the noise that it left as read_noise, "
-                "or add the sky to the images and give it as background"
+                f"{words}; if the sky was subtracted, give the noise that it left as `read_noise`, "
+                "or add the sky to the images and give it as `background`"
             )
 
 
 def _check_oversample(oversample: object) -> int:
     if isinstance(oversample, (int, np.integer)) and oversample in OVERSAMPLES:
         return int(oversample)
-    raise InputError(f"oversample must be 1, 2 or 4; {oversample} was given")
+    raise InputError(f"`oversample` must be 1, 2 or 4; {oversample} was given")
 
 
 def _check_effective(effective_psfs: object) -> bool:
     if isinstance(effective_psfs, (bool, np.bool_)):
         return bool(effective_psfs)
-    raise InputError(f"effective_psfs must be True or False; {effective_psfs!r} was given")
+    raise InputError(f"`effective_psfs` must be True or False; {effective_psfs!r} was given")
 
 
 def _read(name: str, values: Any) -> Any:
@@ -591,7 +591,9 @@ def _read(name: str, values: Any) -> Any:
 def _booleans(mask: ArrayLike) -> NDArray[np.bool_]:
     given = unmasked("mask", mask)
     if given.dtype != np.bool_:
-        raise InputError(f"mask is of type {given.dtype}; give booleans, True where a pixel is bad")
+        raise InputError(
+            f"`mask` is of type {given.dtype}; give booleans, True where a pixel is bad"
+        )
     return given
 
 
@@ -605,13 +607,14 @@ def _stack(name: str, values: ArrayLike) -> Array:
     array = numbers(name, values)
     if array.ndim not in (2, 3):
         raise InputError(
-            f"{name} has {counted(array.ndim, 'dimension')}; give two, or three for several {name}"
+            f"`{name}` has {counted(array.ndim, 'dimension')}; give two, or three for several "
+            f"`{name}`"
         )
     if array.size == 0:
-        raise InputError(f"{name} is empty: its shape is {array.shape}")
+        raise InputError(f"`{name}` is empty: its shape is {array.shape}")
     if array.ndim == 3 and array.shape[2] <= MAX_CHANNELS and min(array.shape[:2]) >= MIN_SIDE:
         raise InputError(
-            f"{name} has shape {array.shape}, but its axes are (p, ny, nx): of colours give one, "
+            f"`{name}` has shape {array.shape}, but its axes are (p, ny, nx): of colours give one, "
             f"{name}[:, :, 0]; if they are of one sky, np.moveaxis({name}, -1, 0)"
         )
     return array.reshape((-1, *array.shape[-2:]))
@@ -631,7 +634,7 @@ def _each_pixel(values: Array) -> Array:
 def _one_each(name: str, values: Array, n_images: int) -> Array:
     if values.ndim > 1 or values.size not in (1, n_images):
         raise InputError(
-            f"{name} has shape {values.shape}; give one number, or one for each of the "
+            f"`{name}` has shape {values.shape}; give one number, or one for each of the "
             f"{n_images} images"
         )
     return np.array(np.broadcast_to(values, (n_images,)))
@@ -645,11 +648,11 @@ def _refuse_unless(name: str, values: Array, requirement: str, holds: NDArray[np
 
 def _refuse_out_of_range(name: str, values: Array) -> None:
     if name in SIGNED:
-        _refuse_unless(name, values, "finite", np.isfinite(values))
+        _refuse_unless(f"`{name}`", values, "finite", np.isfinite(values))
     elif name == "exposure" and values.ndim == 1:
-        _refuse_unless(name, values, "finite and more than zero", values > 0)
+        _refuse_unless(f"`{name}`", values, "finite and more than zero", values > 0)
     else:
-        _refuse_unless(name, values, "finite and not negative", values >= 0)
+        _refuse_unless(f"`{name}`", values, "finite and not negative", values >= 0)
 
 
 def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:
@@ -662,7 +665,7 @@ def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:
     if (bad := ~np.isfinite(stack)).any():
         j, y, x = np.argwhere(bad)[0]
         raise InputError(
-            f"psf {j} is not finite in {counted(int(bad[j].sum()), 'pixel')}, the first at "
+            f"`psfs[{j}]` is not finite in {counted(int(bad[j].sum()), 'pixel')}, the first at "
             f"({x}, {y}): interpolate, or make it of the star's frame with lnocl psf"
         )
     with np.errstate(over="ignore", invalid="ignore"):
@@ -673,8 +676,8 @@ def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:
     if unusable.any():
         j = int(np.argmax(unusable))
         raise InputError(
-            f"psf {j} has the sum {sums.flat[j]:g}; it must be positive, finite and more than the "
-            "rounding of its values: give another, or subtract less of a background from it"
+            f"`psfs[{j}]` has the sum {sums.flat[j]:g}; it must be positive, finite and more than "
+            "the rounding of its values: give another, or subtract less of a background from it"
         )
     if n_negative := int((stack < 0).sum()):
         warn(_pixels(n_negative, "psf", "negative", "kept"))
@@ -684,7 +687,7 @@ def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:
     elif psf_centre == "check":
         _refuse_off_centre(stack)
     elif psf_centre != "given":
-        raise InputError(f"psf_centre {psf_centre!r} is not known; choose from check, fit, given")
+        raise InputError(f"`psf_centre` {psf_centre!r} is not known; choose from check, fit, given")
     return np.broadcast_to(stack, (n_images, *stack.shape[1:]))
 
 
@@ -697,11 +700,11 @@ def _refuse_off_centre(psfs: Array) -> None:
         return
     (dx, dy), (y, x) = offsets[j], centre(psfs.shape[1:])
     words = (
-        f"the core of psf {j} lies ({dx:z.2f}, {dy:z.2f}) pixels off its centre ({x}, {y}), and "
-        "would move the sky by as much: take psf_centre fit to centre it"
+        f"the core of `psfs[{j}]` lies ({dx:z.2f}, {dy:z.2f}) pixels off its centre ({x}, {y}), "
+        "and would move the sky by as much: take `psf_centre` fit to centre it"
     )
     if distances[j] >= FAR_OFF_CENTRE:
-        raise InputError(f"{words}, or psf_centre given if it is to be there")
+        raise InputError(f"{words}, or `psf_centre` given if it is to be there")
     warn(words)
 
 

@@ -61,7 +61,7 @@ class Penalty:
         for name, weight in weights.items():
             if not (isinstance(weight, Real) and _is_weight(cast(float, weight))):
                 raise InputError(
-                    f"{name} must be a number, finite and not negative; {weight!r} was given"
+                    f"`{name}` must be a number, finite and not negative; {weight!r} was given"
                 )
 
 

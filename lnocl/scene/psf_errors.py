@@ -22,11 +22,11 @@ def check_modes(modes: ArrayLike | None, psfs: Array) -> Array:
         given = given[None]
     if given.ndim != 4 or given.shape[0] not in (1, wanted[0]) or given.shape[2:] != wanted[1:]:
         raise InputError(
-            f"psf_modes has shape {np.shape(modes)}; give (n, ky, kx), or one such cube for "
+            f"`psf_modes` has shape {np.shape(modes)}; give (n, ky, kx), or one such cube for "
             f"each of the {wanted[0]} images, with PSFs of shape {wanted[1:]}"
         )
     if not np.isfinite(given).all():
-        raise InputError("psf_modes hold values that are not finite; repair them first")
+        raise InputError("`psf_modes` hold values that are not finite; repair them first")
     return np.broadcast_to(given, (wanted[0], *given.shape[1:])).copy()
 
 
@@ -48,11 +48,11 @@ def check_pixels(name: str, values: ArrayLike | None, psfs: Array) -> Array:
     given = given[None] if given.ndim == 2 else given
     if given.ndim != 3 or given.shape[0] not in (1, len(psfs)) or given.shape[1:] != psfs.shape[1:]:
         raise InputError(
-            f"{name} has shape {np.shape(values)}; give {psfs.shape[1:]}, the shape of the PSFs, "
+            f"`{name}` has shape {np.shape(values)}; give {psfs.shape[1:]}, the shape of the PSFs, "
             f"or one such map for each of the {len(psfs)} images"
         )
     if not np.isfinite(given).all() or (given < 0).any():
-        raise InputError(f"{name} hold values that are negative or not finite; repair them first")
+        raise InputError(f"`{name}` hold values that are negative or not finite; repair them first")
     if not given.any(axis=(1, 2)).all():
-        raise InputError(f"{name} hold a map that is all 0; leave {name} out, or give another")
+        raise InputError(f"`{name}` hold a map that is all 0; leave `{name}` out, or give another")
     return np.broadcast_to(given, psfs.shape).copy()

@@ -204,7 +204,7 @@ def read_fields(psfs: Any, n_images: int, oversample: int, are_effective: bool) 
             "or one for each image"
         )
     if oversample > 1 and not are_effective and any(map(_is_model, given)):
-        raise InputError("PSFs of photutils are effective PSFs; give effective_psfs=True")
+        raise InputError("PSFs of photutils are effective PSFs; give `effective_psfs`=True")
     fields = [PsfField.of_model(each, oversample) if _is_model(each) else each for each in given]
     if len({field.shape for field in fields}) > 1:
         raise InputError("the PSFs of several fields differ in shape; give them in one")

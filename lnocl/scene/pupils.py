@@ -38,9 +38,9 @@ class Pupil:
     def __init__(self, transmission: Array) -> None:
         self.shape = transmission.shape
         apertures = _apertures(transmission > 0)
-        self._lit = np.any(apertures, axis=0)
-        self._transmission = transmission[self._lit]
-        self._phases = _phases(transmission, apertures, self._lit)
+        self._inside = np.any(apertures, axis=0)
+        self._transmission = transmission[self._inside]
+        self._phases = _phases(transmission, apertures, self._inside)
         self.n_phases = len(self._phases)
 
     def ideal_psf(self) -> Array:
@@ -64,37 +64,37 @@ class Pupil:
 
     def _field(self, wave: NDArray[np.complex128]) -> NDArray[np.complex128]:
         pupil = np.zeros(self.shape, complex)
-        pupil[self._lit] = wave
+        pupil[self._inside] = wave
         return np.asarray(np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(pupil))))
 
 
-def _apertures(lit: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+def _apertures(inside: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     from scipy.ndimage import label  # which takes its time to load
 
-    labels, n = label(lit, structure=np.ones((3, 3)))
+    labels, n = label(inside, structure=np.ones((3, 3)))
     parts = [labels == i for i in range(1, n + 1)]
     least = LEAST_APERTURE * max((part.sum() for part in parts), default=0)
     return [part for part in parts if part.sum() >= least]
 
 
 def _phases(
-    transmission: Array, apertures: list[NDArray[np.bool_]], lit: NDArray[np.bool_]
+    transmission: Array, apertures: list[NDArray[np.bool_]], inside: NDArray[np.bool_]
 ) -> Array:
-    """Return the phases at the pixels of the apertures, shape (n, n_lit)."""
-    y, x = (each / max(lit.shape) for each in np.indices(lit.shape))
-    columns = [np.ones(lit.shape), x, y]
+    """Return the phases at the pixels of the apertures, shape (n, n_inside)."""
+    y, x = (each / max(inside.shape) for each in np.indices(inside.shape))
+    columns = [np.ones(inside.shape), x, y]
     powers = [(a, d - a) for d in range(DEGREE + 1) for a in range(d, -1, -1)]
     for part in apertures:
-        reach = np.sqrt(part.sum()) / max(lit.shape)
+        reach = np.sqrt(part.sum()) / max(inside.shape)
         xs, ys = ((each - each[part].mean()) / reach * part for each in (x, y))
         columns += [part * xs**a * ys**b for a, b in powers]
-    weights = np.sqrt(transmission[lit] ** 2 / (transmission[lit] ** 2).sum())
+    weights = np.sqrt(transmission[inside] ** 2 / (transmission[inside] ** 2).sum())
     basis: list[Array] = []
     for column in columns:
-        own = weights * column[lit]
+        own = weights * column[inside]
         length = np.linalg.norm(own)
         for _ in range(2):  # rounding leaves something of the others the first time
             own = own - sum((each * (each @ own) for each in basis), 0.0)
         if np.linalg.norm(own) > SAME * length:
             basis.append(own / np.linalg.norm(own))
-    return np.array(basis[3:]).reshape(-1, lit.sum()) / weights
+    return np.array(basis[3:]).reshape(-1, inside.sum()) / weights

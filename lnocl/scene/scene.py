@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Iterator
 from copy import copy
@@ -18,10 +17,8 @@ from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
 from lnocl.scene.grid import grid_of
 from lnocl.scene.observation import Array, Observation, numbers
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
-from lnocl.scene.shifting import MovablePsf, Stamp
-from lnocl.scene.stars import Lit, StarField, check_positions, lit_box
-
-log = logging.getLogger("lnocl")
+from lnocl.scene.shifting import Cutout, MovablePsf
+from lnocl.scene.stars import Covered, StarField, check_positions, covered_box
 
 # Below this share of its maximum the total weight of a pixel of the extended source is taken as
 # "not observed" (the threshold of Bertero & Boccacci 2005, A&A 437, 369, for boundary effects).
@@ -67,7 +64,7 @@ class Scene:
     pad : int or "auto"
         Unobserved pixels round the images, at least; "auto": those of
         `lnocl.scene.padding.choose_pad`.
-    leeway : float
+    max_shift : float
         Pixels that a star may be moved later on, by `move_stars`.
 
     Attributes
@@ -120,11 +117,11 @@ class Scene:
         stars: ArrayLike = (),
         penalty: Penalty = NO_PENALTY,
         pad: int | str = 0,
-        leeway: float = 0.0,
+        max_shift: float = 0.0,
     ) -> None:
         self.observation = observation
         positions = check_positions(stars, observation)
-        self._leeway = leeway
+        self._max_shift = max_shift
         self.oversample = observation.oversample
         self.image_grid = grid_of(observation, pad)
         ny, nx = self.image_grid
@@ -200,8 +197,8 @@ class Scene:
         """Return a weight of the penalty, scaled; refuse one that is too large for float32."""
         if weight * factor > MAX_WEIGHT:
             raise InputError(
-                f"{name} {weight:g} is too large for images of about {self.scale:g} electrons per "
-                f"pixel; the most that means anything there is {MAX_WEIGHT / factor:g}"
+                f"`{name}` {weight:g} is too large for images of about {self.scale:g} electrons "
+                f"per pixel; the most that means anything there is {MAX_WEIGHT / factor:g}"
             )
         return float(weight) * factor if weight else 0.0  # the factor may be infinite
 
@@ -217,7 +214,7 @@ class Scene:
         return unit
 
     def move_stars(self, stars: ArrayLike) -> None:
-        """Give the stars other positions, none farther away than the leeway.
+        """Give the stars other positions, none farther away than the max_shift.
 
         They may leave the images, but a star stays where it was rather than go where no image has
         observed its light.
@@ -297,10 +294,10 @@ class Scene:
         return np.divide(values, weights, out=np.full_like(values, fill), where=weights > 0)
 
     def psf(self, j: int) -> Array:
-        """Return the response of image j on the grid, shape (Ny, Nx): see `psf_stamp`."""
-        return self.psf_stamp(j).on_grid(self.grid)
+        """Return the response of image j on the grid, shape (Ny, Nx): see `psf_cutout`."""
+        return self.psf_cutout(j).on_grid(self.grid)
 
-    def psf_stamp(self, j: int) -> Stamp:
+    def psf_cutout(self, j: int) -> Cutout:
         """Return the response of image j where it is not 0, the sky moved by the offset.
 
         Its value at a pixel of the sky is what a pixel of the image that begins there sees of a
@@ -310,17 +307,17 @@ class Scene:
 
     def star_image(self, j: int, s: int) -> Array:
         """Return P_js, the PSF of image j centred on star s, shape (ny, nx)."""
-        return self.star_stamp(j, s).on_grid(self.image_grid)
+        return self.star_cutout(j, s).on_grid(self.image_grid)
 
-    def star_stamp(self, j: int, s: int) -> Stamp:
+    def star_cutout(self, j: int, s: int) -> Cutout:
         """Return P_js, where it is not 0."""
-        return self._field.stamps[j][s]
+        return self._field.cutouts[j][s]
 
-    def star_on_sky(self, j: int, s: int) -> Stamp:
+    def star_on_sky(self, j: int, s: int) -> Cutout:
         """Return P_js before the pixels of image j sample it, on the sky's grid."""
         return self._field.psfs[j][s].on_sky(*(self.stars[s] + self.observation.offsets[j]))
 
-    def psf_on_sky(self, j: int, s: int) -> Stamp:
+    def psf_on_sky(self, j: int, s: int) -> Cutout:
         """Return PSF j on the sky's grid, at star s."""
         return self._psfs[j].fine.at(*on_sky(self.stars[s], self.oversample))
 
@@ -334,10 +331,10 @@ class Scene:
         psfs = zip(self.gains, self.observation.psfs, strict=True)
         return [psf if gain == 1.0 else gain * psf for gain, psf in psfs]
 
-    def star_box(self, s: int) -> Lit:
+    def star_box(self, s: int) -> Covered:
         """Return the rows and columns of the images' grid that star s may light."""
-        stamps = [self.star_stamp(j, s) for j in range(self.n_images)]
-        return lit_box(stamps, self.image_grid, self._leeway)
+        cutouts = [self.star_cutout(j, s) for j in range(self.n_images)]
+        return covered_box(cutouts, self.image_grid, self._max_shift)
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
         """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""
@@ -396,8 +393,9 @@ class Scene:
             return extended
         level = self._rough_fit[1]
         warn(
-            f"initial_extended has {mean / level:.2g} times the light of the images, as in another "
-            "unit, and was divided by that; it is in electrons per pixel, per second with exposures"
+            f"`initial_extended` has {mean / level:.2g} times the light of the images, as in "
+            "another unit, and was divided by that; it is in electrons per pixel, per second with "
+            "exposures"
         )
         shape = extended / extended.max()
         return np.asarray(shape * (level / shape.mean()))
@@ -431,13 +429,13 @@ class Scene:
             total, n_observed = total + light, n_observed + n_there
             if not (self.n_stars and n_there):
                 continue
-            lit = self._field.lit(j)
-            stars, weights = self._field.images(j, lit), observed[lit].astype(np.float64)
+            covered = self._field.covered(j)
+            stars, weights = self._field.images(j, covered), observed[covered].astype(np.float64)
             sums = stars.products(weights)[0]
             information = stars.information(weights)
             normal = information if normal is None else normal + information
             levels.append(sums / np.sqrt(n_there))
-            moment += stars.products(weights * (excess[lit] - light / n_there))[0]
+            moment += stars.products(weights * (excess[covered] - light / n_there))[0]
         mean = total / n_observed
         # A star or a sky that starts at zero stays there, so each keeps a small share.
         least = max(1e-3 * mean, float(np.finfo(np.float32).eps))
@@ -457,13 +455,15 @@ class Scene:
             light = np.ones((self.n_images, len(field)))
             # Samples of an effective PSF a pixel apart may sum to another number.
             if self.oversample > 1 and self.observation.effective_psfs:
-                light[:] = [[stamp.values.sum() for stamp in each] for each in field.stamps]
+                light[:] = [[cutout.values.sum() for cutout in each] for each in field.cutouts]
             return light.sum(axis=0), np.ones(len(field), bool)
         total, is_observed = np.zeros(len(field)), np.zeros(len(field), bool)
         for j, weights in enumerate(self.weights):
-            windows = [(stamp, weights[stamp.window(self.image_grid)]) for stamp in field.stamps[j]]
-            light = np.array([float((stamp.values * w).sum()) for stamp, w in windows])
-            on_good = np.array([float((stamp.values * (w > 0)).sum()) for stamp, w in windows])
+            windows = [
+                (cutout, weights[cutout.window(self.image_grid)]) for cutout in field.cutouts[j]
+            ]
+            light = np.array([float((cutout.values * w).sum()) for cutout, w in windows])
+            on_good = np.array([float((cutout.values * (w > 0)).sum()) for cutout, w in windows])
             total += np.maximum(light, 0.0)
             is_observed |= (on_good >= OBSERVED_SHARE * self.gains[j]) & (light > 0)
         return total, is_observed
@@ -495,7 +495,7 @@ class Scene:
         if (offsets > room).any():
             warn(
                 f"the images are shifted by up to {offsets.max()} pixels, and what leaves one edge "
-                f"comes in at the opposite one: give pad {offsets.max()} or more"
+                f"comes in at the opposite one: give `pad` {offsets.max()} or more"
             )
 
     def _warn_of_ringing(self) -> None:
@@ -505,15 +505,15 @@ class Scene:
             moved = np.concatenate([[q * offset], on_sky(self.stars + offset, q)])
             if self.observation.effective_psfs:
                 moved -= (q - 1) / 2.0
-            may_move = self._leeway > 0 and self.n_stars > 0
+            may_move = self._max_shift > 0 and self.n_stars > 0
             if not may_move and (moved == np.round(moved)).all():
                 continue
             psf, moved_psf = self.observation.psfs[j], self._psfs[j].fine.at(0.5, 0.5).values
             dark = min(psf.min(), 0.0) - moved_psf.min() / self.gains[j]
             if dark > MAX_RINGING * psf.max():
                 warn(
-                    f"psf {j} is sharper than its pixels can hold: moved between pixels it rings "
-                    f"by up to {dark / psf.max():.1%} of its peak, at whole pixels not"
+                    f"`psfs[{j}]` is sharper than its pixels can hold: moved between pixels it "
+                    f"rings by up to {dark / psf.max():.1%} of its peak, at whole pixels not"
                 )
 
     def _warn_of_varying_psfs(self) -> None:
@@ -522,8 +522,8 @@ class Scene:
             variation = field.variation(observation.psfs[j], observation.shape)
             if variation > MAX_VARIATION:
                 warn(
-                    f"psf {j} varies over the image by {variation:.0%}, and what is not a star is "
-                    "reconstructed with that of the middle: take tiles, by "
+                    f"`psfs[{j}]` varies over the image by {variation:.0%}, and what is not a star "
+                    "is reconstructed with that of the middle: take tiles, by "
                     "lnocl.deconvolve_tiles, or a smaller tile"
                 )
 
@@ -532,7 +532,7 @@ class Scene:
         if any(k > n for k, n in zip(psf_shape, self.grid, strict=True)):
             warn(
                 f"the psf {psf_shape} is larger than the grid {self.grid}: its wings wrap "
-                "round; crop it, or give pad to enlarge the grid"
+                "round; crop it, or give `pad` to enlarge the grid"
             )
 
 
@@ -567,7 +567,7 @@ def _mean_exposure(exposures: Array) -> float:
 def _check_start(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     array = numbers(name, values)
     if array.shape != shape:
-        raise InputError(f"{name} has shape {array.shape}; it must have {shape}")
+        raise InputError(f"`{name}` has shape {array.shape}; it must have {shape}")
     if not (np.isfinite(array).all() and (array >= 0).all()):
-        raise InputError(f"{name} must be finite and not negative")
+        raise InputError(f"`{name}` must be finite and not negative")
     return array

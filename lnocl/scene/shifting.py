@@ -22,7 +22,7 @@ MIN_NYQUIST = 1e-16
 Window = tuple[Any, Any]
 
 
-class Stamp(NamedTuple):
+class Cutout(NamedTuple):
     """Part of a periodic grid: its values, and the row and column of the first of them."""
 
     values: Array
@@ -56,27 +56,27 @@ class Stamp(NamedTuple):
         if y_in.any() and x_in.any():
             light[np.ix_(y[y_in], x[x_in])] += flux * self.values[np.ix_(y_in, x_in)]
 
-    def aligned(self, grid: tuple[int, int]) -> Stamp:
+    def aligned(self, grid: tuple[int, int]) -> Cutout:
         """Return the same values, those that fill an axis of the grid beginning at its origin."""
         y, x = (
             (first, 0) if size == n else (0, first)
             for first, size, n in zip((self.y, self.x), self.values.shape, grid, strict=True)
         )
         values = np.roll(self.values, (y[0], x[0]), axis=(0, 1)) if y[0] or x[0] else self.values
-        return Stamp(values, y[1], x[1])
+        return Cutout(values, y[1], x[1])
 
-    def trimmed(self, least: float) -> Stamp:
-        """Return the stamp without outer rows and columns whose values all are this or less.
+    def trimmed(self, least: float) -> Cutout:
+        """Return the cutout without outer rows and columns whose values all are this or less.
 
         One pixel is left, at least.
         """
         large = abs(self.values) > least
         rows, columns = (np.flatnonzero(large.any(axis=axis)) for axis in (1, 0))
         if not len(rows):
-            return Stamp(self.values[:1, :1], self.y, self.x)
+            return Cutout(self.values[:1, :1], self.y, self.x)
         inner = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         values = np.ascontiguousarray(self.values[inner])
-        return Stamp(values, self.y + int(rows[0]), self.x + int(columns[0]))
+        return Cutout(values, self.y + int(rows[0]), self.x + int(columns[0]))
 
 
 def window(y: int, x: int, shape: tuple[int, ...], grid: tuple[int, int]) -> Window:
@@ -103,33 +103,33 @@ class MovablePsf:
     def __init__(self, psf: Array, grid: tuple[int, int]) -> None:
         self._psf, self._grid = psf, grid
 
-    def at(self, x: float, y: float, axis: int | None = None) -> Stamp:
+    def at(self, x: float, y: float, axis: int | None = None) -> Cutout:
         """Return the PSF at a position, or a derivative, as `place` does."""
         whole = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
         fraction = y - whole[0], x - whole[1]
         is_moved = any(fraction) or axis is not None
         values = self._spectrum.moved(fraction, axis) if is_moved else self._folded
-        return Stamp(values, *(i - n // 2 for i, n in zip(whole, values.shape, strict=True)))
+        return Cutout(values, *(i - n // 2 for i, n in zip(whole, values.shape, strict=True)))
 
     @property
     def fine(self) -> MovablePsf:
         """The PSF on the pixels of the sky."""
         return self
 
-    def on_sky(self, x: float, y: float) -> Stamp:
+    def on_sky(self, x: float, y: float) -> Cutout:
         """Return the PSF at a position."""
         return self.at(x, y)
 
-    def response(self, x: float, y: float) -> Stamp:
+    def response(self, x: float, y: float) -> Cutout:
         """Return what the image shows of a source at its origin, the sky moved so far."""
         return self.at(x, y)
 
-    def with_slopes(self, x: float, y: float) -> tuple[Stamp, Array]:
+    def with_slopes(self, x: float, y: float) -> tuple[Cutout, Array]:
         """Return the PSF at a position, and it and its derivatives along x and y, (3, h, w)."""
         whole = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
         values = self._spectrum.with_slopes((y - whole[0], x - whole[1]))
         first = (i - n // 2 for i, n in zip(whole, values.shape[1:], strict=True))
-        return Stamp(values[0], *first), values
+        return Cutout(values[0], *first), values
 
     @cached_property
     def _folded(self) -> Array:
@@ -148,7 +148,7 @@ class MovablePsf:
         return _Spectrum(psf, variances)
 
 
-def place(psf: Array, grid: tuple[int, int], x: float, y: float, axis: int | None = None) -> Stamp:
+def place(psf: Array, grid: tuple[int, int], x: float, y: float, axis: int | None = None) -> Cutout:
     """Return a PSF with its middle, pixel ``(ky // 2, kx // 2)``, at a position of a grid.
 
     Whole pixels move it as it is; the fraction left, at most half a pixel, by the phase
@@ -241,7 +241,7 @@ def _half(phases: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 class _Phases:
-    """What moves a spectrum of n frequencies along an axis.
+    """Return the factors that move a spectrum of n frequencies along an axis.
 
     The highest frequency of an even number has no sign: it and its alias share it equally, so that
     a mirrored PSF moves as its mirror image does.

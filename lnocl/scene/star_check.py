@@ -72,7 +72,7 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
                 continue
             model = np.zeros((side, side))
             window = range(rows.start, rows.stop), range(columns.start, columns.stop)
-            scene.star_stamp(j, s).add_to(model, *window, scene.image_grid, 1.0)
+            scene.star_cutout(j, s).add_to(model, *window, scene.image_grid, 1.0)
             found = _compare(star, model, observation.images[j][rows, columns])
             if found is not None:
                 yield StarCheck(j, s, *found)
@@ -147,8 +147,8 @@ def warn_of_stars(scene: Scene, moves: bool) -> None:
         )
         x, y = scene.stars[worst.star]
         warn(
-            f"psf {worst.image} does not fit: it is {psf / star:.2f} times as wide as the star at "
-            f"({x:.7g}, {y:.7g}) in image {worst.image}, FWHM {psf:.2f} and {star:.2f} "
+            f"`psfs[{worst.image}]` does not fit: it is {psf / star:.2f} times as wide as the star "
+            f"at ({x:.7g}, {y:.7g}) in `images[{worst.image}]`, FWHM {psf:.2f} and {star:.2f} "
             f"pixels{hint}"
         )
         return  # the place means little then
@@ -157,6 +157,6 @@ def warn_of_stars(scene: Scene, moves: bool) -> None:
         (dx, dy), (x, y) = farthest.offset, scene.stars[farthest.star]
         warn(
             f"the star at ({x:.7g}, {y:.7g}) lies ({dx:z.2f}, {dy:z.2f}) pixels from there in "
-            f"image {farthest.image}: give its place, take refine_positions, or mend the centre of "
-            f"psf {farthest.image}"
+            f"`images[{farthest.image}]`: give its place, take `refine_positions`, or mend the "
+            f"centre of `psfs[{farthest.image}]`"
         )

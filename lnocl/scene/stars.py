@@ -14,7 +14,7 @@ from lnocl.scene import containers, star_tables
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.observation import Array, Observation, numbers
-from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp, Window, window
+from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf, Window, window
 
 # Pixels of a flattened array: a slice where they are all of it, which takes no gathering.
 Pixels = NDArray[np.intp] | slice
@@ -63,7 +63,7 @@ class StarImages:
 
     Parameters
     ----------
-    lit : ndarray of bool, shape (Ny, Nx)
+    covered : ndarray of bool, shape (Ny, Nx)
         The pixels that are looked at.
     pieces : list of lists of Piece
         The image of each star is the sum of its pieces. The first may be of all k functions, the
@@ -76,24 +76,24 @@ class StarImages:
 
     def __init__(
         self,
-        lit: NDArray[np.bool_],
+        covered: NDArray[np.bool_],
         pieces: list[list[Piece]],
         order: Order,
         cores: list[list[Piece]] | None = None,
     ) -> None:
-        self._grid = lit.shape[0], lit.shape[1]
-        self._lit = slice(None) if lit.all() else np.flatnonzero(lit)
+        self._grid = covered.shape[0], covered.shape[1]
+        self._covered = slice(None) if covered.all() else np.flatnonzero(covered)
         self._pieces, self._order = pieces, order
         self._cores = pieces if cores is None else cores
         self._k = pieces[0][0].values.shape[0] if pieces else 1
 
     def light(self, fluxes: Array) -> Array:
-        """Return ``sum_s c_s P_s``, of the pixels that are lit."""
+        """Return ``sum_s c_s P_s`` at the pixels that are covered."""
         total = np.zeros(self._grid)
         for flux, pieces in zip(fluxes, self._pieces, strict=True):
             for piece in pieces:
                 total[piece.window(self._grid)] += flux * piece.values[0]
-        return np.asarray(total.reshape(-1)[self._lit])
+        return np.asarray(total.reshape(-1)[self._covered])
 
     def products(self, x: Array) -> Array:
         """Return the ``<P_s, x>``, shape (k, n)."""
@@ -124,7 +124,7 @@ class StarImages:
 
     def _on_grid(self, x: Array) -> Array:
         laid = np.zeros(self._grid)
-        laid.reshape(-1)[self._lit] = x
+        laid.reshape(-1)[self._covered] = x
         return laid
 
     def _tiles(
@@ -181,7 +181,7 @@ def _shared(
 
 
 def order_of(
-    stars: Array, images: Iterable[tuple[Array, Sequence[Stamp]]], grid: tuple[int, int]
+    stars: Array, images: Iterable[tuple[Array, Sequence[Cutout]]], grid: tuple[int, int]
 ) -> Order:
     """Return the order of stars along the axis that leaves the least of them between neighbours.
 
@@ -189,16 +189,16 @@ def order_of(
     ----------
     stars : ndarray of float64, shape (n, 2)
         Positions, pixels of an image without offset.
-    images : iterable of (ndarray of float64, shape (2,), sequence of n Stamp)
+    images : iterable of (ndarray of float64, shape (2,), sequence of n Cutout)
         For each image its offset, and what the stars may light there.
     grid : tuple of int
         Shape of the images' grid, which is periodic.
     """
     n = len(stars)
     reach = np.zeros((n, 2))
-    for offset, stamps in images:
-        first = np.array([stamp[1:] for stamp in stamps]).reshape(n, 2)
-        size = np.array([stamp.values.shape for stamp in stamps]).reshape(n, 2)
+    for offset, cutouts in images:
+        first = np.array([cutout[1:] for cutout in cutouts]).reshape(n, 2)
+        size = np.array([cutout.values.shape for cutout in cutouts]).reshape(n, 2)
         away = (stars + offset)[:, ::-1] - first
         is_whole = size >= grid
         reach = np.maximum(reach, np.where(is_whole, grid, np.maximum(away, size - away)))
@@ -244,7 +244,7 @@ class StarField:
         return len(self.positions)
 
     @cached_property
-    def stamps(self) -> list[list[Stamp]]:
+    def cutouts(self) -> list[list[Cutout]]:
         """P_js for each image j and star s."""
         return [
             [
@@ -255,11 +255,11 @@ class StarField:
         ]
 
     @cached_property
-    def cores(self) -> list[list[Stamp]]:
+    def cores(self) -> list[list[Cutout]]:
         """The P_js without their faint outer pixels."""
         return [
-            [stamp.trimmed(FAINT * float(abs(stamp.values).max())) for stamp in stamps]
-            for stamps in self.stamps
+            [cutout.trimmed(FAINT * float(abs(cutout.values).max())) for cutout in cutouts]
+            for cutouts in self.cutouts
         ]
 
     @cached_property
@@ -270,14 +270,14 @@ class StarField:
     def light(self, j: int, fluxes: Array) -> Array:
         """Return ``sum_s c_s P_js``, shape (Ny, Nx)."""
         total = np.zeros(self._grid)
-        for flux, stamp in zip(fluxes, self.stamps[j], strict=True):
+        for flux, cutout in zip(fluxes, self.cutouts[j], strict=True):
             if flux:
-                total[stamp.window(self._grid)] += flux * stamp.values
+                total[cutout.window(self._grid)] += flux * cutout.values
         return total
 
-    def lit(self, j: int) -> NDArray[np.bool_]:
-        """Return the pixels of image j that any star lights, shape (Ny, Nx)."""
-        return light_up(self.stamps[j], self._grid)
+    def covered(self, j: int) -> NDArray[np.bool_]:
+        """Return the pixels of image j that the cutout of any star covers, shape (Ny, Nx)."""
+        return covered_pixels(self.cutouts[j], self._grid)
 
     def reaching(self, j: int, first: tuple[int, int], shape: tuple[int, int]) -> list[int]:
         """Return the stars whose light in image j reaches into a window of the periodic grid."""
@@ -287,58 +287,60 @@ class StarField:
 
     @cached_property
     def _windows(self) -> list[tuple[NDArray[np.int_], NDArray[np.int_]]]:
-        """For each image the first pixels and the shapes of the stamps, shape (n, 2) each."""
+        """For each image the first pixels and the shapes of the cutouts, shape (n, 2) each."""
         return [
             (
-                np.array([stamp[1:] for stamp in stamps]).reshape(-1, 2),
-                np.array([stamp.values.shape for stamp in stamps]).reshape(-1, 2),
+                np.array([cutout[1:] for cutout in cutouts]).reshape(-1, 2),
+                np.array([cutout.values.shape for cutout in cutouts]).reshape(-1, 2),
             )
-            for stamps in self.stamps
+            for cutouts in self.cutouts
         ]
 
-    def images(self, j: int, lit: NDArray[np.bool_]) -> StarImages:
-        """Return the P_js over these pixels, to which all that any star lights must belong."""
+    def images(self, j: int, covered: NDArray[np.bool_]) -> StarImages:
+        """Return the P_js over these pixels, which must include all that cutouts of stars cover."""
         pieces, cores = (
-            [[Piece(stamp.values[None], stamp.y, stamp.x)] for stamp in stamps]
-            for stamps in (self.stamps[j], self.cores[j])
+            [[Piece(cutout.values[None], cutout.y, cutout.x)] for cutout in cutouts]
+            for cutouts in (self.cutouts[j], self.cores[j])
         )
-        return StarImages(lit, pieces, self._order, cores)
+        return StarImages(covered, pieces, self._order, cores)
 
 
-def light_up(stamps: Sequence[Stamp], grid: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return the pixels of the grid that stamps lie on."""
-    lit = np.zeros(grid, bool)
-    for stamp in stamps:
-        lit[stamp.window(grid)] = True
-    return lit
+def covered_pixels(cutouts: Sequence[Cutout], grid: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return the pixels of the grid that cutouts cover."""
+    covered = np.zeros(grid, bool)
+    for cutout in cutouts:
+        covered[cutout.window(grid)] = True
+    return covered
 
 
-def places(lit: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the place of each pixel that is lit among all that are, -1 where it is dark."""
-    place = np.full(lit.shape, -1)
-    place[lit] = np.arange(np.count_nonzero(lit))
+def places(covered: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the index of each covered pixel among them, -1 elsewhere."""
+    place = np.full(covered.shape, -1)
+    place[covered] = np.arange(np.count_nonzero(covered))
     return place
 
 
-class Lit(NamedTuple):
+class Covered(NamedTuple):
     """Rows of the grid, shape (Ny,), and columns, shape (Nx,), that hold light."""
 
     rows: NDArray[np.bool_]
     columns: NDArray[np.bool_]
 
 
-def lit_box(stamps: Sequence[Stamp], grid: tuple[int, int], leeway: float = 0.0) -> Lit:
-    """Return the rows and columns that stamps light, moved by up to the leeway."""
-    box = Lit(*(np.zeros(n, bool) for n in grid))
-    for stamp in stamps:
-        for axis, at in enumerate((stamp.rows(grid), stamp.columns(grid))):
-            may_be_lit = (stamp.values != 0).any(axis=1 - axis) | (leeway > 0)
-            box[axis][at[may_be_lit]] = True
-    if not leeway:
+def covered_box(
+    cutouts: Sequence[Cutout], grid: tuple[int, int], max_shift: float = 0.0
+) -> Covered:
+    """Return the rows and columns that cutouts cover where stars move by up to `max_shift`."""
+    box = Covered(*(np.zeros(n, bool) for n in grid))
+    for cutout in cutouts:
+        for axis, at in enumerate((cutout.rows(grid), cutout.columns(grid))):
+            is_covered = (cutout.values != 0).any(axis=1 - axis) | (max_shift > 0)
+            box[axis][at[is_covered]] = True
+    if not max_shift:
         return box
-    distance = int(np.ceil(leeway)) + MARGIN + 1
+    distance = int(np.ceil(max_shift)) + MARGIN + 1
     steps = range(-distance, distance + 1)
-    return Lit(*(np.any([np.roll(each, step) for step in steps], axis=0) for each in box))
+    return Covered(*(np.any([np.roll(each, step) for step in steps], axis=0) for each in box))
 
 
 # Stars that are nearer to each other, in pixels, are one: nothing tells their fluxes apart.

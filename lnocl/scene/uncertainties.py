@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError, counted
+from lnocl.errors import InputError, counted, note
 from lnocl.scene.arrays import Array, numbers
-
-log = logging.getLogger("lnocl")
 
 # A gain that follows from the errors leaves them below the noise of the counts by so much.
 ROUNDING = 0.05
@@ -62,7 +59,7 @@ def without_source(
     variance: Array,
     counts: Array,
     mask: NDArray[np.bool_],
-    words: tuple[str, str] = ("the uncertainty", "read_noise"),
+    words: tuple[str, str] = ("the uncertainty", "`read_noise`"),
 ) -> Array:
     """Return the standard deviation of all noise but that of the source's counts.
 
@@ -85,12 +82,12 @@ def without_source(
         n_below = int((left < -ROUNDING * counts[j].clip(0.0)).sum())
         if n_below > 0.5 * (~bad).sum():
             raise InputError(
-                f"{words[0]} of image {j} is less than the noise of its counts in most pixels; see "
-                f"to gain and exposure, or give it as {words[1]} if it leaves the source out"
+                f"{words[0]} of `images[{j}]` is less than the noise of its counts in most pixels; "
+                f"see to gain and exposure, or give it as {words[1]} if it leaves the source out"
             )
         median = np.sqrt(np.median(left[~bad].clip(0.0))) if not bad.all() else 0.0
-        log.info(
-            "image %d: noise apart from that of its counts %.3g electrons in the median; %s "
+        note(
+            "`images[%d]`: noise apart from that of its counts %.3g electrons in the median; %s "
             "whose error is less than the noise of its counts %s none",
             j,
             median,

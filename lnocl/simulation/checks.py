@@ -23,10 +23,10 @@ def numbers(name: str, value: Any, unit: u.UnitBase) -> Array:
             array = np.asarray(u.Quantity(value).to_value(unit), np.float64)
     except (TypeError, ValueError, u.UnitsError):
         raise InputError(
-            f"{name} must be a quantity in {unit} or a unit of its kind; {value} was given"
+            f"`{name}` must be a quantity in {unit} or a unit of its kind; {value} was given"
         ) from None
     if not np.isfinite(array).all():
-        raise InputError(f"{name} must be finite; {value} was given")
+        raise InputError(f"`{name}` must be finite; {value} was given")
     return array
 
 
@@ -35,7 +35,7 @@ def number(name: str, value: Any, unit: u.UnitBase, minimum: float = -math.inf) 
     array = numbers(name, value, unit)
     if array.ndim or array < minimum:
         bound = "" if minimum == -math.inf else f", {minimum:g} or more"
-        raise InputError(f"{name} must be one number{bound}; {value} was given")
+        raise InputError(f"`{name}` must be one number{bound}; {value} was given")
     return float(array)
 
 
@@ -43,14 +43,14 @@ def positive(name: str, value: Any, unit: u.UnitBase) -> float:
     """Return a quantity as one finite number in a unit, more than 0."""
     value_in_unit = number(name, value, unit)
     if value_in_unit <= 0:
-        raise InputError(f"{name} must be positive; {value} was given")
+        raise InputError(f"`{name}` must be positive; {value} was given")
     return value_in_unit
 
 
 def check_share(name: str, value: float) -> None:
     """Refuse a number outside (0, 1]."""
     if not (isinstance(value, (int, float, np.floating)) and 0 < value <= 1):
-        raise InputError(f"{name} must be in (0, 1]; {value} was given")
+        raise InputError(f"`{name}` must be in (0, 1]; {value} was given")
 
 
 def check_shape(shape: Any, minimum: int = MIN_SIZE) -> tuple[int, int]:

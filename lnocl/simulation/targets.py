@@ -201,7 +201,7 @@ def load_target(
             f"scene {str(scene)!r} is neither a built-in one ({', '.join(SCENES)}) nor a file"
         )
     if size is not None:
-        raise InputError(f"size {size} was given with {scene}, which has its own; leave it out")
+        raise InputError(f"`size` {size} was given with {scene}, which has its own; leave it out")
     image = fitsread.read_single(str(scene))
     if stars is None:
         keyed = "STARX" in image.header and "STARY" in image.header

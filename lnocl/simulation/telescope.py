@@ -108,7 +108,7 @@ class Experiment:
         check_share("throughput", self.throughput)
         check_share("strehl", self.strehl)
         if not (isinstance(self.seed, (int, np.integer)) and self.seed >= 0):
-            raise InputError(f"seed must be a whole number, 0 or more; {self.seed} was given")
+            raise InputError(f"`seed` must be a whole number, 0 or more; {self.seed} was given")
 
     def source_electrons(self, magnitude: u.Quantity) -> float:
         r"""Return the electrons that one image holds of a source.

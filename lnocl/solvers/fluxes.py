@@ -47,14 +47,14 @@ class StarLikelihood:
 
     @classmethod
     def of_scene(
-        cls, scene: Scene, model: Model, diffuse: Array, lit: Sequence[NDArray[np.bool_]]
+        cls, scene: Scene, model: Model, diffuse: Array, covered: Sequence[NDArray[np.bool_]]
     ) -> StarLikelihood:
-        """Return that of a scene and its model, over the pixels that are lit.
+        """Return the likelihood of a scene and its model, over the pixels that are covered.
 
         `diffuse` holds the ``A_j f + b_j``, shape (p, Ny, Nx).
         """
         images = []
-        for where, *arrays in zip(lit, scene.images(), diffuse, model.weights, strict=True):
+        for where, *arrays in zip(covered, scene.images(), diffuse, model.weights, strict=True):
             g, known, w = (array.ravel() if where.all() else array[where] for array in arrays)
             images.append((g, known, w))
         return cls(images)
@@ -132,9 +132,9 @@ def fit_fluxes(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Arr
     """Return the star fluxes that minimise J_0, by Fisher scoring from these."""
     if not len(fluxes):
         return fluxes
-    lit = [scene.star_field.lit(j) for j in range(scene.n_images)]
-    likelihood = StarLikelihood.of_scene(scene, model, diffuse, lit)
-    stars = [scene.star_field.images(j, where) for j, where in enumerate(lit)]
+    covered = [scene.star_field.covered(j) for j in range(scene.n_images)]
+    likelihood = StarLikelihood.of_scene(scene, model, diffuse, covered)
+    stars = [scene.star_field.images(j, where) for j, where in enumerate(covered)]
     used = list[Array]()
     for _ in range(FIT_ROUNDS):
         models = likelihood.models([each.light(fluxes) for each in stars])

@@ -230,5 +230,5 @@ class LeastSquares:
 
 
 def _sum(products: str, a: Array, b: Array) -> Array:
-    """Return sums of products, whose rounding hangs on no number of threads as BLAS's does."""
+    """Return sums of products, whose rounding depends on no number of threads as BLAS's does."""
     return np.asarray(np.einsum(products, a, b))

@@ -1,7 +1,7 @@
 """The least squares of a star and of the extended source round it, in a window.
 
 The extended source is a field of the covariance that `lnocl.scene.texture` expects. So the fluxes
-and positions of stars, and their errors, hang on no iteration.
+and positions of stars, and their errors, depend on no iteration.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
 from lnocl.scene.forward_model import convolve_at, sampled, spread
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
-from lnocl.scene.shifting import MovablePsf, Stamp
+from lnocl.scene.shifting import Cutout, MovablePsf
 from lnocl.scene.texture import Texture, resolution
 from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
 
@@ -254,28 +254,28 @@ def _linearise(
     model = background.copy()
     first = there.y % scene.image_grid[0], there.x % scene.image_grid[1]
     rows, columns = (range(at, at + n) for at, n in zip(first, there.shape, strict=True))
-    model += convolve_at(sky, scene.psf_stamp(j), rows, columns, scene.oversample) / scene.unit
+    model += convolve_at(sky, scene.psf_cutout(j), rows, columns, scene.oversample) / scene.unit
     for s in scene.star_field.reaching(j, first, there.shape):
-        light = _cut(scene.star_stamp(j, s), there, scene.image_grid)
+        light = _cut(scene.star_cutout(j, s), there, scene.image_grid)
         model += star_fluxes[s] / scene.unit * light
     total = np.maximum(model, MIN_MODEL)
     precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
-    slopes = [_cut(scene.star_stamp(j, s), there, scene.image_grid) for s in held]
+    slopes = [_cut(scene.star_cutout(j, s), there, scene.image_grid) for s in held]
     if moves:
         offset, psfs = scene.observation.offsets[j], scene.star_field.psfs[j]
         moved = [psfs[s].with_slopes(*(scene.stars[s] + offset)) for s in held]
         for axis in (1, 2):
-            for s, (stamp, values) in zip(held, moved, strict=True):
-                slope = stamp._replace(values=star_fluxes[s] / scene.unit * values[axis])
+            for s, (cutout, values) in zip(held, moved, strict=True):
+                slope = cutout._replace(values=star_fluxes[s] / scene.unit * values[axis])
                 slopes.append(_cut(slope, there, scene.image_grid))
     k, left = len(slopes), counts - total - beyond
     return LinearImage(np.array(slopes).reshape(k, -1), np.arange(k), left, precision)
 
 
-def _cut(stamp: Stamp, window: Window, grid: tuple[int, int]) -> Array:
-    """Return the values of a stamp that lie in a window, and 0 elsewhere."""
+def _cut(cutout: Cutout, window: Window, grid: tuple[int, int]) -> Array:
+    """Return the values of a cutout that lie in a window, and 0 elsewhere."""
     light = np.zeros(window.shape)
-    y, x = (stamp.rows(grid) - window.y) % grid[0], (stamp.columns(grid) - window.x) % grid[1]
+    y, x = (cutout.rows(grid) - window.y) % grid[0], (cutout.columns(grid) - window.x) % grid[1]
     y_in, x_in = y < window.shape[0], x < window.shape[1]
-    light[np.ix_(y[y_in], x[x_in])] = stamp.values[np.ix_(y_in, x_in)]
+    light[np.ix_(y[y_in], x[x_in])] = cutout.values[np.ix_(y_in, x_in)]
     return light

@@ -14,8 +14,8 @@ from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.forward_model import ROUNDING, Model
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
-from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp
-from lnocl.scene.stars import Order, Piece, StarImages, light_up, order_of, places
+from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf
+from lnocl.scene.stars import Order, Piece, StarImages, covered_pixels, order_of, places
 from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood
 
 # How far from where it was given a star may go, in pixels.
@@ -82,22 +82,22 @@ class StarFit:
             [_square(shape, position + offset, scene) for position in given]
             for offset in self._offsets
         ]
-        lit = [light_up(each, scene.image_grid) for each in squares]
+        covered = [covered_pixels(each, scene.image_grid) for each in squares]
         reached = [
-            (offset, stamps)
-            for offset, *both in zip(self._offsets, scene.star_field.stamps, squares, strict=True)
-            for stamps in both
+            (offset, cutouts)
+            for offset, *both in zip(self._offsets, scene.star_field.cutouts, squares, strict=True)
+            for cutouts in both
         ]
         order = order_of(scene.stars, reached, scene.image_grid)
         diffuse = model.forward(extended) + model.background
-        self._likelihood = StarLikelihood.of_scene(scene, model, diffuse, lit)
+        self._likelihood = StarLikelihood.of_scene(scene, model, diffuse, covered)
         self._stars = [
             _MovableStars(psfs, where, scene.stars + offset, whole, around, order)
             for psfs, offset, where, whole, around in zip(
                 scene.star_psfs(scene.stars, part),
                 self._offsets,
-                lit,
-                scene.star_field.stamps,
+                covered,
+                scene.star_field.cutouts,
                 squares,
                 strict=True,
             )
@@ -188,19 +188,19 @@ class StarFit:
 
 
 class _MovableStars:
-    """The images of stars over the lit pixels of one image of the sky, at whatever positions.
+    """The images of stars over the covered pixels of one image of the sky, at whatever positions.
 
     Parameters
     ----------
     psfs : sequence of MovablePsf or DetectorPsf
         The part of the PSF that moves with each star.
-    lit : ndarray of bool, shape (Ny, Nx)
+    covered : ndarray of bool, shape (Ny, Nx)
         The pixels.
     positions : ndarray of float64, shape (n, 2)
         On the grid, where the stars have their whole PSF.
-    whole : sequence of Stamp
+    whole : sequence of Cutout
         That whole PSF, for each star.
-    squares : sequence of Stamp
+    squares : sequence of Cutout
         The part of the grid that each star may light, wherever it goes.
     order : Order
         Of the stars.
@@ -214,25 +214,29 @@ class _MovableStars:
     def __init__(
         self,
         psfs: Sequence[MovablePsf | DetectorPsf],
-        lit: NDArray[np.bool_],
+        covered: NDArray[np.bool_],
         positions: Array,
-        whole: Sequence[Stamp],
-        squares: Sequence[Stamp],
+        whole: Sequence[Cutout],
+        squares: Sequence[Cutout],
         order: Order,
     ) -> None:
-        self._grid, self._lit, self._order = (lit.shape[0], lit.shape[1]), lit, order
-        self._psfs, self._places = psfs, places(lit)
+        self._grid, self._covered, self._order = (
+            (covered.shape[0], covered.shape[1]),
+            covered,
+            order,
+        )
+        self._psfs, self._places = psfs, places(covered)
         # One number more, which the dark pixels share: their place is -1.
-        self._image = np.zeros(int(lit.sum()) + 1)
+        self._image = np.zeros(int(covered.sum()) + 1)
         self.around: list[NDArray[np.intp]] = []
         self._beyond: list[Piece] = []
-        for s, (position, stamp, square) in enumerate(zip(positions, whole, squares, strict=True)):
-            at = [self._places[each.window(self._grid)].ravel() for each in (stamp, square)]
+        for s, (position, cutout, square) in enumerate(zip(positions, whole, squares, strict=True)):
+            at = [self._places[each.window(self._grid)].ravel() for each in (cutout, square)]
             reached = np.unique(np.concatenate(at))
             self.around.append(reached[reached >= 0])
-            self._beyond.append(self._find_beyond(s, position, stamp))
+            self._beyond.append(self._find_beyond(s, position, cutout))
 
-    def _find_beyond(self, s: int, position: Array, whole: Stamp) -> Piece:
+    def _find_beyond(self, s: int, position: Array, whole: Cutout) -> Piece:
         """Return the whole PSF of star s less the part that moves."""
         at = self._at(whole)
         self._image[at] = whole.values
@@ -243,13 +247,13 @@ class _MovableStars:
         is_left = (abs(beyond) > ROUNDING * whole.values.max()) & (at >= 0)
         return Piece(np.where(is_left, beyond, 0.0)[None], whole.y, whole.x)
 
-    def _at(self, part: Stamp | Piece) -> NDArray[np.intp]:
+    def _at(self, part: Cutout | Piece) -> NDArray[np.intp]:
         return self._places[part.window(self._grid)]
 
     def _moving(self, s: int, position: Array) -> Piece:
         """Return the part of star s's PSF that moves, and its derivatives along x and y."""
-        stamp, values = self._psfs[s].with_slopes(*position)
-        return Piece(values, stamp.y, stamp.x)
+        cutout, values = self._psfs[s].with_slopes(*position)
+        return Piece(values, cutout.y, cutout.x)
 
     def at(self, positions: Array) -> StarImages:
         """Return the images of the stars and their derivatives along x and y."""
@@ -257,7 +261,7 @@ class _MovableStars:
             [self._moving(s, position), beyond]
             for s, (position, beyond) in enumerate(zip(positions, self._beyond, strict=True))
         ]
-        return StarImages(self._lit, pieces, self._order)
+        return StarImages(self._covered, pieces, self._order)
 
     def image_around(self, s: int, position: Array) -> Array:
         """Return the image of star s, there, over the pixels that it may light."""
@@ -270,13 +274,13 @@ class _MovableStars:
         return image
 
 
-def _square(shape: tuple[int, ...], position: Array, scene: Scene) -> Stamp:
+def _square(shape: tuple[int, ...], position: Array, scene: Scene) -> Cutout:
     """Return the part of an image that a star may light, wherever it goes from a position."""
     margin = int(np.ceil(RADIUS)) + MARGIN + 1
     sizes = (-(-k // scene.oversample) + 2 * margin for k in shape)
     height, width = map(min, sizes, scene.image_grid)
     x, y = np.floor(position + 0.5).astype(int).tolist()
-    return Stamp(np.broadcast_to(1.0, (height, width)), y - height // 2, x - width // 2)
+    return Cutout(np.broadcast_to(1.0, (height, width)), y - height // 2, x - width // 2)
 
 
 def _part(psfs: list[Array]) -> tuple[slice, slice]:

@@ -1,6 +1,6 @@
 r"""PSFs from the images themselves: parameters of each, the extended source marginalised.
 
-The model of image j is ``m_j = A_j f + sum_s c_s P_js + b_j``, all of which hangs on the
+The model of image j is ``m_j = A_j f + sum_s c_s P_js + b_j``, all of which depends on the
 parameters theta_j of PSF j. Near an estimate
 
 .. math:: g_j \approx m_j + J \eta + A_j (a C^{1/2} x) + D_j(y) * (f + \sum_s c_s \delta_s)

@@ -15,7 +15,7 @@ from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.forward_model import Box, Model, largest_window
 from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
-from lnocl.scene.shifting import Stamp
+from lnocl.scene.shifting import Cutout
 from lnocl.solvers.fluxes import bounded_step, fit_fluxes, movable_weights
 
 # Share of the light of stars and background that shifts the scaling. With all of it the
@@ -39,9 +39,9 @@ class Scaling:
     star_information : BandMatrix
         Fisher information of the star fluxes, ``sum_j <P_js, w_j P_jt / m_j>`` at the start.
     cross_values : ndarray of float64
-        The values of `cross_information`, one stamp after the other.
+        The values of `cross_information`, one cutout after the other.
     cross_windows : ndarray of int32, shape (n, 4)
-        For each stamp y, x, height and width.
+        For each cutout y, x, height and width.
     """
 
     shift: Array
@@ -66,7 +66,7 @@ class Scaling:
         }
 
     @property
-    def cross_information(self) -> list[Stamp]:
+    def cross_information(self) -> list[Cutout]:
         """Fisher information between each star flux and the extended source, where it is not 0.
 
         ``sum_j A_j^T (w_j P_js / m_j)`` at the start.
@@ -74,7 +74,7 @@ class Scaling:
         windows = self.cross_windows.tolist()
         ends = np.cumsum([height * width for _, _, height, width in windows], dtype=int)
         return [
-            Stamp(self.cross_values[end - height * width : end].reshape(height, width), y, x)
+            Cutout(self.cross_values[end - height * width : end].reshape(height, width), y, x)
             for end, (y, x, height, width) in zip(ends, windows, strict=True)
         ]
 
@@ -106,7 +106,7 @@ def prepare(
     """Return the star fluxes that are best for this extended source, and the scaling of steps.
 
     The fluxes minimise ``J`` for the extended source as given, whatever fluxes they are sought
-    from; so the answer does not hang on those.
+    from; so the answer does not depend on those.
 
     Parameters
     ----------
@@ -123,14 +123,14 @@ def prepare(
     information = BandMatrix(np.zeros((1, 0)), np.zeros(0, int))
     values, windows = np.zeros(0), np.zeros((0, 4), np.int32)
     if scene.n_stars:
-        lit = [scene.star_field.lit(j) for j in range(scene.n_images)]
-        boxes = [_box(each) for each in lit]
+        covered = [scene.star_field.covered(j) for j in range(scene.n_images)]
+        boxes = [_box(each) for each in covered]
         observed = np.where(scene.observed(total_weight), extended, 0.0)
         diffuse = model.images_at(boxes, observed)
         star_fluxes = fit_fluxes(scene, model, diffuse, star_fluxes)
         change = _change_by_stars(model, star_fluxes, boxes)
         inverse[change.window(scene.grid)] += change.values
-        information, ratios = _star_information(scene, model, diffuse, star_fluxes, lit)
+        information, ratios = _star_information(scene, model, diffuse, star_fluxes, covered)
         values, windows = _cross_information(scene, model, ratios)
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     np.maximum(shift, 0.0, out=shift)
@@ -151,22 +151,22 @@ def _back_projections(model: Model) -> tuple[Array, Array]:
     return model.adjoint(model.weights), model.adjoint(per_background)
 
 
-def _change_by_stars(model: Model, star_fluxes: Array, boxes: Sequence[Box]) -> Stamp:
+def _change_by_stars(model: Model, star_fluxes: Array, boxes: Sequence[Box]) -> Cutout:
     """Return what light of stars changes ``sum_j A_j^T (w_j / b_j)`` by, where it is seen."""
     changes = _changes(model, star_fluxes, boxes)
     if model.are_large(boxes):  # one after the other, lest all are held
-        return Stamp(model.adjoint(each.on_grid(model.shape[1:]) for each in changes), 0, 0)
-    return model.adjoint_of_stamps(list(changes))
+        return Cutout(model.adjoint(each.on_grid(model.shape[1:]) for each in changes), 0, 0)
+    return model.adjoint_of_cutouts(list(changes))
 
 
-def _changes(model: Model, star_fluxes: Array, boxes: Sequence[Box]) -> Iterator[Stamp]:
+def _changes(model: Model, star_fluxes: Array, boxes: Sequence[Box]) -> Iterator[Cutout]:
     for j, (light, box) in enumerate(zip(model.starlight(star_fluxes), boxes, strict=True)):
         background = np.broadcast_to(model.background[j], light.shape)[box]
         bright, dark = (
             np.maximum(each, MIN_BACKGROUND) for each in (light[box] + background, background)
         )
         values = model.weights[j][box] * (1.0 / bright - 1.0 / dark)
-        yield Stamp(values, box[0].start, box[1].start)
+        yield Cutout(values, box[0].start, box[1].start)
 
 
 def _star_information(
@@ -174,11 +174,11 @@ def _star_information(
     model: Model,
     diffuse: Array,
     star_fluxes: Array,
-    lit: Sequence[NDArray[np.bool_]],
+    covered: Sequence[NDArray[np.bool_]],
 ) -> tuple[BandMatrix, list[Array]]:
     """Return the Fisher information of the star fluxes, and the w_j / m_j under stars."""
     informations, ratios = [], []
-    for j, (light, where) in enumerate(zip(model.starlight(star_fluxes), lit, strict=True)):
+    for j, (light, where) in enumerate(zip(model.starlight(star_fluxes), covered, strict=True)):
         total = np.maximum(light[where] + diffuse[j][where], MIN_MODEL)
         ratio = np.zeros(scene.image_grid)
         ratio[where] = movable_weights(model.weights[j][where], total) / total
@@ -195,21 +195,21 @@ def _cross_information(
     values = np.empty(scene.n_stars * math.prod(largest_window(scene)))
     windows, end = np.empty((scene.n_stars, 4), np.int32), 0
     for s, at in enumerate(windows):
-        stamp = model.adjoint_of_stamps(
+        cutout = model.adjoint_of_cutouts(
             [_times(cores[s], w) for cores, w in zip(scene.star_field.cores, ratios, strict=True)]
         )
-        at[:] = stamp.y, stamp.x, *stamp.values.shape
-        begin, end = end, end + stamp.values.size
-        values[begin:end] = stamp.values.ravel()
+        at[:] = cutout.y, cutout.x, *cutout.values.shape
+        begin, end = end, end + cutout.values.size
+        values[begin:end] = cutout.values.ravel()
     return values[:end], windows
 
 
-def _box(lit: NDArray[np.bool_]) -> Box:
-    """Return rows and columns from the first to the last pixel that is lit."""
-    rows, columns = (np.flatnonzero(lit.any(axis=axis)) for axis in (1, 0))
+def _box(covered: NDArray[np.bool_]) -> Box:
+    """Return rows and columns from the first to the last pixel that is covered."""
+    rows, columns = (np.flatnonzero(covered.any(axis=axis)) for axis in (1, 0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def _times(stamp: Stamp, x: Array) -> Stamp:
-    """Return a stamp times an array on the grid."""
-    return Stamp(stamp.values * x[stamp.window(x.shape)], stamp.y, stamp.x)
+def _times(cutout: Cutout, x: Array) -> Cutout:
+    """Return a cutout times an array on the grid."""
+    return Cutout(cutout.values * x[cutout.window(x.shape)], cutout.y, cutout.x)

@@ -92,9 +92,9 @@ def check(
         A file exists and must not be overwritten, or cannot be written.
     """
     if n_iter < PARTS[0]:
-        raise InputError(f"n_iter must be a whole number, {PARTS[0]} or more; {n_iter} was given")
+        raise InputError(f"`n_iter` must be a whole number, {PARTS[0]} or more; {n_iter} was given")
     if not (math.isfinite(accuracy) and accuracy > 0):
-        raise InputError(f"accuracy must be positive and finite; {accuracy} was given")
+        raise InputError(f"`accuracy` must be positive and finite; {accuracy} was given")
     if stem is not None:
         if not os.path.basename(stem):
             raise InputError(f"the output {stem!r} names no file; give a path without its ending")

@@ -375,6 +375,6 @@ def test_without_dask_it_works_but_in_parallel(monkeypatch, capsys):
     write_targets(*GOOD)
     assert batch("--parallel", "2") == 1
     assert one_complaint(capsys.readouterr()) == (
-        "parallel needs Dask; install it with: pip install distributed"
+        "--parallel needs Dask; install it with: pip install distributed"
     )
     assert batch("--quiet") == 0

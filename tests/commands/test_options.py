@@ -32,7 +32,7 @@ def test_every_option_is_a_parameter_and_every_parameter_an_option():
 
 def test_messages_name_the_flag_that_does_it_and_not_the_one_that_undoes_it():
     flags = deconvolve.COMMAND.flags()
-    named = messages.in_shell("give its place, take refine_positions, or mend it", flags)
+    named = messages.in_shell("give its place, take `refine_positions`, or mend it", flags)
     assert named == "give its place, take --refine, or mend it"
 
 
@@ -96,12 +96,13 @@ FLAGS = {"n_iter": "--n-iter", "mu": "--mu", "pad": "--pad", "psfs": "--psf", "s
 @pytest.mark.parametrize(
     ("message", "named"),
     [
-        ("n_iter, mu and pad", "--n-iter, --mu and --pad"),
-        ("give pad 5 or more, or pad less", "give --pad 5 or more, or pad less"),
-        ("with pad=3 it fits", "with --pad 3 it fits"),
+        ("`n_iter`, `mu` and `pad`", "--n-iter, --mu and --pad"),
+        ("give `pad` 5 or more, or pad less", "give --pad 5 or more, or pad less"),
+        ("with `pad`=3 it fits", "with --pad 3 it fits"),
         ("psfs hold values", "psfs hold values"),
-        ("psf 0 of image 9 and image.fits 0", "psf 1 of image 10 and image.fits 0"),
-        ("sky_brightness must be", "--sky must be"),
+        ("`psfs[0]` of `images[9]` and image 3.fits", "psf 1 of image 10 and image 3.fits"),
+        ("`sky_brightness` must be", "--sky must be"),
+        ("`initial_extended` holds values", "initial_extended holds values"),
         ("the sky and the mask are empty", "the sky and the mask are empty"),
         ("give a mask file", "give a mask file"),
         ("mask.fits has no pixels", "mask.fits has no pixels"),

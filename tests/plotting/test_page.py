@@ -133,7 +133,7 @@ class TestCommand:
             cards=[("OBJECT", "RW Aur", "")],
             commands=[["cd", "/home/me/" + "data" * 30], ["lnocl", "deconvolve", "b.fits"]],
             cubes={"MODELS": (cube, "electron"), "RESIDUALS": (cube, "")},
-            said=["warning: it is noisy", "the model fits"],
+            messages=["warning: it is noisy", "the model fits"],
         )
 
     def test_a_result_becomes_a_page(self, capsys):
@@ -150,7 +150,7 @@ class TestCommand:
     def test_a_star_that_was_moved_over_the_edge_is_shown(self):
         cube = np.ones((1, 32, 32))
         said = ["café \\ tab"]
-        fitswrite.write_result("b.fits", cube[0], [(-1, 4)], [7.5], said=said)
+        fitswrite.write_result("b.fits", cube[0], [(-1, 4)], [7.5], messages=said)
         with fits.open("b.fits", mode="append") as file:
             file.append(fits.ImageHDU(1e308 * cube, name="MODELS"))
             file.append(fits.ImageHDU(np.inf * cube, name="RESIDUALS"))

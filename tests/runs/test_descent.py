@@ -160,12 +160,18 @@ def explain(psf):
 NEGATIVE = gaussian() / gaussian().sum()
 NEGATIVE[0, 0] = -0.01
 EXPLAINED = {
-    "negative": (NEGATIVE, "1 pixel of psf 0 is negative, 1.01 % of its sum; mend"),
-    "off centre": (gaussian(off=2.5), "the core of psf 0 lies (2.5, 0.0) pixels off its centre; m"),
-    "background": (gaussian() + 0.05, "psf 0 lies on a background that makes 56.5 % of its sum; m"),
+    "negative": (NEGATIVE, "1 pixel of `psfs[0]` is negative, 1.01 % of its sum; mend"),
+    "off centre": (
+        gaussian(off=2.5),
+        "the core of `psfs[0]` lies (2.5, 0.0) pixels off its centre; m",
+    ),
+    "background": (
+        gaussian() + 0.05,
+        "`psfs[0]` lies on a background that makes 56.5 % of its sum; m",
+    ),
     "nothing": (gaussian(), "nothing in the psfs explains it; take precision double, and if it ri"),
     "a little off": (gaussian(off=0.9), "nothing"),
-    "wide": (gaussian() ** 0.05, "psf 0 lies on a background"),
+    "wide": (gaussian() ** 0.05, "`psfs[0]` lies on a background"),
 }
 
 
@@ -179,4 +185,4 @@ def test_of_several_psfs_the_worst_is_named():
     worst = np.array([NEGATIVE, NEGATIVE - np.eye(SIZE) * 0.01, gaussian()])
     with pytest.warns(lnocl.LnoclWarning):
         observation = lnocl.Observation(np.ones((3, SIZE, SIZE)), worst)
-    assert " of psf 1 are negative, " in explain_rise(observation)
+    assert " of `psfs[1]` are negative, " in explain_rise(observation)

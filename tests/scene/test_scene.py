@@ -387,7 +387,7 @@ def test_star_that_one_image_observed_is_found(engine, case, solver):
 
 def test_stars_are_moved_to_where_one_image_observed_them():
     observation, (x, y), _ = hidden_star("one image of many")
-    scene = Scene(observation, [(x - 10.0, y)], leeway=10.0)
+    scene = Scene(observation, [(x - 10.0, y)], max_shift=10.0)
     scene.move_stars([(x, y)])
     np.testing.assert_array_equal(scene.stars, [(x, y)])
 
@@ -403,7 +403,7 @@ def test_negative_pixels_leave_the_weight_of_a_star_positive():
             np.ones((2, 32, 32)), psf, mask=mask, exposure=[1000.0, 1.0]
         )
     scene = Scene(observation, [(7, 7)])
-    expected = scene.star_stamp(1, 0).values.sum()
+    expected = scene.star_cutout(1, 0).values.sum()
     np.testing.assert_allclose(scene.star_weights, [expected], rtol=1e-14)
 
 
@@ -428,10 +428,10 @@ SHARP = "psf 0 is sharper than its pixels can hold: moved between pixels it ring
     ("fwhm", "off", "given", "warned"),
     [
         (1.5, 0.5, {"stars": [(20, 21.5)]}, SHARP),
-        (1.5, 0.5, {"stars": [(20, 21)], "leeway": 3.0}, SHARP),
+        (1.5, 0.5, {"stars": [(20, 21)], "max_shift": 3.0}, SHARP),
         (1.5, 0.5, {"stars": [(20, 21)]}, None),
         (1.5, 0.5, {}, None),
-        (1.5, 0.5, {"leeway": 3.0}, None),
+        (1.5, 0.5, {"max_shift": 3.0}, None),
         (2.5, 0.5, {"stars": [(20, 21.5)]}, None),
         (0.8, 0.0, {"stars": [(20, 21.5)]}, None),
     ],

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scenes import gaussian_interpolation, gaussian_variance, make_psfs, worst
 from scipy.special import erf, j1
 
-from lnocl.scene.shifting import MARGIN, MovablePsf, Stamp, fold, place
+from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf, fold, place
 
 GRID = (64, 128)
 ROUNDING = 2e-15
@@ -45,13 +45,13 @@ positions = st.floats(-40.0, 40.0, allow_subnormal=False)
 )
 def test_whole_pixels_move_and_wrap_a_psf(shape, grid, x, y):
     psf = make_psfs(1, shape)[0]
-    stamp = place(psf, grid, x, y)
-    assert all(k <= n for k, n in zip(stamp.values.shape, grid, strict=True))
+    cutout = place(psf, grid, x, y)
+    assert all(k <= n for k, n in zip(cutout.values.shape, grid, strict=True))
     expected = wrapped(psf, grid, x, y)
     if all(k <= n for k, n in zip(shape, grid, strict=True)):
-        np.testing.assert_array_equal(stamp.on_grid(grid), expected)
+        np.testing.assert_array_equal(cutout.on_grid(grid), expected)
     else:  # wings that wrap round are summed in another order
-        assert worst(stamp.on_grid(grid), expected) <= 8e-16  # measured 2.7e-16
+        assert worst(cutout.on_grid(grid), expected) <= 8e-16  # measured 2.7e-16
 
 
 def test_whole_pixels_are_moved_bit_for_bit():
@@ -79,13 +79,13 @@ def test_small_grids_have_the_interpolant_of_the_whole_grid(shape, grid, x, y):
 @pytest.mark.parametrize(("x", "y"), [(0.5, 0.25), (70.3, 3), (5, -0.49), (127.9, 63.7)])
 def test_fractions_are_the_interpolant_of_the_psf_in_its_margins(shape, x, y):
     psf = make_psfs(1, shape)[0]
-    stamp = place(psf, GRID, x, y)
+    cutout = place(psf, GRID, x, y)
     whole = np.floor(y + 0.5), np.floor(x + 0.5)
     laid, matrices = psf, []
     for axis, (n, at) in enumerate(zip(GRID, (y, x), strict=True)):
         fits = shape[axis] + 2 * MARGIN < n
         size = shape[axis] + 2 * MARGIN if fits else n
-        assert stamp.values.shape[axis] == size
+        assert cutout.values.shape[axis] == size
         before = MARGIN if fits else size // 2 - shape[axis] // 2
         pads = [(0, 0), (0, 0)]
         pads[axis] = before, size - shape[axis] - before
@@ -93,8 +93,8 @@ def test_fractions_are_the_interpolant_of_the_psf_in_its_margins(shape, x, y):
         variance = gaussian_variance(psf.sum(axis=1 - axis))
         matrices.append(gaussian_interpolation(size, at - whole[axis], variance))
     expected = matrices[0] @ laid @ matrices[1].T
-    assert worst(stamp.values, expected) <= 2e-14  # measured 6e-15, the matrices' own rounding
-    assert (stamp.y, stamp.x) == tuple(
+    assert worst(cutout.values, expected) <= 2e-14  # measured 6e-15, the matrices' own rounding
+    assert (cutout.y, cutout.x) == tuple(
         at - size // 2 for at, size in zip(whole, expected.shape, strict=True)
     )
 
@@ -258,7 +258,7 @@ class TestDerivative:
 
     @pytest.mark.parametrize("fwhm", [1.5, 2.0, 6.0])
     @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.5, 0.25), (-0.3, 0.1)])
-    def test_of_a_gaussian(self, x, y, fwhm):
+    def test_a_gaussian_is_moved_exactly(self, x, y, fwhm):
         grid, sigma = (128, 128), fwhm / np.sqrt(8.0 * np.log(2.0))
 
         def slope(at):
@@ -275,15 +275,15 @@ class TestDerivative:
     @pytest.mark.parametrize(("x", "y"), [(12.0, 17.0), (12.3, -0.4)])
     def test_is_made_with_the_psf_and_the_other_one(self, grid, x, y):
         psf = make_psfs(1, (6, 7))[0]
-        stamp, values = MovablePsf(psf, grid).with_slopes(x, y)
+        cutout, values = MovablePsf(psf, grid).with_slopes(x, y)
         for axis, found in zip((None, 1, 0), values, strict=True):
             expected = place(psf, grid, x, y, axis).on_grid(grid)
-            assert worst(Stamp(found, stamp.y, stamp.x).on_grid(grid), expected) <= 3e-15
+            assert worst(Cutout(found, cutout.y, cutout.x).on_grid(grid), expected) <= 3e-15
 
     @pytest.mark.parametrize("axis", [0, 1])
     def test_has_no_light(self, axis):
-        stamp = place(make_psfs(1, (6, 7))[0], GRID, 3.3, 4.2, axis)
-        assert abs(stamp.values.sum()) <= 2e-15  # measured 8.9e-16
+        cutout = place(make_psfs(1, (6, 7))[0], GRID, 3.3, 4.2, axis)
+        assert abs(cutout.values.sum()) <= 2e-15  # measured 8.9e-16
 
 
 class TestStamp:
@@ -296,14 +296,14 @@ class TestStamp:
     def test_rows_and_columns_are_where_the_values_lie(self, shape, more, y, x):
         grid = shape[0] + more[0], shape[1] + more[1]
         values = 1.0 + np.arange(shape[0] * shape[1], dtype=float).reshape(shape)
-        stamp = Stamp(values, y, x)
-        on_grid = stamp.on_grid(grid)
+        cutout = Cutout(values, y, x)
+        on_grid = cutout.on_grid(grid)
         assert on_grid.sum() == values.sum()
-        chosen = on_grid[np.ix_(stamp.rows(grid), stamp.columns(grid))]
+        chosen = on_grid[np.ix_(cutout.rows(grid), cutout.columns(grid))]
         np.testing.assert_array_equal(chosen, values)
         assert on_grid[y % grid[0], x % grid[1]] == 1.0
-        np.testing.assert_array_equal(on_grid[stamp.window(grid)], values)
-        aligned = stamp.aligned(grid)
+        np.testing.assert_array_equal(on_grid[cutout.window(grid)], values)
+        aligned = cutout.aligned(grid)
         np.testing.assert_array_equal(aligned.on_grid(grid), on_grid)
         for axis in (0, 1):
             if shape[axis] == grid[axis]:
@@ -313,12 +313,12 @@ class TestStamp:
     def test_trimmed_has_all_values_above_the_least(self, place_of_values):
         values = np.full((6, 7), 1e-3)
         values[place_of_values], values[3, 4] = -1.0, 2.0
-        stamp = Stamp(values, -2, 30).trimmed(1e-3)
+        cutout = Cutout(values, -2, 30).trimmed(1e-3)
         expected = np.where(abs(values) > 1e-3, values, 0.0)
-        found = np.where(abs(stamp.on_grid((16, 40))) > 1e-3, stamp.on_grid((16, 40)), 0.0)
-        np.testing.assert_array_equal(found, Stamp(expected, -2, 30).on_grid((16, 40)))
-        assert stamp.values.size < values.size
-        assert Stamp(values, 1, 1).trimmed(9.0).values.shape == (1, 1)
+        found = np.where(abs(cutout.on_grid((16, 40))) > 1e-3, cutout.on_grid((16, 40)), 0.0)
+        np.testing.assert_array_equal(found, Cutout(expected, -2, 30).on_grid((16, 40)))
+        assert cutout.values.size < values.size
+        assert Cutout(values, 1, 1).trimmed(9.0).values.shape == (1, 1)
 
 
 @given(k=st.integers(1, 40), n=st.integers(1, 12), axis=st.integers(0, 1))

@@ -89,20 +89,20 @@ def test_what_was_refined_is_not_said():
         paper(observation, [STAR], n_iter=1, engine="numpy")
 
 
-def lit(**given):
+def halos(**given):
     return list(check_stars(Scene(observe(moffat(2 * WIDTH), **given), [given.get("star", STAR)])))
 
 
 def test_stars_that_show_nothing_are_left_out():
     """Faint, at the edge, masked, on bright emission, and two close by each other."""
     mask = np.zeros((SIZE, SIZE), bool)
-    assert len(lit(mask=mask)) == 1
+    assert len(halos(mask=mask)) == 1
     mask[STAR[1] + 3, STAR[0] - 2] = True
     emission = np.zeros((SIZE, SIZE))
     emission[:, STAR[0] + 12 :] = 3e3
-    assert lit(mask=mask) == []
-    assert lit(flux=300.0) == []
-    assert lit(extended=emission) == []
+    assert halos(mask=mask) == []
+    assert halos(flux=300.0) == []
+    assert halos(extended=emission) == []
     edge = Scene(observe(moffat(2 * WIDTH)), [(5, 44)])
     assert list(check_stars(edge)) == []
     close = Scene(observe(moffat(2 * WIDTH)), [STAR, (STAR[0] + 9, STAR[1])])

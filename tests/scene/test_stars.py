@@ -15,10 +15,10 @@ from lnocl.scene import stars as star_images
 from lnocl.scene.forward_model import add_to_window
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
-from lnocl.scene.shifting import Stamp
+from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import Order, Piece, StarImages, check_positions, order_of
 
-# One is alone, two are neighbours, one wraps round two edges; or all of the grid is lit.
+# One is alone, two are neighbours, one wraps round two edges; or all of the grid is covered.
 FIELDS = {
     "apart and over the edges": ((64, 128), [(100.0, 40.0), (20.3, 30.2), (23.0, 28.0), (0.4, 63)]),
     "one, over the edges": ((64, 64), [(63.0, 1.0)]),
@@ -45,16 +45,16 @@ def test_sums_are_those_over_all_pixels(name, j):
     scene = scene_of(name)
     field, rng = scene.star_field, np.random.default_rng(0)
     dense = np.array([scene.star_image(j, s).ravel() for s in range(scene.n_stars)])
-    lit, x = field.lit(j), rng.normal(size=scene.grid)
+    covered, x = field.covered(j), rng.normal(size=scene.grid)
     fluxes, weights = rng.random(scene.n_stars), rng.random(scene.grid)
-    images = field.images(j, lit)
-    assert not dense[:, ~lit.ravel()].any()
-    assert worst(images.light(fluxes), (fluxes @ dense)[lit.ravel()]) <= 5e-16
+    images = field.images(j, covered)
+    assert not dense[:, ~covered.ravel()].any()
+    assert worst(images.light(fluxes), (fluxes @ dense)[covered.ravel()]) <= 5e-16
     assert worst(field.light(j, fluxes).ravel(), fluxes @ dense) <= 5e-16
-    assert worst(images.products(x[lit]), [dense @ x.ravel()]) <= 2e-15
+    assert worst(images.products(x[covered]), [dense @ x.ravel()]) <= 2e-15
     cores = np.array([core.on_grid(scene.grid).ravel() for core in field.cores[j]])
     expected = (cores * weights.ravel()) @ cores.T
-    assert worst(images.information(weights[lit]).dense(), expected) <= 1e-15
+    assert worst(images.information(weights[covered]).dense(), expected) <= 1e-15
 
 
 @pytest.mark.parametrize("flux", [1e3, 1e7])
@@ -66,10 +66,14 @@ def test_faint_pixels_hardly_inform(wings, flux):
     stars = [(60.3, 50.2), (66.9, 57.4), (9.0, 100.6)]
     scene = Scene(lnocl.Observation(np.full((128, 128), 50.0), psf), stars)
     whole = np.array([scene.star_image(0, s).ravel() for s in range(3)])
-    lit = scene.star_field.lit(0)
+    covered = scene.star_field.covered(0)
     assert scene.star_field.cores[0][0].values.size < (900 if wings == "Gaussian" else 113**2)
     weights = 1.0 / (50.0 + (flux * whole.sum(axis=0)).clip(0))
-    found = scene.star_field.images(0, lit).information(weights.reshape(lit.shape)[lit]).dense()
+    found = (
+        scene.star_field.images(0, covered)
+        .information(weights.reshape(covered.shape)[covered])
+        .dense()
+    )
     expected = (whole * weights) @ whole.T
     assert worst(found, expected) <= 3e-7  # measured 1.6e-7 at most
 
@@ -80,7 +84,7 @@ def test_sums_over_images_of_several_pieces_and_derivatives(tile, monkeypatch):
     monkeypatch.setattr(star_images, "TILE", tile)
     grid, n, rng = (10, 14), 4, np.random.default_rng(1)
     dense, pieces = np.zeros((3, n, *grid)), []
-    lit = rng.random(grid) < 0.8
+    covered = rng.random(grid) < 0.8
     for s in range(n):
         pieces.append([])
         for k in (3, 1):
@@ -88,9 +92,9 @@ def test_sums_over_images_of_several_pieces_and_derivatives(tile, monkeypatch):
             piece = Piece(rng.normal(size=shape), *rng.integers(-20, 20, 2).tolist())
             pieces[s].append(piece)
             for values, each in zip(piece.values, dense[:, s], strict=False):
-                each += Stamp(values, piece.y, piece.x).on_grid(grid)
-    images = StarImages(lit, pieces, Order(np.array([2, 0, 3, 1]), n - 1))
-    x, columns = rng.random(np.count_nonzero(lit)), dense[..., lit].reshape(3 * n, -1)
+                each += Cutout(values, piece.y, piece.x).on_grid(grid)
+    images = StarImages(covered, pieces, Order(np.array([2, 0, 3, 1]), n - 1))
+    x, columns = rng.random(np.count_nonzero(covered)), dense[..., covered].reshape(3 * n, -1)
     assert worst(images.light(x[:n]), x[:n] @ columns[:n]) <= 1e-15
     assert worst(images.products(x).ravel(), columns @ x) <= 1e-15
     information = images.information(x)
@@ -105,13 +109,13 @@ def test_stars_that_share_pixels_are_near_in_their_order(goes_round):
     stars = rng.uniform(margin, np.subtract(grid[::-1], margin), (200, 2))
     offsets = np.array([(0.0, 0.0), (2.6, -3.3)])
     images = [
-        [Stamp(np.ones((k, 15)), int(y) - k // 2, int(x) - 7) for x, y in stars + offset]
+        [Cutout(np.ones((k, 15)), int(y) - k // 2, int(x) - 7) for x, y in stars + offset]
         for k, offset in zip((21, 16), offsets, strict=True)
     ]
     places, width = order_of(stars, zip(offsets, images, strict=True), grid)
     np.testing.assert_array_equal(np.sort(places), np.arange(200))
-    for stamps in images:
-        dense = np.array([stamp.on_grid(grid).ravel() for stamp in stamps])
+    for cutouts in images:
+        dense = np.array([cutout.on_grid(grid).ravel() for cutout in cutouts])
         one, other = np.nonzero(dense @ dense.T)
         assert abs(places[one] - places[other]).max() <= width
     assert width < 70  # along the other axis all 200 stars meet
@@ -123,8 +127,8 @@ def count_products(n):
     stars = np.column_stack([rng.uniform(12, 52, n), 16 * np.arange(n) + 8.0])
     observation = lnocl.Observation(np.ones((ny, 64)), make_smooth_psfs(1, (7, 8)))
     field = Scene(observation, stars, pad=0).star_field
-    lit = field.lit(0)
-    return field.images(0, lit).information(np.ones(np.count_nonzero(lit))).band.size
+    covered = field.covered(0)
+    return field.images(0, covered).information(np.ones(np.count_nonzero(covered))).band.size
 
 
 def test_information_is_of_stars_that_overlap_alone():
@@ -138,8 +142,8 @@ def test_light_of_a_window_is_that_of_the_stars_that_reach_it(monkeypatch):
     stars = rng.uniform(10, 246, (60, 2))
     observation = lnocl.Observation(rng.poisson(50.0, (256, 256)), make_smooth_psfs(1, (7, 8)))
     scene = Scene(observation, stars, pad=0)
-    laid, add_to = [], Stamp.add_to
-    monkeypatch.setattr(Stamp, "add_to", lambda *args: [laid.append(args), add_to(*args)])
+    laid, add_to = [], Cutout.add_to
+    monkeypatch.setattr(Cutout, "add_to", lambda *args: [laid.append(args), add_to(*args)])
     first, image = (10, 90), np.zeros((40, 50))
     fluxes = rng.uniform(1.0, 2.0, 60)
     add_to_window(image, scene, np.zeros(scene.grid), fluxes, 0, first)

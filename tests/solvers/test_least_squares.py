@@ -1,4 +1,4 @@
-"""Least squares of stars and fields: what their rounding hangs on."""
+"""Least squares of stars and fields: what their rounding depends on."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Marginal star fluxes: holes under stars filled, light conserved, and what they hang on."""
+"""Marginal star fluxes: holes under stars filled, light conserved, and what they depend on."""
 
 import numpy as np
 import pytest

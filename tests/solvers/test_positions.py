@@ -74,7 +74,7 @@ def whole_psfs(monkeypatch):
 def fit_of(name, fluxes=(2.5e3, 1.1e3, 3e3)):
     """Return the recipe's arrays, its scene, the fit, and stars off the truth."""
     made = RECIPES[name].make()
-    scene = Scene(made.observation(), made.stars, leeway=RADIUS)
+    scene = Scene(made.observation(), made.stars, max_shift=RADIUS)
     extended, _ = scene.start(made.sky, None)
     n = len(made.stars)
     off = np.array([(0.42, -0.73), (-1.15, 0.3), (0.0, 0.55)])[:n]
@@ -212,7 +212,7 @@ def flat_sky(x, y, flux, level, seed, **known):
 
 
 def fitted(observation, given, level, flux):
-    scene = Scene(observation, [given], leeway=RADIUS)
+    scene = Scene(observation, [given], max_shift=RADIUS)
     fit = StarFit(scene, Model(scene), np.zeros(scene.grid), scene.stars)
     stars = fit.minimise(Stars(np.array([flux / scene.unit]), scene.stars))
     errors = errors_of(fit, stars) * (scene.unit, 1.0, 1.0)
@@ -268,7 +268,7 @@ def test_a_star_may_leave_the_images_but_not_go_where_all_is_masked():
     mask = np.zeros(SHAPE, bool)
     mask[:, 16:] = True
     observation = flat_sky(17.5, 16.0, 3e5, 5.0, 0, mask=mask)
-    scene = Scene(observation, [(14.0, 16.0), (5.0, 5.0)], leeway=30.0)
+    scene = Scene(observation, [(14.0, 16.0), (5.0, 5.0)], max_shift=30.0)
     weights = scene.star_weights
     scene.move_stars([(25.0, 16.0), (6.0, 5.5)])
     np.testing.assert_array_equal(scene.stars, [(14.0, 16.0), (6.0, 5.5)])
@@ -284,16 +284,16 @@ def test_box_that_a_star_may_light_holds_it_wherever_it_goes(shape):
     psf[4, 2] = 1.0  # the rest of it is empty
     observation = lnocl.Observation(np.ones((2, *shape)), psf, offsets=[(0, 0), (1.5, -3.25)])
     for given in ((30.0, 10.0), (30.5, 10.5), (30.2, 0.0)):
-        scene = Scene(observation, [given], leeway=RADIUS)
+        scene = Scene(observation, [given], max_shift=RADIUS)
         rows, columns = scene.star_box(0)
         fit = StarFit(scene, Model(scene), np.ones(scene.grid), scene.stars)
         for angle in np.linspace(0, 2 * np.pi, 17):
             position = np.array(given) + RADIUS * np.array([np.cos(angle), np.sin(angle)])
             scene.move_stars([position])
             for j in range(2):
-                stamp = scene.star_stamp(j, 0)
-                assert rows[stamp.rows(scene.grid)].all()
-                assert columns[stamp.columns(scene.grid)].all()
+                cutout = scene.star_cutout(j, 0)
+                assert rows[cutout.rows(scene.grid)].all()
+                assert columns[cutout.columns(scene.grid)].all()
             for movable, offset in zip(fit._stars, observation.offsets, strict=True):
                 moving = movable._moving(0, position + offset)
                 pixels = movable._at(moving).ravel()

@@ -73,7 +73,7 @@ def test_scaling_is_that_of_the_matrix():
     weighted = unit * (weights / problem.model(x))[:, None] * stars
     # Measured 8.0e-15, 4.9e-16 and 1.6e-16.
     assert worst(steps.shift.ravel(), shift / unit) <= 2.4e-14
-    cross = [stamp.on_grid((8, 8)).ravel() for stamp in steps.cross_information]
+    cross = [cutout.on_grid((8, 8)).ravel() for cutout in steps.cross_information]
     assert worst(cross, (sky.T @ weighted).T) <= 1.5e-15
     assert worst(steps.star_information.dense(), stars.T @ weighted) <= 5e-16
 
@@ -93,14 +93,14 @@ def test_cross_information_lies_in_a_window(psf_shape, offsets):
     model = Model(scene)
     extended, fluxes = scene.start(None, None)
     fluxes, steps = scaling.prepare(scene, model, extended, fluxes)
-    lit = np.where(scene.observed(model.adjoint(model.weights)), extended, 0.0)
-    ratios = model.weights / model.images(lit, fluxes)
-    for s, stamp in enumerate(steps.cross_information):
+    covered = np.where(scene.observed(model.adjoint(model.weights)), extended, 0.0)
+    ratios = model.weights / model.images(covered, fluxes)
+    for s, cutout in enumerate(steps.cross_information):
         cores = [each[s].on_grid(scene.grid) for each in scene.star_field.cores]
         expected = model.adjoint(x * core for x, core in zip(ratios, cores, strict=True))
-        found = stamp.on_grid(scene.grid)
+        found = cutout.on_grid(scene.grid)
         assert worst(found, expected) <= 1.5e-15
-        assert psf_shape != (9, 11) or stamp.values.size < found.size / 2
+        assert psf_shape != (9, 11) or cutout.values.size < found.size / 2
 
 
 FAR, CLOSE, ROUND_THE_EDGE = [(40, 50)], [(40, 50), (47.3, 52.6)], [(0.2, 1.0), (94.0, 3.0)]
@@ -142,8 +142,8 @@ def test_scaling_is_restored_from_its_state(n_stars):
     other = scaling.Scaling.from_state(steps.state())
     for name, array in steps.state().items():
         np.testing.assert_array_equal(other.state()[name], array)
-    stamps = zip(other.cross_information, steps.cross_information, strict=True)
-    for found, expected in stamps:
+    cutouts = zip(other.cross_information, steps.cross_information, strict=True)
+    for found, expected in cutouts:
         np.testing.assert_array_equal(found.values, expected.values)
         assert (found.y, found.x) == (expected.y, expected.x)
     change = other.star_step(np.ones(n_stars), np.ones(n_stars), np.zeros(n_stars))
@@ -168,4 +168,4 @@ def test_star_fluxes_are_best_where_the_engine_starts(recipe):
     engine.start(extended, star_fluxes)
     engine.ratio()
     slopes = engine.star_gradient() / np.sqrt(steps.star_information.diagonal)
-    assert abs(slopes).max() < 1e-7  # measured: 3.1e-8; with a lit sky 3.6e-3
+    assert abs(slopes).max() < 1e-7  # measured: 3.1e-8; with a covered sky 3.6e-3

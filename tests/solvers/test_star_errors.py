@@ -174,6 +174,6 @@ def test_windows_hold_what_the_grid_does(known):
         weights = np.ones(scene.grid) if scene.weights is None else scene.weights[j]
         level = np.broadcast_to(background[j], scene.grid)
         for values, expected in zip(found, (image, level, weights), strict=True):
-            lit = weights[there] > 0  # elsewhere nothing is weighed
-            np.testing.assert_array_equal(values[lit], expected[there][lit])
+            covered = weights[there] > 0  # elsewhere nothing is weighed
+            np.testing.assert_array_equal(values[covered], expected[there][covered])
         np.testing.assert_array_equal(found[2] > 0, weights[there] > 0)
