@@ -248,7 +248,6 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
     np.testing.assert_array_equal(found, [(3.0, 4.0)])
 
 
-@pytest.mark.exhaustive
 def test_a_star_may_leave_the_images_while_psfs_are_judged():
     y, x = np.indices((17, 17)) - 8.0
     y_image, x_image = np.indices((40, 40))
@@ -262,6 +261,7 @@ def test_a_star_may_leave_the_images_while_psfs_are_judged():
     assert abs(result.star_positions[0, 0] - 20.3) < 0.1
 
 
+@pytest.mark.exhaustive
 def test_both_engines_agree():
     images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
     reference = refine(images, PSF)
