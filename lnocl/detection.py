@@ -11,13 +11,12 @@ from scipy import ndimage
 from lnocl.errors import InputError, LnoclError, counted, warn
 from lnocl.matched_filter import DARKER, PointSources, around, find_points, in_boxes, pixels_at
 from lnocl.process import ignored_warnings
-from lnocl.scene.arrays import numbers
+from lnocl.scene.arrays import Array, numbers
 from lnocl.scene.cores import fwhm, peak
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-Array = NDArray[np.float64]
 
 # The sky's level is a median over boxes of so many PSF widths, and of this many pixels or more.
 BOX_WIDTHS, MIN_BOX = 12, 24

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 from scipy.spatial import KDTree
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.cores import centre, fwhm
 
-Array = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 # The disc in which a star is fitted holds this share of the sum of the squared PSF, and as many

@@ -10,12 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError
-from lnocl.scene.arrays import unmasked
-
-Array = NDArray[np.float64]
+from lnocl.scene.arrays import Array, unmasked
 
 N_STAR_ROWS = 24
 

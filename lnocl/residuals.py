@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.cores import fwhm
 from lnocl.scene.detector import on_sky, seen_psfs
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.observation import Observation
 from lnocl.scene.scene import Scene
 
 # The core of a star is where its PSF is above this share of its peak; its wings go on to the other.

@@ -16,7 +16,8 @@ from lnocl.notebook import html_card
 from lnocl.plotting.result import ResultView, draw_result
 from lnocl.residuals import Fit, StarResiduals, judge, judge_stars, residuals
 from lnocl.runs.outcome import Outcome, PsfRefinement
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.arrays import Array
+from lnocl.scene.observation import Observation
 
 if TYPE_CHECKING:
     from astropy.io import fits

@@ -22,8 +22,9 @@ from lnocl.result import Result
 from lnocl.runs.options import StopName, check_length, check_observation, read_penalties
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome
 from lnocl.runs.progress import Progress
+from lnocl.scene.arrays import Array
 from lnocl.scene.grid import length_for
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.observation import Observation
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import EDGE, Scene

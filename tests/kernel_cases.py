@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from lnocl.opencl import program
+from lnocl.opencl import sources
 from lnocl.opencl.device import choose, context_of
 from lnocl.opencl.tuning import Tuning
 from lnocl.verify.comparison import ALLOWED, deviation, kernels_of
@@ -79,7 +79,7 @@ RUNS = [
     for d in precisions
 ]
 
-FOLDER = program.folder()
+FOLDER = sources.folder()
 
 
 def kernels_in(file):

@@ -11,8 +11,8 @@ from lnocl.reference.scale import scale_rows
 from lnocl.reference.smooth import smooth
 from lnocl.reference.step import gradient_rows, step_rows
 from lnocl.reference.sums import collect_sums
+from lnocl.scene.arrays import Array
 from lnocl.scene.forward_model import spread
-from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.solvers.engine import State
 from lnocl.solvers.scaling import Scaling

@@ -17,7 +17,7 @@ from lnocl.opencl.memory import Memory, Transfer, announce, held_bytes, refuse_i
 from lnocl.opencl.program import Program
 from lnocl.opencl.tuning import Tuning, describe_tuning
 from lnocl.opencl.windows import StarWindows
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.stars import covered_box
 from lnocl.solvers.engine import State

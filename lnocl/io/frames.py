@@ -20,7 +20,8 @@ from lnocl.io.maps import Maps, Word
 from lnocl.io.noise import CLASSES, WITH_SOURCE, NoiseMap, electrons_by_variance, read_noise_map
 from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
-from lnocl.scene.observation import OVERSAMPLES, Array, Observation, PsfCentre
+from lnocl.scene.arrays import Array
+from lnocl.scene.observation import OVERSAMPLES, Observation, PsfCentre
 
 Mask = NDArray[np.bool_]
 

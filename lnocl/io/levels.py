@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError, note
+from lnocl.scene.arrays import Array
 from lnocl.scene.noise_check import noise_of
-from lnocl.scene.observation import Array
 
 Mask = NDArray[np.bool_]
 

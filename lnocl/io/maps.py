@@ -11,7 +11,7 @@ from lnocl.errors import InputError, counted
 from lnocl.io.fitsread import read_stack
 from lnocl.io.names import file_of
 from lnocl.scene import units
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 Word = str | float
 

@@ -14,7 +14,7 @@ from lnocl.errors import DeviceError, InputError, note
 from lnocl.opencl.device import describe
 from lnocl.opencl.launch import READ_WRITE
 from lnocl.opencl.layout import Layout
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 # Bytes of pixels that are converted and copied at once, lest a second array of all is needed.
 MAX_COPIED = 16 * 2**20

@@ -8,7 +8,6 @@ import re
 import weakref
 from collections import OrderedDict
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import cast
 
@@ -19,25 +18,9 @@ from lnocl.errors import DeviceError
 from lnocl.opencl import kernel_cache, trial, unknown_cpu
 from lnocl.opencl.device import describe, has_double
 from lnocl.opencl.faults import after_fault, build_failure
+from lnocl.opencl.sources import source
 from lnocl.opencl.tuning import Tuning, odd_part, scratch_points, tune
 from lnocl.process import LOCK, ignored_warnings
-
-# In the order in which they build on each other.
-SOURCES = (
-    "precision.cl",
-    "complex.cl",
-    "odd.cl",
-    "fft.cl",
-    "rows.cl",
-    "columns.cl",
-    "convolve.cl",
-    "sums.cl",
-    "stars.cl",
-    "ratio.cl",
-    "smooth.cl",
-    "scale.cl",
-    "step.cl",
-)
 
 # Rooms for stars that programs are built with. More stars seldom build another program; where there
 # are none, or one, the loops over stars cost nothing.
@@ -227,21 +210,6 @@ def _room_for(n_stars: int) -> int:
         f"{n_stars} stars are too many for the kernels, which have room for {STAR_ROOMS[-1]}: "
         "give fewer stars, or take `engine` numpy"
     )
-
-
-@cache
-def source() -> str:
-    """Return the OpenCL source of all kernels."""
-    return "".join(
-        f'#line 1 "{name}"\n{(folder() / name).read_text(encoding="ascii")}' for name in SOURCES
-    )
-
-
-def folder() -> Path:
-    """Return the folder of the kernels: inside the package, or beside it in a clone."""
-    package = Path(__file__).parents[1]
-    inside = package / "kernels"
-    return inside if inside.is_dir() else package.parent / "kernels"
 
 
 def _arguments(text: str, kernel_names: list[str]) -> Mapping[str, tuple[str, ...]]:

@@ -23,6 +23,7 @@ import pyopencl as cl
 from lnocl.errors import DeviceError
 from lnocl.opencl import kernel_cache
 from lnocl.opencl.device import describe
+from lnocl.opencl.sources import source
 from lnocl.opencl.unknown_cpu import POCL
 
 # What the outcome may depend on, besides the device.
@@ -133,8 +134,6 @@ def _need_files() -> None:
 def _environment(device: cl.Device) -> str:
     words = [sys.executable, cl.VERSION_TEXT, describe(device)]
     if device.platform.name != POCL:
-        from lnocl.opencl.program import source  # which imports this
-
         return "\n".join([*words, source()])
     words += [_foreign(os.environ.get(name, "")) for name in VARIABLES]
     words += [str(shutil.which("ld")), *(file for each in LIBRARIES for file in sorted(glob(each)))]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lnocl.opencl.layout import PixelLayout, shortest_arc
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import Covered
 

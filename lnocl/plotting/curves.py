@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import Array, line_style, new_figure
+from lnocl.plotting.figure import line_style, new_figure
+from lnocl.scene.arrays import Array
 
 
 def draw_costs(settings: Mapping[str, tuple[Array, Array]], measure: str) -> Figure:

@@ -5,17 +5,12 @@ from __future__ import annotations
 import io
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lnocl.errors import LnoclError
 from lnocl.io.atomic import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
-Array = NDArray[np.float64]
 
 DPI = 110
 # The palette of M. Okabe and K. Ito, "Color Universal Design" (2008), for colour-blind readers.

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOUR_MAP, COLOURS, Array, line_style, new_figure
+from lnocl.plotting.figure import COLOUR_MAP, COLOURS, line_style, new_figure
+from lnocl.scene.arrays import Array
 
 # Share of a PSF's peak at which its stretch ends.
 PSF_FLOOR = 1e-4

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.notebook import block_means
-from lnocl.plotting.figure import COLOUR_MAP, DPI, Array, new_figure
+from lnocl.plotting.figure import COLOUR_MAP, DPI, new_figure
 from lnocl.plotting.result import (
     FAINT_SHARE,
     MAX_SIGMA,
@@ -28,6 +28,7 @@ from lnocl.plotting.result import (
     image_limits,
     worst_image,
 )
+from lnocl.scene.arrays import Array
 
 # Bytes of the whole frame's pictures, about: an image and its residuals are noise, of a byte a
 # pixel each, a model takes a third, the extended source a half; in base64 four for three.

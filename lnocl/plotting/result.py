@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOUR_MAP, Array, as_text, line_style, new_figure
+from lnocl.plotting.figure import COLOUR_MAP, as_text, line_style, new_figure
+from lnocl.scene.arrays import Array
 
 # Stars that are shown enlarged, the brightest; more are not numbered from as many on.
 MAX_ZOOMS, MAX_NUMBERS = 6, 40

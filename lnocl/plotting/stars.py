@@ -10,8 +10,9 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOURS, Array, new_figure
+from lnocl.plotting.figure import COLOURS, new_figure
 from lnocl.plotting.result import image_limits
+from lnocl.scene.arrays import Array
 
 # Stars that are numbered, the brightest; more would hide each other.
 MAX_NUMBERED = 200

@@ -10,8 +10,8 @@ from scipy import optimize
 from scipy.ndimage import maximum_filter, median_filter
 
 from lnocl.errors import InputError
+from lnocl.scene.arrays import Array
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 # Places in an image, row before column.
 Pixel = tuple[int, int]

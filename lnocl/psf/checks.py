@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError
-from lnocl.psf.centring import Array, Mask
-from lnocl.scene.arrays import numbers, unmasked, values_and_mask
+from lnocl.psf.centring import Mask
+from lnocl.scene.arrays import Array, numbers, unmasked, values_and_mask
 
 MIN_SIZE = 3
 # Values beyond this have no finite variance in float64.

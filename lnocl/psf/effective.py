@@ -11,9 +11,10 @@ from scipy.ndimage import binary_dilation, maximum_filter, shift
 from scipy.spatial import KDTree
 
 from lnocl.errors import InputError, counted
-from lnocl.psf.centring import Array, Mask, Point, brightest
+from lnocl.psf.centring import Mask, Point, brightest
 from lnocl.psf.repair import repair
 from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
+from lnocl.scene.arrays import Array
 from lnocl.scene.shifting import Cutout, MovablePsf
 
 # Rounds of fitting the stars and adding what is left of them to the PSF.

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError
 from lnocl.psf import checks, effective, resampling, steps
 from lnocl.psf.centring import Mask, Pixel, Point
-
-Array = NDArray[np.float64]
+from lnocl.scene.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError, counted
-from lnocl.scene.arrays import numbers
-
-Array = NDArray[np.float64]
+from lnocl.scene.arrays import Array, numbers
 
 
 class PsfModes(NamedTuple):

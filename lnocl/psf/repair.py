@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import convolve1d, maximum_filter
 
-Array = NDArray[np.float64]
+from lnocl.scene.arrays import Array
+
 Mask = NDArray[np.bool_]
 
 # A bad pixel is repaired if in the square of side `WINDOW` around it are `MIN_GOOD` good ones. So

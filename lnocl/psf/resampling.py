@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.shifting import place
-
-Array = NDArray[np.float64]
 
 
 def shift(image: Array, by: tuple[float, float]) -> Array:

@@ -8,7 +8,8 @@ import numpy as np
 from astropy.stats import mad_std
 from scipy.spatial.distance import cdist
 
-from lnocl.psf.centring import Array, Mask, Point
+from lnocl.psf.centring import Mask, Point
+from lnocl.scene.arrays import Array
 
 # Wings are those of stars from so many widths on. They are measured in so many parts, of pixels as
 # far from the stars, with so many pixels each or more.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import xlog1py, xlogy
 
 from lnocl.reference.rows import ComplexArray, irfft_rows, rfft_rows
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 from lnocl.scene.scene import MIN_MODEL
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 ComplexArray = NDArray[np.complex128]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lnocl.reference.rows import ComplexArray, irfft_rows, rfft_rows
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 
 def scale_rows(

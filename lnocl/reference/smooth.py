@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 
 def smooth(extended: Array, smoothing: float | Array, edge: float) -> tuple[Array, Array, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 
 def collect_sums(

@@ -20,7 +20,7 @@ import numpy as np
 
 from lnocl.errors import refuse_not_finite
 from lnocl.runs.halves import Snapshot
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 # The chosen iteration is the last with an error within a tenth of the least: near a star the
 # estimate improves long after the rest. The least squared error is taken to be the noise alone;

@@ -17,9 +17,9 @@ from lnocl.runs.outcome import Outcome
 from lnocl.runs.progress import Progress
 from lnocl.runs.replicas import Replicas, Sky
 from lnocl.scene.apertures import FLUX, FWHM, LENGTH, Aperture, Label, Profile
+from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
-from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.texture import CORE, resolution

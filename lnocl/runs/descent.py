@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from lnocl.errors import DivergedError, refuse_not_finite
+from lnocl.scene.arrays import Array
 from lnocl.scene.cores import off_centre
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.observation import Observation
 from lnocl.scene.scene import Scene
 
 # With PSFs that are nowhere negative the split-gradient method lowers the objective, but for

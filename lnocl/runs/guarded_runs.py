@@ -22,9 +22,10 @@ from lnocl.process import ignored_notes, ignored_warnings
 from lnocl.runs.options import WRONG_PSFS
 from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_model, make_start
+from lnocl.scene.arrays import Array
 from lnocl.scene.forward_model import Model
 from lnocl.scene.noise_check import with_noise_shown
-from lnocl.scene.observation import OF_PSFS, Array, Observation
+from lnocl.scene.observation import OF_PSFS, Observation
 from lnocl.scene.padding import choose_pad
 from lnocl.scene.penalty import Penalty, recommend_smoothing
 from lnocl.scene.psf_misfit import PsfMisfit, measure_misfit, smoothing_near_stars

@@ -12,7 +12,7 @@ from lnocl.errors import DivergedError, NotFiniteError, warn
 from lnocl.runs.run import Run
 from lnocl.runs.saved import LARGEST, Saved
 from lnocl.runs.start import Start
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 from lnocl.solvers.engine import State
 
 # The ratio of one iteration of which a snapshot is taken to that before.

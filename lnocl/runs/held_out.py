@@ -27,7 +27,7 @@ from lnocl.runs.run import most_bytes as most_bytes_of_run
 from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved, is_whole
 from lnocl.runs.start import Start
 from lnocl.runs.thinning import split_counts
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 from lnocl.scene.penalty import Penalty
 from lnocl.solvers.engine import State
 

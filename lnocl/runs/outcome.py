@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lnocl.errors import warn
 from lnocl.runs.start import Start
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 

@@ -7,8 +7,9 @@ import numpy as np
 from lnocl.process import ignored_warnings
 from lnocl.runs.guarded_runs import Estimate, GuardedRuns, estimate_scatter, rings_of
 from lnocl.runs.start import make_model
+from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.observation import Observation
 from lnocl.scene.psf_misfit import smoothing_near_stars
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import Scene

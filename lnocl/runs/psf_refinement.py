@@ -24,7 +24,8 @@ from lnocl.runs.guarded_runs import (
 from lnocl.runs.outcome import PsfRefinement
 from lnocl.runs.psf_allowance import STRENGTH, Allowance
 from lnocl.runs.start import Setup
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.arrays import Array
+from lnocl.scene.observation import Observation
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters
 from lnocl.scene.psf_misfit import PsfMisfit
 from lnocl.scene.psf_wings import without_noise

@@ -11,9 +11,9 @@ import numpy as np
 from lnocl.process import ignored_warnings
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.run import Run
+from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
-from lnocl.scene.observation import Array
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.texture import Texture, resolution
 from lnocl.solvers.light import Light

@@ -17,7 +17,8 @@ from lnocl.runs.descent import Descent
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.saved import LARGEST, Saved, Shape
 from lnocl.runs.start import Setup, Start, make_model, measure_steps, move_stars
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.arrays import Array
+from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.solvers import SOLVERS

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.arrays import Array
+from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 

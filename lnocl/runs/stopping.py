@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from lnocl.errors import warn
 from lnocl.runs.run import Run
 from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 if TYPE_CHECKING:
     from lnocl.scene.forward_model import Model

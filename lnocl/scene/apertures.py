@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 # What is measured: light, in electrons, or lengths, in pixels.
 FLUX, LENGTH = "flux", "length"

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 # Added to the diagonal, as a share of it, where unknowns that nothing tells apart leave the matrix
 # singular: where less than this is left of an unknown beside the others.

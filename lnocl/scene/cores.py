@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lnocl.scene.arrays import Array
 
 # A core is what is connected to the peak and above this share of it.
 CORE = 0.3

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Cutout
 

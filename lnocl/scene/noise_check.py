@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import warn
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.arrays import Array
+from lnocl.scene.observation import Observation
 
 # Noise is measured in square blocks, of these the darker half, where there are so many.
 BLOCK = 8

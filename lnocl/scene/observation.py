@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl.errors import InputError, counted, warn
 from lnocl.notebook import html_card
 from lnocl.scene import containers
-from lnocl.scene.arrays import numbers, refuse_masked, unmasked, values_and_mask
+from lnocl.scene.arrays import Array, numbers, refuse_masked, unmasked, values_and_mask
 from lnocl.scene.cores import centre, off_centre, peak
 from lnocl.scene.psf_errors import check_modes, check_pixels
 from lnocl.scene.psf_field import PsfField, read_fields
+from lnocl.scene.shifting import place
 from lnocl.scene.uncertainties import is_uncertainty, without_source
 
-Array = NDArray[np.float64]
 PsfCentre = Literal["check", "fit", "given"]
 
 # An array whose last axis is so short, and the others so long, has its channels last.
@@ -710,8 +710,6 @@ def _refuse_off_centre(psfs: Array) -> None:
 
 def _centred(psf: Array) -> Array:
     """Return a PSF moved so that its core lies at its centre, what leaves one edge at the other."""
-    from lnocl.scene.shifting import place  # which is made of arrays of this module
-
     y, x = centre(psf.shape)
     whole = [n - at for n, at in zip((y, x), peak(psf), strict=True)]
     psf = np.roll(psf, whole, axis=(0, 1))

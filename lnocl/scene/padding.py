@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.detector import seen_psfs
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.observation import Observation
 
 # Share of a PSF's light within the radius that is enough for a pad, and the share of the shorter
 # side of the images that the pad is at most (benchmarks/frames.py, docs/validation/frames.md).

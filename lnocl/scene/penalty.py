@@ -10,8 +10,9 @@ from typing import Any, cast
 import numpy as np
 
 from lnocl.errors import InputError
+from lnocl.scene.arrays import Array
 from lnocl.scene.detector import seen_psfs
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.observation import Observation
 
 # A larger weight leaves nothing of the data term of images at unit mean.
 MAX_WEIGHT = 2.0**64

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError
 from lnocl.scene import containers
-from lnocl.scene.arrays import numbers
-
-Array = NDArray[np.float64]
+from lnocl.scene.arrays import Array, numbers
 
 
 def check_modes(modes: ArrayLike | None, psfs: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.pupils import Pupil
 from lnocl.scene.shifting import fold
@@ -15,7 +16,6 @@ from lnocl.scene.shifting import fold
 if TYPE_CHECKING:
     from lnocl.scene.observation import Observation
 
-Array = NDArray[np.float64]
 Spectrum = NDArray[np.complex128]
 
 # Standard deviations of the priors: pixels, square pixels, a power, radians, those of the modes.

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.fft
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.forward_model import Model, spread
-from lnocl.scene.observation import Array
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import MIN_MODEL, Scene
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.smooth_field import SmoothField
-
-Array = NDArray[np.float64]
 
 # Errors of PSFs are correlated over this, pixels of the images.
 CORRELATED = 0.6

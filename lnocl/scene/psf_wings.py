@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 from lnocl.scene.rings import Rings
 
 # The noise is that of pixels beyond this share of the way to the nearest edge.

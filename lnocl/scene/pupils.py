@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lnocl.scene.arrays import Array
 
 # Phases are polynomials up to this degree across each aperture: coma is the last of them.
 DEGREE = 3

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 # A ring is a pixel wide, or this share of its radius.
 WIDTH = 0.15

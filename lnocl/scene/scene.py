@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, warn
+from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
 from lnocl.scene.grid import grid_of
-from lnocl.scene.observation import Array, Observation, numbers
+from lnocl.scene.observation import Observation, numbers
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
 from lnocl.scene.shifting import Cutout, MovablePsf
 from lnocl.scene.stars import Covered, StarField, check_positions, covered_box

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 
 # Pixels added on each side of a PSF before it is moved by a fraction: ringing beyond the edges of
 # its array dies out in them.

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lnocl.errors import counted, warn
-from lnocl.scene.cores import Array, centroid, fwhm
+from lnocl.scene.arrays import Array
+from lnocl.scene.cores import centroid, fwhm
 from lnocl.scene.detector import seen_psfs
 from lnocl.scene.scene import Scene
 

@@ -6,12 +6,10 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lnocl.errors import InputError
+from lnocl.scene.arrays import Array
 from lnocl.scene.units import parse
-
-Array = NDArray[np.float64]
 
 
 class Columns(NamedTuple):

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from lnocl.errors import InputError
 from lnocl.scene import containers, star_tables
+from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf
-from lnocl.scene.observation import Array, Observation, numbers
+from lnocl.scene.observation import Observation, numbers
 from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf, Window, window
 
 # Pixels of a flattened array: a slice where they are all of it, which takes no gathering.

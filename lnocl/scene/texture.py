@@ -18,9 +18,9 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.cores import fwhm
 from lnocl.scene.detector import pixel_spectrum
-from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.smooth_field import SmoothField
 

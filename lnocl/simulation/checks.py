@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 from astropy import units as u
-from numpy.typing import NDArray
 
 from lnocl.errors import InputError
-
-Array = NDArray[np.float64]
+from lnocl.scene.arrays import Array
 
 MIN_SIZE = 32
 

@@ -11,13 +11,8 @@ from scipy import fft
 from scipy.optimize import brentq
 
 from lnocl.errors import InputError
-from lnocl.simulation.checks import (
-    Array,
-    check_shape,
-    check_share,
-    number,
-    positive,
-)
+from lnocl.scene.arrays import Array
+from lnocl.simulation.checks import check_shape, check_share, number, positive
 from lnocl.simulation.telescope import (
     APERTURE_DIAMETER,
     BASELINE,

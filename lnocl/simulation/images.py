@@ -8,7 +8,7 @@ import numpy as np
 from scipy import fft
 
 from lnocl.errors import InputError
-from lnocl.simulation.checks import Array
+from lnocl.scene.arrays import Array
 from lnocl.simulation.fizeau import fizeau_psf
 from lnocl.simulation.targets import Target
 from lnocl.simulation.telescope import Experiment

@@ -9,7 +9,8 @@ import numpy as np
 from astropy import units as u
 
 from lnocl.errors import InputError
-from lnocl.simulation.checks import Array, check_shape, number, positive
+from lnocl.scene.arrays import Array
+from lnocl.simulation.checks import check_shape, number, positive
 from lnocl.simulation.telescope import APERTURE_DIAMETER, BASELINE, OBSCURATION_DIAMETER
 
 # A pixel that an edge cuts is open by the share of its points inside, so many along an axis.

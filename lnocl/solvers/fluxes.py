@@ -9,9 +9,9 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.forward_model import Model
-from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.stars import Pixels, StarImages
 

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 from lnocl.scene.smooth_field import SmoothField
 
 # Of the information's diagonal.

@@ -21,9 +21,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model, images_of_sky, is_flat, model_images
-from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 
 

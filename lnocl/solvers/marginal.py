@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
-from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.texture import core
 from lnocl.solvers.fluxes import variances

@@ -14,9 +14,9 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
 from lnocl.scene.forward_model import convolve_at, sampled, spread
-from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout, MovablePsf
 from lnocl.scene.texture import Texture, resolution

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.forward_model import ROUNDING, Model
-from lnocl.scene.observation import Array
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf
 from lnocl.scene.stars import Order, Piece, StarImages, covered_pixels, order_of, places

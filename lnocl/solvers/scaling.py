@@ -11,9 +11,9 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.forward_model import Box, Model, largest_window
-from lnocl.scene.observation import Array
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout
 from lnocl.solvers.fluxes import bounded_step, fit_fluxes, movable_weights

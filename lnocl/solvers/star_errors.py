@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lnocl.scene.observation import Array
+from lnocl.scene.arrays import Array
 from lnocl.scene.scene import Scene
 from lnocl.solvers.fluxes import variances
 from lnocl.solvers.near_star import NearStar, Surroundings

@@ -22,7 +22,8 @@ from lnocl.plotting.curves import draw_costs
 from lnocl.plotting.figure import check_matplotlib, save_figure
 from lnocl.result import Estimate, Result
 from lnocl.runs.options import PAPER
-from lnocl.scene.observation import Array, Observation
+from lnocl.scene.arrays import Array
+from lnocl.scene.observation import Observation
 from lnocl.simulation import hh34, simulate
 
 # Estimates are measured after an eighth, a quarter, half and all of the iterations.

@@ -8,7 +8,8 @@ import pytest
 
 from lnocl.opencl.device import choose
 from lnocl.opencl.launch import READ_WRITE
-from lnocl.opencl.program import Program, source
+from lnocl.opencl.program import Program
+from lnocl.opencl.sources import source
 
 pytestmark = pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
 

@@ -151,8 +151,8 @@ def test_installed(built, kind, tmp_path):
     python, site = environment(tmp_path, *target, within=within)
     code = (
         "import lnocl, lnocl.commands.cli\n"
-        "from lnocl.opencl import program\n"
-        "print(lnocl.__file__, *(file.name for file in program.folder().iterdir()))"
+        "from lnocl.opencl import sources\n"
+        "print(lnocl.__file__, *(file.name for file in sources.folder().iterdir()))"
     )
     found, *files = run(python, "-I", "-c", code, cwd=tmp_path).split()
     assert found.startswith(str(source if "editable" in kind else site))
