@@ -238,8 +238,8 @@ def open_fits(
                 content.seek(0)
                 with fits.open(content, memmap=False, disable_image_compression=True) as hdus:
                     yield FitsFile(path, stream, content, hdus, length)
-        except (LnoclError, MemoryError, AssertionError, ImportError, NameError):
-            raise  # no file can make the last three
+        except (LnoclError, MemoryError, ImportError, NameError):
+            raise  # no file can make the last two
         except Exception as error:
             # astropy may raise any error on a damaged file; its advice is for programmers.
             reason = str(error).partition(". ")[0] or "it ends too early"

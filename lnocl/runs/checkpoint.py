@@ -124,6 +124,7 @@ def read(path: str, most_bytes: float = math.inf) -> Checkpoint:
     from lnocl.io.fitsfile import open_fits
 
     arrays: State = {}
+    ended, digest, described = "", "", dict[str, str]()
     with open_fits(path, "is not a checkpoint, or a damaged one") as file:
         for k, hdu in enumerate(file.hdus()):
             if isinstance(hdu, fits.PrimaryHDU):
