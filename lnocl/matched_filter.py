@@ -172,6 +172,7 @@ class _Search:
         self.filter = _MatchedFilter(self.profile, weights)
         self.left, self.weights, self.threshold = image.copy(), weights, threshold
         self.stars: list[Array] = []  # x, y, flux, signal of each
+        self.found_at: list[Array] = []  # x, y of each where it was found
         self.whole = self.filter(weights * image)[1]
         self.noise = self.noise_of(self.whole)
 
@@ -229,6 +230,16 @@ class _Search:
         point, broad = np.linalg.lstsq(matrix, self.left[there].ravel() * root, rcond=1e-8)[0][:2]
         sharp, smooth_peak = point * parts[0].max(), max(broad * parts[1].max(), 0.0)
         return bool(sharp > least * (sharp + smooth_peak))
+
+    def is_apart(self, places: Array) -> NDArray[np.bool_]:
+        """Return whether places are farther than `SEPARATION` from all stars found so far.
+
+        That is from where they are, and from where they were found: a fit may have moved them.
+        """
+        if not self.stars:
+            return np.ones(places.shape[:-1], bool)
+        distances = KDTree([star[:2] for star in self.stars] + self.found_at).query(places)[0]
+        return np.asarray(distances > SEPARATION * self.profile.width)
 
     def are_two(self, places: Array) -> bool:
         """Return whether two points or more explain an image that one does not."""
@@ -417,13 +428,12 @@ def find_points(
         places, fluxes, signal = search.maxima()
         pixels = np.round(places).astype(int)
         kept = ~excluded[pixels[:, 1], pixels[:, 0]]
-        if search.stars:  # what a star leaves in its core is none
-            stars = KDTree([star[:2] for star in search.stars])
-            kept &= stars.query(places)[0] > SEPARATION * search.profile.width
+        kept &= search.is_apart(places)  # what a star leaves in its core is none
         candidates = np.column_stack([places, fluxes, signal])[kept]
         points, extended = _points_among(search, candidates, extended)
         for star in points:
             search.stars.append(star)
+            search.found_at.append(star[:2].copy())
             search.take_out(star)
         if points:
             new = np.array([star[:2] for star in points])
@@ -479,7 +489,7 @@ def _points_among(
             order = np.argsort(-fluxes)
             several, fluxes = several[order], fluxes[order]
             is_near = np.hypot(*(several[0] - place)) < search.profile.width
-            if not (is_near and search.are_two(several)):
+            if not (is_near and search.is_apart(several[0]) and search.are_two(several)):
                 extended.append(place)
                 continue
             star[:3] = *several[0], fluxes[0]

@@ -1,10 +1,13 @@
 """Stars are found where they are, and nothing else is."""
 
+import runpy
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lnocl import matched_filter
 from lnocl.errors import InputError, LnoclError, LnoclWarning
 
 pytest.importorskip("photutils", reason="photutils is not installed")
@@ -153,6 +156,21 @@ class TestOtherProfiles:
     def test_without_a_psf_faint_speckles_beside_a_star_are_none(self):
         _, image = self.speckled(0.02, 3.0 * np.array([(0.96, 0.3), (-0.74, 0.68), (-0.21, -0.98)]))
         assert len(find_stars(image)) == 1
+
+
+def test_a_star_that_a_fit_moves_away_is_not_found_again(monkeypatch):
+    """In a field of galaxies the same star was found without end."""
+    scenes = Path(__file__).parents[1] / "benchmarks" / "stars.py"
+    counts, psf, *_ = runpy.run_path(str(scenes))["scene"]("moffat", "galaxies", 6, 740)
+    rounds, search = [], matched_filter._points_among
+
+    def among(*given):
+        rounds.append(given)
+        assert len(rounds) < 20
+        return search(*given)
+
+    monkeypatch.setattr(matched_filter, "_points_among", among)
+    assert len(find_stars(counts, psf)) == 6
 
 
 class TestSaturated:
