@@ -247,10 +247,12 @@ class _Search:
         return self.is_point(places, SEVERAL_SHARE) and self.is_point(second, SEVERAL_SHARE)
 
     def split(self, place: Array) -> Array:
-        """Return two places along the longer axis of the light round one."""
+        """Return two places along the longer axis of the light round one; that one in a hole."""
         there = self.profile.window(place[0], place[1], self.left.shape)
         light = np.clip(self.left[there] - self.left[there].max() / 2.0, 0.0, None)
         rows, columns = np.nonzero(light)
+        if not len(rows):
+            return place[np.newaxis]
         _, axes = np.linalg.eigh(np.cov(columns, rows, aweights=light[rows, columns], ddof=0))
         return place + np.outer([0.5, -0.5], APART * self.profile.width * axes[:, 1])
 

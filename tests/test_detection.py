@@ -158,6 +158,18 @@ class TestOtherProfiles:
         assert len(find_stars(image)) == 1
 
 
+@pytest.mark.filterwarnings("ignore::lnocl.errors.LnoclWarning")
+@pytest.mark.parametrize("seed", range(3))
+def test_between_holes_there_are_next_to_no_stars(seed):
+    rng = np.random.default_rng(seed)
+    image = make_image(seed)
+    for _ in range(6):
+        x, y = rng.uniform(10, 85, 2)
+        image += rng.uniform(200, 2000) * gaussian(x, y, rng.uniform(1.5, 5))
+    for psf in (PSF, None):
+        assert len(find_stars(200 - image, psf)) <= 1
+
+
 def test_a_star_that_a_fit_moves_away_is_not_found_again(monkeypatch):
     """In a field of galaxies the same star was found without end."""
     scenes = Path(__file__).parents[1] / "benchmarks" / "stars.py"
