@@ -373,6 +373,9 @@ def _make(
     side = min(
         steps.fitting_side(given.shape, pixel, side, angle) for angle in angles for pixel in middles
     )
+    if len(middles) == 1:
+        (pixel,) = middles
+        steps.refuse_hole(unrepairable, pixel)
     scatter: Array | None = None
     combined: tuple[str, ...] = ()
     far = max(resampling.reach(side, angle) for angle in angles) + steps.MARGIN
@@ -385,8 +388,6 @@ def _make(
             level, lowered = steps.lower_background(level, light, unusable, centres, width, side)
             light = np.where(unrepairable, 0.0, light + before - level)
     if len(middles) == 1:
-        (pixel,) = middles
-        steps.refuse_hole(unrepairable, pixel)
         steps.warn_of_guess(saturated, light, pixel, side)
     if len(centres) > 1 or others:
         hidden = masked | (unusable if len(centres) > 1 else unrepairable)

@@ -240,7 +240,7 @@ def _fit_star(light: Array, star: Point, start: Pixel, width: float) -> tuple[Po
     """Return where another star, scaled, explains the light at a pixel, and the rms of the rest."""
     pixel, half = nearest_pixel(star), math.ceil(WITHIN * width)
     square, found = cut_square(light, pixel, half + WINDOW // 2), cut_square(light, start, half)
-    scale = light[start] / light[pixel]
+    scale = light[start] / square.max()
 
     def residuals(parameters: Array) -> Array:
         move = np.subtract(pixel, star) + parameters[1:]

@@ -367,7 +367,7 @@ class Observation:
     def _refuse_other_shapes(self) -> None:
         """Refuse attributes whose shape is not that of the images or the PSFs."""
         images, n, psf = self.images.shape, self.n_images, self.psfs.shape[1:]
-        for name in OF_PSFS:  # of which there are none
+        for name in OF_PSFS:  # those left out take the shape of the PSFs
             if not len(getattr(self, name)):
                 vars(self)[name] = np.zeros((0, *psf))
         if not self.psf_modes.size:

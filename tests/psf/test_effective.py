@@ -81,6 +81,14 @@ def test_other_neighbours_are_taken_too(given):
     assert line(star, "neighbours").startswith("neighbours: 1 star not given, taken too; 0 ")
 
 
+def test_a_star_with_a_hole_beside_a_neighbour_is_refused():
+    frame = a_frame(4.0, [(60.2, 60.3), (85.1, 70.4)], [1.0, 0.4])
+    y, x = np.indices(SHAPE)
+    frame[np.hypot(x - 60, y - 60) < 8] = np.nan
+    with pytest.raises(InputError, match="has too few good pixels among"):
+        quiet(frame, (60, 60), 41)
+
+
 @pytest.mark.parametrize("fwhm", [2.0, 4.0])
 def test_two_stars_in_one_are_masked_as_no_neighbour(fwhm):
     other = np.array([PLACES[0]] * 2) + np.outer([6.0, 6.8], (fwhm, fwhm))
