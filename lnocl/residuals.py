@@ -110,7 +110,8 @@ class StarResiduals(NamedTuple):
         In the wings, down to a thousandth of the peak.
     halo : float
         Light of the extended source that lies all round the star and falls outwards, as a share of
-        the star's flux. A PSF that is too narrow, or without wings, leaves such light there.
+        the star's flux; 0 for a star of flux 0. A PSF that is too narrow, or without wings, leaves
+        such light there.
     halo_share : float
         The same light as a share of all that lies round the star.
 
@@ -184,7 +185,7 @@ def judge_stars(scene: Scene, sky: Array, star_fluxes: Array) -> list[StarResidu
             fits = _fits_at(scene, background[j], sky, star_fluxes, j, psf, position)
             core, wings = core.plus(fits[0]), wings.plus(fits[1])
         halo, light = _halo(sky[:ny, :nx], on_pixel, width)
-        shares = (halo / max(each, np.finfo(float).tiny) for each in (float(flux), light))
+        shares = (halo / each if each > 0 else 0.0 for each in (float(flux), light))
         found.append(StarResiduals(core, wings, *shares))
     return found
 

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from lnocl.parallel import Parallel
 
 SUMMARY = "summary.ecsv"
+# Lines of the table that is shown; the summary has all.
+MAX_ROWS = 40
 # Seconds between two writings of the summary.
 WRITE_EVERY = 10.0
 
@@ -369,10 +371,29 @@ def _said(summary: Table, n_old: int, folder: Folder) -> list[str]:
         "column verdict says"
     ]
     return [
+        *_rows(summary),
         f"{counted(len(summary), 'target')}: {counts}{before}",
         *(faults if n_faults else []),
         f"written to {os.path.join(folder.path, SUMMARY)}",
     ]
+
+
+def _rows(summary: Table) -> list[str]:
+    """Return the fluxes of the targets that are done as a table in text."""
+    done = summary[summary["status"] == DONE]
+    if not done:
+        return []
+    shown = done["name", "star_flux", "extended_flux", "unit"]
+    for name, after in (("star_flux", 2), ("extended_flux", 4)):
+        shown[name].info.format = ".6g"
+        errors = done[f"{name}_error"]
+        errors.info.format = ".2g"
+        shown.add_column(errors, after)
+    shown["model"] = [
+        "fits" if verdict.startswith(FITS) else "has faults" for verdict in done["verdict"]
+    ]
+    lines: list[str] = shown.pformat(max_lines=MAX_ROWS, max_width=-1, show_unit=False)
+    return lines
 
 
 def _explain_failures(summary: Table, own: Sequence[Target]) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from lnocl.commands import bootstrap, checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
-from lnocl.commands.summary import summarise, verdict_on
+from lnocl.commands.summary import extended_flux, summarise, verdict_on
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
 from lnocl.residuals import Fit, StarResiduals
@@ -97,7 +97,9 @@ def _run(arguments: argparse.Namespace) -> None:
             shown = arguments.models or arguments.residuals or arguments.plot
             view = view_of(result) if shown else None
             overall = Fit.of(view.residuals, view.models) if view else result.fit()
-            verdict = verdict_on(arguments, result, at_stars, overall, bool(warned))
+            verdict = verdict_on(
+                arguments, result, frames, given["stars"], at_stars, overall, bool(warned)
+            )
             lines = [*summarise(arguments, result, frames, at_stars, overall), *verdict]
             measured = _measured(result, frames, overall, verdict)
         wcs = fitsread.wcs_cards(frames.header)
@@ -171,7 +173,7 @@ def _write(
 
 def _measured(result: Result, frames: Frames, overall: Fit, verdict: Sequence[str]) -> list[Card]:
     """Return the cards of what is in no table, but for values that a card cannot hold."""
-    flux, error = (each / frames.electrons for each in result.extended_flux)
+    flux, error = (each / frames.electrons for each in extended_flux(result, frames))
     cards: list[Card] = [
         ("EXTFLUX", flux, "flux of the extended source"),
         ("EXTERROR", error, "its standard error"),

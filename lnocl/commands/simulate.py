@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 
-from lnocl.commands import messages
+from lnocl.commands import messages, options
 from lnocl.commands.options import option, output_folder
 from lnocl.commands.parser import Command
 
@@ -57,6 +57,7 @@ OPTIONS = [
         help="angle of the baseline in each image, from the x axis towards the y axis (default: "
         "0 45 90 135)",
     ),
+    options.QUIET,
 ]
 
 
@@ -69,7 +70,7 @@ def write(arguments: argparse.Namespace) -> list[str]:
     from lnocl.studies.files import write_simulation
 
     stars = arguments.stars and [Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
-    with messages.shown_log():
+    with messages.shown_log(arguments.quiet):
         target = load_target(arguments.scene, arguments.size, stars)
     units = {"angles": u.deg, "extended_magnitude": u.mag, "exposure_time": 1, "seed": 1}
     given = {name: getattr(arguments, name) for name in units}
@@ -84,6 +85,8 @@ def write(arguments: argparse.Namespace) -> list[str]:
 
 def _run(arguments: argparse.Namespace) -> None:
     words = write(arguments)
+    if arguments.quiet:
+        return
     messages.say(
         [
             f"images, PSFs, truth.fits and record.json written to {arguments.output}; to "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +13,8 @@ import numpy as np
 from lnocl.errors import counted
 from lnocl.residuals import Fit, StarResiduals
 from lnocl.result import Result
+from lnocl.scene.detector import on_sky
+from lnocl.scene.stars import MAX_SHIFT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,6 +26,10 @@ if TYPE_CHECKING:
 DARK_SHARE, FLOOR = 0.05, 0.5
 # How a verdict begins where nothing is wrong.
 FITS = "the model fits"
+# Where a star without light may be instead: so many pixels from its place.
+ELSEWHERE = 10
+# Of a star that was moved by this share of `MAX_SHIFT` more may be needed.
+AT_LIMIT = 0.99
 
 REASONS = {
     "n_iter": "all iterations were done",
@@ -47,15 +53,14 @@ def summarise(
     """Return how a reconstruction ended, and what it found, a line each."""
     objective = result.history["objective"][-1]
     device, _, _ = result.device.partition(" (")  # the header has its platform and driver
-    flux, error = result.extended_flux
     unit = re.sub(r"^(electron|photon)\b", r"\1s", frames.unit)
     stars = [
-        f"star at ({x:.7g}, {y:.7g}): {_flux(flux, error)} {unit}; residuals "
+        f"star at ({x:.7g}, {y:.7g}): {_flux(flux, error, frames)}; residuals "
         f"{_rms(found.core)} in its core, {_rms(found.wings)} in its wings, where noise gives 1"
         for (x, y), flux, error, found in zip(
             result.star_positions,
-            result.star_fluxes / frames.electrons,
-            result.star_flux_errors / frames.electrons,
+            result.star_fluxes,
+            result.star_flux_errors,
             at_stars,
             strict=True,
         )
@@ -64,7 +69,7 @@ def summarise(
         f"{counted(result.n_iter, 'iteration')} on {device}, objective {objective:.6g}",
         REASONS[result.stop_reason],
         *stars,
-        f"extended source: {_flux(flux / frames.electrons, error / frames.electrons)} {unit}",
+        f"extended source: {_flux(*extended_flux(result, frames), frames)} in the whole frame",
         *_floor(result, frames, unit),
         f"residuals {_rms(overall)} in all, where noise gives 1",
         *_shortness(arguments, result),
@@ -98,8 +103,29 @@ def _means(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(values.reshape(len(values), -1).mean(axis=1))
 
 
-def _flux(flux: float, error: float) -> str:
-    return f"{flux:.6g} +- {error:.2g}" if math.isfinite(error) else f"{flux:.6g}"
+def extended_flux(result: Result, frames: Frames) -> tuple[float, float]:
+    """Return the flux of the extended source, electrons, and its error.
+
+    The error is that of the result, and of the background where this was measured.
+    """
+    flux, error = result.extended_flux
+    observation = frames.observation
+    n_pixels = observation.images[0].size
+    of_level = n_pixels * float(np.linalg.norm(frames.background_errors))
+    return flux, math.hypot(error, of_level / float(_means(observation.exposure).sum()))
+
+
+def _flux(flux: float, error: float, frames: Frames) -> str:
+    """Return a flux and its error, electrons, in the unit of the images, and in electrons."""
+    units = {re.sub(r"^(electron|photon)\b", r"\1s", frames.unit): frames.electrons}
+    if frames.electrons != 1.0:
+        units["electrons" + "/s" * frames.unit.endswith("/s")] = 1.0
+    values = [f"{_number(flux / one, error / one)} {unit}" for unit, one in units.items()]
+    return " = ".join(values)
+
+
+def _number(value: float, error: float) -> str:
+    return f"{value:.6g} +- {error:.2g}" if math.isfinite(error) else f"{value:.6g}"
 
 
 def _rms(fit: Fit) -> str:
@@ -109,22 +135,36 @@ def _rms(fit: Fit) -> str:
 def verdict_on(
     arguments: argparse.Namespace,
     result: Result,
+    frames: Frames,
+    given_stars: Sequence[tuple[float, float]],
     at_stars: Sequence[StarResiduals],
     overall: Fit,
     is_warned: bool,
 ) -> list[str]:
     """Return that the model fits, or else where it does not and what to do, a line each."""
-    unfitted, lit, dark = [], [], []
-    for (x, y), flux, found in zip(
-        result.star_positions, result.star_fluxes, at_stars, strict=True
+    unfitted, lit, dark, lost = [], [], [], []
+    for place, given, flux, found in zip(
+        result.star_positions, given_stars, result.star_fluxes, at_stars, strict=True
     ):
         if not flux > 0:
-            dark.append(f"({x:.7g}, {y:.7g})")
+            dark.append(
+                f"{_at(place)}{_elsewhere(result.extended, place, frames.observation.oversample)}"
+            )
+            continue
+        if np.hypot(*(place - np.array(given))) > AT_LIMIT * MAX_SHIFT:
+            lost.append(f"{_at(given)} to {_at(place)}")
         if found.is_misfit:
-            unfitted.append(f"({x:.7g}, {y:.7g})")
+            unfitted.append(_at(place))
         if found.has_halo:
-            lit.append(f"({x:.7g}, {y:.7g}), {100 * found.halo:.0f} %")
+            lit.append(f"{_at(place)}, {100 * found.halo:.0f} %")
     verdict = []
+    if dark:
+        verdict.append(f"no light is left for {counted(len(dark), 'star')}: {'; '.join(dark[:3])}")
+    if lost:
+        verdict.append(
+            f"{counted(len(lost), 'star')} moved as far as stars may, {MAX_SHIFT:g} pixels, from "
+            f"{'; '.join(lost[:3])}: give the place where it is brightest"
+        )
     if unfitted:
         by_default = [] if isinstance(arguments.smoothing, float) else ["pixels"]
         may_free = "pixels" not in (arguments.refine_psfs or by_default)
@@ -133,13 +173,8 @@ def verdict_on(
             f"{' '.join(unfitted[:3])}: give a better PSF"
             + (", or try --refine-psfs jitter pixels" if may_free else "")
         )
-    elif overall.is_misfit:
+    elif overall.is_misfit and not (dark or lost):
         verdict.append("the model does not fit: see to background, noise and gain")
-    if dark:
-        verdict.append(
-            f"no light is left for {counted(len(dark), 'star')}, {' '.join(dark[:3])}: there is "
-            "none, or it is elsewhere; lnocl stars finds where"
-        )
     refinement = result.psf_refinement
     is_fitted = refinement is not None and refinement.has_free_pixels  # which follow the noise
     if overall.is_overfit and not is_fitted:
@@ -155,4 +190,26 @@ def verdict_on(
             f"{'; '.join(lit[:3])}: the PSF is too narrow or lacks its wings, the background is "
             "too low, or a source lies there"
         )
-    return verdict or [f"{FITS}, but see the warnings above" if is_warned else FITS]
+    return verdict or [f"{FITS}, but see the warnings of the run" if is_warned else FITS]
+
+
+def _at(place: Iterable[float]) -> str:
+    x, y = place
+    return f"({x:.7g}, {y:.7g})"
+
+
+def _elsewhere(extended: NDArray[np.float64], place: NDArray[np.float64], finer: int) -> str:
+    """Return where the brightest light near a star without light is, and what to do."""
+    x, y = np.round(on_sky(place, finer)).astype(int)
+    reach = ELSEWHERE * finer
+    rows, columns = (slice(max(at - reach, 0), max(at + reach + 1, 0)) for at in (y, x))
+    around = extended[rows, columns]
+    if not around.any():
+        return ", nor near it: leave it out"
+    row, column = np.unravel_index(int(around.argmax()), around.shape)
+    at = np.array([columns.start + column, rows.start + row], float)
+    brightest = (at - (finer - 1) / 2.0) / finer
+    return (
+        f", and the brightest light within {ELSEWHERE} pixels lies at {_at(brightest)}: give the "
+        "star's place, or leave it out"
+    )

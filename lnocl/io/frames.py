@@ -125,6 +125,8 @@ class Frames(NamedTuple):
         Electrons, or electrons per second, in this unit.
     gain : float, optional
         As given, or as the headers have it.
+    background_errors : ndarray of float64, shape (p,)
+        Standard errors of the backgrounds that ``"auto"`` found, electrons per pixel; 0 of others.
     """
 
     observation: Observation
@@ -135,6 +137,7 @@ class Frames(NamedTuple):
     unit: str
     electrons: float
     gain: float | None
+    background_errors: Array
 
 
 def read_frames(images: Sequence[str], psfs: Sequence[str], calibration: Calibration) -> Frames:
@@ -173,6 +176,7 @@ class _Reader:
         if len(self._grids) not in (0, len(psfs)):
             raise InputError("give grids of PSFs for all images, or for none")
         self._maps = Maps(self._images.data.shape)
+        self._background_errors = np.zeros(len(self._images.data))
         self._sha256: dict[str, list[str]] = {}
 
     def frames(self) -> Frames:
@@ -229,6 +233,7 @@ class _Reader:
             name,
             of_unit,
             self._gain,
+            self._background_errors,
         )
 
     def _psf_errors(self) -> dict[str, Any]:
@@ -522,11 +527,14 @@ class _Reader:
 
     def _background(self, counts: Array, mask: Mask) -> list[Word]:
         """Return the background with numbers in the place of "auto"."""
-        return self._maps.fill(
-            "background",
-            self._calibration.background,
-            lambda j, word: sky_level(j, counts[j], mask[j]) if word == "auto" else None,
-        )
+
+        def electrons(j: int, word: str) -> float | None:
+            if word != "auto":
+                return None
+            level, self._background_errors[j] = sky_level(j, counts[j], mask[j])
+            return level
+
+        return self._maps.fill("background", self._calibration.background, electrons)
 
     def _without_sky(self, counts: Array, background: list[Word]) -> list[Word]:
         """Return the background, but for what is below 0, which is taken from the counts.

@@ -17,8 +17,11 @@ FEW = 0.1
 LAG = 3
 
 
-def sky_level(j: int, counts: Array, mask: Mask) -> float:
-    """Return the background of image j, as `clipped_sky`; negative where too much was subtracted.
+def sky_level(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
+    """Return the background of image j and its standard error, both electrons per pixel.
+
+    It is the median of `clipped_sky`, whose error is ``sqrt(pi / 2)`` that of a mean. It is
+    negative where too much was subtracted.
 
     Raises
     ------
@@ -26,15 +29,15 @@ def sky_level(j: int, counts: Array, mask: Mask) -> float:
         No pixel is good.
     """
     median, scatter = clipped_sky(j, counts, mask)
+    n_pixels = np.count_nonzero(~mask & np.isfinite(counts))
+    error = scatter * np.sqrt(np.pi / 2.0 / n_pixels)
     note(
-        "`images[%d]`: background %.6g electrons per pixel, scatter %.3g (sigma-clipped median)",
-        j,
-        median,
-        scatter,
+        f"`images[{j}]`: background {median:.6g} +- {error:.2g} electrons per pixel, scatter "
+        f"{scatter:.3g} (sigma-clipped median)"
     )
     if median < 0:
         note("`images[%d]`: its sky was subtracted; %.6g electrons are added again", j, -median)
-    return median
+    return median, float(error)
 
 
 def sky_noise(j: int, counts: Array, mask: Mask) -> float:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
+import warnings
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lnocl.errors import FileError, InputError, LnoclError
+from lnocl.errors import FileError, InputError, LnoclError, note
 from lnocl.io.sky import celestial_wcs
 from lnocl.scene.apertures import Aperture, Profile
 
@@ -92,7 +94,9 @@ def _in_pixels(given: Given, header: fits.Header | None) -> list[_Found]:
     words = _regions().TextPixelRegion, _regions().TextSkyRegion
     found = [region for region in found if not isinstance(region, words)]
     if not found:
-        raise FileError(f"{path} holds no regions: draw circles, ellipses, boxes or polygons")
+        raise FileError(
+            f"{path} holds no regions: draw circles, ellipses, boxes, annuli or polygons"
+        )
     listed = [_one_in_pixels(region, k, path, header) for k, region in enumerate(found, 1)]
     names = [each.name for each in listed]
     return [
@@ -116,12 +120,29 @@ def _read(path: str) -> list[Any]:
     if not os.path.isfile(path):
         raise FileError(f"{path} is not there: give a file of regions, such as DS9 writes")
     try:
-        return list(regions.Regions.read(path))
+        with warnings.catch_warnings(record=True) as skipped:
+            warnings.simplefilter("always")
+            found = list(regions.Regions.read(path))
+        if not found:
+            return _read_without_frame(path)
+        for each in skipped:
+            warnings.warn(each.message, stacklevel=2)
+        return found
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
     except Exception as error:  # its parsers raise many
         words = " ".join(str(error).split()) or type(error).__name__
         raise FileError(f"{path} holds no regions as DS9 writes them: {words}") from error
+
+
+def _read_without_frame(path: str) -> list[Any]:
+    """Return regions of a file of DS9 that names no coordinates but physical ones: pixels."""
+    with open(path, encoding="utf-8") as file:
+        text = "image\n" + re.sub(r"(?im)^[ \t]*physical\b", "image", file.read())
+    found = list(_regions().Regions.parse(text, format="ds9"))
+    if found:
+        note(f"{path} names no coordinates: its regions are taken in pixels of the image")
+    return found
 
 
 def _one_in_pixels(region: Any, number: int, path: str, header: fits.Header | None) -> _Found:
@@ -182,15 +203,32 @@ def _refuse_outside(described: str, region: Any, shape: tuple[int, int]) -> None
         raise InputError(f"{described} lies outside the image of {nx} x {ny} pixels, or partly")
 
 
+def _filled(region: Any, which: str) -> Any:
+    """Return the outer or the inner shape of an annulus, whose difference it is; else None."""
+    kind, is_annulus, end = type(region).__name__.partition("Annulus")
+    if not is_annulus:
+        return None
+    lengths = ("radius",) if kind == "Circle" else ("width", "height")
+    sides = [getattr(region, f"{which}_{each}") for each in lengths]
+    turned = {} if kind == "Circle" else {"angle": region.angle}
+    return getattr(_regions(), kind + end)(region.center, *sides, **turned)
+
+
 def _aperture(name: str, described: str, region: Any, shape: tuple[int, int]) -> Aperture:
     _refuse_outside(described, region, shape)
+    outer, inner = _filled(region, "outer"), _filled(region, "inner")
     try:
-        mask = region.to_mask(mode="exact")
+        mask = (outer or region).to_mask(mode="exact")
     except NotImplementedError as error:
         raise InputError(
-            f"{described} cannot be summed over: give circles, ellipses, boxes or polygons"
+            f"{described} cannot be summed over: give circles, ellipses, boxes, annuli or polygons"
         ) from error
     weights = np.asarray(mask.data, np.float64)
+    if inner is not None:
+        hole = inner.to_mask(mode="exact")
+        rows, columns = hole.bbox.iymin - mask.bbox.iymin, hole.bbox.ixmin - mask.bbox.ixmin
+        height, width = hole.data.shape
+        weights[rows : rows + height, columns : columns + width] -= hole.data
     inside = mask.cutout(np.ones(shape), fill_value=0.0)
     total = weights.sum()
     if inside is None or (weights * (inside == 0)).sum() > ROUNDING * total:

@@ -378,7 +378,7 @@ def count_negative(psf: Array, clip: bool) -> tuple[Array, str]:
     """Return the PSF with its negative pixels, or with 0 in their place."""
     negative = psf < 0
     share = _percent(psf[negative].sum() / psf.sum())
-    done = "set to 0" if clip else "left as they are"
+    done = "set to 0, which adds as much to it" if clip else "left as they are"
     line = f"negative pixels: {negative.sum()}, {share} of the flux; {done}"
     return (np.where(negative, 0.0, psf) if clip else psf), line
 

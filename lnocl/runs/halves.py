@@ -13,6 +13,7 @@ from lnocl.runs.run import Run
 from lnocl.runs.saved import LARGEST, Saved
 from lnocl.runs.start import Start
 from lnocl.scene.arrays import Array
+from lnocl.scene.stars import MAX_SHIFT
 from lnocl.solvers.engine import State
 
 # The ratio of one iteration of which a snapshot is taken to that before.
@@ -195,11 +196,7 @@ def take(saved: Saved, name: str, start: Start, n_iter: int) -> list[Snapshot]:
     FileError
         No such halves have such snapshots within `n_iter` iterations.
     """
-    reach = 0.0
-    if start.refines:
-        from lnocl.solvers.positions import RADIUS
-
-        reach = RADIUS * (1.0 + 1e-9)  # which rounding may exceed
+    reach = MAX_SHIFT * (1.0 + 1e-9) if start.refines else 0.0  # which rounding may exceed
     low, high = start.given_stars - reach, start.given_stars + reach
     whole, double = np.dtype(np.int64), np.dtype(np.float64)
     iterations = saved.take(f"{name}_iteration", whole, (range(1, n_iter + 1),), 1, n_iter)

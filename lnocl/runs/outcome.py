@@ -14,6 +14,7 @@ from lnocl.runs.start import Start
 from lnocl.scene.arrays import Array
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
+from lnocl.scene.stars import MAX_SHIFT
 
 if TYPE_CHECKING:
     from lnocl.solvers.light import Light
@@ -183,7 +184,6 @@ class Outcome:
         LnoclWarning
             The images do not determine flux and position of a star.
         """
-        from lnocl.solvers.positions import RADIUS
         from lnocl.solvers.star_errors import standard_errors
 
         scene, moves = self.scene, self.given_stars is not None
@@ -200,5 +200,5 @@ class Outcome:
             of_psfs = np.hypot(refinement.psf_error, refinement.hidden_error)
             errors[:, 0] = np.hypot(errors[:, 0], of_psfs * self.star_fluxes)
         positions = errors[:, 1:]
-        positions[positions > RADIUS] = np.nan  # no star is moved farther
+        positions[positions > MAX_SHIFT] = np.nan  # no star is moved farther
         return errors[:, 0], positions

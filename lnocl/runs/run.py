@@ -21,6 +21,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
+from lnocl.scene.stars import MAX_SHIFT
 from lnocl.solvers import SOLVERS
 from lnocl.solvers.engine import Engine, State
 from lnocl.solvers.sgp import ALPHA_BOUNDS, Steps
@@ -194,9 +195,7 @@ class Run:
     def _bounds_of_stars(self) -> tuple[ArrayLike, ArrayLike]:
         if not self._refines:
             return self.scene.stars, self.scene.stars
-        from lnocl.solvers.positions import RADIUS
-
-        reach = RADIUS * (1.0 + 1e-9)  # which rounding may exceed
+        reach = MAX_SHIFT * (1.0 + 1e-9)  # which rounding may exceed
         return self._given_stars - reach, self._given_stars + reach
 
     def _take_windows(self, saved: Saved, own: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -14,6 +14,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
+from lnocl.scene.stars import MAX_SHIFT
 
 if TYPE_CHECKING:
     from lnocl.scene.forward_model import Model
@@ -116,11 +117,7 @@ def make_start(
     InputError
         As `deconvolve`.
     """
-    max_shift = 0.0
-    if setup.refine_positions:
-        from lnocl.solvers.positions import RADIUS
-
-        max_shift = RADIUS
+    max_shift = MAX_SHIFT if setup.refine_positions else 0.0
     scene = Scene(observation, setup.stars, penalty, setup.pad, max_shift)
     given = scene.stars
     extended, star_fluxes = scene.start(initial_extended, initial_star_fluxes)

@@ -20,6 +20,9 @@ from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf, Window, window
 # Pixels of a flattened array: a slice where they are all of it, which takes no gathering.
 Pixels = NDArray[np.intp] | slice
 
+# How far from where it was given a star may be moved, pixels.
+MAX_SHIFT = 3.0
+
 # Side of the squares of pixels in which products of images are summed, by matrices of stars and
 # pixels that a cache holds.
 TILE = 32

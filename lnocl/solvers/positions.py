@@ -15,12 +15,11 @@ from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.forward_model import ROUNDING, Model
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf
-from lnocl.scene.stars import Order, Piece, StarImages, covered_pixels, order_of, places
+from lnocl.scene.stars import MAX_SHIFT, Order, Piece, StarImages, covered_pixels, order_of, places
 from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood
 
-# How far from where it was given a star may go, in pixels.
-RADIUS = 3.0
-# And in one step: the likelihood is a parabola in a part of the PSF's core only.
+# The farthest that a star goes in one step, pixels: the likelihood is a parabola in a part of the
+# PSF's core only.
 MAX_STEP = 0.5
 # Share of the information on a position that the pixels of the fit must hold: far wings say little
 # and are many.
@@ -71,7 +70,7 @@ class StarFit:
     extended : ndarray of float64, shape (Ny, Nx)
         Extended source, on the grid and scaled.
     given : ndarray of float64, shape (n, 2)
-        Positions that the stars must stay within `RADIUS` of.
+        Positions that the stars must stay within `MAX_SHIFT` of.
     """
 
     def __init__(self, scene: Scene, model: Model, extended: Array, given: Array) -> None:
@@ -184,7 +183,9 @@ class StarFit:
         n = len(stars.fluxes)
         fluxes = np.maximum(stars.fluxes + step[:n], MAX_FADING * stars.fluxes)
         moves = _shorten(step[n:].reshape(2, n).T, MAX_STEP)
-        return Stars(fluxes, self._given + _shorten(stars.positions + moves - self._given, RADIUS))
+        return Stars(
+            fluxes, self._given + _shorten(stars.positions + moves - self._given, MAX_SHIFT)
+        )
 
 
 class _MovableStars:
@@ -276,7 +277,7 @@ class _MovableStars:
 
 def _square(shape: tuple[int, ...], position: Array, scene: Scene) -> Cutout:
     """Return the part of an image that a star may light, wherever it goes from a position."""
-    margin = int(np.ceil(RADIUS)) + MARGIN + 1
+    margin = int(np.ceil(MAX_SHIFT)) + MARGIN + 1
     sizes = (-(-k // scene.oversample) + 2 * margin for k in shape)
     height, width = map(min, sizes, scene.image_grid)
     x, y = np.floor(position + 0.5).astype(int).tolist()

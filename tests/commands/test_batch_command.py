@@ -47,8 +47,8 @@ def test_each_target_is_what_its_command_gives(capsys):
     assert batch() == 0
     said = capsys.readouterr()
     assert said.err == ""
-    assert said.out == (
-        "2 targets: 2 done\nin 2 of the 2 that are done the model has faults, which the column "
+    assert said.out.endswith(
+        "\n2 targets: 2 done\nin 2 of the 2 that are done the model has faults, which the column "
         f"verdict says\nwritten to {os.path.abspath('out/summary.ecsv')}\n"
     )
     assert sorted(os.listdir("out")) == [
@@ -79,7 +79,7 @@ def test_the_summary_says_what_was_found_and_whether_it_fits(capsys):
     assert cli.main(command) == 0
     one, said = found["one"], capsys.readouterr().out
     star = "star at (7, 5): {star_flux:.6g} +- {star_flux_error:.2g} {unit}s; ".format(**one)
-    light = "extended source: {extended_flux:.6g} +- {extended_flux_error:.2g} {unit}s\n"
+    light = "extended source: {extended_flux:.6g} +- {extended_flux_error:.2g} {unit}s in "
     assert star in said
     assert light.format(**one) in said
     assert f"residuals {one['residual_rms']:.2f} +- " in said
@@ -89,7 +89,14 @@ def test_the_summary_says_what_was_found_and_whether_it_fits(capsys):
     assert np.isnan(found["flat"]["star_flux"])
     assert np.isnan(found["lost"]["residual_rms"])
     assert batch() == 1  # those that are done are not done again
-    assert "in 1 of the 2 that are done the model has faults" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "in 1 of the 2 that are done the model has faults" in said
+    rows = [line.split() for line in said.splitlines()[2:4]]
+    assert [(row[0], *row[-2:]) for row in rows] == [
+        ("one", "has", "faults"),
+        ("flat", "electron", "fits"),
+    ]
+    assert rows[0][1:3] == ["{star_flux:.6g}".format(**one), "{star_flux_error:.2g}".format(**one)]
     assert summary()["one"] == one
 
 

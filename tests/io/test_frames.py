@@ -129,10 +129,12 @@ class TestBackground:
         stats = [sigma_clipped_stats(15.0 * image) for image in images]
         assert found.background == [median for _, median, _ in stats]
         np.testing.assert_array_equal(found.observation.background, found.background)
-        for j, (_, median, scatter) in enumerate(stats):
+        errors = [scatter * (np.pi / 2 / images[0].size) ** 0.5 for _, _, scatter in stats]
+        np.testing.assert_allclose(found.background_errors, errors, rtol=1e-14)
+        for j, ((_, median, scatter), error) in enumerate(zip(stats, errors, strict=True)):
             assert (
-                f"image {j}: background {median:.6g} electrons per pixel, scatter {scatter:.3g} "
-                "(sigma-clipped median)"
+                f"image {j}: background {median:.6g} +- {error:.2g} electrons per pixel, scatter "
+                f"{scatter:.3g} (sigma-clipped median)"
             ) in notes(log)
 
     @pytest.mark.filterwarnings("ignore:.* % of image . are masked")

@@ -41,6 +41,27 @@ def test_shares_sum_to_the_area_and_lie_where_the_region_is(tmp_path):
         assert 0 <= each.weights.min() <= each.weights.max() <= 1 + 1e-12
 
 
+def test_an_annulus_lacks_its_hole(tmp_path):
+    annulus, disc, hole = read(
+        "image\nannulus(21.3,20.6,3,6)\ncircle(21.3,20.6,6)\ncircle(21.3,20.6,3)", tmp_path
+    )
+    sky = np.random.default_rng(0).random(SHAPE)
+    assert annulus.flux(sky) == pytest.approx(disc.flux(sky) - hole.flux(sky), rel=1e-12)
+    turned = read("image\nellipse(21,20,2,3,4,6,30)\nbox(21,20,4,6,9,12,30)", tmp_path)
+    areas = [np.pi * (4 * 6 - 2 * 3), 9 * 12 - 4 * 6]
+    np.testing.assert_allclose([each.n_pixels for each in turned], areas, rtol=1e-6)
+
+
+@pytest.mark.parametrize("frame", ["", "physical\n", "global color=red\nPhysical; "])
+def test_a_file_that_names_no_coordinates_is_in_pixels(frame, tmp_path, caplog):
+    with caplog.at_level("INFO", "lnocl"):
+        (found,) = read(f"{frame}circle(20,15,5)\n", tmp_path)
+    (expected,) = read("image\ncircle(20,15,5)", tmp_path)
+    assert (found.y, found.x) == (expected.y, expected.x)
+    np.testing.assert_array_equal(found.weights, expected.weights)
+    assert "a.reg names no coordinates: its regions are taken in pixels" in caplog.text
+
+
 def test_a_region_on_the_sky_is_that_in_pixels(tmp_path):
     (found,) = read('icrs\ncircle(30.0,10.0,1.8")', tmp_path, WCS)
     (expected,) = read("image\ncircle(20,15,5)", tmp_path)
@@ -60,7 +81,6 @@ def test_regions_may_be_given_themselves():
         ("image\ncircle(100,21,4)", r"^region 1 \(circle\) lies outside the image of 50 x 40"),
         ("image\ncircle(2,21,4) # text={a}", r"^a of .*a.reg \(circle\) lies .*, or partly$"),
         ("image\npoint(3,3)", r"^region 1 \(point\) cannot be summed over: give circles, ellipses"),
-        ("image\nannulus(20,20,3,6)", r"\(circleannulus\) cannot be summed over"),
         ("icrs\ncircle(30,10,1\")", r"is on the sky, and the image has no header: give pixels$"),
         ("image\n-circle(20,20,4)", r"^region 1 \(circle\) is to be left out of others: draw what"),
         ("image\ncircle(20,20,1e7)", r"^region 1 \(circle\) lies outside the image of 50 x 40"),

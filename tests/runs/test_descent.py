@@ -33,7 +33,7 @@ def observe(seed, noise=0.03, level=0.0):
     image = rng.poisson(np.maximum(np.fft.irfft2(np.fft.rfft2(disc()) * transfer), 0) + 50)
     psf = gaussian() + noise * rng.standard_normal((SIZE, SIZE)) + level
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".* psf pixels are negative and were kept")
+        warnings.filterwarnings("ignore", ".* psf pixels are negative and were kept.*")
         return lnocl.Observation(image, psf, background=50.0)
 
 

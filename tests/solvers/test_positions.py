@@ -19,8 +19,9 @@ from lnocl.runs.start import Setup, make_start
 from lnocl.scene.forward_model import Model
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
+from lnocl.scene.stars import MAX_SHIFT
 from lnocl.solvers import fluxes, positions, scaling
-from lnocl.solvers.positions import RADIUS, StarFit, Stars
+from lnocl.solvers.positions import StarFit, Stars
 
 # PSFs here are small, and whole offsets periodic.
 pytestmark = pytest.mark.filterwarnings(
@@ -74,7 +75,7 @@ def whole_psfs(monkeypatch):
 def fit_of(name, fluxes=(2.5e3, 1.1e3, 3e3)):
     """Return the recipe's arrays, its scene, the fit, and stars off the truth."""
     made = RECIPES[name].make()
-    scene = Scene(made.observation(), made.stars, max_shift=RADIUS)
+    scene = Scene(made.observation(), made.stars, max_shift=MAX_SHIFT)
     extended, _ = scene.start(made.sky, None)
     n = len(made.stars)
     off = np.array([(0.42, -0.73), (-1.15, 0.3), (0.0, 0.55)])[:n]
@@ -212,7 +213,7 @@ def flat_sky(x, y, flux, level, seed, **known):
 
 
 def fitted(observation, given, level, flux):
-    scene = Scene(observation, [given], max_shift=RADIUS)
+    scene = Scene(observation, [given], max_shift=MAX_SHIFT)
     fit = StarFit(scene, Model(scene), np.zeros(scene.grid), scene.stars)
     stars = fit.minimise(Stars(np.array([flux / scene.unit]), scene.stars))
     errors = errors_of(fit, stars) * (scene.unit, 1.0, 1.0)
@@ -240,11 +241,11 @@ def test_a_star_keeps_within_its_radius():
         values, _ = fitted(observation, given, 5.0, 5000.0)
         gone = np.hypot(*(values[1:] - given))
         if away:
-            assert gone == pytest.approx(RADIUS, abs=1e-12)
+            assert gone == pytest.approx(MAX_SHIFT, abs=1e-12)
         else:
             assert np.hypot(*(values[1:] - (15, 16))) <= 0.1
     result = paper(observation, [(20, 16)], n_iter=20, refine_positions=True, **numpy_alone)
-    assert np.hypot(*(result.star_positions[0] - (20, 16))) <= RADIUS + 1e-12
+    assert np.hypot(*(result.star_positions[0] - (20, 16))) <= MAX_SHIFT + 1e-12
 
 
 def test_a_star_without_light_is_left_alone():
@@ -284,11 +285,11 @@ def test_box_that_a_star_may_light_holds_it_wherever_it_goes(shape):
     psf[4, 2] = 1.0  # the rest of it is empty
     observation = lnocl.Observation(np.ones((2, *shape)), psf, offsets=[(0, 0), (1.5, -3.25)])
     for given in ((30.0, 10.0), (30.5, 10.5), (30.2, 0.0)):
-        scene = Scene(observation, [given], max_shift=RADIUS)
+        scene = Scene(observation, [given], max_shift=MAX_SHIFT)
         rows, columns = scene.star_box(0)
         fit = StarFit(scene, Model(scene), np.ones(scene.grid), scene.stars)
         for angle in np.linspace(0, 2 * np.pi, 17):
-            position = np.array(given) + RADIUS * np.array([np.cos(angle), np.sin(angle)])
+            position = np.array(given) + MAX_SHIFT * np.array([np.cos(angle), np.sin(angle)])
             scene.move_stars([position])
             for j in range(2):
                 cutout = scene.star_cutout(j, 0)
