@@ -114,8 +114,8 @@ def deconvolve(
         down that grows with the iterations, most of all beside bright stars. "auto" is a tenth of
         the noise of the data term's gradient, ``0.1 sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, with < >
         the mean over pixels. With held-out counts it is 0, or 1, 3 or 10 times that, whichever they
-        choose (:doc:`/validation/sgp`). Where PSFs do not fit the stars it is 3 times that, and
-        more near the stars. See Notes.
+        choose (:doc:`/validation/sgp`). Where PSFs do not fit the stars it is 3 times that. It is
+        more near the stars, as far as rings round these show an error of the PSFs. See Notes.
     solver : {"sgp", "sgm"}, optional
         Iteration to use. "sgp" is the scaled gradient projection method. It solves for the star
         fluxes at the start, so that those given matter little. "sgm" is the split-gradient method,
@@ -270,8 +270,10 @@ def deconvolve(
 
     What is left, a relative error κ of the PSFs, adds to λ twice the standard deviation of the data
     term's gradient by it, ``2 sqrt(sum_j (A_j^2)^T (κ S_j / m_j)^2)``, with S_j the starlight. So
-    does a ``psf_scatter`` that is given, and the error that free pixels have mended. The run then
-    ends where the objective hardly changes any more (:doc:`/validation/psf`). Where `smoothing` is
+    does a ``psf_scatter`` that is given, and the error that free pixels have mended. It is the
+    error in each ring round the stars, where it is two standard deviations or more. The run then
+    ends where the objective hardly changes any more (:doc:`/validation/psf`). Where single rings
+    show an error and all of them together show none, held-out counts choose λ. Where `smoothing` is
     a number, it stays as it is, scatter or not, and PSFs are judged only where `refine_psfs` names
     families or a scatter is given. PSFs that vary over the field are not judged, nor, unless
     families are named, those of more than 64 stars in the window. Stars whose positions are not
@@ -345,8 +347,9 @@ def deconvolve(
             observation, refinement = mended.observation, mended.refinement
             near_stars, fits = mended.near_stars, mended.fits
             setup = replace(setup, refine_positions=mended.moves)
-    penalties = read_penalties(mu, smoothing, stop, observation, near_stars)
-    if is_auto and near_stars is not None and stop == "held-out":
+    are_psfs_wrong = is_auto and near_stars is not None and not fits
+    penalties = read_penalties(mu, smoothing, stop, observation, near_stars, are_psfs_wrong)
+    if are_psfs_wrong and stop == "held-out":
         stop = CONVERGED
     if engine == "opencl" and precision == "single":
         warn_of_rounding(int(n_iter))

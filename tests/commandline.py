@@ -52,7 +52,7 @@ def command_files(tmp_path_factory):
         "three": psfs[[0, 1, 0]],
         "zero": np.zeros((7, 7)),
         "nanpsf": nan_psf,
-        "negative": psfs[0] - 0.05,
+        "negative": psfs[0] - 0.15,
     }
     header = fits.Header(
         {"BUNIT": "electron", "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 15.25}

@@ -134,7 +134,7 @@ class HeldOutCounts:
             )
         penalty = self._penalties[best.trial]
         if len(self._penalties) > 1:
-            note("`smoothing` chosen: %.3g, by held-out counts", penalty.smoothing)
+            note(f"`smoothing` chosen: {penalty.in_words()}, by held-out counts")
         outcome = self._outcome(best.chosen, penalty, best.objectives, "held-out")
         return replace(outcome, curve=np.concatenate(self._curves))
 

@@ -242,11 +242,12 @@ def read_penalties(
     stop: object,
     observation: Observation,
     near_stars: Array | None = None,
+    are_psfs_wrong: bool = False,
 ) -> list[Penalty]:
     """Return the penalty; for smoothing "auto" with held-out counts those to choose from.
 
     There is one alone where the PSFs are wrong: held-out counts share that error, and choose too
-    little. `near_stars` is the weight that the error asks for near stars.
+    little. `near_stars` is the weight that an error of the PSFs asks for near stars.
 
     Raises
     ------
@@ -260,17 +261,16 @@ def read_penalties(
     if smoothing != "auto":
         raise InputError(f"`smoothing` {smoothing!r} is not known; give a number or auto")
     recommended = recommend_smoothing(observation)
-    if near_stars is not None:
-        weight = WRONG_PSFS * recommended
-        note(
-            f"`smoothing` chosen: {weight:.3g}, and up to {near_stars.max():.3g} more at the "
-            "stars, by the error of the PSFs"
-        )
-        return [Penalty(mu, weight, near_stars=near_stars)]
+    if are_psfs_wrong and near_stars is not None:
+        penalty = Penalty(mu, WRONG_PSFS * recommended, near_stars=near_stars)
+        note(f"`smoothing` chosen: {penalty.in_words()}, by the error of the PSFs")
+        return [penalty]
     if stop == "held-out":
-        return [Penalty(mu, multiple * recommended) for multiple in (0.0, *MULTIPLES)]
-    note("`smoothing` chosen: %.3g, by the noise of the counts", recommended)
-    return [Penalty(mu, recommended)]
+        weights = [multiple * recommended for multiple in (0.0, *MULTIPLES)]
+        return [Penalty(mu, weight, near_stars=near_stars) for weight in weights]
+    penalty = Penalty(mu, recommended, near_stars=near_stars)
+    note(f"`smoothing` chosen: {penalty.in_words()}, by the noise of the counts")
+    return [penalty]
 
 
 def warn_of_rounding(n_iter: int) -> None:

@@ -41,7 +41,7 @@ class Allowance:
     error : float
         Relative to the PSFs: what is left at the stars, or the scatter that is given.
     edges, in_rings : ndarray of float64, shapes (k + 1,) and (k,)
-        Radii of rings round a star, pixels, and the error in each.
+        Radii of rings round a star, pixels, and the error in each; 0 where `error` is.
     """
 
     def __init__(
@@ -52,7 +52,8 @@ class Allowance:
         self._moved = estimate.scene.stars - runs.stars
         self._stars = runs.all_stars
         self.error = misfit.kappa if misfit.is_significant else 0.0
-        shares = misfit.in_rings * bool(self.error)
+        # Those that are told, and those that the smoothing follows.
+        shares = np.array([misfit.in_rings * bool(self.error), misfit.in_rings])
         rings = rings_of(observation.psfs, observation.oversample)
         if len(scatter):
             errors, lights = (
@@ -63,18 +64,24 @@ class Allowance:
             # Where PSFs give next to nothing, a share of them means nothing.
             least = np.bincount(rings.number.ravel()) * (DARK * observation.psfs.max()) ** 2
             known = np.divide(errors, lights, out=np.zeros_like(errors), where=lights > least)
-            k = max(len(shares), len(known))
-            shares, known = (np.pad(each, (0, k - len(each)), "edge") for each in (shares, known))
-            shares = np.maximum(shares, np.sqrt(known))
-        self.in_rings = shares[: len(rings)]
+            k = max(shares.shape[1], len(known))
+            told, shown, known = (
+                np.pad(each, (0, k - len(each)), "edge") for each in (*shares, known)
+            )
+            shares = np.maximum([told, shown], np.sqrt(known))
+        self.in_rings, self._shown = shares[:, : len(rings)]
         self.edges = rings.edges[: len(self.in_rings) + 1]
 
     def near_stars(self, pad: int | str) -> Array | None:
-        """Return the weight of the edge-preserving term for these errors, None for 0."""
-        if not self.in_rings.any():
+        """Return the weight of the edge-preserving term for these errors, None for 0.
+
+        What single rings show counts, though all of them together may show no error: an extended
+        source that is free there takes the light of the star for it.
+        """
+        if not self._shown.any():
             return None
         scene, fluxes = self._scene(pad)
-        return smoothing_near_stars(scene, make_model(scene), fluxes, self.in_rings, STRENGTH)
+        return smoothing_near_stars(scene, make_model(scene), fluxes, self._shown, STRENGTH)
 
     def scatter(self) -> Array:
         """Return the standard deviations of the PSFs' pixels; of shape (0, ky, kx) for no error."""

@@ -68,20 +68,15 @@ class Mended(NamedTuple):
         The outcome for the PSFs; None where they fit, and nothing was asked of them.
     near_stars : ndarray of float64, of the shape of the extended source, or None
         The weight of the edge-preserving term that the error of the PSFs asks for; None for 0.
-    is_judged : bool
-        Whether the PSFs were looked at.
+    fits : bool
+        Whether the PSFs were judged, and no error is left that noise does not explain.
     """
 
     observation: Observation
     moves: bool
     refinement: PsfRefinement | None
     near_stars: Array | None
-    is_judged: bool = True
-
-    @property
-    def fits(self) -> bool:
-        """Whether the PSFs were looked at, and nothing is left to allow for."""
-        return self.is_judged and self.near_stars is None
+    fits: bool
 
 
 @dataclass(frozen=True)
@@ -142,7 +137,7 @@ def mend(
     if len(runs.stars) > MOST_STARS and not (is_asked or len(observation.psf_scatter)):
         number = counted(len(runs.stars), "star")
         note(f"PSFs are not judged: {number} in the window; name `refine_psfs` to judge them")
-        return Mended(observation, moves is True, None, None, is_judged=False)
+        return Mended(observation, moves is True, None, None, False)
     given = _State(
         observation.psfs, runs.fit(observation.psfs, runs.stars, moves is True), moves is True
     )
@@ -168,11 +163,12 @@ def mend(
         observation = observation.replace(psfs=state.psfs)
     known = observation.psf_scatter
     is_told = state is not given or given.misfit.is_significant
-    if not (is_asked or len(known) or is_told):
-        return Mended(observation, state.moves, None, None)
-    _tell(given, state, tried, is_accepted)
     estimate = replace(state.estimate, misfit=left or state.misfit)
     allowance = Allowance(observation, runs, estimate, known)
+    near_stars = allowance.near_stars(setup.pad)
+    if not (is_asked or len(known) or is_told):
+        return Mended(observation, state.moves, None, near_stars, True)
+    _tell(given, state, tried, is_accepted)
     refinement = PsfRefinement(
         tuple(families.parameters),
         values / families.units,
@@ -189,7 +185,7 @@ def mend(
     # Replicas draw PSFs from it, so that the errors of regions contain that of the PSFs.
     if not len(known):
         observation = observation.replace(psf_scatter=allowance.scatter())
-    return Mended(observation, state.moves, refinement, allowance.near_stars(setup.pad))
+    return Mended(observation, state.moves, refinement, near_stars, not allowance.error)
 
 
 def _shows_pixels(misfit: PsfMisfit) -> bool:

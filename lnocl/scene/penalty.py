@@ -65,6 +65,12 @@ class Penalty:
                     f"`{name}` must be a number, finite and not negative; {weight!r} was given"
                 )
 
+    def in_words(self) -> str:
+        """Return the weight of the edge-preserving term as a message has it."""
+        near = self.near_stars
+        more = "" if near is None else f", and up to {near.max():.3g} more at the stars"
+        return f"{self.smoothing:.3g}{more}"
+
 
 def recommend_smoothing(observation: Observation) -> float:
     """Return the weight of the edge-preserving term that suits the noise of an observation.

@@ -16,7 +16,7 @@ FAULTS = {
     "a little off": (np.roll(MOFFAT, 1, 1) + 2 * MOFFAT, "0.3"),
     "far off": (np.roll(MOFFAT, (2, -1), (0, 1)), "2.24 pixels off its centre, and is refused"),
     "undersampled": (gaussian(1.4, 32, 32), "it is undersampled"),
-    "negative": (MOFFAT - 0.02 * ((X == 9) & (abs(Y) < 9)), "many of its pixels are negative"),
+    "negative": (MOFFAT - 0.1 * ((X == 9) & (abs(Y) < 9)), "many of its pixels are negative"),
     "background": (MOFFAT + 1e-3, "its border is level"),
     "cut": ((1 + R**2 / 4) ** -1.3, "its wings are cut off"),
 }  # fmt: skip
@@ -58,10 +58,12 @@ def test_faults_are_said(psf, said):
 
 
 def test_noise_is_said_with_what_it_makes_negative():
-    noise = 1e-3 * np.random.default_rng(2).standard_normal(MOFFAT.shape)
+    noise = 2e-3 * np.random.default_rng(2).standard_normal(MOFFAT.shape)
     negative, noisy = examine(MOFFAT + noise).faults()
     assert "negative" in negative
     assert "its wings are noise" in noisy
+    side = int(noisy.partition(" or of ")[2].split()[0])
+    assert side == int(SIDE * (0.15 / examine(MOFFAT + noise).noise) ** 0.5)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 3), (2, 5), (6, 4)])

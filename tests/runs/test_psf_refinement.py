@@ -357,6 +357,20 @@ class TestPixels:
         assert not held.psf_refinement.is_accepted
 
 
+def test_an_error_that_single_rings_show_smooths_the_sky_near_the_star():
+    images = images_through([moffat(4.05)], 30.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LnoclWarning)
+        observation = lnocl.Observation(images, PSF, background=LEVEL)
+        result = lnocl.deconvolve(
+            observation, [STAR], engine="numpy", pad=0, n_iter=20, refine_psfs=()
+        )
+    assert result.psf_refinement is None  # all rings together show no error
+    assert set(result.held_out["smoothing"]) >= {0.0}  # held-out counts choose still
+    near = result._outcome.penalty.near_stars
+    assert near[STAR[::-1]] == near.max() > 10 * near[0, 63]
+
+
 class TestAScatterThatIsGiven:
     def test_it_smooths_the_sky_near_the_stars(self):
         images, scatter = images_through([PSF], 30.0), 0.05 * PSF

@@ -560,10 +560,8 @@ def test_without_more_there_is_no_background_and_an_exposure_of_one():
 
 def test_one_pixel_is_said_to_be_one():
     images = np.where(IMAGES == 7, np.nan, np.where(IMAGES == 9, -1.0, IMAGES))
-    _, messages, _ = announced(images=images, psfs=np.where(PSF == 2, -0.5, PSF))
-    assert (
-        messages[0] == "1 psf pixel is negative and was kept: 9.1 % of the light of a PSF at most"
-    )
+    _, messages, _ = announced(images=images, psfs=np.where(PSF == 2, -0.8, PSF))
+    assert messages[0].startswith("1 psf pixel is negative and was kept: 15 % of the light")
     assert messages[1] == "1 image pixel is not finite and was masked"
     assert messages[2].startswith("1 image pixel is negative and was set to 0; if the sky was ")
 
@@ -578,13 +576,13 @@ def test_few_negative_psf_pixels_are_noted_but_not_warned_of(caplog):
 
 def test_negative_psf_pixels_are_kept_and_counted():
     psfs = np.array([PSF, PSF, PSF])
-    psfs[1:, 0, 0] = -0.5
+    psfs[1:, 0, 0] = -0.8
     observation, messages, files = announced(psfs=psfs)
     assert messages == [
-        "2 psf pixels are negative and were kept: 6.7 % of the light of a PSF at most"
+        "2 psf pixels are negative and were kept: 11 % of the light of a PSF at most"
     ]
     assert files == {"caller.py"}
-    np.testing.assert_allclose(observation.psfs[1:], psfs[1:] / 7.5, rtol=3e-16)
+    np.testing.assert_allclose(observation.psfs[1:], psfs[1:] / 7.2, rtol=3e-16)
     np.testing.assert_array_equal(observation.psfs[0], PSF / 8)
 
 
