@@ -1,4 +1,9 @@
-"""The sky of an image, measured: its level and its noise."""
+"""The sky of an image, measured: its level and its noise.
+
+The sigma-clipped median is 2 standard errors of the mean off on an empty sky, 7 under a jet, and 17
+under 40 stars in 128 x 128 pixels; SExtractor's mode, by photutils, is 4, 1 and 9 off. But it is
+1.5 means below 0 where most pixels have no count (benchmarks/libraries.py).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Where a star is in a frame: its brightest pixel, and the centre of its light."""
+"""Where a star is in a frame: its brightest pixel, and the centre of its light.
+
+photutils' `centroid_2dg` finds centres as well, to 0.007 pixels in noise of a hundredth of the
+peak, but is no dependency; its other centroids are 1.5 to 80 times worse (benchmarks/libraries.py).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Bad pixels of an image, interpolated from the good ones around them."""
+"""Bad pixels of an image, interpolated from the good ones around them.
+
+One in the core of a Moffat star 3 pixels wide is right to 0.4 % of the peak, in fringes to 0.08 %;
+astropy's `interpolate_replace_nans` leaves 4 and 13 % there (benchmarks/libraries.py).
+"""
 
 from __future__ import annotations
 

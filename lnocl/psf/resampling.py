@@ -1,4 +1,8 @@
-"""Shifts and rotations of the image of a star."""
+"""Shifts and rotations of the image of a star.
+
+A rotated oval of 4.7 x 2.8 pixels is right to 1.4e-4 of its peak; SciPy's splines leave 3.6e-3
+(cubic) and 7.6e-4 (quintic) (benchmarks/libraries.py).
+"""
 
 from __future__ import annotations
 
