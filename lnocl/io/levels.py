@@ -48,14 +48,21 @@ def sky_level(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
 def sky_noise(j: int, counts: Array, mask: Mask) -> float:
     """Return the noise that the sky of image j has beside that of its counts, electrons.
 
+    It is that of pixels three apart in the darker half of the image, where the clipped scatter is
+    more: sources that fill a frame scatter too.
+
     Raises
     ------
     InputError
         No pixel is good.
     """
     median, scatter = clipped_sky(j, counts, mask)
+    dark, words = noise_of(counts, mask | ~np.isfinite(counts), 0.0), "sigma-clipped scatter"
+    if dark is not None and dark.variance_apart < scatter**2:
+        median, scatter = dark.mean, np.sqrt(dark.variance_apart)
+        words = "pixels three apart, where it is dark"
     noise = float(np.sqrt(max(scatter**2 - max(median, 0.0), 0.0)))
-    note("`images[%d]`: read noise %.4g electrons (sigma-clipped scatter)", j, noise)
+    note(f"`images[{j}]`: read noise {noise:.4g} electrons ({words})")
     return noise
 
 
