@@ -5,7 +5,7 @@ import pytest
 from scenes import Recipe, make_smooth_psfs, paper
 
 import lnocl
-from lnocl.residuals import CORE, WINGS, Fit, judge, judge_stars, residuals
+from lnocl.residuals import CORE, WINGS, Fit, judge, judge_stars, residuals, sharp_sources
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import place
 
@@ -209,3 +209,17 @@ def test_a_result_has_the_residuals():
     assert result.fit() == judge(observation, result.models())
     expected = (observation.images - result.models()) / np.sqrt(result.models())
     np.testing.assert_allclose(result.residuals(), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("finer", [1, 2])
+def test_unnamed_stars_are_sharp_sources_and_knots_are_not(finer):
+    y, x = np.indices((64, 64))
+    sky = 5.0 + 300 * np.exp(-((x - 40) ** 2 + (y - 12) ** 2) / 8.0)  # a knot 4.7 pixels wide
+    sky += 100 * np.exp(-np.hypot(x - 20, y - 44) / 4.0)  # a cusp
+    sky[30, 10], sky[30, 11], sky[50, 50] = 6000.0, 3000.0, 4000.0
+    found = sharp_sources(sky, 5.0, finer)
+    middle = (finer - 1) / 2.0
+    np.testing.assert_allclose(finer * found[:, :2] + middle, [(10, 30), (50, 50)])
+    np.testing.assert_allclose(found[:, 2], [9000.0, 4000.0], rtol=0.01)
+    assert len(sharp_sources(sky / 100.0, 5.0, finer)) == 0  # told from noise
+    assert len(sharp_sources(np.zeros((8, 8)), 0.0)) == 0

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lnocl.errors import counted
-from lnocl.residuals import Fit, StarResiduals
+from lnocl.residuals import Fit, StarResiduals, sharp_sources
 from lnocl.result import Result
 from lnocl.scene.detector import on_sky
 from lnocl.scene.stars import MAX_SHIFT
@@ -53,7 +53,7 @@ def summarise(
     """Return how a reconstruction ended, and what it found, a line each."""
     objective = result.history["objective"][-1]
     device, _, _ = result.device.partition(" (")  # the header has its platform and driver
-    unit = re.sub(r"^(electron|photon)\b", r"\1s", frames.unit)
+    unit = _unit(frames)
     stars = [
         f"star at ({x:.7g}, {y:.7g}): {_flux(flux, error, frames)}; residuals "
         f"{_rms(found.core)} in its core, {_rms(found.wings)} in its wings, where noise gives 1"
@@ -71,6 +71,7 @@ def summarise(
         *stars,
         f"extended source: {_flux(*extended_flux(result, frames), frames)} in the whole frame",
         *_floor(result, frames, unit),
+        *_unnamed(result, frames),
         f"residuals {_rms(overall)} in all, where noise gives 1",
         *_shortness(arguments, result),
     ]
@@ -82,6 +83,21 @@ def _shortness(arguments: argparse.Namespace, result: Result) -> list[str]:
     return [
         f"it ended after {counted(result.n_iter, 'iteration')}: there is little but noise, or PSF, "
         "background or noise are wrong"
+    ]
+
+
+def _unnamed(result: Result, frames: Frames) -> list[str]:
+    """Return what to say of sources in the extended source that are as sharp as stars."""
+    observation = frames.observation
+    background = float(_means(observation.background).sum()) / observation.oversample**2
+    found = sharp_sources(result.extended, background, observation.oversample)
+    if not len(found):
+        return []
+    (x, y, light), n = found[0], len(found)
+    return [
+        f"{counted(n, 'source')} in the extended source {'is' if n == 1 else 'are'} as sharp as "
+        f"stars, the brightest at ({x:.7g}, {y:.7g}) with {light / frames.electrons:.3g} "
+        f"{_unit(frames)}: name stars by --star, or --stars with the table of lnocl stars"
     ]
 
 
@@ -117,11 +133,15 @@ def extended_flux(result: Result, frames: Frames) -> tuple[float, float]:
 
 def _flux(flux: float, error: float, frames: Frames) -> str:
     """Return a flux and its error, electrons, in the unit of the images, and in electrons."""
-    units = {re.sub(r"^(electron|photon)\b", r"\1s", frames.unit): frames.electrons}
+    units = {_unit(frames): frames.electrons}
     if frames.electrons != 1.0:
         units["electrons" + "/s" * frames.unit.endswith("/s")] = 1.0
     values = [f"{_number(flux / one, error / one)} {unit}" for unit, one in units.items()]
     return " = ".join(values)
+
+
+def _unit(frames: Frames) -> str:
+    return re.sub(r"^(electron|photon)\b", r"\1s", frames.unit)
 
 
 def _number(value: float, error: float) -> str:
