@@ -67,7 +67,6 @@ def deconvolve(
     refine_positions: bool | Literal["auto"] = "auto",
     refine_psfs: Literal["auto"] | Iterable[Family] = "auto",
     checkpoint: str | PathLike[str] | None = None,
-    checkpoint_every: float = 60.0,
     resume: str | PathLike[str] | None = None,
 ) -> Result:
     r"""Reconstruct the sky from several images as stars plus an extended source.
@@ -173,10 +172,8 @@ def deconvolve(
         they need, and then pixels. An empty sequence is for none. See Notes. At least one star.
     checkpoint : str or path, optional
         File for checkpoints (FITS): written after the first iteration, then every
-        `checkpoint_every` seconds, and at the end. Each replaces the one before once it is
-        complete. With held-out counts it holds both halves and about twenty estimates of each.
-    checkpoint_every : float, optional
-        Seconds between checkpoints, zero or more.
+        minute, and at the end. Each replaces the one before once it is complete. With held-out
+        counts it holds both halves and about twenty estimates of each.
     resume : str or path, optional
         Checkpoint to resume from. Everything else must be as it was when it was written. The result
         is then bit for bit that of a run that was never interrupted.
@@ -376,7 +373,7 @@ def deconvolve(
         warn_of_stars(start.scene, setup.refine_positions)
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes
         largest = partial(measure, start, int(n_iter))
-        checkpointer = Checkpointer(checkpoint, checkpoint_every, resume, inputs, largest)
+        checkpointer = Checkpointer(checkpoint, resume, inputs, largest)
         with Bar(int(n_iter), bool(progress)) as bar:
             if stop == "held-out":
                 held_out = HeldOutCounts(start, penalties, int(n_iter))

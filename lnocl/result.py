@@ -543,7 +543,7 @@ class Result:
     ) -> None:
         """Write a FITS file, which ``lnocl plot`` and ``lnocl report`` read.
 
-        It is the file of ``lnocl deconvolve --models --residuals``, without the command and the
+        It is the file of ``lnocl deconvolve --residuals``, without the command and the
         messages of the run. The primary HDU holds the extended source. The tables STARS, HISTORY
         and HELDOUT hold the stars, the objectives, and the errors that held-out counts estimate.
         The cubes MODELS and RESIDUALS hold those of each image. PSFS and others are added where

@@ -15,7 +15,7 @@ done
 first=$data/chandra-counts-obs-id-4683.fits.gz second=$data/chandra-counts-obs-id-4684.fits.gz
 psfs="$out/psf_4683.fits $out/psf_4684.fits"
 # No background: a constant would be more than the darkest parts of the field, and add counts.
-common="--pad 24 --n-iter 20 --models --residuals --quiet --overwrite"
+common="--pad 24 --n-iter 20 --residuals --quiet --overwrite"
 lnocl deconvolve $paper "$first" "$second" --psf $psfs $common --align wcs -o "$out/aligned.fits"
 lnocl deconvolve $paper "$first" "$second" --psf $psfs $common -o "$out/not_aligned.fits"
 python "$here/real.py" figures "$out/aligned.fits" "$out/not_aligned.fits"

@@ -13,7 +13,7 @@ counts=$data/pg1634_counts_0.25pix.fits
 # The PSF file is that of the mirrors; the counts were spread by the pixels, twice.
 python "$here/real.py" pixel-psf "$data/pg1634_psf_0.25pix.fits" "$out/psf.fits"
 # Background: 15 counts in 5884 pixels, 55 to 70 pixels from the star.
-known="--background 0.0025 --star 89,76 --n-iter 30 --models --residuals --quiet --overwrite"
+known="--background 0.0025 --star 89,76 --n-iter 30 --residuals --quiet --overwrite"
 for refine in "" --refine; do
     for psf in "$data/pg1634_psf_0.25pix.fits" "$out/psf.fits"; do
         name=$(basename "$psf" .fits)$refine

@@ -7,7 +7,7 @@ data=${1:-"$here/../../../shared/data"}
 out=${2:-$(mktemp -d)}
 mkdir -p "$out"
 [ -d "$data" ] || { echo "skipped: $data is not there"; exit 0; }
-common="--models --residuals --quiet --overwrite"
+common="--residuals --quiet --overwrite"
 
 look() {
     lnocl report "$out/$1.fits" -o "$out/$1.html" --overwrite

@@ -14,7 +14,7 @@ sci=$data/sci_J0005-0006.fits
 python "$here/real.py" centred-psf "$data/sci_psf.fits" "$out/psf.fits" 63
 known="--psf $out/psf.fits --background 0 --inverse-variance $data/ivm_J0005-0006.fits"
 known="$known --exposure EXPTIME --pad 16"
-how="--solver sgp --n-iter 10 --models --residuals --quiet --overwrite"
+how="--solver sgp --n-iter 10 --residuals --quiet --overwrite"
 lnocl deconvolve $paper "$sci" $known --star 64,64 $how -o "$out/whole.fits"
 lnocl deconvolve $paper "$sci" $known --star 64,64 --refine $how -o "$out/refined.fits"
 python "$here/real.py" figures "$out/whole.fits" "$out/refined.fits"

@@ -15,7 +15,7 @@ python "$here/real.py" airy-psf "$out/psf.fits" 0.936 16 2
 # background: all of the emission is the sky's.
 lnocl deconvolve "$image" --psf "$out/psf.fits" --oversample 2 --gain 31.306 \
     --star 442,344 --star 459,201 --star 174,151 --star 397,81 --star 561,254 --star 450,269 \
-    --refine --n-iter 60 --stop none --models --residuals --overwrite -o "$out/spitzer.fits"
+    --refine --n-iter 60 --stop none --residuals --overwrite -o "$out/spitzer.fits"
 python "$here/real.py" figures "$out/spitzer.fits"
 python "$here/real.py" draw "$out/spitzer.png" "image, MJy/sr=$image:450,270,100:2:300" \
     "extended, MJy/sr=$out/spitzer.fits:900,540,200:0:75" \

@@ -9,7 +9,7 @@ import signal
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from lnocl.commands.options import finite, option
+from lnocl.commands.options import option
 from lnocl.commands.signals import ENDING, first_handled
 from lnocl.errors import InputError, LnoclError, counted
 
@@ -24,15 +24,7 @@ OPTIONS = [
         "--checkpoint",
         metavar="FILE",
         is_repeated=False,
-        help="save the state of the run at regular times, at the end and on Ctrl-C",
-    ),
-    option(
-        "--checkpoint-every",
-        type=finite,
-        default=60.0,
-        metavar="SECONDS",
-        is_repeated=False,
-        help="time between checkpoints (default: %(default)s)",
+        help="save the state of the run every minute, at the end and on Ctrl-C",
     ),
     option(
         "--resume",

@@ -67,7 +67,7 @@ def _solve_tiles(
 
     if arguments.bootstrap is not None:
         raise InputError("replicas are of one run, not of tiles; leave `bootstrap` out")
-    for name in ("checkpoint", "checkpoint_every", "resume", "refine_psfs"):
+    for name in ("checkpoint", "resume", "refine_psfs"):
         if parameters.pop(name, PARAMETERS[name]) not in (PARAMETERS[name], []):
             raise InputError(f"`{name}` is not for tiles; leave it out")
     return deconvolve_tiles(
@@ -94,8 +94,7 @@ def _run(arguments: argparse.Namespace) -> None:
             result = dataclasses.replace(result, stop_reason="interrupt")
         with Progress(None, "", not arguments.quiet, "measuring errors", stays=False):
             at_stars = result.star_residuals()
-            shown = arguments.models or arguments.residuals or arguments.plot
-            view = view_of(result) if shown else None
+            view = view_of(result) if arguments.residuals or arguments.plot else None
             overall = Fit.of(view.residuals, view.models) if view else result.fit()
             verdict = verdict_on(
                 arguments, result, frames, given["stars"], at_stars, overall, bool(warned)
@@ -162,10 +161,9 @@ def _write(
         overwrite=arguments.overwrite,
         unit=frames.unit,
         star_columns=_star_columns(arguments, result, frames, at_stars),
-        cubes={
-            **({"MODELS": (view.models, "electron")} if arguments.models and view else {}),
-            **({"RESIDUALS": (view.residuals, "")} if arguments.residuals and view else {}),
-        },
+        cubes={"MODELS": (view.models, "electron"), "RESIDUALS": (view.residuals, "")}
+        if arguments.residuals and view
+        else {},
         messages=lines,
         **parts,
     )
@@ -250,15 +248,9 @@ def _star_columns(
     """Return the columns of the table of stars after positions and fluxes."""
     from lnocl.io import sky
     from lnocl.io.fitswrite import StarColumn, error_columns
-    from lnocl.metrics import magnitude
 
-    header = frames.header
-    flux_errors = result.star_flux_errors / frames.electrons
+    header, flux_errors = frames.header, result.star_flux_errors / frames.electrons
     columns = error_columns(result.star_position_errors, flux_errors, frames.unit)
-    if arguments.zero_point is not None:
-        fluxes = result.star_fluxes / frames.electrons
-        magnitudes = [magnitude(flux, 1.0) + arguments.zero_point for flux in fluxes]
-        columns.append(StarColumn("mag", magnitudes, "mag", "by the zero point"))
     if sky.has_celestial(header):
         ra, dec = sky.to_sky(result.star_positions, header).T
         columns += [

@@ -6,7 +6,7 @@ import inspect
 from typing import Any
 
 from lnocl.commands import bootstrap, checkpoints, options
-from lnocl.commands.options import SEVERAL, finite, number_or_word, option, whole_or_word
+from lnocl.commands.options import SEVERAL, number_or_word, option, whole_or_word
 from lnocl.deconvolution import deconvolve
 from lnocl.runs.options import ENGINES, PRECISIONS
 from lnocl.scene.observation import OVERSAMPLES
@@ -65,16 +65,11 @@ OPTIONS = {
         ),
         options.OVERWRITE.but(help="replace OUT.fits if it exists"),
         option(
-            "--models",
-            action="store_true",
-            help="add a cube with the model of each image, in electrons; its header has the "
-            "coordinates of the image where all images share them, else their offsets",
-        ),
-        option(
             "--residuals",
             action="store_true",
-            help="add a cube with the residuals of each image, (image - model) / sqrt(model), with "
-            "the same header",
+            help="add two cubes: RESIDUALS of each image, (image - model) / sqrt(model), and "
+            "MODELS, in electrons; their headers have the coordinates of the image where all "
+            "images share them, else their offsets",
         ),
         options.PICTURE.but(
             help="picture of image, model, residuals and extended source, whole and at each star, "
@@ -172,19 +167,12 @@ OPTIONS = {
         options.STAR_TABLE,
         option(
             "--refine",
-            action="store_true",
-            default=None,  # for no card where it is not given
+            action=options.EITHER,
             dest="refine_positions",
             card=("REFINED", "star positions"),
-            help="fit the positions of the stars too, each within 3 pixels of the one given; by "
-            "default that is done where it mends a misfit at the stars and smoothing is chosen",
-        ),
-        option(
-            "--no-refine",
-            action="store_false",
-            default=None,  # as above
-            dest="refine_positions",
-            help="take the positions of the stars as given",
+            help="fit the positions of the stars too, each within 3 pixels of the one given, or "
+            "take them as given; by default they are fitted where that mends a misfit at the "
+            "stars and smoothing is chosen",
         ),
         option(
             "--refine-psfs",
@@ -233,14 +221,6 @@ OPTIONS = {
             help="FITS file with the standard deviation of the pixels of a PSF of unit sum, in an "
             "extension SCATTER, as lnocl psf writes it, or as its image: the smoothing near "
             "stars follows it; one for all images or one for each",
-        ),
-        option(
-            "--zero-point",
-            type=finite,
-            metavar="MAG",
-            card=("ZEROPT", "magnitude of a flux of 1"),
-            help="magnitude of a flux of 1 in the unit of the result, that of the images, per "
-            "second where exposures are given; adds a column mag to the table of stars",
         ),
     ],
     "reconstruction": [

@@ -13,6 +13,8 @@ from lnocl.parallel import CURRENT
 
 # The values for which a switch is on the command line.
 SWITCHES = {"store_true": True, "store_false": False}
+# The action of a switch that is turned on by its flag, and off by the same with no- before it.
+EITHER = argparse.BooleanOptionalAction
 # The keywords of an option that takes several values and may be repeated.
 SEVERAL: dict[str, Any] = {"nargs": "+", "action": "extend"}
 
@@ -82,6 +84,10 @@ class Option:
         action = self.keywords.get("action")
         if action in SWITCHES:
             return flag if value is SWITCHES[action] else []
+        if action is EITHER and value is False:
+            return [self.flags[0].replace("--", "--no-", 1)]
+        if action is EITHER:
+            return flag if value else []
         values = _listed(value)
         if action == "append":
             return [word for each in values for word in (*flag, _word(each))]

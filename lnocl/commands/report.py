@@ -14,7 +14,7 @@ OPTIONS = [
         "result",
         metavar="RESULT",
         is_input=True,
-        help="FITS file that lnocl deconvolve has written, with --models and --residuals",
+        help="FITS file that lnocl deconvolve has written, with --residuals",
     ),
     option("-o", "--output", required=True, metavar="REPORT.html", help="page to write"),
     options.OVERWRITE.but(help="replace REPORT.html if it exists"),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lnocl.commands import deconvolve
-from lnocl.commands.options import SWITCHES, Option
+from lnocl.commands.options import EITHER, SWITCHES, Option
 from lnocl.errors import FileError, InputError
 from lnocl.io.names import file_of
 
@@ -162,11 +162,13 @@ def _is_file_name(name: str) -> bool:
 def _values(cell: Any, option: Option) -> bool | list[str] | None:
     """Return the value of an option, as `Option.words` takes it."""
     text = _text(cell)
-    action = option.keywords.get("action")
-    if action in SWITCHES:
+    action: Any = option.keywords.get("action")
+    if action is EITHER and not text:
+        return None
+    if action in SWITCHES or action is EITHER:
         if text.lower() not in (*YES, *NO):
             raise ValueError(f"{option.flags[-1]} is true or false; {text!r} was given")
-        is_set: bool = SWITCHES[action]
+        is_set = SWITCHES.get(action, True)
         return is_set if text.lower() in YES else not is_set
     if not text:
         return None

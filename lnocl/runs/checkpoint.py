@@ -35,6 +35,8 @@ WIDTH = 256
 MAX_ROWS = 100
 MAX_HDUS = 100
 ROW_BYTES = 32 + WIDTH
+# Seconds between two checkpoints.
+EVERY = 60.0
 
 
 @dataclass(frozen=True)
@@ -193,8 +195,6 @@ class Checkpointer:
     ----------
     path : str or None
         File to write; None for no checkpoints.
-    every : float
-        Seconds between them, zero or more.
     resume : str or None
         The checkpoint to resume from, which may be replaced.
     describe : callable
@@ -205,7 +205,7 @@ class Checkpointer:
     Raises
     ------
     InputError
-        `every` is not a number of seconds, or the checkpoint is of another run.
+        The checkpoint is of another run.
     FileError
         The file cannot be written, or exists and is not the one to resume from; the checkpoint
         cannot be read.
@@ -214,7 +214,6 @@ class Checkpointer:
     def __init__(
         self,
         path: object,
-        every: object,
         resume: object,
         describe: Callable[[], dict[str, str]],
         most_bytes: Callable[[], int],
@@ -222,9 +221,6 @@ class Checkpointer:
         self._path, source = _file_name("checkpoint", path), _file_name("resume", resume)
         self._saved_at = time.monotonic() if path is None else -math.inf
         self._best: State = {}
-        if not (isinstance(every, Real) and cast(float, every) >= 0):
-            raise InputError(f"`checkpoint_every` must be seconds, 0 or more; {every!r} was given")
-        self._every = cast(float, every)
         resumed = None if source is None else read(source, most_bytes())
         self._may_replace = False
         if self._path is not None:
@@ -332,7 +328,7 @@ class Checkpointer:
             self._write(ended, held_out.state())
 
     def _is_due(self) -> bool:
-        return time.monotonic() - self._saved_at >= self._every
+        return time.monotonic() - self._saved_at >= EVERY
 
     def _write(self, ended: str, arrays: State) -> None:
         """Write a checkpoint; a failure to write ends the run only where it is the first one."""

@@ -34,7 +34,7 @@ def commands(folder: str, words: list[str]) -> Iterator[list[str]]:
     at = words.index("--star")
     for method, mu in METHODS.items():
         star = [] if method == "RLM" else words[at : at + 2]
-        more = ["--mu", mu, "--n-iter", str(N_ITER), *PAPER, "--models", "--residuals"]
+        more = ["--mu", mu, "--n-iter", str(N_ITER), *PAPER, "--residuals"]
         yield [*words[:at], *star, *words[at + 2 : -1], _path(folder, method), *more]
 
 

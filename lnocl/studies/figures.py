@@ -73,7 +73,7 @@ def draw(folder: str, results: Sequence[str], overwrite: bool = False) -> Iterat
         yield save(folder, picture, draw_result(view), overwrite)
         if not each.cubes:
             yield (
-                f"{each.path} has no models and residuals to show: repeat its run with --models "
+                f"{each.path} has no models and residuals to show: repeat its run with "
                 "--residuals, or draw them in the run, with --plot"
             )
     for name, profile in profiles.items():

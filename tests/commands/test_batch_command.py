@@ -21,7 +21,7 @@ from lnocl.commands.targets import read_targets
 
 pytestmark = pytest.mark.usefixtures("command_folder")
 
-HEADER = "name,images,psf,star,n_iter,engine,psf_centre,solver,stop,smoothing,pad,models"
+HEADER = "name,images,psf,star,n_iter,engine,psf_centre,solver,stop,smoothing,pad,residuals"
 COMMON = "numpy,given,sgm,none,0,0,"
 
 
@@ -122,7 +122,7 @@ def test_a_bad_target_is_a_row_and_stops_no_other(capsys):
     found = summary()
     assert found["one"]["status"] == "done"
     assert "argument --n-iter: invalid int value: 'two'" in found["bad"]["message"]
-    assert found["flagged"]["message"] == "--models is true or false; 'maybe' was given"
+    assert found["flagged"]["message"] == "--residuals is true or false; 'maybe' was given"
     assert "lnocl: error: gone.fits cannot be opened" in Path("out/lost.log").read_text()
 
 

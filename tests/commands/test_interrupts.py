@@ -19,7 +19,7 @@ def interrupted(small_command, monkeypatch):
     # Which may be ignored here.
     before = {signal.SIGINT: signal.signal(signal.SIGINT, signal.default_int_handler)}
     before |= {number: signal.signal(number, signal.SIG_DFL) for number in ENDING}
-    words = [*small_command, "--engine", "numpy", "--n-iter", "3", "--models", "--residuals"]
+    words = [*small_command, "--engine", "numpy", "--n-iter", "3", "--residuals"]
 
     def interrupt(called, numbers, *more):
         genuine, due = pkgutil.resolve_name(called), list(numbers)

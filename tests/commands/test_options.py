@@ -9,14 +9,14 @@ from astropy.io import fits
 from commandline import NUMPY, one_complaint, run
 
 from lnocl.commands import cli, deconvolve, messages, psf, record
-from lnocl.commands.options import option, position
+from lnocl.commands.options import EITHER, option, position
 from lnocl.io.frames import Calibration
 
 pytestmark = pytest.mark.usefixtures("command_folder")
 
 # Options of lnocl deconvolve that no function takes as they are.
-OF_THE_SHELL = {"images", "output", "overwrite", "plot", "quiet", "models", "residuals",
-                "star_sky", "star_table", "zero_point",
+OF_THE_SHELL = {"images", "output", "overwrite", "plot", "quiet", "residuals",
+                "star_sky", "star_table",
                 "bootstrap", "regions", "profiles", "seed",
                 "parallel", "tile"}  # fmt: skip
 # Parameters of lnocl.deconvolve that the shell gives itself, or that no option gives.
@@ -51,8 +51,11 @@ def test_no_two_options_share_a_keyword_or_a_checksum(table):
         (option("--mask", nargs="+", action="extend"), ["--mask", "a.fits", "./-b.fits"]),
         (option("--star", action="append", type=position),
          ["--star", "1.5,-2.0", "--star", "3.0,4.0"]),
-        (option("--models", action="store_true"), ["--models"]),
-        (option("--models", action="store_true"), []),
+        (option("--residuals", action="store_true"), ["--residuals"]),
+        (option("--residuals", action="store_true"), []),
+        (option("--refine", action=EITHER, dest="moves"), ["--refine"]),
+        (option("--refine", action=EITHER, dest="moves"), ["--no-refine"]),
+        (option("--refine", action=EITHER, dest="moves"), []),
         (option("--no-recentre", action="store_false", dest="recentre"), ["--no-recentre"]),
         (option("--no-recentre", action="store_false", dest="recentre"), []),
         (option("--gain", type=float), []),

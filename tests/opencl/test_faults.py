@@ -16,6 +16,7 @@ import lnocl
 from lnocl.engines import opencl
 from lnocl.engines.numpy import ReferenceEngine
 from lnocl.opencl import device, program
+from lnocl.runs import checkpoint
 
 
 def observe():
@@ -268,6 +269,7 @@ def test_an_estimate_is_proven_by_its_objective_before_it_is_kept(
 ):
     """Where a finite estimate has an infinite objective, again and again."""
     path, genuine = tmp_path / "run.fits", ReferenceEngine.objective
+    monkeypatch.setattr(checkpoint, "EVERY", every)
 
     def objective(engine):
         return np.inf if len(engine._objectives) > 6 else genuine(engine)
@@ -278,7 +280,7 @@ def test_an_estimate_is_proven_by_its_objective_before_it_is_kept(
     monkeypatch.setattr(ReferenceEngine, "objective", objective)
     monkeypatch.setattr(ReferenceEngine, "objectives", objectives)
     keywords = {"solver": solver, "engine": "numpy", "n_iter": 20}
-    for files in ({"checkpoint": path, "checkpoint_every": every}, {"resume": path}):
+    for files in ({"checkpoint": path}, {"resume": path}):
         with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
             result = paper(observe(), **keywords, **files)
         assert (result.stop_reason, result.n_iter) == ("not finite", 5)
@@ -339,7 +341,7 @@ def test_a_device_that_always_computes_nan_is_refused(monkeypatch, engine, solve
 
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
 @pytest.mark.parametrize("what", ["extended", "images"])
-def test_a_checkpoint_is_not_replaced_by_what_is_not_finite(tmp_path, solver, what):
+def test_a_checkpoint_is_not_replaced_by_what_is_not_finite(tmp_path, monkeypatch, solver, what):
     """Resumed, the run ends as if nothing had happened."""
 
     def callback(iteration, estimate):
@@ -348,9 +350,9 @@ def test_a_checkpoint_is_not_replaced_by_what_is_not_finite(tmp_path, solver, wh
 
     path = str(tmp_path / "run.fits")
     keywords = {"solver": solver, "n_iter": 12, "stars": [(5, 6)], "stop": 1e-9}
-    every = {"checkpoint": path, "checkpoint_every": 0}
+    monkeypatch.setattr(checkpoint, "EVERY", 0.0)
     with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
-        result = paper(observe(), callback=callback, **every, **keywords)
+        result = paper(observe(), callback=callback, checkpoint=path, **keywords)
     assert result.stop_reason == "not finite"
     assert 6 <= result.n_iter <= 8
     resumed, expected = (paper(observe(), **keywords, **which) for which in ({"resume": path}, {}))

@@ -117,7 +117,6 @@ def anything(draw):
         "precision": "double",
         "device": None,
         "refine_positions": False,
-        "checkpoint_every": 60.0,
         "resume": None,
     }
     if draw(st.booleans()):

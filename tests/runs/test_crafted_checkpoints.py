@@ -42,7 +42,7 @@ def make_saved(folder, kind, engine="numpy"):
     recipe = STARS if engine == "numpy" else ON_DEVICE
     made, path = recipe.make(), str(folder / f"{kind}.fits")
     given = {"n_iter": N_ITER, "engine": engine} | KINDS[kind]
-    made.deconvolve(**given, checkpoint=path, checkpoint_every=1e9, callback=lambda k, _: k == 4)
+    made.deconvolve(**given, checkpoint=path, callback=lambda k, _: k == 4)
     return made, given, checkpoint.read(path)
 
 

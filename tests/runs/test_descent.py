@@ -8,6 +8,7 @@ from scenes import paper, same
 
 import lnocl
 from lnocl.errors import DivergedError, NotFiniteError
+from lnocl.runs import checkpoint
 from lnocl.runs.descent import MAX_RISE, N_ABOVE, Descent, explain_rise
 from lnocl.scene.scene import Scene
 
@@ -78,15 +79,15 @@ def test_the_scaled_gradient_projection_method_is_not_trapped():
 
 @pytest.mark.parametrize("every", [0.0, 1e9], ids=["always", "once"])
 @pytest.mark.parametrize("cut", [1, 6, 13])
-def test_a_run_cut_off_ends_where_it_would_have(cut, every, tmp_path):
+def test_a_run_cut_off_ends_where_it_would_have(cut, every, tmp_path, monkeypatch):
     """With checkpoints before the least objective, and after it."""
     path, given = tmp_path / "run.fits", {"engine": "numpy", "stop": "discrepancy"}
     with rises:
         whole = paper(observe(1), **given)
     assert 1 < whole.n_iter < 6
-    paper(
-        observe(1), **given, checkpoint=path, checkpoint_every=every, callback=lambda k, _: k == cut
-    )
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "EVERY", every)
+        paper(observe(1), **given, checkpoint=path, callback=lambda k, _: k == cut)
     with rises:
         resumed = paper(observe(1), **given, resume=path)
     same(resumed, whole)

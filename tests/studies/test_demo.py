@@ -264,7 +264,7 @@ class TestPlot:
         assert cli.main(["plot", "a.fits", "-o", "out"]) == 0
         assert capsys.readouterr().out.splitlines() == [
             "drew out/result.png",
-            "a.fits has no models and residuals to show: repeat its run with --models --residuals, "
+            "a.fits has no models and residuals to show: repeat its run with --residuals, "
             "or draw them in the run, with --plot",
         ]
         assert os.listdir("out") == ["result.png"]

@@ -17,9 +17,13 @@ from lnocl.runs import checkpoint
 pytestmark = pytest.mark.system
 
 
-def start(command, *more):
+def start(command, *more, every=checkpoint.EVERY):
+    program = (
+        "import sys\nfrom lnocl.commands import cli\nfrom lnocl.runs import checkpoint\n"
+        f"checkpoint.EVERY = {every}\nsys.exit(cli.main(sys.argv[1:]))"
+    )
     return subprocess.Popen(
-        [sys.executable, "-m", "lnocl", *command, *more],
+        [sys.executable, "-c", program, *command, *more],
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=heed_signals,
@@ -65,12 +69,12 @@ def test_killed_at_any_moment_it_ends_where_it_would_have(solver, kills, more, s
     command = [*small_command, "--solver", solver, "--n-iter", "400", *more]
     whole, found, saved = (Path(f"{name}.fits") for name in ("whole", "found", "run"))
     finish(start(command, "-o", whole.name))
-    command = [*command, "-o", found.name, "--checkpoint", saved.name, "--checkpoint-every", "0"]
+    command = [*command, "-o", found.name, "--checkpoint", saved.name]
     progress, killed = 0, 0
     while killed < kills:
         resume = ["--resume", saved.name] if saved.exists() else []
         before = saved.stat().st_mtime_ns if resume else None
-        process = start(command, *resume)
+        process = start(command, *resume, every=0.0)
         wait_for_change(saved, process, before)
         time.sleep(rng.uniform(0.0, 0.03))
         process.kill()

@@ -309,7 +309,7 @@ def run(*words):
     words = [str(word) for word in words]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        what = ["--models", "--residuals", "--quiet", "--overwrite", "-o", "out.fits"]
+        what = ["--residuals", "--quiet", "--overwrite", "-o", "out.fits"]
         assert main(["deconvolve", *PAPER, *GIVEN, *words, *what]) == 0
         with fits.open("out.fits") as hdus:
             return (
