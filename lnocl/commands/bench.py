@@ -64,7 +64,8 @@ def _run(arguments: argparse.Namespace) -> None:
     if images:
         levels = arguments.background or [0.0], arguments.read_noise or [0.0]
         read = read_frames(images, psfs, Calibration(*levels))
-        case = bench.Case(read.observation, arguments.stars, [*images, *psfs])
+        stars = options.star_places(arguments.stars, None, read.header, images[0])
+        case = bench.Case(read.observation, stars, [*images, *psfs])
     else:
         case = bench.simulated_case(256 if size is None else size)
     lines = bench.run(case, n_iter, accuracy, spec, stem, arguments.overwrite, not arguments.quiet)

@@ -47,7 +47,9 @@ def solve(arguments: argparse.Namespace, interrupts: checkpoints.Interrupts) -> 
     given |= missions.calibrate(arguments.images[0], given)
     calibration = Calibration(**_given(given, Calibration._fields))
     frames = read_frames(arguments.images, arguments.psfs, calibration)
-    given["stars"] = _stars(arguments, frames.header)
+    given["stars"] = options.star_places(
+        arguments.stars, arguments.star_table, frames.header, arguments.images[0]
+    )
     parts = bootstrap.read(arguments, frames)
     # Each process that makes replicas or tiles takes a device of its own, unless one was named.
     parameters = _parameters(given | {"device": arguments.device})
@@ -201,7 +203,6 @@ def _repeated(given: Mapping[str, Any], frames: Frames) -> dict[str, Any]:
     return {
         "background": frames.background,
         "read_noise": frames.read_noise,
-        "star_sky": [],
         "star_table": None,
         "precision": given["precision"] if given["engine"] == "opencl" else "double",
     }
@@ -222,21 +223,6 @@ def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[s
         "pad": choose_pad(frames.observation) if repeated["pad"] == "auto" else repeated["pad"],
         **({"exposure": exposure.tolist()} if repeated["exposure"] and exposure.ndim == 1 else {}),
     }
-
-
-def _stars(arguments: argparse.Namespace, header: fits.Header) -> list[tuple[float, float]]:
-    """Return the positions of all stars, in pixels: of --star, --star-sky and --stars."""
-    positions = list(arguments.stars)
-    if arguments.star_sky or arguments.star_table:
-        from lnocl.io import sky
-
-        if arguments.star_sky:
-            wcs = sky.celestial_wcs(header, arguments.images[0])
-            coordinates = sky.parse_sky(arguments.star_sky)
-            positions += sky.to_pixels(coordinates, wcs, arguments.images[0]).tolist()
-        if arguments.star_table:
-            positions += sky.read_stars(arguments.star_table, header, arguments.images[0]).tolist()
-    return [(x, y) for x, y in positions]
 
 
 def _star_columns(

@@ -156,14 +156,6 @@ OPTIONS = {
     ],
     "stars": [
         options.STARS,
-        option(
-            "--star-sky",
-            action="append",
-            default=[],
-            metavar="RA,DEC",
-            help="position of a star on the sky (ICRS), in degrees or as hh:mm:ss,dd:mm:ss; may "
-            "be repeated",
-        ),
         options.STAR_TABLE,
         option(
             "--refine",

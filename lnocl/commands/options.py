@@ -6,10 +6,14 @@ import argparse
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from lnocl.errors import InputError
 from lnocl.io.names import file_of
 from lnocl.parallel import CURRENT
+
+if TYPE_CHECKING:
+    from astropy.io import fits
 
 # The values for which a switch is on the command line.
 SWITCHES = {"store_true": True, "store_false": False}
@@ -165,19 +169,62 @@ def finite(text: str) -> float:
     return number
 
 
-def position(text: str) -> tuple[float, float]:
-    """Return the numbers of ``X,Y``.
+def position(text: str) -> tuple[float, float] | str:
+    """Return the numbers of ``X,Y``, or a text that is a position on the sky.
 
     Raises
     ------
     argparse.ArgumentTypeError
-        A text that is not two numbers.
+        A text that is neither.
     """
     try:
         x, y = map(float, text.split(","))
+        return x, y
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not X,Y") from None
-    return x, y
+        from lnocl.io.sky import parse_sky  # which takes its time to load
+
+        try:
+            parse_sky([text])
+        except InputError as error:
+            raise argparse.ArgumentTypeError(error.message) from None
+        return text
+
+
+def star_places(
+    positions: Sequence[tuple[float, float] | str],
+    table: str | None,
+    header: fits.Header,
+    image: str,
+) -> list[tuple[float, float]]:
+    """Return the places of stars in pixels, from --star and the table of --stars.
+
+    Parameters
+    ----------
+    positions : sequence
+        As from `position`.
+    table : str, optional
+        File with a table of stars.
+    header : astropy.io.fits.Header
+        Header of the image, for positions on the sky.
+    image : str
+        Its file, for messages.
+
+    Raises
+    ------
+    FileError, InputError
+        As `sky.to_pixels` and `sky.read_stars`; positions on the sky of an image without WCS.
+    """
+    texts = [each for each in positions if isinstance(each, str)]
+    if texts or table:
+        from lnocl.io import sky
+    found = iter(())
+    if texts:
+        wcs = sky.celestial_wcs(header, image)
+        found = iter(sky.to_pixels(sky.parse_sky(texts), wcs, image).tolist())
+    places = [next(found) if isinstance(each, str) else each for each in positions]
+    if table:
+        places += sky.read_stars(table, header, image).tolist()
+    return [(x, y) for x, y in places]
 
 
 def processes(text: str) -> int | str:
@@ -251,7 +298,9 @@ STARS = option(
     type=position,
     dest="stars",
     metavar="X,Y",
-    help="position of a star in pixels, 0-based, x along columns; may be repeated",
+    help="position of a star: in pixels, 0-based, x along columns; or RA,DEC on the sky (ICRS), "
+    "with units or as hours and degrees: 65d,19.5d or 4h20m,19d30m or 4:20:00,19:30:00; may be "
+    "repeated",
 )
 STAR_TABLE = option(
     "--stars",

@@ -45,8 +45,9 @@ OPTIONS = [
     ),
     options.STARS.but(
         dest="position",
-        help="position of the star to a few pixels, 0-based, x along columns (default: the "
-        "brightest pixel that is not a single hot one); several give the PSF that they share, "
+        help="position of the star to a few pixels, 0-based, x along columns, or on the sky, as "
+        "in 65d,19.5d (default: the brightest pixel that is not a single hot one); several give "
+        "the PSF that they share, "
         "and an extension SCATTER with the standard deviation of theirs from it",
     ),
     options.STAR_TABLE,
@@ -269,12 +270,8 @@ def _positions(
     arguments: argparse.Namespace, header: fits.Header
 ) -> list[tuple[float, float]] | None:
     """Return the positions of the stars that are given, by --star and --stars."""
-    positions = list(arguments.position)
-    if arguments.star_table is not None:
-        from lnocl.io.sky import read_stars
-
-        positions += read_stars(arguments.star_table, header, arguments.frames[0]).tolist()
-    return positions or None
+    given = arguments.position, arguments.star_table
+    return options.star_places(*given, header, arguments.frames[0]) or None
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
-import math
 from codecs import BOM_UTF8
 from collections.abc import Callable, Sequence
 from typing import IO, Any
@@ -103,17 +103,17 @@ def to_sky(positions: Pairs, header: fits.Header) -> Pairs:
 
 
 def parse_sky(texts: Sequence[str]) -> SkyCoord:
-    """Return positions RA,DEC (ICRS): degrees, or hours and degrees in sexagesimal.
+    """Return positions RA,DEC (ICRS) with units, or in sexagesimal hours and degrees.
 
     Raises
     ------
     InputError
-        A text that is not a position.
+        A text that is not such a position.
 
     Examples
     --------
     >>> from lnocl.io.sky import parse_sky
-    >>> parse_sky(["15.25,-3.5", "1:01:00,-3:30:00"]).to_string()
+    >>> parse_sky(["15.25d,-3.5d", "1:01:00,-3:30:00"]).to_string()
     ['15.25 -3.5', '15.25 -3.5']
     """
     return SkyCoord([_parse_sky(text) for text in texts])
@@ -121,19 +121,13 @@ def parse_sky(texts: Sequence[str]) -> SkyCoord:
 
 def _parse_sky(text: str) -> SkyCoord:
     ra, _, dec = text.partition(",")
-    try:
-        if _is_number(ra):
-            return SkyCoord(float(ra), float(dec), unit="deg")
-        return SkyCoord(ra, dec, unit=("hourangle", "deg"))
-    except (ValueError, u.UnitsError):
-        raise InputError(f"{text!r} is not RA,DEC in degrees, or as hh:mm:ss,dd:mm:ss") from None
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
+    with contextlib.suppress(ValueError):
+        if set(ra) - set("+-.0123456789"):  # degrees, and not hours, would be meant by a number
+            return SkyCoord(ra, dec, unit=("hourangle", "deg"))
+    raise InputError(
+        f"{text!r} is neither X,Y in pixels nor RA,DEC with units, as in 65d,19.5d or "
+        "4:20:00,19:30:00"
+    )
 
 
 def to_pixels(coordinates: SkyCoord, wcs: WCS, path: str) -> Pairs:

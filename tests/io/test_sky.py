@@ -120,7 +120,7 @@ class TestPositions:
         degrees = sky.to_sky(positions, given)
         expected = WCS(given).pixel_to_world(*positions.T).icrs
         np.testing.assert_allclose(degrees, np.array([expected.ra.deg, expected.dec.deg]).T)
-        texts = [f"{ra!r},{dec!r}" for ra, dec in degrees.tolist()]
+        texts = [f"{ra!r}d,{dec!r}d" for ra, dec in degrees.tolist()]
         found = sky.to_pixels(sky.parse_sky(texts), wcs, "a.fits")
         np.testing.assert_allclose(found, positions, atol=1e-6)
 
@@ -129,23 +129,26 @@ class TestPositions:
         position = SkyCoord(ra, dec, unit="deg")
         ra_text = position.ra.to_string("hour", sep=sep, precision=6)
         dec_text = position.dec.to_string("deg", sep=sep, precision=6)
-        found = sky.parse_sky([f"{ra!r},{dec!r}", f"{ra_text},{dec_text}"])
+        found = sky.parse_sky([f"{ra:.12f}d,{dec:.12f}d", f"{ra_text},{dec_text}"])
         assert found.separation(position).arcsec.max() < 2e-4
 
     @pytest.mark.parametrize(
         "text",
-        ["", "1", "15.25,-3:30:00", "x,y", "10,95", "25:00:00,3:00:00", "1,2,3", "nan,5", "inf,5",
-         "10,", ",10", "1:61:00,5:00:00"],
+        ["", "1", "15.25,-3:30:00", "x,y", "10d,95d", "25:00:00,3:00:00", "1,2,3", "nand,5d",
+         "infd,5d", "10d,", ",10d", "1:61:00,5:00:00", "15.25,-3.5d", "10d,5d,3d"],
     )  # fmt: skip
     def test_what_is_no_position(self, text):
         with pytest.raises(InputError) as caught:
-            sky.parse_sky(["1,2", text])
-        assert str(caught.value) == (f"{text!r} is not RA,DEC in degrees, or as hh:mm:ss,dd:mm:ss")
+            sky.parse_sky(["1d,2d", text])
+        assert str(caught.value) == (
+            f"{text!r} is neither X,Y in pixels nor RA,DEC with units, as in 65d,19.5d or "
+            "4:20:00,19:30:00"
+        )
 
     @pytest.mark.parametrize("given", [header(), with_sip()])
     def test_what_the_projection_does_not_show(self, given):
         wcs = sky.celestial_wcs(given, "a.fits")
-        coordinates = sky.parse_sky(["150,30", "330,-30"])
+        coordinates = sky.parse_sky(["150d,30d", "330d,-30d"])
         with pytest.raises(InputError) as caught:
             sky.to_pixels(coordinates, wcs, "a.fits")
         assert str(caught.value) == (
