@@ -83,7 +83,8 @@ def measure(seed, n_replicas, options, folder):
     call("psf", image, *stars, "--size", 64, "-o", psf)
     noise = "--gain", GAIN, "--background", "auto", "--read-noise", READ_NOISE
     call("deconvolve", image, "--psf", psf, *noise, "--star", f"{x:.0f},{y:.0f}", *options,
-         "--bootstrap", n_replicas, "--regions", regions, "-o", out)  # fmt: skip
+         "-o", out)  # fmt: skip
+    call("errors", out, "--bootstrap", n_replicas, "--regions", regions)
     errors = Table.read(out, hdu="ERRORS")
     star, there = (errors[errors["name"] == name][0] for name in ("star 1 flux", "region 1"))
     inside = np.hypot(*(np.indices(SHAPE)[::-1] - places[0][:, None, None])) < RADIUS

@@ -501,7 +501,6 @@ def test_stdpsf_files_are_read(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--bootstrap", "10"], "replicas are of one run, not of tiles; leave --bootstrap out"),
         (["--checkpoint", "c.fits"], "--checkpoint is not for tiles; leave it out"),
         (["--refine-psfs", "jitter"], "--refine-psfs is not for tiles; leave it out"),
         (["--tile", "20"], "--tile must be a whole number of"),

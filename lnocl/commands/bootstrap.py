@@ -1,4 +1,4 @@
-"""The options ``--bootstrap``, ``--regions``, ``--profiles`` and ``--seed``: errors by replicas."""
+"""Errors of a result by replicas, added to its file as they are done."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lnocl.commands.options import option
-from lnocl.errors import note
 from lnocl.scene.apertures import Aperture
 
 if TYPE_CHECKING:
@@ -22,87 +20,10 @@ if TYPE_CHECKING:
     from lnocl.runs.bootstrap import Bootstrap, Part
 
 
-DEFAULT = 50
 # Seconds between two writings of the replicas so far.
 WRITE_EVERY = 10.0
 # Quantities of which the run says the errors, unless more regions were given.
 MAX_SAID = 12
-
-OPTIONS = [
-    option(
-        "--bootstrap",
-        type=int,
-        metavar="N",
-        help="replicas, each about as long as the run, for the errors of stars, regions and "
-        "pixels; ten or more, such as 50",
-    ),
-    option(
-        "--regions",
-        metavar="FILE",
-        is_input=True,
-        help="regions whose light is measured: a file such as DS9 writes, in pixels of the "
-        "extended source or on the sky",
-    ),
-    option(
-        "--profiles",
-        metavar="FILE",
-        is_input=True,
-        help="boxes along whose longer sides light and width are measured, pixel by pixel: such a "
-        "file; lnocl plot draws them with their errors",
-    ),
-    option(
-        "--seed",
-        type=int,
-        metavar="S",
-        help="of the replicas, 0 or more (default: 0); the same seed gives the same errors",
-    ),
-]
-
-
-def check(arguments: argparse.Namespace) -> None:
-    """Refuse options that have no meaning, before any work.
-
-    Raises
-    ------
-    InputError
-        A number of replicas below ten, a negative seed; regions or a seed without replicas; tiles
-        with them.
-    LnoclError
-        Dask is missing.
-    """
-    from lnocl.errors import InputError
-    from lnocl.parallel import check_parallel
-    from lnocl.runs.bootstrap import check_number
-
-    check_parallel(arguments.parallel)
-    if arguments.bootstrap is None:
-        if any(getattr(arguments, name) is not None for name in ("regions", "profiles", "seed")):
-            raise InputError(
-                "`regions`, `profiles` and `seed` are for replicas: give --bootstrap 50 with them"
-            )
-        return
-    if arguments.tile is not None:
-        raise InputError("replicas are of one run, not of tiles; leave `tile` out, or bootstrap")
-    check_number(arguments.bootstrap, arguments.seed or 0)
-
-
-def read(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
-    """Return the regions and profiles that were given."""
-    if arguments.regions is None and arguments.profiles is None:
-        return []
-    from lnocl.io.fitsread import sky_header
-    from lnocl.io.regions import read_apertures, read_profiles
-
-    oversample = frames.observation.oversample
-    if oversample > 1:
-        note(
-            "`regions` in pixels are in those of the extended source, %d to one of the images",
-            oversample,
-        )
-    where = sky_header(frames.header, oversample), frames.observation.sky_shape
-    apertures = [] if arguments.regions is None else read_apertures(arguments.regions, *where)
-    profiles = [] if arguments.profiles is None else read_profiles(arguments.profiles, *where)
-    return [*apertures, *profiles]
 
 
 def add_errors(
@@ -110,29 +31,23 @@ def add_errors(
     result: Result,
     frames: Frames,
     parts: Sequence[Part],
-    path: str,
-    continues: bool,
 ) -> list[str]:
     """Add the errors of a result to its file, as replicas are done; return what to say of them.
 
     Parameters
     ----------
     arguments : Namespace
-        With the options of this module.
+        Those of ``lnocl errors``.
     result : Result
         What the file holds.
     frames : Frames
         What it was made of.
     parts : list of Aperture or Profile
-        What `read` returns.
-    path : str
-        The file.
-    continues : bool
-        Whether replicas that it has already are counted.
+        Regions and profiles that are measured.
     """
     from lnocl.runs.bootstrap import bootstrap, without_replicas
 
-    outcome, seed = result._outcome, arguments.seed or 0
+    outcome, seed, path = result._outcome, arguments.seed, arguments.result
     latest: list[Bootstrap] = []
     written = time.monotonic()
 
@@ -144,7 +59,7 @@ def add_errors(
             written = time.monotonic()
 
     expected = without_replicas(outcome, parts, seed)
-    earlier = _earlier(path, expected, frames) if continues else None
+    earlier = None if arguments.overwrite else _earlier(path, expected, frames)
     try:
         found = bootstrap(
             outcome,

@@ -7,9 +7,9 @@ import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from lnocl.commands import bootstrap, checkpoints, messages, options, pictures, record
+from lnocl.commands import checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
 from lnocl.commands.summary import extended_flux, summarise, verdict_on
@@ -25,21 +25,11 @@ if TYPE_CHECKING:
     from lnocl.io.fitswrite import Card, StarColumn
     from lnocl.io.frames import Frames
     from lnocl.plotting.result import ResultView
-    from lnocl.runs.bootstrap import Part
     from lnocl.scene.observation import Observation
 
 
-class Solved(NamedTuple):
-    """A run that has ended: its result, what it was made of, and the values that it was given."""
-
-    result: Result
-    frames: Frames
-    given: dict[str, Any]
-    parts: list[Part]
-
-
-def solve(arguments: argparse.Namespace, interrupts: checkpoints.Interrupts) -> Solved:
-    """Read what the arguments of ``lnocl deconvolve`` name, and run."""
+def read(arguments: argparse.Namespace) -> tuple[Frames, dict[str, Any]]:
+    """Read what the arguments of ``lnocl deconvolve`` name; return it, and the values given."""
     from lnocl.io import missions
     from lnocl.io.frames import Calibration, read_frames
 
@@ -50,15 +40,22 @@ def solve(arguments: argparse.Namespace, interrupts: checkpoints.Interrupts) -> 
     given["stars"] = options.star_places(
         arguments.stars, arguments.star_table, frames.header, arguments.images[0]
     )
-    parts = bootstrap.read(arguments, frames)
+    return frames, given
+
+
+def solve(
+    arguments: argparse.Namespace,
+    frames: Frames,
+    given: Mapping[str, Any],
+    interrupts: checkpoints.Interrupts,
+) -> Result:
+    """Reconstruct what `read` has returned."""
     # Each process that makes replicas or tiles takes a device of its own, unless one was named.
-    parameters = _parameters(given | {"device": arguments.device})
+    parameters = _parameters({**given, "device": arguments.device})
     parameters["progress"] = not arguments.quiet
     if arguments.tile is None and not frames.observation.psf_fields:
-        result = deconvolve(frames.observation, **parameters, callback=interrupts.callback)
-    else:
-        result = _solve_tiles(arguments, frames.observation, parameters)
-    return Solved(result, frames, given, parts)
+        return deconvolve(frames.observation, **parameters, callback=interrupts.callback)
+    return _solve_tiles(arguments, frames.observation, parameters)
 
 
 def _solve_tiles(
@@ -67,8 +64,6 @@ def _solve_tiles(
     """Run tile by tile; refuse what is for one run alone."""
     from lnocl.tiles import deconvolve_tiles
 
-    if arguments.bootstrap is not None:
-        raise InputError("replicas are of one run, not of tiles; leave `bootstrap` out")
     for name in ("checkpoint", "resume", "refine_psfs"):
         if parameters.pop(name, PARAMETERS[name]) not in (PARAMETERS[name], []):
             raise InputError(f"`{name}` is not for tiles; leave it out")
@@ -79,18 +74,20 @@ def _solve_tiles(
 
 def _run(arguments: argparse.Namespace) -> None:
     from lnocl.io import atomic, fitsread
+    from lnocl.parallel import check_parallel
 
     inputs = options.input_paths(ALL_OPTIONS, vars(arguments))
     atomic.check_fits_output(arguments.output, arguments.overwrite, inputs)
     pictures.check(arguments, inputs)
     checkpoints.check(arguments, inputs)
-    bootstrap.check(arguments)
+    check_parallel(arguments.parallel)
     with (
         messages.shown_log(arguments.quiet, COMMAND.flags()),
         messages.recorded_warnings(COMMAND.flags()) as warned,
         checkpoints.Interrupts() as interrupts,
     ):
-        result, frames, given, parts = solve(arguments, interrupts)
+        frames, given = read(arguments)
+        result = solve(arguments, frames, given, interrupts)
         interrupts.listen()  # a run that was resumed at its end has no iteration to start from
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
@@ -113,13 +110,6 @@ def _run(arguments: argparse.Namespace) -> None:
         if not arguments.quiet:
             messages.say(lines)
     interrupts.explain(arguments, result)
-    if arguments.bootstrap is not None:
-        with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
-            lines = bootstrap.add_errors(
-                arguments, result, frames, parts, arguments.output, continues=False
-            )
-        if not arguments.quiet:
-            messages.say(lines)
 
 
 def _write(

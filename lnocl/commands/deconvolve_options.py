@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
-from lnocl.commands import bootstrap, checkpoints, options
+from lnocl.commands import checkpoints, options
 from lnocl.commands.options import SEVERAL, number_or_word, option, whole_or_word
 from lnocl.deconvolution import deconvolve
 from lnocl.runs.options import ENGINES, PRECISIONS
@@ -288,12 +288,10 @@ OPTIONS = {
             "five times its side, else the whole)",
         ),
         options.PARALLEL.but(
-            help="tiles, or replicas of --bootstrap, at once: a number of processes, or "
-            "current-scheduler, the workers of the scheduler of Dask that DASK_SCHEDULER_ADDRESS "
-            "names (default: one after the other)"
+            help="tiles at once: a number of processes, or current-scheduler, the workers of the "
+            "scheduler of Dask that DASK_SCHEDULER_ADDRESS names (default: one after the other)"
         ),
     ],
-    "errors": bootstrap.OPTIONS,
     "long runs": checkpoints.OPTIONS,
 }
 ALL_OPTIONS = [each for group in OPTIONS.values() for each in group]

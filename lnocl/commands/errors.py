@@ -14,11 +14,13 @@ from lnocl.commands import bootstrap, checkpoints, deconvolve, messages, options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command, Parser
 from lnocl.commands.signals import Terminated
-from lnocl.errors import FileError, InputError
+from lnocl.errors import FileError, InputError, note
 from lnocl.process import ignored_warnings
 
 if TYPE_CHECKING:
+    from lnocl.io.frames import Frames
     from lnocl.io.saved_results import SavedResult
+    from lnocl.runs.bootstrap import Part
 
 # The run is taken for the same where pixels and fluxes are to this share of them, and pixels to
 # this share of the brightest: another device rounds otherwise.
@@ -32,7 +34,36 @@ OPTIONS = [
         help="file that lnocl deconvolve has written; its errors are added to it, after those of "
         "replicas that it has",
     ),
-    *bootstrap.OPTIONS,
+    option(
+        "--bootstrap",
+        type=int,
+        default=50,
+        metavar="N",
+        help="replicas, each about as long as the run, for the errors of stars, regions and "
+        "pixels; ten or more (default: %(default)s)",
+    ),
+    option(
+        "--regions",
+        metavar="FILE",
+        is_input=True,
+        help="regions whose light is measured: a file such as DS9 writes, in pixels of the "
+        "extended source or on the sky",
+    ),
+    option(
+        "--profiles",
+        metavar="FILE",
+        is_input=True,
+        help="boxes along whose longer sides light and width are measured, pixel by pixel: such a "
+        "file; lnocl plot draws them with their errors",
+    ),
+    option(
+        "--seed",
+        type=int,
+        default=0,
+        metavar="S",
+        help="of the replicas, 0 or more (default: %(default)s); the same seed gives the same "
+        "errors",
+    ),
     options.PARALLEL.but(
         help="replicas at once: a number of processes, or current-scheduler, the workers of the "
         "scheduler of Dask that DASK_SCHEDULER_ADDRESS names (default: one after the other)"
@@ -45,7 +76,11 @@ OPTIONS = [
 def _run(arguments: argparse.Namespace) -> None:
     from lnocl.io import atomic
     from lnocl.io.saved_results import read_result
+    from lnocl.parallel import check_parallel
+    from lnocl.runs.bootstrap import check_number
 
+    check_parallel(arguments.parallel)
+    check_number(arguments.bootstrap, arguments.seed)
     saved = read_result(arguments.result)
     atomic.check_fits_output(arguments.result, overwrite=True)
     if saved.header.get("STOPPED") == "interrupt":
@@ -54,33 +89,34 @@ def _run(arguments: argparse.Namespace) -> None:
             "deconvolve to the end"
         )
     folder, run = _run_of(saved)
-    given = {name: getattr(arguments, name) for name in ("bootstrap", "seed")}
-    for name, value in given.items():
-        setattr(run, name, getattr(run, name) if value is None else value)
-    for name in ("regions", "profiles"):
-        if getattr(arguments, name) is not None:
-            setattr(run, name, os.path.abspath(getattr(arguments, name)))
-    run.bootstrap = bootstrap.DEFAULT if run.bootstrap is None else run.bootstrap
-    run.parallel = arguments.parallel
-    run.quiet, path = arguments.quiet, os.path.abspath(arguments.result)
-    bootstrap.check(run)
-    try:
-        there = contextlib.chdir(folder)
-        # What the run has to say it has lines.
-        progress = messages.shown_log(run.quiet, name=messages.PROGRESS)
-        with there, progress, ignored_warnings(), checkpoints.Interrupts() as interrupts:
-            solved = deconvolve.solve(run, interrupts)
-    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
-        raise FileError(
-            f"{folder}, where {arguments.result} was made, is not there: deconvolve again"
-        ) from error
+    run.quiet = arguments.quiet
+    # What the run has to say it has lines.
+    with (
+        messages.shown_log(run.quiet, name=messages.PROGRESS),
+        ignored_warnings(),
+        checkpoints.Interrupts() as interrupts,
+    ):
+        try:
+            with contextlib.chdir(folder):
+                frames, given = deconvolve.read(run)
+        except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
+            raise FileError(
+                f"{folder}, where {arguments.result} was made, is not there: deconvolve again"
+            ) from error
+        if run.tile is not None or frames.observation.psf_fields:
+            raise InputError(
+                f"{arguments.result} was made in tiles, and replicas are of one run: deconvolve a "
+                "cut-out without tiles"
+            )
+        with messages.shown_log(arguments.quiet, COMMAND.flags()):
+            parts = _parts(arguments, frames)
+        found = deconvolve.solve(run, frames, given, interrupts)
     if interrupts.caught:
         raise (
             KeyboardInterrupt
             if interrupts.caught == signal.SIGINT
             else Terminated(interrupts.caught)
         )
-    found, frames = solved.result, solved.frames
     expected = saved.extended * frames.electrons
     fluxes = saved.star_fluxes * frames.electrons
     if (
@@ -93,11 +129,28 @@ def _run(arguments: argparse.Namespace) -> None:
             "have changed; deconvolve again"
         )
     with messages.shown_log(run.quiet, name=messages.PROGRESS):
-        lines = bootstrap.add_errors(
-            run, found, frames, solved.parts, path, not arguments.overwrite
-        )
+        lines = bootstrap.add_errors(arguments, found, frames, parts)
     if not arguments.quiet:
         messages.say([*lines, f"added to {arguments.result}"])
+
+
+def _parts(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
+    """Return the regions and profiles that were given."""
+    if arguments.regions is None and arguments.profiles is None:
+        return []
+    from lnocl.io.fitsread import sky_header
+    from lnocl.io.regions import read_apertures, read_profiles
+
+    oversample = frames.observation.oversample
+    if oversample > 1:
+        note(
+            "`regions` in pixels are in those of the extended source, %d to one of the images",
+            oversample,
+        )
+    where = sky_header(frames.header, oversample), frames.observation.sky_shape
+    apertures = [] if arguments.regions is None else read_apertures(arguments.regions, *where)
+    profiles = [] if arguments.profiles is None else read_profiles(arguments.profiles, *where)
+    return [*apertures, *profiles]
 
 
 def _run_of(saved: SavedResult) -> tuple[str, argparse.Namespace]:

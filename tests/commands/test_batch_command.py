@@ -300,10 +300,10 @@ def test_an_interrupt_ends_it_and_the_next_call_goes_on():
 def test_an_error_that_nobody_thought_of_is_a_row(error, monkeypatch):
     solve = deconvolve.solve
 
-    def fail(arguments, interrupts):
+    def fail(arguments, *more):
         if "a.fits" in arguments.images:
             raise error
-        return solve(arguments, interrupts)
+        return solve(arguments, *more)
 
     monkeypatch.setattr(deconvolve, "solve", fail)
     write_targets("odd,a.fits,k1.fits,,1", "good,b.fits,k1.fits,,1")

@@ -1,4 +1,4 @@
-"""``lnocl errors``, and ``--bootstrap`` of ``lnocl deconvolve``: what they write and refuse."""
+"""``lnocl errors``: what it writes and refuses."""
 
 import os
 import signal
@@ -21,15 +21,21 @@ REGIONS = "image\ncircle(30,30,6) # text={round}\nbox(20,40,12,8,0)\ncircle(9,9,
 NAMES = ["star 1 flux", "round", "region 2", "dot"]
 WCS = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 30.0, "CDELT1": -1e-4,
        "CDELT2": 1e-4}  # fmt: skip
+ERRORS = ["errors", "out.fits", "--regions", "jet é.reg", "--bootstrap"]
 EXTENSIONS = ["ERRORS", "REGIONS", "ERROR", "BIAS", "REPLICAS", "REPLSUMS"]
 
 
 @pytest.fixture
 def words(small_command):
-    """Return the words that deconvolve and give errors, in their folder."""
+    """Return the words that deconvolve, in their folder, with regions."""
     Path("jet é.reg").write_text(REGIONS)
-    return [*small_command, "--engine", "numpy", "--n-iter", "6", "-o", "out.fits",
-            "--regions", "jet é.reg", "--bootstrap"]  # fmt: skip
+    return [*small_command, "--engine", "numpy", "--n-iter", "6", "-o", "out.fits"]
+
+
+@pytest.fixture
+def result(words):
+    """Make a result."""
+    assert cli.main(words) == 0
 
 
 def held(path="out.fits"):
@@ -43,10 +49,10 @@ def same_errors(one, other):
 
 
 def test_errors_are_added_to_the_file(words, capsys):
-    words.remove("--quiet")
     for name, value in WCS.items():
         fits.setval("images.fits", name, value=value)
-    assert cli.main([*words, "10"]) == 0
+    assert cli.main(words) == 0
+    assert cli.main([*ERRORS, "10"]) == 0
     said = capsys.readouterr().out
     assert "errors by 10 replicas, less their bias; in brackets 95 %:\nround: " in said
     assert "below the resolution: do not trust its error)" in said
@@ -76,23 +82,22 @@ def test_errors_are_added_to_the_file(words, capsys):
     assert lnocl.io.saved_results.read_result("out.fits").extended.shape == (64, 64)
 
 
-def test_regions_are_said_before_stars_and_all_of_them(words, capsys, monkeypatch):
+@pytest.mark.usefixtures("result")
+def test_regions_are_said_before_stars_and_all_of_them(capsys, monkeypatch):
     monkeypatch.setattr("lnocl.commands.bootstrap.MAX_SAID", 2)
-    words.remove("--quiet")
-    assert cli.main([*words, "10"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    first = next(i for i, line in enumerate(lines) if line.startswith("errors by 10 replicas"))
-    assert [line.partition(": ")[0] for line in lines[first + 1 :]] == [
-        *NAMES[1:], "and 1 more in the table ERRORS",
+    assert cli.main([*ERRORS, "10"]) == 0
+    first, *lines = capsys.readouterr().out.splitlines()
+    assert first.startswith("errors by 10 replicas")
+    assert [line.partition(": ")[0] for line in lines] == [
+        *NAMES[1:], "and 1 more in the table ERRORS", "added to out.fits",
     ]  # fmt: skip
 
 
-@pytest.mark.usefixtures("quick_figures")
-def test_profiles_are_drawn_with_their_errors(words, capsys):
+@pytest.mark.usefixtures("quick_figures", "result")
+def test_profiles_are_drawn_with_their_errors(capsys):
     pytest.importorskip("matplotlib")
     Path("p.reg").write_text("image\nbox(30,34,40,6,10) # text={jet}\nbox(30,34,6,20,0)")
-    words.remove("--quiet")
-    assert cli.main([*words, "10", "--profiles", "p.reg"]) == 0
+    assert cli.main([*ERRORS, "10", "--profiles", "p.reg"]) == 0
     assert "jet flux" not in capsys.readouterr().out  # they are many
     table = held()["ERRORS"].data
     along = table[np.isfinite(table["at"])]
@@ -116,21 +121,26 @@ def test_profiles_are_drawn_with_their_errors(words, capsys):
 
 def test_errors_go_on_bit_for_bit_as_if_computed_at_once(words):
     """The command in the header says where files are, names beyond ASCII and all."""
-    assert cli.main([*words, "12"]) == 0
+    os.rename("psfs.fits", "pśf.fits")
+    words[words.index("psfs.fits")] = "pśf.fits"
+    assert cli.main(words) == 0
+    assert cli.main([*ERRORS, "12"]) == 0
     expected = held()
-    assert cli.main([*words, "10"]) == 0
+    assert cli.main([*ERRORS, "10", "--overwrite"]) == 0
     folder = os.getcwd()
-    os.chdir("/")
+    os.mkdir("elsewhere")
+    os.rename("jet é.reg", "elsewhere/jet é.reg")
+    os.chdir("elsewhere")
     try:
-        assert cli.main(["errors", f"{folder}/out.fits", "--bootstrap", "12", "--quiet"]) == 0
+        elsewhere = [word.replace("out.fits", f"{folder}/out.fits") for word in ERRORS]
+        assert cli.main([*elsewhere, "12", "--quiet"]) == 0
     finally:
         os.chdir(folder)
     same_errors(held(), expected)
 
 
-def test_a_result_without_errors_is_given_them(words, capsys):
-    alone = words[: words.index("--regions")]
-    assert cli.main(alone) == 0
+@pytest.mark.usefixtures("result")
+def test_a_result_without_errors_is_given_them(capsys):
     before, headers = Path("out.fits").read_bytes(), held()
     assert cli.main(["errors", "out.fits", "--bootstrap", "10", "--seed", "4"]) == 0
     assert capsys.readouterr().out.endswith("added to out.fits\n")
@@ -151,7 +161,8 @@ def test_a_result_without_errors_is_given_them(words, capsys):
 def test_errors_are_in_the_unit_of_the_result(words):
     """Per second, of images in electrons with an exposure; and go on in it."""
     fits.setval("images.fits", "BUNIT", value="adu")
-    assert cli.main([*words, "10", "--gain", "4", "--exposure", "2"]) == 0
+    assert cli.main([*words, "--gain", "4", "--exposure", "2"]) == 0
+    assert cli.main([*ERRORS, "10"]) == 0
     first = held()
     unit = first["PRIMARY"].header["BUNIT"]
     assert unit == "adu/s"
@@ -164,24 +175,25 @@ def test_errors_are_in_the_unit_of_the_result(words):
     sums, n = first["REPLSUMS"].data, 10
     scatter = np.sqrt((sums[1] - sums[0] ** 2 / n) / (n - 1))
     np.testing.assert_allclose(first["ERROR"].data, scatter / 4, rtol=1e-9)
-    assert cli.main(["errors", "out.fits", "--bootstrap", "11", "--quiet"]) == 0
+    assert cli.main([*ERRORS, "11", "--quiet"]) == 0
     replicas = held()["REPLICAS"].data["errors"]
     np.testing.assert_array_equal(replicas[:10], first["REPLICAS"].data["errors"])
     assert len(replicas) == 11
 
 
-def test_names_beyond_ascii_are_escaped(words):
+@pytest.mark.usefixtures("result")
+def test_names_beyond_ascii_are_escaped():
     Path("jet é.reg").write_text("image\ncircle(30,30,6) # text={knöt ★}\n")
-    assert cli.main([*words, "10"]) == 0
+    assert cli.main([*ERRORS, "10"]) == 0
     assert held()["ERRORS"].data["name"][1] == r"kn\xf6t \u2605"
-    assert cli.main(["errors", "out.fits", "--bootstrap", "11", "--quiet"]) == 0
+    assert cli.main([*ERRORS, "11", "--quiet"]) == 0
     assert len(held()["REPLICAS"].data) == 11
 
 
 def test_without_stars_and_regions_pixels_have_errors(words):
-    alone = words[: words.index("--regions")]
-    alone[alone.index("--star") : alone.index("--star") + 2] = []
-    assert cli.main([*alone, "--bootstrap", "10"]) == 0
+    words[words.index("--star") : words.index("--star") + 2] = []
+    assert cli.main(words) == 0
+    assert cli.main(["errors", "out.fits", "--bootstrap", "10", "--quiet"]) == 0
     assert cli.main(["errors", "out.fits", "--bootstrap", "12", "--quiet"]) == 0
     found = held()
     assert len(found["ERRORS"].data) == 0
@@ -189,8 +201,8 @@ def test_without_stars_and_regions_pixels_have_errors(words):
     assert (found["ERROR"].data > 0).all()
 
 
-def test_a_run_that_was_interrupted_has_no_errors(words, capsys):
-    assert cli.main(words[: words.index("--regions")]) == 0
+@pytest.mark.usefixtures("result")
+def test_a_run_that_was_interrupted_has_no_errors(capsys):
     fits.setval("out.fits", "STOPPED", value="interrupt")
     assert cli.main(["errors", "out.fits"]) == 2
     assert "the run of out.fits was interrupted, and its command" in capsys.readouterr().err
@@ -198,11 +210,12 @@ def test_a_run_that_was_interrupted_has_no_errors(words, capsys):
     assert cli.main(["errors", "out.fits.gz"]) != 0
 
 
-def test_overwrite_begins_anew(words):
-    assert cli.main([*words, "10"]) == 0
+@pytest.mark.usefixtures("result")
+def test_overwrite_begins_anew():
+    assert cli.main([*ERRORS, "10"]) == 0
     expected = held()
     for seed, more in (("5", []), ("5", ["--overwrite"]), ("0", ["--overwrite"])):
-        status = cli.main(["errors", "out.fits", "--quiet", "--seed", seed, *more])
+        status = cli.main([*ERRORS, "10", "--quiet", "--seed", seed, *more])
         assert status == (0 if more else 2)
     np.testing.assert_array_equal(
         held()["REPLICAS"].data["errors"], expected["REPLICAS"].data["errors"]
@@ -220,12 +233,13 @@ WRONG_USES = [
 ]
 
 
-def test_wrong_uses_are_one_line_and_leave_the_file(words, capsys):
+@pytest.mark.usefixtures("result")
+def test_wrong_uses_are_one_line_and_leave_the_file(capsys):
     Path("empty.reg").write_text("")
     Path("beyond.reg").write_text("image\ncircle(300,3,2)")
     Path("sky.reg").write_text('icrs\ncircle(10,10,1")')
     Path("other.reg").write_text("image\ncircle(30,30,6)")
-    assert cli.main([*words, "10"]) == 0
+    assert cli.main([*ERRORS, "10"]) == 0
     before = Path("out.fits").read_bytes()
     capsys.readouterr()
     for change, status, message in WRONG_USES:
@@ -236,8 +250,8 @@ def test_wrong_uses_are_one_line_and_leave_the_file(words, capsys):
     assert Path("out.fits").read_bytes() == before
 
 
-def test_what_has_changed_since_is_refused(words, capsys):
-    assert cli.main([*words, "10"]) == 0
+@pytest.mark.usefixtures("result")
+def test_what_has_changed_since_is_refused(capsys):
     images = fits.getdata("images.fits")
     fits.writeto("images.fits", images[:, ::-1], overwrite=True)
     assert cli.main(["errors", "out.fits", "--quiet"]) == 2
@@ -250,32 +264,33 @@ def test_what_has_changed_since_is_refused(words, capsys):
     assert "images.fits" in capsys.readouterr().err
 
 
-def test_a_file_of_no_command_is_refused(words, capsys):
+def test_a_file_of_no_command_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     made = fits.HDUList([fits.PrimaryHDU(np.ones((8, 8)))])
     columns = [fits.Column(name, "D", array=[1.0]) for name in ("x", "y", "flux")]
     made.append(fits.BinTableHDU.from_columns(columns, name="STARS"))
     made.writeto("bare.fits")
     assert cli.main(["errors", "bare.fits"]) == 2
     assert "bare.fits has no command of lnocl deconvolve in its header" in capsys.readouterr().err
-    alone = words[: words.index("--regions")]
-    assert cli.main([*alone, "--seed", "3"]) == 2
-    assert (
-        "--regions, --profiles and --seed are for replicas: give --bootstrap"
-        in capsys.readouterr().err
-    )
+
+
+def test_replicas_of_tiles_are_refused(words, capsys):
+    assert cli.main([*words, "--tile", "64"]) == 0
+    assert cli.main([*ERRORS, "10"]) == 2
+    assert "out.fits was made in tiles, and replicas are of one run" in capsys.readouterr().err
 
 
 @pytest.mark.system
 def test_killed_errors_go_on_bit_for_bit(words, monkeypatch):
-    assert cli.main([*words, "40"]) == 0
+    assert cli.main(words) == 0
+    assert cli.main([*ERRORS, "40"]) == 0
     expected = held()
-    alone = words[: words.index("--bootstrap")]
-    assert cli.main(alone[: alone.index("--regions")]) == 0
+    assert cli.main(words) == 0
     program = (
         "import sys\nfrom lnocl.commands import bootstrap, cli\nbootstrap.WRITE_EVERY = 0.0\n"
         "sys.exit(cli.main(sys.argv[1:]))"
     )
-    options = ["errors", "out.fits", "--regions", "jet é.reg", "--quiet", "--bootstrap", "40"]
+    options = [*ERRORS, "40", "--quiet"]
     killed = 0
     for pause in (0.02, 0.3, 0.6):
         process = subprocess.Popen([sys.executable, "-c", program, *options])

@@ -17,7 +17,6 @@ pytestmark = pytest.mark.usefixtures("command_folder")
 # Options of lnocl deconvolve that no function takes as they are.
 OF_THE_SHELL = {"images", "output", "overwrite", "plot", "quiet", "residuals",
                 "star_table",
-                "bootstrap", "regions", "profiles", "seed",
                 "parallel", "tile"}  # fmt: skip
 # Parameters of lnocl.deconvolve that the shell gives itself, or that no option gives.
 NOT_OPTIONS = {"observation", "callback", "progress", "initial_extended", "initial_star_fluxes"}

@@ -163,6 +163,8 @@ def test_regions_are_measured_on_the_finer_sky(result, tmp_path, capsys):
     )
     command = ["errors", result, "--bootstrap", "10", "--regions", str(regions)]
     assert cli.main(command) == 0
+    said = capsys.readouterr().err
+    assert f"--regions in pixels are in those of the extended source, {Q} to one of the" in said
     with fits.open(result) as hdus:
         table = Table(hdus["ERRORS"].data)
     values = {row["name"]: row["value"] for row in table}
