@@ -27,7 +27,7 @@ look lensed_quasar
 # A quasar and its host (HST F125W), with a map of the inverse variance.
 host=$data/hst-quasar-j0005
 lnocl deconvolve "$host/sci_J0005-0006.fits" --psf "$host/sci_psf.fits" --psf-centre fit \
-    --inverse-variance "$host/ivm_J0005-0006.fits" --exposure EXPTIME --star 64,64 --refine \
+    --noise "ivar=$host/ivm_J0005-0006.fits" --exposure EXPTIME --star 64,64 --refine \
     --plot "$out/quasar_host.png" $common -o "$out/quasar_host.fits"
 look quasar_host
 

@@ -12,7 +12,7 @@ mkdir -p "$out"
 sci=$data/sci_J0005-0006.fits
 # The PSF star is noisy and has negative pixels; its background was subtracted.
 python "$here/real.py" centred-psf "$data/sci_psf.fits" "$out/psf.fits" 63
-known="--psf $out/psf.fits --background 0 --inverse-variance $data/ivm_J0005-0006.fits"
+known="--psf $out/psf.fits --background 0 --noise ivar=$data/ivm_J0005-0006.fits"
 known="$known --exposure EXPTIME --pad 16"
 how="--solver sgp --n-iter 10 --residuals --quiet --overwrite"
 lnocl deconvolve $paper "$sci" $known --star 64,64 $how -o "$out/whole.fits"

@@ -8,6 +8,7 @@ from typing import Any
 from lnocl.commands import checkpoints, options
 from lnocl.commands.options import SEVERAL, number_or_word, option, whole_or_word
 from lnocl.deconvolution import deconvolve
+from lnocl.io.names import NOISE, PSF_ERRORS
 from lnocl.runs.options import ENGINES, PRECISIONS
 from lnocl.scene.observation import OVERSAMPLES
 from lnocl.scene.psf_families import FAMILIES
@@ -99,7 +100,7 @@ OPTIONS = {
             help="electrons for each adu, or for each of whatever unit the images have; or a "
             "keyword of the images' headers such as GAIN; or their extension with the variance of "
             "counts, as VAR_POISSON of JWST (default: 1 for counts; for other units what their "
-            "VAR_POISSON, --error or ERR shows)",
+            "VAR_POISSON, --noise err or ERR shows)",
         ),
         option(
             "--mask",
@@ -107,45 +108,22 @@ OPTIONS = {
             metavar="FILE",
             checksum="MSUM",
             help="FITS file that is not 0 where a pixel is bad; or dq, the extension DQ of each "
-            "image, or wht, where its extension WHT is 0; one for all images or one for each",
-        ),
-        option(
-            "--good-bits",
-            metavar="BITS",
-            card=("GOODBITS", "flags of DQ that are no fault"),
-            help="with --mask dq: flags that are no fault, as in 16,64, or ~1 for all but 1; 0 for "
-            "none (default: of JWST ~1,512, of HST those of pixels that were corrected, else 0)",
+            "image, or wht, where its extension WHT is 0; one for all images or one for each. "
+            "dq:BITS names the flags that are no fault, as in dq:16,64, or dq:~1 for all but 1; "
+            "dq:0 for none (default: of JWST ~1,512, of HST those of pixels that were corrected, "
+            "else 0)",
         ),
         options.SATURATION,
         option(
-            "--inverse-variance",
+            "--noise",
             **SEVERAL,
-            metavar="FILE",
-            checksum="VSUM",
-            help="FITS file with 1 / variance of sky and read noise, in units of the images, 0 "
-            "where a pixel is bad; one for all images or one for each",
-        ),
-        option(
-            "--variance",
-            **SEVERAL,
-            metavar="FILE",
-            checksum="WSUM",
-            help="the same with their variance",
-        ),
-        option(
-            "--rms",
-            **SEVERAL,
-            metavar="FILE",
-            checksum="QSUM",
-            help="the same with their standard deviation",
-        ),
-        option(
-            "--error",
-            **SEVERAL,
-            metavar="FILE",
+            kinds=NOISE,
             checksum="NSUM",
-            help="the same with the standard deviation of all noise, that of the source's counts "
-            "too; or err, the extension ERR of each image",
+            help="FITS file with the noise of each pixel in units of the images, 0 where a pixel "
+            "is bad: of sky and read noise 1 / variance (ivar=FILE), variance (var=FILE) or "
+            "standard deviation (rms=FILE); or the standard deviation of all noise, that of the "
+            "source's counts too (err=FILE; err alone is the extension ERR of each image); one for "
+            "all images or one for each",
         ),
         option(
             "--align",
@@ -174,45 +152,22 @@ OPTIONS = {
             card=("REFPSF", "asked of the PSFs"),
             help="fit the PSFs to the stars before the reconstruction where they do not fit, and "
             "use them where they fit better: shift, jitter (a blur, or a sharpening), strehl "
-            "(needs --ideal-psf or --pupil), pupil (phases; needs --pupil), modes (needs "
-            "--psf-modes), pixels, none; by default, where smoothing is chosen, jitter, of several "
-            "images shift, those whose files are given, and pixels",
+            "(needs --psf-errors ideal or pupil), pupil (phases; needs --psf-errors pupil), modes "
+            "(needs --psf-errors modes), pixels, none; by default, where smoothing is chosen, "
+            "jitter, of several images shift, those whose files are given, and pixels",
         ),
         option(
-            "--ideal-psf",
-            dest="ideal_psfs",
+            "--psf-errors",
             **SEVERAL,
-            metavar="FILE",
+            kinds=PSF_ERRORS,
             checksum="DSUM",
-            help="FITS file with a PSF without aberrations, of the shape of the PSFs; one for all "
-            "images or one for each",
-        ),
-        option(
-            "--pupil",
-            dest="pupils",
-            **SEVERAL,
-            metavar="FILE",
-            checksum="TSUM",
-            help="FITS file with the transmission of a pupil, of the shape of the PSFs and in "
-            "their frequencies, its middle at (ky // 2, kx // 2); one for all images or one "
-            "for each",
-        ),
-        option(
-            "--psf-modes",
-            metavar="FILE",
-            checksum="LSUM",
-            help="FITS file with a cube of the ways in which the PSFs may differ, one standard "
-            "deviation each, of the shape of the PSFs and for all of them; in an extension MODES, "
-            "as lnocl psf --modes writes it, or as its image",
-        ),
-        option(
-            "--psf-scatter",
-            **SEVERAL,
-            metavar="FILE",
-            checksum="SSUM",
-            help="FITS file with the standard deviation of the pixels of a PSF of unit sum, in an "
-            "extension SCATTER, as lnocl psf writes it, or as its image: the smoothing near "
-            "stars follows it; one for all images or one for each",
+            help="FITS files of the shape of the PSFs that tell how these may be wrong: ideal="
+            "FILE, a PSF without aberrations; pupil=FILE, the transmission of a pupil in the "
+            "frequencies of the PSFs, its middle at (ky // 2, kx // 2); scatter=FILE, the standard "
+            "deviation of the pixels of a PSF of unit sum, which the smoothing near stars follows; "
+            "of these one for all images or one for each; modes=FILE, a cube of the ways in which "
+            "all PSFs may differ, one standard deviation each. Scatter and modes may be extensions "
+            "SCATTER and MODES, as lnocl psf writes them",
         ),
     ],
     "reconstruction": [

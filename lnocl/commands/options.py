@@ -6,10 +6,11 @@ import argparse
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from lnocl.errors import InputError
-from lnocl.io.names import file_of
+from lnocl.io.names import ERR, file_of, parse_kind
 from lnocl.parallel import CURRENT
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ class Option:
         Keyword of the cards with the checksums of its files.
     is_input : bool
         Whether a text that it is given may be the name of a file to read.
+    kinds : mapping of str to str
+        The kinds of its values, ``KIND=FILE``, with the parameter that each stands for.
     is_repeated : bool
         Whether the command that repeats a run has it.
     """
@@ -49,6 +52,7 @@ class Option:
     checksum: str = ""
     is_input: bool = False
     is_repeated: bool = True
+    kinds: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -99,7 +103,8 @@ class Option:
 
     def inputs(self, value: Any) -> list[str]:
         """Return the names in a value that may be those of files to read."""
-        return [word for word in _listed(value) if self.is_input and isinstance(word, str)]
+        words = [word for word in _listed(value) if self.is_input and isinstance(word, str)]
+        return [parse_kind(word)[1] for word in words] if self.kinds else words
 
 
 # The options of a subcommand, by the headings of its help.
@@ -112,10 +117,21 @@ def option(
     checksum: str = "",
     is_input: bool = False,
     is_repeated: bool = True,
+    kinds: Mapping[str, str] | None = None,
     **keywords: Any,
 ) -> Option:
     """Return an `Option`; all further keywords are for the parser."""
-    return Option(flags, keywords, card, checksum, is_input or bool(checksum), is_repeated)
+    if kinds is not None:
+        keywords |= {"type": partial(_of_kind, kinds), "metavar": "KIND=FILE"}
+    is_input = is_input or bool(checksum)
+    return Option(flags, keywords, card, checksum, is_input, is_repeated, kinds or {})
+
+
+def _of_kind(kinds: Mapping[str, str], word: str) -> str:
+    kind, path = parse_kind(word)
+    if kind not in kinds or not (path or word == ERR):
+        raise argparse.ArgumentTypeError(f"{word!r} is not KIND=FILE; kinds are {', '.join(kinds)}")
+    return word
 
 
 def input_paths(options: Sequence[Option], values: Mapping[str, Any]) -> list[str]:

@@ -44,9 +44,14 @@ class Command(NamedTuple):
                 group.add_argument(*each.flags, **each.keywords)
 
     def flags(self) -> dict[str, str]:
-        """Return the flag of each parameter that an option stands for, the first of several."""
+        """Return the flag of each parameter that an option, or a kind of its values, stands for."""
         options = [each for group in self.options.values() for each in group]
-        return {each.name: each.flags[-1] for each in reversed(options) if not each.is_positional}
+        kinds = {
+            parameter: f"{each.flags[-1]} {kind}"
+            for each in options
+            for kind, parameter in each.kinds.items()
+        }
+        return kinds | {each.name: each.flags[-1] for each in options if not each.is_positional}
 
 
 class Parser(argparse.ArgumentParser):

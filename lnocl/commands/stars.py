@@ -48,7 +48,8 @@ OPTIONS = [
         metavar="FILE",
         is_input=True,
         help="FITS file that is not 0 where a pixel is bad; or dq, the extension DQ of the image, "
-        "or wht, where its extension WHT is 0 (default: of JWST and HST what their files have); "
+        "or dq:16,64 where these flags are no fault, or wht, where its extension WHT is 0 "
+        "(default: of JWST and HST what their files have); "
         "pixels that are NaN are bad too",
     ),
     options.SATURATION.but(
@@ -115,17 +116,19 @@ def _mask(arguments: argparse.Namespace) -> NDArray[np.bool_] | None:
     word = arguments.mask or missions.mask_word(contents)
     if not word:
         return None
-    if word not in ("dq", "wht"):
+    extension, colon, good_bits = word.partition(":")
+    if extension not in ("dq", "wht"):
         return fitsread.read_single(word).data[0] != 0
-    values = fitsread.read_extension(arguments.image, word.upper())
+    values = fitsread.read_extension(arguments.image, extension.upper())
     if values is None:
         raise InputError(
-            f"{arguments.image} has no extension {word.upper()}; give `mask` as a file, or leave "
-            "it out"
+            f"{arguments.image} has no extension {extension.upper()}; give `mask` as a file, or "
+            "leave it out"
         )
-    if word == "wht":
+    if extension == "wht":
         return values == 0
-    good_bits = flags.good_bits_of(*map(contents.value, ("TELESCOP", "INSTRUME", "DETECTOR")))
+    if not colon:
+        good_bits = flags.good_bits_of(*map(contents.value, ("TELESCOP", "INSTRUME", "DETECTOR")))
     return flags.bad_pixels(values, good_bits, arguments.image)
 
 

@@ -86,7 +86,7 @@ def bad_pixels(flags: NDArray[Any], good_bits: str, path: str) -> NDArray[np.boo
         good = None
     if good is None:
         raise InputError(
-            f"`good_bits` {good_bits!r} are no flags; give powers of 2, such as 16,64, or ~1 for "
+            f"`mask` dq:{good_bits} names no flags; give powers of 2, as in dq:16,64, or dq:~1 for "
             "all but 1"
         )
     return np.asarray(bitfield_to_boolean_mask(sums, ignore_flags=good), bool)

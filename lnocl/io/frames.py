@@ -17,7 +17,8 @@ from lnocl.io.fitsread import read_contents, read_extension, read_keyword, read_
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
 from lnocl.io.levels import is_rate, sky_level, sky_noise
 from lnocl.io.maps import Maps, Word
-from lnocl.io.noise import CLASSES, WITH_SOURCE, NoiseMap, electrons_by_variance, read_noise_map
+from lnocl.io.names import ERR, PSF_ERRORS, parse_kind
+from lnocl.io.noise import NoiseMap, electrons_by_variance, read_noise_map
 from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.arrays import Array
@@ -31,8 +32,6 @@ MAX_SCALE_ERROR = 0.02
 MUCH_MASKED = 0.1
 # Of images with more negative pixels than this share the sky was subtracted.
 SUBTRACTED = 0.01
-# Words for masks in the images' own files.
-MASK_WORDS = ("dq", "wht")
 # The extensions in which `lnocl psf` writes what it finds beside a PSF.
 MADE_OF_PSFS = {"psf_modes": "MODES", "psf_scatter": "SCATTER"}
 
@@ -49,18 +48,17 @@ class Calibration(NamedTuple):
         Standard deviation, electrons: numbers, maps, a keyword of the headers, of the images or
         their files, or ``"auto"``, what the sigma-clipped scatter of the image has beyond the noise
         of its counts.
-    inverse_variance, variance, rms : sequence of str
-        Maps of one over the variance of all noise but that of the source, of this variance, or of
-        its root, in units of the images; one kind at most. 0 where a pixel is bad.
-    error : sequence of str
-        Maps of the standard deviation of all noise, that of the source's counts too; or ``"err"``,
-        the extension ERR of each image's file.
+    noise : sequence of str
+        Maps of noise in units of the images, 0 where a pixel is bad, as ``KIND=FILE``: of all noise
+        but that of the source one over the variance (ivar), the variance (var) or its root (rms);
+        or the standard deviation of all noise, that of the source's counts too (err). ``"err"``
+        alone is the extension ERR of each image's file.
     exposure : sequence of Word
         Seconds: numbers, maps, or a keyword of the headers, of the images or their files.
     mask : sequence of str
-        Maps, not 0 where a pixel is bad; or ``"dq"``, the extension DQ of each image's file.
-    good_bits : str, optional
-        Flags of DQ that are no fault, as for `flags.bad_pixels`; by default those of the mission.
+        Maps, not 0 where a pixel is bad; ``"wht"``, the extension WHT of each image's file, 0 where
+        a pixel is bad; or ``"dq"``, its extension DQ. ``"dq:16,64"`` names the flags that are no
+        fault, as for `flags.bad_pixels`; by default they are those of the mission.
     saturation : float, optional
         Pixels of this value and above, in units of the images, are bad.
     gain : float or str, optional
@@ -74,35 +72,24 @@ class Calibration(NamedTuple):
         As for `Observation`.
     oversample, effective_psfs : int, bool
         As for `Observation`.
-    ideal_psfs : sequence of str
-        Files of the PSFs without aberrations, as for `Observation`.
-    pupils, psf_scatter : sequence of str
-        Files of pupils, and of the scatter of PSFs, as for `Observation`; of the latter their
-        extension SCATTER, where they have one.
-    psf_modes : str, optional
-        File of a cube of the modes of all PSFs, as for `Observation`: its extension MODES, where it
-        has one.
+    psf_errors : sequence of str
+        Files that tell how PSFs may be wrong, as ``KIND=FILE`` with a kind of `names.PSF_ERRORS`,
+        as for `Observation`. Of scatter and modes they are the extensions SCATTER and MODES, where
+        a file has these. There is one file of modes, for all PSFs.
     """
 
     background: Sequence[Word] = (0.0,)
     read_noise: Sequence[Word] = (0.0,)
-    inverse_variance: Sequence[str] = ()
-    variance: Sequence[str] = ()
-    rms: Sequence[str] = ()
-    error: Sequence[str] = ()
+    noise: Sequence[str] = ()
     exposure: Sequence[Word] = ()
     mask: Sequence[str] = ()
-    good_bits: str | None = None
     saturation: float | None = None
     gain: Word | None = None
     align: str | None = None
     oversample: int = 1
     effective_psfs: bool = False
     psf_centre: PsfCentre = "check"
-    ideal_psfs: Sequence[str] = ()
-    pupils: Sequence[str] = ()
-    psf_scatter: Sequence[str] = ()
-    psf_modes: str | None = None
+    psf_errors: Sequence[str] = ()
 
 
 class Frames(NamedTuple):
@@ -238,22 +225,20 @@ class _Reader:
 
     def _psf_errors(self) -> dict[str, Any]:
         """Return what is known of the ways in which PSFs may be wrong."""
-        given = self._calibration
-        files = {
-            "ideal_psfs": given.ideal_psfs,
-            "pupils": given.pupils,
-            "psf_scatter": given.psf_scatter,
-            "psf_modes": [given.psf_modes] if given.psf_modes else [],
-        }
+        files: dict[str, list[str]] = {}
+        for kind, path in map(parse_kind, self._calibration.psf_errors):
+            files.setdefault(PSF_ERRORS[kind], []).append(path)
+        if len(files.get("psf_modes", ())) > 1:
+            raise InputError("the modes are those of all images; give one file of `psf_modes`")
         found = {}
         for name, paths in files.items():
-            if paths:
-                stack = read_stack(paths)
-                found[name], self._sha256[name] = stack.data, stack.sha256
-                if name in MADE_OF_PSFS:
-                    parts = [read_extension(path, MADE_OF_PSFS[name]) for path in paths]
-                    held = [np.atleast_3d(part.T).T for part in parts if part is not None]
-                    found[name] = np.concatenate(held) if held else found[name]
+            stack = read_stack(paths)
+            found[name] = stack.data
+            self._sha256.setdefault("psf_errors", []).extend(stack.sha256)
+            if name in MADE_OF_PSFS:
+                parts = [read_extension(path, MADE_OF_PSFS[name]) for path in paths]
+                held = [np.atleast_3d(part.T).T for part in parts if part is not None]
+                found[name] = np.concatenate(held) if held else found[name]
         return found
 
     def _warn_of_pixel_scales(self) -> None:
@@ -350,20 +335,20 @@ class _Reader:
         """The electrons in a unit of each image, by the variance of its counts.
 
         That is the extension that gain names; where no gain is given and the images are not in
-        counts it is VAR_POISSON, or error, or the extension ERR.
+        counts it is VAR_POISSON, or a map of all noise, or the extension ERR.
         """
         gain = self._calibration.gain
         held = frozenset.intersection(*(read_contents(path).extensions for path in self._paths))
-        words = [gain.upper()] if isinstance(gain, str) else ["VAR_POISSON", "error", "ERR"]
+        words = [gain.upper()] if isinstance(gain, str) else ["VAR_POISSON", "`noise`", "ERR"]
         if isinstance(gain, float) or (gain is None and self._counts() is not None):
             return None
         noise = self._noise_map
-        has_errors = noise is not None and noise.kind == WITH_SOURCE
-        found_in = [word for word in words if word in held or (word == "error" and has_errors)]
+        has_errors = noise is not None and noise.kind == ERR
+        found_in = [word for word in words if word in held or (word == "`noise`" and has_errors)]
         if not found_in:
             return None
         word = found_in[0]
-        if word == "error" and noise is not None:
+        if word == "`noise`" and noise is not None:
             variances = noise.variance
         else:
             variances = self._extensions(word, "gain") ** (2 if word == "ERR" else 1)
@@ -443,13 +428,10 @@ class _Reader:
 
     @cached_property
     def _noise_map(self) -> NoiseMap | None:
-        given = {kind: getattr(self._calibration, kind) for kind in CLASSES}
-        found = read_noise_map(given, self._maps, lambda: self._extensions("ERR", "error"))
-        if found is not None and any(self._calibration.read_noise):
-            raise InputError(
-                f"give `read_noise`, or give `{found.kind}`, which includes it, not both"
-            )
-        return found
+        given = self._calibration
+        if given.noise and any(given.read_noise):
+            raise InputError("give `read_noise`, or give `noise`, which includes it, not both")
+        return read_noise_map(given.noise, self._maps, lambda: self._extensions("ERR", "noise"))
 
     def _mask(self, exposure: Array | None, noise: NoiseMap | None) -> Mask:
         """Return which pixels are bad, and log their number, each pixel for its first reason."""
@@ -462,20 +444,21 @@ class _Reader:
             if share > MUCH_MASKED:
                 warn(
                     f"{100 * share:.0f} % of `images[{j}]` are masked: look at why, above; leave "
-                    "`mask` out, or give other `good_bits`, if they are good"
+                    "`mask` out, or name flags that are no fault, as in `mask` dq:16, if they are "
+                    "good"
                 )
         return masked
 
     def _bad_pixels(
         self, exposure: Array | None, noise: NoiseMap | None
     ) -> Iterator[tuple[str, Mask]]:
-        if paths := [word for word in self._calibration.mask if word not in MASK_WORDS]:
+        words = self._calibration.mask
+        flags = [word for word in words if word.partition(":")[0] == "dq"]
+        if paths := [word for word in words if word not in (*flags, "wht")]:
             yield "by the mask", self._maps.read("mask", paths) != 0  # NaN is not 0 either
-        if "dq" in self._calibration.mask:
-            yield "by the extension DQ", self._data_quality()
-        elif self._calibration.good_bits is not None:
-            raise InputError("`good_bits` are flags of the extension DQ; give `mask` dq too")
-        if "wht" in self._calibration.mask:
+        if flags:
+            yield "by the extension DQ", self._data_quality(flags[-1])
+        if "wht" in words:
             yield "without weight", self._extensions("WHT", "mask") == 0
         level = self._calibration.saturation
         if level is not None:
@@ -483,14 +466,14 @@ class _Reader:
         if exposure is not None and exposure.ndim == 3:
             yield "without exposure", exposure == 0
         if noise is not None:
-            yield f"without {noise.kind.replace('_', ' ')}", noise.variance == 0
+            yield "by the map of noise", noise.variance == 0
 
-    def _data_quality(self) -> Mask:
+    def _data_quality(self, word: str) -> Mask:
         sums = self._extensions("DQ", "mask")
         flagged = np.empty(sums.shape, bool)
         for j, header in enumerate(self._images.headers):
-            path, good_bits = self._paths[j], self._calibration.good_bits
-            if good_bits is None:
+            path, good_bits = self._paths[j], word[len("dq:") :]
+            if word == "dq":
                 words = (
                     str(read_keyword(path, header, keyword) or "").strip()
                     for keyword in ("TELESCOP", "INSTRUME", "DETECTOR")

@@ -7,14 +7,13 @@ from typing import Any
 
 from lnocl.errors import InputError, note
 from lnocl.io.fitsread import Contents, read_contents
+from lnocl.io.names import ERR
 from lnocl.scene import units
 
 # Those whose files are known.
 TELESCOPES = ("HST", "JWST")
 # Detectors that count photons, so that a count is one.
 PHOTON_COUNTING = ("SBC", "FUV-MAMA", "NUV-MAMA")
-# Kinds of noise, of which one is enough.
-NOISE = ("read_noise", "inverse_variance", "variance", "rms", "error")
 
 
 def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -47,8 +46,8 @@ def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
         return {}
     found: dict[str, Any] = {}
     held = contents.extensions
-    if not any(given.get(kind) for kind in NOISE):
-        found |= {"error": ["err"]} if "ERR" in held else {"read_noise": ["auto"]}
+    if not (given.get("read_noise") or given.get("noise")):
+        found |= {"noise": [ERR]} if "ERR" in held else {"read_noise": ["auto"]}
     if not given.get("mask") and (word := mask_word(contents)):
         found["mask"] = [word]
     if not given.get("background"):

@@ -1,4 +1,7 @@
-"""Names of images in files: ``FILE``, ``FILE[SCI]``, ``FILE[SCI,2]`` or ``FILE[1]``."""
+"""Names of images in files: ``FILE``, ``FILE[SCI]``, ``FILE[SCI,2]`` or ``FILE[1]``.
+
+Files of several kinds are named as ``KIND=FILE``.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,23 @@ from typing import NamedTuple
 _NAMED = re.compile(
     r"(?P<file>.+)\[((?P<number>\d+)|(?P<name>[^\[\],\s][^\[\],]*)(,\s*(?P<version>\d+))?)\]"
 )
+
+# The kinds of maps of noise, and the class of astropy.nddata for each.
+NOISE = {
+    "ivar": "InverseVariance",
+    "var": "VarianceUncertainty",
+    "rms": "StdDevUncertainty",
+    "err": "StdDevUncertainty",
+}
+# The kind that has the noise of the source's own counts too; alone it is the extension ERR.
+ERR = "err"
+# The kinds of files that tell how PSFs may be wrong, and the parameter of `Observation` for each.
+PSF_ERRORS = {
+    "ideal": "ideal_psfs",
+    "pupil": "pupils",
+    "modes": "psf_modes",
+    "scatter": "psf_scatter",
+}
 
 
 class ImageName(NamedTuple):
@@ -65,3 +85,16 @@ def parse_name(path: str) -> ImageName:
 def file_of(path: str) -> str:
     """Return the file that the name of an image begins with."""
     return parse_name(path).file
+
+
+def parse_kind(word: str) -> tuple[str, str]:
+    """Return kind and file of ``KIND=FILE``; the file is empty where there is none.
+
+    Examples
+    --------
+    >>> from lnocl.io.names import parse_kind
+    >>> parse_kind("rms=a.fits"), parse_kind("err")
+    (('rms', 'a.fits'), ('err', ''))
+    """
+    kind, _, path = word.partition("=")
+    return kind, path

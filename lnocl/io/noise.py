@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,16 +11,10 @@ from numpy.typing import NDArray
 from lnocl.errors import InputError
 from lnocl.io.levels import clipped_sky
 from lnocl.io.maps import Maps
+from lnocl.io.names import ERR, NOISE, parse_kind
 from lnocl.scene.arrays import Array
 from lnocl.scene.uncertainties import variance_of, without_source
 
-# The class of astropy.nddata for each kind of map.
-CLASSES = {
-    "inverse_variance": "InverseVariance",
-    "variance": "VarianceUncertainty",
-    "rms": "StdDevUncertainty",
-    "error": "StdDevUncertainty",
-}
 # No image has so many times the noise that its sky shows.
 TOO_NOISY = 5.0
 # The share of pixels that are the brightest.
@@ -28,8 +22,6 @@ BRIGHT = 0.01
 # The flags DO_NOT_USE, SATURATED and JUMP_DET of JWST: the counts of such a pixel were not summed
 # over the whole exposure, so that their variance in its units is larger.
 CUT_SHORT = 1 | 2 | 4
-# The kind that has the noise of the source's own counts too.
-WITH_SOURCE = "error"
 
 
 class NoiseMap(NamedTuple):
@@ -38,7 +30,7 @@ class NoiseMap(NamedTuple):
     Attributes
     ----------
     kind : str
-        Of `CLASSES`.
+        Of `names.NOISE`.
     variance : ndarray of float64, shape (p, ny, nx)
         In units of the images squared; 0 where a pixel is bad.
     """
@@ -66,9 +58,9 @@ class NoiseMap(NamedTuple):
         """
         variance = np.where(mask, 0.0, each**2 * self.variance)
         self._refuse_other_kinds(counts, variance, mask)
-        if self.kind != WITH_SOURCE:
+        if self.kind != ERR:
             return np.asarray(np.sqrt(variance))
-        return without_source(variance, counts, mask, (f"`{WITH_SOURCE}`", "`rms`"))
+        return without_source(variance, counts, mask, (f"`noise` {ERR}", "rms"))
 
     def _refuse_other_kinds(self, counts: Array, variance: Array, mask: NDArray[np.bool_]) -> None:
         """Refuse a map of another kind than it is given as: its noise is not in the image."""
@@ -78,11 +70,11 @@ class NoiseMap(NamedTuple):
             noise = float(np.sqrt(np.median(variance[j][~bad])))
             _, scatter = clipped_sky(j, counts[j], bad)
             if noise > TOO_NOISY * scatter > 0:
-                others = ", ".join(f"`{kind}`" for kind in CLASSES if kind != self.kind)
+                others = ", ".join(kind for kind in NOISE if kind != self.kind)
                 raise InputError(
-                    f"`{self.kind}` says that the noise of `images[{j}]` is {noise:.3g} electrons, "
-                    f"and its sky scatters by {scatter:.3g}: see to its unit, or give it as what "
-                    f"it is ({others})"
+                    f"`noise` {self.kind} says that the noise of `images[{j}]` is {noise:.3g} "
+                    f"electrons, and its sky scatters by {scatter:.3g}: see to its unit, or give "
+                    f"it as what it is ({others})"
                 )
 
 
@@ -133,14 +125,14 @@ def electrons_by_variance(
 
 
 def read_noise_map(
-    given: Mapping[str, Sequence[str]], maps: Maps, errors: Callable[[], Array]
+    words: Sequence[str], maps: Maps, errors: Callable[[], Array]
 ) -> NoiseMap | None:
     """Return the map of noise that is given, None where none is.
 
     Parameters
     ----------
-    given : mapping of str to sequence of str
-        Files, by the kind of their map.
+    words : sequence of str
+        ``KIND=FILE`` with a kind of `names.NOISE`, or ``"err"``.
     maps : Maps
         Their reader.
     errors : callable
@@ -151,19 +143,21 @@ def read_noise_map(
     FileError, InputError
         As `Maps.read`; several kinds; negative values.
     """
-    kinds = [kind for kind in CLASSES if given.get(kind)]
-    if not kinds:
+    if not words:
         return None
-    if len(kinds) > 1:
-        raise InputError(f"give `{kinds[0]}`, or give `{kinds[1]}`: each is all there is of noise")
-    (kind,) = kinds
-    is_extension = kind == WITH_SOURCE and list(given[kind]) == ["err"]
-    values = errors() if is_extension else maps.read(kind, given[kind])
+    kinds, paths = zip(*map(parse_kind, words), strict=True)
+    if len(set(kinds)) > 1:
+        raise InputError(
+            f"`noise` {kinds[0]} and {kinds[-1]} were given: each is all there is of noise; leave "
+            "one out"
+        )
+    kind = kinds[0]
+    values = errors() if list(words) == [ERR] else maps.read("noise", paths)
     if (values < 0).any():
         raise InputError(
-            f"`{kind}` {given[kind][0]} has negative pixels; they must be 0 or more, and 0 where a "
+            f"`noise` {words[0]} has negative pixels; they must be 0 or more, and 0 where a "
             "pixel is bad"
         )
     from astropy import nddata  # which takes its time to load
 
-    return NoiseMap(kind, variance_of(kind, getattr(nddata, CLASSES[kind])(values))[0])
+    return NoiseMap(kind, variance_of("noise", getattr(nddata, NOISE[kind])(values))[0])

@@ -30,7 +30,7 @@ class TestFrames:
     INPUTS = ("f1.fits", "f2.fits", "--psf", "psfs.fits")
     OPTIONS = (
         *("--background", "auto", "level.fits", "--exposure", "EXPTIME", "--gain", "1.7"),
-        *("--inverse-variance", "inverse.fits", "--mask", "mask.fits", "dq", "--align", "wcs"),
+        *("--noise", "ivar=inverse.fits", "--mask", "mask.fits", "dq", "--align", "wcs"),
         *("--saturation", "1000", "--star", "3,12.25", "--stars", "stars.csv", "--refine"),
         *("--mu", "1e-4", "--smoothing", "1e-3", "--solver", "sgp"),
         *("--n-iter", "9", "--stop", "1e-9", "--pad", "2"),
@@ -101,7 +101,7 @@ class TestFrames:
         assert self.run(*self.OPTIONS, *self.sky_option, "--quiet") == 0
         known = Calibration(
             background=["auto", "level.fits"],
-            inverse_variance=["inverse.fits"],
+            noise=["ivar=inverse.fits"],
             exposure=["EXPTIME"],
             mask=["mask.fits", "dq"],
             saturation=1000.0,
@@ -189,7 +189,7 @@ class TestFrames:
             "ISUM2": "f2.fits",
             "PSUM1": "psfs.fits",
             "BSUM1": "level.fits",
-            "VSUM1": "inverse.fits",
+            "NSUM1": "inverse.fits",
             "MSUM1": "mask.fits",
         }.items():
             assert header[keyword] == hashlib.sha256(Path(path).read_bytes()).hexdigest()
@@ -220,8 +220,8 @@ class TestFrames:
             "image 2: 1 pixel masked by the extension DQ",
             "image 1: 1 pixel masked as saturated, at 1000 or above",
             "image 2: 1 pixel masked as saturated, at 1000 or above",
-            "image 1: 0 pixels masked without inverse variance",
-            "image 2: 0 pixels masked without inverse variance",
+            "image 1: 0 pixels masked by the map of noise",
+            "image 2: 0 pixels masked by the map of noise",
             next(line for line in said.err.splitlines() if "sigma-clipped" in line)[7:],
             "image 2: offset 1.250, -0.500 pixels in x, y, from the WCS",
             "stars.csv: 1 star, by ra and dec",
@@ -233,7 +233,7 @@ class TestFrames:
 
     @pytest.mark.parametrize(
         "options",
-        [("--mask", "out.fits"), ("--inverse-variance", "out.fits"), ("--background", "out.fits"),
+        [("--mask", "out.fits"), ("--noise", "ivar=out.fits"), ("--background", "out.fits"),
          ("--read-noise", "1", "out.fits"), ("--exposure", "out.fits"), ("--stars", "out.fits")],
     )  # fmt: skip
     def test_an_output_that_is_an_input_is_refused(self, capsys, options):

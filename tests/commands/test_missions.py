@@ -201,11 +201,11 @@ def test_tables_of_stars(command_folder, capsys, kind):
 
 
 EXPECTED = {
-    "cal": ["--gain VAR_POISSON", "--error err", "--mask dq"],
-    "i2d": ["--gain VAR_POISSON", "--error err"],
-    "flt": ["--error err", "--mask dq"],
-    "flc": ["--error err", "--mask dq"],
-    "ir": ["--exposure EXPTIME", "--error err", "--mask dq"],
+    "cal": ["--gain VAR_POISSON", "--noise err", "--mask dq"],
+    "i2d": ["--gain VAR_POISSON", "--noise err"],
+    "flt": ["--noise err", "--mask dq"],
+    "flc": ["--noise err", "--mask dq"],
+    "ir": ["--exposure EXPTIME", "--noise err", "--mask dq"],
     "drz": ["--exposure EXPTIME", "--mask wht"],
     "single": ["--exposure EXPTIME", "--mask wht"],
 }
@@ -215,11 +215,11 @@ EXPECTED = {
 class TestWhatIsGiven:
     def test_goes_before_what_the_telescope_says(self):
         of_wfc3_ir("ir")
-        every = {"error", "mask", "background", "exposure"}
+        every = {"noise", "mask", "background", "exposure"}
         assert calibrate("ir.fits", {}).keys() == every
         for name, value, without in [
-            ("rms", ["a.fits"], {"error"}),
-            ("read_noise", [3.0], {"error"}),
+            ("noise", ["rms=a.fits"], {"noise"}),
+            ("read_noise", [3.0], {"noise"}),
             ("mask", ["a.fits"], {"mask"}),
             ("background", [5.0], {"background"}),
             ("gain", 2.0, {"exposure"}),

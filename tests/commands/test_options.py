@@ -35,6 +35,12 @@ def test_messages_name_the_flag_that_does_it_and_not_the_one_that_undoes_it():
     assert named == "give its place, take --refine, or mend it"
 
 
+def test_messages_name_the_kind_of_file_that_is_a_parameter():
+    flags = deconvolve.COMMAND.flags()
+    named = messages.in_shell("`psf_modes` has shape (2, 5)", flags)
+    assert named == "--psf-errors modes has shape (2, 5)"
+
+
 @pytest.mark.parametrize("table", [deconvolve.ALL_OPTIONS, psf.OPTIONS])
 def test_no_two_options_share_a_keyword_or_a_checksum(table):
     keywords = [each.card[0] for each in table if each.card]

@@ -1,7 +1,9 @@
 """``lnocl deconvolve --refine-psfs``: what is written and said, and what is refused."""
 
+import hashlib
 import shlex
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,30 +96,34 @@ def test_with_a_smoothing_that_is_given_the_file_has_neither():
 
 
 def test_files_of_ideal_psfs_and_modes():
-    files = ["--ideal-psf", "ideal.fits", "--psf-modes", "modes.fits"]
+    files = ["--psf-errors", "ideal=ideal.fits", "modes=modes.fits"]
     assert run("--refine-psfs", "strehl", "modes", *files) == 0
     with fits.open("out.fits") as hdus:
         assert hdus["PSFFIT"].data.names == ["image", "strehl_power", "modes_1", "modes_2"]
-        assert {"DSUM1", "LSUM1"} <= set(hdus[0].header)
+        header = hdus[0].header
+    for keyword, path in {"DSUM1": "ideal.fits", "DSUM2": "modes.fits"}.items():
+        assert header[keyword] == hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def test_files_of_pupils_and_scatter():
     fits.writeto("pupil.fits", (np.hypot(X - 16, Y - 16) < 6.0).astype(float))
     fits.writeto("scatter.fits", 0.02 * PSF)
-    assert run("--refine-psfs", "pupil", "strehl", "--pupil", "pupil.fits",
-               "--psf-scatter", "scatter.fits") == 0  # fmt: skip
+    assert run("--refine-psfs", "pupil", "strehl", "--psf-errors", "pupil=pupil.fits",
+               "scatter=scatter.fits") == 0  # fmt: skip
     with fits.open("out.fits") as hdus:
         names = ["image", "strehl_power", *(f"pupil_{i}" for i in range(1, 8))]
         assert hdus["PSFFIT"].data.names == names
         header = hdus[0].header
-        assert {"TSUM1", "SSUM1"} <= set(header)
+        assert "--psf-errors pupil=pupil.fits scatter=scatter.fits" in " ".join(
+            "\n".join(header["HISTORY"]).replace("\\\n", "").split()
+        )
         assert header["PSFERR"] == pytest.approx(0.02, rel=0.1)  # of other PSFs
         assert hdus["DOUBTFUL"].data[STAR[::-1]] == 1
 
 
 def test_doubtful_pixels_are_outlined_and_said(capsys):
     fits.writeto("scatter.fits", 0.05 * PSF)
-    assert run("--psf-scatter", "scatter.fits") == 0
+    assert run("--psf-errors", "scatter=scatter.fits") == 0
     assert cli.main(["plot", "out.fits", "--output", "figures"]) == 0
     saved = read_result("out.fits")
     np.testing.assert_array_equal(saved.doubtful, fits.getdata("out.fits", "DOUBTFUL") == 1)
@@ -128,13 +134,21 @@ def test_doubtful_pixels_are_outlined_and_said(capsys):
 
 REFUSED = {
     "unknown": (["--refine-psfs", "tilt"], "invalid choice: 'tilt'"),
-    "no ideal": (["--refine-psfs", "strehl"], "--refine-psfs strehl needs --ideal-psf"),
-    "no modes": (["--refine-psfs", "modes"], "--refine-psfs modes needs --psf-modes"),
+    "no ideal": (["--refine-psfs", "strehl"], "--refine-psfs strehl needs --psf-errors ideal"),
+    "no modes": (["--refine-psfs", "modes"], "--refine-psfs modes needs --psf-errors modes"),
     "a missing file": (
-        ["--refine-psfs", "modes", "--psf-modes", "no.fits"], "no.fits cannot be opened",
+        ["--refine-psfs", "modes", "--psf-errors", "modes=no.fits"], "no.fits cannot be opened",
     ),
     "modes of another shape": (
-        ["--refine-psfs", "modes", "--psf-modes", "small.fits"], "--psf-modes has shape (2, 5, 5)",
+        ["--psf-errors", "modes=small.fits"], "--psf-errors modes has shape (2, 5, 5)",
+    ),
+    "two files of modes": (
+        ["--psf-errors", "modes=modes.fits", "modes=modes.fits"],
+        "the modes are those of all images; give one file of --psf-errors modes",
+    ),
+    "a file of no kind": (
+        ["--psf-errors", "modes.fits"],
+        "'modes.fits' is not KIND=FILE; kinds are ideal, pupil, modes, scatter",
     ),
 }  # fmt: skip
 

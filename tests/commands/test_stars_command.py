@@ -90,6 +90,8 @@ def test_flags_and_weights_of_the_file_are_heeded(word, capsys):
     assert is_second.any()
     assert ((by_flags["saturated"] == "True") == is_second).all()
     assert np.hypot(by_weights["x"] - 20.3, by_weights["y"] - 40.1).min() > 5
+    assert cli.main(["stars", "dq.fits", "--mask", "dq:4096", "-o", "all.csv"]) == 0
+    assert "True" not in Table.read("all.csv")["saturated"].astype(str)
     assert cli.main(["stars", "image.fits", "--mask", "dq", "-o", "a.csv"]) == 2
     assert "image.fits has no extension DQ; give --mask as a file" in capsys.readouterr().err
 

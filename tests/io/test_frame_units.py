@@ -152,7 +152,7 @@ class TestUnits:
                 hdus.append(fits.ImageHDU(extra[word], name=word))
             fits.HDUList(hdus).writeto(f"{j + 1}.fits")
             save(f"e{j}.fits", extra["ERR"])
-        known = {"error": ["e0.fits", "e1.fits"]} if word == "file" else {}
+        known = {"noise": ["err=e0.fits", "err=e1.fits"]} if word == "file" else {}
         found = read(**known)
         assert found.unit == unit
         raw = found.observation.images - (found.observation.background if known else 0.0)
@@ -164,7 +164,7 @@ class TestUnits:
         image = np.random.default_rng(4).poisson(means) / 100.0
         save("1.fits", image, BUNIT="MJy/sr")
         save("err.fits", np.sqrt(image / 100.0).astype("f4") * 0.999)
-        found = observe("1.fits", error=["err.fits"])
+        found = observe("1.fits", noise=["err=err.fits"])
         assert np.median(found.background) < 1.0
 
     def test_images_in_several_units_are_refused(self):

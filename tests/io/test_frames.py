@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wcs_headers import NORTH_UP
 
-from lnocl.errors import InputError, LnoclWarning, counted
+from lnocl.errors import FileError, InputError, LnoclWarning, counted
 from lnocl.scene.noise_check import warn_of_noise
 
 pytestmark = pytest.mark.usefixtures("frame_folder")
@@ -245,14 +245,14 @@ class TestNoise:
         save_images(**cards)
         save("map.fits", MAP)
         save("inverse.fits", 1.0 / MAP)
-        observation = observe(inverse_variance=["inverse.fits"], **known)
+        observation = observe(noise=["ivar=inverse.fits"], **known)
         np.testing.assert_allclose(
             observation.background, [MAP * factor**2] * 2, rtol=1e-14, atol=0
         )
 
     @pytest.mark.parametrize(
         ("kind", "values"),
-        [("inverse_variance", 1.0 / MAP), ("variance", MAP), ("rms", np.sqrt(MAP))],
+        [("ivar", 1.0 / MAP), ("var", MAP), ("rms", np.sqrt(MAP))],
     )
     def test_other_maps_of_the_same_noise(self, log, kind, values):
         save_images(BUNIT="adu")
@@ -260,12 +260,12 @@ class TestNoise:
         values[0, 1], values[2, 3], values[4, 5] = 0.0, np.nan, np.inf
         bad = (values == 0) | ~np.isfinite(values)
         save("map.fits", values)
-        found = read(**{kind: ["map.fits"]}, gain=1.5)
+        found = read(noise=[f"{kind}=map.fits"], gain=1.5)
         np.testing.assert_array_equal(found.observation.mask, [bad, bad])
         background = found.observation.background[0]
         np.testing.assert_allclose(background[~bad], 2.25 * MAP[~bad], rtol=1e-14)
-        assert f"image 0: 3 pixels masked without {kind.replace('_', ' ')}" in notes(log)
-        assert len(found.sha256[kind]) == 1
+        assert "image 0: 3 pixels masked by the map of noise" in notes(log)
+        assert len(found.sha256["noise"]) == 1
 
     def test_errors_with_those_of_the_counts(self, log):
         """As HST writes them: in counts, the noise of which is in them where there are any."""
@@ -279,9 +279,9 @@ class TestNoise:
             hdus[1].header["BUNIT"] = "adu"
             fits.HDUList(hdus).writeto(f"{j + 1}.fits")
         save("errors.fits", errors)
-        for source in ("err", "errors.fits"):
+        for source in ("err", "err=errors.fits"):
             log.clear()
-            found = observe(error=[source], gain=2.0)
+            found = observe(noise=[source], gain=2.0)
             expected = np.array([MAP, MAP]) * 4.0
             expected[1, 6, 6] = 0.0
             bad = errors == 0
@@ -317,37 +317,37 @@ class TestNoise:
         save_images()
         save("errors.fits", MAP)
         with pytest.raises(InputError) as caught:
-            observe(error=["errors.fits"])
+            observe(noise=["err=errors.fits"])
         assert str(caught.value) == (
-            "error of image 0 is less than the noise of its counts in most pixels; see to gain and "
-            "exposure, or give it as rms if it leaves the source out"
+            "noise err of image 0 is less than the noise of its counts in most pixels; see to gain "
+            "and exposure, or give it as rms if it leaves the source out"
         )
 
     def test_no_errors_and_two_kinds(self):
         save_images()
         save("map.fits", MAP)
         with pytest.raises(InputError) as caught:
-            observe(error=["err"])
+            observe(noise=["err"])
         assert str(caught.value) == (
-            "1.fits has no extension ERR; give error as a file, or leave it out"
+            "1.fits has no extension ERR; give noise as a file, or leave it out"
         )
-        with pytest.raises(InputError, match=r"^give variance, or give rms: each is all there"):
-            observe(rms=["map.fits"], variance=["map.fits"])
+        with pytest.raises(InputError, match=r"^noise var and rms were given: each is all there"):
+            observe(noise=["var=map.fits", "rms=map.fits"])
+        with pytest.raises(FileError):
+            observe(noise=["err", "err=map.fits"])
 
     def test_refusals(self):
         save_images()
         save("inverse.fits", MAP - 1.5)
-        with pytest.raises(InputError, match=r"inverse_variance inverse\.fits has negative"):
-            observe(inverse_variance=["inverse.fits"])
+        with pytest.raises(InputError, match=r"noise ivar=inverse\.fits has negative"):
+            observe(noise=["ivar=inverse.fits"])
         save("inverse.fits", MAP)
-        with pytest.raises(
-            InputError, match="give read_noise, or give inverse_variance, which includes it"
-        ):
-            observe(inverse_variance=["inverse.fits"], read_noise=[1.0])
-        observe(inverse_variance=["inverse.fits"], read_noise=[0.0])
+        with pytest.raises(InputError, match="give read_noise, or give noise, which includes it"):
+            observe(noise=["ivar=inverse.fits"], read_noise=[1.0])
+        observe(noise=["ivar=inverse.fits"], read_noise=[0.0])
         save("inverse.fits", MAP[:-1])
-        with pytest.raises(InputError, match=r"inverse_variance inverse\.fits has the shape"):
-            observe(inverse_variance=["inverse.fits"])
+        with pytest.raises(InputError, match=r"noise inverse\.fits has the shape"):
+            observe(noise=["ivar=inverse.fits"])
 
 
 def save_with_dq(path, image, flags, **cards):
@@ -424,22 +424,21 @@ class TestMask:
         flags[0, : len(sums)] = sums
         keywords = zip(("TELESCOP", "INSTRUME", "DETECTOR"), words.split(), strict=False)
         save_with_dq("1.fits", IMAGES[0], flags, **dict(keywords))
-        masked = observe("1.fits", mask=["dq"], good_bits=bits).mask[0]
+        masked = observe("1.fits", mask=["dq" if bits is None else f"dq:{bits}"]).mask[0]
         assert flags[masked].tolist() == [each for each in sums if each in expected]
 
     @pytest.mark.parametrize("bits", ["", "a", "3,5", "-1", "1.5", "~", "16 64"])
     def test_what_are_no_flags(self, bits):
         save_with_dq("1.fits", IMAGES[0], NONE[0].astype("i2"))
         with pytest.raises(InputError) as caught:
-            observe("1.fits", mask=["dq"], good_bits=bits)
+            observe("1.fits", mask=[f"dq:{bits}"])
         assert str(caught.value) == (
-            f"good_bits {bits!r} are no flags; give powers of 2, such as 16,64, or ~1 for all but 1"
+            f"mask dq:{bits} names no flags; give powers of 2, as in dq:16,64, or dq:~1 for all "
+            "but 1"
         )
 
-    def test_flags_without_dq_and_dq_without_flags(self):
+    def test_dq_that_holds_no_flags(self):
         save_with_dq("1.fits", IMAGES[0], NONE[0] + 0.5)
-        with pytest.raises(InputError, match=r"^good_bits are flags of the extension DQ; give mas"):
-            observe("1.fits", good_bits="16")
         with pytest.raises(InputError, match=r"^the extension DQ of 1\.fits does not hold whole"):
             observe("1.fits", mask=["dq"])
 
@@ -501,7 +500,7 @@ class TestMask:
         known = {
             "mask": ["dq", "flags.fits"],
             "saturation": 100.0,
-            "inverse_variance": ["inverse.fits"],
+            "noise": ["ivar=inverse.fits"],
         }
         if bad.all():
             with pytest.raises(InputError, match="all pixels are masked"):

@@ -84,10 +84,10 @@ class TestInTheShell:
         fits.writeto("image.fits", np.random.default_rng(2).poisson(sky).astype(float))
         words = ["deconvolve", "image.fits", "--psf", "psf.fits", "--star", "32,32", "-o"]
         words += ["out.fits", "--background", "30", "--engine", "numpy", "--n-iter", "3"]
-        words += ["--stop", "none", "--refine-psfs", "modes", "--psf-modes", "psf.fits"]
+        words += ["--stop", "none", "--refine-psfs", "modes", "--psf-errors", "modes=psf.fits"]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LnoclWarning)
-            assert cli.main([*words, "--psf-scatter", "psf.fits"]) == 0
+            assert cli.main([*words, "scatter=psf.fits"]) == 0
         with fits.open("out.fits") as hdus:
             assert hdus["PSFFIT"].data.names == ["image", "modes_1", "modes_2"]
             assert hdus[0].header["PSFERR"] == pytest.approx(

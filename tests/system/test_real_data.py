@@ -407,8 +407,8 @@ class TestExamples:
     def test_the_quasar_is_between_pixels(self, example):
         where = DATA / "hst-quasar-j0005"
         example.centred_psf(where / "sci_psf.fits", "psf.fits", 63)
-        words = [where / "sci_J0005-0006.fits", "--psf", "psf.fits", "--inverse-variance",
-                 where / "ivm_J0005-0006.fits", "--exposure", "EXPTIME", "--pad", 16,
+        words = [where / "sci_J0005-0006.fits", "--psf", "psf.fits", "--noise",
+                 f"ivar={where / 'ivm_J0005-0006.fits'}", "--exposure", "EXPTIME", "--pad", 16,
                  "--background", 0, "--star", "64,64", "--solver", "sgp",
                  "--n-iter", 10]  # fmt: skip
         whole, refined = run(*words), run(*words, "--refine")
