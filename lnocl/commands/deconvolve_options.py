@@ -166,8 +166,8 @@ OPTIONS = {
             "frequencies of the PSFs, its middle at (ky // 2, kx // 2); scatter=FILE, the standard "
             "deviation of the pixels of a PSF of unit sum, which the smoothing near stars follows; "
             "of these one for all images or one for each; modes=FILE, a cube of the ways in which "
-            "all PSFs may differ, one standard deviation each. Scatter and modes may be extensions "
-            "SCATTER and MODES, as lnocl psf writes them",
+            "all PSFs may differ, one standard deviation each. Each may be an extension of its "
+            "name beside a PSF, as lnocl psf writes SCATTER and MODES",
         ),
     ],
     "reconstruction": [

@@ -90,26 +90,25 @@ def _run(arguments: argparse.Namespace) -> None:
         )
     folder, run = _run_of(saved)
     run.quiet = arguments.quiet
-    # What the run has to say it has lines.
+    try:
+        with contextlib.chdir(folder), ignored_warnings():  # which were shown once
+            frames, given = deconvolve.read(run)
+    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        raise FileError(
+            f"{folder}, where {arguments.result} was made, is not there: deconvolve again"
+        ) from error
+    if run.tile is not None or frames.observation.psf_fields:
+        raise InputError(
+            f"{arguments.result} was made in tiles, and replicas are of one run: deconvolve a "
+            "cut-out without tiles"
+        )
+    with messages.shown_log(run.quiet, COMMAND.flags()):
+        parts = _parts(arguments, frames)
     with (
         messages.shown_log(run.quiet, name=messages.PROGRESS),
         ignored_warnings(),
         checkpoints.Interrupts() as interrupts,
     ):
-        try:
-            with contextlib.chdir(folder):
-                frames, given = deconvolve.read(run)
-        except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
-            raise FileError(
-                f"{folder}, where {arguments.result} was made, is not there: deconvolve again"
-            ) from error
-        if run.tile is not None or frames.observation.psf_fields:
-            raise InputError(
-                f"{arguments.result} was made in tiles, and replicas are of one run: deconvolve a "
-                "cut-out without tiles"
-            )
-        with messages.shown_log(arguments.quiet, COMMAND.flags()):
-            parts = _parts(arguments, frames)
         found = deconvolve.solve(run, frames, given, interrupts)
     if interrupts.caught:
         raise (

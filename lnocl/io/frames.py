@@ -32,8 +32,6 @@ MAX_SCALE_ERROR = 0.02
 MUCH_MASKED = 0.1
 # Of images with more negative pixels than this share the sky was subtracted.
 SUBTRACTED = 0.01
-# The extensions in which `lnocl psf` writes what it finds beside a PSF.
-MADE_OF_PSFS = {"psf_modes": "MODES", "psf_scatter": "SCATTER"}
 
 
 class Calibration(NamedTuple):
@@ -74,8 +72,9 @@ class Calibration(NamedTuple):
         As for `Observation`.
     psf_errors : sequence of str
         Files that tell how PSFs may be wrong, as ``KIND=FILE`` with a kind of `names.PSF_ERRORS`,
-        as for `Observation`. Of scatter and modes they are the extensions SCATTER and MODES, where
-        a file has these. There is one file of modes, for all PSFs.
+        as for `Observation`: the extension that is called as the kind, such as the SCATTER that
+        `lnocl psf` writes beside a PSF, or else the image. There is one file of modes, for all
+        PSFs.
     """
 
     background: Sequence[Word] = (0.0,)
@@ -227,18 +226,16 @@ class _Reader:
         """Return what is known of the ways in which PSFs may be wrong."""
         files: dict[str, list[str]] = {}
         for kind, path in map(parse_kind, self._calibration.psf_errors):
-            files.setdefault(PSF_ERRORS[kind], []).append(path)
-        if len(files.get("psf_modes", ())) > 1:
+            files.setdefault(kind, []).append(path)
+        if len(files.get("modes", ())) > 1:
             raise InputError("the modes are those of all images; give one file of `psf_modes`")
         found = {}
-        for name, paths in files.items():
+        for kind, paths in files.items():
             stack = read_stack(paths)
-            found[name] = stack.data
             self._sha256.setdefault("psf_errors", []).extend(stack.sha256)
-            if name in MADE_OF_PSFS:
-                parts = [read_extension(path, MADE_OF_PSFS[name]) for path in paths]
-                held = [np.atleast_3d(part.T).T for part in parts if part is not None]
-                found[name] = np.concatenate(held) if held else found[name]
+            parts = [read_extension(path, kind.upper()) for path in paths]
+            held = [np.atleast_3d(part.T).T for part in parts if part is not None]
+            found[PSF_ERRORS[kind]] = np.concatenate(held) if held else stack.data
         return found
 
     def _warn_of_pixel_scales(self) -> None:
