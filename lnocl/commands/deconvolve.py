@@ -16,7 +16,7 @@ from lnocl.commands.summary import extended_flux, summarise, verdict_on
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
 from lnocl.residuals import Fit, StarResiduals
-from lnocl.result import Result, saved_parts, view_of
+from lnocl.result import Callback, Result, saved_parts, view_of
 from lnocl.runs.progress import Progress
 
 if TYPE_CHECKING:
@@ -47,14 +47,14 @@ def solve(
     arguments: argparse.Namespace,
     frames: Frames,
     given: Mapping[str, Any],
-    interrupts: checkpoints.Interrupts,
+    callback: Callback | None = None,
 ) -> Result:
     """Reconstruct what `read` has returned."""
     # Each process that makes replicas or tiles takes a device of its own, unless one was named.
     parameters = _parameters({**given, "device": arguments.device})
     parameters["progress"] = not arguments.quiet
     if arguments.tile is None and not frames.observation.psf_fields:
-        return deconvolve(frames.observation, **parameters, callback=interrupts.callback)
+        return deconvolve(frames.observation, **parameters, callback=callback)
     return _solve_tiles(arguments, frames.observation, parameters)
 
 
@@ -87,7 +87,7 @@ def _run(arguments: argparse.Namespace) -> None:
         checkpoints.Interrupts() as interrupts,
     ):
         frames, given = read(arguments)
-        result = solve(arguments, frames, given, interrupts)
+        result = solve(arguments, frames, given, interrupts.callback)
         interrupts.listen()  # a run that was resumed at its end has no iteration to start from
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")

@@ -5,15 +5,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import signal
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lnocl.commands import bootstrap, checkpoints, deconvolve, messages, options
+from lnocl.commands import bootstrap, deconvolve, messages, options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command, Parser
-from lnocl.commands.signals import Terminated
 from lnocl.errors import FileError, InputError, note
 from lnocl.process import ignored_warnings
 
@@ -104,18 +102,8 @@ def _run(arguments: argparse.Namespace) -> None:
         )
     with messages.shown_log(run.quiet, COMMAND.flags()):
         parts = _parts(arguments, frames)
-    with (
-        messages.shown_log(run.quiet, name=messages.PROGRESS),
-        ignored_warnings(),
-        checkpoints.Interrupts() as interrupts,
-    ):
-        found = deconvolve.solve(run, frames, given, interrupts)
-    if interrupts.caught:
-        raise (
-            KeyboardInterrupt
-            if interrupts.caught == signal.SIGINT
-            else Terminated(interrupts.caught)
-        )
+    with messages.shown_log(run.quiet, name=messages.PROGRESS), ignored_warnings():
+        found = deconvolve.solve(run, frames, given)
     expected = saved.extended * frames.electrons
     fluxes = saved.star_fluxes * frames.electrons
     if (

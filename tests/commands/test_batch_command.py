@@ -220,6 +220,7 @@ def test_tables_give_the_same_commands_in_every_format(ending):
             "n-iter": np.ma.array([1, 2, 3], mask=[False, True, False]),
             "mu": [0.0, np.nan, 1e-7],
             "residuals": [True, False, True],
+            "refine": ["true", "no", ""],
             "saturation": [60000.0, 60000.5, 1e5],
         }
     )
@@ -228,9 +229,9 @@ def test_tables_give_the_same_commands_in_every_format(ending):
     assert [each.name for each in targets] == ["a", "with blank", "c"]
     assert [each.words for each in targets] == [
         ("a.fits", "--psf", "k.fits", "--n-iter", "1", "--mu", "0", "--residuals",
-         "--saturation", "60000"),
+         "--refine", "--saturation", "60000"),
         ("with blank.fits", "b.fits[SCI]", "--psf", "k.fits", "--star", "1,2", "--star", "3.5,-4",
-         "--saturation", "60000.5"),
+         "--no-refine", "--saturation", "60000.5"),
         ("c.fits", "--psf", "k.fits", "--n-iter", "3", "--mu", "1e-07", "--residuals",
          "--saturation", "100000"),
     ]  # fmt: skip
