@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.io.fits.scripts import fitscheck
+from astropy.wcs import WCS
+from wcs_headers import NORTH_UP
 
 import lnocl
 from lnocl.commands import cli
@@ -56,6 +58,17 @@ def folder(tmp_path, monkeypatch):
 def run(*options, frame="star.fits", output="out.fits"):
     made = [] if output is None else ["-o", output]
     return cli.main(["psf", frame, *made, *options])
+
+
+def test_a_star_is_named_by_its_place_on_the_sky_too():
+    for name, value in NORTH_UP.items():
+        fits.setval("star.fits", name, value=value)
+    there = WCS(fits.getheader("star.fits")).pixel_to_world(50, 45)
+    place = f"{float(there.ra.deg)!r}d,{float(there.dec.deg)!r}d"
+    assert run("--star", place, "--size", "15", output="sky.fits") == 0
+    assert run("--star", "50,45", "--size", "15", output="pixels.fits") == 0
+    np.testing.assert_array_equal(fits.getdata("sky.fits"), fits.getdata("pixels.fits"))
+    assert place in "".join(fits.getheader("sky.fits")["HISTORY"]).replace("\\\n", "")
 
 
 def complaint(captured):
@@ -421,7 +434,7 @@ REFUSED = {
     "star outside": ({}, ["--star", "70,3"], 2, "position (70, 3) is outside the frame"),
     "star at the edge": ({}, ["--star", "0,3", "--no-recentre"], 2, "at the edge of the frame"),
     "no star": ({}, ["--star", "5,8", "--background", "40"], 2, "no star is found within 16"),
-    "star of one": ({}, ["--star", "3"], 2, "argument --star: '3' is not X,Y"),
+    "star of one": ({}, ["--star", "3"], 2, "argument --star: '3' is neither X,Y"),
     "mask missing": ({}, ["--mask", "no.fits"], 1, "no.fits cannot be opened"),
     "mask shape": (
         {}, ["--mask", "oblong.fits"], 2,
