@@ -77,21 +77,6 @@ def test_a_longer_unit_of_time_is_bit_for_bit(solver, recipe, start, exponent):
     np.testing.assert_array_equal(scaled.history["objective"], result.history["objective"])
 
 
-def test_any_other_unit_of_time_scales_the_answer():
-    made, factor = MAP.make(), 37.0
-    result = made.deconvolve(n_iter=30, **numpy_alone)
-    scaled = made.deconvolve(
-        made.observation(exposure=factor * made.exposure),
-        n_iter=30,
-        mu=factor**2 * made.recipe.mu,
-        initial_extended=made.initial_extended / factor,
-        initial_star_fluxes=made.initial_star_fluxes / factor,
-        **numpy_alone,
-    )
-    assert worst(factor * scaled.extended, result.extended) <= 2e-15  # measured 6.4e-16
-    assert worst(factor * scaled.star_fluxes, result.star_fluxes) <= 6e-16  # measured 2.0e-16
-
-
 @numpy_first
 def test_a_constant_map_is_a_number(engine):
     made = EACH.make()

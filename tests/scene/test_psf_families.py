@@ -19,7 +19,6 @@ MODES = 1e-3 * RNG.standard_normal((1, 2, N, N))
 ALL = ("shift", "jitter", "strehl", "pupil", "modes")
 PUPIL = (np.hypot(X, Y / 1.1) < 7.0).astype(float)
 SCATTER = 0.2 * PSF[None]
-N_PHASES = 7
 
 
 def families(*names, psf=PSF, ideal=IDEAL, modes=MODES):
