@@ -219,21 +219,17 @@ def test_a_checkpoint_of_another_run_is_refused(name, saved):
         made.deconvolve(**changed)
 
 
-def test_another_device_or_version_is_refused(saved, tmp_path):
+def test_another_device_version_or_tuning_is_refused(saved, tmp_path):
     found = checkpoint.read(saved)
-    for name in ("device", "version"):
+    for name, words in {
+        "device": "of another run: device differs; repeat",
+        "version": "of another run: version differs; repeat",
+        "tuning": "of a run before lnocl devices --tune, which has",
+    }.items():
         path = str(tmp_path / f"{name}.fits")
         checkpoint.write(path, found.described | {name: "'other'"}, found.ended, found.arrays)
-        with pytest.raises(lnocl.InputError, match=f"of another run: {name} differs; repeat"):
+        with pytest.raises(lnocl.InputError, match=words):
             STARS.make().deconvolve(n_iter=6, engine="numpy", resume=path)
-
-
-def test_another_tuning_is_refused(saved, tmp_path):
-    found, path = checkpoint.read(saved), str(tmp_path / "tuning.fits")
-    other = found.described | {"tuning": "'vectors of 64 bits'"}
-    checkpoint.write(path, other, found.ended, found.arrays)
-    with pytest.raises(lnocl.InputError, match="of a run before lnocl devices --tune, which has"):
-        STARS.make().deconvolve(n_iter=6, engine="numpy", resume=path)
 
 
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")

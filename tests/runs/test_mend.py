@@ -1,6 +1,5 @@
 """What the defaults do about PSFs and positions: nothing where they are right, else what mends."""
 
-import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +11,8 @@ from lnocl.errors import LnoclWarning
 from lnocl.runs.psf_refinement import _is_trusted, _State
 from lnocl.scene.psf_families import PsfFamilies
 from lnocl.scene.psf_misfit import PsfMisfit
+
+pytestmark = pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 
 N, STAR, LEVEL = 64, (30, 24), 50.0
 Y, X = np.indices((N, N))
@@ -33,11 +34,9 @@ def solve(psf=PSF, beside=(0.0, 0.0), sky=SKY, given=PSF, **options):
     means = np.fft.irfft2(spectrum, sky.shape)
     means += FLUX * np.roll(psf, (STAR[1] - N // 2, STAR[0] - N // 2), (0, 1)) + LEVEL
     counts = np.random.default_rng(3).poisson(means.clip(0.0)).astype(float)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LnoclWarning)
-        observation = lnocl.Observation(counts, given, background=LEVEL, psf_centre="given")
-        stars = [np.add(STAR, beside)]
-        return lnocl.deconvolve(observation, stars, **{**RUN, **options})
+    observation = lnocl.Observation(counts, given, background=LEVEL, psf_centre="given")
+    stars = [np.add(STAR, beside)]
+    return lnocl.deconvolve(observation, stars, **{**RUN, **options})
 
 
 @pytest.fixture(scope="module")
@@ -83,10 +82,8 @@ def few_counts(given, rms=0.0, claimed=0.0, flux=4000.0, size=48):
     cut = slice(N // 2 - size // 2, N // 2 + size // 2)
     image = (rng.poisson(means) + rng.normal(0.0, rms, (N, N)))[cut, cut]
     stars = np.array([(-5, 0), (5, 0)]) + size // 2
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LnoclWarning)
-        observation = lnocl.Observation(image, given, background=LEVEL, read_noise=claimed)
-        found = lnocl.deconvolve(observation, stars, **RUN)
+    observation = lnocl.Observation(image, given, background=LEVEL, read_noise=claimed)
+    found = lnocl.deconvolve(observation, stars, **RUN)
     return found.star_fluxes / flux, getattr(found.psf_refinement, "is_accepted", False)
 
 

@@ -1,6 +1,5 @@
 """PSFs refined from the images: found where they are wrong, left alone where they are right."""
 
-import warnings
 from dataclasses import replace
 
 import astropy.units as u
@@ -9,7 +8,6 @@ import pytest
 from scenes import PAPER
 
 import lnocl
-from lnocl.errors import LnoclWarning
 from lnocl.metrics import restoration_error, star_rows
 from lnocl.runs import guarded_runs, psf_refinement
 from lnocl.runs.psf_allowance import STRENGTH
@@ -18,6 +16,8 @@ from lnocl.scene.padding import choose_pad
 from lnocl.scene.psf_families import PsfFamilies
 from lnocl.scene.pupils import Pupil
 from lnocl.simulation import Experiment, fizeau_psf, hh34
+
+pytestmark = pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 
 N, STAR, LEVEL = 64, (30, 24), 50.0
 Y, X = np.indices((N, N))
@@ -56,10 +56,8 @@ def refine(images, psfs, names=("shift", "jitter"), n_iter=40, **options):
     known |= {"psf_modes": options.pop("psf_modes")} if "psf_modes" in options else {}
     star = options.pop("star", STAR)
     given = {"solver": "sgp", "n_iter": n_iter, "engine": "numpy", "refine_psfs": names}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LnoclWarning)
-        observation = lnocl.Observation(images, psfs, **known)
-        return lnocl.deconvolve(observation, [star], **{**PAPER, **given, **options})
+    observation = lnocl.Observation(images, psfs, **known)
+    return lnocl.deconvolve(observation, [star], **{**PAPER, **given, **options})
 
 
 def error(result):
@@ -111,6 +109,8 @@ def test_right_psfs_are_left_as_they_are(contrast):
     images = images_through([PSF, PSF], contrast)
     result = refine(images, [PSF, PSF], ("shift", "jitter", "strehl"))
     assert not result.psf_refinement.is_accepted
+    assert result.psf_refinement.psf_error == 0
+    assert not result.doubtful.any()
     plain = refine(images, [PSF, PSF], ())
     assert plain.psf_refinement is None
     np.testing.assert_array_equal(result.extended, plain.extended)
@@ -150,31 +150,6 @@ class TestAnErrorThatIsLeft:
         assert result.star_fluxes == pytest.approx(flux, rel=0.03)
         assert plain.star_fluxes < 0.95 * flux
         np.testing.assert_array_equal(result._outcome.scene.observation.images, images)
-
-    def test_of_a_psf_that_is_all_wrong_it_is_said(self):
-        observation = lnocl.Observation(images_through([moffat(2.5)], 30.0), moffat(6.0))
-        options = {"engine": "numpy", "n_iter": 20, "stop": None, "refine_psfs": ["shift"]}
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            result = lnocl.deconvolve(observation, [STAR], **options)
-        assert any("the PSFs do not fit the stars, by" in str(each.message) for each in caught)
-        assert result.psf_refinement.psf_error > 0.25
-
-    @pytest.mark.parametrize("contrast", [1.0, 10.0, 100.0])
-    def test_it_is_0_where_psfs_fit(self, contrast):
-        result = refine(images_through([PSF, PSF], contrast), [PSF, PSF])
-        found = result.psf_refinement
-        assert found.psf_error == 0
-        assert not result.doubtful.any()
-
-    def test_it_is_that_of_mirrored_images(self):
-        images = images_through([self.TRUE], 30.0)
-        once = refine(images, PSF, ("shift",)).psf_refinement
-        again = refine(
-            images[:, :, ::-1], np.roll(PSF[:, ::-1], 1, 1), ("shift",), star=(N - 1 - STAR[0], 24)
-        )
-        assert again.psf_refinement.psf_error == pytest.approx(once.psf_error, rel=0.05)
-        assert once.psf_error > 0.1
 
 
 def test_no_step_leads_to_psfs_of_no_light():
@@ -254,22 +229,9 @@ def test_a_star_may_leave_the_images_while_psfs_are_judged():
     star = np.exp(-((x_image - 20.3) ** 2 + (y_image + 0.9) ** 2) / 5.12) / 16.1
     counts = np.random.default_rng(0).poisson(20.0 + 3e4 * star)
     observation = lnocl.Observation(counts, np.exp(-(x**2 + y**2) / 7.22), background=20.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LnoclWarning)
-        result = lnocl.deconvolve(observation, [(20, 0)], n_iter=20, engine="numpy", pad=0)
+    result = lnocl.deconvolve(observation, [(20, 0)], n_iter=20, engine="numpy", pad=0)
     assert result.star_positions[0, 1] < -0.5
     assert abs(result.star_positions[0, 0] - 20.3) < 0.1
-
-
-@pytest.mark.exhaustive
-def test_both_engines_agree():
-    images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
-    reference = refine(images, PSF)
-    result = refine(images, PSF, engine="opencl", precision="double")
-    np.testing.assert_allclose(
-        result.psf_refinement.values, reference.psf_refinement.values, rtol=0, atol=1e-5
-    )
-    assert np.linalg.norm(result.extended - reference.extended) < 1e-4 * np.linalg.norm(SKY)
 
 
 def test_a_run_goes_on_from_its_checkpoint_bit_for_bit(tmp_path):
@@ -325,13 +287,9 @@ class TestPixels:
         return np.random.default_rng(1).poisson(means).astype(float)[None]
 
     def run(self, images, psf, names=("pixels",), **known):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", LnoclWarning)
-            observation = lnocl.Observation(
-                images, psf, background=LEVEL, psf_centre="given", **known
-            )
-            options = {"n_iter": 40, "stop": None, "engine": "numpy", "pad": 0, "smoothing": 0}
-            return lnocl.deconvolve(observation, self.STARS, refine_psfs=names, **options)
+        observation = lnocl.Observation(images, psf, background=LEVEL, psf_centre="given", **known)
+        options = {"n_iter": 40, "stop": None, "engine": "numpy", "pad": 0, "smoothing": 0}
+        return lnocl.deconvolve(observation, self.STARS, refine_psfs=names, **options)
 
     def test_they_are_found_where_several_stars_show_them(self):
         result = self.run(self.images(self.TRUE), PSF)
@@ -342,11 +300,6 @@ class TestPixels:
         np.testing.assert_allclose(fluxes, 1.0, rtol=0, atol=0.08)
         plain = self.run(self.images(self.TRUE), PSF, ())
         assert error(result) < 0.5 * error(plain)
-
-    def test_of_right_psfs_they_stay(self):
-        result = self.run(self.images(PSF), PSF)
-        assert not result.psf_refinement.is_accepted
-        np.testing.assert_array_equal(result.psfs[0], PSF / PSF.sum())
 
     def test_they_keep_to_the_scatter_that_is_given(self):
         images = self.images(self.TRUE)
@@ -359,12 +312,8 @@ class TestPixels:
 
 def test_an_error_that_single_rings_show_smooths_the_sky_near_the_star():
     images = images_through([moffat(4.05)], 30.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LnoclWarning)
-        observation = lnocl.Observation(images, PSF, background=LEVEL)
-        result = lnocl.deconvolve(
-            observation, [STAR], engine="numpy", pad=0, n_iter=20, refine_psfs=()
-        )
+    observation = lnocl.Observation(images, PSF, background=LEVEL)
+    result = lnocl.deconvolve(observation, [STAR], engine="numpy", pad=0, n_iter=20, refine_psfs=())
     assert result.psf_refinement is None  # all rings together show no error
     assert set(result.held_out["smoothing"]) >= {0.0}  # held-out counts choose still
     near = result._outcome.penalty.near_stars
@@ -374,10 +323,8 @@ def test_an_error_that_single_rings_show_smooths_the_sky_near_the_star():
 class TestAScatterThatIsGiven:
     def test_it_smooths_the_sky_near_the_stars(self):
         images, scatter = images_through([PSF], 30.0), 0.05 * PSF
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", LnoclWarning)
-            observation = lnocl.Observation(images, PSF, background=LEVEL, psf_scatter=scatter)
-            result = lnocl.deconvolve(observation, [STAR], engine="numpy", pad=0, n_iter=5)
+        observation = lnocl.Observation(images, PSF, background=LEVEL, psf_scatter=scatter)
+        result = lnocl.deconvolve(observation, [STAR], engine="numpy", pad=0, n_iter=5)
         found = result.psf_refinement
         assert not found.is_accepted
         assert found.psf_error == pytest.approx(0.05)
@@ -402,11 +349,9 @@ def test_what_may_be_faked_is_the_share_of_the_light_in_the_sky(exposure):
     observation = lnocl.Observation(
         images, [PSF, PSF], background=LEVEL, psf_centre="given", exposure=exposure
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LnoclWarning)
-        result = lnocl.deconvolve(
-            observation, [STAR], refine_psfs=["shift"], engine="numpy", pad=0, n_iter=10, stop=None
-        )
+    result = lnocl.deconvolve(
+        observation, [STAR], refine_psfs=["shift"], engine="numpy", pad=0, n_iter=10, stop=None
+    )
     found = result.psf_refinement
     x, y = STAR
     assert len(found.edges) == len(found.errors_in_rings) + 1
@@ -427,9 +372,7 @@ def test_phases_across_a_pupil_are_found():
         observation = lnocl.Observation(
             images_through([true]), ideal, background=LEVEL, psf_centre="given", pupils=pupil
         )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", LnoclWarning)
-            results.append(lnocl.deconvolve(observation, [STAR], refine_psfs=names, **options))
+        results.append(lnocl.deconvolve(observation, [STAR], refine_psfs=names, **options))
     found, plain = results
     assert found.psf_refinement.is_accepted
     assert found.psf_refinement.parameters == tuple(f"pupil {i}" for i in range(1, 8))
@@ -506,11 +449,9 @@ def test_the_grid_stays_though_wider_psfs_would_take_a_larger_one():
     images = np.random.default_rng(0).poisson(np.fft.irfft2(spectrum, sky.shape)).astype(float)
     pads = [choose_pad(lnocl.Observation(images, psf)) for psf in (given, wide)]
     assert pads[0] <= 2 < pads[1]  # a grid of 64, and of 128
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LnoclWarning)
-        observation = lnocl.Observation(images, given)
-        options = {"engine": "numpy", "n_iter": 3, "stop": None, "refine_psfs": ["jitter"]}
-        result = lnocl.deconvolve(observation, [star], **options)
+    observation = lnocl.Observation(images, given)
+    options = {"engine": "numpy", "n_iter": 3, "stop": None, "refine_psfs": ["jitter"]}
+    result = lnocl.deconvolve(observation, [star], **options)
     assert result.psf_refinement.is_accepted
     np.testing.assert_allclose(result.psf_refinement.values, [(1.0, 0.0, 1.0)], rtol=0, atol=0.05)
 
@@ -546,7 +487,6 @@ def undersampled(oversample, width, true=1.7):
 TWO = [(16.2, 19.4), (28.6, 11.9)]
 
 
-@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 @pytest.mark.parametrize(
     ("oversample", "names"),
     [
@@ -570,7 +510,6 @@ def test_psfs_finer_than_the_images_are_refined(oversample, names):
     assert result.doubtful.shape == result.extended.shape == (40 * oversample, 40 * oversample)
 
 
-@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 def test_where_psfs_give_nothing_their_error_is_no_noise():
     """A share of the rounding in a Gaussian's wings made noise of 1e100 electrons."""
     observation = undersampled(1, width=1.4)
