@@ -28,19 +28,6 @@ def test_results_are_compared_by_identity():
     assert len({first, second}) == 2
 
 
-@pytest.mark.parametrize("refine_positions", [False, True])
-def test_positions_have_errors_where_they_were_refined_and_fluxes_always(refine_positions):
-    y, x = np.indices((16, 16))
-    psf = np.exp(-((x - 8) ** 2 + (y - 8) ** 2) / 4.0)
-    observation = lnocl.Observation(5.0 + 100.0 * psf, psf, background=5.0)
-    options = {"n_iter": 2, "engine": "numpy", "refine_positions": refine_positions}
-    result = paper(observation, stars=[(8, 8)], **options)
-    assert result.star_flux_errors.shape == (1,)
-    assert result.star_flux_errors[0] > 0
-    assert result.star_position_errors.shape == (1, 2)
-    assert np.isnan(result.star_position_errors).all() != refine_positions
-
-
 @pytest.mark.parametrize("exposure", [1.0, 4.0])
 @pytest.mark.parametrize("refine_positions", [False, True])
 def test_the_table_of_stars(exposure, refine_positions):
@@ -114,13 +101,6 @@ def test_units_of_a_start(name):
     }.items():
         with pytest.raises(lnocl.InputError, match=message):
             begin(numbers * unit)
-
-
-def test_stars_on_the_sky_are_refused_and_stars_in_pixels_taken():
-    with pytest.raises(lnocl.InputError, match=r"^stars must be in pixels, not in arcsec; convert"):
-        deconvolve(stars=[(3, 4)] * u.arcsec)
-    found, expected = (deconvolve(stars=[(3, 4)] * unit) for unit in (u.pix, 1))
-    np.testing.assert_array_equal(found.star_fluxes, expected.star_fluxes)
 
 
 ARRAYS = {"extended", "star_fluxes", "star_positions", "history", "held_out"}

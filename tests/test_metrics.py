@@ -31,11 +31,6 @@ def test_restoration_error_by_hand():
     assert restoration_error(found, truth, rows=slice(0, 1)) == pytest.approx(math.sqrt(5 / 20))
 
 
-def test_restoration_error_is_not_symmetric():
-    assert restoration_error([[1.0]], [[2.0]]) == 0.5
-    assert restoration_error([[2.0]], [[1.0]]) == 1.0
-
-
 def test_restoration_error_masks_star_in_both():
     truth = np.zeros((5, 5))
     truth[0] = 3.0  # 5 pixels of 3 outside the mask
@@ -51,32 +46,12 @@ def test_restoration_error_masks_star_in_both():
     )
 
 
-def test_restoration_error_known_answer_near_star():
-    """Right but for a factor of 1.25 in the 24 rows: 0.25 there, less over all rows."""
-    truth = np.ones((96, 8))
-    rows = star_rows((4, 40), truth.shape)
-    found = truth.copy()
-    found[rows] *= 1.25
-    assert restoration_error(found, truth, rows=rows) == pytest.approx(0.25)
-    assert restoration_error(found, truth) == pytest.approx(0.25 * math.sqrt(24 / 96))
-    error = flux_profile(found) / flux_profile(truth) - 1.0
-    assert np.count_nonzero(error) == 24
-    assert error[rows] == pytest.approx(0.25)
-
-
 @given(planes, planes, st.floats(0.01, 100))
 def test_restoration_error_has_no_unit(found, truth, scale):
     truth[0, 0] = 1.0
     assert restoration_error(scale * found, scale * truth) == pytest.approx(
         restoration_error(found, truth)
     )
-
-
-@given(planes)
-def test_restoration_error_of_truth_and_of_nothing(truth):
-    truth[0, 0] = 1.0
-    assert restoration_error(truth, truth) == 0
-    assert restoration_error(np.zeros_like(truth), truth) == pytest.approx(1)
 
 
 def test_star_rows_are_24_with_12_below():
@@ -137,27 +112,18 @@ def test_star_elsewhere_is_refused(star, message):
     [
         (lambda: restoration_error(np.ones((2, 2)), np.ones((2, 3))), "shape"),
         (lambda: restoration_error(np.ones((2, 2)), np.zeros((2, 2))), "truth is zero"),
-        (lambda: restoration_error(np.ones((2, 3)), np.ones((2, 2))), "shape"),
         (lambda: restoration_error(np.ones(2), np.ones(2)), "1 dimensions"),
-        (lambda: restoration_error(np.ones((1, 2, 2)), np.ones((1, 2, 2))), "3 dimensions"),
         (lambda: restoration_error([[math.nan]], [[1.0]]), "not finite"),
         (lambda: restoration_error([[1j]], [[1.0]]), "complex128"),
         (lambda: restoration_error(MASKED, np.ones((4, 4))), "reconstruction has 2 masked values"),
         (lambda: restoration_error(np.ones((4, 4)), MASKED), "truth has 2 masked values; fill"),
-        (lambda: restoration_error([[2e200]], [[1e200]]), "too large to be squared"),
-        (lambda: restoration_error([[1e200]], [[1e200]]), "too large to be squared"),
         (lambda: restoration_error([[1e200]], [[1.0]]), "too large to be squared"),
         (lambda: restoration_error([[-1e308]], [[1e308]]), "too large to be squared"),
         (lambda: mask_star(MASKED, (1, 1)), "image has 2 masked values; fill"),
         (lambda: flux_profile(MASKED), "image has 2 masked values; fill"),
-        (lambda: mask_star(np.ones((4, 4)), (0, 2)), "leave the image"),
-        (lambda: mask_star(np.ones((4, 4)), (4, 2)), "outside"),
-        (lambda: mask_star(np.ones((4, 4)), (1.5, 2)), "between pixels"),
         (lambda: star_rows((2, 11), (64, 48)), "do not fit in 64 rows"),
-        (lambda: star_rows((2, 53), (64, 64)), "do not fit"),
         (lambda: magnitude(-1.0, 1.0), "flux"),
         (lambda: magnitude(1.0, 0.0), "zero_magnitude_flux"),
-        (lambda: magnitude(1.0, -1.0), "zero_magnitude_flux"),
     ],
 )
 def test_refuses_in_one_line(call, message):

@@ -5,7 +5,6 @@ import functools
 import numpy as np
 import pyopencl as cl
 import pytest
-import scipy.fft
 
 from lnocl.opencl.device import choose
 from lnocl.opencl.transform import Transform
@@ -111,23 +110,6 @@ def test_impulse_is_flat_and_exact(grid, dtype):
     pixels = np.zeros(grid)
     pixels[0, 0] = 1.0
     assert (transform(grid, dtype).rfft2(pixels) == 1.0).all()
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_error_grows_as_the_root_of_the_logarithm(dtype, record_property):
-    """RMS error = c (log2 N)^power against long double; the power is reported, about 1/2."""
-    grids = [grid for grid in COLUMNS if grid[0] >= 32]
-    exact = [scipy.fft.fft(columns_of(g, dtype).astype(np.clongdouble), axis=0) for g in grids]
-    errors = [
-        float(l2(transform(g, dtype).fft(columns_of(g, dtype)), e))
-        for g, e in zip(grids, exact, strict=True)
-    ]
-    logs = np.log2([grid[0] for grid in grids])
-    power, constant = np.polyfit(np.log(logs), np.log(errors), 1)
-    record_property("error", f"{np.exp(constant):.2g} (log2 N)^{power:.2f}")
-    assert 0.4 < power < 0.65
-    assert errors[-1] < 1.3 * np.finfo(dtype).eps
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,12 @@ promised bit for bit is compared bit for bit.
 """
 
 import dataclasses
-import warnings
 
 import numpy as np
 import pytest
 from scenes import FEWER_ENGINES, NUMPY_FIRST, Recipe, blur, make_psfs, paper, same, worst
 
 import lnocl
-from lnocl import reference
-from lnocl.scene.scene import Scene
 
 SHAPE = (16, 32)
 # Few scenes, as an OpenCL program is built for each: what a scene has is fixed when it is built.
@@ -52,40 +49,7 @@ def assert_close(result, extended, star_fluxes, objective, precision):
     assert worst(result.history["objective"], objective) <= objective_tolerance
 
 
-def operators(psfs, shape):
-    """Return A, which makes p images of a sky, and its adjoint, as the reference has them."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", lnocl.LnoclWarning)  # a large PSF wraps round
-        scene = Scene(lnocl.Observation(np.ones((len(psfs), *shape)), psfs))
-    spectra = [reference.rfft_rows(scene.psf(j)) for j in range(len(psfs))]
-    otfs = np.array([reference.otf_columns(spectrum) for spectrum in spectra])
-
-    def forward(sky):
-        return reference.irfft_rows(reference.convolve_columns(reference.rfft_rows(sky), otfs))
-
-    def back(stack):
-        return reference.irfft_rows(reference.correlate_columns(reference.rfft_rows(stack), otfs))
-
-    return forward, back
-
-
 # --- The adjoint
-
-
-@pytest.mark.parametrize("psf_shape", [(1, 1), (3, 4), (4, 7), (3, 8)])
-def test_operators_are_those_of_the_dense_matrix(psf_shape):
-    ny, nx = 4, 8
-    psfs = make_psfs(2, psf_shape)
-    forward, back = operators(psfs, (ny, nx))
-    matrices = np.zeros((2, ny, nx, ny, nx))
-    for (j, ky, kx), value in np.ndenumerate(psfs / psfs.sum(axis=(1, 2), keepdims=True)):
-        for y, x in np.ndindex(ny, nx):
-            to = (y + ky - psf_shape[0] // 2) % ny, (x + kx - psf_shape[1] // 2) % nx
-            matrices[j, *to, y, x] += value
-    rng = np.random.default_rng(2)
-    sky, ratios = rng.normal(size=(ny, nx)), rng.normal(size=(2, ny, nx))
-    assert worst(forward(sky), np.einsum("jabyx,yx->jab", matrices, sky)) <= 1e-15
-    assert worst(back(ratios), np.einsum("jabyx,jab->yx", matrices, ratios)) <= 1e-15
 
 
 # --- What is conserved, what stays as it is

@@ -130,7 +130,7 @@ def test_a_callback_that_ends_a_run_where_it_ends_anyway_is_not_heeded(tmp_path)
 def test_held_out_counts_go_on_from_their_last_checkpoint(engine, tmp_path, monkeypatch):
     """And those that had ended do not iterate again."""
     made, path = STARS.make(), str(tmp_path / "run.fits")
-    given = {"n_iter": 100, "engine": engine, "solver": "sgp", "stop": "held-out", "mu": 0.0}
+    given = {"n_iter": 40, "engine": engine, "solver": "sgp", "stop": "held-out", "mu": 0.0}
     given |= {"smoothing": "auto", "checkpoint": path}
     monkeypatch.setattr(checkpoint, "EVERY", 0.0)
     written, iterated, cut = [], [], 0
@@ -147,7 +147,7 @@ def test_held_out_counts_go_on_from_their_last_checkpoint(engine, tmp_path, monk
     assert set(written[:-1]) == {""}
     assert written[-1] == "held-out"
     all_iterated, n_iter = iterated.copy(), len(iterated)
-    for cut in (1, n_iter // 3, n_iter // 2, 2 * n_iter // 3, len(written) - 1):
+    for cut in (1, n_iter // 2, len(written) - 1):
         os.remove(path)
         written.clear()
         with pytest.raises(KeyboardInterrupt):

@@ -380,6 +380,7 @@ def test_phases_across_a_pupil_are_found():
     assert error(found) < 0.5 * error(plain)
 
 
+@pytest.mark.exhaustive
 def test_phases_are_searched_from_several_places():
     """One search alone ends at PSFs that are wrong by 0.03, with an even phase's sign wrong."""
     pupil = np.clip(12.5 - np.hypot(X - N // 2, Y - N // 2), 0.0, 1.0)

@@ -152,20 +152,6 @@ def test_masks(images, mask, held):
     np.testing.assert_array_equal(observation.images, np.where(held, 0.0, data))
 
 
-@pytest.mark.parametrize("dtype", ["f4", ">f8", ">i2", "u1", "?", "f2"])
-def test_everything_is_held_in_double(dtype):
-    observation = observe(
-        images=IMAGES.astype(dtype),
-        psfs=PSF.astype(dtype),
-        background=np.ones(3, dtype),
-        read_noise=np.ones(3, dtype),
-    )
-    for array in (observation.images, observation.psfs, observation.background):
-        assert array.dtype == np.float64
-        assert array.dtype.isnative
-    np.testing.assert_array_equal(observation.images, IMAGES.astype(dtype).astype(float) + 1)
-
-
 @pytest.mark.filterwarnings(
     "ignore:psf . is sharper than its pixels", "ignore:the images are shifted by up to"
 )

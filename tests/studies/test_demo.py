@@ -120,12 +120,9 @@ class TestDemo:
 
 
 BAD_SIMULATE = {
-    "scene": (["hh35"], 2, "scene 'hh35' is neither a built-in one (hh34) nor a file"),
-    "small": (["hh34", "--size", "32"], 2, "each side must be even and 64 or more"),
     "no FITS": (["text.fits"], 1, "text.fits is not a FITS file"),
     "size of a file": (["dark.fits", *SMALL], 2, "which has its own; leave it out"),
     "angle": (["hh34", "--angle", "0", "nan"], 2, "--angle must be finite"),
-    "angle inf": (["hh34", "--angle", "-inf"], 2, "--angle must be finite"),
     "time": (["hh34", "--exposure-time", "30"], 2, "--exposure-time must be a quantity in min"),
     "star": (["hh34", "--star", "3,4"], 2, "argument --star: '3,4' is not X,Y,MAG"),
     "folder": (["hh34", "-o", "full"], 1, "the output folder full is not empty; give another"),
