@@ -119,25 +119,25 @@ class TestDemo:
         assert sorted(os.listdir()) == ["full"]
 
 
-BAD_SIMULATE = {
-    "no FITS": (["text.fits"], 1, "text.fits is not a FITS file"),
-    "size of a file": (["dark.fits", *SMALL], 2, "which has its own; leave it out"),
-    "angle": (["hh34", "--angle", "0", "nan"], 2, "--angle must be finite"),
-    "time": (["hh34", "--exposure-time", "30"], 2, "--exposure-time must be a quantity in min"),
-    "star": (["hh34", "--star", "3,4"], 2, "argument --star: '3,4' is not X,Y,MAG"),
-    "folder": (["hh34", "-o", "full"], 1, "the output folder full is not empty; give another"),
-    "file": (["hh34", "-o", "text.fits"], 1, "the output folder text.fits cannot be used"),
-}
+BAD_SIMULATE = [
+    (["text.fits"], 1, "text.fits is not a FITS file"),
+    (["dark.fits", *SMALL], 2, "which has its own; leave it out"),
+    (["hh34", "--angle", "0", "nan"], 2, "--angle must be finite"),
+    (["hh34", "--exposure-time", "30"], 2, "--exposure-time must be a quantity in min"),
+    (["hh34", "--star", "3,4"], 2, "argument --star: '3,4' is not X,Y,MAG"),
+    (["hh34", "-o", "full"], 1, "the output folder full is not empty; give another"),
+    (["hh34", "-o", "text.fits"], 1, "the output folder text.fits cannot be used"),
+]
 
 
-EXTREMES = {
-    "star": (["--star", "32,16,-40"], "all light together and the read noise would leave"),
-    "time": (["--exposure-time", "1e300min"], "would leave"),
-}
+EXTREMES = [
+    (["--star", "32,16,-40"], "all light together and the read noise would leave"),
+    (["--exposure-time", "1e300min"], "would leave"),
+]
 
 
 class TestSimulate:
-    @pytest.mark.parametrize(("arguments", "message"), EXTREMES.values(), ids=EXTREMES)
+    @pytest.mark.parametrize(("arguments", "message"), EXTREMES)
     def test_extreme_numbers_are_refused_and_leave_no_folder(self, arguments, message, capsys):
         assert cli.main(["simulate", "hh34", *SMALL, *arguments, "-o", "deep/out"]) == 2
         assert message in one_complaint(capsys.readouterr())
@@ -230,9 +230,7 @@ class TestSimulate:
         assert cli.main(["simulate", "mine.fits", "-o", "out", "--angle", "0"]) == 0
         assert saved_results.read_result("out/truth.fits").stars == [(20.0, 24.0)]
 
-    @pytest.mark.parametrize(
-        ("arguments", "status", "message"), BAD_SIMULATE.values(), ids=BAD_SIMULATE
-    )
+    @pytest.mark.parametrize(("arguments", "status", "message"), BAD_SIMULATE)
     def test_refusals(self, arguments, status, message, capsys, monkeypatch):
         monkeypatch.setattr(
             "lnocl.simulation.simulate", lambda *arguments: pytest.fail("work was begun")
