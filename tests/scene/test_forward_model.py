@@ -108,12 +108,6 @@ def test_there_is_none_where_nothing_is_modelled(monkeypatch):
     assert np.isnan(residuals).sum() == 1
 
 
-def test_noise_alone_leaves_residuals_of_about_one():
-    images = np.random.default_rng(2).poisson(50.0, (1, 64, 64)).astype(float)
-    _, result = solve(np.ones((9, 9)), [], images=images)
-    assert result.residuals().std() == pytest.approx(1.0, abs=0.1)
-
-
 def test_they_are_those_of_the_last_iteration_whatever_follows():
     _, result = solve()
     first = result.models()

@@ -59,7 +59,6 @@ def run(name, **keywords):
 
 # --- The minimum
 
-# mu is so large that the split-gradient method, too, comes near the minimum.
 MINIMA = {
     "star": Recipe((16, 16), 2, 1, mu=0.05),
     "three stars, mask, map": Recipe((16, 16), 3, 3, mu=0.05, masked=0.05, background="map"),
@@ -73,18 +72,14 @@ MINIMA = {
     "large, star": Recipe((32, 32), 3, 1, mu=0.05, background="each"),
     "large, three stars": Recipe((32, 32), 2, 3, mu=0.05),
 }
-# In CI alone: large ones; the others on OpenCL; the split-gradient method, whose 5000 iterations
-# take long, on all but one. test_iteration.py has exposures on both engines.
+# In CI alone: large ones; the others on OpenCL. test_iteration.py has exposures on both engines.
 SMALL = [name for name in MINIMA if "large" not in name and "exposures" not in name]
 ON_OPENCL = "smoothed, two stars"
-BY_SGM = "star"
-
 
 # Of J, of the extended source and of the star fluxes. Measured: in double 1.1e-15, 4.1e-8 and
 # 1.3e-8, which is where L-BFGS-B ends, farther from the minimum than these runs; in single 6.2e-7,
-# 9.5e-4 and 7.9e-6; after 5000 iterations of the split-gradient method 2.5e-9, 6.4e-5 and 3.9e-6.
+# 9.5e-4 and 7.9e-6.
 SGP_TOLERANCES = {"double": (2.5e-15, 7e-8, 4e-8), "single": (1.6e-6, 2.5e-3, 2e-5)}
-SGM_TOLERANCES = 7e-9, 1.5e-4, 1e-5
 # In standard errors. Measured 3.8e-6 and 0.036.
 OFF_THE_MINIMUM = {"double": 1e-5, "single": 0.1}
 
@@ -141,19 +136,6 @@ def test_minimum_is_that_of_l_bfgs_b(engine, name):
     assert (errors <= SGP_TOLERANCES[engine["precision"]]).all(), errors
     problem, _ = minimum(name)
     assert problem.off_the_minimum(unknowns(result)) <= OFF_THE_MINIMUM[engine["precision"]]
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[] if name == BY_SGM else [pytest.mark.exhaustive])
-        for name in MINIMA
-    ],
-)
-def test_split_gradient_method_has_the_same_minimum(name):
-    result = MINIMA[name].make().deconvolve(solver="sgm", n_iter=5000, engine="numpy")
-    errors = errors_at_the_minimum(name, result)
-    assert (errors <= SGM_TOLERANCES).all(), errors
 
 
 def test_star_that_is_not_there_leaves_its_neighbour_alone():
