@@ -24,10 +24,10 @@ from lnocl.verify.harness import (
 # block among work-items, as a GPU does.
 # (PoCL 3 miscompiles vectors of 2 in groups of several work-items; no tuning has them.)
 CASES = {
-    "outer radix 2": ((2, 2), None, "plain", "sD"),
+    "outer radix 2": ((2, 2), None, "plain", "SD"),
     "outer radix 4": ((4, 4), None, "plain", "S"),
     "outer radix 8": ((8, 8), None, "mask, mu, smoothing", "S"),
-    "radices 4, 4 and 8, 4": ((16, 32), None, THREE_IMAGES, "sD"),
+    "radices 4, 4 and 8, 4": ((16, 32), None, THREE_IMAGES, "SD"),
     "radices 8, 8 and 4, 8, 4": ((64, 128), None, "two images, star, mu", "sD"),
     "radices 8, 8, 4": ((256, 16), None, "plain", "S"),
     "exposure map": ((32, 16), None, "exposure map, mu", "SD"),

@@ -24,7 +24,7 @@ KERNEL void probe(__global vec *out, __global const vec *ratios)
 def divergence(ratios):
     """Run the kernels' function on an array whose length is a multiple of 16."""
     context = cl.Context([choose().device])
-    program = Program(context, (128, 128), ratios.dtype)
+    program = Program(context, (128, 64), ratios.dtype)
     built = cl.Program(context, source() + PROBE).build(program.options)
     copy = cl.mem_flags.COPY_HOST_PTR
     given = cl.Buffer(context, READ_WRITE | copy, hostbuf=ratios)

@@ -27,11 +27,11 @@ def test_kernel_twin_and_test_have_one_name(name):
 def test_every_kernel_is_compared():
     kernels = {kernel for name in FILES for kernel in kernels_in(f"{name}.cl")}
     assert kernels == set(KERNELS)
-    assert set(harness_of("radices 4, 4 and 8, 4", np.float32).program.arguments) == kernels
+    assert set(harness_of("odd factors 3 and 5", np.float32).program.arguments) == kernels
 
 
 def test_writes_past_the_end_of_an_array_are_found():
-    harness = harness_of("outer radix 2", np.float32)
+    harness = harness_of("odd factors 3 and 5", np.float32)
     harness.forget()
     written, other = harness.put(np.zeros(4)), harness.put(np.zeros(4))
     assert not harness.take(other, 4).any()

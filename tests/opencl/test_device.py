@@ -15,6 +15,8 @@ import lnocl
 from lnocl import process
 from lnocl.engines import opencl
 from lnocl.opencl import device, program, sharing
+from lnocl.opencl.tuning import Tuning
+from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import MIN_MODEL
 
 GPU = SimpleNamespace(name="Fast GPU", type=cl.device_type.GPU)
@@ -174,25 +176,24 @@ def test_no_double_precision(monkeypatch):
     paper(observation, precision="single", n_iter=1)
 
 
-def scene(p, shape, stars=0, mask=None):
-    observation = lnocl.Observation(np.ones((p, *shape)), np.ones(shape), mask=mask)
-    return opencl.Scene(observation, [(i, i) for i in range(stars)])
-
-
 @pytest.mark.parametrize("limit", ["global_mem_size", "max_mem_alloc_size"])
 def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, limit):
     found = device.choose().device
     monkeypatch.setattr(opencl.Memory, "allocate", lambda *_, **__: pytest.fail("allocated"))
     monkeypatch.setattr(cl.Device, limit, 20_000)
     mask = np.arange(16 * 32).reshape(16, 32) == 100
-    many = scene(2, (16, 32), 8, mask)
+    observation = lnocl.Observation(np.ones((2, 16, 32)), np.ones((16, 32)), mask=mask)
+    many = opencl.Scene(observation, [(i, i) for i in range(8)], Penalty(mu=1e-6))
     with pytest.raises(lnocl.DeviceError, match=r"the scene needs \d+ MiB, .* for star_images"):
         opencl.OpenCLEngine(many, "single", device.spec_of(found), 10)
 
 
 @pytest.mark.parametrize(
     ("shape", "tuning"),
-    [((16, 32), None), ((64, 32), program.Tuning(4, 16, scratch_is_global=True))],
+    [
+        ((16, 32), None),
+        pytest.param((64, 32), Tuning(4, 16, scratch_is_global=True), marks=pytest.mark.exhaustive),
+    ],
 )
 def test_memory_estimate_is_what_the_buffers_hold(shape, tuning, caplog):
     """With scratch in local memory, of which 32 KiB will do, and with scratch in global memory."""
@@ -211,11 +212,13 @@ def test_memory_estimate_is_what_the_buffers_hold(shape, tuning, caplog):
     assert message.startswith(start)
 
 
-def test_the_reference_engine_needs_no_opencl():
+def test_plain_arrays_need_no_astropy_and_the_reference_engine_no_opencl():
     code = (
         "import sys; sys.modules['pyopencl'] = None\n"
         "import numpy, lnocl\n"
-        "obs = lnocl.Observation(numpy.ones((8, 8)), numpy.ones((1, 1)))\n"
+        "obs = lnocl.Observation(numpy.ones((2, 8, 8)), numpy.ones((1, 1)), background=1.0,"
+        " read_noise=[1, 2], exposure=[1, 2], offsets=[(0, 0), (1, 0.5)])\n"
+        "assert not [name for name in sys.modules if name.startswith('astropy')]\n"
         "print(lnocl.deconvolve(obs, n_iter=1, stop=None, engine='numpy').device)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -223,9 +226,10 @@ def test_the_reference_engine_needs_no_opencl():
 
 
 def test_values_too_large_for_single_precision_are_refused():
-    observation = lnocl.Observation(np.ones((16, 32)), np.ones((1, 1)))
+    observation = lnocl.Observation(np.ones((16, 32)), np.ones((1, 1)), mask=np.eye(16, 32) > 0)
+    given = {"mu": 1e-6, "initial_star_fluxes": [1e300, 1.0]}
     with pytest.raises(lnocl.InputError, match=r"star fluxes as large as .* held in float32"):
-        paper(observation, [(1, 1)], n_iter=1, initial_star_fluxes=[1e300])
+        paper(observation, [(1, 2), (7, 5)], n_iter=1, **given)
 
 
 @pytest.mark.parametrize("engine", ["numpy", "opencl"])

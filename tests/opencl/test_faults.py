@@ -18,10 +18,14 @@ from lnocl.engines.numpy import ReferenceEngine
 from lnocl.opencl import device, program
 from lnocl.runs import checkpoint
 
+# Of images of this shape, with a star and mu, kernel_cases.py has the program.
+WITH_STAR = {"stars": [(5, 6)], "mu": 1e-6}
+SHAPE_WITH_STAR = 64, 128
 
-def observe():
-    rng = np.random.default_rng(16)
-    return lnocl.Observation(rng.poisson(50.0, (16, 32)), np.ones((3, 3)), background=1.0)
+
+def observe(shape=(16, 32)):
+    images = np.random.default_rng(16).poisson(50.0, shape)
+    return lnocl.Observation(images, np.ones((3, 3)), background=1.0)
 
 
 def error_of(kind, code, routine):
@@ -308,16 +312,16 @@ def test_a_run_ends_before_the_objective_is_not_finite(engine, solver, what, at,
         if iteration == at:
             poison(estimate._run.engine, what)
 
-    keywords = {"solver": solver, "engine": engine, "stars": [(5, 6)]}
+    keywords = {"solver": solver, "engine": engine, **WITH_STAR}
     with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
-        result = paper(observe(), n_iter=n_iter, callback=callback, **keywords)
+        result = paper(observe(SHAPE_WITH_STAR), n_iter=n_iter, callback=callback, **keywords)
     assert result.stop_reason == "not finite"
     assert at - 1 <= result.n_iter <= at
     assert len(seen) <= min(n_iter, at + 2 * opencl.FETCH_EVERY)
     assert len(result.history) == result.n_iter + 1
     assert np.isfinite(result.history["objective"]).all()
     if result.n_iter:
-        expected = paper(observe(), n_iter=result.n_iter, **keywords)
+        expected = paper(observe(SHAPE_WITH_STAR), n_iter=result.n_iter, **keywords)
         assert np.array_equal(result.extended, expected.extended)
         assert np.array_equal(result.star_fluxes, expected.star_fluxes)
         assert np.array_equal(result.history, expected.history)
@@ -349,13 +353,15 @@ def test_a_checkpoint_is_not_replaced_by_what_is_not_finite(tmp_path, monkeypatc
             poison(estimate._run.engine, what)
 
     path = str(tmp_path / "run.fits")
-    keywords = {"solver": solver, "n_iter": 12, "stars": [(5, 6)], "stop": 1e-9}
+    keywords = {"solver": solver, "n_iter": 12, "stop": 1e-9, **WITH_STAR}
     monkeypatch.setattr(checkpoint, "EVERY", 0.0)
     with pytest.warns(lnocl.LnoclWarning, match="the objective became infinite or not a n"):
-        result = paper(observe(), callback=callback, checkpoint=path, **keywords)
+        result = paper(observe(SHAPE_WITH_STAR), callback=callback, checkpoint=path, **keywords)
     assert result.stop_reason == "not finite"
     assert 6 <= result.n_iter <= 8
-    resumed, expected = (paper(observe(), **keywords, **which) for which in ({"resume": path}, {}))
+    resumed, expected = (
+        paper(observe(SHAPE_WITH_STAR), **keywords, **which) for which in ({"resume": path}, {})
+    )
     assert resumed.n_iter == expected.n_iter == 12
     assert np.array_equal(resumed.extended, expected.extended)
     assert np.array_equal(resumed.history, expected.history)

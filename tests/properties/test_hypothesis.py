@@ -197,7 +197,7 @@ def test_opencl_answers_or_refuses_as_the_reference_does(precision, form, seed, 
     mask = np.zeros((16, 32), bool)
     mask[3, 4] = True
     observation = {"images": given, "psfs": np.ones((3, 3)), "background": 1.0, "mask": mask}
-    case = observation, {"stars": [(5, 6)], "n_iter": 3, "mu": 1e-6}
+    case = observation, {"stars": [(5, 6), (20, 3)], "n_iter": 3, "mu": 1e-6}
     answers(case, engine="opencl", precision=precision)
     if not values:
         plain = {**observation, "images": images}

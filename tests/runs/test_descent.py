@@ -38,10 +38,11 @@ def observe(seed, noise=0.03, level=0.0):
         return lnocl.Observation(image, psf, background=50.0)
 
 
+ENGINES = ["numpy", pytest.param("opencl", marks=pytest.mark.exhaustive)]
 rises = pytest.warns(lnocl.LnoclWarning, match="the objective rises: .* is that of iteration")
 
 
-@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("seed", [1, 4])
 def test_the_result_is_the_estimate_of_the_least_objective(engine, seed):
     iterations = []
@@ -96,7 +97,7 @@ def test_a_run_cut_off_ends_where_it_would_have(cut, every, tmp_path, monkeypatc
         same(paper(observe(1), **given, resume=path, checkpoint=path), whole)
 
 
-@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_it_is_noticed_at_the_end_of_a_short_run(engine):
     """Long before the device is asked for objectives."""
     with rises:

@@ -387,16 +387,3 @@ def test_refused(changes, message):
         observe(**changes)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_nothing_of_astropy_is_loaded_for_plain_arrays():
-    import subprocess
-    import sys
-
-    code = (
-        "import sys, numpy as np, lnocl\n"
-        "lnocl.Observation(np.ones((2, 4, 4)), np.ones((1, 1)), background=1.0, read_noise=[1, 2],"
-        " exposure=[1, 2], offsets=[(0, 0), (1, 0.5)])\n"
-        "assert not [name for name in sys.modules if name.startswith('astropy')]"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

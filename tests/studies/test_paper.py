@@ -93,6 +93,7 @@ def test_wrong_uses(experiment):
         experiment.Tracker(several, "RLM", 0, 5)
 
 
+@pytest.mark.system
 def test_the_table_is_resumed_and_bound_to_its_experiment(tmp_path):
     pytest.importorskip("matplotlib")
 

@@ -23,6 +23,10 @@ TRIED = comparison.kernels_of(harness.SCENES[SCENE])
 # In the source of the kernels, once each: what is there, and a fault to put in its place.
 FAULTS = {
     "correlate_columns": ("edge[0], -edge[1], z, t", "edge[0], edge[1], z, t"),
+    "convolve_columns": (
+        "edge[2 * point], edge[2 * point + 1], source",
+        "edge[2 * point], -edge[2 * point + 1], source",
+    ),
     "elsewhere": (
         "finish_columns(columns, total, NY, column_roots);",
         "finish_columns(columns, total, NY, column_roots);"
@@ -124,22 +128,19 @@ def test_a_deconvolution_strays_by_the_worst_of_what_it_returns(field):
     assert selftest._strays(lambda: found, result()) == pytest.approx(5e-4)
 
 
-def test_a_wrong_kernel_is_named(capsys, plant):
-    plant("correlate_columns")
+def test_wrong_kernels_are_named(capsys, plant):
+    """By what they compute, by where they write, and as they do not start."""
+    plant("convolve_columns", "elsewhere", "step_rows")
     status, out, err = outcome(capsys)
     assert status == 1
-    assert err == [f"lnocl: error: WRONG on {NAME}: correlate_columns (single): {ADVICE}"]
-    assert verdicts(out) == dict.fromkeys(TRIED, "right") | {"correlate_columns": "WRONG"}
-    assert out[-1] == NO_DOUBLE
-
-
-def test_kernels_that_write_where_they_must_not_or_do_not_start_are_named(capsys, plant):
-    plant("elsewhere", "step_rows")
-    status, out, err = outcome(capsys)
-    assert status == 1
-    named = "correlate_columns (single), step_rows (single)"
+    wrong = "convolve_columns", "correlate_columns", "step_rows"
+    named = ", ".join(f"{name} (single)" for name in wrong)
     assert err == [f"lnocl: error: WRONG on {NAME}: {named}: {ADVICE}"]
+    assert {name for name, verdict in verdicts(out).items() if verdict == "right"} == {*TRIED} - {
+        *wrong
+    }
     assert sum(" failed " in line for line in out) == 2
+    assert NO_DOUBLE in out
     of_correlate, of_step = out[-2:]
     assert of_correlate == "correlate_columns (single, 16 x 32): others than array 0 are written"
     assert of_step.startswith("step_rows (single, 16 x 32): ")
