@@ -1,7 +1,6 @@
 """The picture of a result shows what the result has, in memory and from its file."""
 
 import dataclasses
-import sys
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from result_views import make_view
 from scenes import Recipe
 
-from lnocl.errors import LnoclError
 from lnocl.io.saved_results import read_result
 from lnocl.plotting.result import (
     MAX_SIGMA,
@@ -196,12 +194,6 @@ def test_without_models_the_source_alone_is_shown():
         "extended source, whole frame",
         *(f"extended source, star {s}" for s in range(1, 6)),
     ]
-
-
-def test_without_matplotlib_one_line_says_what_to_install(result, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(LnoclError, match=r"pip install matplotlib$"):
-        result.plot()
 
 
 def test_colour_bars_are_as_high_as_their_panels_and_their_ticks_apart():

@@ -91,21 +91,6 @@ def test_equal_exposures_are_none(engine):
         np.testing.assert_array_equal(8 * other.extended, result.extended)
 
 
-def test_a_map_of_ones_and_zeros_is_a_mask():
-    made = dataclasses.replace(EACH, exposure="none").make()
-    result = made.deconvolve(n_iter=10, **numpy_alone)
-    ones = np.where(made.mask, 0.0, 1.0)
-    other = made.deconvolve(made.observation(exposure=ones, mask=None), n_iter=10, **numpy_alone)
-    same(other, result)
-    # Zeros as a mask beside a map.
-    made = MAP.make()
-    dead = made.exposure == 0
-    assert dead.any()
-    given = {"exposure": np.where(dead, 3.0, made.exposure), "mask": made.mask | dead}
-    result = made.deconvolve(n_iter=10, **numpy_alone)
-    same(made.deconvolve(made.observation(**given), n_iter=10, **numpy_alone), result)
-
-
 @pytest.mark.parametrize("start", ["given", "default"])
 @every_engine
 def test_what_saw_nothing_has_no_influence(engine, start):

@@ -59,25 +59,6 @@ def test_slopes_are_the_derivatives(pupil, n):
         np.testing.assert_allclose(slope, change, rtol=0, atol=1e-7 * abs(change).max())
 
 
-def test_an_even_phase_and_its_negative_have_one_psf():
-    found = Pupil(DISC)
-    even = [k for k in range(7) if np.allclose(phase_map(DISC, k)[1:, 1:],
-                                               phase_map(DISC, k)[:0:-1, :0:-1])]  # fmt: skip
-    assert len(even) == 3  # defocus and two of astigmatism
-    for k in even:
-        z = 0.3 * np.eye(7)[k]
-        np.testing.assert_allclose(found.psf(z), found.psf(-z), rtol=0, atol=1e-15)
-        np.testing.assert_allclose(found.slopes(0.0 * z)[k], 0.0, rtol=0, atol=1e-15)
-
-
-def test_the_strehl_ratio_falls_as_the_phase_rises():
-    """By Marechal's approximation, exp(-z^2)."""
-    found = Pupil(DISC)
-    for k in range(7):
-        ratio = found.psf(0.1 * np.eye(7)[k]).max() / found.ideal_psf().max()
-        assert ratio == pytest.approx(np.exp(-0.01), abs=2e-3)
-
-
 def test_stray_pixels_are_no_aperture():
     stray = DISC.copy()
     stray[3, 3] = 0.5
