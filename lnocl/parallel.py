@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import threading
@@ -156,9 +157,16 @@ def _client_of(parallel: Parallel) -> Iterator[Client]:
 
 
 def close_cluster(cluster: LocalCluster) -> None:
-    """Close a cluster of Dask, whose list of workers may lack one that was killed."""
+    """Close a cluster of Dask, whose list of workers may lack one that was killed.
+
+    A busy machine takes its time to end workers that have nothing to do: that is not warned of.
+    """
+    nanny = logging.getLogger("distributed.nanny")
+    level = nanny.level
+    nanny.setLevel(logging.ERROR)
     with suppress(KeyError):
         cluster.close()
+    nanny.setLevel(level)
 
 
 def _refuse_a_script_without_guard() -> None:

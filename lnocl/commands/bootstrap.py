@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import re
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lnocl.errors import InputError
 from lnocl.scene.apertures import Aperture
 
 if TYPE_CHECKING:
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 WRITE_EVERY = 10.0
 # Quantities of which the run says the errors, unless more regions were given.
 MAX_SAID = 12
+# Names of quantities of stars; others are of regions and profiles.
+_OF_STARS = re.compile(r"star \d+ (flux|x|y)")
 
 
 def add_errors(
@@ -77,9 +81,36 @@ def add_errors(
     return _said(found, parts, frames)
 
 
+def check_earlier(path: str, seed: int, parts: Sequence[Part]) -> None:
+    """Refuse replicas in a file of another seed, or of other regions and profiles.
+
+    Raises
+    ------
+    InputError
+        The file has such replicas.
+    """
+    from lnocl.io.fitserrors import read_replicas
+    from lnocl.io.fitswrite import ascii_of
+
+    held = read_replicas(path)
+    if held is None:
+        return
+    names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
+    given = {ascii_of(each.name).strip() for each in parts}
+    if held.seed != seed or not all(any(name.startswith(g) for g in given) for name in names):
+        raise _of_others(path, held.seed, list(names))
+
+
+def _of_others(path: str, seed: int, names: Sequence[str]) -> InputError:
+    regions = f"the regions {', '.join(names[:3])}" if names else "no regions"
+    return InputError(
+        f"{path} has replicas with `seed` {seed} of {regions}: give the same `regions`, `profiles` "
+        "and `seed`, or take `overwrite` to begin anew"
+    )
+
+
 def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None:
     """Return the replicas that a file has; refuse those of something else."""
-    from lnocl.errors import InputError
     from lnocl.io.fitserrors import read_replicas
     from lnocl.io.fitswrite import ascii_of
 
@@ -93,10 +124,8 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
         and held.seed == expected.seed
     )
     if not is_same:
-        raise InputError(
-            f"{path} has replicas of other regions or another seed: give those, or take "
-            "`overwrite` to begin anew"
-        )
+        names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
+        raise _of_others(path, held.seed, list(names))
     return dataclasses.replace(expected, errors=held.errors, of_psfs=held.of_psfs, sums=held.sums)
 
 

@@ -44,8 +44,8 @@ OPTIONS = [
         "--regions",
         metavar="FILE",
         is_input=True,
-        help="regions whose light is measured: a file such as DS9 writes, in pixels of the "
-        "extended source or on the sky",
+        help="circles, ellipses, boxes, annuli or polygons whose light is measured: a file such as "
+        "DS9 writes, in pixels of the extended source or on the sky",
     ),
     option(
         "--profiles",
@@ -102,6 +102,8 @@ def _run(arguments: argparse.Namespace) -> None:
         )
     with messages.shown_log(run.quiet, COMMAND.flags()):
         parts = _parts(arguments, frames)
+        if not arguments.overwrite:
+            bootstrap.check_earlier(arguments.result, arguments.seed, parts)
     with messages.shown_log(run.quiet, name=messages.PROGRESS), ignored_warnings():
         found = deconvolve.solve(run, frames, given)
     expected = saved.extended * frames.electrons

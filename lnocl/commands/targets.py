@@ -124,7 +124,8 @@ def _options_of(path: str, table: Table) -> dict[str, Option]:
         options[column] = known[_plain(column)]
     if not any(each.name == "images" for each in options.values()):
         raise InputError(f"{path} has no column images; give the files of each target there")
-    return options
+    # An option of several values would take images that follow it.
+    return dict(sorted(options.items(), key=lambda item: item[1].name != "images"))
 
 
 def _plain(flag: str) -> str:

@@ -100,6 +100,14 @@ def test_the_summary_says_what_was_found_and_whether_it_fits(capsys):
     assert summary()["one"] == one
 
 
+def test_the_order_of_columns_does_not_matter():
+    """An option of several values would take the images that follow it."""
+    Path("targets.csv").write_text("refine_psfs,psf,name,images\njitter,k1.fits,one,a.fits\n")
+    (target,) = read_targets("targets.csv")
+    assert target.words == ("a.fits", "--refine-psfs", "jitter", "--psf", "k1.fits")
+    assert not target.fault
+
+
 def test_a_table_of_excel_begins_with_a_mark_of_its_encoding():
     write_targets(*GOOD)
     Path("targets.csv").write_text(Path("targets.csv").read_text(), encoding="utf-8-sig")

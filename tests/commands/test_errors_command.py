@@ -229,7 +229,12 @@ WRONG_USES = [
     (["--regions", "empty.reg"], 1, "empty.reg holds no regions"),
     (["--regions", "beyond.reg"], 2, "region 1 (circle) lies outside the image of 64 x 64"),
     (["--regions", "sky.reg"], 2, "the image has no sky coordinates (WCS) that can be"),
-    (["--regions", "other.reg"], 2, "has replicas of other regions or another seed: give"),
+    (["--regions", "other.reg"], 2, "has replicas with --seed 0 of the regions round, region 2"),
+    (
+        ["--bootstrap", "20"],
+        2,
+        "out.fits has replicas with --seed 0 of the regions round, region 2",
+    ),
 ]
 
 
