@@ -16,6 +16,7 @@ import numpy as np
 import lnocl
 from lnocl.runs.replicas import Replicas
 from lnocl.runs.run import Run
+from lnocl.runs.start import make_start
 from lnocl.scene.penalty import Penalty
 
 
@@ -52,7 +53,7 @@ def main():
         print(f"{given.memory}: {peak() - before:.0f} MB above {before:.0f}")
         return
     replicas = Replicas(result._outcome, 0)
-    start = result._outcome.restart(Penalty(smoothing=1e-3))
+    start = make_start(result._outcome.setup, Penalty(smoothing=1e-3))
     run, times = Run(start, given.n_iter), {"iterations": [], "replica": []}
     for k in range(given.turns):
         run.repeat(start, observation)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -33,7 +33,7 @@ from lnocl.runs.options import (
     read_start,
     warn_of_rounding,
 )
-from lnocl.runs.outcome import Outcome
+from lnocl.runs.outcome import Mended, Outcome
 from lnocl.runs.progress import Bar, Progress
 from lnocl.runs.run import Run, most_bytes
 from lnocl.runs.start import Setup, make_start
@@ -324,69 +324,98 @@ def deconvolve(
     refine_positions = read_refine_positions(refine_positions)
     fits_stars = solver == "sgp" or refine_positions is True
     positions = check_positions(stars, observation)
-    initial_extended, initial_star_fluxes = read_start(
-        observation, fits_stars, initial_extended, initial_star_fluxes
-    )
+    initial = read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
     Penalty(mu)  # a wrong weight is refused before any work
     is_auto = isinstance(smoothing, str) and smoothing == "auto" and len(positions) > 0
     is_auto = is_auto and not observation.psf_fields  # which are not judged
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
     moves = refine_positions if is_auto else refine_positions is True
-    setup = Setup(positions, pad, solver, precision, engine, device, moves is True)
-    refinement, near_stars, fits = None, None, False
+    setup = Setup(
+        observation, positions, pad, solver, precision, engine, device, moves is True, *initial
+    )
+    mended = Mended(setup)
     if is_auto or families or len(observation.psf_scatter):
-        from lnocl.runs.psf_refinement import mend  # which loads scipy
-
         is_asked = bool(families) and not isinstance(refine_psfs, str)
-        judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
-        with judging, suppress(NotFiniteError):  # of which the run itself tells
-            mended = mend(setup, observation, families, moves, is_asked, judging.update)
-            observation, refinement = mended.observation, mended.refinement
-            near_stars, fits = mended.near_stars, mended.fits
-            setup = replace(setup, refine_positions=mended.moves)
-    are_psfs_wrong = is_auto and near_stars is not None and not fits
+        mended = judge_psfs(setup, families, moves, is_asked, progress)
+    are_psfs_wrong = is_auto and mended.near_stars is not None and not mended.fits
+    observation, near_stars = mended.setup.observation, mended.near_stars
     penalties = read_penalties(mu, smoothing, stop, observation, near_stars, are_psfs_wrong)
     if are_psfs_wrong and stop == "held-out":
         stop = CONVERGED
-    if engine == "opencl" and precision == "single":
-        warn_of_rounding(int(n_iter))
     inputs = partial(
-        describe,
-        observation,
-        setup,
-        mu=mu,
-        smoothing=smoothing,
-        n_iter=int(n_iter),
-        stop=stop,
-        initial_extended=initial_extended,
-        initial_star_fluxes=initial_star_fluxes,
+        describe, mended.setup, mu=mu, smoothing=smoothing, n_iter=int(n_iter), stop=stop
+    )
+    checkpoints = partial(
+        Checkpointer,
+        describe=inputs,
+        path=checkpoint,
+        resume=resume,
     )
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
-    # What is too large makes the objective infinite, which the run looks for: NumPy need not warn.
-    with np.errstate(over="ignore", invalid="ignore"):
+    outcome = reconstruct(mended.setup, penalties, n_iter, stop, callback, progress, checkpoints)
+    if is_auto and mended.fits:
+        with _quietly(), Progress(None, "", bool(progress), "fitting star fluxes", stays=False):
+            outcome = outcome.marginal()
+    return make_result(replace(outcome, psf_refinement=mended.refinement))
+
+
+def _quietly() -> np.errstate:
+    """Have NumPy not warn of what is too large: the run looks for objectives that are infinite."""
+    return np.errstate(over="ignore", invalid="ignore")
+
+
+def judge_psfs(
+    setup: Setup, families: Sequence[str], moves: bool | str, is_asked: bool, progress: bool
+) -> Mended:
+    """Return what `lnocl.runs.psf_refinement.mend` does, or nothing where that is not finite."""
+    from lnocl.runs.psf_refinement import mend  # which loads scipy
+
+    judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
+    with judging, suppress(NotFiniteError):  # of which the run itself tells
+        return mend(setup, families, moves, is_asked, judging.update)
+    return Mended(setup)
+
+
+def reconstruct(
+    setup: Setup,
+    penalties: Sequence[Penalty],
+    n_iter: int,
+    stop: str | float | None,
+    callback: Callback | None = None,
+    progress: bool = False,
+    checkpoints: Callable[[Callable[[], int]], Checkpointer] = Checkpointer,
+) -> Outcome:
+    """Return the outcome with the first penalty, or with those that held-out counts choose.
+
+    Parameters
+    ----------
+    setup : Setup
+        The observation and the parameters.
+    penalties : sequence of Penalty
+        One, or more to choose from.
+    n_iter, stop, callback, progress
+        As for `deconvolve`.
+    checkpoints : callable
+        Returns what writes checkpoints, given what returns the bytes that they may take.
+    """
+    if setup.engine == "opencl" and setup.precision == "single":
+        warn_of_rounding(int(n_iter))
+    with _quietly():
         with Progress(None, "", bool(progress), "measuring steps", stays=False):
-            start = make_start(
-                setup, observation, penalties[0], initial_extended, initial_star_fluxes
-            )
-        warn_of_noise(observation)
+            start = make_start(setup, penalties[0])
+        warn_of_noise(setup.observation)
         warn_of_stars(start.scene, setup.refine_positions)
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes
         largest = partial(measure, start, int(n_iter))
-        checkpointer = Checkpointer(checkpoint, resume, inputs, largest)
+        checkpointer = checkpoints(largest)
         with Bar(int(n_iter), bool(progress)) as bar:
             if stop == "held-out":
                 held_out = HeldOutCounts(start, penalties, int(n_iter))
-                outcome = _choose(held_out, callback, bar, checkpointer)
-            else:
-                run = Run(start, int(n_iter))
-                del start, largest  # which hold arrays of the grid
-                stop_reason = _complete(run, make_rule(stop), callback, bar, checkpointer)
-                outcome = run.outcome(penalties[0], stop_reason)
-        if is_auto and fits:
-            with Progress(None, "", bool(progress), "fitting star fluxes", stays=False):
-                outcome = outcome.marginal()
-        return make_result(replace(outcome, psf_refinement=refinement))
+                return _choose(held_out, callback, bar, checkpointer)
+            run = Run(start, int(n_iter))
+            del start, largest  # which hold arrays of the grid
+            return run.outcome(_complete(run, make_rule(stop), callback, bar, checkpointer))
 
 
 def _choose(

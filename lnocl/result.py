@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.errors import InputError
 from lnocl.notebook import html_card
 from lnocl.plotting.result import ResultView, draw_result
-from lnocl.residuals import Fit, StarResiduals, judge, judge_stars, residuals
+from lnocl.residuals import Fit, StarResiduals, judge, residuals
 from lnocl.runs.outcome import Outcome, PsfRefinement
 from lnocl.scene.arrays import Array
 from lnocl.scene.observation import Observation
@@ -44,6 +45,26 @@ class Iterating(Protocol):
 
     def star_positions(self) -> Array:
         """Return the star positions, pixels, shape (n, 2)."""
+
+
+class Findings(Protocol):
+    """What a result is computed from when it is asked for: the outcome of a run, or of tiles."""
+
+    @property
+    def observation(self) -> Observation:
+        """The observation, with the PSFs that were used."""
+
+    def models(self) -> Iterator[Array]:
+        """Yield the m_j, electrons per pixel, shape (ny, nx)."""
+
+    def star_errors(self) -> tuple[Array, Array]:
+        """Return the standard errors of star fluxes and positions."""
+
+    def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
+        """Return the light of the extended source and its standard error, electrons."""
+
+    def star_residuals(self) -> list[StarResiduals]:
+        """Return how well the model fits at each star."""
 
 
 class Estimate:
@@ -184,7 +205,7 @@ class Result:
     smoothing: float
     held_out: NDArray[np.void]
     psf_refinement: PsfRefinement | None
-    _outcome: Outcome = field(repr=False, compare=False)
+    _findings: Findings = field(repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for values in vars(self).values():
@@ -248,7 +269,7 @@ class Result:
 
     @cached_property
     def _star_errors(self) -> tuple[Array, Array]:
-        errors = self._outcome.star_errors()
+        errors = self._findings.star_errors()
         for each in errors:
             each.flags.writeable = False
         return errors
@@ -277,12 +298,18 @@ class Result:
         >>> bool(result.extended.sum() > 3 * error)
         True
         """
-        whole = np.broadcast_to(1.0, self.extended.shape)
-        return self._outcome.light().flux(whole, self.star_flux_errors)
+        return self._findings.extended_flux(self.star_flux_errors)
+
+    @property
+    def _outcome(self) -> Outcome:
+        """The outcome that replicas are of."""
+        if not isinstance(self._findings, Outcome):
+            raise InputError("replicas are of one run, and this result is of tiles: they have none")
+        return self._findings
 
     @property
     def _observation(self) -> Observation:
-        return self._outcome.scene.observation
+        return self._findings.observation
 
     @property
     def psfs(self) -> Array:
@@ -339,10 +366,7 @@ class Result:
         >>> result.models().shape, result.models().mean().round(3)
         ((2, 8, 8), np.float64(4.0))
         """
-        return np.array(list(self._models()))
-
-    def _models(self) -> Iterator[Array]:
-        return models_of(self._outcome)
+        return np.array(list(self._findings.models()))
 
     def residuals(self) -> Array:
         """Return the normalised residuals, ``(g_j - m_j) / sqrt(m_j)``.
@@ -364,7 +388,7 @@ class Result:
         >>> result.residuals().shape, bool(0.9 < result.residuals().std() < 1.1)
         ((1, 32, 32), True)
         """
-        return self._residuals(self._models())
+        return self._residuals(self._findings.models())
 
     def _residuals(self, models: Iterable[Array]) -> Array:
         observation = self._observation
@@ -497,14 +521,15 @@ class Result:
 
         check_number(n, seed)
         check_parallel(parallel)
-        shape = self._outcome.scene.observation.sky_shape
+        outcome = self._outcome
+        shape = self._observation.sky_shape
         if header is not None:
-            header = sky_header(header, self._outcome.scene.oversample)
+            header = sky_header(header, self._observation.oversample)
         parts: list[Part] = []
         for given, read in ((regions, read_apertures), (profiles, read_profiles)):
             listed = given if isinstance(given, (str, os.PathLike)) else list(given)
             parts += read(listed, header, shape) if listed else []
-        return bootstrap(self._outcome, n, parts, seed, progress, earlier, callback, parallel)
+        return bootstrap(outcome, n, parts, seed, progress, earlier, callback, parallel)
 
     def plot(self) -> Figure:
         """Return a picture of the result, whole and at each of the brightest stars.
@@ -652,7 +677,7 @@ class Result:
         >>> fit.n_pixels, bool(0.9 < fit.rms < 1.1), fit.is_misfit
         (1024, True, False)
         """
-        return judge(self._observation, self._models())
+        return judge(self._observation, self._findings.models())
 
     def star_residuals(self) -> list[StarResiduals]:
         """Return how well the model fits at each star: in its core, its wings and round it.
@@ -674,8 +699,7 @@ class Result:
         >>> star.core.n_pixels, star.is_misfit, star.has_halo
         (9, False, False)
         """
-        outcome = self._outcome
-        return judge_stars(outcome.scene, outcome.sky, outcome.star_fluxes)
+        return self._findings.star_residuals()
 
 
 def make_result(outcome: Outcome) -> Result:
@@ -691,13 +715,13 @@ def make_result(outcome: Outcome) -> Result:
         star_positions=scene.stars,
         n_iter=len(history) - 1,
         stop_reason=outcome.stop_reason,
-        device=outcome.engine_name,
+        device=outcome.setup.engine_name(),
         history=history,
-        mu=outcome.penalty.mu,
-        smoothing=outcome.penalty.smoothing,
+        mu=scene.penalty.mu,
+        smoothing=scene.penalty.smoothing,
         held_out=outcome.curve,
         psf_refinement=outcome.psf_refinement,
-        _outcome=outcome,
+        _findings=outcome,
     )
 
 
@@ -741,17 +765,3 @@ def view_of(result: Result) -> ResultView:
         unit=result._unit,
         oversample=observation.oversample,
     )
-
-
-def models_of(outcome: Outcome) -> Iterator[Array]:
-    """Yield the m_j, electrons per pixel."""
-    from lnocl.scene.forward_model import model_images  # which loads scipy
-
-    scene = outcome.scene
-    ny, nx = scene.observation.shape
-    extended, star_fluxes = outcome.sky / scene.unit, outcome.star_fluxes / scene.unit
-    for j, image in enumerate(model_images(scene, extended, star_fluxes)):
-        if scene.weights is not None and scene.has_exposure_map:
-            image *= scene.weights[j]
-        image *= scene.scale
-        yield image[:ny, :nx]

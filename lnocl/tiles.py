@@ -4,24 +4,33 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, NoReturn, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.deconvolution import deconvolve
+from lnocl.deconvolution import judge_psfs, reconstruct
 from lnocl.errors import InputError, LnoclWarning, counted, warn
 from lnocl.parallel import Parallel, check_parallel, work
 from lnocl.process import ignored_warnings, recorded_warnings
 from lnocl.residuals import StarResiduals
-from lnocl.result import Result
-from lnocl.runs.options import StopName, check_length, check_observation, read_penalties
-from lnocl.runs.outcome import CURVE_DTYPE, Outcome
+from lnocl.result import Result, make_result
+from lnocl.runs.options import (
+    StopName,
+    check_choices,
+    check_families,
+    check_length,
+    check_observation,
+    read_penalties,
+    read_refine_positions,
+)
+from lnocl.runs.outcome import CURVE_DTYPE, Mended, Outcome
 from lnocl.runs.progress import Progress
+from lnocl.runs.start import Setup
 from lnocl.scene.arrays import Array
 from lnocl.scene.grid import length_for
 from lnocl.scene.observation import Observation
@@ -80,41 +89,6 @@ class TiledResult(Result):
     """
 
     tiles: NDArray[np.void]
-    _images: Observation
-    _all_models: Array
-    _errors: tuple[Array, Array]
-    _flux: tuple[float, float]
-    _at_stars: list[StarResiduals]
-
-    @property
-    def _observation(self) -> Observation:
-        return self._images
-
-    def _models(self) -> Iterator[Array]:
-        return iter(self._all_models)
-
-    @property
-    def _star_errors(self) -> tuple[Array, Array]:
-        return self._errors
-
-    @property
-    def extended_flux(self) -> tuple[float, float]:
-        """The light of the extended source in the frame and its standard error, electrons."""
-        return self._flux
-
-    def star_residuals(self) -> list[StarResiduals]:
-        """Return how well the model fits at each star: in its core, its wings and round it."""
-        return self._at_stars
-
-    def bootstrap(self, *_: Any, **__: Any) -> NoReturn:
-        """Refuse: replicas are made of one run.
-
-        Raises
-        ------
-        InputError
-            Always.
-        """
-        raise InputError("replicas are of one run, and this result is of tiles: they have none")
 
 
 class _Span(NamedTuple):
@@ -194,7 +168,7 @@ class _Found(NamedTuple):
     extended: Array
     models: Array
     flux: tuple[float, float]
-    stars: tuple[Array, Array, Array, Array]
+    stars: Array
     at_stars: list[StarResiduals]
     history: NDArray[np.void]
     stop_reason: str
@@ -299,10 +273,15 @@ def deconvolve_tiles(
     check_observation(observation)
     check_length(n_iter, stop)
     _check_options(options)
+    given = {"solver": "sgp", "precision": "single", "engine": "opencl", "device": None, **options}
+    moves = read_refine_positions(given.pop("refine_positions", "auto")) is True
     positions = check_positions(stars, observation)
+    check_families("auto", observation, positions, moves, False)
     penalties = read_penalties(mu, smoothing, stop, observation)
-    pad = _pad(observation, options.get("pad", "auto"))
-    tiles = _lay(observation, tile, pad)
+    pad = given.pop("pad", "auto")
+    check_choices(**given)
+    tile_pad = _pad(observation, pad)
+    tiles = _lay(observation, tile, tile_pad)
     observed = [
         _cut(observation, positions, (y, x))
         for y, x in tiles
@@ -310,22 +289,22 @@ def deconvolve_tiles(
     ]
     _refuse_unowned(positions, observed)
     if len(tiles) > 1:
-        options["pad"] = pad
+        pad = tile_pad
         if any(each.smoothing for each in penalties):
             with ignored_warnings():  # of which the tiles know more
                 edge = EDGE * Scene(observation, positions).level
             penalties = [replace(each, edge=edge) for each in penalties]
     curve, reason, penalty, last = np.zeros(0, CURVE_DTYPE), "", penalties[0], stop
+    setup = partial(Setup, pad=pad, refine_positions=moves, **given)
     if isinstance(stop, str):
-        given = {**options, "smoothing": penalties, "n_iter": n_iter, "stop": stop}
-        chosen = _choose(observed, parallel, given)
+        chosen = _choose(observed, parallel, _Solver(setup, penalties, n_iter, stop))
         curve, reason, n_iter, last = chosen.held_out, chosen.stop_reason, chosen.n_iter, None
         penalty = next(each for each in penalties if each.smoothing == chosen.smoothing)
-    make = partial(_Solving, smoothing=[penalty], n_iter=max(n_iter, 1), stop=last, **options)
+    solver = _Solver(setup, [penalty], max(n_iter, 1), last)
     mosaic = _Mosaic(observation, len(positions))
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
-        closing(work(make, observed, parallel)) as answers,
+        closing(work(solver.solving, observed, parallel)) as answers,
     ):
         for each, found in zip(observed, answers, strict=True):
             mosaic.add(each, found)
@@ -424,7 +403,7 @@ def _are_own(positions: Array, spans: tuple[_Span, _Span]) -> NDArray[np.bool_]:
 def _choose(
     tiles: Sequence[_Tile],
     parallel: Parallel,
-    options: dict[str, Any],
+    solver: _Solver,
 ) -> _Choice:
     """Return the choice in the middle of those of the tiles with the brightest extended source.
 
@@ -432,7 +411,7 @@ def _choose(
     where 8 was best (docs/validation/tiles.md).
     """
     brightest = sorted(tiles, key=_light)[-N_CHOOSING:]
-    with closing(work(partial(_Choosing, **options), brightest, parallel)) as answers:
+    with closing(work(solver.choosing, brightest, parallel)) as answers:
         choices = sorted(answers, key=lambda each: each.n_iter)
     return choices[len(choices) // 2]
 
@@ -446,17 +425,68 @@ class _Choice(NamedTuple):
     held_out: NDArray[np.void]
 
 
-class _Choosing:
-    """Has tiles choose iterations and smoothing."""
+class _Solver(NamedTuple):
+    """The parameters that tiles share; `setup` takes the observation and the stars of each."""
 
-    def __init__(self, **options: Any) -> None:
-        self._options = options
+    setup: Callable[[Observation, Array], Setup]
+    penalties: Sequence[Penalty]
+    n_iter: int
+    stop: str | float | None
 
-    def __call__(self, tile: _Tile) -> _Choice:
-        tile = tile.without_unseen_neighbours()
+    def choosing(self) -> Callable[[_Tile], _Choice]:
+        """Return the function that has a tile choose iterations and smoothing."""
+        return self._choose
+
+    def solving(self) -> Callable[[_Tile], _Found]:
+        """Return the function that reconstructs a tile."""
+        return self._solve
+
+    def _choose(self, tile: _Tile) -> _Choice:
         with ignored_warnings(LnoclWarning):  # the tile is done again
-            result = deconvolve(tile.observation, tile.stars, **self._options)
+            result = make_result(self._outcome(tile.without_unseen_neighbours()))
         return _Choice(result.n_iter, result.smoothing, result.stop_reason, result.held_out)
+
+    def _outcome(self, tile: _Tile) -> Outcome:
+        mended = Mended(self.setup(tile.observation, tile.stars))
+        if len(tile.observation.psf_scatter) and len(tile.stars):
+            mended = judge_psfs(mended.setup, (), mended.setup.refine_positions, False, False)
+        outcome = reconstruct(mended.setup, self.penalties, self.n_iter, self.stop)
+        return replace(outcome, psf_refinement=mended.refinement)
+
+    def _solve(self, tile: _Tile) -> _Found:
+        tile = tile.without_unseen_neighbours()
+        begins = "tile that begins at pixel ({1}, {0}), where positions there begin".format(
+            *(span.window.start for span in tile.spans)
+        )
+        with recorded_warnings() as recorded:
+            try:
+                outcome = self._outcome(tile)
+            except InputError as error:
+                raise InputError(f"{begins}: {error.message}") from error
+            errors = outcome.star_errors()
+        result, q = make_result(outcome), tile.observation.oversample
+        rows, columns = (
+            slice(span.core.start - span.window.start, span.core.stop - span.window.start)
+            for span in tile.spans
+        )
+        within = np.zeros(result.extended.shape)
+        within[q * rows.start : q * rows.stop, q * columns.start : q * columns.stop] = 1.0
+        at_stars = result.star_residuals()
+        return _Found(
+            result.extended,
+            result.models()[:, rows, columns],
+            outcome.light().flux(within, errors[0]),
+            np.column_stack([result.star_positions, result.star_fluxes, *errors])[tile.own],
+            [at_stars[s] for s in tile.own],
+            result.history,
+            result.stop_reason,
+            result.device,
+            [
+                f"{begins}: {getattr(each.message, 'message', each.message)}"
+                for each in recorded
+                if issubclass(each.category, LnoclWarning)
+            ],
+        )
 
 
 def _light(tile: _Tile) -> float:
@@ -478,63 +508,11 @@ def _light(tile: _Tile) -> float:
     return float(light.sum())
 
 
-class _Solving:
-    """Reconstructs tiles with the same options."""
-
-    def __init__(self, **options: Any) -> None:
-        self._options = options
-
-    def __call__(self, tile: _Tile) -> _Found:
-        tile = tile.without_unseen_neighbours()
-        begins = "tile that begins at pixel ({1}, {0}), where positions there begin".format(
-            *(span.window.start for span in tile.spans)
-        )
-        with recorded_warnings() as recorded:
-            try:
-                result = deconvolve(tile.observation, tile.stars, **self._options)
-            except InputError as error:
-                raise InputError(f"{begins}: {error.message}") from error
-            stars = (
-                result.star_positions,
-                result.star_fluxes,
-                result.star_flux_errors,
-                result.star_position_errors,
-            )
-        rows, columns = (
-            slice(span.core.start - span.window.start, span.core.stop - span.window.start)
-            for span in tile.spans
-        )
-        at_stars = result.star_residuals()
-        return _Found(
-            result.extended,
-            result.models()[:, rows, columns],
-            _flux_within(result, rows, columns),
-            cast(Any, tuple(each[tile.own] for each in stars)),
-            [at_stars[s] for s in tile.own],
-            result.history,
-            result.stop_reason,
-            result.device,
-            [
-                f"{begins}: {getattr(each.message, 'message', each.message)}"
-                for each in recorded
-                if issubclass(each.category, LnoclWarning)
-            ],
-        )
-
-
-def _flux_within(result: Result, rows: slice, columns: slice) -> tuple[float, float]:
-    """Return the light of the extended source in some pixels of the images, and its error."""
-    q = result._observation.oversample
-    within = np.zeros(result.extended.shape)
-    within[q * rows.start : q * rows.stop, q * columns.start : q * columns.stop] = 1.0
-    return result._outcome.light().flux(within, result.star_flux_errors)
-
-
 class _Mosaic:
     """What all tiles have found, put together as they are done."""
 
     def __init__(self, observation: Observation, n_stars: int) -> None:
-        self._observation = observation
+        self.observation = observation
         self._extended = np.zeros(observation.sky_shape)
         self._weight = np.zeros(observation.sky_shape)
         self._models = np.zeros(observation.images.shape)
@@ -546,7 +524,7 @@ class _Mosaic:
 
     def add(self, tile: _Tile, found: _Found) -> None:
         """Add what a tile has found."""
-        q = self._observation.oversample
+        q = self.observation.oversample
         y, x = tile.spans
         weights = np.multiply.outer(y.weights(q), x.weights(q))
         there = tuple(slice(q * s.window.start, q * s.window.stop) for s in tile.spans)
@@ -558,10 +536,8 @@ class _Mosaic:
              found.history["objective"][-1])
         )  # fmt: skip
         self.said += found.said
-        positions, fluxes, flux_errors, position_errors = found.stars
-        placed = positions + np.array([x.window.start, y.window.start])
-        columns = [placed, fluxes, flux_errors, position_errors]
-        self._stars[tile.numbers] = np.column_stack(columns)
+        self._stars[tile.numbers] = found.stars
+        self._stars[tile.numbers, :2] += x.window.start, y.window.start
         for s, at_star in zip(tile.numbers, found.at_stars, strict=True):
             self._at_stars[s] = at_star
         self._found.append(found._replace(extended=np.zeros(0), models=np.zeros(0)))
@@ -580,7 +556,6 @@ class _Mosaic:
         extended = np.divide(
             self._extended, self._weight, out=self._extended, where=self._weight > 0
         )
-        fluxes, errors = zip(*(found.flux for found in self._found), strict=True)
         return TiledResult(
             extended=extended,
             star_fluxes=self._stars[:, 2],
@@ -593,14 +568,26 @@ class _Mosaic:
             smoothing=penalty.smoothing,
             held_out=curve,
             psf_refinement=None,
-            _outcome=cast(Outcome, None),
+            _findings=self,
             tiles=np.array(self._tiles, TILE_DTYPE),
-            _images=self._observation,
-            _all_models=self._models,
-            _errors=(self._stars[:, 3], self._stars[:, 4:]),
-            _flux=(sum(fluxes), math.hypot(*errors)),
-            _at_stars=cast(Any, self._at_stars),
         )
+
+    def models(self) -> Iterator[Array]:
+        """Yield the models of the images."""
+        return iter(self._models)
+
+    def star_errors(self) -> tuple[Array, Array]:
+        """Return the standard errors of star fluxes and positions."""
+        return self._stars[:, 3], self._stars[:, 4:]
+
+    def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
+        """Return the light of the extended source and its standard error, electrons."""
+        fluxes, errors = zip(*(found.flux for found in self._found), strict=True)
+        return sum(fluxes), math.hypot(*errors)
+
+    def star_residuals(self) -> list[StarResiduals]:
+        """Return how well the model fits at each star."""
+        return cast(list[StarResiduals], self._at_stars)
 
 
 def _warn_of_tiles(said: Sequence[str]) -> None:

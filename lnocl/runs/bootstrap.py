@@ -359,7 +359,7 @@ class _Measuring:
     """Makes a replica by its number, and measures it."""
 
     def __init__(self, outcome: Outcome, parts: Sequence[Part], seed: int, width: float) -> None:
-        self._moves, self._parts, self._width = outcome.given_stars is not None, parts, width
+        self._moves, self._parts, self._width = outcome.moves, parts, width
         self._replicas = Replicas(outcome, seed)
 
     def __call__(self, k: int) -> _Measured:
@@ -398,7 +398,7 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
     """Return what is measured, in the order of `_measure`."""
     scene = outcome.scene
     n, (ny, nx) = scene.n_stars, scene.observation.sky_shape
-    moves = outcome.given_stars is not None
+    moves = outcome.moves
     labels = [Label(f"star {s} flux", FLUX) for s in range(1, n + 1)]
     if moves:
         labels += [Label(f"star {s} {axis}", LENGTH) for s in range(1, n + 1) for axis in "xy"]
@@ -423,7 +423,7 @@ def _shares(outcome: Outcome, parts: Sequence[Part], n_quantities: int) -> Array
     for s in range(scene.n_stars):
         shares[s, s] = 1.0
         cutouts = [scene.psf_on_sky(j, s) for j in range(scene.n_images)]
-        k = scene.n_stars if outcome.given_stars is None else 3 * scene.n_stars
+        k = 3 * scene.n_stars if outcome.moves else scene.n_stars
         for part in parts:
             slices = part.slices if isinstance(part, Profile) else [part]
             shares[k : k + len(slices), s] = [

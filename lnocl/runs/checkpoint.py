@@ -17,11 +17,11 @@ import numpy as np
 from lnocl.errors import FileError, InputError, counted, warn
 from lnocl.io.atomic import check_output, whole_file
 from lnocl.runs.held_out import HeldOutCounts
-from lnocl.runs.run import Run, Setup, engine_name, tuning_name
+from lnocl.runs.run import Run
 from lnocl.runs.saved import Saved
+from lnocl.runs.start import Setup
 from lnocl.runs.stopping import Rule
 from lnocl.scene.arrays import numbers
-from lnocl.scene.observation import Observation
 from lnocl.solvers.engine import State
 
 OBSERVED = (
@@ -81,15 +81,16 @@ class Checkpoint:
             )
 
 
-def describe(observation: Observation, setup: Setup, **parameters: Any) -> dict[str, str]:
+def describe(setup: Setup, **parameters: Any) -> dict[str, str]:
     """Return the inputs and parameters of a run: checksums of arrays, other values in words."""
+    observation = setup.observation
     bound = {
         "version": version("lnocl"),
         **{name: getattr(observation, name) for name in OBSERVED},
-        **vars(setup),
+        **{name: value for name, value in vars(setup).items() if name != "observation"},
         **parameters,
     }
-    bound |= {"device": engine_name(setup), "tuning": tuning_name(setup)}
+    bound |= {"device": setup.engine_name(), "tuning": setup.tuning_name()}
     if observation.psf_fields:
         bound["psf_fields"] = np.concatenate([each.numbers() for each in observation.psf_fields])
     return {name: _describe(name, value) for name, value in bound.items()}
@@ -193,14 +194,14 @@ class Checkpointer:
 
     Parameters
     ----------
-    path : str or None
-        File to write; None for no checkpoints.
-    resume : str or None
-        The checkpoint to resume from, which may be replaced.
-    describe : callable
-        Returns the inputs and parameters of the run; called where there is a path or a checkpoint.
     most_bytes : callable
         Returns the bytes that the state of such a run may take; called where there is a checkpoint.
+    describe : callable
+        Returns the inputs and parameters of the run; called where there is a path or a checkpoint.
+    path : str, optional
+        File to write; None for no checkpoints.
+    resume : str, optional
+        The checkpoint to resume from, which may be replaced.
 
     Raises
     ------
@@ -213,10 +214,10 @@ class Checkpointer:
 
     def __init__(
         self,
-        path: object,
-        resume: object,
-        describe: Callable[[], dict[str, str]],
         most_bytes: Callable[[], int],
+        describe: Callable[[], dict[str, str]] = dict,
+        path: object = None,
+        resume: object = None,
     ) -> None:
         self._path, source = _file_name("checkpoint", path), _file_name("resume", resume)
         self._saved_at = time.monotonic() if path is None else -math.inf

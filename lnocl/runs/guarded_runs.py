@@ -80,9 +80,7 @@ class GuardedRuns:
     Parameters
     ----------
     setup : Setup
-        The parameters of the runs; one star or more among them.
-    observation : Observation
-        The images.
+        The images and the parameters of the runs; one star or more among them.
     tick : callable, optional
         Is called after each iteration.
 
@@ -98,17 +96,17 @@ class GuardedRuns:
         All stars, in the whole images.
     """
 
-    def __init__(
-        self, setup: Setup, observation: Observation, tick: Callable[[], object] = int
-    ) -> None:
-        self._tick = tick
+    def __init__(self, setup: Setup, tick: Callable[[], object] = int) -> None:
+        self._tick, observation = tick, setup.observation
         self.all_stars = setup.stars
         # PSFs that are cut to the window go without what has the shape of whole ones.
         shown = with_noise_shown(observation).replace(**dict.fromkeys((*OF_PSFS, "psf_modes")))
-        self.observation, self.stars, self.held = find_window(setup, shown)
+        self.observation, self.stars, self.held = find_window(setup.stars, shown)
         # One grid for all PSFs that are tried.
         pad = choose_pad(observation) if setup.pad == "auto" else setup.pad
-        self._setup = replace(setup, solver="sgp", pad=pad)
+        self._setup = replace(
+            setup, solver="sgp", pad=pad, initial_extended=None, initial_star_fluxes=None
+        )
         self._smoothing = WRONG_PSFS * recommend_smoothing(self.observation)
 
     def fit(
@@ -135,9 +133,10 @@ class GuardedRuns:
             How strongly the extended source is kept from the stars, as `GUARD`.
         """
         observation = self.observation.replace(psfs=self.cut(psfs))
-        setup = replace(self._setup, stars=self._inside(stars), refine_positions=moves)
+        inside = self._inside(stars)
+        setup = replace(self._setup, observation=observation, stars=inside, refine_positions=moves)
         with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
-            start = make_start(setup, observation, Penalty())
+            start = make_start(setup, Penalty())
             found = Estimate(start.scene, start.extended, start.star_fluxes, _unknown(error))
             moved = replace(setup, refine_positions=False)
             rounds = (moved, FIRST_ITERATIONS), *[(setup, ITERATIONS)] * (MAX_ROUNDS - 1)
@@ -154,13 +153,13 @@ class GuardedRuns:
         penalty = Penalty(smoothing=self._smoothing, near_stars=near)
         ny, nx = found.scene.observation.sky_shape
         unit = found.scene.unit
-        start = make_start(
-            replace(setup, stars=self._inside(found.scene.stars)),
-            found.scene.observation,
-            penalty,
-            np.maximum(found.extended[:ny, :nx], 0.0) * unit,
-            found.fluxes * unit,
+        setup = replace(
+            setup,
+            stars=self._inside(found.scene.stars),
+            initial_extended=np.maximum(found.extended[:ny, :nx], 0.0) * unit,
+            initial_star_fluxes=found.fluxes * unit,
         )
+        start = make_start(setup, penalty)
         # Stars are moved at the start of a round alone.
         run = Run(replace(start, setup=replace(start.setup, refine_positions=False)), n_iter)
         with suppress(DivergedError):  # by negative PSFs: the misfit tells how good the end is
@@ -210,17 +209,17 @@ class GuardedRuns:
         return y, x
 
 
-def find_window(setup: Setup, observation: Observation) -> tuple[Observation, Array, Array]:
+def find_window(stars: Array, observation: Observation) -> tuple[Observation, Array, Array]:
     """Return the observation cut to a window round most of the stars, these, and which they are."""
     size = np.minimum(observation.shape[::-1], WINDOW)
     last = np.array(observation.shape[::-1]) - size
-    middle = (setup.stars.min(axis=0) + setup.stars.max(axis=0)) / 2.0
-    firsts = np.clip(np.round(np.vstack([middle, setup.stars])) - size // 2, 0, last).astype(int)
-    best = int(np.argmax(_count_in_windows(setup.stars, firsts, size, observation.shape)))
+    middle = (stars.min(axis=0) + stars.max(axis=0)) / 2.0
+    firsts = np.clip(np.round(np.vstack([middle, stars])) - size // 2, 0, last).astype(int)
+    best = int(np.argmax(_count_in_windows(stars, firsts, size, observation.shape)))
     low = firsts[best] - 0.5
-    held = np.all((setup.stars >= low) & (setup.stars < low + size), axis=1)
+    held = np.all((stars >= low) & (stars < low + size), axis=1)
     x, y = (range(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
-    return observation.window(y, x), setup.stars[held] - firsts[best], held
+    return observation.window(y, x), stars[held] - firsts[best], held
 
 
 def _count_in_windows(

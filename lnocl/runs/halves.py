@@ -197,7 +197,7 @@ def take(saved: Saved, name: str, start: Start, n_iter: int) -> list[Snapshot]:
         No such halves have such snapshots within `n_iter` iterations.
     """
     reach = MAX_SHIFT * (1.0 + 1e-9) if start.refines else 0.0  # which rounding may exceed
-    low, high = start.given_stars - reach, start.given_stars + reach
+    low, high = start.setup.stars - reach, start.setup.stars + reach
     whole, double = np.dtype(np.int64), np.dtype(np.float64)
     iterations = saved.take(f"{name}_iteration", whole, (range(1, n_iter + 1),), 1, n_iter)
     k, n = len(iterations), len(low)

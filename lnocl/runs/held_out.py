@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import replace
 from typing import NamedTuple, cast
 
@@ -22,7 +21,6 @@ from lnocl.process import ignored_notes
 from lnocl.runs.assessment import assess
 from lnocl.runs.halves import Halves, Snapshot, next_snapshot, pack, take
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome
-from lnocl.runs.run import engine_name
 from lnocl.runs.run import most_bytes as most_bytes_of_run
 from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved, is_whole
 from lnocl.runs.start import Start
@@ -209,21 +207,18 @@ class HeldOutCounts:
     ) -> Outcome:
         """Return the sum of both halves' estimates; scaled, it is their mean."""
         start = self._start
-        scene = copy(start.scene)
+        scene = start.scene.penalised(penalty)
         if start.refines:
             scene.move_stars(snapshot.positions.mean(axis=0))
         sky = snapshot.extended.mean(axis=0, dtype=np.float64)
         sky *= scene.unit
         return Outcome(
+            setup=start.setup,
             scene=scene,
             sky=sky,
             star_fluxes=snapshot.star_fluxes.mean(axis=0) * scene.unit,
-            given_stars=start.given_stars if start.refines else None,
             objectives=objectives,
-            engine_name=engine_name(start.setup),
-            penalty=penalty,
             stop_reason=stop_reason,
-            restart=start.again,
         )
 
     def state(self) -> State:

@@ -254,8 +254,6 @@ def read_penalties(
     InputError
         A weight is not a number, finite and not negative; smoothing is another word than "auto".
     """
-    if isinstance(smoothing, list) and all(isinstance(each, Penalty) for each in smoothing):
-        return smoothing  # those of tiles, with the edge of the whole
     if not isinstance(smoothing, str):
         return [Penalty(mu, smoothing)]
     if smoothing != "auto":

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import warn
-from lnocl.runs.start import Start
+from lnocl.residuals import StarResiduals, judge_stars
+from lnocl.runs.start import Setup
 from lnocl.scene.arrays import Array
-from lnocl.scene.penalty import Penalty
+from lnocl.scene.observation import Observation
 from lnocl.scene.scene import Scene
 from lnocl.scene.stars import MAX_SHIFT
 
@@ -114,50 +115,68 @@ class PsfRefinement:
         ]
 
 
+class Mended(NamedTuple):
+    """A setup whose PSFs and positions fit as well as could be found.
+
+    Attributes
+    ----------
+    setup : Setup
+        With the refined PSFs, where they are used, the scatter that they have left, and whether
+        stars are to be moved.
+    refinement : PsfRefinement or None
+        The outcome for the PSFs; None where they fit, and nothing was asked of them.
+    near_stars : ndarray of float64, of the shape of the extended source, or None
+        The weight of the edge-preserving term that the error of the PSFs asks for; None for 0.
+    fits : bool
+        Whether the PSFs were judged, and no error is left that noise does not explain.
+    """
+
+    setup: Setup
+    refinement: PsfRefinement | None = None
+    near_stars: Array | None = None
+    fits: bool = False
+
+
 @dataclass(frozen=True)
 class Outcome:
     """The estimate that a reconstruction ended with, and how it came there.
 
     Attributes
     ----------
+    setup : Setup
+        Observation and parameters, from which it starts anew.
     scene : Scene
         The model of the observation, with the stars where they are now.
     sky : ndarray of float64, shape (Ny, Nx)
         Extended source on the grid, electrons per pixel.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons.
-    given_stars : ndarray of float64, shape (n, 2), or None
-        The positions that were given, where the stars were moved from them.
     objectives : ndarray of float64, shape (n_iter + 1,)
         Objectives of the start and after each iteration; not scaled.
-    engine_name : str
-        The device, its platform and driver.
-    penalty : Penalty
-        On the extended source.
     stop_reason : str
         As `lnocl.Result.stop_reason`.
     curve : ndarray of `CURVE_DTYPE`
         As `lnocl.Result.held_out`.
-    restart : callable
-        Returns where a run of the observation starts, given the penalty.
     psf_refinement : PsfRefinement or None
         None where the PSFs were not to be refined.
     is_marginal : bool
         Whether the star fluxes are those of `marginal`, and so those of replicas.
     """
 
+    setup: Setup
     scene: Scene
     sky: Array
     star_fluxes: Array
-    given_stars: Array | None
     objectives: Array
-    engine_name: str
-    penalty: Penalty
     stop_reason: str
-    restart: Callable[[Penalty], Start]
     curve: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
     psf_refinement: PsfRefinement | None = None
     is_marginal: bool = False
+
+    @property
+    def moves(self) -> bool:
+        """Whether stars were moved."""
+        return self.setup.refine_positions and self.scene.n_stars > 0
 
     def marginal(self) -> Outcome:
         """Return the outcome with marginal star fluxes, as `lnocl.solvers.marginal` has them."""
@@ -165,6 +184,33 @@ class Outcome:
 
         sky, star_fluxes = marginal(self.scene, self.sky, self.star_fluxes)
         return replace(self, sky=sky, star_fluxes=star_fluxes, is_marginal=True)
+
+    @property
+    def observation(self) -> Observation:
+        """The observation, with the PSFs that were used."""
+        return self.scene.observation
+
+    def models(self) -> Iterator[Array]:
+        """Yield the m_j, electrons per pixel."""
+        from lnocl.scene.forward_model import model_images  # which loads scipy
+
+        scene = self.scene
+        ny, nx = scene.observation.shape
+        extended, star_fluxes = self.sky / scene.unit, self.star_fluxes / scene.unit
+        for j, image in enumerate(model_images(scene, extended, star_fluxes)):
+            if scene.weights is not None and scene.has_exposure_map:
+                image *= scene.weights[j]
+            image *= scene.scale
+            yield image[:ny, :nx]
+
+    def star_residuals(self) -> list[StarResiduals]:
+        """Return how well the model fits at each star."""
+        return judge_stars(self.scene, self.sky, self.star_fluxes)
+
+    def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
+        """Return the light of the extended source and its standard error, electrons."""
+        whole = np.broadcast_to(1.0, self.observation.sky_shape)
+        return self.light().flux(whole, star_flux_errors)
 
     def light(self) -> Light:
         """Return the light of the extended source without bias."""
@@ -186,7 +232,7 @@ class Outcome:
         """
         from lnocl.solvers.star_errors import standard_errors
 
-        scene, moves = self.scene, self.given_stars is not None
+        scene, moves = self.scene, self.moves
         errors = standard_errors(scene, self.sky, self.star_fluxes, moves)
         is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (self.star_fluxes > 0)
         if is_lost.any():

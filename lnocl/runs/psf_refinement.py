@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,11 +20,10 @@ from lnocl.runs.guarded_runs import (
     GuardedRuns,
     estimate_scatter,
 )
-from lnocl.runs.outcome import PsfRefinement
+from lnocl.runs.outcome import Mended, PsfRefinement
 from lnocl.runs.psf_allowance import STRENGTH, Allowance
 from lnocl.runs.start import Setup
 from lnocl.scene.arrays import Array
-from lnocl.scene.observation import Observation
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters
 from lnocl.scene.psf_misfit import PsfMisfit
 from lnocl.scene.psf_wings import without_noise
@@ -55,30 +53,6 @@ MOST_STARS = 64
 MAX_HALVED = 10
 
 
-class Mended(NamedTuple):
-    """An observation whose PSFs and positions fit as well as could be found.
-
-    Attributes
-    ----------
-    observation : Observation
-        With the refined PSFs, where they are used, and the scatter that they have left.
-    moves : bool
-        Whether stars are to be moved.
-    refinement : PsfRefinement or None
-        The outcome for the PSFs; None where they fit, and nothing was asked of them.
-    near_stars : ndarray of float64, of the shape of the extended source, or None
-        The weight of the edge-preserving term that the error of the PSFs asks for; None for 0.
-    fits : bool
-        Whether the PSFs were judged, and no error is left that noise does not explain.
-    """
-
-    observation: Observation
-    moves: bool
-    refinement: PsfRefinement | None
-    near_stars: Array | None
-    fits: bool
-
-
 @dataclass(frozen=True)
 class _State:
     """PSFs, the estimate by which they are judged, and whether stars may move for them."""
@@ -102,13 +76,12 @@ class _State:
 
 def mend(
     setup: Setup,
-    observation: Observation,
     names: Sequence[str],
     moves: bool | str,
     is_asked: bool,
     tick: Callable[[], object] = int,
 ) -> Mended:
-    """Return an observation whose positions and PSFs are mended where the images ask for it.
+    """Return a setup whose positions and PSFs are mended where the images ask for it.
 
     Stars are moved first, then the noise of PSFs is taken from their wings, the families are
     fitted, and pixels freed. Each is tried only where the misfit before is in doubt. It is taken
@@ -121,9 +94,7 @@ def mend(
     Parameters
     ----------
     setup : Setup
-        The parameters of the runs; one star or more among them.
-    observation : Observation
-        The images and the given PSFs.
+        The images, the given PSFs and the parameters of the runs; one star or more among them.
     names : sequence of str
         Families of `PsfFamilies` that may be refined.
     moves : bool or "auto"
@@ -133,11 +104,11 @@ def mend(
     tick : callable, optional
         Is called after each iteration of the runs.
     """
-    runs = GuardedRuns(setup, observation, tick)
+    observation, runs = setup.observation, GuardedRuns(setup, tick)
     if len(runs.stars) > MOST_STARS and not (is_asked or len(observation.psf_scatter)):
         number = counted(len(runs.stars), "star")
         note(f"PSFs are not judged: {number} in the window; name `refine_psfs` to judge them")
-        return Mended(observation, moves is True, None, None, False)
+        return Mended(setup)
     given = _State(
         observation.psfs, runs.fit(observation.psfs, runs.stars, moves is True), moves is True
     )
@@ -167,7 +138,8 @@ def mend(
     allowance = Allowance(observation, runs, estimate, known)
     near_stars = allowance.near_stars(setup.pad)
     if not (is_asked or len(known) or is_told):
-        return Mended(observation, state.moves, None, near_stars, True)
+        changed = replace(setup, observation=observation, refine_positions=state.moves)
+        return Mended(changed, None, near_stars, True)
     _tell(given, state, tried, is_accepted)
     refinement = PsfRefinement(
         tuple(families.parameters),
@@ -185,7 +157,8 @@ def mend(
     # Replicas draw PSFs from it, so that the errors of regions contain that of the PSFs.
     if not len(known):
         observation = observation.replace(psf_scatter=allowance.scatter())
-    return Mended(observation, state.moves, refinement, near_stars, not allowance.error)
+    changed = replace(setup, observation=observation, refine_positions=state.moves)
+    return Mended(changed, refinement, near_stars, not allowance.error)
 
 
 def _shows_pixels(misfit: PsfMisfit) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from lnocl.process import ignored_warnings
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.run import Run
+from lnocl.runs.start import make_start
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
@@ -83,7 +84,7 @@ class Replicas:
                 observation.psfs, observation.psf_scatter, observation.oversample
             )
         with ignored_warnings():  # those of the reconstruction are the same
-            self._start = outcome.restart(outcome.penalty)
+            self._start = make_start(outcome.setup, outcome.scene.penalty)
         self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
 
     def reconstruct(self, k: int) -> Replica:

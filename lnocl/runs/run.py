@@ -19,7 +19,6 @@ from lnocl.runs.saved import LARGEST, Saved, Shape
 from lnocl.runs.start import Setup, Start, make_model, measure_steps, move_stars
 from lnocl.scene.arrays import Array
 from lnocl.scene.observation import Observation
-from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.scene.stars import MAX_SHIFT
 from lnocl.solvers import SOLVERS
@@ -66,8 +65,7 @@ class Run:
     def __init__(self, start: Start, n_iter: int, half: int | None = None) -> None:
         self._setup, self.n_iter, self._half = start.setup, n_iter, half
         self.scene = copy(start.scene)
-        self._given_stars, self._refines = start.given_stars, start.refines
-        self._restart = start.again
+        self._refines = start.refines
         self.engine = _make_engine(self._setup, self.scene, n_iter, start.scaling, half)
         self._begin(start)
 
@@ -196,7 +194,7 @@ class Run:
         if not self._refines:
             return self.scene.stars, self.scene.stars
         reach = MAX_SHIFT * (1.0 + 1e-9)  # which rounding may exceed
-        return self._given_stars - reach, self._given_stars + reach
+        return self._setup.stars - reach, self._setup.stars + reach
 
     def _take_windows(self, saved: Saved, own: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the windows of the cross information: first row, column, height, width."""
@@ -257,12 +255,9 @@ class Run:
         self._forget_end()
         extended = self.engine.extended()
         refuse_not_finite(extended.sum())
-        star_fluxes = move_stars(
-            self.scene, self._model, extended, self.engine.star_fluxes(), self._given_stars
-        )
-        star_fluxes, scaling = measure_steps(
-            self._setup, self.scene, self._model, extended, star_fluxes
-        )
+        shared = self._setup, self.scene, self._model, extended
+        star_fluxes = move_stars(*shared, self.engine.star_fluxes())
+        star_fluxes, scaling = measure_steps(*shared, star_fluxes)
         if scaling is not None:
             self.engine.set_scaling(scaling)
         self.engine.move_stars()
@@ -311,57 +306,24 @@ class Run:
         if len(self.engine.objectives()) == self.done:
             self.engine.ratio()
 
-    def outcome(self, penalty: Penalty, stop_reason: str) -> Outcome:
+    def outcome(self, stop_reason: str) -> Outcome:
         """Return the estimate and the record of a run that has ended."""
         self.finish()
         sky = self.engine.extended()
         sky *= self.scene.unit
         return Outcome(
+            setup=self._setup,
             scene=self.scene,
             sky=sky,
             star_fluxes=self.star_fluxes(),
-            given_stars=self._given_stars if self._refines else None,
             objectives=self.objectives(),
-            engine_name=self.engine.name,
-            penalty=penalty,
             stop_reason=stop_reason,
-            restart=self._restart,
         )
 
     def _forget_end(self) -> None:
         """Take the objective of the current estimate off the record, where it is there."""
         if len(self.engine.objectives()) > self.done:
             self.engine.forget_objective()
-
-
-def engine_name(setup: Setup) -> str:
-    """Return the name of the engine of a run: the device, its platform and driver.
-
-    Raises
-    ------
-    InputError
-        There is no such device.
-    DeviceError
-        There is no device at all.
-    """
-    if setup.engine == "numpy":
-        from lnocl.engines.numpy import ReferenceEngine
-
-        return ReferenceEngine.name
-    from lnocl.opencl import device
-
-    return device.describe(device.choose(setup.device).device)
-
-
-def tuning_name(setup: Setup) -> str:
-    """Return the name of the tuning of a run, on which its last digits hang; "" with NumPy."""
-    if setup.engine == "numpy":
-        return ""
-    from lnocl.opencl import device, tuning
-
-    dtype = np.dtype(np.float64 if setup.precision == "double" else np.float32)
-    chosen = device.choose(setup.device).device
-    return tuning.in_words(tuning.chosen(chosen, dtype), dtype)
 
 
 def _make_engine(

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
-from numpy.typing import ArrayLike
+import numpy as np
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.observation import Observation
@@ -24,8 +22,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Setup:
-    """The parameters that all runs of one call of `deconvolve` share."""
+    """The observation and the parameters that all runs of one call of `deconvolve` share.
 
+    Attributes are the arguments of `deconvolve`, checked; `stars` are the positions as given.
+    """
+
+    observation: Observation
     stars: Array
     pad: int | str
     solver: SolverName
@@ -33,6 +35,36 @@ class Setup:
     engine: str
     device: str | None
     refine_positions: bool = False
+    initial_extended: Array | None = None
+    initial_star_fluxes: Array | None = None
+
+    def engine_name(self) -> str:
+        """Return the name of the engine: the device, its platform and driver.
+
+        Raises
+        ------
+        InputError
+            There is no such device.
+        DeviceError
+            There is no device at all.
+        """
+        if self.engine == "numpy":
+            from lnocl.engines.numpy import ReferenceEngine
+
+            return ReferenceEngine.name
+        from lnocl.opencl import device
+
+        return device.describe(device.choose(self.device).device)
+
+    def tuning_name(self) -> str:
+        """Return the name of the tuning, which decides the last digits; "" with NumPy."""
+        if self.engine == "numpy":
+            return ""
+        from lnocl.opencl import device, tuning
+
+        dtype = np.dtype(np.float64 if self.precision == "double" else np.float32)
+        chosen = device.choose(self.device).device
+        return tuning.in_words(tuning.chosen(chosen, dtype), dtype)
 
 
 @dataclass(frozen=True)
@@ -45,25 +77,19 @@ class Start:
         The parameters that the runs share.
     scene : Scene
         The model of the observation, with the stars where they start.
-    given_stars : ndarray of float64, shape (n, 2)
-        The positions as they were given.
     extended : ndarray of float64, shape (Ny, Nx)
         Extended source.
     star_fluxes : ndarray of float64, shape (n,)
         Star fluxes.
     scaling : Scaling or None
         For the scaled gradient projection method.
-    again : callable
-        Returns this start, made anew, for a penalty.
     """
 
     setup: Setup
     scene: Scene
-    given_stars: Array
     extended: Array
     star_fluxes: Array
     scaling: Scaling | None
-    again: Callable[[Penalty], Start]
 
     @property
     def refines(self) -> bool:
@@ -92,25 +118,15 @@ class Start:
         )
 
 
-def make_start(
-    setup: Setup,
-    observation: Observation,
-    penalty: Penalty,
-    initial_extended: ArrayLike | None = None,
-    initial_star_fluxes: ArrayLike | None = None,
-) -> Start:
-    """Return where a run of an observation starts, its stars moved there where that is asked for.
+def make_start(setup: Setup, penalty: Penalty) -> Start:
+    """Return where a run starts, its stars moved there where that is asked for.
 
     Parameters
     ----------
     setup : Setup
         The parameters that the runs share.
-    observation : Observation
-        The observation to reconstruct.
     penalty : Penalty
         The penalty on the extended source.
-    initial_extended, initial_star_fluxes : array_like, optional
-        The estimate to start from, as for `deconvolve`.
 
     Raises
     ------
@@ -118,24 +134,16 @@ def make_start(
         As `deconvolve`.
     """
     max_shift = MAX_SHIFT if setup.refine_positions else 0.0
-    scene = Scene(observation, setup.stars, penalty, setup.pad, max_shift)
-    given = scene.stars
-    extended, star_fluxes = scene.start(initial_extended, initial_star_fluxes)
+    scene = Scene(setup.observation, setup.stars, penalty, setup.pad, max_shift)
+    extended, star_fluxes = scene.start(setup.initial_extended, setup.initial_star_fluxes)
     refines = setup.refine_positions and scene.n_stars > 0
     scaling = None
     if refines or setup.solver == "sgp":
         model = make_model(scene)  # which is large, and goes with this block
         if refines:
-            star_fluxes = move_stars(scene, model, extended, star_fluxes, given, look_round=True)
+            star_fluxes = move_stars(setup, scene, model, extended, star_fluxes, look_round=True)
         star_fluxes, scaling = measure_steps(setup, scene, model, extended, star_fluxes)
-    again = partial(
-        make_start,
-        setup,
-        observation,
-        initial_extended=initial_extended,
-        initial_star_fluxes=initial_star_fluxes,
-    )
-    return Start(setup, scene, given, extended, star_fluxes, scaling, again)
+    return Start(setup, scene, extended, star_fluxes, scaling)
 
 
 # What follows loads scipy, which not every start needs.
@@ -149,17 +157,17 @@ def make_model(scene: Scene) -> Model:
 
 
 def move_stars(
+    setup: Setup,
     scene: Scene,
     model: Model,
     extended: Array,
     star_fluxes: Array,
-    given: Array,
     look_round: bool = False,
 ) -> Array:
     """Move the stars of a scene to where they are most likely; return their fluxes there."""
     from lnocl.solvers.positions import StarFit, Stars
 
-    fit = StarFit(scene, model, extended, given)
+    fit = StarFit(scene, model, extended, setup.stars)
     current = Stars(star_fluxes, scene.stars)
     starts = [current, fit.look_round(current)] if look_round else [current]
     stars = min(map(fit.minimise, starts), key=fit.objective)

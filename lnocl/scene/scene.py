@@ -82,8 +82,10 @@ class Scene:
         Electrons per unit of the images.
     unit : float
         Electrons per exposure and unit of the estimate.
+    penalty : Penalty
+        On the extended source.
     mu, smoothing : float
-        Weights of the penalty, scaled.
+        Its weights, scaled.
     smoothing_map : ndarray of float64, shape (Ny, Nx), or None
         The weight of the edge-preserving term in each pixel, scaled, where the penalty has a map;
         with `smoothing` in it.
@@ -150,6 +152,7 @@ class Scene:
         self._penalise(penalty)
 
     def _penalise(self, penalty: Penalty) -> None:
+        self.penalty = penalty
         self.mu = self._scaled("mu", penalty.mu, self.unit / self._mean_exposure)
         self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / self._mean_exposure)
         self.smoothing_map = self._smoothing_map(penalty)

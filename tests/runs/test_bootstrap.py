@@ -51,8 +51,8 @@ def test_a_repeated_run_is_bit_for_bit_a_new_one(engine, precision, solver, refi
     made = BASE.make()
     observation = made.observation()
     other = made.observation(images=made.images[:, ::-1, ::-1].copy())
-    setup = Setup(made.stars, 0, solver, precision, engine, None, refine)
-    start = make_start(setup, observation, Penalty(smoothing=1e-3))
+    setup = Setup(observation, made.stars, 0, solver, precision, engine, None, refine)
+    start = make_start(setup, Penalty(smoothing=1e-3))
     expected = Run(start, 9)
     run = Run(start, 9)
     for each in (other, observation):

@@ -186,7 +186,7 @@ class TestSpeckles:
     def test_a_smoothing_that_is_given_stands(self):
         found = solve(self.TRUE, smoothing=1e-3, stop=None, n_iter=5)
         assert found.psf_refinement is None
-        assert found._outcome.penalty.near_stars is None
+        assert found._outcome.scene.penalty.near_stars is None
 
 
 def test_psfs_of_many_stars_are_judged_only_where_that_is_asked(monkeypatch, caplog):

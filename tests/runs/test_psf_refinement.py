@@ -1,7 +1,5 @@
 """PSFs refined from the images: found where they are wrong, left alone where they are right."""
 
-from dataclasses import replace
-
 import astropy.units as u
 import numpy as np
 import pytest
@@ -144,7 +142,7 @@ class TestAnErrorThatIsLeft:
         assert "PSFs left as given" in caplog.text
         plain = refine(images, PSF, (), n_iter=300)
         assert error(result) < 0.2 * error(plain)
-        near = result._outcome.penalty.near_stars
+        near = result._outcome.scene.penalty.near_stars
         assert near[STAR[::-1]] > 0.01 > 1e-3 > near[60, 60]
         flux = 30.0 * SKY.sum()
         assert result.star_fluxes == pytest.approx(flux, rel=0.03)
@@ -206,19 +204,19 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
     monkeypatch.setattr("lnocl.runs.guarded_runs.WINDOW", 32)
     observation = lnocl.Observation(np.ones((1, 100, 120)), np.ones((40, 5)))
     stars = np.array([(5.0, 90.0), (100.0, 20.0), (108.4, 24.0)])
-    setup = Setup(stars, 0, "sgp", "single", "numpy", None)
-    cut, found, held = guarded_runs.find_window(setup, observation)
+    setup = Setup(observation, stars, 0, "sgp", "single", "numpy", None)
+    cut, found, held = guarded_runs.find_window(stars, observation)
     assert cut.shape == (32, 32)
     np.testing.assert_array_equal(held, (False, True, True))
     np.testing.assert_array_equal(found, stars[1:] - (84, 4))
-    runs = guarded_runs.GuardedRuns(setup, observation)
+    runs = guarded_runs.GuardedRuns(setup)
     inner = runs.cut(observation.psfs)
     assert inner.shape == (1, 32, 5)
     whole = runs.completed(observation.psfs, 2.0 * inner)
     np.testing.assert_allclose(whole[0, 4:36], 2.0 / (72 * 5))
     np.testing.assert_allclose(whole[0, :4], 1.0 / (72 * 5))
     whole = lnocl.Observation(np.ones((1, 20, 30)), np.ones((3, 3)))
-    cut, found, _ = guarded_runs.find_window(replace(setup, stars=np.array([(3.0, 4.0)])), whole)
+    cut, found, _ = guarded_runs.find_window(np.array([(3.0, 4.0)]), whole)
     assert cut.shape == (20, 30)
     np.testing.assert_array_equal(found, [(3.0, 4.0)])
 
@@ -313,7 +311,7 @@ def test_an_error_that_single_rings_show_smooths_the_sky_near_the_star():
     result = lnocl.deconvolve(observation, [STAR], engine="numpy", pad=0, n_iter=20, refine_psfs=())
     assert result.psf_refinement is None  # all rings together show no error
     assert set(result.held_out["smoothing"]) >= {0.0}  # held-out counts choose still
-    near = result._outcome.penalty.near_stars
+    near = result._outcome.scene.penalty.near_stars
     assert near[STAR[::-1]] == near.max() > 10 * near[0, 63]
 
 
@@ -326,7 +324,7 @@ class TestAScatterThatIsGiven:
         assert not found.is_accepted
         assert found.psf_error == pytest.approx(0.05)
         light = 30.0 * SKY.sum() * np.roll(PSF, (STAR[1] - N // 2, STAR[0] - N // 2), (0, 1))
-        near, of_star = result._outcome.penalty.near_stars, 0.05 * np.sqrt((PSF**2).sum())
+        near, of_star = result._outcome.scene.penalty.near_stars, 0.05 * np.sqrt((PSF**2).sum())
         assert near[STAR[::-1]] == pytest.approx(STRENGTH * of_star, rel=0.05)
         assert near[0, 63] < 0.02 * of_star
         np.testing.assert_allclose(found.may_be_faked, 0.05 * light, rtol=0.03, atol=1e-6)

@@ -14,12 +14,12 @@ PSF = np.exp(-(X**2 + Y**2) / 3.0)
 
 
 def run_of(observation, stars):
-    setup = Setup(stars, 0, "sgm", "double", "numpy", None, refine_positions=True)
-    return Run(make_start(setup, observation, Penalty()), 1)
+    setup = Setup(observation, stars, 0, "sgm", "double", "numpy", None, refine_positions=True)
+    return Run(make_start(setup, Penalty()), 1)
 
 
 def errors_of(run):
-    return run.outcome(Penalty(), "n_iter").star_errors()
+    return run.outcome("n_iter").star_errors()
 
 
 def test_errors_of_stars_that_have_come_to_one_place_are_nan_and_said():

@@ -190,10 +190,10 @@ def test_memory_does_not_grow_as_stars_times_pixels(refines, solver, monkeypatch
     rng, size, n = np.random.default_rng(3), 256, 100
     stars = rng.uniform(20, size - 20, (n, 2))
     observation = lnocl.Observation(rng.poisson(20.0, (size, size)), make_smooth_psfs(1, (15, 15)))
-    setup = Setup(stars, 0, solver, "double", "numpy", None, refine_positions=refines)
+    setup = Setup(observation, stars, 0, solver, "double", "numpy", None, refine_positions=refines)
     tracemalloc.start()
     try:
-        Run(make_start(setup, observation, Penalty(smoothing=1e-3)), 3)
+        Run(make_start(setup, Penalty(smoothing=1e-3)), 3)
         _, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
