@@ -151,20 +151,6 @@ class Layout(PixelLayout):
         row_spectra[:, self._kept] = np.where(self._conjugated, columns.conj(), columns)
         return row_spectra
 
-    def half_spectrum(self, columns: NDArray) -> NDArray[np.complex128]:
-        """Return the half spectrum (Ny, Nx // 2 + 1) of real pixels from their kept columns.
-
-        Column 0 holds ``A + i B`` with A and B the Hermitian spectra of columns 0 and Nx / 2;
-        the others hold k or, where conjugated, -k: ``F(-k) = conj(F(k))`` in both axes.
-        """
-        ny, nx = self.grid
-        opposite = columns[-np.arange(ny)].conj()
-        spectrum = np.empty((ny, nx // 2 + 1), np.complex128)
-        spectrum[:, 0] = (columns[:, 0] + opposite[:, 0]) / 2
-        spectrum[:, -1] = (columns[:, 0] - opposite[:, 0]) / 2j
-        spectrum[:, self._kept] = np.where(self._conjugated, opposite[:, 1:], columns[:, 1:])
-        return spectrum
-
     def columns_of(self, spectrum: NDArray) -> NDArray[np.complex128]:
         """Return the columns (Ny, Nx / 2) that are kept of a half spectrum of real pixels."""
         ny, nx = self.grid

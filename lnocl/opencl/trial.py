@@ -43,9 +43,13 @@ finally:
     print("lives")
 """
 KERNELS = """
-from lnocl.opencl import transform, trial
+from lnocl.opencl import launch, program, trial
 trial.check = lambda device: None
-transform.Transform(context, (8, 8), numpy.dtype("f4")).rfft2(numpy.ones((8, 8)))
+launcher = launch.Launcher(program.Program(context, (8, 8), numpy.dtype("f4")))
+buffers = {each: cl.Buffer(context, launch.READ_WRITE, 2**16) for each in ("pixels", "spectra")}
+for name in ("rfft_rows", "fft_columns"):
+    launcher.bind(name, buffers)()
+launcher.queue.finish()
 """
 # Enough for a linker.
 KERNEL = """

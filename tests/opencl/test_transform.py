@@ -5,9 +5,9 @@ import functools
 import numpy as np
 import pyopencl as cl
 import pytest
+from transform import Transform
 
 from lnocl.opencl.device import choose
-from lnocl.opencl.transform import Transform
 
 POWERS = [(n, n) for n in (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)]
 # Each odd factor with one, two and three passes within.

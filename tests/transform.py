@@ -1,4 +1,4 @@
-"""The transforms by themselves."""
+"""The transforms on a device by themselves, on arrays in natural order."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Transform:
         self._fft_columns()
         ny = self.program.grid[0]
         columns = self._download_columns()[np.argsort(reversed_order(ny))] / 2.0
-        return self.layout.half_spectrum(columns)
+        return half_spectrum(self.layout, columns)
 
     def irfft2(self, spectrum: NDArray) -> NDArray[np.float64]:
         """Return the real pixels (Ny, Nx) of a half spectrum, divided by Ny Nx."""
@@ -89,3 +89,18 @@ class Transform:
         packed = np.empty(self.layout.spectra_shape, self.layout.dtype)
         cl.enqueue_copy(self.launcher.queue, packed, self._spectra)
         return self.layout.unpack_columns(packed)
+
+
+def half_spectrum(layout: Layout, columns: NDArray) -> NDArray[np.complex128]:
+    """Return the half spectrum (Ny, Nx // 2 + 1) of real pixels from their kept columns.
+
+    Column 0 holds ``A + i B`` with A and B the Hermitian spectra of columns 0 and Nx / 2;
+    the others hold k or, where conjugated, -k: ``F(-k) = conj(F(k))`` in both axes.
+    """
+    ny, nx = layout.grid
+    opposite = columns[-np.arange(ny)].conj()
+    spectrum = np.empty((ny, nx // 2 + 1), np.complex128)
+    spectrum[:, 0] = (columns[:, 0] + opposite[:, 0]) / 2
+    spectrum[:, -1] = (columns[:, 0] - opposite[:, 0]) / 2j
+    spectrum[:, layout._kept] = np.where(layout._conjugated, opposite[:, 1:], columns[:, 1:])
+    return spectrum
