@@ -144,7 +144,7 @@ def observe(size, seed, n_stars, field):
     image = see(sky, field, 33) + 10.0
     for (x, y), flux in zip(stars, fluxes, strict=True):
         cutout = MovablePsf(field.at(x, y), (size, size)).at(x, y)
-        cutout.add_to(image, range(size), range(size), (size, size), flux)
+        cutout.add_to(image, (0, 0), (size, size), flux)
     return rng.poisson(np.maximum(image, 0.0)).astype(float), sky, stars, fluxes
 
 

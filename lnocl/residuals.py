@@ -265,9 +265,7 @@ def _fits_at(
     model = np.array(background[there])
     add_to_window(model, scene, sky, star_fluxes, j, (there[0].start, there[1].start))
     np.maximum(model, 0.0, out=model)
-    if scene.weights is not None and scene.has_exposure_map:
-        model *= scene.weights[j][there]
-    model *= scene.scale
+    model = scene.in_electrons(model, j, there)
     values = residuals(observation.images[j][there], observation.mask[j][there], model)
     share = bright[of_psf] / psf.max()
     is_core, is_wing = share > CORE, (share > WINGS) & (share <= CORE)

@@ -46,15 +46,7 @@ class StarWindows:
 
     def cut(self, s: int, cutout: Cutout) -> Array:
         """Return the pixels of a star's window, with a cutout in them."""
-        grid = self._layout.grid
-        block, column = self.corners[s]
-        first = self._layout.rows_of(int(block), 1)[0]
+        block, column = self.corners[s].tolist()
+        first = int(self._layout.rows_of(block, 1)[0]), column
         window = np.zeros((self._layout.rows_of(0, self.n_blocks).size, self.n_columns))
-        rows = (cutout.rows(grid) - first) % grid[0]
-        columns = (cutout.columns(grid) - column) % grid[1]
-        row_in, column_in = rows < window.shape[0], columns < window.shape[1]
-        values = cutout.values
-        if not (row_in.all() and column_in.all()):
-            values = values[np.ix_(row_in, column_in)]
-        window[rows[row_in][:, None], columns[column_in]] = values
-        return window
+        return cutout.add_to(window, first, self._layout.grid)

@@ -15,7 +15,7 @@ from lnocl.psf.centring import Mask, Point, brightest
 from lnocl.psf.repair import repair
 from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
 from lnocl.scene.arrays import Array
-from lnocl.scene.shifting import Cutout, MovablePsf
+from lnocl.scene.shifting import MovablePsf
 
 # Rounds of fitting the stars and adding what is left of them to the PSF.
 ROUNDS = 20
@@ -274,11 +274,9 @@ class _Stars:
         steps = np.zeros((len(self._places), 2))
         core = psf > CORE * psf.max()
         for s, c in enumerate(self._fluxes):
-            cutout, parts = movable.with_slopes(*self._middle(s))
-            columns = [
-                Cutout(part, cutout.y, cutout.x).on_grid(psf.shape)
-                for part in (parts[0], c * parts[2], c * parts[1])
-            ]
+            cutout = movable.with_slopes(*self._middle(s))
+            parts = cutout.values[0], c * cutout.values[2], c * cutout.values[1]
+            columns = [cutout._replace(values=part).on_grid(psf.shape) for part in parts]
             used = core & self._good[self._window(s)]
             if used.sum() < len(columns):
                 raise InputError(

@@ -436,11 +436,8 @@ def _shares(outcome: Outcome, parts: Sequence[Part], n_quantities: int) -> Array
 def _light_within(aperture: Aperture, cutouts: Sequence[Cutout], grid: tuple[int, int]) -> float:
     """Return the mean light of cutouts on the periodic grid within an aperture."""
     light = np.zeros(aperture.weights.shape)
-    height, width = aperture.weights.shape
-    rows = range(aperture.y, aperture.y + height)
-    columns = range(aperture.x, aperture.x + width)
     for cutout in cutouts:
-        cutout.add_to(light, rows, columns, grid, 1.0 / len(cutouts))
+        cutout.add_to(light, (aperture.y, aperture.x), grid, 1.0 / len(cutouts))
     return float((aperture.weights * light).sum())
 
 

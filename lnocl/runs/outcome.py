@@ -198,10 +198,7 @@ class Outcome:
         ny, nx = scene.observation.shape
         extended, star_fluxes = self.sky / scene.unit, self.star_fluxes / scene.unit
         for j, image in enumerate(model_images(scene, extended, star_fluxes)):
-            if scene.weights is not None and scene.has_exposure_map:
-                image *= scene.weights[j]
-            image *= scene.scale
-            yield image[:ny, :nx]
+            yield scene.in_electrons(image, j)[:ny, :nx]
 
     def star_residuals(self) -> list[StarResiduals]:
         """Return how well the model fits at each star."""

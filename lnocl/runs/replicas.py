@@ -148,9 +148,7 @@ class Replicas:
         images = model.images(sky, self._outcome.star_fluxes / scene.unit)
         ny, nx = scene.observation.shape
         for j, image in enumerate(images):
-            if scene.weights is not None and scene.has_exposure_map:
-                image *= scene.weights[j]
-            yield image[:ny, :nx] * scene.scale
+            yield scene.in_electrons(image, j)[:ny, :nx]
 
 
 def _draw(model: Array, added: Array, seed: np.random.SeedSequence) -> Array:

@@ -99,48 +99,41 @@ class DetectorPsf:
 
     def response(self, x: float, y: float) -> Cutout:
         """Return h on the fine grid, the sky moved by so many pixels of the image."""
-        cutout = self.fine.at(self._q * x - self._lag, self._q * y - self._lag)
-        return self._seen(cutout, cutout.values)[0]
+        return self._seen(self.fine.at(self._q * x - self._lag, self._q * y - self._lag))
 
     def on_sky(self, x: float, y: float) -> Cutout:
         """Return what pixels that begin at each fine pixel see of a star at a position, pixels."""
-        cutout = self.fine.at(*self._on_fine_pixels(x, y))
-        return self._seen(cutout, cutout.values)[0]
+        return self._seen(self.fine.at(*self._on_fine_pixels(x, y)))
 
     def at(self, x: float, y: float, axis: int | None = None) -> Cutout:
         """Return the image of a star at a position, pixels, or a derivative, as `place` does."""
         cutout = self.fine.at(*self._on_fine_pixels(x, y), axis)
         per_pixel = 1.0 if axis is None else float(self._q)
-        return self._sampled(*self._seen(cutout, per_pixel * cutout.values))[0]
+        return self._sampled(self._seen(cutout._replace(values=per_pixel * cutout.values)))
 
-    def with_slopes(self, x: float, y: float) -> tuple[Cutout, Array]:
-        """Return the image of a star, and it and its derivatives along x and y, (3, h, w)."""
-        cutout, values = self.fine.with_slopes(*self._on_fine_pixels(x, y))
+    def with_slopes(self, x: float, y: float) -> Cutout:
+        """Return the image of a star and its derivatives along x and y, (3, h, w)."""
+        cutout = self.fine.with_slopes(*self._on_fine_pixels(x, y))
         per_pixel = np.array([1.0, self._q, self._q])[:, None, None]
-        return self._sampled(*self._seen(cutout, per_pixel * values))
+        return self._sampled(self._seen(cutout._replace(values=per_pixel * cutout.values)))
 
     def _on_fine_pixels(self, x: float, y: float) -> tuple[float, float]:
         shift = self._half - self._lag
         return self._q * x + shift, self._q * y + shift
 
-    def _seen(self, cutout: Cutout, values: Array) -> tuple[Cutout, Array]:
-        """Return what pixels that begin at each fine pixel see, for values (..., h, w) there."""
+    def _seen(self, cutout: Cutout) -> Cutout:
+        """Return what pixels that begin at each fine pixel see."""
         if self._is_effective:
-            values = self._q**2 * values
-            return Cutout(_first(values), cutout.y, cutout.x), values
-        y, values = _sum_ahead(values, cutout.y, self._q, self._fine_grid[0], -2)
+            return cutout._replace(values=self._q**2 * cutout.values)
+        y, values = _sum_ahead(cutout.values, cutout.y, self._q, self._fine_grid[0], -2)
         x, values = _sum_ahead(values, cutout.x, self._q, self._fine_grid[1], -1)
-        return Cutout(_first(values), y, x), values
+        return Cutout(values, y, x)
 
-    def _sampled(self, cutout: Cutout, values: Array) -> tuple[Cutout, Array]:
+    def _sampled(self, cutout: Cutout) -> Cutout:
         """Return what the pixels of the image see."""
-        y, x = -(-cutout.y // self._q), -(-cutout.x // self._q)
-        values = values[..., self._q * y - cutout.y :: self._q, self._q * x - cutout.x :: self._q]
-        return Cutout(_first(values), y, x), values
-
-
-def _first(values: Array) -> Array:
-    return values if values.ndim == 2 else values[0]
+        q, (values, top, left) = self._q, cutout
+        y, x = -(-top // q), -(-left // q)
+        return Cutout(values[..., q * y - top :: q, q * x - left :: q], y, x)
 
 
 def _sum_ahead(values: Array, first: int, q: int, n: int, axis: int) -> tuple[int, Array]:

@@ -303,7 +303,7 @@ def add_to_window(
     image += seen / scene.unit
     cutouts = scene.star_field.cutouts[j]
     for s in scene.star_field.reaching(j, first, image.shape):
-        cutouts[s].add_to(image, rows, columns, scene.image_grid, star_fluxes[s] / scene.unit)
+        cutouts[s].add_to(image, first, scene.image_grid, star_fluxes[s] / scene.unit)
 
 
 def _illuminate(image: Array, background: Array | float, starlight: Array) -> None:

@@ -297,6 +297,13 @@ class Scene:
         weights = self.weights[j]
         return np.divide(values, weights, out=np.full_like(values, fill), where=weights > 0)
 
+    def in_electrons(self, model: Array, j: int, there: Any = np.s_[:]) -> Array:
+        """Return the model of pixels of image j, changed in place, as its counts are."""
+        if self.weights is not None and self.has_exposure_map:
+            model *= self.weights[j][there]
+        model *= self.scale
+        return model
+
     def psf(self, j: int) -> Array:
         """Return the response of image j on the grid, shape (Ny, Nx): see `psf_cutout`."""
         return self.psf_cutout(j).on_grid(self.grid)

@@ -23,7 +23,10 @@ Window = tuple[Any, Any]
 
 
 class Cutout(NamedTuple):
-    """Part of a periodic grid: its values, and the row and column of the first of them."""
+    """Part of a periodic grid: its values, and the row and column of the first of them.
+
+    Several functions of the same pixels have values of shape (k, h, w).
+    """
 
     values: Array
     y: int
@@ -37,24 +40,27 @@ class Cutout(NamedTuple):
 
     def window(self, grid: tuple[int, int]) -> Window:
         """Return where the values lie, as an index of arrays on the grid."""
-        return window(self.y, self.x, self.values.shape, grid)
+        return window(self.y, self.x, self.values.shape[-2:], grid)
 
     def rows(self, grid: tuple[int, int]) -> NDArray[np.int_]:
         """Return the rows of the grid that the values lie in."""
-        return (self.y + np.arange(self.values.shape[0])) % grid[0]
+        return (self.y + np.arange(self.values.shape[-2])) % grid[0]
 
     def columns(self, grid: tuple[int, int]) -> NDArray[np.int_]:
         """Return the columns of the grid that the values lie in."""
-        return (self.x + np.arange(self.values.shape[1])) % grid[1]
+        return (self.x + np.arange(self.values.shape[-1])) % grid[1]
 
     def add_to(
-        self, light: Array, rows: range, columns: range, grid: tuple[int, int], flux: float
-    ) -> None:
-        """Add the values times a flux to the light in a window of the grid."""
-        y, x = self.rows(grid) - rows.start, self.columns(grid) - columns.start
-        y_in, x_in = (y >= 0) & (y < len(rows)), (x >= 0) & (x < len(columns))
-        if y_in.any() and x_in.any():
-            light[np.ix_(y[y_in], x[x_in])] += flux * self.values[np.ix_(y_in, x_in)]
+        self, light: Array, first: tuple[int, int], grid: tuple[int, int], flux: float = 1.0
+    ) -> Array:
+        """Add the values times a flux to the light in a window of the grid; return that light.
+
+        The window has a first row and column, and may go round the edges of the grid.
+        """
+        y, x = (self.rows(grid) - first[0]) % grid[0], (self.columns(grid) - first[1]) % grid[1]
+        y_in, x_in = y < light.shape[0], x < light.shape[1]
+        light[np.ix_(y[y_in], x[x_in])] += flux * self.values[np.ix_(y_in, x_in)]
+        return light
 
     def aligned(self, grid: tuple[int, int]) -> Cutout:
         """Return the same values, those that fill an axis of the grid beginning at its origin."""
@@ -124,12 +130,12 @@ class MovablePsf:
         """Return what the image shows of a source at its origin, the sky moved so far."""
         return self.at(x, y)
 
-    def with_slopes(self, x: float, y: float) -> tuple[Cutout, Array]:
-        """Return the PSF at a position, and it and its derivatives along x and y, (3, h, w)."""
+    def with_slopes(self, x: float, y: float) -> Cutout:
+        """Return the PSF at a position and its derivatives along x and y, (3, h, w)."""
         whole = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
         values = self._spectrum.with_slopes((y - whole[0], x - whole[1]))
         first = (i - n // 2 for i, n in zip(whole, values.shape[1:], strict=True))
-        return Cutout(values[0], *first), values
+        return Cutout(values, *first)
 
     @cached_property
     def _folded(self) -> Array:

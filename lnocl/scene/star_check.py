@@ -71,9 +71,9 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
             side = 2 * reach + 1
             if star.shape != (side, side) or observation.mask[j][rows, columns].any():
                 continue
-            model = np.zeros((side, side))
-            window = range(rows.start, rows.stop), range(columns.start, columns.stop)
-            scene.star_cutout(j, s).add_to(model, *window, scene.image_grid, 1.0)
+            first = rows.start, columns.start
+            cutout = scene.star_cutout(j, s)
+            model = cutout.add_to(np.zeros((side, side)), first, scene.image_grid)
             found = _compare(star, model, observation.images[j][rows, columns])
             if found is not None:
                 yield StarCheck(j, s, *found)

@@ -15,7 +15,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.observation import Observation, numbers
-from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf, Window, window
+from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf
 
 # Pixels of a flattened array: a slice where they are all of it, which takes no gathering.
 Pixels = NDArray[np.intp] | slice
@@ -30,21 +30,6 @@ TILE = 32
 # Outer rows and columns of a star with less than this share of its peak have no part in the Fisher
 # information that measures steps: all of them together change it by 2e-7.
 FAINT = 1e-6
-
-
-class Piece(NamedTuple):
-    """k functions of the pixels in a window of a periodic grid: values, and its first pixel.
-
-    The values have shape (k, h, w).
-    """
-
-    values: Array
-    y: int
-    x: int
-
-    def window(self, grid: tuple[int, int]) -> Window:
-        """Return where the values lie, as an index of arrays on the grid."""
-        return window(self.y, self.x, self.values.shape[1:], grid)
 
 
 class Order(NamedTuple):
@@ -69,21 +54,21 @@ class StarImages:
     ----------
     covered : ndarray of bool, shape (Ny, Nx)
         The pixels that are looked at.
-    pieces : list of lists of Piece
+    pieces : list of lists of Cutout
         The image of each star is the sum of its pieces. The first may be of all k functions, the
         others of the image alone, which does not move.
     order : Order
         Of the stars.
-    cores : list of lists of Piece, optional
+    cores : list of lists of Cutout, optional
         What the information is of, where that is less than the images.
     """
 
     def __init__(
         self,
         covered: NDArray[np.bool_],
-        pieces: list[list[Piece]],
+        pieces: list[list[Cutout]],
         order: Order,
-        cores: list[list[Piece]] | None = None,
+        cores: list[list[Cutout]] | None = None,
     ) -> None:
         self._grid = covered.shape[0], covered.shape[1]
         self._covered = slice(None) if covered.all() else np.flatnonzero(covered)
@@ -104,9 +89,9 @@ class StarImages:
         x = self._on_grid(x)
         products = np.zeros((len(self._pieces), self._k))
         for product, pieces in zip(products, self._pieces, strict=True):
-            for values, y, left in pieces:
-                there = x[window(y, left, values.shape[1:], self._grid)].ravel()
-                product[: len(values)] += values.reshape(len(values), -1) @ there
+            for piece in pieces:
+                k = len(piece.values)
+                product[:k] += piece.values.reshape(k, -1) @ x[piece.window(self._grid)].ravel()
         return products.T
 
     def information(self, weights: Array) -> BandMatrix:
@@ -303,7 +288,7 @@ class StarField:
     def images(self, j: int, covered: NDArray[np.bool_]) -> StarImages:
         """Return the P_js over these pixels, which must include all that cutouts of stars cover."""
         pieces, cores = (
-            [[Piece(cutout.values[None], cutout.y, cutout.x)] for cutout in cutouts]
+            [[cutout._replace(values=cutout.values[None])] for cutout in cutouts]
             for cutouts in (self.cutouts[j], self.cores[j])
         )
         return StarImages(covered, pieces, self._order, cores)

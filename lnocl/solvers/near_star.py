@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
-from lnocl.scene.forward_model import convolve_at, sampled, spread
+from lnocl.scene.forward_model import add_to_window, sampled, spread
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout, MovablePsf
 from lnocl.scene.texture import Texture, resolution
@@ -253,11 +253,7 @@ def _linearise(
     counts, background, weights = _observed(scene, j, there)
     model = background.copy()
     first = there.y % scene.image_grid[0], there.x % scene.image_grid[1]
-    rows, columns = (range(at, at + n) for at, n in zip(first, there.shape, strict=True))
-    model += convolve_at(sky, scene.psf_cutout(j), rows, columns, scene.oversample) / scene.unit
-    for s in scene.star_field.reaching(j, first, there.shape):
-        light = _cut(scene.star_cutout(j, s), there, scene.image_grid)
-        model += star_fluxes[s] / scene.unit * light
+    add_to_window(model, scene, sky, star_fluxes, j, first)
     total = np.maximum(model, MIN_MODEL)
     precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
     slopes = [_cut(scene.star_cutout(j, s), there, scene.image_grid) for s in held]
@@ -265,8 +261,8 @@ def _linearise(
         offset, psfs = scene.observation.offsets[j], scene.star_field.psfs[j]
         moved = [psfs[s].with_slopes(*(scene.stars[s] + offset)) for s in held]
         for axis in (1, 2):
-            for s, (cutout, values) in zip(held, moved, strict=True):
-                slope = cutout._replace(values=star_fluxes[s] / scene.unit * values[axis])
+            for flux, each in zip(star_fluxes[held] / scene.unit, moved, strict=True):
+                slope = each._replace(values=flux * each.values[axis])
                 slopes.append(_cut(slope, there, scene.image_grid))
     k, left = len(slopes), counts - total - beyond
     return LinearImage(np.array(slopes).reshape(k, -1), np.arange(k), left, precision)
@@ -274,8 +270,4 @@ def _linearise(
 
 def _cut(cutout: Cutout, window: Window, grid: tuple[int, int]) -> Array:
     """Return the values of a cutout that lie in a window, and 0 elsewhere."""
-    light = np.zeros(window.shape)
-    y, x = (cutout.rows(grid) - window.y) % grid[0], (cutout.columns(grid) - window.x) % grid[1]
-    y_in, x_in = y < window.shape[0], x < window.shape[1]
-    light[np.ix_(y[y_in], x[x_in])] = cutout.values[np.ix_(y_in, x_in)]
-    return light
+    return cutout.add_to(np.zeros(window.shape), (window.y, window.x), grid)

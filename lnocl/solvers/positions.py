@@ -15,7 +15,7 @@ from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.forward_model import ROUNDING, Model
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf
-from lnocl.scene.stars import MAX_SHIFT, Order, Piece, StarImages, covered_pixels, order_of, places
+from lnocl.scene.stars import MAX_SHIFT, Order, StarImages, covered_pixels, order_of, places
 from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood
 
 # The farthest that a star goes in one step, pixels: the likelihood is a parabola in a part of the
@@ -230,14 +230,14 @@ class _MovableStars:
         # One number more, which the dark pixels share: their place is -1.
         self._image = np.zeros(int(covered.sum()) + 1)
         self.around: list[NDArray[np.intp]] = []
-        self._beyond: list[Piece] = []
+        self._beyond: list[Cutout] = []
         for s, (position, cutout, square) in enumerate(zip(positions, whole, squares, strict=True)):
             at = [self._places[each.window(self._grid)].ravel() for each in (cutout, square)]
             reached = np.unique(np.concatenate(at))
             self.around.append(reached[reached >= 0])
             self._beyond.append(self._find_beyond(s, position, cutout))
 
-    def _find_beyond(self, s: int, position: Array, whole: Cutout) -> Piece:
+    def _find_beyond(self, s: int, position: Array, whole: Cutout) -> Cutout:
         """Return the whole PSF of star s less the part that moves."""
         at = self._at(whole)
         self._image[at] = whole.values
@@ -246,15 +246,14 @@ class _MovableStars:
         beyond = self._image[at]
         self._image[at] = self._image[self._at(moving)] = 0.0
         is_left = (abs(beyond) > ROUNDING * whole.values.max()) & (at >= 0)
-        return Piece(np.where(is_left, beyond, 0.0)[None], whole.y, whole.x)
+        return Cutout(np.where(is_left, beyond, 0.0)[None], whole.y, whole.x)
 
-    def _at(self, part: Cutout | Piece) -> NDArray[np.intp]:
+    def _at(self, part: Cutout) -> NDArray[np.intp]:
         return self._places[part.window(self._grid)]
 
-    def _moving(self, s: int, position: Array) -> Piece:
+    def _moving(self, s: int, position: Array) -> Cutout:
         """Return the part of star s's PSF that moves, and its derivatives along x and y."""
-        cutout, values = self._psfs[s].with_slopes(*position)
-        return Piece(values, cutout.y, cutout.x)
+        return self._psfs[s].with_slopes(*position)
 
     def at(self, positions: Array) -> StarImages:
         """Return the images of the stars and their derivatives along x and y."""

@@ -16,7 +16,7 @@ from lnocl.scene.forward_model import add_to_window
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import Cutout
-from lnocl.scene.stars import Order, Piece, StarImages, check_positions, order_of
+from lnocl.scene.stars import Order, StarImages, check_positions, order_of
 
 # One is alone, two are neighbours, one wraps round two edges; or all of the grid is covered.
 FIELDS = {
@@ -89,7 +89,7 @@ def test_sums_over_images_of_several_pieces_and_derivatives(tile, monkeypatch):
         pieces.append([])
         for k in (3, 1):
             shape = k, *rng.integers(3, 11, 2)
-            piece = Piece(rng.normal(size=shape), *rng.integers(-20, 20, 2).tolist())
+            piece = Cutout(rng.normal(size=shape), *rng.integers(-20, 20, 2).tolist())
             pieces[s].append(piece)
             for values, each in zip(piece.values, dense[:, s], strict=False):
                 each += Cutout(values, piece.y, piece.x).on_grid(grid)
