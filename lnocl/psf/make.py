@@ -267,8 +267,8 @@ def make_psf(
     negative pixels: 0, 0.00 % of the flux; left as they are
     normalised: flux 125664 set to 1
     """
-    (star,) = _make(
-        frame, position, size, background, mask, saturation, recentre, clip_negative, [rotate]
+    (star,) = make_psfs(
+        frame, [rotate], position, size, background, mask, saturation, recentre, clip_negative
     )
     return star
 
@@ -335,23 +335,6 @@ def make_psfs(
     >>> np.abs(stars[1].psf - stars[0].psf.T).max() < 1e-7
     np.True_
     """
-    return _make(
-        frame, position, size, background, mask, saturation, recentre, clip_negative, rotate
-    )
-
-
-def _make(
-    frame: ArrayLike,
-    position: ArrayLike | None,
-    size: int | None,
-    background: float | str,
-    mask: ArrayLike | None,
-    saturation: float | None,
-    recentre: bool,
-    clip_negative: bool,
-    rotate: Sequence[float],
-) -> list[StarPsf]:
-    """Return the PSFs at all angles; the arguments are those of `make_psfs`."""
     given, bad = checks.read_frame(frame, mask)
     saturated = ~bad & (given >= checks.saturation_level(saturation))
     unusable = bad | saturated

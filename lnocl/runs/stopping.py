@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from functools import cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,22 +21,25 @@ if TYPE_CHECKING:
 CHANGE_WINDOW = 10
 
 
-class Rule(Protocol):
-    """A rule that ends a run."""
+class Rule:
+    """A rule that ends a run; this one leaves it to go on to its last iteration."""
 
-    reason: str
+    reason = "n_iter"
 
     def met(self, run: Run) -> bool:
         """Return whether the run should end; asked once after each iteration."""
+        return False
 
     def miss(self, run: Run) -> None:
         """Tell, after the last iteration, that the rule was not met, where that matters."""
 
     def quantity(self, run: Run) -> str:
         """Return the quantity that decides, for the progress bar."""
+        return f"objective {run.objective():.6g}"
 
     def state(self) -> list[float]:
         """Return the numbers that `restore` needs."""
+        return []
 
     def restore(self, saved: Saved, done: int) -> None:
         """Continue from the state in a checkpoint of so many iterations.
@@ -48,31 +51,7 @@ class Rule(Protocol):
         """
 
 
-class NoRule:
-    """The run ends at its last iteration."""
-
-    reason = "n_iter"
-
-    def met(self, run: Run) -> bool:
-        """Return False."""
-        return False
-
-    def miss(self, run: Run) -> None:
-        """Do nothing."""
-
-    def quantity(self, run: Run) -> str:
-        """Return the objective."""
-        return f"objective {run.objective():.6g}"
-
-    def state(self) -> list[float]:
-        """Return an empty list."""
-        return []
-
-    def restore(self, saved: Saved, done: int) -> None:
-        """Do nothing."""
-
-
-class Change:
+class Change(Rule):
     """The relative change of the objective an iteration, its mean over ten, falls below a bound."""
 
     reason = "change"
@@ -85,9 +64,6 @@ class Change:
         """Return whether the objective has settled."""
         self._recent.append(run.objective())
         return len(self._recent) > CHANGE_WINDOW and self._change() < self._threshold
-
-    def miss(self, run: Run) -> None:
-        """Do nothing."""
 
     def quantity(self, run: Run) -> str:
         """Return the relative change an iteration."""
@@ -109,7 +85,7 @@ class Change:
         return abs(first - last) / (len(self._recent) - 1) / abs(last)
 
 
-class Discrepancy:
+class Discrepancy(Rule):
     """The data term falls to its expectation for Poisson noise alone.
 
     ``2 J_0 = sum_j sum_n e(m_j)`` over the observed pixels, with ``e(m)`` the expectation of
@@ -212,5 +188,5 @@ def make_rule(stop: str | float | None) -> Rule:
     if stop == "discrepancy":
         return Discrepancy()
     if stop is None or stop == "held-out":
-        return NoRule()
+        return Rule()
     return Change(float(stop))

@@ -204,12 +204,7 @@ def seconds(values: Any) -> Any:
     InputError
         A unit that is not a time.
     """
-    numbers, unit = _split("exposure", values)
-    if unit is None or unit.physical_type == "dimensionless":
-        return numbers if unit is None else numbers * unit.to("")
-    if unit.physical_type != "time":
-        raise InputError(f"`exposure` must be in seconds or numbers without unit, not in {unit}")
-    return numbers * unit.to("s")
+    return _in_unit("exposure", values, "s", "in seconds or numbers without unit, not in {}")
 
 
 def pixels(name: str, values: Any) -> Any:
@@ -220,14 +215,18 @@ def pixels(name: str, values: Any) -> Any:
     InputError
         A unit other than pixels.
     """
+    wanted = "in pixels, not in {}; convert them with the WCS of the images"
+    return _in_unit(name, values, "pix", wanted)
+
+
+def _in_unit(name: str, values: Any, wanted: str, words: str) -> Any:
+    """Return values as plain numbers in a unit; those without unit stay as they are."""
     numbers, unit = _split(name, values)
     if unit is None or unit.physical_type == "dimensionless":
         return numbers if unit is None else numbers * unit.to("")
-    if not unit.is_equivalent("pix"):
-        raise InputError(
-            f"`{name}` must be in pixels, not in {unit}; convert them with the WCS of the images"
-        )
-    return numbers * unit.to("pix")
+    if not unit.is_equivalent(wanted):
+        raise InputError(f"`{name}` must be {words.format(unit)}")
+    return numbers * unit.to(wanted)
 
 
 def bare(name: str, values: Any) -> Any:

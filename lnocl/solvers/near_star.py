@@ -6,7 +6,7 @@ and positions of stars, and their errors, depend on no iteration.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -15,10 +15,10 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
-from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
+from lnocl.scene.detector import movable_psfs, on_sky
 from lnocl.scene.forward_model import add_to_window, sampled, spread
 from lnocl.scene.scene import MIN_MODEL, Scene
-from lnocl.scene.shifting import Cutout, MovablePsf
+from lnocl.scene.shifting import Cutout
 from lnocl.scene.texture import Texture, resolution
 from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
 
@@ -114,18 +114,11 @@ class NearStar:
         self.window = _window_round(scene, scene.stars[star], width)
         held = np.append(star, _neighbours(scene, star, width))
         there, texture = _texture_in(self.window, scene, sky, width)
-        self.source = _source_error(
-            scene, around.psfs, texture.amplitude[there], texture.width, self.window
-        )
+        self.source = self._source_error(around, texture.amplitude[there], texture.width)
         self.n_held, self.resolution, self._finished = len(held), width, finished
         self.expected = texture.mean[there] - sky[self.places(scene)] / scene.unit
         beyond = self.source.images_of(self.expected)
-        self._images = [
-            _linearise(
-                scene, j, sky, around.star_fluxes, held, self.window, around.moves, beyond[j]
-            )
-            for j in range(scene.n_images)
-        ]
+        self._images = [self._linearise(around, j, held, each) for j, each in enumerate(beyond)]
 
     def places(self, scene: Scene) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Return the rows and columns of the window in the sky, on the grid."""
@@ -136,6 +129,55 @@ class NearStar:
         """The least squares: the unknowns are all fluxes, perhaps all x, and all y."""
         k = len(self._images[0].slopes)
         return LeastSquares(self._images, [self.source], np.zeros(k), N_STEPS, self._finished)
+
+    def _source_error(self, around: Surroundings, amplitude: Array, width: float) -> SourceError:
+        """Return the error of the extended source in the window, and its change there."""
+        scene = around.scene
+        q, window = scene.oversample, self.window.finer(scene.oversample)
+        # Twice the window, in which nothing wraps round; or the grid, on which it does.
+        height, breadth = (min(2 * k, n) for k, n in zip(window.shape, scene.grid, strict=True))
+        shape = height, breadth
+        whole = Window(-(height // 2), -(breadth // 2), shape)
+        otfs = []
+        for psf, offset in zip(around.psfs, scene.observation.offsets, strict=True):
+            cut = _cut(psf.response(*(offset - np.round(offset))), whole, scene.grid)
+            otfs.append(scipy.fft.rfft2(np.roll(cut, (whole.y, whole.x), axis=(0, 1))))
+        inside = (..., *map(slice, window.shape))
+
+        def forward(sky: Array) -> Array:
+            images = scipy.fft.irfft2(otfs * scipy.fft.rfft2(sky, shape), shape)
+            return np.asarray(sampled(images[inside], q))
+
+        def adjoint(images: Iterable[Array]) -> Array:
+            spectra = np.conj(otfs) * scipy.fft.rfft2(spread(np.array(images), q), shape)
+            return np.asarray(scipy.fft.irfft2(spectra.sum(axis=0), shape)[inside])
+
+        return SourceError(forward, adjoint, amplitude, width)
+
+    def _linearise(
+        self, around: Surroundings, j: int, held: NDArray[np.int_], beyond: Array
+    ) -> LinearImage:
+        """Return image j near the estimate: its slopes in all fluxes, perhaps all x, and all y.
+
+        `beyond` is the light of the sky that is expected, less that of the estimate.
+        """
+        scene, grid = around.scene, around.scene.image_grid
+        there = _in_image(scene, j, self.window)
+        counts, background, weights = _observed(scene, j, there)
+        model, first = background.copy(), (there.y % grid[0], there.x % grid[1])
+        add_to_window(model, scene, around.sky, around.star_fluxes, j, first)
+        total = np.maximum(model, MIN_MODEL)
+        precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
+        slopes = [_cut(scene.star_cutout(j, s), there, grid) for s in held]
+        if around.moves:
+            offset, psfs = scene.observation.offsets[j], scene.star_field.psfs[j]
+            moved = [psfs[s].with_slopes(*(scene.stars[s] + offset)) for s in held]
+            for axis in (1, 2):
+                for flux, each in zip(around.star_fluxes[held] / scene.unit, moved, strict=True):
+                    slope = each._replace(values=flux * each.values[axis])
+                    slopes.append(_cut(slope, there, grid))
+        k, left = len(slopes), counts - total - beyond
+        return LinearImage(np.array(slopes).reshape(k, -1), np.arange(k), left, precision)
 
 
 def _texture_in(
@@ -203,69 +245,6 @@ def _neighbours(scene: Scene, star: int, resolution: float) -> NDArray[np.int_]:
     away = (away + size / 2) % size - size / 2
     near = np.flatnonzero(np.hypot(*away.T) <= NEIGHBOURS * resolution)
     return near[near != star]
-
-
-def _source_error(
-    scene: Scene,
-    psfs: Sequence[MovablePsf | DetectorPsf],
-    amplitude: Array,
-    width: float,
-    window: Window,
-) -> SourceError:
-    """Return the error of the extended source in a window of the images, and its change there."""
-    q, window = scene.oversample, window.finer(scene.oversample)
-    # Twice the window, in which nothing wraps round; or the grid, on which it does.
-    height, breadth = (min(2 * k, n) for k, n in zip(window.shape, scene.grid, strict=True))
-    shape = height, breadth
-    around = Window(-(height // 2), -(breadth // 2), shape)
-    otfs = []
-    for psf, offset in zip(psfs, scene.observation.offsets, strict=True):
-        cut = _cut(psf.response(*(offset - np.round(offset))), around, scene.grid)
-        otfs.append(scipy.fft.rfft2(np.roll(cut, (around.y, around.x), axis=(0, 1))))
-    inside = (..., *map(slice, window.shape))
-
-    def forward(sky: Array) -> Array:
-        images = scipy.fft.irfft2(otfs * scipy.fft.rfft2(sky, shape), shape)
-        return np.asarray(sampled(images[inside], q))
-
-    def adjoint(images: Iterable[Array]) -> Array:
-        spectra = np.conj(otfs) * scipy.fft.rfft2(spread(np.array(images), q), shape)
-        return np.asarray(scipy.fft.irfft2(spectra.sum(axis=0), shape)[inside])
-
-    return SourceError(forward, adjoint, amplitude, width)
-
-
-def _linearise(
-    scene: Scene,
-    j: int,
-    sky: Array,
-    star_fluxes: Array,
-    held: NDArray[np.int_],
-    window: Window,
-    moves: bool,
-    beyond: Array,
-) -> LinearImage:
-    """Return image j near the estimate: its slopes in all fluxes, perhaps all x, and all y.
-
-    `beyond` is the light of the sky that is expected, less that of the estimate.
-    """
-    there = _in_image(scene, j, window)
-    counts, background, weights = _observed(scene, j, there)
-    model = background.copy()
-    first = there.y % scene.image_grid[0], there.x % scene.image_grid[1]
-    add_to_window(model, scene, sky, star_fluxes, j, first)
-    total = np.maximum(model, MIN_MODEL)
-    precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
-    slopes = [_cut(scene.star_cutout(j, s), there, scene.image_grid) for s in held]
-    if moves:
-        offset, psfs = scene.observation.offsets[j], scene.star_field.psfs[j]
-        moved = [psfs[s].with_slopes(*(scene.stars[s] + offset)) for s in held]
-        for axis in (1, 2):
-            for flux, each in zip(star_fluxes[held] / scene.unit, moved, strict=True):
-                slope = each._replace(values=flux * each.values[axis])
-                slopes.append(_cut(slope, there, scene.image_grid))
-    k, left = len(slopes), counts - total - beyond
-    return LinearImage(np.array(slopes).reshape(k, -1), np.arange(k), left, precision)
 
 
 def _cut(cutout: Cutout, window: Window, grid: tuple[int, int]) -> Array:
