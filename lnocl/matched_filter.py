@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -225,9 +226,7 @@ class _Search:
             for place in places
             for smooth in (False, True)
         ]
-        root = np.sqrt(self.weights[there]).ravel()
-        matrix = np.stack([*parts, np.ones(root.size)], axis=1) * root[:, np.newaxis]
-        point, broad = np.linalg.lstsq(matrix, self.left[there].ravel() * root, rcond=1e-8)[0][:2]
+        point, broad = self._solve(there, [*parts, np.ones(parts[0].size)])[:2]
         sharp, smooth_peak = point * parts[0].max(), max(broad * parts[1].max(), 0.0)
         return bool(sharp > least * (sharp + smooth_peak))
 
@@ -260,7 +259,6 @@ class _Search:
         """Return places and fluxes of stars at about these places, as they fit best together."""
         x, y = places[0]
         there = self.profile.window(x, y, self.left.shape)
-        root = np.sqrt(self.weights[there]).ravel()
         places = places.copy()
         fluxes: Array = np.zeros(len(places))
         for step in range(STEPS):
@@ -268,14 +266,20 @@ class _Search:
             values = [value.ravel() for value, _, _ in parts]
             slopes = [flux * each.ravel() for flux, part in zip(fluxes, parts, strict=True)
                       for each in part[1:]]  # fmt: skip
-            matrix = np.stack([*values, np.ones(root.size), *(slopes if step else [])], axis=1)
-            matrix *= root[:, np.newaxis]
-            found = np.linalg.lstsq(matrix, self.left[there].ravel() * root, rcond=1e-8)[0]
+            found = self._solve(
+                there, [*values, np.ones(values[0].size), *(slopes if step else [])]
+            )
             fluxes = found[: len(places)]
             moves = found[len(places) + 1 :].reshape(-1, 2)
             if step:
                 places += np.clip(moves, -FARTHEST, FARTHEST)
         return places, fluxes
+
+    def _solve(self, there: Window, parts: Sequence[Array]) -> Array:
+        """Return the amounts of some images that explain what is left in a window best."""
+        root = np.sqrt(self.weights[there]).ravel()
+        matrix = np.stack(parts, axis=1) * root[:, np.newaxis]
+        return np.asarray(np.linalg.lstsq(matrix, self.left[there].ravel() * root, rcond=1e-8)[0])
 
     def width(self, star: Array) -> float:
         """Return the width of a star's image without its neighbours; NaN where noise hides it.

@@ -34,7 +34,6 @@ MIN_IMPROVEMENT = 50
 # Good pixels that a Gaussian of four parameters and a constant are fitted to, at least.
 MIN_PIXELS = 9
 MAX_EVALUATIONS = 500
-FWHM = 2 * math.sqrt(2 * math.log(2))
 
 
 def brightest(pixels: Array, bad: Mask) -> Pixel:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError
 from lnocl.psf.centring import Mask
-from lnocl.scene.arrays import Array, numbers, unmasked, values_and_mask
+from lnocl.scene.arrays import Array, booleans, numbers, values_and_mask
 
 MIN_SIZE = 3
 # Values beyond this have no finite variance in float64.
@@ -26,11 +26,7 @@ def read_frame(frame: ArrayLike, mask: ArrayLike | None) -> tuple[Array, Mask]:
         raise InputError(f"frame has shape {pixels.shape}; give one image, (ny, nx)")
     bad = ~np.isfinite(pixels) | masked
     if mask is not None:
-        more = unmasked("mask", mask)
-        if more.dtype != np.bool_:
-            raise InputError(
-                f"`mask` is of type {more.dtype}; give booleans, True where a pixel is bad"
-            )
+        more = booleans("mask", mask)
         if more.shape != pixels.shape:
             raise InputError(f"`mask` has shape {more.shape}; the frame has {pixels.shape}")
         bad |= more
@@ -77,10 +73,3 @@ def wrapped_angles(rotate: Sequence[float]) -> list[float]:
     if not angles:
         raise InputError("`rotate` holds no angle; give one or more")
     return angles
-
-
-def refuse_unless_bool(**flags: object) -> None:
-    """Refuse flags that are neither True nor False."""
-    for name, flag in flags.items():
-        if not isinstance(flag, bool | np.bool_):
-            raise InputError(f"`{name}` is {flag!r}; give True or False")

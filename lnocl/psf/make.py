@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from lnocl.errors import InputError
 from lnocl.psf import checks, effective, resampling, steps
 from lnocl.psf.centring import Mask, Pixel, Point
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, flag
 
 
 @dataclass(frozen=True)
@@ -339,7 +339,7 @@ def make_psfs(
     saturated = ~bad & (given >= checks.saturation_level(saturation))
     unusable = bad | saturated
     side, angles = checks.whole_size(size), checks.wrapped_angles(rotate)
-    checks.refuse_unless_bool(recentre=recentre, clip_negative=clip_negative)
+    recentre, clip_negative = flag("recentre", recentre), flag("clip_negative", clip_negative)
     if unusable.all():
         raise InputError("all pixels of the frame are bad; give a frame that shows a star")
     # A repaired pixel takes nothing from its value, however far beyond the level that is.

@@ -13,10 +13,11 @@ from scipy.optimize import least_squares
 
 from lnocl.errors import InputError, counted, warn
 from lnocl.psf import resampling
-from lnocl.psf.centring import FWHM, SEARCH, Mask, Pixel, Point, brightest, fit_gaussian
+from lnocl.psf.centring import SEARCH, Mask, Pixel, Point, brightest, fit_gaussian
 from lnocl.psf.checks import MIN_SIZE, one_number
 from lnocl.psf.repair import WINDOW, repair
 from lnocl.psf.wings import FROM, distance, fit_sky
+from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array, numbers
 
 # Pixels around the crop while it is shifted and rotated: both wrap round its edges.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError, note, warn
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, flag
 from lnocl.scene.containers import counts
 from lnocl.scene.observation import Observation, numbers
 from lnocl.scene.penalty import Penalty, recommend_smoothing
@@ -195,9 +195,8 @@ def check_types(callback: object, **flags: object) -> None:
     """
     if not (callback is None or callable(callback)):
         raise InputError(f"callback must be a function or None; {callback!r} was given")
-    for name, flag in flags.items():
-        if not isinstance(flag, (bool, np.bool_)):
-            raise InputError(f"`{name}` must be True or False; {flag!r} was given")
+    for name, value in flags.items():
+        flag(name, value)
 
 
 def read_start(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from lnocl.scene.arrays import Array
 # What is measured: light, in electrons, or lengths, in pixels.
 FLUX, LENGTH = "flux", "length"
 # A full width at half maximum in standard deviations, of a Gaussian.
-FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
+FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
 
 class Label(NamedTuple):

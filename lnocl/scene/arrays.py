@@ -58,3 +58,20 @@ def numbers(name: str, values: ArrayLike, copy: bool = True) -> Array:
     if array.dtype.kind not in "biuf":
         raise InputError(f"`{name}` holds {array.dtype}; give real numbers")
     return array.astype(np.float64, copy=copy)
+
+
+def booleans(name: str, values: ArrayLike) -> NDArray[np.bool_]:
+    """Return a mask, none of it masked itself."""
+    given = unmasked(name, values)
+    if given.dtype != np.bool_:
+        raise InputError(
+            f"`{name}` is of type {given.dtype}; give booleans, True where a pixel is bad"
+        )
+    return given
+
+
+def flag(name: str, value: object) -> bool:
+    """Return True or False; refuse anything else."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputError(f"`{name}` must be True or False; {value!r} was given")
+    return bool(value)

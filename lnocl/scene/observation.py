@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl.errors import InputError, counted, note, warn
 from lnocl.notebook import html_card
 from lnocl.scene import containers
-from lnocl.scene.arrays import Array, numbers, refuse_masked, unmasked, values_and_mask
+from lnocl.scene.arrays import Array, booleans, flag, numbers, refuse_masked, values_and_mask
 from lnocl.scene.cores import centre, off_centre, peak
 from lnocl.scene.psf_errors import check_modes, check_pixels
 from lnocl.scene.psf_field import PsfField, read_fields
@@ -210,7 +211,7 @@ class Observation:
         psf_scatter: ArrayLike | None = None,
     ) -> None:
         self.oversample = _check_oversample(oversample)
-        self.effective_psfs = _check_effective(effective_psfs)
+        self.effective_psfs = flag("effective_psfs", effective_psfs)
         has_exposure = exposure is not None
         counts, are_rates = containers.counts("images", images, has_exposure)
         given, masked = values_and_mask("images", counts)
@@ -393,6 +394,12 @@ class Observation:
                     "replace those that belong together at once"
                 )
 
+    def shows(self, positions: Array) -> NDArray[np.bool_]:
+        """Return which positions, shape (n, 2), lie within any image, its offset added."""
+        places = positions[:, None] + self.offsets
+        size = np.array(self.shape[::-1])
+        return np.asarray(np.any(np.all((places >= -0.5) & (places < size - 0.5), axis=2), axis=1))
+
     def window(
         self, rows: range, columns: range, middle: tuple[float, float] | None = None
     ) -> Observation:
@@ -452,7 +459,7 @@ class Observation:
 
     def _apply_mask(self, mask: ArrayLike | None) -> None:
         if mask is not None:
-            given = _booleans(mask)
+            given = booleans("mask", mask)
             if given.shape not in (self.images.shape, self.shape):
                 raise InputError(
                     f"`mask` has shape {given.shape}; the images have {self.images.shape}"
@@ -574,32 +581,17 @@ def _check_oversample(oversample: object) -> int:
     raise InputError(f"`oversample` must be 1, 2 or 4; {oversample} was given")
 
 
-def _check_effective(effective_psfs: object) -> bool:
-    if isinstance(effective_psfs, (bool, np.bool_)):
-        return bool(effective_psfs)
-    raise InputError(f"`effective_psfs` must be True or False; {effective_psfs!r} was given")
-
-
 def _read(name: str, values: Any) -> Any:
     """Return the value of an attribute as it is held, in a read-only array that is no copy."""
     if name in ("oversample", "effective_psfs"):
-        return (_check_oversample if name == "oversample" else _check_effective)(values)
+        return _check_oversample(values) if name == "oversample" else flag(name, values)
     if name == "psf_fields":
         return tuple(values)
     if values is None and name in (*OF_PSFS, "psf_modes"):
         return np.zeros(0)
-    array = (_booleans(values) if name == "mask" else numbers(name, values, copy=False)).view()
+    array = (booleans if name == "mask" else partial(numbers, copy=False))(name, values).view()
     array.flags.writeable = False
     return array
-
-
-def _booleans(mask: ArrayLike) -> NDArray[np.bool_]:
-    given = unmasked("mask", mask)
-    if given.dtype != np.bool_:
-        raise InputError(
-            f"`mask` is of type {given.dtype}; give booleans, True where a pixel is bad"
-        )
-    return given
 
 
 def _range(values: Array) -> str:

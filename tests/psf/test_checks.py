@@ -63,8 +63,8 @@ REFUSED = {
     "saturation must be positive; -1 was given": {"saturation": -1},
     "saturation must be positive; 0 was given": {"saturation": 0},
     "rotate is inf; give one finite number": {"rotate": math.inf},
-    "recentre is 'no'; give True or False": {"recentre": "no"},
-    "clip_negative is 1; give True or False": {"clip_negative": 1},
+    "recentre must be True or False; 'no' was given": {"recentre": "no"},
+    "clip_negative must be True or False; 1 was given": {"clip_negative": 1},
     "the star at x = 30, y = 30 has too few good pixels among the 11 x 11 around it; take a frame "
     "with a shorter exposure": {"frame": UNREPAIRABLE},
 }  # fmt: skip
