@@ -34,7 +34,7 @@ from lnocl.runs.options import (
     warn_of_rounding,
 )
 from lnocl.runs.outcome import Mended, Outcome
-from lnocl.runs.progress import Bar, Progress
+from lnocl.runs.progress import Progress
 from lnocl.runs.run import Run, most_bytes
 from lnocl.runs.start import Setup, make_start
 from lnocl.runs.stopping import Rule, make_rule
@@ -409,7 +409,7 @@ def reconstruct(
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes
         largest = partial(measure, start, int(n_iter))
         checkpointer = checkpoints(largest)
-        with Bar(int(n_iter), bool(progress)) as bar:
+        with Progress(int(n_iter), "it", bool(progress), "iterations") as bar:
             if stop == "held-out":
                 held_out = HeldOutCounts(start, penalties, int(n_iter))
                 return _choose(held_out, callback, bar, checkpointer)
@@ -419,11 +419,11 @@ def reconstruct(
 
 
 def _choose(
-    held_out: HeldOutCounts, callback: Callback | None, bar: Bar, checkpointer: Checkpointer
+    held_out: HeldOutCounts, callback: Callback | None, bar: Progress, checkpointer: Checkpointer
 ) -> Outcome:
     """Have held-out counts choose, from their checkpoint where there is one."""
     checkpointer.restore_held_out(held_out)
-    bar.expect(None)
+    bar.total = None
 
     def look(iteration: int, halves: Halves) -> bool:
         bar.show(iteration, lambda: f"objective {halves.objective():.6g}")
@@ -438,7 +438,7 @@ def _complete(
     run: Run,
     rule: Rule,
     callback: Callback | None,
-    bar: Bar,
+    bar: Progress,
     checkpointer: Checkpointer,
 ) -> str:
     """Take a run from its checkpoint, if any, to its end; return why it ended."""
@@ -467,7 +467,7 @@ def _iterate(
     run: Run,
     rule: Rule,
     callback: Callback | None,
-    bar: Bar,
+    bar: Progress,
     save: Callable[[str], None],
 ) -> str:
     """Iterate to the end, saving checkpoints; return why it ended."""

@@ -373,9 +373,7 @@ def _cut(observation: Observation, positions: Array, spans: tuple[_Span, _Span])
     moved = positions - (columns.start, rows.start)
     y, x = ((each.core.start + each.core.stop - 1) / 2.0 - each.window.start for each in spans)
     part = observation.window(rows, columns, (x, y))
-    ny, nx = part.shape
-    x, y = (moved[:, None] + part.offsets).transpose(2, 0, 1)
-    is_seen = ((x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)).any(axis=1)
+    is_seen = part.shows(moved)
     is_own = _are_own(positions, spans) & is_seen
     own = np.flatnonzero(is_own[is_seen])
     return _Tile(spans, part, moved[is_seen], own, np.flatnonzero(is_own))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -43,15 +44,12 @@ def _all_roots(program: Program) -> dict[str, NDArray[np.float64]]:
 
     Those of images are left out where their grid is the sky's.
     """
-    (ny, nx), (image_ny, image_nx) = program.grid, program.image_grid
+    lengths = (*program.grid[::-1], *program.image_grid[::-1])
     tables = {
-        "row_roots": roots(nx, *program.row_radices),
-        "column_roots": roots(ny, *program.column_radices),
+        f"{name}_roots": roots(n, *radices)
+        for (name, radices), n in zip(program.radices.items(), lengths, strict=True)
     }
-    if program.oversample > 1:
-        tables["image_row_roots"] = roots(image_nx, *program.image_row_radices)
-        tables["image_column_roots"] = roots(image_ny, *program.image_column_radices)
-    return tables
+    return tables if program.oversample > 1 else dict(islice(tables.items(), 2))
 
 
 class Launch:

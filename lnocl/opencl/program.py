@@ -81,8 +81,8 @@ class Program:
         The names of each kernel's arguments, in the order of its declaration.
     image_grid : tuple of int
         Shape of the images' grid.
-    row_radices, column_radices, image_row_radices, image_column_radices : tuple of int
-        As `radices`.
+    radices : dict of str to tuple of int
+        Those of each transform: "row", "column", "image_row" and "image_column".
     rows : int
         Rows that a block of spectra takes in memory.
     max_groups : int
@@ -124,26 +124,20 @@ class Program:
         self.image_grid = grid[0] // oversample, grid[1] // oversample
         self.rows = grid[0] + self.tuning.padding
         self.max_groups = device.max_compute_units if self.tuning.scratch_is_global else 0
-        self.row_radices = radices(grid[1])
-        self.column_radices = radices(grid[0])
-        self.image_row_radices = radices(self.image_grid[1])
-        self.image_column_radices = radices(self.image_grid[0])
+        lengths = {"row": grid[1], "column": grid[0]}
+        lengths |= {"image_row": self.image_grid[1], "image_column": self.image_grid[0]}
+        self.radices = {name: radices(n) for name, n in lengths.items()}
         constants = {
             "REAL": "double" if dtype == np.float64 else "float",
             "BITS": "long" if dtype == np.float64 else "int",
             "LANES": self.tuning.lanes,
             "BLOCK": self.tuning.block,
             "GROUP": self.tuning.group,
-            "ROW_ODD": self.row_radices[0],
-            "ROW_OUTER": self.row_radices[1],
-            "ROW_LAST": self.row_radices[2],
-            "COLUMN_ODD": self.column_radices[0],
-            "COLUMN_OUTER": self.column_radices[1],
-            "COLUMN_LAST": self.column_radices[2],
-            "IMAGE_ROW_OUTER": self.image_row_radices[1],
-            "IMAGE_ROW_LAST": self.image_row_radices[2],
-            "IMAGE_COLUMN_OUTER": self.image_column_radices[1],
-            "IMAGE_COLUMN_LAST": self.image_column_radices[2],
+            **{
+                f"{name.upper()}_{part}": value
+                for name, each in self.radices.items()
+                for part, value in zip(("ODD", "OUTER", "LAST"), each, strict=True)
+            },
             "CHUNK": self.tuning.chunk,
             "SCRATCH_IS_GLOBAL": int(self.tuning.scratch_is_global),
             "HAS_BUILTIN_PREFETCH": int(_has_builtin_prefetch(device)),

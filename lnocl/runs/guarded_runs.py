@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import KDTree
 
 from lnocl.errors import DivergedError
 from lnocl.process import ignored_notes, ignored_warnings
@@ -184,11 +185,9 @@ class GuardedRuns:
 
     def _inside(self, stars: Array) -> Array:
         """Return stars, those at an edge that have moved out of all images."""
-        size = np.array(self.observation.shape[::-1])
-        places = stars[:, None] + self.observation.offsets
-        are_within = np.all((places >= -0.5) & (places < size - 0.5), axis=2)
-        are_inside = np.any(are_within, axis=1)
-        return np.where(are_inside[:, None], stars, stars.clip(0, size - 1))
+        last = np.array(self.observation.shape[::-1]) - 1
+        are_inside = self.observation.shows(stars)
+        return np.where(are_inside[:, None], stars, stars.clip(0, last))
 
     def cut(self, psfs: Array) -> Array:
         """Return PSFs as far as the window may show them."""
@@ -215,7 +214,7 @@ def find_window(stars: Array, observation: Observation) -> tuple[Observation, Ar
     last = np.array(observation.shape[::-1]) - size
     middle = (stars.min(axis=0) + stars.max(axis=0)) / 2.0
     firsts = np.clip(np.round(np.vstack([middle, stars])) - size // 2, 0, last).astype(int)
-    best = int(np.argmax(_count_in_windows(stars, firsts, size, observation.shape)))
+    best = int(np.argmax(_count_in_windows(stars, firsts, observation.shape)))
     low = firsts[best] - 0.5
     held = np.all((stars >= low) & (stars < low + size), axis=1)
     x, y = (range(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
@@ -223,17 +222,17 @@ def find_window(stars: Array, observation: Observation) -> tuple[Observation, Ar
 
 
 def _count_in_windows(
-    stars: Array, firsts: NDArray[np.int_], size: NDArray[np.int_], shape: tuple[int, int]
+    stars: Array, firsts: NDArray[np.int_], shape: tuple[int, int]
 ) -> NDArray[np.int_]:
-    """Return how many stars lie in each window of this size, from sums over all pixels before."""
-    x, y = np.floor(stars + 0.5).astype(int).T
-    inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
-    before = np.zeros((shape[0] + 1, shape[1] + 1), int)
-    np.add.at(before, (y[inside] + 1, x[inside] + 1), 1)
-    before = before.cumsum(axis=0).cumsum(axis=1)
-    (left, top), (right, bottom) = firsts.T, (firsts + size).T
-    counts = before[bottom, right] - before[top, right] - before[bottom, left] + before[top, left]
-    return np.asarray(counts)
+    """Return how many stars lie in pixels of each window, which is as wide as a narrow image."""
+    pixels = np.floor(stars + 0.5)
+    inside = pixels[np.all((pixels >= 0) & (pixels < shape[::-1]), axis=1)]
+    if not len(inside):
+        return np.zeros(len(firsts), int)
+    half = (WINDOW - 1) / 2.0
+    return np.asarray(
+        KDTree(inside).query_ball_point(firsts + half, half, p=np.inf, return_length=True)
+    )
 
 
 def estimate_scatter(psfs: Array, in_rings: Array, oversample: int) -> Array:

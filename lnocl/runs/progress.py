@@ -39,15 +39,14 @@ class Progress:
         Steps done.
     total : int or None
         As given; it may be changed.
-    is_lines : bool
-        Whether it is shown in the log.
     """
 
     def __init__(
         self, total: int | None, unit: str, is_shown: bool, name: str = "", stays: bool = True
     ) -> None:
         self.n, self.total, self._unit, self._name = 0, total, unit, name
-        self._bar, self.is_lines, self._start = None, False, time.monotonic()
+        self._bar, self._is_lines, self._start = None, False, time.monotonic()
+        self._shown = self._start
         self._is_ended = threading.Event()
         if not (is_shown and sys.stderr):
             return
@@ -58,9 +57,9 @@ class Progress:
         bar = tqdm(
             total=total, unit=unit, desc=name or None, disable=None, leave=stays, bar_format=clock
         )
-        self.is_lines = bool(bar.disable)
+        self._is_lines = bool(bar.disable)
         self._bar = None if bar.disable else bar
-        if self.is_lines or sys.stderr.isatty():  # a notebook is not drawn by other threads
+        if self._is_lines or sys.stderr.isatty():  # a notebook is not drawn by other threads
             threading.Thread(target=self._go_on, daemon=True).start()
 
     def __enter__(self) -> Progress:
@@ -68,11 +67,6 @@ class Progress:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-    @property
-    def is_bar(self) -> bool:
-        """Whether it is shown as a bar."""
-        return self._bar is not None
 
     def update(self, n: int = 1, words: str = "") -> None:
         """Count steps that are done, and show a few words beside the bar."""
@@ -83,6 +77,16 @@ class Progress:
                 self._bar.set_postfix_str(words, refresh=False)
             self._bar.update(n)
 
+    def show(self, n: int, quantity: Callable[[], str], last: bool = False) -> None:
+        """Show so many steps and a quantity, where an update is due or this is the last.
+
+        Each tenth of a second the quantity is asked for, which may wait for the device.
+        """
+        is_due = last or time.monotonic() - self._shown > PROGRESS_INTERVAL
+        if self._is_lines or (self._bar is not None and is_due):
+            self.update(n - self.n, "" if self._bar is None else quantity())
+            self._shown = time.monotonic()
+
     def close(self) -> None:
         """End it."""
         self._is_ended.set()
@@ -90,7 +94,7 @@ class Progress:
             self._bar.close()
 
     def _go_on(self) -> None:
-        while not self._is_ended.wait(LINE_INTERVAL if self.is_lines else CLOCK_INTERVAL):
+        while not self._is_ended.wait(LINE_INTERVAL if self._is_lines else CLOCK_INTERVAL):
             if self._bar is not None:
                 self._bar.refresh()
             else:
@@ -102,29 +106,3 @@ class Progress:
         unit = "iteration" if self._unit == "it" else self._unit
         steps = f"{unit} {self.n}{of}, " if self.n or of else ""
         return f"{self._name or 'running'}: {steps}{minutes:.0f} min"
-
-
-class Bar:
-    """The progress of iterations, which reads a quantity at most every tenth of a second."""
-
-    def __init__(self, n_iter: int, is_shown: bool) -> None:
-        self._progress = Progress(n_iter, "it", is_shown, "iterations")
-        self._shown = time.monotonic()
-
-    def __enter__(self) -> Bar:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._progress.close()
-
-    def expect(self, n_iter: int | None) -> None:
-        """Change the number of iterations, which may be unknown."""
-        self._progress.total = n_iter
-
-    def show(self, iteration: int, quantity: Callable[[], str], last: bool = False) -> None:
-        """Show the iteration and a quantity, where an update is due or this is the last."""
-        is_due = last or time.monotonic() - self._shown > PROGRESS_INTERVAL
-        if self._progress.is_lines or (self._progress.is_bar and is_due):
-            words = quantity() if self._progress.is_bar else ""
-            self._progress.update(iteration - self._progress.n, words)
-            self._shown = time.monotonic()

@@ -356,14 +356,12 @@ def check_positions(stars: Any, observation: Observation) -> Array:
     if positions.ndim != 2 or positions.shape[1] != 2:
         raise InputError(f"stars has shape {positions.shape}; give pairs (x, y)")
     ny, nx = observation.shape
-    for position in positions:
-        x, y = (position + observation.offsets).T
-        if not ((x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)).any():
-            raise InputError(
-                f"the star at ({position[0]:g}, {position[1]:g}) lies outside the images: x must "
-                f"be in [0, {nx - 1}] and y in [0, {ny - 1}]"
-                + (" of one of them, its offset added" if observation.offsets.any() else "")
-            )
+    for x, y in positions[~observation.shows(positions)]:
+        raise InputError(
+            f"the star at ({x:g}, {y:g}) lies outside the images: x must be in [0, {nx - 1}] and y "
+            f"in [0, {ny - 1}]"
+            + (" of one of them, its offset added" if observation.offsets.any() else "")
+        )
     _refuse_twins(positions)
     return positions
 

@@ -18,7 +18,7 @@ import lnocl
 from lnocl.commands import cli
 from lnocl.opencl import device
 from lnocl.opencl.tuning import candidates, chosen, describe_tuning
-from lnocl.runs.progress import Bar
+from lnocl.runs.progress import Progress
 from lnocl.studies import tuning
 
 pytestmark = pytest.mark.usefixtures("command_folder")
@@ -97,7 +97,7 @@ class TestProcess:
 
     def test_a_library_s_bar_where_stderr_is_closed(self, monkeypatch):
         monkeypatch.setattr(sys, "stderr", None)
-        with Bar(1, True) as bar:
+        with Progress(1, "it", True) as bar:
             bar.show(1, lambda: "done", last=True)
 
     @pytest.mark.parametrize(
