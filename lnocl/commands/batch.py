@@ -25,6 +25,7 @@ from lnocl.commands.signals import Terminated
 from lnocl.commands.summary import FITS
 from lnocl.commands.targets import Target, read_targets
 from lnocl.errors import FileError, LnoclError, counted
+from lnocl.residuals import MUCH_HALO
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -104,6 +105,7 @@ class Record:
     stopped: str = ""
     star_flux: float = math.nan
     star_flux_error: float = math.nan
+    star_halo: float = math.nan
     extended_flux: float = math.nan
     extended_flux_error: float = math.nan
     unit: str = ""
@@ -229,7 +231,9 @@ def _found(said: str, output: str, status: int) -> dict[str, Any]:
     with fits.open(output) as hdus:
         header, stars = hdus[0].header, hdus["STARS"].data
         of_star = {
-            f"star_{name}": float(stars[name][0]) for name in ("flux", "flux_error") if len(stars)
+            f"star_{name}": float(stars[name][0])
+            for name in ("flux", "flux_error", "halo")
+            if len(stars)
         }
     return {
         "n_iter": header["NITER"],
@@ -370,10 +374,16 @@ def _said(summary: Table, n_old: int, folder: Folder) -> list[str]:
         f"in {n_faults} of the {len(verdicts)} that are done the model has faults, which the "
         "column verdict says"
     ]
+    n_lit = int((summary["star_halo"] > MUCH_HALO).sum())
+    halos = [
+        f"in {n_lit} light lies all round the star, star_halo times its flux, and its error does "
+        "not hold"
+    ]
     return [
         *_rows(summary),
         f"{counted(len(summary), 'target')}: {counts}{before}",
         *(faults if n_faults else []),
+        *(halos if n_lit else []),
         f"written to {os.path.join(folder.path, SUMMARY)}",
     ]
 
@@ -383,12 +393,13 @@ def _rows(summary: Table) -> list[str]:
     done = summary[summary["status"] == DONE]
     if not done:
         return []
-    shown = done["name", "star_flux", "extended_flux", "unit"]
-    for name, after in (("star_flux", 2), ("extended_flux", 4)):
+    shown = done["name", "star_flux", "star_halo", "extended_flux", "unit"]
+    for name, after in (("star_flux", 2), ("extended_flux", 5)):
         shown[name].info.format = ".6g"
         errors = done[f"{name}_error"]
         errors.info.format = ".2g"
         shown.add_column(errors, after)
+    shown["star_halo"].info.format = ".2f"
     shown["model"] = [
         "fits" if verdict.startswith(FITS) else "has faults" for verdict in done["verdict"]
     ]

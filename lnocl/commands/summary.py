@@ -167,9 +167,8 @@ def verdict_on(
         result.star_positions, given_stars, result.star_fluxes, at_stars, strict=True
     ):
         if not flux > 0:
-            dark.append(
-                f"{_at(place)}{_elsewhere(result.extended, place, frames.observation.oversample)}"
-            )
+            where = _elsewhere(result.extended, place, frames.observation.oversample)
+            dark.append(f"{_at(given)}{where}")
             continue
         if np.hypot(*(place - np.array(given))) > AT_LIMIT * MAX_SHIFT:
             lost.append(f"{_at(given)} to {_at(place)}")
@@ -187,11 +186,11 @@ def verdict_on(
         )
     if unfitted:
         by_default = [] if isinstance(arguments.smoothing, float) else ["pixels"]
+        remedy = "leave --refine-psfs out" if by_default else "try --refine-psfs jitter pixels"
         may_free = "pixels" not in (arguments.refine_psfs or by_default)
         verdict.append(
             f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
-            f"{' '.join(unfitted[:3])}: give a better PSF"
-            + (", or try --refine-psfs jitter pixels" if may_free else "")
+            f"{' '.join(unfitted[:3])}: give a better PSF" + (f", or {remedy}" if may_free else "")
         )
     elif overall.is_misfit and not (dark or lost):
         verdict.append("the model does not fit: see to background, noise and gain")

@@ -95,7 +95,7 @@ class PsfReport(NamedTuple):
             f"centre: its core lies ({dx:z.2f}, {dy:z.2f}) pixels from ({x}, {y})",
             f"FWHM: {self.fwhm:.2f} pixels",
             f"negative pixels: {_percent(self.negative)} of its light",
-            f"noise: {_percent(self.noise)} of its light, were it everywhere as in the wings",
+            f"noise: {_percent(self.noise)} of its light, if all pixels have that of the wings",
             f"border: {_percent(self.border)} of its light, were all of it a background{fall}",
         ]
 

@@ -117,18 +117,21 @@ def mend(
         state = _move(runs, state)
     if state.misfit.is_doubtful and names and (observation.psfs < 0).any():
         state = _clean(runs, state)
-    families = PsfFamilies(
-        [name for name in names if name != "pixels"], observation.replace(psfs=state.psfs)
-    )
+    of_parameters = [name for name in names if name != "pixels"]
+    families = PsfFamilies(of_parameters, observation.replace(psfs=state.psfs))
     values, tried, left = np.zeros((observation.n_images, len(families.prior))), state, None
+    done = ["the noise of wings taken"] if state.psfs is not observation.psfs else []
     if state.misfit.is_doubtful and families.parameters:
         tried, values = _fit(runs, families, state, moves is not False)
-        state = tried if state.is_mended_by(tried) else state
+        if state.is_mended_by(tried):
+            state = tried
+            done.append(f"{' and '.join(of_parameters)} fitted")
     if state.misfit.is_doubtful and _shows_pixels(state.misfit) and "pixels" in names:
         loose = _loosen(runs, min(state, tried, key=lambda each: each.misfit.kappa))
         tried = _free_pixels(runs, observation.psf_scatter, loose, moves is not False)
         if _is_trusted(tried, loose, state.misfit.kappa):
             left, state = state.misfit, tried
+            done.append("pixels fitted")
     is_accepted = state.psfs is not observation.psfs
     if is_accepted:
         observation = observation.replace(psfs=state.psfs)
@@ -140,7 +143,7 @@ def mend(
     if not (is_asked or len(known) or is_told):
         changed = replace(setup, observation=observation, refine_positions=state.moves)
         return Mended(changed, None, near_stars, True)
-    _tell(given, state, tried, is_accepted)
+    _tell(given, state, tried, done)
     refinement = PsfRefinement(
         tuple(families.parameters),
         values / families.units,
@@ -285,13 +288,13 @@ def _follow(
     return parameters
 
 
-def _tell(given: _State, state: _State, tried: _State, is_accepted: bool) -> None:
+def _tell(given: _State, state: _State, tried: _State, done: Sequence[str]) -> None:
     """Say in a line what was done."""
     before, after, found = (each.misfit.reduced for each in (given, state, tried))
-    if is_accepted:
+    if done:
         note(
-            f"PSFs refined: their misfit is {after:.3g} instead of {before:.3g}, "
-            "where noise gives 1"
+            f"PSFs refined, {', '.join(done)}: their misfit is {after:.3g} instead of "
+            f"{before:.3g}, where noise gives 1"
         )
     elif state.moves and not given.moves:
         note(
@@ -301,7 +304,7 @@ def _tell(given: _State, state: _State, tried: _State, is_accepted: bool) -> Non
     elif tried is not given:
         note(
             f"PSFs left as given: their misfit is {before:.3g}, refined {found:.3g}, "
-            "where noise gives 1"
+            "where noise gives 1; too much of the error is left, or a star loses its light"
         )
     else:
         note(f"the misfit of the PSFs is {before:.3g}, where noise gives 1")

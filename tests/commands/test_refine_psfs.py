@@ -48,7 +48,9 @@ def run(*options, output="out.fits"):
 
 def test_the_file_has_the_psfs_and_their_parameters(capsys):
     assert run("--refine-psfs", "shift", "jitter") == 0
-    assert "lnocl: PSFs refined: their misfit is " in capsys.readouterr().err
+    assert (
+        "lnocl: PSFs refined, shift and jitter fitted: their misfit is " in capsys.readouterr().err
+    )
     observation = lnocl.Observation(fits.getdata("image.fits"), PSF, background=40.0)
     options = {"engine": "numpy", "n_iter": 20, "stop": None, "refine_psfs": ["shift", "jitter"]}
     result = lnocl.deconvolve(observation, [STAR], **options)
@@ -77,7 +79,7 @@ def test_the_file_has_the_psfs_and_their_parameters(capsys):
 
 def test_by_default_what_does_not_fit_is_refined(capsys):
     assert run() == 0
-    assert "lnocl: PSFs refined: their misfit is " in capsys.readouterr().err
+    assert "lnocl: PSFs refined, jitter fitted: their misfit is " in capsys.readouterr().err
     assert fits.getheader("out.fits")["PSFUSED"] is True
 
 
