@@ -368,7 +368,7 @@ def _quietly() -> np.errstate:
 def judge_psfs(
     setup: Setup, families: Sequence[str], moves: bool | str, is_asked: bool, progress: bool
 ) -> Mended:
-    """Return what `lnocl.runs.psf_refinement.mend` does, or nothing where that is not finite."""
+    """Return the result of `lnocl.runs.psf_refinement.mend`, or `setup` where it is not finite."""
     from lnocl.runs.psf_refinement import mend  # which loads scipy
 
     judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)

@@ -205,7 +205,7 @@ def _require_photutils() -> None:
 
 
 def _above_sky(pixels: Array, bad: NDArray[np.bool_], width: float) -> tuple[Array, Array]:
-    """Return what is above the sky, 0 where it is not known; and its noise, infinite there.
+    """Return the light above the sky and its noise; 0 and infinite where the sky is not known.
 
     The noise is that of what a Gaussian leaves of white noise. Of whole counts it is that of
     Poisson counts at least, since a median of few counts is 0.

@@ -747,7 +747,7 @@ def saved_parts(result: Result) -> dict[str, Any]:
 
 
 def view_of(result: Result) -> ResultView:
-    """Return what the picture of a result shows."""
+    """Return the arrays and texts of the picture of a result."""
     observation = result._observation
     models = result.models()
     return ResultView(

@@ -173,7 +173,7 @@ class _Found(NamedTuple):
     history: NDArray[np.void]
     stop_reason: str
     device: str
-    said: list[str]
+    messages: list[str]
 
 
 def deconvolve_tiles(
@@ -309,7 +309,7 @@ def deconvolve_tiles(
         for each, found in zip(observed, answers, strict=True):
             mosaic.add(each, found)
             bar.update()
-    _warn_of_tiles(mosaic.said)
+    _warn_of_tiles(mosaic.messages)
     return mosaic.result(penalty, curve, reason, n_iter if reason else None)
 
 
@@ -518,7 +518,7 @@ class _Mosaic:
         self._at_stars: list[StarResiduals | None] = [None] * n_stars
         self._tiles: list[tuple[Any, ...]] = []
         self._found: list[_Found] = []
-        self.said: list[str] = []
+        self.messages: list[str] = []
 
     def add(self, tile: _Tile, found: _Found) -> None:
         """Add what a tile has found."""
@@ -533,7 +533,7 @@ class _Mosaic:
             (x.core.start, y.core.start, len(x.core), len(y.core), len(found.history) - 1,
              found.history["objective"][-1])
         )  # fmt: skip
-        self.said += found.said
+        self.messages += found.messages
         self._stars[tile.numbers] = found.stars
         self._stars[tile.numbers, :2] += x.window.start, y.window.start
         for s, at_star in zip(tile.numbers, found.at_stars, strict=True):
@@ -588,8 +588,8 @@ class _Mosaic:
         return cast(list[StarResiduals], self._at_stars)
 
 
-def _warn_of_tiles(said: Sequence[str]) -> None:
-    for message in said[:MAX_WARNINGS]:
+def _warn_of_tiles(messages: Sequence[str]) -> None:
+    for message in messages[:MAX_WARNINGS]:
         warn(message)
-    if len(said) > MAX_WARNINGS:
-        warn(f"{counted(len(said) - MAX_WARNINGS, 'other warning')} of tiles")
+    if len(messages) > MAX_WARNINGS:
+        warn(f"{counted(len(messages) - MAX_WARNINGS, 'other warning')} of tiles")

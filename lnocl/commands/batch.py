@@ -149,7 +149,7 @@ class Folder:
         write_text(self.file(record.name, ".json"), text + "\n", overwrite=True)
 
     def state(self, target: Target, start: str) -> Record:
-        """Return what became of a target by the command of its row, given in a folder.
+        """Return the record of a target for the command of its row, given in a folder.
 
         That is its record; that it fails, where its outputs are of something else; or that it is
         waiting.
@@ -191,19 +191,19 @@ def _do(folder: Folder, start: str, target: Target) -> Record:
         folder=start,
     )
     folder.write(new)
-    output, said = folder.file(target.name, ".fits"), io.StringIO()
+    output, log = folder.file(target.name, ".fits"), io.StringIO()
     words = ["deconvolve", *target.words, "-o", output, "--overwrite"]
     begun = time.perf_counter()
     with (
         contextlib.chdir(start),
-        contextlib.redirect_stdout(said),
-        contextlib.redirect_stderr(said),
+        contextlib.redirect_stdout(log),
+        contextlib.redirect_stderr(log),
     ):
         try:
             status = running.run({"deconvolve": deconvolve.COMMAND}, words)
         except Exception as error:  # which stops no other target
             status = 1
-            said.write(f"{traceback.format_exc()}lnocl: error: {type(error).__name__}: {error}\n")
+            log.write(f"{traceback.format_exc()}lnocl: error: {type(error).__name__}: {error}\n")
     if status == running.INTERRUPTED:
         raise KeyboardInterrupt
     if status > 128:
@@ -212,16 +212,16 @@ def _do(folder: Folder, start: str, target: Target) -> Record:
         new,
         status=FAILED if status else DONE,
         seconds=round(time.perf_counter() - begun, 3),
-        **_found(said.getvalue(), output, status),
+        **_found(log.getvalue(), output, status),
     )
-    _write_log(folder, record, said.getvalue())
+    _write_log(folder, record, log.getvalue())
     folder.write(record)
     return record
 
 
-def _found(said: str, output: str, status: int) -> dict[str, Any]:
-    """Return what the record has of the outcome."""
-    lines = said.splitlines()
+def _found(log: str, output: str, status: int) -> dict[str, Any]:
+    """Return the fields of the record that the outcome gives."""
+    lines = log.splitlines()
     errors = [line.partition("error: ")[2] for line in lines if line.startswith("lnocl: error: ")]
     warnings = sum(line.startswith("lnocl: warning: ") for line in lines)
     if status:
@@ -249,12 +249,12 @@ def _found(said: str, output: str, status: int) -> dict[str, Any]:
     }
 
 
-def _write_log(folder: Folder, record: Record, said: str) -> None:
+def _write_log(folder: Folder, record: Record, log: str) -> None:
     from lnocl.io.atomic import write_text
 
     write_text(
         folder.file(record.name, ".log"),
-        f"$ cd {shlex.quote(record.folder)}; {record.command}\n{said}",
+        f"$ cd {shlex.quote(record.folder)}; {record.command}\n{log}",
         overwrite=True,
     )
 
@@ -298,7 +298,7 @@ def _run(arguments: argparse.Namespace) -> None:
         raise
     summary = _write_summary(folder, targets, start)
     if not arguments.quiet:
-        messages.say(_said(summary, n_old, folder))
+        messages.say(_summarise(summary, n_old, folder))
     if arguments.plot is not None:
         from lnocl.plotting.batch import draw_batch
 
@@ -359,8 +359,8 @@ def _write_summary(folder: Folder, targets: Sequence[Target], start: str) -> Tab
     return summary
 
 
-def _said(summary: Table, n_old: int, folder: Folder) -> list[str]:
-    """Return what to say of the targets."""
+def _summarise(summary: Table, n_old: int, folder: Folder) -> list[str]:
+    """Return the lines that sum up the targets."""
     statuses = summary["status"].tolist()
     counts = ", ".join(
         f"{statuses.count(each)} {each}"

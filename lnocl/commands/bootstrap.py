@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 # Seconds between two writings of the replicas so far.
 WRITE_EVERY = 10.0
-# Quantities of which the run says the errors, unless more regions were given.
-MAX_SAID = 12
+# Quantities whose errors are printed, unless more regions were given.
+MAX_LISTED = 12
 # Names of quantities of stars; others are of regions and profiles.
 _OF_STARS = re.compile(r"star \d+ (flux|x|y)")
 
@@ -78,7 +78,7 @@ def add_errors(
     finally:
         if latest:
             _write(path, latest[0], parts, frames)
-    return _said(found, parts, frames)
+    return _summarise(found, parts, frames)
 
 
 def check_earlier(path: str, seed: int, parts: Sequence[Part]) -> None:
@@ -170,14 +170,14 @@ def _table_of(regions: Sequence[Aperture], measured: QTable) -> QTable:
     return table
 
 
-def _said(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[str]:
+def _summarise(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[str]:
     """Return a line a quantity, first those of regions, which were asked for."""
     table = found.to_table(frames.electrons, frames.unit)
     table = table[[each.at is None for each in found.quantities]]  # profiles are to be drawn
     n_regions = len(_regions(parts))
-    table, n_said = table[np.roll(np.arange(len(table)), n_regions)], max(MAX_SAID, n_regions)
+    table, n_listed = table[np.roll(np.arange(len(table)), n_regions)], max(MAX_LISTED, n_regions)
     lines = [f"errors by {found.n} replicas, less their bias; in brackets 95 %:"]
-    for row in table[:n_said]:
+    for row in table[:n_listed]:
         note = f"; {row['note']}: do not trust its error" if row["note"] else ""
         if len(found.of_psfs):
             note += f"; noise {row['error_noise']:.2g}, PSF {row['error_psf']:.2g}"
@@ -185,6 +185,6 @@ def _said(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[str]:
             f"{row['name']}: {row['value'] - row['bias']:.6g} +- {row['error']:.2g} "
             f"{row['unit']} ({row['low95']:.6g} to {row['high95']:.6g}{note})"
         )
-    if len(table) > n_said:
-        lines.append(f"and {len(table) - n_said} more in the table ERRORS")
+    if len(table) > n_listed:
+        lines.append(f"and {len(table) - n_listed} more in the table ERRORS")
     return lines

@@ -87,7 +87,7 @@ def _shortness(arguments: argparse.Namespace, result: Result) -> list[str]:
 
 
 def _unnamed(result: Result, frames: Frames) -> list[str]:
-    """Return what to say of sources in the extended source that are as sharp as stars."""
+    """Return a line on sources in the extended source that are as sharp as stars."""
     observation = frames.observation
     background = float(_means(observation.background).sum()) / observation.oversample**2
     found = sharp_sources(result.extended, background, observation.oversample)
@@ -102,7 +102,7 @@ def _unnamed(result: Result, frames: Frames) -> list[str]:
 
 
 def _floor(result: Result, frames: Frames, unit: str) -> list[str]:
-    """Return what to say where the extended source is nowhere dark."""
+    """Return a line where the extended source is nowhere dark."""
     observation = frames.observation
     darkest = float(np.quantile(result.extended, DARK_SHARE))
     counts = darkest * observation.oversample**2 * _means(observation.exposure)

@@ -196,7 +196,7 @@ class ReferenceEngine:
         return fetched
 
     def state(self) -> State:
-        """Return what `restore` needs, as it is between iterations."""
+        """Return the arrays from which `restore` continues between iterations."""
         return {
             "extended": self._extended,
             "star_fluxes": self._star_fluxes,

@@ -172,7 +172,7 @@ class Contents(NamedTuple):
 
 
 def read_contents(path: str) -> Contents:
-    """Return what the file of an image holds; warnings are left to those who read its pixels.
+    """Return the contents of an image's file; reading its pixels shows the warnings.
 
     Raises
     ------

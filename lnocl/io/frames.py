@@ -35,7 +35,7 @@ SUBTRACTED = 0.01
 
 
 class Calibration(NamedTuple):
-    """The calibration of images in files; a word is a number, the name of a file, or as said.
+    """The calibration of images in files; a `Word` is a number, a file, or as listed.
 
     Attributes
     ----------
@@ -223,7 +223,7 @@ class _Reader:
         )
 
     def _psf_errors(self) -> dict[str, Any]:
-        """Return what is known of the ways in which PSFs may be wrong."""
+        """Return the ideal PSFs, pupils, modes and scatter that were given."""
         files: dict[str, list[str]] = {}
         for kind, path in map(parse_kind, self._calibration.psf_errors):
             files.setdefault(kind, []).append(path)

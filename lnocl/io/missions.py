@@ -68,7 +68,7 @@ def mask_word(contents: Contents) -> str:
 
 
 def _electrons(path: str, contents: Contents) -> dict[str, Any]:
-    """Return what makes electrons of the unit of the image."""
+    """Return the options that convert the unit of the image to electrons."""
     unit = contents.value("BUNIT")
     if unit.upper().startswith("COUNT") and contents.value("DETECTOR") not in PHOTON_COUNTING:
         raise InputError(

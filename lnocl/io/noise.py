@@ -1,4 +1,4 @@
-"""Maps of the noise of images, as telescopes write them."""
+"""Noise maps of images, in the forms that telescope pipelines write."""
 
 from __future__ import annotations
 
@@ -25,36 +25,40 @@ CUT_SHORT = 1 | 2 | 4
 
 
 class NoiseMap(NamedTuple):
-    """A map of the noise of images.
+    """The noise map of p images.
 
     Attributes
     ----------
     kind : str
-        Of `names.NOISE`.
+        The form in which it was given, a key of `names.NOISE`. The noise of kind `names.ERR`
+        includes that of the source's photons.
     variance : ndarray of float64, shape (p, ny, nx)
-        In units of the images squared; 0 where a pixel is bad.
+        Variance of each pixel, in units of the images squared; 0 where a pixel is bad.
     """
 
     kind: str
     variance: Array
 
     def read_noise(self, counts: Array, each: Array | float, mask: NDArray[np.bool_]) -> Array:
-        """Return the read noise that stands for all noise but that of counts, electrons.
+        """Return the read noise of each pixel, electrons (rms), shape (p, ny, nx); 0 where masked.
+
+        It holds all noise but the photon noise of `counts`, which is subtracted from a map of kind
+        `names.ERR`.
 
         Parameters
         ----------
         counts : ndarray of float64, shape (p, ny, nx)
-            Electrons.
+            The images, electrons.
         each : ndarray or float
-            Electrons in each unit of the images.
+            Electrons in one unit of the images; it broadcasts to (p, ny, nx).
         mask : ndarray of bool, shape (p, ny, nx)
-            Where it is not needed.
+            True where a pixel is bad.
 
         Raises
         ------
         InputError
-            A map whose noise is far more than the sky scatters; one with the source's noise that
-            has less of it than counts have.
+            The noise is more than `TOO_NOISY` times the scatter of an image's sky. A map of kind
+            `names.ERR` has less noise than the counts.
         """
         variance = np.where(mask, 0.0, each**2 * self.variance)
         self._refuse_other_kinds(counts, variance, mask)
@@ -63,7 +67,7 @@ class NoiseMap(NamedTuple):
         return without_source(variance, counts, mask, (f"`noise` {ERR}", "rms"))
 
     def _refuse_other_kinds(self, counts: Array, variance: Array, mask: NDArray[np.bool_]) -> None:
-        """Refuse a map of another kind than it is given as: its noise is not in the image."""
+        """Refuse a map far noisier than the sky of an image: its kind or unit is another."""
         for j, bad in enumerate(mask):
             if bad.all():
                 continue
@@ -83,24 +87,26 @@ def electrons_by_variance(
 ) -> float:
     """Return the electrons in a unit of an image, by the variance of their counts.
 
-    Counts n = e g of an image g have the variance g / e in its units: e is the difference of image
-    between the brightest hundredth of its pixels and the median one, over that of the variance. A
-    sky that was subtracted, and the variance of read noise and dark current, cancel. Pixels are
-    bright by their neighbours, whose noise is not theirs.
+    Poisson counts n = e g of an image g have the variance g / e in its units. So e is the rise of
+    the image over the rise of the variance. Each rise is the mean of the brightest hundredth of the
+    pixels minus the mean of the fainter half. A subtracted sky cancels, as do the variances of read
+    noise and dark current. Pixels are ranked by the sum of their eight neighbours, so that their
+    own noise does not rank them.
 
     Parameters
     ----------
     image, variance : ndarray of float64, shape (ny, nx)
-        In units of the image, and those squared; not finite or 0 where they are not known.
+        In units of the image, and those squared. Pixels that are not finite, or have no variance,
+        are left out.
     path : str
         Their file, for messages.
     flags : ndarray, shape (ny, nx), optional
-        Sums of flags; pixels with one of `CUT_SHORT` are left out.
+        Bits of data quality; pixels with one of `CUT_SHORT` are left out.
 
     Raises
     ------
     InputError
-        The variance does not grow with the image.
+        No pixel is known, or the variance does not grow with the image.
     """
     known = np.isfinite(image) & np.isfinite(variance) & (variance > 0)
     if flags is not None:
@@ -127,21 +133,22 @@ def electrons_by_variance(
 def read_noise_map(
     words: Sequence[str], maps: Maps, errors: Callable[[], Array]
 ) -> NoiseMap | None:
-    """Return the map of noise that is given, None where none is.
+    """Return the noise map that the user gave, as a variance; None for no words.
 
     Parameters
     ----------
     words : sequence of str
-        ``KIND=FILE`` with a kind of `names.NOISE`, or ``"err"``.
+        ``KIND=FILE`` for each map, all with the same key of `names.NOISE`. The single word
+        ``"err"`` stands for the extensions ERR of the images.
     maps : Maps
-        Their reader.
+        Reads these files.
     errors : callable
-        ``errors()`` returns the extensions ERR of the images, which ``"err"`` means.
+        ``errors()`` returns the extensions ERR; it is called for the word ``"err"`` alone.
 
     Raises
     ------
     FileError, InputError
-        As `Maps.read`; several kinds; negative values.
+        As `Maps.read`; several kinds were given, or a map has negative values.
     """
     if not words:
         return None

@@ -126,7 +126,7 @@ def _ambiguous(path: str, hdus: Sequence[Any], claims: Sequence[int]) -> InputEr
 
 
 def _word(hdus: Sequence[Any], claims: Sequence[int]) -> str:
-    """Return what names the first of these HDUs: its name, with its version, or its number."""
+    """Return the name of the first of these HDUs, with its version, or else its number."""
     names = [name_of(hdus[i]) for i in claims]
     versions = [
         f"{name},{hdus[i].header.get('EXTVER', 1)}" for name, i in zip(names, claims, strict=True)

@@ -110,7 +110,7 @@ def _explain(error: Exception, engine: OnDevice) -> str:
 
 
 def build_failure(name: str, error: Exception) -> DeviceError:
-    """Return the error that a compiler's failure makes, and save all that the compiler said."""
+    """Return the error that a compiler's failure makes, and save all messages of the compiler."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     first = next((line for line in lines if "error:" in line), lines[0] if lines else "no word")
     try:
@@ -119,9 +119,9 @@ def build_failure(name: str, error: Exception) -> DeviceError:
         ) as log:
             log.write(f"{name}\n{error}\n")
     except OSError as reason:
-        saved = f"all it said could not be saved: {reason}"
+        saved = f"its messages could not be saved: {reason}"
     else:
-        saved = f"all it said is in {log.name}"
+        saved = f"its messages are in {log.name}"
     return DeviceError(
         f"the kernels do not build on {name}: {first[:200]}; {saved}; "
         "update the driver, or take another `device`"

@@ -134,11 +134,11 @@ def describe_tuning(device: cl.Device, dtype: np.dtype, used: Tuning | None = No
     return f"{words}; lnocl devices --tune measures whether others are faster"
 
 
-_damaged: set[Path] = set()  # of which it was said once
+_damaged: set[Path] = set()  # of which was warned
 
 
 def _read() -> dict[str, object]:
-    """Return what was measured, by device and precision."""
+    """Return the tunings that were measured, by device and precision."""
     file = kernel_cache.store() / FILE
     with contextlib.suppress(OSError):
         state = file.stat()

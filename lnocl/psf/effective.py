@@ -258,7 +258,7 @@ class _Stars:
         return np.array([covered[self._window(s)] == core for s in range(len(self._places))])
 
     def _residual(self, psf: Array, own: Array | None = None) -> tuple[Array, Array]:
-        """Return what the model leaves of good pixels, and the fluxes that each is used for."""
+        """Return the residuals of good pixels, and the sum of the fluxes that each is used for."""
         left, overlap = self._light.copy(), np.zeros_like(self._light)
         movable = MovablePsf(psf, psf.shape)
         for s, c in enumerate(self._fluxes):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from astropy.stats import mad_std, sigma_clipped_stats
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import maximum_filter, shift
+from scipy.ndimage import label, maximum_filter, shift
 from scipy.optimize import least_squares
 
 from lnocl.errors import InputError, counted, warn
@@ -212,8 +212,9 @@ def find_neighbours(
     far = _distance(bad.shape, [nearest_pixel(centre) for centre in centres]) > half
     highest = (light == maximum_filter(light, 2 * math.ceil(width) + 1)) & ~bad
     brightest_given = max(centres, key=lambda centre: light[nearest_pixel(centre)])
-    stars, others = list[Point](), list[Point]()
-    for row, column in np.argwhere(highest & (light > SIGNIFICANT * noise)).tolist():
+    stars, others, n_others = list[Point](), list[Point](), 0
+    for plateau in _plateaus(highest & (light > SIGNIFICANT * noise)):
+        row, column = plateau[len(plateau) // 2]
         offsets = np.abs(np.array(centres) - (row, column))
         peaks = [light[nearest_pixel(centres[s])] for s in range(len(centres))]
         is_near = offsets.max(axis=1) < half + APART * width
@@ -227,14 +228,24 @@ def find_neighbours(
         if is_there and is_alike and is_new and not _touches(bad | far, place, width):
             stars.append(place)
         else:
-            others.append((row, column))
+            others += plateau
+            n_others += 1
     if not (stars or others):
         return [], far & False, []
     line = (
         f"neighbours: {counted(len(stars), 'star')} not given, taken too; "
-        f"{counted(len(others), 'other source')} masked"
+        f"{counted(n_others, 'other source')} masked"
     )
     return stars, far | (distance(bad.shape, others) < MASKED * width), [line]
+
+
+def _plateaus(highest: Mask) -> list[list[Pixel]]:
+    """Return the pixels of each maximum, several where it is flat, as of a saturated star."""
+    labels, n = label(highest, np.ones((3, 3)))
+    places = [list[Pixel]() for _ in range(n)]
+    for row, column in np.argwhere(highest).tolist():
+        places[labels[row, column] - 1].append((row, column))
+    return places
 
 
 def _fit_star(light: Array, star: Point, start: Pixel, width: float) -> tuple[Point, float]:

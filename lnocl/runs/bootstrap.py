@@ -318,7 +318,7 @@ def bootstrap(
 
 
 def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Bootstrap:
-    """Return what will be measured of a reconstruction, before its first replica."""
+    """Return the quantities of a reconstruction, measured on itself, without replicas."""
     width = resolution(outcome.scene)
     quantities = _quantities(outcome, parts, width)
     stated = np.nan_to_num(outcome.star_errors()[0])
@@ -395,7 +395,7 @@ def _measure(sky: Sky, parts: Sequence[Part], moves: bool) -> Array:
 
 
 def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[Quantity, ...]:
-    """Return what is measured, in the order of `_measure`."""
+    """Return the quantities in the order of `_measure`."""
     scene = outcome.scene
     n, (ny, nx) = scene.n_stars, scene.observation.sky_shape
     moves = outcome.moves

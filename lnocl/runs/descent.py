@@ -66,7 +66,7 @@ class Descent:
 
 
 def explain_rise(observation: Observation) -> str:
-    """Return what in the PSFs may make an objective rise, and what to do about it."""
+    """Return the faults of PSFs that may make an objective rise, with their remedies."""
     findings = [
         *_negative_pixels(observation.psfs),
         *_off_centre(observation.psfs),

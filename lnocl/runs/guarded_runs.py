@@ -1,9 +1,9 @@
-"""Short runs that judge PSFs: the extended source is kept from the light of the stars.
+"""Short runs that judge PSFs, with the extended source smoothed more strongly near the stars.
 
-A wrong PSF leaves light beside each star, and an extended source that is free there takes it up:
-the images fit, the star is too faint, and nothing shows that the PSF is wrong. So the weight of the
-edge-preserving term near stars follows the error of the PSFs (`lnocl.scene.psf_misfit`), which is
-first taken to be large and then measured, until it stays.
+A wrong PSF leaves light around each star. A free extended source absorbs it: the residuals are
+small, the star is too faint, and the error of the PSF goes unnoticed. So the weight of the
+edge-preserving term near stars follows the relative error of the PSFs (`lnocl.scene.psf_misfit`).
+This error is first assumed to be large. It is then measured after each run, until it stays.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ SPREAD = 2.0
 
 @dataclass(frozen=True)
 class Estimate:
-    """An estimate whose extended source was kept from the stars, and how well it fits there.
+    """An estimate with extra smoothing near the stars, and its misfit at the stars.
 
     Attributes
     ----------
@@ -71,12 +71,14 @@ class Estimate:
 
     @cached_property
     def model(self) -> Model:
-        """The model of the scene on the host."""
+        """The forward model of the scene, computed on the host."""
         return make_model(self.scene)
 
 
 class GuardedRuns:
-    """Short runs in a window round most of the stars.
+    """Short runs in the window that holds most stars, smoothed more strongly near them.
+
+    The window has `WINDOW` pixels a side, or the side of smaller images. Positions are (x, y).
 
     Parameters
     ----------
@@ -88,13 +90,13 @@ class GuardedRuns:
     Attributes
     ----------
     observation : Observation
-        Those of the window, with the noise that they show.
+        The images in the window, without their PSFs; their noise is that of the whole images.
     stars : ndarray of float64, shape (n, 2)
-        The stars in it, and where they are in it.
-    held : ndarray of bool
-        Which of all stars they are.
-    all_stars : ndarray of float64, shape (n, 2)
-        All stars, in the whole images.
+        The positions of the stars in the window, from its first pixel.
+    held : ndarray of bool, shape (m,)
+        Which of all m stars these are.
+    all_stars : ndarray of float64, shape (m, 2)
+        The positions of all stars in the whole images.
     """
 
     def __init__(self, setup: Setup, tick: Callable[[], object] = int) -> None:
@@ -120,18 +122,22 @@ class GuardedRuns:
     ) -> Estimate:
         """Return the estimate with these PSFs.
 
+        At most `MAX_ROUNDS` runs follow each other, each from the estimate of the one before. Each
+        is smoothed near the stars by the misfit that the one before has left. They end where the
+        misfit is insignificant or stays.
+
         Parameters
         ----------
         psfs : ndarray of float64, shape (p, ky, kx)
             The PSFs.
         stars : ndarray of float64, shape (n, 2)
-            Where the stars are, or are sought from.
+            The positions of the stars in the window; first guesses where they are moved.
         moves : bool
-            Whether they are moved.
+            Whether stars are moved, at the start of each run.
         error : float
-            The relative error that the PSFs are first taken to have.
+            The relative error of the PSFs that the first run assumes.
         guard : float
-            How strongly the extended source is kept from the stars, as `GUARD`.
+            The weight of the smoothing near stars for that error, in the units of `GUARD`.
         """
         observation = self.observation.replace(psfs=self.cut(psfs))
         inside = self._inside(stars)
@@ -148,7 +154,11 @@ class GuardedRuns:
         return found
 
     def _run(self, setup: Setup, found: Estimate, n_iter: int, guard: float) -> Estimate:
-        """Return the estimate after a run that begins at one, and is smoothed by its misfit."""
+        """Return the estimate after a run that begins at `found`, with its misfit measured anew.
+
+        The misfit of `found` sets the smoothing near the stars. A run that diverges keeps its last
+        state.
+        """
         rings = found.misfit.in_rings
         near = smoothing_near_stars(found.scene, found.model, found.fluxes, rings, guard)
         penalty = Penalty(smoothing=self._smoothing, near_stars=near)
@@ -176,7 +186,10 @@ class GuardedRuns:
         return Estimate(run.scene, extended, fluxes, misfit)
 
     def moved(self, estimate: Estimate, psfs: Array, fluxes: Array, stars: Array) -> Estimate:
-        """Return an estimate with other PSFs and stars, whose misfit is that of before."""
+        """Return an estimate with other PSFs, star fluxes and positions.
+
+        Its extended source and misfit are unchanged; stars are clipped to the window.
+        """
         ny, nx = self.observation.shape
         observation = self.observation.replace(psfs=self.cut(psfs))
         with ignored_warnings():
@@ -184,22 +197,23 @@ class GuardedRuns:
         return Estimate(scene, estimate.extended, fluxes, estimate.misfit)
 
     def _inside(self, stars: Array) -> Array:
-        """Return stars, those at an edge that have moved out of all images."""
+        """Return star positions; those that no image shows are clipped to the window."""
         last = np.array(self.observation.shape[::-1]) - 1
         are_inside = self.observation.shows(stars)
         return np.where(are_inside[:, None], stars, stars.clip(0, last))
 
     def cut(self, psfs: Array) -> Array:
-        """Return PSFs as far as the window may show them."""
+        """Return the middle of PSFs, at most as large as the window."""
         return psfs[:, *self._shown(psfs)]
 
     def completed(self, psfs: Array, inner: Array) -> Array:
-        """Return PSFs that are others as far as the window may show them."""
+        """Return PSFs of unit sum whose middle, as by `cut`, is replaced by `inner`."""
         whole = psfs.copy()
         whole[:, *self._shown(psfs)] = inner
         return np.asarray(whole / whole.sum(axis=(1, 2), keepdims=True))
 
     def _shown(self, psfs: Array) -> tuple[slice, slice]:
+        """Return the slices of the middle of PSFs that `cut` keeps."""
         most = WINDOW * self.observation.oversample
         y, x = (
             slice(n // 2 - min(n, most) // 2, n // 2 - min(n, most) // 2 + min(n, most))
@@ -209,7 +223,19 @@ class GuardedRuns:
 
 
 def find_window(stars: Array, observation: Observation) -> tuple[Observation, Array, Array]:
-    """Return the observation cut to a window round most of the stars, these, and which they are."""
+    """Return the observation cut to the window that holds most stars.
+
+    Candidates lie round the middle of all stars and round each star, inside the images.
+
+    Returns
+    -------
+    observation : Observation
+        The images in the window.
+    stars : ndarray of float64, shape (n, 2)
+        The positions (x, y) of its stars, from its first pixel.
+    held : ndarray of bool, shape (m,)
+        Which of all m stars it holds.
+    """
     size = np.minimum(observation.shape[::-1], WINDOW)
     last = np.array(observation.shape[::-1]) - size
     middle = (stars.min(axis=0) + stars.max(axis=0)) / 2.0
@@ -224,7 +250,7 @@ def find_window(stars: Array, observation: Observation) -> tuple[Observation, Ar
 def _count_in_windows(
     stars: Array, firsts: NDArray[np.int_], shape: tuple[int, int]
 ) -> NDArray[np.int_]:
-    """Return how many stars lie in pixels of each window, which is as wide as a narrow image."""
+    """Return the number of stars in each window; stars outside the images do not count."""
     pixels = np.floor(stars + 0.5)
     inside = pixels[np.all((pixels >= 0) & (pixels < shape[::-1]), axis=1)]
     if not len(inside):
@@ -236,7 +262,10 @@ def _count_in_windows(
 
 
 def estimate_scatter(psfs: Array, in_rings: Array, oversample: int) -> Array:
-    """Return the scatter of the pixels of PSFs, a share of the PSF round each pixel.
+    """Return the standard deviation of each pixel of PSFs, of their shape.
+
+    It is the relative error in the pixel's ring times the PSF, smoothed over `SPREAD` pixels of the
+    images. The error of the last ring holds beyond it.
 
     Parameters
     ----------
@@ -254,16 +283,16 @@ def estimate_scatter(psfs: Array, in_rings: Array, oversample: int) -> Array:
 
 
 def rings_of(psfs: Array, oversample: int) -> Rings:
-    """Return the rings round the middle of PSFs."""
+    """Return the rings round the central pixel of PSFs, ``(kx // 2, ky // 2)``."""
     ky, kx = psfs.shape[1:]
     return Rings((ky, kx), np.array([(kx // 2, ky // 2)]), oversample)
 
 
 def _unknown(error: float) -> PsfMisfit:
-    """Return the misfit of PSFs of this error, which are not yet looked at."""
+    """Return a misfit with this relative error of the PSFs at all radii, before any is measured."""
     return PsfMisfit(np.array([error**2]), 0.0, 0.0, 1.0, np.array([error]))
 
 
 def _is_settled(before: PsfMisfit, after: PsfMisfit) -> bool:
-    """Return whether a misfit has changed so little that the next would be the same."""
+    """Return whether kappa has changed by less than the share `SETTLED` of itself."""
     return abs(after.kappa - before.kappa) < SETTLED * after.kappa

@@ -105,7 +105,7 @@ class PsfRefinement:
         return rows
 
     def cards(self) -> list[tuple[str, bool | float, str]]:
-        """Return what became of the PSFs as cards of a FITS header."""
+        """Return whether PSFs were refined, their misfits and their error, as FITS cards."""
         before, after = self.misfit
         return [
             ("PSFUSED", self.is_accepted, "whether refined PSFs are used"),

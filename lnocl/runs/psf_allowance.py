@@ -91,7 +91,7 @@ class Allowance:
         return estimate_scatter(psfs, self.in_rings, self._observation.oversample)
 
     def may_be_faked(self) -> Array:
-        """Return what the errors may fake in the sky, ``kappa(r) sum_s c_s K_s / sqrt(p)``.
+        """Return the light that errors may fake, ``kappa(r) sum_s c_s K_s / sqrt(p)``.
 
         Electrons per pixel of the sky: K is the mean over the PSFs, at the stars.
         """

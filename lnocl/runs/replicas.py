@@ -114,7 +114,7 @@ class Replicas:
         return Replica(drawn, found, self._find(np.maximum(changed, 0.0)))
 
     def _find(self, counts: Array) -> Sky:
-        """Return what is found of an observation with these counts."""
+        """Return the reconstruction of an observation with these counts."""
         observation, run = self._outcome.scene.observation.replace(images=counts), self._run
         run.repeat(self._start, observation)
         with np.errstate(over="ignore", invalid="ignore"):

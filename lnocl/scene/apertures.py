@@ -63,7 +63,7 @@ class Aperture(NamedTuple):
         return float(self.light(sky).sum())
 
     def labels(self) -> list[Label]:
-        """Return what `measure` measures."""
+        """Return the labels of the quantities that `measure` returns."""
         return [Label(self.name, FLUX)]
 
     def measure(self, sky: Array, light: Array) -> Array:
@@ -92,7 +92,7 @@ class Profile(NamedTuple):
     across: Sequence[Array]
 
     def labels(self) -> list[Label]:
-        """Return what `measure` measures."""
+        """Return the labels of the quantities that `measure` returns."""
         return [
             *(Label(f"{self.name} flux", FLUX, at) for at in self.at),
             *(Label(f"{self.name} width", LENGTH, at) for at in self.at),

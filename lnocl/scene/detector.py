@@ -102,7 +102,7 @@ class DetectorPsf:
         return self._seen(self.fine.at(self._q * x - self._lag, self._q * y - self._lag))
 
     def on_sky(self, x: float, y: float) -> Cutout:
-        """Return what pixels that begin at each fine pixel see of a star at a position, pixels."""
+        """Return the light of a star at (x, y), pixels, in a pixel that begins at each fine one."""
         return self._seen(self.fine.at(*self._on_fine_pixels(x, y)))
 
     def at(self, x: float, y: float, axis: int | None = None) -> Cutout:
@@ -122,7 +122,7 @@ class DetectorPsf:
         return self._q * x + shift, self._q * y + shift
 
     def _seen(self, cutout: Cutout) -> Cutout:
-        """Return what pixels that begin at each fine pixel see."""
+        """Return the light in a detector pixel that begins at each fine pixel."""
         if self._is_effective:
             return cutout._replace(values=self._q**2 * cutout.values)
         y, values = _sum_ahead(cutout.values, cutout.y, self._q, self._fine_grid[0], -2)
@@ -130,7 +130,7 @@ class DetectorPsf:
         return Cutout(values, y, x)
 
     def _sampled(self, cutout: Cutout) -> Cutout:
-        """Return what the pixels of the image see."""
+        """Return the light in the pixels of the image, every q-th of the fine ones."""
         q, (values, top, left) = self._q, cutout
         y, x = -(-top // q), -(-left // q)
         return Cutout(values[..., q * y - top :: q, q * x - left :: q], y, x)

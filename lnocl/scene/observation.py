@@ -403,7 +403,7 @@ class Observation:
     def window(
         self, rows: range, columns: range, middle: tuple[float, float] | None = None
     ) -> Observation:
-        """Return what is in some rows and columns of the images; positions begin at its corner.
+        """Return the observation cut to some rows and columns; positions begin at their corner.
 
         PSFs that vary are those of a place (x, y) there, by default of its middle.
         """
@@ -502,7 +502,7 @@ class Observation:
         return sigma
 
     def _read_noise_of(self, variances: Array) -> Array:
-        """Return what the uncertainty of images has beyond the noise of their counts."""
+        """Return the noise of images beyond that of their counts, by their uncertainty."""
         if self.read_noise.any():
             raise InputError(
                 "give `read_noise`, or images with their uncertainty, which includes it, not both"

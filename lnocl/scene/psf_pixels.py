@@ -39,5 +39,5 @@ class PsfPixels:
         return np.asarray(change - change.sum() * self._psfs[j])
 
     def adjoint(self, j: int, image: Array) -> Array:
-        """Return what `correction` is the transpose of."""
+        """Return the transpose of `correction`, applied to an image (ky, kx)."""
         return self._smooth.apply(self._scatter[j] * (image - (self._psfs[j] * image).sum()))

@@ -127,7 +127,7 @@ class MovablePsf:
         return self.at(x, y)
 
     def response(self, x: float, y: float) -> Cutout:
-        """Return what the image shows of a source at its origin, the sky moved so far."""
+        """Return the image of a source at the origin, with the sky moved by (x, y) pixels."""
         return self.at(x, y)
 
     def with_slopes(self, x: float, y: float) -> Cutout:

@@ -60,7 +60,7 @@ class StarLikelihood:
         return cls(images)
 
     def of_one(self, pixels: Sequence[Pixels], others: Sequence[Array]) -> StarLikelihood:
-        """Return that of one star, over the pixels that it may light, beside the light of others.
+        """Return the likelihood of one star over its pixels, with the light of others held.
 
         Parameters
         ----------

@@ -1,12 +1,18 @@
-r"""Least squares of a few unknowns and of fields of many, as one linear problem.
+r"""Joint least squares for a few parameters and for large Gaussian random fields.
 
-The images differ from their models by ``J eta + B x``, with a few unknowns eta, of derivatives J,
-and fields x of N(0, 1), one number a pixel and more. Weighted by one over their variances P,
+The residual of image j, ``g_j - m_j``, is modelled as ``J_j eta + B_j x``. The vector eta is the
+change of a few parameters, and J_j holds the derivatives of the model. The vector x is the change
+of the fields, whose values are independent and standard normal a priori, and B_j their linear
+effect. P_j are the inverse variances of the pixels, Pi those of the prior of the parameters. From
+the current values eta_0 and x_0 the changes minimise
 
-.. math:: \sum_j \| P_j^{1/2} (g_j - m_j - J_j \eta - B_j x) \|^2 + \|x\|^2 + \eta^T \Pi \eta
+.. math::
+    \sum_j \| P_j^{1/2} (g_j - m_j - J_j \eta - B_j x) \|^2
+    + \|x_0 + x\|^2 + (\eta_0 + \eta)^T \Pi (\eta_0 + \eta)
 
-is least where eta is eliminated and x found by conjugate gradients. The inverse of its second
-derivative is the covariance of both; that of eta is the inverse of the Schur complement of x.
+Eliminating eta leaves a linear system for x, which conjugate gradients solve. Its matrix is the
+Schur complement of the block of eta. The covariance of eta and x is the inverse of half the second
+derivative of this sum.
 """
 
 from __future__ import annotations
@@ -21,23 +27,23 @@ from numpy.typing import NDArray
 from lnocl.scene.arrays import Array
 from lnocl.scene.smooth_field import SmoothField
 
-# Of the information's diagonal.
+# Added to the diagonal of the information, which is scaled to 1 before.
 ROUNDING = 1e-12
 
 
 class LinearImage(NamedTuple):
-    """One image near an estimate.
+    """An image and its model, linear near the current estimate.
 
     Attributes
     ----------
-    slopes : ndarray of float64, shape (k, Ny * Nx)
-        Derivatives of its model with respect to its k unknowns.
-    unknowns : ndarray of int, shape (k,)
-        Which they are.
+    slopes : ndarray of float64, shape (n, Ny * Nx)
+        Derivatives of the model with respect to the n parameters that it depends on.
+    unknowns : ndarray of int, shape (n,)
+        Indices of these among all parameters, without repeats.
     left : ndarray of float64, shape (Ny, Nx)
-        ``g_j - m_j``.
+        The residuals ``g_j - m_j``.
     precision : ndarray of float64, shape (Ny, Nx)
-        One over the variance of that, for Poisson counts.
+        One over the Poisson variance of each pixel.
     """
 
     slopes: Array
@@ -47,12 +53,12 @@ class LinearImage(NamedTuple):
 
 
 class Field(Protocol):
-    """A field of many numbers x ~ N(0, 1), and what it changes in the images, linearly.
+    """A random field of independent standard normal values, and its linear effect on the images.
 
     Attributes
     ----------
     at : ndarray of float64
-        x, where it is.
+        The current value of x, where the models are linear.
     """
 
     at: Array
@@ -61,25 +67,31 @@ class Field(Protocol):
         """Return the changes of the images, shape (p, Ny, Nx)."""
 
     def adjoint(self, images: Sequence[Array]) -> Array:
-        """Return what `forward` is the transpose of, of the shape of x."""
+        """Return the transpose of `forward` applied to images, in the shape of x."""
 
 
 class SourceError:
-    """The error of the extended source, ``A_j (a C^(1/2) x)``.
+    """The error of the extended source as a random field, ``a C^(1/2) x``.
+
+    C is the correlation matrix of the error; its effect on image j is ``A_j (a C^(1/2) x)``.
 
     Parameters
     ----------
-    forward, adjoint : callable
-        ``A_j f`` of a sky f, shape (p, Ny, Nx), and ``sum_j A_j^T y_j`` of images y.
+    forward : callable
+        Returns the images ``A_j f``, shape (p, Ny, Nx), of a sky f, shape (Ny, Nx).
+    adjoint : callable
+        Returns ``sum_j A_j^T y_j``, shape (Ny, Nx), of p images y.
     amplitude : ndarray of float64, shape (Ny, Nx)
-        a, its standard deviation.
+        The standard deviation a of the error, in the unit of the sky.
     width : float
         Pixels over which it is correlated (`lnocl.scene.smooth_field.SmoothField`).
 
     Attributes
     ----------
     images_of : callable
-        `forward`, of a sky.
+        The parameter `forward`.
+    at : ndarray of float64, shape (Ny, Nx)
+        The current value of x, which is 0.
     """
 
     def __init__(
@@ -102,30 +114,30 @@ class SourceError:
         return np.asarray(self._amplitude * self._smooth.apply(x))
 
     def adjoint(self, images: Sequence[Array]) -> Array:
-        """Return what `forward` is the transpose of, shape (Ny, Nx)."""
+        """Return the transpose of `forward` applied to images, shape (Ny, Nx)."""
         return self._smooth.apply(self._amplitude * self._adjoint(images))
 
 
 class LeastSquares:
-    """The least squares of a few unknowns, and of fields.
+    """The joint least squares of a few parameters and of random fields.
 
     Parameters
     ----------
     images : list of LinearImage
-        The images.
+        The images, of one shape.
     fields : list of Field
         The fields; one at least.
     prior : ndarray of float64, shape (k,)
-        One over the variance of the prior of each unknown, 0 for none; its mean is 0.
+        One over the variance of the prior of each parameter, whose mean is 0; 0 for no prior.
     n_steps : int
         Steps of conjugate gradients, at most.
     finished : float
-        The share of the gradient at which they end.
+        They end where the norm of the residual is this share of the first.
 
     Attributes
     ----------
     information : ndarray of float64, shape (k, k)
-        The Fisher information of the unknowns, the fields held.
+        The Fisher information of the parameters with the fields held, and that of the prior.
     """
 
     def __init__(
@@ -149,21 +161,41 @@ class LeastSquares:
         self._factor = scipy.linalg.cho_factor(scaled + ROUNDING * np.eye(len(prior)))
 
     def solve(self, at: Array) -> tuple[Array, list[Array]]:
-        """Return the changes of the unknowns, from where they are, and of the fields."""
+        """Return the changes of the parameters and of the fields that minimise the sum.
+
+        Parameters
+        ----------
+        at : ndarray of float64, shape (k,)
+            The current values of the parameters, which the prior draws towards 0.
+
+        Returns
+        -------
+        change : ndarray of float64, shape (k,)
+            To add to `at`.
+        fields : list of ndarray of float64
+            To add to `at` of each field.
+        """
         change, x = self._solve(self._prior * at)
         return change, self._each(x)
 
     def variance(self, unknown: int) -> float:
-        """Return the variance of an unknown, the others and the fields not being known either."""
+        """Return the variance of one parameter, with the others and the fields marginalised.
+
+        It is too small where conjugate gradients end early.
+        """
         direct = self._invert(np.eye(len(self._prior))[unknown])
         wanted = self._adjoint(self._changes(direct))
         return float(direct[unknown] + _sum("i,i", wanted, self._find_fields(wanted)))
 
     def _left(self) -> Array:
+        """Return the residuals of all images, shape (p, Ny, Nx)."""
         return np.array([each.left for each in self._images])
 
     def _solve(self, pull: Array) -> tuple[Array, Array]:
-        """Return the changes of the unknowns, and of the fields, one after the other."""
+        """Return the changes of the parameters, shape (k,), and of the fields, one after the other.
+
+        `pull` is half the gradient of the prior of the parameters, shape (k,).
+        """
         left = self._left()
         direct = self._invert(self._moments(left) - pull)
         at = np.concatenate([field.at.ravel() for field in self._fields])
@@ -171,7 +203,7 @@ class LeastSquares:
         return self._invert(self._moments(left - self._forward(x)) - pull), x
 
     def _find_fields(self, wanted: Array) -> Array:
-        """Return the changes of the fields, by conjugate gradients."""
+        """Return x with ``S x = wanted`` by conjugate gradients from 0; `_curvature` applies S."""
         x, rest, along = np.zeros_like(wanted), wanted, wanted
         square = first = float(_sum("i,i", rest, rest))
         for _ in range(self._n_steps):
@@ -185,18 +217,21 @@ class LeastSquares:
         return x
 
     def _curvature(self, x: Array) -> Array:
-        """Return the second derivative along x, the unknowns following it."""
+        """Return ``S x``, S half the second derivative in the fields, the parameters eliminated.
+
+        S is the Schur complement of the block of the parameters.
+        """
         images = self._forward(x)
         images -= self._changes(self._invert(self._moments(images)))
         return x + self._adjoint(images)
 
     def _each(self, x: Array) -> list[Array]:
-        """Return each field, in its shape."""
+        """Return the fields in their shapes, from all their values one after the other."""
         parts = zip(np.split(x, self._ends), self._fields, strict=True)
         return [part.reshape(field.at.shape) for part, field in parts]
 
     def _forward(self, x: Array) -> Array:
-        """Return what the fields change in the images, shape (p, Ny, Nx)."""
+        """Return the changes of the images by the fields, shape (p, Ny, Nx)."""
         images = np.zeros((len(self._images), *self._images[0].left.shape))
         for field, part in zip(self._fields, self._each(x), strict=True):
             for image, change in zip(images, field.forward(part), strict=True):
@@ -204,12 +239,12 @@ class LeastSquares:
         return images
 
     def _adjoint(self, images: Array) -> Array:
-        """Return what `_forward` is the transpose of, the images weighted."""
+        """Return ``sum_j B_j^T P_j y_j`` of images y, the fields one after the other."""
         weighted = [each.precision * x for each, x in zip(self._images, images, strict=True)]
         return np.concatenate([field.adjoint(weighted).ravel() for field in self._fields])
 
     def _moments(self, images: Array) -> Array:
-        """Return the products of images with the slopes, weighted."""
+        """Return ``sum_j J_j^T P_j y_j`` of images y, shape (k,)."""
         moments = np.zeros(len(self._prior))
         for each, image in zip(self._images, images, strict=True):
             weighted = (each.precision * image).ravel()
@@ -226,9 +261,10 @@ class LeastSquares:
         )
 
     def _invert(self, moments: Array) -> Array:
+        """Return the inverse of `information` applied to a vector, shape (k,)."""
         return np.asarray(self._units * scipy.linalg.cho_solve(self._factor, self._units * moments))
 
 
 def _sum(products: str, a: Array, b: Array) -> Array:
-    """Return sums of products, whose rounding depends on no number of threads as BLAS's does."""
+    """Return an Einstein sum without BLAS, whose rounding depends on the number of threads."""
     return np.asarray(np.einsum(products, a, b))

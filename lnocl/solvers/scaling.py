@@ -56,7 +56,7 @@ class Scaling:
         return cls(state["shift"], information, state["cross_values"], state["cross_windows"])
 
     def state(self) -> dict[str, NDArray]:
-        """Return what `from_state` needs."""
+        """Return the arrays from which `from_state` makes the scaling."""
         return {
             "shift": self.shift,
             "star_information": self.star_information.band.T,
@@ -152,7 +152,7 @@ def _back_projections(model: Model) -> tuple[Array, Array]:
 
 
 def _change_by_stars(model: Model, star_fluxes: Array, boxes: Sequence[Box]) -> Cutout:
-    """Return what light of stars changes ``sum_j A_j^T (w_j / b_j)`` by, where it is seen."""
+    """Return the change of ``sum_j A_j^T (w_j / b_j)`` by the light of stars."""
     changes = _changes(model, star_fluxes, boxes)
     if model.are_large(boxes):  # one after the other, lest all are held
         return Cutout(model.adjoint(each.on_grid(model.shape[1:]) for each in changes), 0, 0)

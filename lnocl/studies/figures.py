@@ -124,7 +124,7 @@ def report(path: str) -> str:
 
 
 def view_of(saved: SavedResult) -> ResultView:
-    """Return what the picture of a saved result shows."""
+    """Return the arrays and texts of the picture of a saved result."""
     q = saved.oversample
     nothing = np.zeros((0, *(n // q for n in saved.extended.shape)))
     models, residuals = (

@@ -139,7 +139,7 @@ class KernelHarness:
         return self._buffers[-1]
 
     def take(self, buffer: cl.Buffer, shape: Any) -> NDArray:
-        """Return what a buffer holds, after looking at the canaries of all buffers."""
+        """Return the contents of a buffer, after a look at the canaries of all buffers."""
         for each in self._buffers:
             if not np.array_equal(self._bytes(each)[-len(CANARY) :], CANARY):
                 raise DeviceError("written past the end of an array")

@@ -84,7 +84,7 @@ def test_errors_are_added_to_the_file(words, capsys):
 
 @pytest.mark.usefixtures("result")
 def test_regions_are_said_before_stars_and_all_of_them(capsys, monkeypatch):
-    monkeypatch.setattr("lnocl.commands.bootstrap.MAX_SAID", 2)
+    monkeypatch.setattr("lnocl.commands.bootstrap.MAX_LISTED", 2)
     assert cli.main([*ERRORS, "10"]) == 0
     first, *lines = capsys.readouterr().out.splitlines()
     assert first.startswith("errors by 10 replicas")

@@ -145,7 +145,7 @@ def test_a_compiler_that_fails_leaves_its_whole_log(monkeypatch, tmp_path):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     message = refused()
     (log,) = tmp_path.glob("lnocl-build-*.log")
-    assert f"all it said is in {log}" in message
+    assert f"its messages are in {log}" in message
     said = log.read_text()
     assert "error:" in message
     assert said.count("error:") >= 1
