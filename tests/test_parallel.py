@@ -192,6 +192,7 @@ def test_tasks_whose_workers_are_lost_again_and_again_are_given_up(client, monke
     assert rounds == [3] * 6
 
 
+@pytest.mark.exhaustive
 def test_a_task_that_ends_its_workers_ends_the_work_or_has_another_answer():
     with pytest.raises(LnoclError, match="4 workers ended at the same task"):
         list(work(make_ender, [1], 2))
@@ -229,6 +230,7 @@ def test_a_script_that_processes_cannot_read_is_told(tmp_path, is_file):
     assert "it has to be a file, not standard input, with 'if __name__ == \"__main__\":'" in last
 
 
+@pytest.mark.exhaustive
 def test_where_all_workers_have_gone_it_says_so(monkeypatch):
     monkeypatch.setattr(parallel, "PATIENCE", 1.0)
     with cluster_of_two() as client:

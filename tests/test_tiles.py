@@ -350,6 +350,7 @@ def test_processes_give_the_same_tiles():
         np.testing.assert_array_equal(getattr(here, name), getattr(there, name), name)
 
 
+@pytest.mark.exhaustive
 def test_images_that_are_shifted_are_seen_whole_by_tiles():
     """Most of the light is in the image that is shifted by more than half a PSF."""
     psf = vary(N / 2, N / 2)
