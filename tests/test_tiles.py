@@ -338,6 +338,7 @@ def test_masked_tiles_are_dark_and_stars_keep_their_order():
 
 
 @pytest.mark.filterwarnings("ignore:.*psf 0 varies", "ignore:.*other warnings of tiles")
+@pytest.mark.exhaustive
 def test_processes_give_the_same_tiles():
     pytest.importorskip("distributed", reason="Dask is not installed")
     field = make_field()
