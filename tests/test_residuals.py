@@ -215,6 +215,7 @@ def test_a_result_has_the_residuals():
 def test_unnamed_stars_are_sharp_sources_and_knots_are_not(finer):
     y, x = np.indices((64, 64))
     sky = 5.0 + 300 * np.exp(-((x - 40) ** 2 + (y - 12) ** 2) / 8.0)  # a knot 4.7 pixels wide
+    sky += 1e3 * np.exp(-((x - 52) ** 2 + (y - 30) ** 2) / 4.0)  # one of 3.3, and brighter
     sky += 100 * np.exp(-np.hypot(x - 20, y - 44) / 4.0)  # a cusp
     sky[30, 10], sky[30, 11], sky[50, 50] = 6000.0, 3000.0, 4000.0
     found = sharp_sources(sky, 5.0, finer)

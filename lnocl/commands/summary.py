@@ -90,7 +90,11 @@ def _unnamed(result: Result, frames: Frames) -> list[str]:
     """Return a line on sources in the extended source that are as sharp as stars."""
     observation = frames.observation
     background = float(_means(observation.background).sum()) / observation.oversample**2
-    found = sharp_sources(result.extended, background, observation.oversample)
+    exposure = float(_means(observation.exposure).sum())  # of all images, whose noise tells
+    found = sharp_sources(result.extended * exposure, background, observation.oversample)
+    found = found / (1.0, 1.0, exposure)
+    offsets = found[:, None, :2] - result.star_positions
+    found = found[(np.hypot(*np.moveaxis(offsets, -1, 0)) > MAX_SHIFT).all(axis=1)]
     if not len(found):
         return []
     (x, y, light), n = found[0], len(found)

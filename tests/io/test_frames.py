@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from wcs_headers import NORTH_UP
 
 from lnocl.errors import FileError, InputError, LnoclWarning, counted
+from lnocl.io.levels import sky_noise
 from lnocl.scene.noise_check import warn_of_noise
 
 pytestmark = pytest.mark.usefixtures("frame_folder")
@@ -587,3 +588,15 @@ class TestPixelScales:
 
     def test_images_without_coordinates_tell_nothing(self):
         assert self.said({"PIXELSCL": 0.0125}, {}) == []
+
+
+def test_sources_that_fill_a_frame_are_no_read_noise():
+    y, x = np.indices((128, 128))
+    rng = np.random.default_rng(4)
+    places = rng.uniform(4, 124, (40, 2))
+    light = sum(3000 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 4.0) for a, b in places)
+    counts = rng.poisson(200.0 + light) + rng.normal(0, 10.0, x.shape)
+    found = sky_noise(0, counts, np.zeros(x.shape, bool))
+    assert found == pytest.approx(10.0, rel=0.1)
+    _, median, scatter = sigma_clipped_stats(counts)
+    assert np.sqrt(scatter**2 - median) > 11.2  # what it was taken for

@@ -120,3 +120,14 @@ def test_a_rotated_crop_must_lie_in_the_frame():
     make_psf(frame, background=0.0, rotate=45.0, size=largest)
     with pytest.raises(InputError, match=r"rotated by 45 degrees, .* a size of 45 or less"):
         make_psf(frame, background=0.0, rotate=45.0, size=largest + 1)
+
+
+def test_a_flat_source_is_one_and_is_masked_whole():
+    frame = gaussian(3.0, 32.5, 32.5, (80, 80))
+    clean = make_psf(frame, size=41, background=0.0, position=(32.5, 32.5)).psf
+    frame[28:37, 44:64] = frame.max()  # saturated, and not given as such
+    star = make_psf(frame, size=41, background=0.0, position=(32.5, 32.5))
+    assert any("; 1 other source masked" in step for step in star.steps)
+    off = abs(star.psf / star.psf.max() - clean / clean.max())
+    assert off.max() < 0.1  # it rings at its border; it is as bright as the star
+    assert off[:, :26].max() < 2e-4
