@@ -376,8 +376,8 @@ def _summarise(summary: Table, n_old: int, folder: Folder) -> list[str]:
     ]
     n_lit = int((summary["star_halo"] > MUCH_HALO).sum())
     halos = [
-        f"in {n_lit} light lies all round the star, star_halo times its flux, and its error does "
-        "not hold"
+        f"in {counted(n_lit, 'target')} light lies all round the star, star_halo times its flux, "
+        "and its error does not hold"
     ]
     return [
         *_rows(summary),

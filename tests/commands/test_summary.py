@@ -79,4 +79,4 @@ def test_halos_of_a_batch_are_counted():
     table = Table(rows=rows, names=names)
     table["status"] = ["done", "done"]
     lines = _summarise(table, 0, SimpleNamespace(path="."))
-    assert any(line.startswith("in 1 light lies all round the star") for line in lines)
+    assert any(line.startswith("in 1 target light lies all round the star") for line in lines)
