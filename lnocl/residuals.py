@@ -64,8 +64,9 @@ class Fit(NamedTuple):
         """Return the fit of pixels with these residuals and models."""
         good = ~np.isnan(values)
         n = int(np.count_nonzero(good))
+        square_sum = float(np.sum(values**2, where=good))
         inverse = np.divide(1.0, models, out=np.zeros_like(models), where=good)
-        return cls(n, float(np.nansum(values**2)), 2.0 * n + float(inverse.sum()))
+        return cls(n, square_sum, 2.0 * n + float(inverse.sum()))
 
     def plus(self, other: Fit) -> Fit:
         """Return the fit of these pixels and others."""
@@ -170,27 +171,31 @@ def sharp_sources(sky: Array, background: float, finer: int = 1) -> Array:
     ndarray of float64, shape (n, 3)
         x and y in pixels of the images, and electrons.
     """
-    from scipy.ndimage import maximum_filter, uniform_filter  # which --help need not load
+    from scipy.ndimage import maximum_filter  # which --help need not load
 
-    inner, between, outer = (
-        uniform_filter(sky, side, mode="constant") * side**2 for side in SHARP_SIDES
+    inner, between, outer = SHARP_SIDES
+    is_maximum = sky == maximum_filter(sky, outer)
+    is_maximum &= sky * inner**2 > CLEAR  # no source is fainter, and dark skies are all maxima
+    y, x = np.nonzero(is_maximum)
+    squares = np.lib.stride_tricks.sliding_window_view(np.pad(sky, outer // 2), (outer, outer))
+    core, ring, whole = (
+        squares[y, x][:, cut, cut].sum(axis=(1, 2))
+        for cut in (slice((outer - side) // 2, (outer + side) // 2) for side in SHARP_SIDES)
     )
-    level = (outer - between) / (SHARP_SIDES[2] ** 2 - SHARP_SIDES[1] ** 2)
-    light = inner - SHARP_SIDES[0] ** 2 * level
-    whole = outer - SHARP_SIDES[2] ** 2 * level
-    noise = np.sqrt(np.maximum(inner + SHARP_SIDES[0] ** 2 * background, 1.0))
-    is_sharp = (light > SHARP * whole) & (light > CLEAR * noise)
-    y, x = np.nonzero(is_sharp & (sky == maximum_filter(sky, SHARP_SIDES[2])))
-    order = np.argsort(-light[y, x])
-    places = (np.stack([x, y], axis=1) - (finer - 1) / 2.0) / finer
-    return np.column_stack([places, light[y, x]])[order]
+    level = (whole - ring) / (outer**2 - between**2)
+    light = core - inner**2 * level
+    noise = np.sqrt(np.maximum(core + inner**2 * background, 1.0))
+    is_sharp = (light > SHARP * (whole - outer**2 * level)) & (light > CLEAR * noise)
+    found = np.stack([x, y, light], axis=1)[is_sharp]
+    found[:, :2] = (found[:, :2] - (finer - 1) / 2.0) / finer
+    return found[np.argsort(-found[:, 2])]
 
 
 def residuals(image: Array, mask: NDArray[np.bool_], model: Array) -> Array:
     """Return ``(g - m) / sqrt(m)``, shape (ny, nx); NaN where a pixel is bad, or the model is 0."""
     usable = ~mask & (model > 0)
-    noise = np.sqrt(np.maximum(model, 0.0))
-    return np.divide(image - model, noise, out=np.full_like(model, np.nan), where=usable)
+    values = np.where(usable, image - model, np.nan)
+    return np.divide(values, np.sqrt(model, where=usable, out=np.ones_like(model)), out=values)
 
 
 def judge(observation: Observation, models: Iterable[Array]) -> Fit:

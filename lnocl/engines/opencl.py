@@ -140,15 +140,16 @@ class OpenCLEngine:
         """Return about how many bytes the process takes on the host, besides the device's.
 
         It holds most of them by now: libraries, the observation and the stars. To come are the
-        answer, a model to judge it by, and the compiler; with a scaling, the factor of the
-        information.
+        compiler and the answer, and at the end, when the device holds nothing more, the models
+        and residuals of an image; with a scaling, the factor of the information.
         """
-        to_come = COMPILER + 4 * math.prod(self.scene.grid) * np.dtype(np.float64).itemsize
+        held, most = held_bytes()
+        of_device = self.bytes_needed if self._device_type & cl.device_type.CPU else 0
+        frame = math.prod(self.scene.grid) * np.dtype(np.float64).itemsize
+        to_come = COMPILER + max(2 * frame, 6 * frame - of_device)
         if self.scaling is not None:
             to_come += 2 * self.scaling.star_information.band.nbytes
-        held, most = held_bytes()
-        is_shared = bool(self._device_type & cl.device_type.CPU)
-        return max(held + to_come, most - (self.bytes_needed if is_shared else 0))
+        return max(held + to_come, most - of_device)
 
     def _bytes_of_halves(self) -> int:
         """Return about how many bytes halves take on the host besides: counts and snapshots."""
