@@ -11,16 +11,32 @@
  * which are neighbours in reversed order. Here columns are folded so; ratio.cl folds the rows.
  */
 
-/* a plus what column 0 gets from its opposite point, (re + i im) conj(p(opposite place)); one point
- * of p stands for `share` points of the column.
+/* What a column block holds while it goes through the images lies in the scratch where that has room
+ * for two blocks, else in array 0 of the spectra; `z` is the block that is transformed.
  */
-INLINE cvec add_edge(
-    const cvec a, const real re, const real im, SCRATCH const vec *p, const int t, const int share)
+#if SCRATCH_BLOCKS > 1
+#define HELD SCRATCH
+#define SCRATCH_POINTS (NY + IMAGE_NY)
+#define SCRATCH_OF(scratch, columns)                       \
+    HELD vec *held = OWN_SCRATCH(scratch, SCRATCH_POINTS); \
+    SCRATCH vec *z = held + 2 * NY * SIDE
+#else
+#define HELD __global
+#define SCRATCH_POINTS NY
+#define SCRATCH_OF(scratch, columns) \
+    HELD vec *held = columns;        \
+    SCRATCH vec *z = OWN_SCRATCH(scratch, SCRATCH_POINTS)
+#endif
+
+/* Where the opposite of point t of column 0 begins, in reals; one point stands for `share` points. */
+#define OPPOSITE(t, share) (2 * (opposite_place(t, NY) / (share)) * BLOCK)
+
+/* a plus what column 0 gets from its opposite point p: (re + i im) conj(p). */
+INLINE cvec add_edge(const cvec a, const real re, const real im, const real p_re, const real p_im)
 {
-    SCRATCH const real *opposite =
-        (SCRATCH const real *)p + 2 * (opposite_place(t, NY) / share) * BLOCK;
-    const real x = opposite[0], y = opposite[BLOCK];
-    return (cvec){a.re + FIRST_LANE * (re * x + im * y), a.im + FIRST_LANE * (im * x - re * y)};
+    return (cvec){
+        a.re + FIRST_LANE * (re * p_re + im * p_im), a.im + FIRST_LANE * (im * p_re - re * p_im)
+    };
 }
 
 /* otfs_image = FFT(spectra) / (4 NX NY) along the columns, made from the row spectra of a PSF: 1 / (NX NY)
@@ -47,7 +63,7 @@ KERNEL void otf_columns(
         if (block == 0) {
             FOR_EACH(t, NY) {
                 SCRATCH const real *p = (SCRATCH const real *)z + 2 * t * BLOCK;
-                SCRATCH const real *q = (SCRATCH const real *)z + 2 * opposite_place(t, NY) * BLOCK;
+                SCRATCH const real *q = (SCRATCH const real *)z + OPPOSITE(t, 1);
                 const real a_re = p[0] + q[0], a_im = p[BLOCK] - q[BLOCK];
                 const real b_re = p[BLOCK] + q[BLOCK], b_im = q[0] - p[0];
                 __global real *column_0 = (__global real *)k + 2 * t * BLOCK;
@@ -65,7 +81,7 @@ KERNEL void otf_columns(
  * `k` and `edge` are those of image and block; `edges` tells whether this is column 0.
  */
 INLINE cvec convolved(
-    SCRATCH const vec *source, __global const vec *k, __global const real *edge, const int t,
+    HELD const vec *source, __global const vec *k, __global const real *edge, const int t,
     const int lane, const bool edges)
 {
     cvec total;
@@ -73,18 +89,20 @@ INLINE cvec convolved(
     for (int q = 0; q < OVERSAMPLE; ++q) {
         const int point = t * OVERSAMPLE + q;
         cvec a = multiply(LOAD(source + lane, point), LOAD(k + lane, point));
-        if (edges)
-            a = add_edge(a, edge[2 * point], edge[2 * point + 1], source, point, 1);
+        if (edges) {
+            HELD const real *opposite = (HELD const real *)source + OPPOSITE(point, 1);
+            a = add_edge(a, edge[2 * point], edge[2 * point + 1], opposite[0], opposite[BLOCK]);
+        }
         total = q > 0 ? add(total, a) : a;
     }
     return total;
 }
 
 /* spectra_j <- IFFT(otfs_j FFT(spectra_0)) along the columns: the row spectra of A_j f from f's, in
- * every OVERSAMPLE-th row.
+ * every OVERSAMPLE-th row. FFT(spectra_0) may be held in array 0, which is made last.
  * spectra: n_images arrays, written but for their padding. otfs: n_images arrays, const;
  * otf_edges: [n_images][NY][2].
- * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: NY + IMAGE_NY points.
+ * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: SCRATCH_POINTS.
  * Twin: reference.convolve_columns.
  */
 KERNEL void convolve_columns(
@@ -93,12 +111,18 @@ KERNEL void convolve_columns(
     __global const real *restrict column_roots, __global const real *restrict image_column_roots,
     SCRATCH vec *restrict scratch)
 {
-    SCRATCH vec *source = OWN_SCRATCH(scratch, NY + IMAGE_NY);
-    SCRATCH vec *z = source + 2 * NY * SIDE;
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
-        forward_columns(source, columns, NY, column_roots);
-        for (int image = 0; image < n_images; ++image) {
+        SCRATCH_OF(scratch, columns);
+#if SCRATCH_BLOCKS > 1
+        forward_columns(held, columns, NY, column_roots);
+#else
+        forward_columns(z, columns, NY, column_roots);
+        FOR_EACH(i, NY * 2 * SIDE)
+            held[i] = z[i];
+        BARRIER;
+#endif
+        for (int image = n_images - 1; image >= 0; --image) {
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
             __global const real *edge = otf_edges + 2 * image * NY;
@@ -108,7 +132,7 @@ KERNEL void convolve_columns(
                     cvec a[8];
                     UNROLL
                     for (int q = 0; q < LAST(IMAGE_NY); ++q)
-                        a[q] = convolved(source, k, edge, t + q, lane, block == 0 && lane == 0);
+                        a[q] = convolved(held, k, edge, t + q, lane, block == 0 && lane == 0);
                     dit(a, LAST(IMAGE_NY));
                     UNROLL
                     for (int q = 0; q < LAST(IMAGE_NY); ++q)
@@ -126,7 +150,7 @@ KERNEL void convolve_columns(
 /* spectra_0 <- IFFT(sum_j conj(otfs_j) FFT(spectra_j)) along the columns: the row spectrum of
  * sum_j A_j^T (r_j - w_j) from those of the r_j - w_j. Shapes as in convolve_columns; array 0 alone
  * is written.
- * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: NY + IMAGE_NY points.
+ * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: SCRATCH_POINTS.
  * Twin: reference.correlate_columns.
  */
 KERNEL void correlate_columns(
@@ -135,10 +159,9 @@ KERNEL void correlate_columns(
     __global const real *restrict column_roots, __global const real *restrict image_column_roots,
     SCRATCH vec *restrict scratch)
 {
-    SCRATCH vec *total = OWN_SCRATCH(scratch, NY + IMAGE_NY);
-    SCRATCH vec *z = total + 2 * NY * SIDE;
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
+        SCRATCH_OF(scratch, columns);
         for (int image = 0; image < n_images; ++image) {
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
@@ -150,15 +173,24 @@ KERNEL void correlate_columns(
                 cvec product = multiply_conjugate(a, LOAD(k + lane, t));
                 if (block == 0 && lane == 0) {
                     __global const real *edge = otf_edges + 2 * (image * NY + t);
-                    product = add_edge(product, edge[0], -edge[1], z, t, OVERSAMPLE);
+                    SCRATCH const real *opposite =
+                        (SCRATCH const real *)z + OPPOSITE(t, OVERSAMPLE);
+                    product = add_edge(product, edge[0], -edge[1], opposite[0], opposite[BLOCK]);
                 }
                 if (image > 0)
-                    product = add(product, LOAD(total + lane, t));
-                STORE(total + lane, t, product);
+                    product = add(product, LOAD(held + lane, t));
+                STORE(held + lane, t, product);
             }
             BARRIER;
         }
-        dit_inner(total, NY, column_roots);
-        finish_columns(columns, total, NY, column_roots);
+#if SCRATCH_BLOCKS > 1
+        z = held;
+#else
+        FOR_EACH(i, NY * 2 * SIDE)
+            z[i] = held[i];
+        BARRIER;
+#endif
+        dit_inner(z, NY, column_roots);
+        finish_columns(columns, z, NY, column_roots);
     }
 }

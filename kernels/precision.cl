@@ -11,12 +11,12 @@
  *                   the same of the images' axes, whose odd factors are those of the sky's
  *   CHUNK           points of a transform that are finished before the next are begun
  *   SCRATCH_IS_GLOBAL   0 or 1: where a block lies while it is transformed
+ *   SCRATCH_BLOCKS  1 or 2: blocks of columns that the scratch has room for
  *   HAS_BUILTIN_PREFETCH   0 or 1: whether the compiler is known to take __builtin_prefetch
  *   NX, NY          the grid of the sky, each 1, 3, 5, 7 or 9 times a power of two, up to 8192
  *   OVERSAMPLE      pixels of the sky to one of the images, along each axis: 1, 2 or 4; 2 BLOCK
  *                   OVERSAMPLE divides that power of two
  *   ROWS            rows that a block of spectra takes in memory: NY and some padding
- *   MAX_STARS       room for stars: the scene has no more than these
  *   HAS_MU, HAS_SMOOTHING, HAS_SMOOTHING_MAP, HAS_WEIGHTS, HAS_BACKGROUND_MAP, HAS_EXPOSURE_MAP
  *                   0 or 1: what the scene has
  *   MIN_MODEL     the division guard

@@ -105,8 +105,9 @@ INLINE SCRATCH vec *fold_rows(SCRATCH vec *z)
  * images: n_images arrays of pixels, negative where not observed (HAS_WEIGHTS).
  * background: [n_images], or n_images arrays of pixels (HAS_BACKGROUND_MAP).
  * exposure: n_images arrays of pixels, w (HAS_EXPOSURE_MAP; then no image is negative).
- * star_images: [n_stars][n_images], a window of star_blocks blocks and star_columns columns each, see
- * stars.cl; star_corners: [n_stars][2]. star_fluxes: [n_stars].
+ * star_images: [n_stars][n_images], a window of star_blocks blocks and star_columns columns each;
+ * star_corners: [n_stars][2]; star_near: the stars of each block, see stars.cl.
+ * star_fluxes: [n_stars].
  * ratio_sums: [IMAGE_ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
  * Launch: up to IMAGE_ROW_BLOCKS n_images groups. In place. Scratch: NX points, and where
  * OVERSAMPLE > 1 IMAGE_NX more.
@@ -117,9 +118,9 @@ KERNEL void ratio_rows(
     __global real *restrict star_sums, __global const vec *restrict images,
     __global const real *restrict background, __global const vec *restrict exposure,
     __global const vec *restrict star_images, __global const int *restrict star_corners,
-    __global const real *restrict star_fluxes, const int n_images, const int n_stars,
-    const int star_blocks, const int star_columns, __global const real *restrict image_row_roots,
-    SCRATCH vec *restrict scratch)
+    __global const int *restrict star_near, __global const real *restrict star_fluxes,
+    const int n_images, const int star_blocks, const int star_columns,
+    __global const real *restrict image_row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *wide = OWN_SCRATCH(scratch, NX + (OVERSAMPLE > 1 ? IMAGE_NX : 0));
@@ -130,61 +131,76 @@ KERNEL void ratio_rows(
         read_tiles(wide, row_spectra, block);
         SCRATCH vec *z = fold_rows(wide);
         dit_inner(z, IMAGE_NX, image_row_roots);
-        const near_stars near = stars_near(
-            star_corners, n_stars, n_images, star_blocks, image, block, IMAGE_ROW_BLOCKS);
-        vec_sum objective = {0, 0}, products[NEAR_ROOM];
-        for (int s = 0; s < near.count; ++s)
-            products[s] = (vec_sum){0, 0};
         FOR_EACH(piece, INNER(IMAGE_NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[OUTER(IMAGE_NX)];
             load_inverse(a, z + lane, x, IMAGE_NX, image_row_roots);
-            vec terms = 0;
-            /* Left rolled: unrolled, the pixelwise work runs out of registers and is slower. */
-            for (int q = 0; q < OUTER(IMAGE_NX); ++q) {
-                const int pixel = q * INNER(IMAGE_NX) + x;
-                const cvec g = LOAD(images + at + lane, pixel);
-#if HAS_BACKGROUND_MAP
-                a[q] = add(a[q], LOAD((__global const vec *)background + at + lane, pixel));
-#else
-                a[q].re += background[image];
-                a[q].im += background[image];
-#endif
-                for (int s = 0; s < near.count; ++s) {
-                    const int column = window_column(pixel, near.column[s], IMAGE_NX);
-                    if (column >= star_columns)
-                        continue;
-                    const cvec p =
-                        LOAD(WINDOW_BLOCK(star_images, near.block[s], star_columns) + lane, column);
-                    a[q].re += star_fluxes[near.star[s]] * p.re;
-                    a[q].im += star_fluxes[near.star[s]] * p.im;
-                }
-                cvec term;
-                a[q].re = ratio(g.re, a[q].re, &term.re);
-                a[q].im = ratio(g.im, a[q].im, &term.im);
-#if HAS_EXPOSURE_MAP
-                const cvec w = LOAD(exposure + at + lane, pixel);
-                a[q].re *= w.re;
-                a[q].im *= w.im;
-                term.re *= w.re;
-                term.im *= w.im;
-#endif
-                terms += term.re + term.im;
-                for (int s = 0; s < near.count; ++s) {
-                    const int column = window_column(pixel, near.column[s], IMAGE_NX);
-                    if (column >= star_columns)
-                        continue;
-                    const cvec p =
-                        LOAD(WINDOW_BLOCK(star_images, near.block[s], star_columns) + lane, column);
-                    ACCUMULATE(products[s], p.re * a[q].re + p.im * a[q].im);
-                }
+            UNROLL
+            for (int q = 0; q < OUTER(IMAGE_NX); ++q)
+                STORE(z + lane, q * INNER(IMAGE_NX) + x, a[q]);
+        }
+        BARRIER;
+        for (int i = star_near[block]; i < star_near[block + 1]; ++i) {
+            const int s = star_near[i];
+            const int window = window_block(
+                star_corners, s, n_images, image, star_blocks, block, IMAGE_ROW_BLOCKS);
+            __global const vec *star = WINDOW_BLOCK(star_images, window, star_columns);
+            const real flux = star_fluxes[s];
+            FOR_EACH(piece, star_columns * SIDE) {
+                const int column = piece / SIDE, lane = piece % SIDE;
+                const int pixel = window_pixel(star_corners, s, column, IMAGE_NX);
+                const cvec m = LOAD(z + lane, pixel), p = LOAD(star + lane, column);
+                const cvec sum = {m.re + flux * p.re, m.im + flux * p.im};
+                STORE(z + lane, pixel, sum);
             }
-            ACCUMULATE(objective, terms);
+            BARRIER;
+        }
+        vec_sum objective = {0, 0};
+        FOR_EACH(piece, IMAGE_NX * SIDE) {
+            const int pixel = piece / SIDE, lane = piece % SIDE;
+            const cvec g = LOAD(images + at + lane, pixel);
+            cvec a = LOAD(z + lane, pixel), term;
+#if HAS_BACKGROUND_MAP
+            a = add(a, LOAD((__global const vec *)background + at + lane, pixel));
+#else
+            a.re += background[image];
+            a.im += background[image];
+#endif
+            a.re = ratio(g.re, a.re, &term.re);
+            a.im = ratio(g.im, a.im, &term.im);
+#if HAS_EXPOSURE_MAP
+            const cvec w = LOAD(exposure + at + lane, pixel);
+            a = (cvec){a.re * w.re, a.im * w.im};
+            term = (cvec){term.re * w.re, term.im * w.im};
+#endif
+            ACCUMULATE(objective, term.re + term.im);
+            STORE(z + lane, pixel, a);
+        }
+        BARRIER;
+        for (int i = star_near[block]; i < star_near[block + 1]; ++i) {
+            const int s = star_near[i];
+            const int window = window_block(
+                star_corners, s, n_images, image, star_blocks, block, IMAGE_ROW_BLOCKS);
+            __global const vec *star = WINDOW_BLOCK(star_images, window, star_columns);
+            vec_sum product = {0, 0};
+            FOR_EACH(piece, star_columns * SIDE) {
+                const int column = piece / SIDE, lane = piece % SIDE;
+                const int pixel = window_pixel(star_corners, s, column, IMAGE_NX);
+                const cvec r = LOAD(z + lane, pixel), p = LOAD(star + lane, column);
+                ACCUMULATE(product, p.re * r.re + p.im * r.im);
+            }
+            store_pair(star_sums + 2 * window, sum_group(sum_lanes(product), shared));
+        }
+        BARRIER;
+        FOR_EACH(piece, INNER(IMAGE_NX) * SIDE) {
+            const int x = piece / SIDE, lane = piece % SIDE;
+            cvec a[OUTER(IMAGE_NX)];
+            UNROLL
+            for (int q = 0; q < OUTER(IMAGE_NX); ++q)
+                a[q] = LOAD(z + lane, q * INNER(IMAGE_NX) + x);
             store_forward(z + lane, a, x, IMAGE_NX, image_row_roots);
         }
         store_pair(ratio_sums + 2 * unit, sum_group(sum_lanes(objective), shared));
-        for (int s = 0; s < near.count; ++s)
-            store_pair(star_sums + 2 * near.block[s], sum_group(sum_lanes(products[s]), shared));
         BARRIER;
         dif_inner(z, IMAGE_NX, image_row_roots);
         write_tiles(row_spectra, z, block, OVERSAMPLE);

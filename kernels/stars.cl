@@ -4,42 +4,25 @@
  * column corners[s][1] on, round the edges of the grid; beyond it the array is 0. Windows lie one
  * behind the other, [n_stars][n_arrays], all with as many blocks and columns, and each block of one
  * may have a sum: [n_stars][n_arrays][n_blocks][2].
+ *
+ * The host lists the stars of each block: those whose windows hold block b of row_blocks are
+ * near[near[b]] to near[near[b + 1] - 1]. So no work-item holds a list, however many stars there are.
  */
 
-/* The stars whose windows hold one of row_blocks blocks of row pairs: their numbers, which block of all
- * windows that is, and its first column.
- */
-#define NEAR_ROOM (MAX_STARS > 0 ? MAX_STARS : 1)
-typedef struct {
-    int count;
-    int star[NEAR_ROOM];
-    int block[NEAR_ROOM];
-    int column[NEAR_ROOM];
-} near_stars;
-
-INLINE near_stars stars_near(
-    __global const int *corners, const int n_stars, const int n_arrays, const int n_blocks,
-    const int array, const int block, const int row_blocks)
+/* Which block of all windows is block b of row_blocks, in the window of star s for one of n_arrays. */
+INLINE int window_block(
+    __global const int *corners, const int s, const int n_arrays, const int array,
+    const int n_blocks, const int b, const int row_blocks)
 {
-    near_stars near;
-    near.count = 0;
-    /* The second bound lets compilers know that none or one star is all there is. */
-    for (int s = 0; s < n_stars && s < MAX_STARS; ++s) {
-        const int ahead = block - corners[2 * s], k = ahead < 0 ? ahead + row_blocks : ahead;
-        if (k < n_blocks) {
-            near.star[near.count] = s;
-            near.column[near.count] = corners[2 * s + 1];
-            near.block[near.count] = (s * n_arrays + array) * n_blocks + k;
-            ++near.count;
-        }
-    }
-    return near;
+    const int ahead = b - corners[2 * s];
+    return (s * n_arrays + array) * n_blocks + (ahead < 0 ? ahead + row_blocks : ahead);
 }
 
-/* The column of a window that pixel x of a row of nx lies in; beyond its columns where there is none. */
-INLINE int window_column(const int x, const int first, const int nx)
+/* The pixel of a row of nx in which a column of the window of star s lies. */
+INLINE int window_pixel(__global const int *corners, const int s, const int column, const int nx)
 {
-    return x < first ? x - first + nx : x - first;
+    const int pixel = corners[2 * s + 1] + column;
+    return pixel < nx ? pixel : pixel - nx;
 }
 
 #define WINDOW_BLOCK(windows, block, columns) ((windows) + (size_t)(block) * ((columns) * 2 * SIDE))

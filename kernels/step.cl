@@ -102,7 +102,8 @@ KERNEL void gradient_rows(
  * spectra: one array, out: twice the row spectrum. extended: one array of pixels, written.
  * previous (f), gradient, shift: one each, const; inverse_weight, curvature: as for gradient_rows,
  * which has D. cross_information: [n_stars], a window of cross_blocks blocks and cross_columns
- * columns each, see stars.cl; cross_corners: [n_stars][2]; coupling_sums: [n_stars][cross_blocks][2].
+ * columns each; cross_corners: [n_stars][2]; cross_near: the stars of each block, see stars.cl.
+ * coupling_sums: [n_stars][cross_blocks][2].
  * step_sums, square_sums (HAS_MU): [ROW_BLOCKS][2].
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.step_rows.
  */
@@ -113,16 +114,15 @@ KERNEL void step_rows(
     __global const vec *restrict gradient, __global const vec *restrict shift,
     __global const vec *restrict inverse_weight, __global const vec *restrict curvature,
     __global const vec *restrict cross_information, __global const int *restrict cross_corners,
-    const real mu, const real alpha, const real share, const int n_images, const int n_stars,
-    const int cross_blocks, const int cross_columns, __global const real *restrict row_roots,
-    SCRATCH vec *restrict scratch)
+    __global const int *restrict cross_near, const real mu, const real alpha, const real share,
+    const int n_images, const int cross_blocks, const int cross_columns,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
     FOR_EACH_BLOCK(block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
-        const near_stars near =
-            stars_near(cross_corners, n_stars, 1, cross_blocks, 0, block, ROW_BLOCKS);
+        const bool has_stars = cross_near[block] < cross_near[block + 1];
         vec_sum slope_total = {0, 0}, square_total = {0, 0};
         /* A pass of its own over the pixels in their order, which prefetching follows: inside the
          * transform they come from too many places at once.
@@ -141,23 +141,26 @@ KERNEL void step_rows(
             const cvec trial = {not_below_0(f.re + share * d.re), not_below_0(f.im + share * d.im)};
             STORE(extended + at + lane, pixel, trial);
             ACCUMULATE(slope_total, g.re * d.re + g.im * d.im);
-            if (near.count > 0)
+            if (has_stars)
                 STORE(z + lane, pixel, d);
 #if HAS_MU
             ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
 #endif
         }
         BARRIER;
-        for (int s = 0; s < near.count; ++s) {
-            __global const vec *r = WINDOW_BLOCK(cross_information, near.block[s], cross_columns);
+        for (int i = cross_near[block]; i < cross_near[block + 1]; ++i) {
+            const int s = cross_near[i];
+            const int window =
+                window_block(cross_corners, s, 1, 0, cross_blocks, block, ROW_BLOCKS);
+            __global const vec *r = WINDOW_BLOCK(cross_information, window, cross_columns);
             vec_sum coupling = {0, 0};
             FOR_EACH(piece, cross_columns * SIDE) {
                 const int column = piece / SIDE, lane = piece % SIDE;
-                const int pixel = (near.column[s] + column) % NX;
+                const int pixel = window_pixel(cross_corners, s, column, NX);
                 const cvec d = LOAD(z + lane, pixel), there = LOAD(r + lane, column);
                 ACCUMULATE(coupling, there.re * d.re + there.im * d.im);
             }
-            store_pair(coupling_sums + 2 * near.block[s], sum_group(sum_lanes(coupling), shared));
+            store_pair(coupling_sums + 2 * window, sum_group(sum_lanes(coupling), shared));
         }
         BARRIER;
         FOR_EACH(piece, INNER(NX) * SIDE) {

@@ -49,7 +49,7 @@ CASES = {
     "group, middle pass along y": ((128, 4), Tuning(1, 2, group=16, chunk=8), "plain", "D"),
     "group, all passes": ((2, 1024), Tuning(1, 1, group=8), "plain", "S"),
     "group, global scratch": (
-        (16, 16),
+        (32, 32),
         Tuning(1, 2, group=4, scratch_is_global=True),
         "mask, mu, smoothing",
         "sD",
@@ -58,7 +58,7 @@ CASES = {
     "deconvolution": ((16, 16), None, DECONVOLUTION, "SD"),
 }
 # Fewer groups than blocks to share the scratch.
-DEVICE_OPTIONS = {"group, global scratch": ["--compute-units", "2"]}
+DEVICE_OPTIONS = {"group, global scratch": ["--compute-units", "1"]}
 
 
 class Layout(layout.Layout):
@@ -183,6 +183,7 @@ def tune_as_on_gpu():
         gpu = SimpleNamespace(
             type=cl.device_type.GPU,
             max_work_group_size=device.max_work_group_size,
+            max_compute_units=device.max_compute_units,
             local_mem_size=device.local_mem_size,
             name=device.name,
             platform=device.platform,

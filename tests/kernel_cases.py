@@ -2,6 +2,7 @@
 
 import functools
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,13 @@ from lnocl.verify.harness import (
     KernelHarness,
     inputs,
 )
+
+
+def of_gpu(*grid, oversample=1):
+    """Return the tuning of a GPU with 132 compute units and 48 KiB of local memory a group."""
+    gpu = SimpleNamespace(local_mem_size=48 * 1024, max_compute_units=132)
+    return Tuning(1, 8, group=256).fit(gpu, np.dtype(np.float32), grid, oversample)
+
 
 # Name: (grid, tuning, scene, precisions), a capital letter for one that only CI tests. Each grid
 # is the smallest that takes some path of kernels/fft.cl; tunings other than the default share a
@@ -62,6 +70,12 @@ CASES = {
         "mask, mu, smoothing",
         "S",
     ),
+    "GPU, 64": ((64, 64), of_gpu(64, 64), THREE_IMAGES, "SD"),
+    "GPU, 512": ((512, 512), of_gpu(512, 512), "exposure map, mu", "SD"),
+    "GPU, 1024": ((1024, 1024), of_gpu(1024, 1024), THREE_IMAGES, "SD"),
+    "GPU, blocks of 1": ((4096, 16), of_gpu(4096, 16), "mask, mu, smoothing", "S"),
+    "GPU, sky twice as fine": ((64, 96), of_gpu(64, 96, oversample=2), TWICE_AS_FINE, "S"),
+    "GPU, odd factors": ((144, 80), of_gpu(144, 80), "two images, star, mu", "SD"),
 }
 DTYPES = {"s": np.float32, "d": np.float64}
 # Of tests that need a program with stars and without weights; CI runs them in double.

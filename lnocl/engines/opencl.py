@@ -90,7 +90,6 @@ class OpenCLEngine:
             np.dtype(np.float64 if precision == "double" else np.float32),
             tuning,
             oversample=scene.oversample,
-            n_stars=scene.n_stars,
             has_mu=scene.mu > 0,
             has_smoothing=scene.is_smoothed,
             has_smoothing_map=scene.smoothing_map is not None,
@@ -178,6 +177,7 @@ class OpenCLEngine:
             "exposure": p * image if scene.has_exposure_map else item,
             "star_images": max(p * self._stars.bytes, item),
             "star_corners": max(n, 1) * 8,
+            "star_near": self._stars.near.nbytes,
             "star_fluxes": max(n, 1) * item,
             "star_weights": max(n, 1) * item,
             "star_corrections": max(n, 1) * item,
@@ -209,6 +209,7 @@ class OpenCLEngine:
         return {
             "cross_information": max(self._cross.bytes, item),
             "cross_corners": max(self.scene.n_stars, 1) * 8,
+            "cross_near": self._cross.near.nbytes,
             "coupling_sums": max(self._cross.n_blocks_of_all, 1) * 2 * item,
         }
 
@@ -255,6 +256,7 @@ class OpenCLEngine:
             memory.upload_pixels("smoothing_map", [scene.smoothing_map])
         self._make_otfs()
         memory.upload_integers("star_corners", self._stars.corners)
+        memory.upload_integers("star_near", self._stars.near)
         self.move_stars()
         if scene.weights is not None:
             self._invert(self._total_weight(scene.weights))
@@ -294,6 +296,7 @@ class OpenCLEngine:
             map(self._cross.cut, range(len(scaling.cross_information)), scaling.cross_information),
         )
         self._memory.upload_integers("cross_corners", self._cross.corners)
+        self._memory.upload_integers("cross_near", self._cross.near)
         self._gradient = self._bind("gradient_rows")
         self._step = self._bind("step_rows")
 

@@ -19,12 +19,11 @@ from lnocl.opencl import kernel_cache, trial, unknown_cpu
 from lnocl.opencl.device import describe, has_double
 from lnocl.opencl.faults import after_fault, build_failure
 from lnocl.opencl.sources import source
-from lnocl.opencl.tuning import Tuning, odd_part, scratch_points, tune
+from lnocl.opencl.tuning import Tuning, odd_part, tune
 from lnocl.process import LOCK, ignored_warnings
 
-# Rooms for stars that programs are built with. More stars seldom build another program; where there
-# are none, or one, the loops over stars cost nothing.
-STAR_ROOMS = (0, 1, 8, 64, 512, 4096, 32768)
+# Groups a compute unit that have a scratch in global memory, where groups have several work-items.
+GROUPS_A_UNIT = 4
 
 # Built programs that a process holds, the last used; each takes some 3 MiB.
 MAX_PROGRAMS = 16
@@ -65,8 +64,6 @@ class Program:
         By default that of `lnocl.opencl.tuning.tune`.
     oversample : int, optional
         Pixels of the sky to one of the images, along each axis: 1, 2 or 4.
-    n_stars : int, optional
-        Stars of the scene, at most 32768; the program has room for more.
     has_mu, has_smoothing, has_smoothing_map : bool, optional
     has_weights, has_background_map, has_exposure_map : bool, optional
         Parts that the scene has.
@@ -91,8 +88,7 @@ class Program:
     Raises
     ------
     DeviceError
-        The device has no double precision and float64 is asked of it, its compiler fails, or the
-        scene has more than 32768 stars.
+        The device has no double precision and float64 is asked of it, or its compiler fails.
     """
 
     def __init__(
@@ -103,7 +99,6 @@ class Program:
         tuning: Tuning | None = None,
         *,
         oversample: int = 1,
-        n_stars: int = 0,
         has_mu: bool = False,
         has_smoothing: bool = False,
         has_smoothing_map: bool = False,
@@ -123,7 +118,8 @@ class Program:
         self.oversample = oversample
         self.image_grid = grid[0] // oversample, grid[1] // oversample
         self.rows = grid[0] + self.tuning.padding
-        self.max_groups = device.max_compute_units if self.tuning.scratch_is_global else 0
+        a_unit = GROUPS_A_UNIT if self.tuning.group > 1 else 1
+        self.max_groups = a_unit * device.max_compute_units * self.tuning.scratch_is_global
         lengths = {"row": grid[1], "column": grid[0]}
         lengths |= {"image_row": self.image_grid[1], "image_column": self.image_grid[0]}
         self.radices = {name: radices(n) for name, n in lengths.items()}
@@ -140,12 +136,12 @@ class Program:
             },
             "CHUNK": self.tuning.chunk,
             "SCRATCH_IS_GLOBAL": int(self.tuning.scratch_is_global),
+            "SCRATCH_BLOCKS": self.tuning.scratch_blocks,
             "HAS_BUILTIN_PREFETCH": int(_has_builtin_prefetch(device)),
             "NX": grid[1],
             "NY": grid[0],
             "OVERSAMPLE": oversample,
             "ROWS": self.rows,
-            "MAX_STARS": _room_for(n_stars),
             "HAS_MU": int(has_mu),
             "HAS_SMOOTHING": int(has_smoothing),
             "HAS_SMOOTHING_MAP": int(has_smoothing_map),
@@ -187,23 +183,13 @@ class Program:
     @property
     def scratch_bytes(self) -> int:
         """Bytes that a work-group needs for its block."""
-        points = scratch_points(self.grid, self.oversample)
+        points = self.tuning.scratch_points(self.grid, self.oversample)
         return points * 2 * self.tuning.block * self.dtype.itemsize
 
 
 def _has_builtin_prefetch(device: cl.Device) -> bool:
     """Return whether a device's compiler is known to take clang's builtin."""
     return device.platform.name == unknown_cpu.POCL and bool(device.type & cl.device_type.CPU)
-
-
-def _room_for(n_stars: int) -> int:
-    for room in STAR_ROOMS:
-        if n_stars <= room:
-            return room
-    raise DeviceError(
-        f"{n_stars} stars are too many for the kernels, which have room for {STAR_ROOMS[-1]}: "
-        "give fewer stars, or take `engine` numpy"
-    )
 
 
 def _arguments(text: str, kernel_names: list[str]) -> Mapping[str, tuple[str, ...]]:

@@ -18,6 +18,8 @@ from lnocl.opencl.device import describe
 
 FILE = "tunings.json"
 MAX_BYTES = 2**16
+# Bytes that a device reads or writes at once.
+SECTOR = 32
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,9 @@ class Tuning:
         the same cache sets.
     scratch_is_global : bool
         Whether a block lies in global memory while it is transformed, not in local memory.
+    scratch_blocks : int
+        Blocks that the scratch has room for: 2 where local memory is the cache of a CPU; 1 where it
+        is scarce, and products with OTFs wait in global memory.
     """
 
     lanes: int
@@ -42,18 +47,50 @@ class Tuning:
     chunk: int = 128
     padding: int = 16
     scratch_is_global: bool = False
+    scratch_blocks: int = 1
 
     def fit(
         self, device: cl.Device, dtype: np.dtype, grid: tuple[int, int], oversample: int = 1
     ) -> Tuning:
-        """Return the tuning for a grid: small grids have smaller blocks, none filled in part."""
+        """Return the tuning for a grid.
+
+        Blocks are no larger than those of this tuning, and none is filled in part. They are the
+        largest with which a device is busy: two groups fit in the local memory that one may have,
+        and each compute unit has a block of columns. Else they are the smallest of which a tile of
+        spectra fills a sector of memory; if that does not fit the smallest; and if that does not
+        fit either they lie in global memory.
+        """
         most = min(n // odd_part(n) for n in grid) // (2 * oversample)
-        block = min(self.block, most)
-        group = min(self.group, _power_of_2_up_to(max(1, min(grid) // (8 * oversample))))
-        needed = local_bytes(grid, oversample, dtype, block, group)
-        is_global = self.scratch_is_global or needed > device.local_mem_size
         lanes = min(self.lanes, most)
-        return replace(self, lanes=lanes, block=block, group=group, scratch_is_global=is_global)
+        cuts = [
+            replace(self, lanes=lanes, block=block, group=self._group(grid, oversample, block))
+            for block in _powers_of_2_down(min(self.block, most), lanes)
+        ]
+        full = [cut for cut in cuts if 4 * cut.block**2 * dtype.itemsize >= SECTOR] or cuts[:1]
+        busy = [cut for cut in full if min(grid) // (2 * cut.block) >= device.max_compute_units]
+        if not self.scratch_is_global:
+            sizes = {cut: cut.local_bytes(grid, oversample, dtype) for cut in cuts}
+            fitting = [cut for cut in busy if 2 * sizes[cut] <= device.local_mem_size]
+            for cut in (*fitting[:1], full[-1], cuts[-1]):
+                if sizes[cut] <= device.local_mem_size:
+                    return cut
+        return replace((busy or full)[0], scratch_is_global=True)
+
+    def _group(self, grid: tuple[int, int], oversample: int, block: int) -> int:
+        """Return the items of a group: no more than a pass has butterflies of radix 8."""
+        butterflies = min(grid) // (8 * oversample) * block // min(self.lanes, block)
+        return min(self.group, _power_of_2_up_to(max(1, butterflies)))
+
+    def local_bytes(self, grid: tuple[int, int], oversample: int, dtype: np.dtype) -> int:
+        """Return the bytes of local memory of a work-group: its block, and a sum for each item."""
+        sums = 2 * self.group if self.group > 1 else 0
+        return (self.scratch_points(grid, oversample) * 2 * self.block + sums) * dtype.itemsize
+
+    def scratch_points(self, grid: tuple[int, int], oversample: int) -> int:
+        """Return the points of a block that a work-group holds while it transforms."""
+        ny, nx = grid
+        held = ny // oversample if self.scratch_blocks > 1 else 0
+        return max(nx + (nx // oversample if oversample > 1 else 0), ny + held)
 
 
 def odd_part(n: int) -> int:
@@ -79,10 +116,10 @@ def candidates(device: cl.Device, dtype: np.dtype) -> list[Tuning]:
     """
     if device.type & cl.device_type.CPU:
         lanes = (n_bytes // dtype.itemsize for n_bytes in (32, 64))
-        return [Tuning(n, n) for n in lanes]
+        return [Tuning(n, n, scratch_blocks=2) for n in lanes]
     most = _power_of_2_up_to(device.max_work_group_size)
-    groups = dict.fromkeys(min(n, most) for n in (128, 32, 64))
-    return [Tuning(1, 8, group) for group in groups]
+    groups = dict.fromkeys(min(n, most) for n in (256, 128, 64))
+    return [Tuning(1, block, group) for block in (8, 2) for group in groups]
 
 
 def measured(device: cl.Device, dtype: np.dtype) -> Tuning | None:
@@ -122,7 +159,7 @@ def store(device: cl.Device, fastest: Mapping[np.dtype, Tuning]) -> Path:
 def in_words(tuning: Tuning, dtype: np.dtype) -> str:
     """Return the width of the vectors, or the size of the work-groups, of a tuning."""
     if tuning.group > 1 or tuning.lanes == 1:
-        return f"work-groups of {tuning.group}"
+        return f"work-groups of {tuning.group} and blocks of {tuning.block}"
     return f"vectors of {8 * dtype.itemsize * tuning.lanes} bits"
 
 
@@ -157,19 +194,9 @@ def _read() -> dict[str, object]:
     return {}
 
 
-def local_bytes(
-    grid: tuple[int, int], oversample: int, dtype: np.dtype, block: int, group: int
-) -> int:
-    """Return the bytes of local memory of a work-group: its block, and a sum for each item."""
-    sums = 2 * group if group > 1 else 0
-    return (scratch_points(grid, oversample) * 2 * block + sums) * dtype.itemsize
-
-
-def scratch_points(grid: tuple[int, int], oversample: int) -> int:
-    """Return the points of a block that a work-group holds while it transforms."""
-    ny, nx = grid
-    return max(nx + (nx // oversample if oversample > 1 else 0), ny + ny // oversample)
-
-
 def _power_of_2_up_to(n: int) -> int:
     return 1 << (n.bit_length() - 1)
+
+
+def _powers_of_2_down(most: int, least: int) -> list[int]:
+    return [1 << k for k in range(most.bit_length() - 1, least.bit_length() - 2, -1)]

@@ -5,11 +5,35 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.opencl.layout import PixelLayout, shortest_arc
 from lnocl.scene.arrays import Array
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import Covered
+
+
+def stars_near(corners: NDArray[np.int32], n_blocks: int, row_blocks: int) -> NDArray[np.int32]:
+    """Return the stars of each block of row pairs, as kernels/stars.cl has them.
+
+    Parameters
+    ----------
+    corners : ndarray of int, shape (n, 2)
+        First block and column of each star's window.
+    n_blocks : int
+        Blocks of a window.
+    row_blocks : int
+        Blocks of the grid.
+
+    Returns
+    -------
+    ndarray of int32, shape (row_blocks + 1 + n * n_blocks,)
+        Where the stars of each block begin, and where the last ones end; then the stars.
+    """
+    blocks = ((corners[:, :1] + np.arange(n_blocks)) % row_blocks).ravel()
+    order = np.argsort(blocks, kind="stable")
+    starts = row_blocks + 1 + np.searchsorted(blocks[order], np.arange(row_blocks + 1))
+    return np.concatenate([starts, order // n_blocks]).astype(np.int32)
 
 
 class StarWindows:
@@ -32,6 +56,7 @@ class StarWindows:
         ).reshape(-1, 2)
         self.n_blocks = max((count for _, count in blocks), default=1)
         self.n_columns = max((count for _, count in columns), default=1)
+        self.near = stars_near(self.corners, self.n_blocks, layout.pixels_shape[0])
 
     @property
     def n_blocks_of_all(self) -> int:

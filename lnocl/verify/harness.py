@@ -16,6 +16,7 @@ from lnocl.opencl.launch import READ_WRITE, Launcher
 from lnocl.opencl.layout import Layout, PixelLayout, reversed_order
 from lnocl.opencl.program import Program
 from lnocl.opencl.tuning import Tuning
+from lnocl.opencl.windows import stars_near
 from lnocl.scene.scene import MIN_MODEL
 
 # Scenes with all parts, together, that a program can have.
@@ -88,6 +89,7 @@ class Windows:
         self.n_blocks = row_blocks if n_stars < 2 else max(1, row_blocks // 2)
         self.n_columns = nx if n_stars < 2 else max(1, 3 * nx // 4)
         self.corners = np.array([(row_blocks - 1, nx - 1), (0, 1 % nx)])[:n_stars]
+        self.near = stars_near(self.corners, self.n_blocks, row_blocks)
 
     def rows(self, s: int) -> NDArray[np.int64]:
         """Return the rows of a star's window."""
@@ -111,7 +113,8 @@ class KernelHarness:
     grid, dtype, tuning
         Grid of the sky; as for `lnocl.opencl.program.Program`.
     **scene
-        Parts of the scene, as for `lnocl.opencl.program.Program`, and n_images: one of `SCENES`.
+        Parts of the scene, as for `lnocl.opencl.program.Program`, n_images and n_stars: one of
+        `SCENES`.
     """
 
     def __init__(
@@ -123,7 +126,7 @@ class KernelHarness:
         **scene: Any,
     ) -> None:
         self.n_images, self.n_stars = scene.get("n_images", 1), scene.get("n_stars", 0)
-        parts = {name: has for name, has in scene.items() if name != "n_images"}
+        parts = {name: has for name, has in scene.items() if name not in ("n_images", "n_stars")}
         self.program = Program(context, grid, np.dtype(dtype), tuning, min_model=MIN_MODEL, **parts)
         self.layout, self.launcher = Layout(self.program), Launcher(self.program)
         self.dtype, self.grid, self.scene = self.program.dtype, grid, scene

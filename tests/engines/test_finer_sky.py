@@ -10,6 +10,7 @@ import pytest
 from scenes import FEWER_ENGINES, paper, same, worst
 
 import lnocl
+from lnocl.engines.opencl import ROUNDING
 
 SHAPE = NY, NX = 16, 32
 FLUXES = np.array([1500.0, 900.0])
@@ -99,7 +100,9 @@ def test_steps_lower_the_objective_to_one_minimum(engine):
     """Both methods end where the gradient in every pixel of the sky is 0 or holds it at 0."""
     made = MADE[2]
     result = made.deconvolve(n_iter=300, solver="sgp", **engine)
-    assert (np.diff(result.history["objective"]) <= 0).all()
+    objective = result.history["objective"]
+    rounding = ROUNDING if engine["precision"] == "single" else 0.0
+    assert (np.diff(objective) <= rounding * objective[1:]).all()
     x = np.append(result.extended.ravel(), result.star_fluxes)
     background = np.concatenate([made.background.ravel()] * 2)
     weights = (~made.mask).ravel()

@@ -253,7 +253,7 @@ def test_objectives_are_those_of_scipy(engine, recipe):
 )
 def test_the_tuning_of_a_gpu_gives_the_same(monkeypatch, precision, recipe):
     """Several work-items share a block, whatever device there is."""
-    monkeypatch.setattr(program, "tune", lambda *_: program.Tuning(lanes=1, block=8, group=4))
+    monkeypatch.setattr(program, "tune", lambda *_: program.Tuning(1, 8, group=4))
     made = RECIPES[recipe].make()
     result = made.deconvolve(n_iter=CHECKPOINTS[1], engine="opencl", precision=precision)
     extended, star_fluxes = expected(recipe)[0][CHECKPOINTS[1]]

@@ -5,6 +5,7 @@ import pytest
 from kernel_cases import agree_with_twins, harness_of, in_each_precision
 
 from lnocl import reference
+from lnocl.opencl.windows import stars_near
 from lnocl.scene.scene import MIN_MODEL
 from lnocl.verify.harness import rounded
 
@@ -25,9 +26,9 @@ def launch_ratio_rows(harness, model, images, star_image):
         background=harness.put([1.0]),
         star_images=harness.put_pixels(star_image[None]),
         star_corners=harness.put([0, 0], np.int32),
+        star_near=harness.put(stars_near(np.zeros((1, 2), int), blocks, blocks), np.int32),
         star_fluxes=harness.put([0.0]),
         n_images=1,
-        n_stars=1,
         star_blocks=blocks,
         star_columns=harness.grid[1],
     )

@@ -6,7 +6,6 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-import lnocl
 from lnocl.opencl import program
 from lnocl.opencl.device import choose, context_of
 from lnocl.opencl.program import Program
@@ -43,18 +42,6 @@ def test_a_process_builds_a_program_once(context, compiled):
     for _ in range(3):
         build(context)
     assert len(compiled) == 1
-
-
-@pytest.mark.parametrize("n_stars", [[2, 3, 8], [9, 64], [65, 200, 512]])
-def test_a_star_more_is_no_other_program(context, compiled, n_stars):
-    for n in n_stars:
-        build(context, n_stars=n)
-    assert len(compiled) == 1
-
-
-def test_more_stars_than_there_is_room_for_are_refused(context):
-    with pytest.raises(lnocl.DeviceError, match="40000 stars are too many for the kernels"):
-        build(context, n_stars=40000)
 
 
 def test_the_programs_used_last_are_held(context, compiled):

@@ -15,11 +15,12 @@ KIB = 1024
 SINGLE, DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 
 
-def device(kind, local_kib, name="a device"):
+def device(kind, local_kib, name="a device", units=56):
     return SimpleNamespace(
         type=kind,
         local_mem_size=local_kib * KIB,
         max_work_group_size=256,
+        max_compute_units=units,
         name=name,
         platform=SimpleNamespace(name="a platform"),
         driver_version="1.0",
@@ -54,14 +55,46 @@ def test_scratch_is_global_where_a_block_does_not_fit_in_local_memory(
     assert tuning.scratch_is_global == (needed_kib > local_kib)
 
 
+@pytest.mark.parametrize(
+    ("local_kib", "grid", "dtype", "block", "group", "is_global"),
+    [
+        (48, 64, SINGLE, 2, 16, False),  # too few blocks for all units, however small
+        (48, 512, SINGLE, 4, 256, False),
+        (48, 1024, SINGLE, 2, 256, False),
+        (48, 2048, SINGLE, 2, 256, False),  # one group: blocks of 1 leave half of a sector unused
+        (48, 4096, SINGLE, 1, 256, False),
+        (48, 8192, SINGLE, 8, 256, True),
+        (96, 8192, SINGLE, 1, 256, False),
+        (48, 1024, DOUBLE, 1, 128, False),
+        (48, 4096, DOUBLE, 8, 256, True),
+        (128, 1024, SINGLE, 4, 256, False),
+        (32, 1024, SINGLE, 2, 256, False),
+        (32, 2048, SINGLE, 1, 256, False),
+        (65536, 1024, SINGLE, 8, 256, False),
+    ],
+)
+def test_blocks_of_a_gpu_lie_in_local_memory(local_kib, grid, dtype, block, group, is_global):
+    gpu = device(cl.device_type.GPU, local_kib)
+    tuning = tune(gpu, dtype, (grid, grid))
+    found = tuning.block, tuning.group, tuning.scratch_is_global
+    assert found == (block, group, is_global)
+    sums = 2 * group * dtype.itemsize
+    needed = 2 * grid * block * dtype.itemsize + sums
+    assert tuning.local_bytes((grid, grid), 1, dtype) == needed
+    assert is_global or needed <= local_kib * KIB
+
+
 def test_a_group_needs_room_for_its_sums_beside_the_block():
-    """A block of 64 KiB, and 128 sums: no more than the block would fit."""
-    gpu = device(cl.device_type.GPU, 64)
-    tuning = tune(gpu, np.dtype(np.float32), (512, 1024))
-    assert (tuning.block, tuning.group) == (8, 64)
-    assert tuning.scratch_is_global
-    gpu.local_mem_size += 2 * 64 * 4
-    assert not tune(gpu, np.dtype(np.float32), (512, 1024)).scratch_is_global
+    gpu = device(cl.device_type.GPU, 64)  # as large as the block alone
+    assert tune(gpu, SINGLE, (8192, 8192)).scratch_is_global
+    gpu.local_mem_size += 2 * 256 * 4
+    assert not tune(gpu, SINGLE, (8192, 8192)).scratch_is_global
+
+
+def test_each_unit_of_a_gpu_has_a_block():
+    """Of 132 units a quarter would have none with the largest blocks, where memory is no limit."""
+    gpu = device(cl.device_type.GPU, 1024, units=132)
+    assert [tune(gpu, SINGLE, (n, n)).block for n in (256, 1024, 2048, 4096)] == [2, 2, 4, 8]
 
 
 def test_the_default_is_the_first_candidate():
@@ -72,7 +105,7 @@ def test_the_default_is_the_first_candidate():
     ]
     assert in_words(candidates(CPU, DOUBLE)[0], DOUBLE) == "vectors of 256 bits"
     assert [in_words(each, SINGLE) for each in candidates(GPU, SINGLE)] == [
-        f"work-groups of {n}" for n in (128, 32, 64)
+        f"work-groups of {n} and blocks of {block}" for block in (8, 2) for n in (256, 128, 64)
     ]
 
 
@@ -81,7 +114,7 @@ def test_what_was_measured_is_taken_for_this_device_and_precision_alone(given):
     fastest = candidates(given, SINGLE)[1]
     assert measured(given, SINGLE) is None
     assert store(given, {SINGLE: fastest}).is_file()
-    assert measured(given, SINGLE) == fastest == tune(given, SINGLE, (512, 512))
+    assert measured(given, SINGLE) == fastest == tune(given, SINGLE, (1024, 1024))
     assert measured(given, DOUBLE) is None
     assert measured(device(given.type, 1024, "another"), SINGLE) is None
     other = device(given.type, 1024, "another")

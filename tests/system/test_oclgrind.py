@@ -151,7 +151,7 @@ FAULTS = {
         "Read-write data race at global memory",
     ),
     "scratch read before it is written": (
-        "group larger than its work",
+        "an item a block",
         "correlate_columns",
         "if (image > 0)",
         "if (image >= 0)",

@@ -22,16 +22,12 @@ TRIED = comparison.kernels_of(harness.SCENES[SCENE])
 
 # In the source of the kernels, once each: what is there, and a fault to put in its place.
 FAULTS = {
-    "correlate_columns": ("edge[0], -edge[1], z, t", "edge[0], edge[1], z, t"),
+    "correlate_columns": ("edge[0], -edge[1], opposite", "edge[0], edge[1], opposite"),
     "convolve_columns": (
-        "edge[2 * point], edge[2 * point + 1], source",
-        "edge[2 * point], -edge[2 * point + 1], source",
+        "edge[2 * point], edge[2 * point + 1], opposite",
+        "edge[2 * point], -edge[2 * point + 1], opposite",
     ),
-    "elsewhere": (
-        "finish_columns(columns, total, NY, column_roots);",
-        "finish_columns(columns, total, NY, column_roots);"
-        "finish_columns(columns + SPECTRA_SIZE, total, NY, column_roots);",
-    ),
+    "elsewhere": ("z = held;", "z = held; STORE(columns + SPECTRA_SIZE, 0, LOAD(z, 0));"),
     "step_rows": (
         "KERNEL void step_rows",
         "#undef GROUP\n#define GROUP 2\nKERNEL void step_rows",
