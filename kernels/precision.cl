@@ -69,6 +69,14 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define INLINE static inline __attribute__((always_inline))
 /* For loops over registers: what is not unrolled early goes through memory. */
 #define UNROLL _Pragma("unroll")
+/* For pixelwise work on an array of registers: unrolled, a CPU runs out of them and is slower; rolled,
+ * a GPU takes the array for one in memory.
+ */
+#if GROUP > 1
+#define UNROLL_IN_GROUPS UNROLL
+#else
+#define UNROLL_IN_GROUPS
+#endif
 #define KERNEL __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 #define ITEM ((int)get_local_id(0))
 #if GROUP > 1

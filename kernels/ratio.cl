@@ -131,15 +131,7 @@ KERNEL void ratio_rows(
         read_tiles(wide, row_spectra, block);
         SCRATCH vec *z = fold_rows(wide);
         dit_inner(z, IMAGE_NX, image_row_roots);
-        FOR_EACH(piece, INNER(IMAGE_NX) * SIDE) {
-            const int x = piece / SIDE, lane = piece % SIDE;
-            cvec a[OUTER(IMAGE_NX)];
-            load_inverse(a, z + lane, x, IMAGE_NX, image_row_roots);
-            UNROLL
-            for (int q = 0; q < OUTER(IMAGE_NX); ++q)
-                STORE(z + lane, q * INNER(IMAGE_NX) + x, a[q]);
-        }
-        BARRIER;
+        finish_rows(z, IMAGE_NX, image_row_roots);
         for (int i = star_near[block]; i < star_near[block + 1]; ++i) {
             const int s = star_near[i];
             const int window = window_block(
@@ -192,16 +184,8 @@ KERNEL void ratio_rows(
             store_pair(star_sums + 2 * window, sum_group(sum_lanes(product), shared));
         }
         BARRIER;
-        FOR_EACH(piece, INNER(IMAGE_NX) * SIDE) {
-            const int x = piece / SIDE, lane = piece % SIDE;
-            cvec a[OUTER(IMAGE_NX)];
-            UNROLL
-            for (int q = 0; q < OUTER(IMAGE_NX); ++q)
-                a[q] = LOAD(z + lane, q * INNER(IMAGE_NX) + x);
-            store_forward(z + lane, a, x, IMAGE_NX, image_row_roots);
-        }
         store_pair(ratio_sums + 2 * unit, sum_group(sum_lanes(objective), shared));
-        BARRIER;
+        begin_rows(z, IMAGE_NX, image_row_roots);
         dif_inner(z, IMAGE_NX, image_row_roots);
         write_tiles(row_spectra, z, block, OVERSAMPLE);
     }

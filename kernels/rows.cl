@@ -196,6 +196,34 @@ INLINE void store_forward(
         STORE(z, q * INNER(n) + x, a[q]);
 }
 
+/* Those passes in place, over all points of a block. */
+
+INLINE void finish_rows(SCRATCH vec *z, const int n, __global const real *roots)
+{
+    FOR_EACH(piece, INNER(n) * SIDE) {
+        const int x = piece / SIDE, lane = piece % SIDE;
+        cvec a[MAX_OUTER];
+        load_inverse(a, z + lane, x, n, roots);
+        UNROLL
+        for (int q = 0; q < OUTER(n); ++q)
+            STORE(z + lane, q * INNER(n) + x, a[q]);
+    }
+    BARRIER;
+}
+
+INLINE void begin_rows(SCRATCH vec *z, const int n, __global const real *roots)
+{
+    FOR_EACH(piece, INNER(n) * SIDE) {
+        const int x = piece / SIDE, lane = piece % SIDE;
+        cvec a[MAX_OUTER];
+        UNROLL
+        for (int q = 0; q < OUTER(n); ++q)
+            a[q] = LOAD(z + lane, q * INNER(n) + x);
+        store_forward(z + lane, a, x, n, roots);
+    }
+    BARRIER;
+}
+
 /* spectra = 2 sum_x pixels(x) exp(-2 pi i k x / NX), k = 0 .. NX / 2.
  * pixels: one array, const. spectra: one array, all of it but its padding is written.
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.rfft_rows.

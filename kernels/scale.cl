@@ -47,7 +47,8 @@ KERNEL void scale_rows(
             cvec a[OUTER(NX)];
             load_inverse(a, z + lane, x, NX, row_roots);
             vec part = 0;
-            /* Left rolled: unrolled, the pixelwise work runs out of registers and is slower. */
+            /* A pass of its own over the pixels takes longer here. */
+            UNROLL_IN_GROUPS
             for (int q = 0; q < OUTER(NX); ++q) {
                 const int pixel = q * INNER(NX) + x;
                 const cvec f = LOAD(source + lane, pixel);

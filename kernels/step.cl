@@ -63,32 +63,25 @@ KERNEL void gradient_rows(
         const size_t at = (size_t)block * NX * 2 * SIDE;
         read_tiles(z, spectra, block);
         dit_inner(z, NX, row_roots);
+        finish_rows(z, NX, row_roots);
         vec_sum change_step = {0, 0}, change_change = {0, 0};
-        FOR_EACH(piece, INNER(NX) * SIDE) {
-            const int x = piece / SIDE, lane = piece % SIDE;
-            cvec a[OUTER(NX)];
-            load_inverse(a, z + lane, x, NX, row_roots);
-            vec step_part = 0, change_part = 0;
-            /* Left rolled: unrolled, the pixelwise work runs out of registers and is slower. */
-            for (int q = 0; q < OUTER(NX); ++q) {
-                const int pixel = q * INNER(NX) + x;
-                const cvec f = LOAD(extended + at + lane, pixel);
-                const cvec before = LOAD(previous + at + lane, pixel);
-                const cvec g = LOAD(gradient + at + lane, pixel);
-                const cvec down = smoothing_at(slope + at + lane, pixel);
-                const cvec d =
-                    scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu, n_images);
-                const cvec next = {
-                    next_gradient(a[q].re, f.re, down.re, mu),
-                    next_gradient(a[q].im, f.im, down.im, mu)
-                };
-                const cvec change = {d.re * (next.re - g.re), d.im * (next.im - g.im)};
-                step_part += change.re * (f.re - before.re) + change.im * (f.im - before.im);
-                change_part += change.re * change.re + change.im * change.im;
-                STORE(gradient + at + lane, pixel, next);
-            }
-            ACCUMULATE(change_step, step_part);
-            ACCUMULATE(change_change, change_part);
+        FOR_EACH(piece, NX * SIDE) {
+            const int pixel = piece / SIDE, lane = piece % SIDE;
+            const cvec a = LOAD(z + lane, pixel);
+            const cvec f = LOAD(extended + at + lane, pixel);
+            const cvec before = LOAD(previous + at + lane, pixel);
+            const cvec g = LOAD(gradient + at + lane, pixel);
+            const cvec down = smoothing_at(slope + at + lane, pixel);
+            const cvec d =
+                scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu, n_images);
+            const cvec next = {
+                next_gradient(a.re, f.re, down.re, mu), next_gradient(a.im, f.im, down.im, mu)
+            };
+            const cvec change = {d.re * (next.re - g.re), d.im * (next.im - g.im)};
+            ACCUMULATE(
+                change_step, change.re * (f.re - before.re) + change.im * (f.im - before.im));
+            ACCUMULATE(change_change, change.re * change.re + change.im * change.im);
+            STORE(gradient + at + lane, pixel, next);
         }
         store_pair(change_sums + 4 * block, sum_group(sum_lanes(change_step), shared));
         store_pair(change_sums + 4 * block + 2, sum_group(sum_lanes(change_change), shared));
