@@ -69,6 +69,8 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define INLINE static inline __attribute__((always_inline))
 /* For loops over registers: what is not unrolled early goes through memory. */
 #define UNROLL _Pragma("unroll")
+/* For rounds of work: unrolled, they take five times the registers of a GPU. */
+#define ROLLED _Pragma("unroll 1")
 /* For pixelwise work on an array of registers: unrolled, a CPU runs out of them and is slower; rolled,
  * a GPU takes the array for one in memory.
  */
@@ -112,10 +114,9 @@ typedef PASTE(BITS, WIDTH) ivec;
  * PoCL 3 miscompiles loops round barriers whose bounds differ between the items.
  */
 #if GROUP > 1
-#define FOR_EACH(piece, n)                                                 \
-    for (int round_ = 0, piece = ITEM; round_ < ((n) + GROUP - 1) / GROUP; \
-        ++round_, piece += GROUP)                                          \
-        if (piece < (n))
+#define FOR_EACH(piece, n)                                                        \
+    ROLLED for (int round_ = 0, piece = ITEM; round_ < ((n) + GROUP - 1) / GROUP; \
+        ++round_, piece += GROUP) if (piece < (n))
 #else
 #define FOR_EACH(piece, n) for (int piece = 0; piece < (n); ++piece)
 #endif
