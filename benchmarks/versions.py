@@ -96,6 +96,5 @@ if __name__ == "__main__":
         low, middle, high = np.percentile(ratios, (25, 50, 75))
         error = 1.25 * (high - low) / 1.35 / np.sqrt(len(ratios))
         size, images, solver, stars = case
-        print(
-            f"{size:<4}  {images:<6}  {solver:<6}  {stars:<5}  {ms:<6.3g}  {middle:.3f}  {error:.3f}"
-        )
+        what = f"{size:<4}  {images:<6}  {solver:<6}  {stars:<5}"
+        print(f"{what}  {ms:<6.3g}  {middle:.3f}  {error:.3f}")

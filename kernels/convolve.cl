@@ -126,22 +126,12 @@ KERNEL void convolve_columns(
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
             __global const real *edge = otf_edges + 2 * image * NY;
-            for (int start = 0; start < IMAGE_NY; start += SPAN(IMAGE_NY)) {
-                FOR_EACH(piece, SPAN(IMAGE_NY) / LAST(IMAGE_NY) * SIDE) {
-                    const int t = start + piece / SIDE * LAST(IMAGE_NY), lane = piece % SIDE;
-                    cvec a[8];
-                    UNROLL
-                    for (int q = 0; q < LAST(IMAGE_NY); ++q)
-                        a[q] = convolved(held, k, edge, t + q, lane, block == 0 && lane == 0);
-                    dit(a, LAST(IMAGE_NY));
-                    UNROLL
-                    for (int q = 0; q < LAST(IMAGE_NY); ++q)
-                        STORE(z + lane, t + q, a[q]);
-                }
-                BARRIER;
-                dit_span(z + 2 * SIDE * start, IMAGE_NY, image_column_roots);
+            FOR_EACH(piece, IMAGE_NY * SIDE) {
+                const int t = piece / SIDE, lane = piece % SIDE;
+                STORE(z + lane, t, convolved(held, k, edge, t, lane, block == 0 && lane == 0));
             }
-            dit_middle(z, IMAGE_NY, image_column_roots);
+            BARRIER;
+            dit_inner(z, IMAGE_NY, image_column_roots);
             finish_columns(columns + (size_t)image * SPECTRA_SIZE, z, IMAGE_NY, image_column_roots);
         }
     }

@@ -21,10 +21,10 @@ from lnocl.verify.harness import (
 )
 
 
-def of_gpu(*grid, oversample=1):
+def of_gpu(*grid, oversample=1, dtype=np.float32):
     """Return the tuning of a GPU with 132 compute units and 48 KiB of local memory a group."""
     gpu = SimpleNamespace(local_mem_size=48 * 1024, max_compute_units=132)
-    return Tuning(1, 8, group=256).fit(gpu, np.dtype(np.float32), grid, oversample)
+    return Tuning(1, 8, group=256).fit(gpu, np.dtype(dtype), grid, oversample)
 
 
 # Name: (grid, tuning, scene, precisions), a capital letter for one that only CI tests. Each grid

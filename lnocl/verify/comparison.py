@@ -19,7 +19,7 @@ from lnocl.verify.harness import KernelHarness, rounded
 Pairs = Iterator[tuple[NDArray, NDArray]]
 
 # Worst element over largest: three times what was measured over all cases of the tests on PoCL,
-# 3.3e-7 and 1.2e-15.
+# 3.3e-7 and 1.2e-15. With divisions and roots as far off as OpenCL allows it is 5.8e-7 in single.
 ALLOWED = {np.float32: 1e-6, np.float64: 3.7e-15}
 
 

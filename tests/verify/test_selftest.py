@@ -36,6 +36,32 @@ FAULTS = {
 }
 
 
+# Divisions and roots, and the same as far off as OpenCL allows in single precision (full profile,
+# section 7.4): 2.5 and 3 units in the last place.
+COARSE = {
+    "g / modelled;": "coarse(g / modelled, 2.5);",
+    "a[q].re /= 1 + penalty_weight(mu, curved.re) * f.re * weight.re;": (
+        "a[q].re = coarse(a[q].re / (1 + penalty_weight(mu, curved.re) * f.re * weight.re), 2.5);"
+    ),
+    "a[q].im /= 1 + penalty_weight(mu, curved.im) * f.im * weight.im;": (
+        "a[q].im = coarse(a[q].im / (1 + penalty_weight(mu, curved.im) * f.im * weight.im), 2.5);"
+    ),
+    "beta / sqrt(t * t + delta * delta);": (
+        "coarse(beta / coarse(sqrt(t * t + delta * delta), 3), 2.5);"
+    ),
+    "t * t / (sqrt(t * t + delta * delta) + delta);": (
+        "coarse(t * t / (coarse(sqrt(t * t + delta * delta), 3) + delta), 2.5);"
+    ),
+    "scaled / (1 + penalty_weight(mu, curvature) * scaled);": (
+        "coarse(scaled / (1 + penalty_weight(mu, curvature) * scaled), 2.5);"
+    ),
+    "(star.sum + star.lost) / star_weights[s];": (
+        "(star.sum + star.lost) / star_weights[s] * (1 + 2.5f * 0x1p-23f);"
+    ),
+}
+SIGNS = {"one way": "1", "either way": "(as_ivec(x) & 4) != 0 ? (vec)1 : (vec)-1"}
+
+
 @pytest.fixture
 def plant(monkeypatch):
     """Put faults into the source of the kernels, of one small case in single precision."""
@@ -84,6 +110,23 @@ def is_right(capsys, n_runs):
 @pytest.mark.exhaustive
 def test_a_device_without_double_precision_is_right(capsys, monkeypatch):
     monkeypatch.setattr(selftest, "CASES", selftest.CASES[:2])
+    monkeypatch.setattr(selftest, "has_double", lambda _: False)
+    is_right(capsys, n_runs=2)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("signs", SIGNS)
+def test_a_device_as_coarse_as_may_be_is_right(capsys, monkeypatch, signs):
+    text, before = program.source(), "/* Shares n blocks among"
+    for exact, coarse in COARSE.items():
+        assert text.count(exact) == 1, exact
+        text = text.replace(exact, coarse)
+    inline = (
+        "INLINE vec coarse(const vec x, const real ulps)\n"
+        f"{{ const vec sign = {SIGNS[signs]}; return x * (1 + sign * ulps * 0x1p-23f); }}\n"
+    )
+    assert text.count(before) == 1
+    monkeypatch.setattr(program, "source", lambda: text.replace(before, inline + before))
     monkeypatch.setattr(selftest, "has_double", lambda _: False)
     is_right(capsys, n_runs=2)
 

@@ -1,0 +1,115 @@
+"""What two compilers for GPUs make of the kernels: no work-item needs memory of its own.
+
+clang compiles the kernels, cut as for a GPU, for NVIDIA's and AMD's processors; NVIDIA's own
+assembler, where it is installed, assembles what comes of the first.
+"""
+
+import re
+import shutil
+import subprocess
+from glob import glob
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from kernel_cases import of_gpu
+
+from lnocl.opencl import program
+from lnocl.opencl.device import choose, context_of
+from lnocl.opencl.sources import source
+from lnocl.verify.harness import FOUR_TIMES_AS_FINE, SCENES, THREE_IMAGES
+
+pytestmark = [pytest.mark.system]
+
+CLANG = next(filter(None, map(shutil.which, ["clang-19", "clang-18", "clang-17", "clang"])), None)
+PTXAS = shutil.which("ptxas")
+LIBRARIES = "/usr/lib/clc", "/usr/share/clc"  # of functions that OpenCL has built in
+# Target, processor and library.
+TARGETS = {
+    "NVIDIA": ("nvptx64--nvidiacl", "sm_70", "nvptx64--nvidiacl.bc"),
+    "AMD": ("amdgcn-amd-amdhsa", "gfx906", "amdgcn--amdhsa.bc"),
+}
+# Lengths, one with three blocks in 48 KiB, one with a single one, and both odd and finer.
+CASES = {
+    "64": ((64, 64), THREE_IMAGES),
+    "1024": ((1024, 1024), THREE_IMAGES),
+    "4096": ((4096, 4096), "exposure map, mu"),
+    "odd": ((144, 112), "mask, mu, smoothing"),
+    "finer": ((256, 512), FOUR_TIMES_AS_FINE),
+}
+# Most registers of 32 bits: 256 work-items of 128 leave room for another group on either processor.
+MAX_REGISTERS = {np.float32: 128, np.float64: 256}
+
+
+def options(monkeypatch, grid, scene, dtype):
+    """Return the options with which a program for a GPU is built."""
+    built = SimpleNamespace(kernel_names=[], store=lambda: None)
+    monkeypatch.setattr(program, "_build", lambda *_: built)
+    parts = {k: v for k, v in SCENES[scene].items() if k not in ("n_images", "n_stars")}
+    oversample = parts.get("oversample", 1)
+    cut = of_gpu(*grid, oversample=oversample, dtype=dtype)
+    assert cut.group > 1
+    return program.Program(
+        context_of(choose().device), grid, np.dtype(dtype), cut, min_model=1e-6, **parts
+    ).options
+
+
+def compiled(target, given, tmp_path):
+    """Return the assembly of all kernels."""
+    triple, processor, library = TARGETS[target]
+    found = [file for folder in LIBRARIES for file in glob(f"{folder}/{library}")]
+    if CLANG is None or not found:
+        pytest.skip("no clang with libclc here: install clang-19 and libclc-19")
+    (tmp_path / "kernels.cl").write_text(source(), encoding="ascii")
+    which = "-march=" if target == "NVIDIA" else "-mcpu="
+    command = [
+        *(CLANG, "-x", "cl", "-O3", "-S", "-nogpulib", "-target", triple, which + processor),
+        *("-Xclang", "-finclude-default-header"),
+        *("-Xclang", "-mlink-builtin-bitcode", "-Xclang", found[0]),
+        *given,
+        *("kernels.cl", "-o", "kernels.s"),
+    ]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True)
+    return (tmp_path / "kernels.s").read_text()
+
+
+RUNS = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["single", "double"])
+
+
+@RUNS
+@pytest.mark.parametrize("case", CASES)
+def test_work_items_of_amd_have_registers_alone(monkeypatch, tmp_path, case, dtype):
+    assembly = compiled("AMD", options(monkeypatch, *CASES[case], dtype), tmp_path)
+    kernels = re.findall(
+        r"\.name: +(\w+)\n.*?private_segment_fixed_size: (\d+).*?"
+        r"\.vgpr_count: +(\d+)\n +\.vgpr_spill_count: (\d+)",
+        assembly,
+        re.DOTALL,
+    )
+    names = {name for name, *_ in kernels}
+    assert {"ratio_rows", "scale_rows", "convolve_columns", "step_rows"} <= names
+    for name, private, registers, spilt in kernels:
+        assert (int(private), int(spilt)) == (0, 0), name
+        assert int(registers) <= MAX_REGISTERS[dtype], name
+
+
+@RUNS
+@pytest.mark.parametrize("case", CASES)
+def test_work_items_of_nvidia_have_registers_alone(monkeypatch, tmp_path, case, dtype):
+    assembly = compiled("NVIDIA", options(monkeypatch, *CASES[case], dtype), tmp_path)
+    assert len(re.findall(r"\.entry (\w+)", assembly)) >= 12
+    assert not re.findall(r"__local_depot|\bld\.local|\bst\.local", assembly)
+    if PTXAS is None:
+        return
+    done = subprocess.run(
+        [PTXAS, "-arch=sm_90", "-v", "-o", "kernels.o", "kernels.s"],
+        cwd=tmp_path,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    frames = re.findall(r"(\d+) bytes stack frame, (\d+) bytes spill stores", done.stderr)
+    registers = [int(n) for n in re.findall(r"Used (\d+) registers", done.stderr)]
+    assert len(frames) == len(registers) >= 12
+    assert set(frames) == {("0", "0")}
+    assert max(registers) <= MAX_REGISTERS[dtype]
