@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from lnocl.opencl.device import choose, context_of, describe
+from lnocl.opencl.device import choose, context_of, describe, tell
 from lnocl.opencl.faults import guarded
 from lnocl.opencl.launch import Launch, Launcher
 from lnocl.opencl.layout import Layout
@@ -81,7 +81,9 @@ class OpenCLEngine:
     ) -> None:
         self.name, self.bytes_needed = "the device", 0
         self._forget_record()
-        chosen = choose(device).device
+        choice = choose(device)
+        tell(choice)
+        chosen = choice.device
         self.name, self._device_type = describe(chosen), chosen.type
         self.scene, self.scaling = scene, scaling
         self.program = Program(

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import pyopencl as cl
 
 from lnocl import process
-from lnocl.errors import DeviceError, InputError
+from lnocl.errors import DeviceError, InputError, note
 from lnocl.opencl import kernel_cache, sharing
 from lnocl.opencl.faults import after_fault, claim_process
 
@@ -21,10 +21,11 @@ THREADS, MAX_THREADS = "POCL_MAX_PTHREAD_COUNT", 4096
 
 
 class Choice(NamedTuple):
-    """A device and why it was chosen."""
+    """A device, why it was chosen, and the CPU that a GPU was taken before unasked."""
 
     device: cl.Device
     reason: str
+    instead: cl.Device | None = None
 
 
 def find_devices() -> list[cl.Device]:
@@ -71,17 +72,34 @@ def choose(spec: str | None = None) -> Choice:
     if environment := os.environ.get("PYOPENCL_CTX"):
         return Choice(_by_spec(environment, "PYOPENCL_CTX"), f"PYOPENCL_CTX is {environment!r}")
     gpus = [device for device in devices if device.type & cl.device_type.GPU]
+    cpus = [device for device in devices if device.type & cl.device_type.CPU]
     # Another platform may have the same ones under other names.
     like = [device for device in gpus if device.platform == gpus[0].platform]
     if process.is_worker and len(like) > 1:
         number = sharing.claim(len(like))
         return Choice(like[number], f"GPU {number + 1} of {len(like)}, shared among processes")
     if gpus:
-        return Choice(gpus[0], "the first GPU")
-    for device in devices:
-        if device.type & cl.device_type.CPU:
-            return Choice(device, "the first CPU")
+        return Choice(gpus[0], "the first GPU", cpus[0] if cpus else None)
+    if cpus:
+        return Choice(cpus[0], "the first CPU")
     return Choice(devices[0], "the first device, neither GPU nor CPU")
+
+
+def tell(choice: Choice) -> None:
+    """Log, once, that a GPU was taken unasked, and how the CPU is taken."""
+    if choice.instead is not None:
+        _tell(describe(choice.device), choice.reason, spec_of(choice.instead))
+
+
+@functools.cache
+def _tell(name: str, reason: str, spec: str) -> None:
+    note(
+        "%s is taken, %s; `device` %s takes the CPU, which may be faster than a small GPU: lnocl "
+        "bench times either",
+        name,
+        reason,
+        spec,
+    )
 
 
 def describe(device: cl.Device) -> str:

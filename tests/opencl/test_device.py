@@ -56,6 +56,19 @@ def test_choose(machine, spec, expected):
     assert device.choose(spec).device is expected
 
 
+def test_a_gpu_that_is_taken_unasked_is_named_once_and_the_cpu_beside_it(machine, caplog):
+    caplog.set_level("INFO")
+    device._tell.cache_clear()
+    for spec in (None, None, "1:0", "0:0"):
+        device.tell(device.choose(spec))
+    assert caplog.messages == [
+        "Fast GPU (Vendor, 1) is taken, the first GPU; device 0:0 takes the CPU, which may be "
+        "faster than a small GPU: lnocl bench times either"
+    ]
+    machine.pop(0)
+    assert device.choose().instead is None
+
+
 def test_first_cpu_where_there_is_no_gpu(machine):
     machine.pop()
     assert device.choose().device is CPU
