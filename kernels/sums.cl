@@ -94,7 +94,8 @@ INLINE real_sum sum_pairs(__global const real *pairs, const int n)
  * data_term: [2], J_0. star_totals: [n_stars][2]. star_corrections, star_weights: [n_stars].
  * ratio_sums: [IMAGE_ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
  * square_sums (HAS_MU), smooth_sums (HAS_SMOOTHING): [ROW_BLOCKS][2].
- * Launch: one group. Out of place. Twin: reference.collect_sums.
+ * Launch: up to n_stars groups, at least one. Out of place.
+ * Twin: reference.collect_sums.
  */
 KERNEL void collect_sums(
     __global real *restrict objectives, __global real *restrict data_term,
@@ -105,8 +106,9 @@ KERNEL void collect_sums(
     const int n_stars, const int star_blocks, const int iteration)
 {
     SHARED_SUMS(shared);
-    real_sum objective = sum_group(sum_pairs(ratio_sums, IMAGE_ROW_BLOCKS * n_images), shared);
-    store_pair(data_term, objective);
+    /* Every group makes the objective: a barrier in a branch stops PoCL. */
+    const real_sum data = sum_group(sum_pairs(ratio_sums, IMAGE_ROW_BLOCKS * n_images), shared);
+    real_sum objective = data;
 #if HAS_MU
     real_sum squares = sum_group(sum_pairs(square_sums, ROW_BLOCKS), shared);
     squares.sum *= mu / 2;
@@ -117,9 +119,12 @@ KERNEL void collect_sums(
     const real_sum smooth = sum_group(sum_pairs(smooth_sums, ROW_BLOCKS), shared);
     MERGE(objective, smooth);
 #endif
-    store_pair(objectives + 2 * iteration, objective);
+    if (get_group_id(0) == 0) {
+        store_pair(data_term, data);
+        store_pair(objectives + 2 * iteration, objective);
+    }
     const int n_units = n_images * star_blocks;
-    for (int s = 0; s < n_stars; ++s) {
+    FOR_EACH_BLOCK(s, n_stars) {
         const real_sum star = sum_group(sum_pairs(star_sums + 2 * s * n_units, n_units), shared);
         store_pair(star_totals + 2 * s, star);
         const real correction = 1 + (star.sum + star.lost) / star_weights[s];

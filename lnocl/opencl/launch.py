@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from lnocl.opencl.layout import reversed_order
 from lnocl.opencl.program import Program
 
+# Stars that a work-group of collect_sums sums up one after the other.
+STARS_A_GROUP = 16
 READ_WRITE = cl.mem_flags.READ_WRITE
 
 
@@ -155,7 +157,7 @@ class Launcher:
     def _blocks(self, name: str, arguments: Mapping[str, Any]) -> int:
         """Return the number of work-groups that a kernel has work for."""
         if name == "collect_sums":
-            return 1
+            return 1 + int(arguments["n_stars"]) // STARS_A_GROUP
         if name == "ratio_rows":
             return self.program.image_row_blocks * int(arguments["n_images"])
         return self.program.column_blocks if name.endswith("_columns") else self.program.row_blocks

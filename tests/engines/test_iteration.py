@@ -12,7 +12,7 @@ import functools
 import numpy as np
 import pytest
 import scipy.fft
-from scenes import ENGINES, Recipe, placed, worst
+from scenes import ENGINES, Recipe, paper, placed, worst
 from scipy.special import kl_div
 
 from lnocl.opencl import program
@@ -260,3 +260,23 @@ def test_the_tuning_of_a_gpu_gives_the_same(monkeypatch, precision, recipe):
     extended_tolerance, star_tolerance = TOLERANCES[precision][CHECKPOINTS[1]]
     assert worst(result.extended, extended) <= extended_tolerance
     assert worst(result.star_fluxes, star_fluxes) <= star_tolerance
+
+
+@pytest.mark.parametrize(
+    "tuning", [None, pytest.param(program.Tuning(1, 8, group=4), marks=pytest.mark.exhaustive)]
+)
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_more_stars_than_a_group_sums(monkeypatch, solver, tuning):
+    """Fifty stars, several in each block of rows, from an edge to the other."""
+    if tuning is not None:
+        monkeypatch.setattr(program, "tune", lambda *_: tuning)
+    made = Recipe((64, 256), 2, 2, background="map").make()
+    stars = np.random.default_rng(5).uniform((0, 0), (255, 63), (50, 2)).round(1)
+    found, expected = (
+        paper(
+            made.observation(), stars, n_iter=10, solver=solver, engine=engine, precision="double"
+        )
+        for engine in ("opencl", "numpy")
+    )
+    assert worst(found.extended, expected.extended) <= 1e-12
+    assert worst(found.star_fluxes, expected.star_fluxes) <= 1e-12
