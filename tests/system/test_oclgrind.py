@@ -146,8 +146,8 @@ FAULTS = {
     "every group scales the stars": (
         "group, exposure map",
         "scale_rows",
-        "if (get_group_id(0) == 0) {",
-        "{",
+        "if (get_group_id(0) == 0) {\n        FOR_EACH",
+        "{\n        FOR_EACH",
         "Read-write data race at global memory",
     ),
     "scratch read before it is written": (
