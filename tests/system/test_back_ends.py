@@ -99,8 +99,13 @@ def test_work_items_of_nvidia_have_registers_alone(monkeypatch, tmp_path, case, 
     assembly = compiled("NVIDIA", options(monkeypatch, *CASES[case], dtype), tmp_path)
     assert len(re.findall(r"\.entry (\w+)", assembly)) >= 12
     assert not re.findall(r"__local_depot|\bld\.local|\bst\.local", assembly)
-    if PTXAS is None:
-        return
+
+
+@RUNS
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.skipif(PTXAS is None, reason="no ptxas here: it comes with NVIDIA's CUDA")
+def test_nvidia_assembles_them_without_spilling(monkeypatch, tmp_path, case, dtype):
+    compiled("NVIDIA", options(monkeypatch, *CASES[case], dtype), tmp_path)
     done = subprocess.run(
         [PTXAS, "-arch=sm_90", "-v", "-o", "kernels.o", "kernels.s"],
         cwd=tmp_path,
