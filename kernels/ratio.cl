@@ -169,21 +169,9 @@ KERNEL void ratio_rows(
             STORE(z + lane, pixel, a);
         }
         BARRIER;
-        for (int i = star_near[block]; i < star_near[block + 1]; ++i) {
-            const int s = star_near[i];
-            const int window = window_block(
-                star_corners, s, n_images, image, star_blocks, block, IMAGE_ROW_BLOCKS);
-            __global const vec *star = WINDOW_BLOCK(star_images, window, star_columns);
-            vec_sum product = {0, 0};
-            FOR_EACH(piece, star_columns * SIDE) {
-                const int column = piece / SIDE, lane = piece % SIDE;
-                const int pixel = window_pixel(star_corners, s, column, IMAGE_NX);
-                const cvec r = LOAD(z + lane, pixel), p = LOAD(star + lane, column);
-                ACCUMULATE(product, p.re * r.re + p.im * r.im);
-            }
-            store_pair(star_sums + 2 * window, sum_group(sum_lanes(product), shared));
-        }
-        BARRIER;
+        sum_products(
+            star_sums, z, star_images, star_corners, star_near, n_images, image, star_blocks,
+            star_columns, block, IMAGE_ROW_BLOCKS, IMAGE_NX, shared);
         store_pair(ratio_sums + 2 * unit, sum_group(sum_lanes(objective), shared));
         begin_rows(z, IMAGE_NX, image_row_roots);
         dif_inner(z, IMAGE_NX, image_row_roots);

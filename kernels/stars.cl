@@ -26,3 +26,26 @@ INLINE int window_pixel(__global const int *corners, const int s, const int colu
 }
 
 #define WINDOW_BLOCK(windows, block, columns) ((windows) + (size_t)(block) * ((columns) * 2 * SIDE))
+
+/* sums of each star near block b: of the products of its window and of z, a block of rows of nx. */
+INLINE void sum_products(
+    __global real *sums, SCRATCH const vec *z, __global const vec *windows,
+    __global const int *corners, __global const int *near, const int n_arrays, const int array,
+    const int n_blocks, const int n_columns, const int b, const int row_blocks, const int nx,
+    __local real_sum *shared)
+{
+    for (int i = near[b]; i < near[b + 1]; ++i) {
+        const int s = near[i];
+        const int window = window_block(corners, s, n_arrays, array, n_blocks, b, row_blocks);
+        __global const vec *star = WINDOW_BLOCK(windows, window, n_columns);
+        vec_sum product = {0, 0};
+        FOR_EACH(piece, n_columns * SIDE) {
+            const int column = piece / SIDE, lane = piece % SIDE;
+            const int pixel = window_pixel(corners, s, column, nx);
+            const cvec a = LOAD(z + lane, pixel), p = LOAD(star + lane, column);
+            ACCUMULATE(product, p.re * a.re + p.im * a.im);
+        }
+        store_pair(sums + 2 * window, sum_group(sum_lanes(product), shared));
+    }
+    BARRIER;
+}

@@ -141,21 +141,9 @@ KERNEL void step_rows(
 #endif
         }
         BARRIER;
-        for (int i = cross_near[block]; i < cross_near[block + 1]; ++i) {
-            const int s = cross_near[i];
-            const int window =
-                window_block(cross_corners, s, 1, 0, cross_blocks, block, ROW_BLOCKS);
-            __global const vec *r = WINDOW_BLOCK(cross_information, window, cross_columns);
-            vec_sum coupling = {0, 0};
-            FOR_EACH(piece, cross_columns * SIDE) {
-                const int column = piece / SIDE, lane = piece % SIDE;
-                const int pixel = window_pixel(cross_corners, s, column, NX);
-                const cvec d = LOAD(z + lane, pixel), there = LOAD(r + lane, column);
-                ACCUMULATE(coupling, there.re * d.re + there.im * d.im);
-            }
-            store_pair(coupling_sums + 2 * window, sum_group(sum_lanes(coupling), shared));
-        }
-        BARRIER;
+        sum_products(
+            coupling_sums, z, cross_information, cross_corners, cross_near, 1, 0, cross_blocks,
+            cross_columns, block, ROW_BLOCKS, NX, shared);
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[OUTER(NX)];

@@ -40,10 +40,10 @@ SIZE = 64
 ANGLES = (0.0, 60.0, 120.0) * u.deg
 STARS = Star(32, 16), Star(50, 44, 15.0 * u.mag)
 MASKED = 0.02
-# By solver, iterations and the deviation allowed. In single precision it is twice what a device has
-# whose divisions and roots are as far off as OpenCL allows, 5.9e-7 and 1.7e-6; in double precision,
-# where they are exact, three times what was measured on PoCL or what the reference makes of images
-# that differ by rounding.
+# By solver, iterations and the deviation allowed. In single precision OpenCL allows divisions and
+# roots that are inexact; with the worst of them the deviations are 5.9e-7 and 1.7e-6, and twice as
+# much is allowed. In double precision it is three times the larger of what was measured on PoCL and
+# what the reference makes of images that differ by rounding.
 RUNS: dict[str, tuple[int, dict[str, float]]] = {
     "sgm": (30, {"single": 1.3e-6, "double": 5e-15}),
     "sgp": (10, {"single": 3.5e-6, "double": 1.6e-14}),
