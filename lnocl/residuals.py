@@ -171,11 +171,12 @@ def sharp_sources(sky: Array, background: float, finer: int = 1) -> Array:
     ndarray of float64, shape (n, 3)
         x and y in pixels of the images, and electrons.
     """
-    from scipy.ndimage import maximum_filter  # which --help need not load
+    from scipy.ndimage import maximum_filter, minimum_filter  # which --help need not load
 
     inner, between, outer = SHARP_SIDES
     is_maximum = sky == maximum_filter(sky, outer)
-    is_maximum &= sky * inner**2 > CLEAR  # no source is fainter, and dark skies are all maxima
+    # In flat parts of the sky, dark or not, all pixels are maxima.
+    is_maximum &= (sky * inner**2 > CLEAR) & (sky > minimum_filter(sky, outer))
     y, x = np.nonzero(is_maximum)
     squares = np.lib.stride_tricks.sliding_window_view(np.pad(sky, outer // 2), (outer, outer))
     core, ring, whole = (

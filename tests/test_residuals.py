@@ -1,5 +1,7 @@
 """Whether models fit: residuals in all pixels, at stars, and the light that lies round these."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scenes import Recipe, make_smooth_psfs, paper
@@ -224,3 +226,15 @@ def test_unnamed_stars_are_sharp_sources_and_knots_are_not(finer):
     np.testing.assert_allclose(found[:, 2], [9000.0, 4000.0], rtol=0.01)
     assert len(sharp_sources(sky / 100.0, 5.0, finer)) == 0  # told from noise
     assert len(sharp_sources(np.zeros((8, 8)), 0.0)) == 0
+
+
+def test_flat_parts_of_the_sky_take_no_memory_for_sharp_sources():
+    """All their pixels are maxima, and 9 x 9 pixels round each would be 81 frames."""
+    sky = np.full((512, 512), 20.0)
+    sky[200, 100] = 5000.0
+    tracemalloc.start()
+    found = sharp_sources(sky, 5.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(found[:, :2], [(100, 200)])
+    assert peak < 6 * sky.nbytes

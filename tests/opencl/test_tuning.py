@@ -92,7 +92,7 @@ def test_a_group_needs_room_for_its_sums_beside_the_block():
 
 
 def test_each_unit_of_a_gpu_has_a_block():
-    """Of 132 units a quarter would have none with the largest blocks, where memory is no limit."""
+    """Blocks are smaller than local memory allows where there are fewer of them than units."""
     gpu = device(cl.device_type.GPU, 1024, units=132)
     assert [tune(gpu, SINGLE, (n, n)).block for n in (256, 1024, 2048, 4096)] == [2, 2, 4, 8]
 
