@@ -77,6 +77,29 @@ KERNEL void otf_columns(
     }
 }
 
+#if HAS_TURNS
+/* Row y of the block of columns times its phase, sign 1, or that of the way back, -1: the first shear
+ * of an image that is turned. `phases` are those of image and block: of the first of PHASE_ROWS rows
+ * each, and then of a row among them. Columns 0 and NX / 2 are real, and share column 0: the first
+ * stays, the other is multiplied by a cosine.
+ */
+INLINE cvec shifted(
+    const cvec a, __global const vec *phases, const int y, const bool edges, const int sign)
+{
+    const cvec phase =
+        multiply(LOAD(phases, y / PHASE_ROWS), LOAD(phases, NY / PHASE_ROWS + y % PHASE_ROWS));
+    cvec b = sign > 0 ? multiply(a, phase) : multiply_conjugate(a, phase);
+    if (edges) {
+        b.re += FIRST_LANE * (a.re - b.re);
+        b.im += FIRST_LANE * (a.im * phase.re - b.im);
+    }
+    return b;
+}
+#define PHASES_OF(phases, image, block)              \
+    ((phases) + ((size_t)(image) * COLUMN_BLOCKS + (block)) \
+        * ((NY / PHASE_ROWS + PHASE_ROWS) * 2 * SIDE))
+#endif
+
 /* Point t of a column of an image, in reversed order: the sum of OVERSAMPLE points of otfs_j FFT(f).
  * `k` and `edge` are those of image and block; `edges` tells whether this is column 0.
  */
@@ -101,15 +124,16 @@ INLINE cvec convolved(
 /* spectra_j <- IFFT(otfs_j FFT(spectra_0)) along the columns: the row spectra of A_j f from f's, in
  * every OVERSAMPLE-th row. FFT(spectra_0) may be held in array 0, which is made last.
  * spectra: n_images arrays, written but for their padding. otfs: n_images arrays, const;
- * otf_edges: [n_images][NY][2].
+ * otf_edges: [n_images][NY][2]. row_phases (HAS_TURNS), by which rows are multiplied then:
+ * [n_images][COLUMN_BLOCKS][NY / PHASE_ROWS + PHASE_ROWS][2][BLOCK].
  * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: SCRATCH_POINTS.
  * Twin: reference.convolve_columns.
  */
 KERNEL void convolve_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
-    __global const real *restrict otf_edges, const int n_images,
-    __global const real *restrict column_roots, __global const real *restrict image_column_roots,
-    SCRATCH vec *restrict scratch)
+    __global const real *restrict otf_edges, __global const vec *restrict row_phases,
+    const int n_images, __global const real *restrict column_roots,
+    __global const real *restrict image_column_roots, SCRATCH vec *restrict scratch)
 {
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
@@ -132,7 +156,19 @@ KERNEL void convolve_columns(
             }
             BARRIER;
             dit_inner(z, IMAGE_NY, image_column_roots);
+#if HAS_TURNS
+            __global const vec *phases = PHASES_OF(row_phases, image, block);
+            __global vec *to = columns + (size_t)image * SPECTRA_SIZE;
+            finish_rows(z, NY, column_roots);
+            FOR_EACH(piece, NY * SIDE) {
+                const int y = piece / SIDE, lane = piece % SIDE;
+                const cvec a = LOAD(z + lane, y);
+                STORE(to + lane, y, shifted(a, phases + lane, y, block == 0 && lane == 0, 1));
+            }
+            BARRIER;
+#else
             finish_columns(columns + (size_t)image * SPECTRA_SIZE, z, IMAGE_NY, image_column_roots);
+#endif
         }
     }
 }
@@ -145,9 +181,9 @@ KERNEL void convolve_columns(
  */
 KERNEL void correlate_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
-    __global const real *restrict otf_edges, const int n_images,
-    __global const real *restrict column_roots, __global const real *restrict image_column_roots,
-    SCRATCH vec *restrict scratch)
+    __global const real *restrict otf_edges, __global const vec *restrict row_phases,
+    const int n_images, __global const real *restrict column_roots,
+    __global const real *restrict image_column_roots, SCRATCH vec *restrict scratch)
 {
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
@@ -155,8 +191,21 @@ KERNEL void correlate_columns(
         for (int image = 0; image < n_images; ++image) {
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
+#if HAS_TURNS
+            __global const vec *phases = PHASES_OF(row_phases, image, block);
+            __global const vec *from = columns + (size_t)image * SPECTRA_SIZE;
+            FOR_EACH(piece, NY * SIDE) {
+                const int y = piece / SIDE, lane = piece % SIDE;
+                const cvec a = LOAD(from + lane, y);
+                STORE(z + lane, y, shifted(a, phases + lane, y, block == 0 && lane == 0, -1));
+            }
+            BARRIER;
+            begin_rows(z, NY, column_roots);
+            dif_inner(z, NY, column_roots);
+#else
             forward_columns(
                 z, columns + (size_t)image * SPECTRA_SIZE, IMAGE_NY, image_column_roots);
+#endif
             FOR_EACH(piece, NY * SIDE) {
                 const int t = piece / SIDE, lane = piece % SIDE;
                 const cvec a = LOAD(z + lane, t / OVERSAMPLE);

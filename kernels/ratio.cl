@@ -99,6 +99,60 @@ INLINE SCRATCH vec *fold_rows(SCRATCH vec *z)
 #endif
 }
 
+/* z <- r_j - w_j, from A_j f in a block of rows of an image; ratio_sums and star_sums of the block. */
+INLINE void compare(
+    SCRATCH vec *z, __global real *ratio_sums, __global real *star_sums,
+    __global const vec *images, __global const real *background, __global const vec *exposure,
+    __global const vec *star_images, __global const int *star_corners,
+    __global const int *star_near, __global const real *star_fluxes, const int n_images,
+    const int star_blocks, const int star_columns, const int block, const int image,
+    __local real_sum *shared)
+{
+    const size_t at = (size_t)image * IMAGE_SIZE + (size_t)block * IMAGE_NX * 2 * SIDE;
+    const int unit = image * IMAGE_ROW_BLOCKS + block;
+    for (int i = star_near[unit]; i < star_near[unit + 1]; ++i) {
+        const int s = star_near[i], w = s * n_images + image;
+        const int window =
+            window_block(star_corners, w, star_blocks, block, IMAGE_ROW_BLOCKS);
+        __global const vec *star = WINDOW_BLOCK(star_images, window, star_columns);
+        const real flux = star_fluxes[s];
+        FOR_EACH(piece, star_columns * SIDE) {
+            const int column = piece / SIDE, lane = piece % SIDE;
+            const int pixel = window_pixel(star_corners, w, column, IMAGE_NX);
+            const cvec m = LOAD(z + lane, pixel), p = LOAD(star + lane, column);
+            const cvec sum = {m.re + flux * p.re, m.im + flux * p.im};
+            STORE(z + lane, pixel, sum);
+        }
+        BARRIER;
+    }
+    vec_sum objective = {0, 0};
+    FOR_EACH(piece, IMAGE_NX * SIDE) {
+        const int pixel = piece / SIDE, lane = piece % SIDE;
+        const cvec g = LOAD(images + at + lane, pixel);
+        cvec a = LOAD(z + lane, pixel), term;
+#if HAS_BACKGROUND_MAP
+        a = add(a, LOAD((__global const vec *)background + at + lane, pixel));
+#else
+        a.re += background[image];
+        a.im += background[image];
+#endif
+        a.re = ratio(g.re, a.re, &term.re);
+        a.im = ratio(g.im, a.im, &term.im);
+#if HAS_EXPOSURE_MAP
+        const cvec w = LOAD(exposure + at + lane, pixel);
+        a = (cvec){a.re * w.re, a.im * w.im};
+        term = (cvec){term.re * w.re, term.im * w.im};
+#endif
+        ACCUMULATE(objective, term.re + term.im);
+        STORE(z + lane, pixel, a);
+    }
+    BARRIER;
+    sum_products(
+        star_sums, z, star_images, star_corners, star_near, n_images, image, star_blocks,
+        star_columns, block, IMAGE_ROW_BLOCKS, IMAGE_NX, shared);
+    store_pair(ratio_sums + 2 * (block * n_images + image), sum_group(sum_lanes(objective), shared));
+}
+
 /* m_j = A_j f + sum_s c_s P_js + b_j;  r_j = w_j g_j / m_j;  spectra <- row spectra of r_j - w_j;
  * ratio_sums: J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j); star_sums: <P_js, r_j - w_j>.
  * spectra: n_images arrays, in: row spectra of A_j f, out: twice the row spectra of r_j - w_j.
@@ -106,7 +160,7 @@ INLINE SCRATCH vec *fold_rows(SCRATCH vec *z)
  * background: [n_images], or n_images arrays of pixels (HAS_BACKGROUND_MAP).
  * exposure: n_images arrays of pixels, w (HAS_EXPOSURE_MAP; then no image is negative).
  * star_images: [n_stars][n_images], a window of star_blocks blocks and star_columns columns each;
- * star_corners: [n_stars][2]; star_near: the stars of each block, see stars.cl.
+ * star_corners: [n_stars][n_images][2]; star_near: the stars of each block, see stars.cl.
  * star_fluxes: [n_stars].
  * ratio_sums: [IMAGE_ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
  * Launch: up to IMAGE_ROW_BLOCKS n_images groups. In place. Scratch: NX points, and where
@@ -127,52 +181,13 @@ KERNEL void ratio_rows(
     FOR_EACH_BLOCK(unit, IMAGE_ROW_BLOCKS * n_images) {
         const int block = unit / n_images, image = unit % n_images;
         __global vec *row_spectra = spectra + (size_t)image * SPECTRA_SIZE;
-        const size_t at = (size_t)image * IMAGE_SIZE + (size_t)block * IMAGE_NX * 2 * SIDE;
         read_tiles(wide, row_spectra, block);
         SCRATCH vec *z = fold_rows(wide);
         dit_inner(z, IMAGE_NX, image_row_roots);
         finish_rows(z, IMAGE_NX, image_row_roots);
-        for (int i = star_near[block]; i < star_near[block + 1]; ++i) {
-            const int s = star_near[i];
-            const int window = window_block(
-                star_corners, s, n_images, image, star_blocks, block, IMAGE_ROW_BLOCKS);
-            __global const vec *star = WINDOW_BLOCK(star_images, window, star_columns);
-            const real flux = star_fluxes[s];
-            FOR_EACH(piece, star_columns * SIDE) {
-                const int column = piece / SIDE, lane = piece % SIDE;
-                const int pixel = window_pixel(star_corners, s, column, IMAGE_NX);
-                const cvec m = LOAD(z + lane, pixel), p = LOAD(star + lane, column);
-                const cvec sum = {m.re + flux * p.re, m.im + flux * p.im};
-                STORE(z + lane, pixel, sum);
-            }
-            BARRIER;
-        }
-        vec_sum objective = {0, 0};
-        FOR_EACH(piece, IMAGE_NX * SIDE) {
-            const int pixel = piece / SIDE, lane = piece % SIDE;
-            const cvec g = LOAD(images + at + lane, pixel);
-            cvec a = LOAD(z + lane, pixel), term;
-#if HAS_BACKGROUND_MAP
-            a = add(a, LOAD((__global const vec *)background + at + lane, pixel));
-#else
-            a.re += background[image];
-            a.im += background[image];
-#endif
-            a.re = ratio(g.re, a.re, &term.re);
-            a.im = ratio(g.im, a.im, &term.im);
-#if HAS_EXPOSURE_MAP
-            const cvec w = LOAD(exposure + at + lane, pixel);
-            a = (cvec){a.re * w.re, a.im * w.im};
-            term = (cvec){term.re * w.re, term.im * w.im};
-#endif
-            ACCUMULATE(objective, term.re + term.im);
-            STORE(z + lane, pixel, a);
-        }
-        BARRIER;
-        sum_products(
-            star_sums, z, star_images, star_corners, star_near, n_images, image, star_blocks,
-            star_columns, block, IMAGE_ROW_BLOCKS, IMAGE_NX, shared);
-        store_pair(ratio_sums + 2 * unit, sum_group(sum_lanes(objective), shared));
+        compare(
+            z, ratio_sums, star_sums, images, background, exposure, star_images, star_corners,
+            star_near, star_fluxes, n_images, star_blocks, star_columns, block, image, shared);
         begin_rows(z, IMAGE_NX, image_row_roots);
         dif_inner(z, IMAGE_NX, image_row_roots);
         write_tiles(row_spectra, z, block, OVERSAMPLE);

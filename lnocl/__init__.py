@@ -23,6 +23,7 @@ from lnocl.errors import LnoclError, LnoclWarning
 from lnocl.result import Result
 from lnocl.scene.observation import Observation
 from lnocl.scene.psf_field import PsfField
+from lnocl.scene.transforms import rotations
 from lnocl.tiles import deconvolve_tiles
 
 __all__ = [
@@ -33,5 +34,6 @@ __all__ = [
     "Result",
     "deconvolve",
     "deconvolve_tiles",
+    "rotations",
 ]
 __version__ = version("lnocl")

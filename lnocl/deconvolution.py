@@ -324,10 +324,12 @@ def deconvolve(
     refine_positions = read_refine_positions(refine_positions)
     fits_stars = solver == "sgp" or refine_positions is True
     positions = check_positions(stars, observation)
+    observation = observation.upright()
     initial = read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
     Penalty(mu)  # a wrong weight is refused before any work
     is_auto = isinstance(smoothing, str) and smoothing == "auto" and len(positions) > 0
-    is_auto = is_auto and not observation.psf_fields  # which are not judged
+    # Those are not judged.
+    is_auto = is_auto and not (observation.psf_fields or observation.is_turned)
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
     moves = refine_positions if is_auto else refine_positions is True
     setup = Setup(

@@ -257,7 +257,7 @@ def _fits_at(
     middle = [
         round(at) - n // 2 + low + size // 2
         for at, n, low, size in zip(
-            (position + observation.offsets[j])[::-1],
+            observation.places(j, position)[::-1],
             psf.shape,
             (y.min(), x.min()),
             bright.shape,

@@ -324,7 +324,7 @@ class Result:
         >>> result.psfs.shape, result.psfs[0].sum()
         ((2, 3, 3), np.float64(1.0))
         """
-        return self._observation.psfs
+        return self._observation.as_given(self._observation.psfs, cut=False)
 
     @property
     def doubtful(self) -> NDArray[np.bool_]:
@@ -366,7 +366,7 @@ class Result:
         >>> result.models().shape, result.models().mean().round(3)
         ((2, 8, 8), np.float64(4.0))
         """
-        return np.array(list(self._findings.models()))
+        return self._observation.as_given(np.array(list(self._findings.models())))
 
     def residuals(self) -> Array:
         """Return the normalised residuals, ``(g_j - m_j) / sqrt(m_j)``.
@@ -388,12 +388,12 @@ class Result:
         >>> result.residuals().shape, bool(0.9 < result.residuals().std() < 1.1)
         ((1, 32, 32), True)
         """
-        return self._residuals(self._findings.models())
+        return self._residuals(self.models())
 
     def _residuals(self, models: Iterable[Array]) -> Array:
         observation = self._observation
-        images = zip(observation.images, observation.mask, models, strict=True)
-        return np.array([residuals(*each) for each in images])
+        images, mask = map(observation.as_given, (observation.images, observation.mask))
+        return np.array([residuals(*each) for each in zip(images, mask, models, strict=True)])
 
     def to_table(self) -> QTable:
         """Return the stars as a table of astropy, which `lnocl.deconvolve` takes as stars again.
@@ -757,7 +757,7 @@ def view_of(result: Result) -> ResultView:
         n_iter=result.n_iter,
         history={name: result.history[name] for name in HISTORY_DTYPE.names or ()},
         held_out={name: result.held_out[name] for name in result.held_out.dtype.names or ()},
-        images=np.where(observation.mask, np.nan, observation.images),
+        images=observation.as_given(np.where(observation.mask, np.nan, observation.images)),
         models=models,
         residuals=result._residuals(models),
         offsets=observation.offsets,

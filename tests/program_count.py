@@ -10,7 +10,7 @@ import pytest
 
 from lnocl.opencl import program
 
-MAX_PROGRAMS = 15
+MAX_PROGRAMS = 16
 FAST = "not exhaustive and not system"
 
 built = {}  # the test that built each program first

@@ -6,13 +6,14 @@ import numpy as np
 
 from lnocl.reference.convolve import convolve_columns, correlate_columns, otf_columns
 from lnocl.reference.ratio import ratio_rows
-from lnocl.reference.rows import irfft_rows, rfft_rows
+from lnocl.reference.rows import rfft_rows
 from lnocl.reference.scale import scale_rows
 from lnocl.reference.smooth import smooth
 from lnocl.reference.step import gradient_rows, step_rows
 from lnocl.reference.sums import collect_sums
+from lnocl.reference.turn import irfft_sheared, ratio_sheared, rfft_sheared
 from lnocl.scene.arrays import Array
-from lnocl.scene.forward_model import spread
+from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.solvers.engine import State
 from lnocl.solvers.scaling import Scaling
@@ -40,6 +41,11 @@ class ReferenceEngine:
         background = scene.background()
         self._background = background if background.ndim == 3 else background[:, None, None]
         self._otfs = np.array([otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)])
+        self._phases = None
+        if rotations := scene.rotations:
+            self._phases = np.array([each.row_phases() for each in rotations])
+            self._column_shifts = np.array([each.column_shifts for each in rotations])
+            self._image_shifts = np.array([each.image_shifts for each in rotations])
         self.move_stars()
         self._inverse_weight = self._invert_weight()
         self._slope = self._curvature = np.zeros(scene.grid)
@@ -66,9 +72,8 @@ class ReferenceEngine:
     def _invert_weight(self) -> Array | float:
         if self.scene.weights is None:
             return 1.0 / self.scene.n_images
-        weights = self.scene.weights.astype(np.float64)
-        row_spectra = rfft_rows(spread(weights, self.scene.oversample))
-        total = irfft_rows(correlate_columns(row_spectra, self._otfs))
+        model = Model(self.scene)
+        total = model.adjoint(model.weights)
         observed = self.scene.observed(total)
         return np.divide(1.0, total, out=np.zeros_like(total), where=observed)
 
@@ -83,14 +88,25 @@ class ReferenceEngine:
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
-        self._ratio_row_spectra, self._data_term, self._star_sums = ratio_rows(
-            convolve_columns(self._row_spectrum, self._otfs, self.scene.oversample),
+        row_spectra = convolve_columns(
+            self._row_spectrum, self._otfs, self.scene.oversample, self._phases
+        )
+        observed = (
             self._images,
             self.scene.weights,
             self._background,
             self._star_images,
             self._star_fluxes,
         )
+        if self._phases is None:
+            self._ratio_row_spectra, self._data_term, self._star_sums = ratio_rows(
+                row_spectra, *observed
+            )
+        else:
+            sheared, self._data_term, self._star_sums = ratio_sheared(
+                irfft_sheared(row_spectra), self._column_shifts, self._image_shifts, *observed
+            )
+            self._ratio_row_spectra = rfft_sheared(sheared, self._column_shifts)
         smoothness = 0.0
         if self.scene.is_smoothed:
             weights = self.scene.smoothing_map
@@ -111,7 +127,7 @@ class ReferenceEngine:
 
     def correct(self) -> None:
         """Back-project the ratios to the correction."""
-        self._row_spectrum = correlate_columns(self._ratio_row_spectra, self._otfs)
+        self._row_spectrum = correlate_columns(self._ratio_row_spectra, self._otfs, self._phases)
 
     def scale(self) -> None:
         """Scale the estimate by its correction."""

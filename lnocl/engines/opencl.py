@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pyopencl as cl
@@ -15,9 +15,11 @@ from lnocl.opencl.launch import Launch, Launcher
 from lnocl.opencl.layout import Layout
 from lnocl.opencl.memory import Memory, Transfer, announce, held_bytes, refuse_if_too_large
 from lnocl.opencl.program import Program
+from lnocl.opencl.shears import Shears
 from lnocl.opencl.tuning import Tuning, describe_tuning
 from lnocl.opencl.windows import StarWindows
 from lnocl.scene.arrays import Array
+from lnocl.scene.rotation import TAPS
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.stars import covered_box
 from lnocl.solvers.engine import State
@@ -98,12 +100,17 @@ class OpenCLEngine:
             has_weights=scene.weights is not None,
             has_exposure_map=scene.has_exposure_map,
             has_background_map=self._has_background_map,
+            has_turns=bool(scene.rotations),
             min_model=MIN_MODEL,
         )
         self.rounding = ROUNDING if precision == "single" else 0.0
         self.layout = Layout(self.program)
+        self._shears = [Shears(rotation) for rotation in scene.rotations]
         self._stars = StarWindows(
-            self.layout.images, [scene.star_box(s) for s in range(scene.n_stars)]
+            self.layout.images,
+            [[scene.star_box(j, s) for j in range(scene.n_images)] for s in range(scene.n_stars)],
+            scene.n_images,
+            [each.roll for each in self._shears],
         )
         self._cross = self._cross_windows()
         sizes = self._sizes(n_iter)
@@ -160,7 +167,7 @@ class OpenCLEngine:
     def _cross_windows(self) -> StarWindows:
         cutouts = self.scaling.cross_information if self.scaling is not None else []
         return StarWindows(
-            self.layout, [covered_box([cutout], self.scene.grid) for cutout in cutouts]
+            self.layout, [[covered_box([cutout], self.scene.grid)] for cutout in cutouts], 1
         )
 
     def _sizes(self, n_iter: int) -> dict[str, int]:
@@ -178,7 +185,7 @@ class OpenCLEngine:
             "background": p * (image if self._has_background_map else item),
             "exposure": p * image if scene.has_exposure_map else item,
             "star_images": max(p * self._stars.bytes, item),
-            "star_corners": max(n, 1) * 8,
+            "star_corners": max(n * p, 1) * 8,
             "star_near": self._stars.near.nbytes,
             "star_fluxes": max(n, 1) * item,
             "star_weights": max(n, 1) * item,
@@ -193,7 +200,10 @@ class OpenCLEngine:
             "smoothing_map": pixels if scene.smoothing_map is not None else item,
             "smooth_sums": program.row_blocks * pair,
             "objectives": (n_iter + 1) * pair,
+            "row_phases": item,
         }
+        if self._shears:
+            sizes |= self._shear_sizes()
         if self.scaling is None:
             return sizes
         return {
@@ -204,6 +214,20 @@ class OpenCLEngine:
             "change_sums": program.row_blocks * 2 * pair,
             "step_sums": program.row_blocks * pair,
             **self._cross_sizes(),
+        }
+
+    def _shear_sizes(self) -> dict[str, int]:
+        """Return the bytes of the buffers of images that are turned."""
+        p, item, (ny, nx) = self.scene.n_images, self.program.dtype.itemsize, self.program.grid
+        columns = self.program.columns_size * item
+        n_phases = ny // self.program.phase_rows + self.program.phase_rows
+        return {
+            "row_phases": p * n_phases * nx * item,
+            "columns": columns,
+            "ratio_columns": columns,
+            "column_shifts": p * nx * 4,
+            "column_weights": p * nx * TAPS * item,
+            "image_weights": p * ny * TAPS * item,
         }
 
     def _cross_sizes(self) -> dict[str, int]:
@@ -237,7 +261,11 @@ class OpenCLEngine:
     def _bind_iteration(self) -> None:
         """Bind the kernels of an iteration, in its order."""
         self._convolve = self._bind("convolve_columns")
-        self._ratio = self._bind("ratio_rows")
+        if self._shears:
+            names = "irfft_sheared", "ratio_sheared", "rfft_sheared"
+            self._turned_ratio = [self._bind(name) for name in names]
+        else:
+            self._ratio = self._bind("ratio_rows")
         if self.scene.is_smoothed:
             self._smooth = self._bind("smooth")
         self._collect = self._bind("collect_sums")
@@ -246,12 +274,14 @@ class OpenCLEngine:
 
     def _upload_scene(self) -> None:
         scene, memory = self.scene, self._memory
+        if self._shears:
+            self._upload_shears()
         self.take_images()
         if scene.weights is not None and scene.has_exposure_map:
-            memory.upload_pixels("exposure", scene.weights)
+            memory.upload_pixels("exposure", self._laid(scene.weights))
         background = scene.background()
         if background.ndim == 3:
-            memory.upload_pixels("background", background)
+            memory.upload_pixels("background", self._laid(background))
         else:
             memory.upload("background", background)
         if scene.smoothing_map is not None:
@@ -263,9 +293,28 @@ class OpenCLEngine:
         if scene.weights is not None:
             self._invert(self._total_weight(scene.weights))
 
+    def _upload_shears(self) -> None:
+        memory, layout, shears = self._memory, self.layout, self._shears
+        phases = [layout.pack_phases(each) for each in self.scene.rotations]
+        memory.upload_raw("row_phases", np.array(phases))
+        memory.upload_integers("column_shifts", np.array([each.column_wholes for each in shears]))
+        memory.upload("column_weights", np.array([each.column_weights for each in shears]))
+        block = self.program.tuning.block
+        memory.upload(
+            "image_weights", np.array([each.pack_image_weights(block) for each in shears])
+        )
+
+    def _laid(self, images: Iterable[Array]) -> Iterator[Array]:
+        """Yield images as they lie on the device: each row rotated by whole pixels, if turned."""
+        if not self._shears:
+            yield from images
+            return
+        for shears, image in zip(self._shears, images, strict=True):
+            yield shears.lay(image)
+
     def take_images(self) -> None:
         """Take the images that the scene has now, all else being as it was; forget the record."""
-        self._memory.upload_pixels("images", self._marked_images())
+        self._memory.upload_pixels("images", self._laid(self._marked_images()))
         self._forget_record()
 
     def _forget_record(self) -> None:
@@ -295,7 +344,7 @@ class OpenCLEngine:
         self._memory.upload_pixels("shift", [scaling.shift])
         self._memory.upload_pixels(
             "cross_information",
-            map(self._cross.cut, range(len(scaling.cross_information)), scaling.cross_information),
+            (self._cross.cut(s, 0, each) for s, each in enumerate(scaling.cross_information)),
         )
         self._memory.upload_integers("cross_corners", self._cross.corners)
         self._memory.upload_integers("cross_near", self._cross.near)
@@ -308,7 +357,7 @@ class OpenCLEngine:
         self._memory.upload_pixels(
             "star_images",
             (
-                self._stars.cut(s, scene.star_cutout(j, s))
+                self._stars.cut(s, j, scene.star_cutout(j, s))
                 for s in range(scene.n_stars)
                 for j in range(scene.n_images)
             ),
@@ -326,7 +375,7 @@ class OpenCLEngine:
 
     def _total_weight(self, weights: NDArray) -> Array:
         """Return sum_j A_j^T w_j."""
-        if self.scene.oversample > 1:  # rfft_rows takes no images that are coarser than the sky
+        if self.scene.oversample > 1 or self._shears:  # rfft_rows takes no such images
             from lnocl.scene.forward_model import Model  # which loads scipy
 
             model = Model(self.scene)
@@ -366,7 +415,13 @@ class OpenCLEngine:
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
-        self._ratio()
+        if self._shears:
+            for image in range(self.scene.n_images):
+                for launch in self._turned_ratio:
+                    launch.set(image=image)
+                    launch()
+        else:
+            self._ratio()
         if self.scene.is_smoothed:
             self._smooth_buffer("extended")
         self._collect.set(iteration=self._n_objectives)

@@ -158,6 +158,8 @@ class Launcher:
         """Return the number of work-groups that a kernel has work for."""
         if name == "collect_sums":
             return 1 + int(arguments["n_stars"]) // STARS_A_GROUP
+        if name == "ratio_sheared":
+            return self.program.image_row_blocks
         if name == "ratio_rows":
             return self.program.image_row_blocks * int(arguments["n_images"])
         return self.program.column_blocks if name.endswith("_columns") else self.program.row_blocks

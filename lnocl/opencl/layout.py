@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lnocl.opencl.program import Program
 from lnocl.opencl.tuning import odd_part
+from lnocl.scene.rotation import Rotation
 
 
 def reversed_order(n: int) -> NDArray[np.int64]:
@@ -159,6 +160,16 @@ class Layout(PixelLayout):
         kept = spectrum[:, self._kept]
         columns[:, 1:] = np.where(self._conjugated, kept[-np.arange(ny)].conj(), kept)
         return columns
+
+    def pack_phases(self, rotation: Rotation) -> NDArray:
+        """Return the phases of the first shear of an image, as `convolve_columns` has them."""
+        nx, block = self.grid[1], self.spectra_shape[-1]
+        kept = np.append(nx // 2, self._kept)  # column 0 takes the phase of Nx / 2
+        signs = np.append(1.0, np.where(self._conjugated, -1.0, 1.0))
+        frequency = signs * np.fft.rfftfreq(nx)[kept]
+        phases = np.concatenate(rotation.phase_tables(frequency))
+        blocks = phases.reshape(len(phases), -1, block).transpose(1, 0, 2)
+        return np.stack([blocks.real, blocks.imag], axis=2).astype(self.dtype)
 
     def pack_columns(self, columns: NDArray) -> NDArray:
         """Return complex columns (rows, Nx / 2) in the kernels' order, as they are."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import re
@@ -21,9 +22,13 @@ from lnocl.opencl.faults import after_fault, build_failure
 from lnocl.opencl.sources import source
 from lnocl.opencl.tuning import Tuning, odd_part, tune
 from lnocl.process import LOCK, ignored_warnings
+from lnocl.scene.rotation import PHASE_ROWS, TAPS
 
 # Groups a compute unit that have a scratch in global memory, where groups have several work-items.
 GROUPS_A_UNIT = 4
+
+# Pairs of rows in a piece of a column, where an image is sheared.
+COLUMN_PAIRS = 64
 
 # Built programs that a process holds, the last used; each takes some 3 MiB.
 MAX_PROGRAMS = 16
@@ -65,7 +70,7 @@ class Program:
     oversample : int, optional
         Pixels of the sky to one of the images, along each axis: 1, 2 or 4.
     has_mu, has_smoothing, has_smoothing_map : bool, optional
-    has_weights, has_background_map, has_exposure_map : bool, optional
+    has_weights, has_background_map, has_exposure_map, has_turns : bool, optional
         Parts that the scene has.
     min_model : float, optional
         The division guard.
@@ -105,6 +110,7 @@ class Program:
         has_weights: bool = False,
         has_background_map: bool = False,
         has_exposure_map: bool = False,
+        has_turns: bool = False,
         min_model: float = 0.0,
     ) -> None:
         device = context.devices[0]
@@ -114,7 +120,8 @@ class Program:
                 f"{describe(device)} has no double precision; take `precision` single, or another "
                 "device"
             )
-        self.tuning = tuning or tune(device, dtype, grid, oversample)
+        self.tuning = tuning or tune(device, dtype, grid, oversample, has_turns)
+        self.has_turns, self.phase_rows = has_turns, math.gcd(grid[0], PHASE_ROWS)
         self.oversample = oversample
         self.image_grid = grid[0] // oversample, grid[1] // oversample
         self.rows = grid[0] + self.tuning.padding
@@ -148,6 +155,10 @@ class Program:
             "HAS_WEIGHTS": int(has_weights),
             "HAS_BACKGROUND_MAP": int(has_background_map),
             "HAS_EXPOSURE_MAP": int(has_exposure_map),
+            "HAS_TURNS": int(has_turns),
+            "TURN_TAPS": TAPS,
+            "PHASE_ROWS": self.phase_rows,
+            "COLUMN_PAIRS": self.column_pairs,
             "MIN_MODEL": f"{min_model!r}",
         }
         definitions = [f"-D{name}={value}" for name, value in constants.items()]
@@ -181,9 +192,21 @@ class Program:
         return self.grid[1] // 2 // self.tuning.block
 
     @property
+    def column_pairs(self) -> int:
+        """Pairs of rows in a piece of a column: see kernels/turn.cl."""
+        return math.gcd(self.grid[0] // 2, COLUMN_PAIRS)
+
+    @property
+    def columns_size(self) -> int:
+        """Reals that the columns of an image take, which kernels/turn.cl shears."""
+        pairs, (ny, nx), block = self.column_pairs, self.grid, self.tuning.block
+        copied = -(-(self.tuning.lanes + TAPS // 2) // block) * block
+        return ny // pairs * nx * (pairs + copied)
+
+    @property
     def scratch_bytes(self) -> int:
         """Bytes that a work-group needs for its block."""
-        points = self.tuning.scratch_points(self.grid, self.oversample)
+        points = self.tuning.scratch_points(self.grid, self.oversample, self.has_turns)
         return points * 2 * self.tuning.block * self.dtype.itemsize
 
 

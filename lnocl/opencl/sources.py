@@ -17,6 +17,7 @@ SOURCES = (
     "sums.cl",
     "stars.cl",
     "ratio.cl",
+    "turn.cl",
     "smooth.cl",
     "scale.cl",
     "step.cl",

@@ -15,6 +15,7 @@ import pyopencl as cl
 from lnocl.errors import FileError, warn
 from lnocl.opencl import kernel_cache
 from lnocl.opencl.device import describe
+from lnocl.scene.rotation import TAPS
 
 FILE = "tunings.json"
 MAX_BYTES = 2**16
@@ -50,7 +51,12 @@ class Tuning:
     scratch_blocks: int = 1
 
     def fit(
-        self, device: cl.Device, dtype: np.dtype, grid: tuple[int, int], oversample: int = 1
+        self,
+        device: cl.Device,
+        dtype: np.dtype,
+        grid: tuple[int, int],
+        oversample: int = 1,
+        has_turns: bool = False,
     ) -> Tuning:
         """Return the tuning for a grid.
 
@@ -69,7 +75,7 @@ class Tuning:
         full = [cut for cut in cuts if 4 * cut.block**2 * dtype.itemsize >= SECTOR] or cuts[:1]
         busy = [cut for cut in full if min(grid) // (2 * cut.block) >= device.max_compute_units]
         if not self.scratch_is_global:
-            sizes = {cut: cut.local_bytes(grid, oversample, dtype) for cut in cuts}
+            sizes = {cut: cut.local_bytes(grid, oversample, dtype, has_turns) for cut in cuts}
             fitting = [cut for cut in busy if 2 * sizes[cut] <= device.local_mem_size]
             for cut in (*fitting[:1], full[-1], cuts[-1]):
                 if sizes[cut] <= device.local_mem_size:
@@ -81,16 +87,22 @@ class Tuning:
         butterflies = min(grid) // (8 * oversample) * block // min(self.lanes, block)
         return min(self.group, _power_of_2_up_to(max(1, butterflies)))
 
-    def local_bytes(self, grid: tuple[int, int], oversample: int, dtype: np.dtype) -> int:
+    def local_bytes(
+        self, grid: tuple[int, int], oversample: int, dtype: np.dtype, has_turns: bool = False
+    ) -> int:
         """Return the bytes of local memory of a work-group: its block, and a sum for each item."""
         sums = 2 * self.group if self.group > 1 else 0
-        return (self.scratch_points(grid, oversample) * 2 * self.block + sums) * dtype.itemsize
+        points = self.scratch_points(grid, oversample, has_turns)
+        return (points * 2 * self.block + sums) * dtype.itemsize
 
-    def scratch_points(self, grid: tuple[int, int], oversample: int) -> int:
+    def scratch_points(
+        self, grid: tuple[int, int], oversample: int, has_turns: bool = False
+    ) -> int:
         """Return the points of a block that a work-group holds while it transforms."""
         ny, nx = grid
         held = ny // oversample if self.scratch_blocks > 1 else 0
-        return max(nx + (nx // oversample if oversample > 1 else 0), ny + held)
+        rows = nx + (nx // oversample if oversample > 1 else 0)
+        return max(2 * (nx + TAPS) if has_turns else rows, ny + held)
 
 
 def odd_part(n: int) -> int:
@@ -98,9 +110,15 @@ def odd_part(n: int) -> int:
     return n // (n & -n)
 
 
-def tune(device: cl.Device, dtype: np.dtype, grid: tuple[int, int], oversample: int = 1) -> Tuning:
+def tune(
+    device: cl.Device,
+    dtype: np.dtype,
+    grid: tuple[int, int],
+    oversample: int = 1,
+    has_turns: bool = False,
+) -> Tuning:
     """Return the tuning of a device for a grid: what was measured there, else the default."""
-    return chosen(device, dtype).fit(device, dtype, grid, oversample)
+    return chosen(device, dtype).fit(device, dtype, grid, oversample, has_turns)
 
 
 def chosen(device: cl.Device, dtype: np.dtype) -> Tuning:

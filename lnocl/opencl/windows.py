@@ -13,13 +13,13 @@ from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import Covered
 
 
-def stars_near(corners: NDArray[np.int32], n_blocks: int, row_blocks: int) -> NDArray[np.int32]:
+def stars_near(corners: NDArray[np.integer], n_blocks: int, row_blocks: int) -> NDArray[np.int32]:
     """Return the stars of each block of row pairs, as kernels/stars.cl has them.
 
     Parameters
     ----------
-    corners : ndarray of int, shape (n, 2)
-        First block and column of each star's window.
+    corners : ndarray of int, shape (n, n_arrays, 2)
+        First block and column of the windows of each star.
     n_blocks : int
         Blocks of a window.
     row_blocks : int
@@ -27,13 +27,18 @@ def stars_near(corners: NDArray[np.int32], n_blocks: int, row_blocks: int) -> ND
 
     Returns
     -------
-    ndarray of int32, shape (row_blocks + 1 + n * n_blocks,)
-        Where the stars of each block begin, and where the last ones end; then the stars.
+    ndarray of int32, shape (n_arrays * row_blocks + 1 + n * n_arrays * n_blocks,)
+        Where the stars of each block of each array begin, and where the last ones end; then the
+        stars.
     """
-    blocks = ((corners[:, :1] + np.arange(n_blocks)) % row_blocks).ravel()
-    order = np.argsort(blocks, kind="stable")
-    starts = row_blocks + 1 + np.searchsorted(blocks[order], np.arange(row_blocks + 1))
-    return np.concatenate([starts, order // n_blocks]).astype(np.int32)
+    n, n_arrays = corners.shape[:2]
+    blocks = (corners[..., :1] + np.arange(n_blocks)) % row_blocks
+    units = (blocks + row_blocks * np.arange(n_arrays)[:, None]).ravel()
+    order = np.argsort(units, kind="stable")
+    n_units = n_arrays * row_blocks
+    starts = n_units + 1 + np.searchsorted(units[order], np.arange(n_units + 1))
+    stars = np.repeat(np.arange(n), n_arrays * n_blocks)[order]
+    return np.concatenate([starts, stars]).astype(np.int32)
 
 
 class StarWindows:
@@ -43,24 +48,37 @@ class StarWindows:
     ----------
     layout : PixelLayout
         Of the arrays.
-    boxes : sequence of Covered
-        For each star the rows and columns that its arrays may reach into.
+    boxes : sequence of sequences of Covered
+        For each star, and each of its arrays, the rows and columns that it may reach into.
+    n_arrays : int
+        Arrays of a star.
+    rolls : sequence of ndarray of int, shape (Ny,), optional
+        For each array the columns by which its rows are rotated.
     """
 
-    def __init__(self, layout: PixelLayout, boxes: Sequence[Covered]) -> None:
-        blocks = [layout.window(box.rows) for box in boxes]
-        columns = [shortest_arc(box.columns) for box in boxes]
-        self._layout = layout
+    def __init__(
+        self,
+        layout: PixelLayout,
+        boxes: Sequence[Sequence[Covered]],
+        n_arrays: int,
+        rolls: Sequence[NDArray[np.int_]] = (),
+    ) -> None:
+        self._layout, self._rolls = layout, rolls
+        blocks, columns = [], []
+        for of_star in boxes:
+            for a, box in enumerate(of_star):
+                blocks.append(layout.window(box.rows))
+                columns.append(_rolled_arc(box, rolls[a]) if rolls else shortest_arc(box.columns))
         self.corners = np.array(
             [(block, x) for (block, _), (x, _) in zip(blocks, columns, strict=True)], np.int32
-        ).reshape(-1, 2)
+        ).reshape(-1, n_arrays, 2)
         self.n_blocks = max((count for _, count in blocks), default=1)
         self.n_columns = max((count for _, count in columns), default=1)
         self.near = stars_near(self.corners, self.n_blocks, layout.pixels_shape[0])
 
     @property
     def n_blocks_of_all(self) -> int:
-        """Blocks of the windows of all stars."""
+        """Blocks of the windows of one array of all stars."""
         return len(self.corners) * self.n_blocks
 
     @property
@@ -69,9 +87,25 @@ class StarWindows:
         width = self._layout.grid[1]
         return self.n_blocks_of_all * self._layout.block_bytes // width * self.n_columns
 
-    def cut(self, s: int, cutout: Cutout) -> Array:
-        """Return the pixels of a star's window, with a cutout in them."""
-        block, column = self.corners[s].tolist()
-        first = int(self._layout.rows_of(block, 1)[0]), column
-        window = np.zeros((self._layout.rows_of(0, self.n_blocks).size, self.n_columns))
-        return cutout.add_to(window, first, self._layout.grid)
+    def cut(self, s: int, a: int, cutout: Cutout) -> Array:
+        """Return the pixels of a window of a star, with a cutout in them."""
+        block, column = self.corners[s, a].tolist()
+        rows = self._layout.rows_of(block, self.n_blocks)
+        if not self._rolls:
+            window = np.zeros((rows.size, self.n_columns))
+            return cutout.add_to(window, (int(rows[0]), column), self._layout.grid)
+        ny, nx = self._layout.grid
+        y = ((rows - cutout.y) % ny)[:, None]
+        x = (column + np.arange(self.n_columns) - self._rolls[a][rows, None] - cutout.x) % nx
+        height, width = cutout.values.shape
+        inside = (y < height) & (x < width)
+        return np.where(inside, cutout.values[y % height, x % width], 0.0)
+
+
+def _rolled_arc(box: Covered, roll: NDArray[np.int_]) -> tuple[int, int]:
+    """Return first and number of the columns of a box, its rows being rotated by some columns."""
+    nx = len(box.columns)
+    first, count = shortest_arc(box.columns)
+    by = roll[box.rows]
+    count = min(count + int(np.ptp(by)), nx)
+    return (first + int(by.min())) % nx, count

@@ -12,6 +12,7 @@ from lnocl.reference.scale import scale_rows
 from lnocl.reference.smooth import smooth
 from lnocl.reference.step import gradient_rows, step_rows
 from lnocl.reference.sums import collect_sums
+from lnocl.reference.turn import irfft_sheared, ratio_sheared, rfft_sheared
 
 __all__ = [
     "collect_sums",
@@ -21,9 +22,12 @@ __all__ = [
     "gradient_rows",
     "ifft_columns",
     "irfft_rows",
+    "irfft_sheared",
     "otf_columns",
     "ratio_rows",
+    "ratio_sheared",
     "rfft_rows",
+    "rfft_sheared",
     "scale_rows",
     "smooth",
     "step_rows",

@@ -19,20 +19,29 @@ def otf_columns(row_spectra: ComplexArray) -> ComplexArray:
 
 
 def convolve_columns(
-    row_spectrum: ComplexArray, otfs: ComplexArray, oversample: int = 1
+    row_spectrum: ComplexArray,
+    otfs: ComplexArray,
+    oversample: int = 1,
+    phases: ComplexArray | None = None,
 ) -> ComplexArray:
     """Return the row spectra of ``A_j f``, shape (p, Ny / oversample, Nx // 2 + 1), from that of f.
 
-    Of the rows, each in `oversample` of them is an image's.
+    Of the rows, each in `oversample` of them is an image's. Where images are turned, each row has
+    been shifted by its phases, the first of three shears (`lnocl.scene.rotation`).
     """
-    return ifft_columns(otfs * fft_columns(row_spectrum))[..., ::oversample, :]
+    rows = ifft_columns(otfs * fft_columns(row_spectrum))[..., ::oversample, :]
+    return rows if phases is None else rows * phases
 
 
-def correlate_columns(row_spectra: ComplexArray, otfs: ComplexArray) -> ComplexArray:
+def correlate_columns(
+    row_spectra: ComplexArray, otfs: ComplexArray, phases: ComplexArray | None = None
+) -> ComplexArray:
     """Return the row spectrum of ``sum_j A_j^T (r_j - w_j)`` from those of the r_j - w_j.
 
     The rows of an image are some of the sky's, each in `oversample` of them; 0 is in the others.
     """
+    if phases is not None:
+        row_spectra = row_spectra * phases.conj()
     rows = np.zeros((*row_spectra.shape[:-2], *otfs.shape[-2:]), np.complex128)
     rows[..., :: otfs.shape[-2] // row_spectra.shape[-2], :] = row_spectra
     return ifft_columns((np.conj(otfs) * fft_columns(rows)).sum(axis=0))

@@ -31,7 +31,24 @@ def ratio_rows(
     """
     convolved = irfft_rows(row_spectra)
     oversample = convolved.shape[-1] // images.shape[-1]
-    model = convolved[..., ::oversample] + background
+    excess, objective, star_sums = compare(
+        convolved[..., ::oversample], images, weights, background, star_images, star_fluxes
+    )
+    spread = np.zeros_like(convolved)
+    spread[..., ::oversample] = excess
+    return rfft_rows(spread), objective, star_sums
+
+
+def compare(
+    seen: Array,
+    images: Array,
+    weights: NDArray[Any] | None,
+    background: Array,
+    star_images: Array,
+    star_fluxes: Array,
+) -> tuple[Array, float, Array]:
+    """Return ``r_j - w_j``, the data term and the star sums, from what images see of the sky."""
+    model = seen + background
     model += np.einsum("s,sjyx->jyx", star_fluxes, star_images)
     dark = model <= MIN_MODEL  # which NaN is not: it reaches the objective
     model = np.where(dark, MIN_MODEL, model)
@@ -45,6 +62,4 @@ def ratio_rows(
         excess, divergence = weights * excess, weights * divergence
     # Not by einsum, which adds one by one: its rounding is seen in sums of many small terms.
     star_sums = np.array([np.sum(each * excess) for each in star_images])
-    spread = np.zeros_like(convolved)
-    spread[..., ::oversample] = excess
-    return rfft_rows(spread), float(divergence.sum()), star_sums
+    return excess, float(divergence.sum()), star_sums

@@ -25,7 +25,7 @@ from lnocl.scene.arrays import numbers
 from lnocl.solvers.engine import State
 
 OBSERVED = (
-    *("images", "psfs", "background", "mask", "exposure", "offsets"),
+    *("images", "psfs", "background", "mask", "exposure", "offsets", "turns"),
     *("oversample", "effective_psfs"),
 )
 # The widest value: a SHA-256 in hexadecimal, or the repr of a parameter or name of a device.

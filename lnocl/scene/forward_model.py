@@ -12,6 +12,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.rotation import TAPS, Rotation
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Cutout
 
@@ -68,7 +69,8 @@ class Model:
 
     @cached_property
     def _otfs(self) -> list[NDArray[np.complex128]]:
-        return [scipy.fft.rfft2(psf.on_grid(self.grid), workers=-1) for psf in self._psfs]
+        p = self.shape[0]
+        return [scipy.fft.rfft2(self._scene.psf(j), workers=-1) for j in range(p)]
 
     def forward(self, extended: Array) -> Array:
         """Return the ``A_j f``, shape (p, ny, nx)."""
@@ -83,8 +85,9 @@ class Model:
     def convolved(self, extended: Array) -> Iterator[Array]:
         """Yield the ``A_j f`` before pixels sample them, each of shape (Ny, Nx)."""
         spectrum = scipy.fft.rfft2(extended, workers=-1)
-        for otf in self._otfs:
-            yield scipy.fft.irfft2(otf * spectrum, self.grid, workers=-1, overwrite_x=True)
+        for j, otf in enumerate(self._otfs):
+            sky = scipy.fft.irfft2(otf * spectrum, self.grid, workers=-1, overwrite_x=True)
+            yield turned(self._scene, j, sky)
 
     def adjoint(self, arrays: Iterable[Array]) -> Array:
         """Return ``sum_j A_j^T x_j``, shape (Ny, Nx)."""
@@ -97,12 +100,15 @@ class Model:
         It may be read-only: of arrays of one value each it is a view of one value, too.
         """
         flat, spectra = np.zeros(len(factors)), list[NDArray[np.complex128]]()
-        for array, members in _runs(arrays):
+        rotations = self._scene.rotations
+        runs = _runs(arrays) if not rotations else ((each, [j]) for j, each in enumerate(arrays))
+        for array, members in runs:
             shares = factors[:, members]
             if not any(array.strides):  # of one value, as weights are where all is observed
                 flat += shares @ self._back_sums[members] * array[0, 0]
                 continue
-            spectrum = scipy.fft.rfft2(spread(array, self.oversample), workers=-1).conj()
+            seen = rotations[members[0]].adjoint(array) if rotations else array
+            spectrum = scipy.fft.rfft2(spread(seen, self.oversample), workers=-1).conj()
             spectra = spectra or [np.zeros_like(spectrum) for _ in factors]
             for total, share in zip(spectra, shares, strict=True):
                 total += self._mixed_otf(members, share) * spectrum
@@ -134,7 +140,7 @@ class Model:
         given, q = cutouts, self.oversample
         cutouts = [Cutout(spread(each.values, q), q * each.y, q * each.x) for each in given]
         first, size = _window_of_correlations(cutouts, self._psfs)
-        if (size >= self.grid).any():
+        if self._scene.rotations or (size >= self.grid).any():
             total = self.adjoint(cutout.on_grid(self.shape[1:]) for cutout in given)
             return _without_rounding(Cutout(total, 0, 0))
         shape = tuple(scipy.fft.next_fast_len(int(n), real=True) for n in size)
@@ -169,7 +175,7 @@ class Model:
     def images_at(self, boxes: Sequence[Box], extended: Array) -> Array:
         """Return the m_j without stars in a box of each; beyond it they may be 0."""
         flat = is_flat(extended)
-        if not flat and self.are_large(boxes):
+        if not flat and (self._scene.rotations or self.are_large(boxes)):
             return self.images(extended, np.zeros(self._scene.n_stars))
         images = np.zeros(self.shape)
         for j, (image, box) in enumerate(zip(images, boxes, strict=True)):
@@ -229,6 +235,11 @@ def spread(image: Array, oversample: int) -> Array:
     return sky
 
 
+def turned(scene: Scene, j: int, sky: Array) -> Array:
+    """Return image j of a convolved sky, turned where it is."""
+    return scene.rotations[j].forward(sky) if scene.rotations else sky
+
+
 def convolve_at(
     extended: Array, psf: Cutout, rows: range, columns: range, oversample: int = 1
 ) -> Array:
@@ -277,7 +288,7 @@ def images_of_sky(scene: Scene, extended: Array) -> Iterator[Array]:
         otf = scipy.fft.rfft2(scene.psf(j), workers=-1)
         otf *= spectrum
         sky = scipy.fft.irfft2(otf, scene.grid, workers=-1, overwrite_x=True)
-        yield np.ascontiguousarray(sampled(sky, scene.oversample))
+        yield np.ascontiguousarray(sampled(turned(scene, j, sky), scene.oversample))
 
 
 def add_to_window(
@@ -299,11 +310,69 @@ def add_to_window(
         Row and column of the first pixel of the window.
     """
     rows, columns = (range(at, at + n) for at, n in zip(first, image.shape, strict=True))
-    seen = convolve_at(sky, scene.psf_cutout(j), rows, columns, scene.oversample)
+    if scene.rotations:
+        seen = _turned_at(scene, j, sky, rows, columns)
+    else:
+        seen = convolve_at(sky, scene.psf_cutout(j), rows, columns, scene.oversample)
     image += seen / scene.unit
     cutouts = scene.star_field.cutouts[j]
     for s in scene.star_field.reaching(j, first, image.shape):
         cutouts[s].add_to(image, first, scene.image_grid, star_fluxes[s] / scene.unit)
+
+
+def _turned_at(scene: Scene, j: int, sky: Array, rows: range, columns: range) -> Array:
+    """Return ``A_j f`` in some rows and columns of an image that is turned."""
+    local = LocalRotation(scene, j, rows, columns)
+    return local.image(_around(sky, local.rows, local.columns))
+
+
+class LocalRotation:
+    """``A_j f`` and its adjoint between a window of the sky and one of an image that is turned.
+
+    Parameters
+    ----------
+    scene : Scene
+        With the images and the PSFs.
+    j : int
+        Which image.
+    rows, columns : range
+        Its window, pixels of the images' grid.
+
+    Attributes
+    ----------
+    rows, columns : range
+        What of the sky's grid, round its edges, reaches the window.
+    """
+
+    def __init__(self, scene: Scene, j: int, rows: range, columns: range) -> None:
+        turn, shift = scene.observation.turns[j], scene.observation.offsets[j]
+        psf = scene.psf_cutout(j)
+        corners = [(x, y) for x in (columns[0], columns[-1]) for y in (rows[0], rows[-1])]
+        seen = np.linalg.solve(turn, (np.array(corners) - shift).T).T
+        margin = np.array(psf.values.shape[::-1]) // 2 + TAPS
+        first = np.floor(seen.min(axis=0) - margin).astype(int)
+        last = np.ceil(seen.max(axis=0) + margin).astype(int)
+        self._shape = len(rows), len(columns)
+        angle = scene.rotations[j].angle
+        sheared = len(columns) + abs(math.tan(angle / 2.0)) * len(rows) + TAPS
+        needed = np.maximum(last - first + 1, (math.ceil(sheared), len(rows)))
+        nx, ny = (scipy.fft.next_fast_len(int(n), real=True) for n in needed)
+        self.rows, self.columns = range(first[1], first[1] + ny), range(first[0], first[0] + nx)
+        at = turn @ first + shift - (columns[0], rows[0])
+        self._rotation = Rotation(angle, at, (ny, nx), self._shape)
+        self._otf = scipy.fft.rfft2(psf.on_grid((ny, nx))) * self._rotation.undone()
+
+    def image(self, sky: Array) -> Array:
+        """Return the window of the image, from that of the sky."""
+        seen = scipy.fft.irfft2(self._otf * scipy.fft.rfft2(sky), sky.shape)
+        return self._rotation.forward(seen)[: self._shape[0], : self._shape[1]]
+
+    def adjoint(self, image: Array) -> Array:
+        """Return the adjoint of `image`."""
+        grid = len(self.rows), len(self.columns)
+        laid = Cutout(image, 0, 0).on_grid(grid)
+        spectrum = scipy.fft.rfft2(self._rotation.adjoint(laid))
+        return np.asarray(scipy.fft.irfft2(self._otf.conj() * spectrum, grid))
 
 
 def _illuminate(image: Array, background: Array | float, starlight: Array) -> None:
@@ -329,6 +398,8 @@ def _window_of_correlations(
 def largest_window(scene: Scene) -> tuple[int, int]:
     """Return the largest shape of `Model.adjoint_of_cutouts` of star images, wherever these lie."""
     grid, psf_shape = scene.grid, scene.observation.psfs.shape[1:]
+    if scene.rotations:
+        return grid
     height, width = (2 * (k + 2 * MARGIN + 2 * (scene.oversample - 1)) for k in psf_shape)
     return grid if height >= grid[0] or width >= grid[1] else (height, width)
 

@@ -7,6 +7,7 @@ import numpy as np
 from lnocl.errors import InputError, note
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import choose_pad
+from lnocl.scene.rotation import TAPS
 
 MAX_AXIS = 8192
 # Odd factors of an axis, and the least power of two beside them: a transform takes blocks of 8
@@ -38,7 +39,7 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
         pad = choose_pad(observation)
         reason = "light runs" if pad else "no light runs"
         note("`pad` chosen: %d pixels, as %s over the edge of the images", pad, reason)
-    shape = observation.shape
+    shape = extent(observation) if observation.is_turned else observation.shape
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
         raise InputError(f"`pad` must be a whole number, 0 or more, or auto; {pad} was given")
     # Light that is farther from its source than the images are wide reaches none of them.
@@ -53,6 +54,27 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
             f"the largest axis is {most}: cut the images or pad less"
         )
     return length_for(ny), length_for(nx)
+
+
+def extent(observation: Observation) -> tuple[int, int]:
+    """Return the shape of what holds the sky of images that are turned, and what it passes through.
+
+    That is the frame of the sky, the corners of all images in it, and what two of the three shears
+    leave of them (`lnocl.scene.rotation.Rotation`).
+    """
+    ny, nx = observation.shape
+    height, width = observation.sky_shape
+    frame = [(0.0, 0.0), (width - 1.0, height - 1.0)]
+    corners = np.array([(x, y) for x in (0.0, nx - 1.0) for y in (0.0, ny - 1.0)])
+    seen = [
+        np.linalg.solve(turn, (corners - shift).T).T
+        for turn, shift in zip(observation.turns, observation.offsets, strict=True)
+    ]
+    size = np.ptp(np.concatenate([frame, *seen]), axis=0)
+    angles = np.arctan2(observation.turns[:, 1, 0], observation.turns[:, 0, 0])
+    sheared = nx - 1.0 + float(abs(np.tan(angles / 2.0)).max()) * (ny - 1.0)
+    x, y = np.ceil([max(size[0], sheared), size[1]]).astype(int).tolist()
+    return max(y + 1 + TAPS, ny), max(x + 1 + TAPS, nx)
 
 
 def length_for(n: int) -> int:

@@ -18,6 +18,7 @@ from lnocl.scene.cores import centre, off_centre, peak
 from lnocl.scene.psf_errors import check_modes, check_pixels
 from lnocl.scene.psf_field import PsfField, read_fields
 from lnocl.scene.shifting import place
+from lnocl.scene.transforms import Orientation, check_transforms, enlarged, rotation
 from lnocl.scene.uncertainties import is_uncertainty, without_source
 
 PsfCentre = Literal["check", "fit", "given"]
@@ -94,6 +95,11 @@ class Observation:
         ``(dx, dy)`` of each image, pixels, each less than the image's side. A source at (x, y) in
         the sky is at ``(x + dx, y + dy)`` in the image. Offsets are taken into the PSFs; no counts
         are resampled.
+    transforms : array_like, shape (p, 2, 3), optional
+        The map from the sky to each image, in place of `offsets`: a source at (x, y) in the sky is
+        at ``transforms[j] @ (x, y, 1)`` in the image. It is a rotation by any angle, with or
+        without a flip, and a shift; `lnocl.rotations` makes those of field rotation. The sky is
+        turned in the model; no counts are resampled. PSFs are as the images show them.
     oversample : {1, 2, 4}, optional
         Pixels of the sky, and of the PSFs, to one of the images along each axis. The model of a
         pixel is the sum over its pixels of the sky. It is meant for detectors with fewer than two
@@ -139,7 +145,9 @@ class Observation:
     psf_fields : tuple of PsfField
         One for each image where PSFs vary over the field, else empty.
     offsets : ndarray of float64, shape (p, 2)
-        As given, or 0.
+        As given, or 0; with `transforms` their shifts.
+    turns : ndarray of float64, shape (p, 2, 2)
+        The rotations and flips of `transforms`; without it those of no turn.
     oversample : int
         As given.
     effective_psfs : bool
@@ -160,6 +168,8 @@ class Observation:
         - A PSF or its sum is not finite, its sum is not positive, or its core is off its centre.
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
+        - `transforms` are given beside `offsets`, `oversample` or PSFs that vary over the field, or
+          scale or shear the images by more than 0.05 pixels.
 
     Warns
     -----
@@ -202,6 +212,7 @@ class Observation:
         mask: ArrayLike | None = None,
         exposure: ArrayLike | None = None,
         offsets: ArrayLike | None = None,
+        transforms: ArrayLike | None = None,
         oversample: int = 1,
         effective_psfs: bool = False,
         psf_centre: PsfCentre = "check",
@@ -239,7 +250,9 @@ class Observation:
         self.ideal_psfs = self._check_ideals(ideal_psfs, psf_centre)
         self.psf_modes = check_modes(psf_modes, self.psfs)
         self.psf_scatter = check_pixels("psf_scatter", psf_scatter, self.psfs)
-        self.offsets = self._check_offsets(offsets)
+        self.turns, self.offsets = self._check_maps(offsets, transforms)
+        self._orientations: tuple[Orientation, ...] = ()
+        self._frame = self.shape
         self._apply_mask(mask)
         self.exposure = self._check_exposure(1.0 if exposure is None else exposure)
         self._refuse_all_masked()
@@ -312,7 +325,59 @@ class Observation:
         >>> lnocl.Observation(np.ones((8, 9)), np.ones((3, 3)), oversample=2).sky_shape
         (16, 18)
         """
-        return self.oversample * self.shape[0], self.oversample * self.shape[1]
+        return self.oversample * self._frame[0], self.oversample * self._frame[1]
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether any image is turned against the sky."""
+        return bool((self.turns != np.eye(2)).any())
+
+    def places(self, j: int, positions: Array) -> Array:
+        """Return where positions (..., 2) of the sky are in image j."""
+        if (self.turns[j] == np.eye(2)).all():
+            return positions + self.offsets[j]
+        return np.asarray(positions @ self.turns[j].T + self.offsets[j])
+
+    def upright(self) -> Observation:
+        """Return the observation with quarter turns and flips of its images undone, by index.
+
+        What is left of `turns` is by 45 degrees at most. Images that are not square are enlarged
+        by bad pixels where a quarter turn asks for it.
+        """
+        nearest = [Orientation.nearest(turn) for turn in self.turns]
+        orientations = tuple(orientation for orientation, _ in nearest)
+        if all(orientation.is_identity for orientation in orientations):
+            return self
+        swaps = any(orientation.swaps for orientation in orientations)
+        shape = (max(self.shape),) * 2 if swaps else self.shape
+        other = copy(self)
+        held = vars(other)
+        for name, values in self._arrays().items():
+            if name == "turns" or values.ndim < 3 or not values.size:
+                continue
+            if name in ("psfs", "psf_modes", *OF_PSFS):
+                values = _about_centre(values, swaps)
+            else:
+                values = enlarged(values, shape, float(name == "mask"))
+            pairs = zip(orientations, values, strict=True)
+            held[name] = np.array([orientation.of(array) for orientation, array in pairs])
+            held[name].flags.writeable = False
+        places = zip(orientations, self.offsets, strict=True)
+        held["offsets"] = np.array([each.place(at, shape) for each, at in places])
+        held["turns"] = np.array([rotation(angle) for _, angle in nearest])
+        held["_orientations"] = orientations
+        return other
+
+    def as_given(self, images: NDArray[Any], cut: bool = True) -> NDArray[Any]:
+        """Return images (p, ny, nx) of `upright` in the orientation of those given.
+
+        They are cut to the shape of the images unless told otherwise.
+        """
+        if not self._orientations:
+            return images
+        ny, nx = self._frame if cut else images.shape[1:]
+        pairs = zip(self._orientations, images, strict=True)
+        return np.array([orientation.back(image)[:ny, :nx] for orientation, image in pairs])
 
     def replace(self, **changes: Any) -> Observation:
         """Return an observation with other values of some attributes; the rest is shared.
@@ -350,18 +415,20 @@ class Observation:
         """
         other = copy(self)
         held = vars(other)
-        if unknown := sorted(changes.keys() - (held.keys() - {"_is_checked"})):
+        if unknown := sorted(changes.keys() - {name for name in held if name[0] != "_"}):
             raise InputError(f"{unknown[0]} is no attribute of an observation; leave it out")
         if "psfs" in changes:
             changes = {"psf_fields": (), **changes}
         held |= {name: _read(name, values) for name, values in changes.items()}
         other._refuse_other_shapes()
+        if not other._orientations:
+            held["_frame"] = other.shape
         for name in changes:
-            if isinstance(held[name], np.ndarray) and name not in ("mask", "offsets"):
+            if isinstance(held[name], np.ndarray) and name not in ("mask", "offsets", "turns"):
                 _refuse_out_of_range(name, held[name])
         if not (other.psfs.sum(axis=(1, 2)) > 0).all():
             raise InputError("psfs must have positive sums; give others")
-        if "offsets" in changes:
+        if "offsets" in changes and not other.is_turned:
             other._check_offsets(other.offsets)
         other._refuse_overflow()
         if other.mask.all() or other.images[other.mask].any():
@@ -396,7 +463,7 @@ class Observation:
 
     def shows(self, positions: Array) -> NDArray[np.bool_]:
         """Return which positions, shape (n, 2), lie within any image, its offset added."""
-        places = positions[:, None] + self.offsets
+        places = np.stack([self.places(j, positions) for j in range(self.n_images)], axis=1)
         size = np.array(self.shape[::-1])
         return np.asarray(np.any(np.all((places >= -0.5) & (places < size - 0.5), axis=2), axis=1))
 
@@ -543,6 +610,23 @@ class Observation:
             )
         return np.where(self.mask, masked, values)
 
+    def _check_maps(
+        self, offsets: ArrayLike | None, transforms: ArrayLike | None
+    ) -> tuple[Array, Array]:
+        """Return the rotations and the shifts of the images."""
+        if transforms is None:
+            still = np.broadcast_to(np.eye(2), (self.n_images, 2, 2))
+            return still, self._check_offsets(offsets)
+        for name, is_given in (
+            ("offsets", offsets is not None),
+            ("oversample", self.oversample > 1),
+            ("PSFs that vary over the field", bool(self.psf_fields)),
+        ):
+            if is_given:
+                raise InputError(f"`transforms` are not taken beside {name}; give one of them")
+        exact = check_transforms(transforms, self.n_images, self.shape)
+        return exact[:, :, :2].copy(), exact[:, :, 2].copy()
+
     def _check_offsets(self, offsets: ArrayLike | None) -> Array:
         if offsets is None:
             return np.zeros((self.n_images, 2))
@@ -650,6 +734,16 @@ def _refuse_out_of_range(name: str, values: Array) -> None:
         _refuse_unless(f"`{name}`", values, "finite and more than zero", values > 0)
     else:
         _refuse_unless(f"`{name}`", values, "finite and not negative", values >= 0)
+
+
+def _about_centre(psfs: Array, is_square: bool) -> Array:
+    """Return PSFs enlarged about their centre to odd sides, whose middle it is."""
+    ky, kx = psfs.shape[-2:]
+    ny, nx = (k + 1 - k % 2 for k in ((max(ky, kx),) * 2 if is_square else (ky, kx)))
+    y, x = ny // 2 - ky // 2, nx // 2 - kx // 2
+    laid = np.zeros((*psfs.shape[:-2], ny, nx))
+    laid[..., y : y + ky, x : x + kx] = psfs
+    return laid
 
 
 def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:

@@ -22,6 +22,8 @@ def choose_pad(observation: Observation) -> int:
     """Return the pad "auto": `recommend_pad` where light runs over an edge, else the offsets."""
     if runs_over_the_edge(observation):
         return recommend_pad(observation)
+    if observation.is_turned:  # the grid holds all that is turned
+        return 0
     return int(np.ceil(abs(observation.offsets).max()))
 
 

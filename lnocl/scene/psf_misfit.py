@@ -131,7 +131,7 @@ def measure_misfit(
         weight = squared * total / (total + 0.5)
         left = weight * residuals**2 / total
         squares[j] = left.sum()
-        rings = Rings(scene.observation.shape, scene.stars + scene.observation.offsets[j])
+        rings = Rings(scene.observation.shape, scene.star_field.places[j])
         variance = weight**2 * (2.0 + 1.0 / total)
         parts.append((rings.number[seen], left - weight, variance, weight * squared * total))
     number, excess, variance, norm = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -186,7 +186,7 @@ def smoothing_near_stars(
     for j, (counts, light) in enumerate(images):
         background = np.broadcast_to(model.background[j], light.shape)
         total = np.maximum(np.maximum(counts, light + background), MIN_MODEL)
-        number = Rings((ny, nx), scene.stars + scene.observation.offsets[j]).number
+        number = Rings((ny, nx), scene.star_field.places[j]).number
         kappa = np.zeros(light.shape)
         kappa[:ny, :nx] = in_rings[np.minimum(number, len(in_rings) - 1)]
         share = (light / total).clip(0.0)

@@ -18,6 +18,7 @@ from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
 from lnocl.scene.grid import grid_of
 from lnocl.scene.observation import Observation, numbers
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
+from lnocl.scene.rotation import Rotation, turned_psf
 from lnocl.scene.shifting import Cutout, MovablePsf
 from lnocl.scene.stars import Covered, StarField, check_positions, covered_box
 
@@ -78,6 +79,8 @@ class Scene:
         Pixels of the sky to one of the images, along each axis.
     stars : ndarray of float64, shape (n, 2)
         Positions.
+    rotations : list of Rotation
+        How each image is turned against the sky; empty where none is.
     scale : float
         Electrons per unit of the images.
     unit : float
@@ -122,7 +125,7 @@ class Scene:
         pad: int | str = 0,
         max_shift: float = 0.0,
     ) -> None:
-        self.observation = observation
+        self.observation = observation = observation.upright()
         positions = check_positions(stars, observation)
         self._max_shift = max_shift
         self.oversample = observation.oversample
@@ -144,12 +147,36 @@ class Scene:
         relative = exposure / self._mean_exposure
         self.gains = np.ones(self.n_images) if has_map else relative
         self._psfs = movable_psfs(self.scaled_psfs(), observation, self.image_grid)
+        self.rotations = self._rotations()
         self.weights = self._weigh(relative if has_map else None)
         self._field = self._place_stars(positions)
         self.star_weights, is_observed = self._weigh_stars(self._field)
         self._refuse_unobserved_stars(is_observed)
         self._warn_of_ringing()
         self._penalise(penalty)
+
+    def _rotations(self) -> list[Rotation]:
+        observation = self.observation
+        if not observation.is_turned:
+            return []
+        angles = np.arctan2(observation.turns[:, 1, 0], observation.turns[:, 0, 0])
+        return [
+            Rotation(float(angle), shift, self.grid, observation.shape)
+            for angle, shift in zip(angles, observation.offsets, strict=True)
+        ]
+
+    def psfs_of_sky(self) -> list[Array]:
+        """Return the PSFs as the sky sees them: turned back where images are turned."""
+        if not self.rotations:
+            return list(self.observation.psfs)
+        psfs = zip(self.observation.psfs, self.rotations, strict=True)
+        return [turned_psf(psf, rotation.angle) for psf, rotation in psfs]
+
+    @cached_property
+    def _psfs_of_sky(self) -> list[MovablePsf]:
+        """Those, times the relative exposure of their image where that is a number."""
+        psfs = zip(self.gains, self.psfs_of_sky(), strict=True)
+        return [MovablePsf(gain * psf, self.grid) for gain, psf in psfs]
 
     def _penalise(self, penalty: Penalty) -> None:
         self.penalty = penalty
@@ -194,6 +221,7 @@ class Scene:
         other = copy(self)
         other.observation = self.observation.replace(psfs=psfs)
         other._psfs = movable_psfs(other.scaled_psfs(), other.observation, self.image_grid)
+        vars(other).pop("_psfs_of_sky", None)
         other._field = other._place_stars(self.stars)
         return other
 
@@ -236,7 +264,7 @@ class Scene:
 
     def _place_stars(self, positions: Array) -> StarField:
         psfs = self.star_psfs(positions)
-        return StarField(psfs, self.observation.offsets, self.image_grid, positions)
+        return StarField(psfs, self.observation, self.image_grid, positions)
 
     def star_psfs(
         self, positions: Array, part: tuple[slice, slice] | None = None
@@ -305,15 +333,28 @@ class Scene:
         return model
 
     def psf(self, j: int) -> Array:
-        """Return the response of image j on the grid, shape (Ny, Nx): see `psf_cutout`."""
-        return self.psf_cutout(j).on_grid(self.grid)
+        """Return what the sky is convolved with for image j, on the grid, shape (Ny, Nx).
+
+        That is `psf_cutout`; for an image that is turned, with the effect of the shears' weights
+        undone (`Rotation.undone`).
+        """
+        psf = self.psf_cutout(j).on_grid(self.grid)
+        if not self.rotations:
+            return psf
+        import scipy.fft
+
+        spectrum = scipy.fft.rfft2(psf) * self.rotations[j].undone()
+        return np.asarray(scipy.fft.irfft2(spectrum, self.grid))
 
     def psf_cutout(self, j: int) -> Cutout:
         """Return the response of image j where it is not 0, the sky moved by the offset.
 
         Its value at a pixel of the sky is what a pixel of the image that begins there sees of a
-        source at the origin. Without oversampling it is the PSF with its peak at the offset.
+        source at the origin. Without oversampling it is the PSF with its peak at the offset. For an
+        image that is turned it is the PSF turned back.
         """
+        if self.rotations:
+            return self._psfs_of_sky[j].at(0.0, 0.0)
         return self._psfs[j].response(*self.observation.offsets[j])
 
     def star_image(self, j: int, s: int) -> Array:
@@ -326,11 +367,12 @@ class Scene:
 
     def star_on_sky(self, j: int, s: int) -> Cutout:
         """Return P_js before the pixels of image j sample it, on the sky's grid."""
-        return self._field.psfs[j][s].on_sky(*(self.stars[s] + self.observation.offsets[j]))
+        return self._field.psfs[j][s].on_sky(*self._field.places[j][s])
 
     def psf_on_sky(self, j: int, s: int) -> Cutout:
         """Return PSF j on the sky's grid, at star s."""
-        return self._psfs[j].fine.at(*on_sky(self.stars[s], self.oversample))
+        fine = self._psfs_of_sky[j] if self.rotations else self._psfs[j].fine
+        return fine.at(*on_sky(self.stars[s], self.oversample))
 
     @property
     def star_field(self) -> StarField:
@@ -342,10 +384,9 @@ class Scene:
         psfs = zip(self.gains, self.observation.psfs, strict=True)
         return [psf if gain == 1.0 else gain * psf for gain, psf in psfs]
 
-    def star_box(self, s: int) -> Covered:
-        """Return the rows and columns of the images' grid that star s may light."""
-        cutouts = [self.star_cutout(j, s) for j in range(self.n_images)]
-        return covered_box(cutouts, self.image_grid, self._max_shift)
+    def star_box(self, j: int, s: int) -> Covered:
+        """Return the rows and columns of the images' grid that star s may light in image j."""
+        return covered_box([self.star_cutout(j, s)], self.image_grid, self._max_shift)
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
         """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""
@@ -501,6 +542,8 @@ class Scene:
         return _lay(array, self.image_grid, fill)
 
     def _warn_of_wrapped_offsets(self) -> None:
+        if self.observation.is_turned:  # the grid holds all that is turned
+            return
         offsets = np.ceil(abs(self.observation.offsets).max(axis=0)).astype(int)[::-1]
         room = np.subtract(self.image_grid, self.observation.shape)
         if (offsets > room).any():
@@ -513,11 +556,12 @@ class Scene:
         """Warn of PSFs that are moved between pixels and are sharper than pixels can hold."""
         for j, offset in enumerate(self.observation.offsets):
             q = self.oversample
-            moved = np.concatenate([[q * offset], on_sky(self.stars + offset, q)])
+            places = self.observation.places(j, self.stars)
+            moved = np.concatenate([[q * offset], on_sky(places, q)])
             if self.observation.effective_psfs:
                 moved -= (q - 1) / 2.0
             may_move = self._max_shift > 0 and self.n_stars > 0
-            if not may_move and (moved == np.round(moved)).all():
+            if not (may_move or self.rotations) and (moved == np.round(moved)).all():
                 continue
             psf, moved_psf = self.observation.psfs[j], self._psfs[j].fine.at(0.5, 0.5).values
             dark = min(psf.min(), 0.0) - moved_psf.min() / self.gains[j]

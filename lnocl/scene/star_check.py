@@ -61,7 +61,7 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
     for j, psf in enumerate(seen_psfs(observation)):
         reach = int(np.clip(np.ceil(REACH * fwhm(psf)), LEAST_REACH, MOST_REACH))
         light = observation.images[j] - observation.background[j]
-        positions = scene.stars + observation.offsets[j]
+        positions = scene.star_field.places[j]
         nearest = KDTree(positions).query(positions, k=[2], p=np.inf)[0]  # infinite if alone
         for s in np.flatnonzero(nearest >= 2 * reach).tolist():
             position = positions[s]
@@ -103,7 +103,8 @@ def _masked_stars(scene: Scene) -> Iterator[int]:
     observation = scene.observation
     size = observation.shape[::-1]
     for s, star in enumerate(scene.stars):
-        nearest = np.round(star + observation.offsets).astype(int)
+        places = [observation.places(j, star) for j in range(observation.n_images)]
+        nearest = np.round(places).astype(int)
         inside = ((nearest >= 0) & (nearest < size)).all(axis=1)
         bad = [observation.mask[j][tuple(nearest[j][::-1])] for j in np.flatnonzero(inside)]
         if all(bad):

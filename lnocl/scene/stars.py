@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence, Set
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -170,27 +171,35 @@ def _shared(
 
 
 def order_of(
-    stars: Array, images: Iterable[tuple[Array, Sequence[Cutout]]], grid: tuple[int, int]
+    stars: Array,
+    images: Iterable[tuple[Array, Sequence[Cutout]]],
+    grid: tuple[int, int],
+    is_turned: bool = False,
 ) -> Order:
     """Return the order of stars along the axis that leaves the least of them between neighbours.
 
     Parameters
     ----------
     stars : ndarray of float64, shape (n, 2)
-        Positions, pixels of an image without offset.
-    images : iterable of (ndarray of float64, shape (2,), sequence of n Cutout)
-        For each image its offset, and what the stars may light there.
+        Positions in the sky, pixels of the images.
+    images : iterable of (ndarray of float64, shape (n, 2), sequence of n Cutout)
+        For each image where the stars are in it, and what they may light there.
     grid : tuple of int
         Shape of the images' grid, which is periodic.
+    is_turned : bool
+        Whether images are turned, so that squares in them reach farther along the sky's axes.
     """
     n = len(stars)
     reach = np.zeros((n, 2))
-    for offset, cutouts in images:
+    for places_there, cutouts in images:
         first = np.array([cutout[1:] for cutout in cutouts]).reshape(n, 2)
         size = np.array([cutout.values.shape for cutout in cutouts]).reshape(n, 2)
-        away = (stars + offset)[:, ::-1] - first
+        away = places_there[:, ::-1] - first
         is_whole = size >= grid
         reach = np.maximum(reach, np.where(is_whole, grid, np.maximum(away, size - away)))
+    if is_turned:
+        farthest = np.minimum(math.sqrt(2.0) * reach.max(axis=1), max(grid))
+        reach = np.stack([farthest, farthest], axis=1)
     orders = []
     for axis, length in enumerate(grid):
         at, far = stars[:, 1 - axis] % length, reach[:, axis].max(initial=0.0)
@@ -211,23 +220,29 @@ class StarField:
     ----------
     psfs : sequence of p sequences of n MovablePsf or DetectorPsf
         That of each image at each star.
-    offsets : ndarray of float64, shape (p, 2)
-        Of the images, pixels.
+    observation : Observation
+        The images.
     grid : tuple of int
         Shape (ny, nx) of the images' grid.
     positions : ndarray of float64, shape (n, 2)
-        Pixels of an image without offset.
+        In the sky, pixels of the images.
+
+    Attributes
+    ----------
+    places : list of ndarray of float64, shape (n, 2)
+        Where they are in each image.
     """
 
     def __init__(
         self,
         psfs: Sequence[Sequence[MovablePsf | DetectorPsf]],
-        offsets: Array,
+        observation: Observation,
         grid: tuple[int, int],
         positions: Array,
     ) -> None:
         self.positions = positions
-        self.psfs, self._offsets, self._grid = psfs, offsets, grid
+        self.psfs, self._grid, self._is_turned = psfs, grid, observation.is_turned
+        self.places = [observation.places(j, positions) for j in range(len(psfs))]
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -237,10 +252,10 @@ class StarField:
         """P_js for each image j and star s."""
         return [
             [
-                psf.at(*(position + offset)).aligned(self._grid)
-                for psf, position in zip(psfs, self.positions, strict=True)
+                psf.at(*place).aligned(self._grid)
+                for psf, place in zip(psfs, places_there, strict=True)
             ]
-            for psfs, offset in zip(self.psfs, self._offsets, strict=True)
+            for psfs, places_there in zip(self.psfs, self.places, strict=True)
         ]
 
     @cached_property
@@ -253,8 +268,8 @@ class StarField:
 
     @cached_property
     def _order(self) -> Order:
-        images = zip(self._offsets, self.cores, strict=True)
-        return order_of(self.positions, images, self._grid)
+        images = zip(self.places, self.cores, strict=True)
+        return order_of(self.positions, images, self._grid, self._is_turned)
 
     def light(self, j: int, fluxes: Array) -> Array:
         """Return ``sum_s c_s P_js``, shape (Ny, Nx)."""
@@ -292,6 +307,14 @@ class StarField:
             for cutouts in (self.cutouts[j], self.cores[j])
         )
         return StarImages(covered, pieces, self._order, cores)
+
+
+def along_sky(star: Cutout, turn: Array) -> Cutout:
+    """Return a star with slopes along the sky's axes, (3, h, w), from those along an image's."""
+    if (turn == np.eye(2)).all():
+        return star
+    slopes = np.tensordot(turn.T, star.values[1:], axes=1)
+    return star._replace(values=np.concatenate([star.values[:1], slopes]))
 
 
 def covered_pixels(cutouts: Sequence[Cutout], grid: tuple[int, int]) -> NDArray[np.bool_]:

@@ -101,8 +101,8 @@ def resolution(scene: Scene) -> float:
     It is that of the PSF whose OTF is the root of the mean of ``|OTF_j|^2``, each with the
     response of the images' pixels, in pixels of the sky.
     """
-    psfs, observation = scene.observation.psfs, scene.observation
-    v, u = (np.fft.fftfreq(n) for n in psfs.shape[1:])
+    psfs, observation = scene.psfs_of_sky(), scene.observation
+    v, u = (np.fft.fftfreq(n) for n in psfs[0].shape)
     pixel = abs(pixel_spectrum(v[:, None], u, observation)) / observation.oversample**2
     power = np.mean([abs(scipy.fft.fft2(psf) * pixel) ** 2 for psf in psfs], axis=0)
     return fwhm(scipy.fft.fftshift(scipy.fft.ifft2(np.sqrt(power)).real))

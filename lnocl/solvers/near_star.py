@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import movable_psfs, on_sky
-from lnocl.scene.forward_model import add_to_window, sampled, spread
+from lnocl.scene.forward_model import LocalRotation, add_to_window, sampled, spread
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout
+from lnocl.scene.stars import along_sky
 from lnocl.scene.texture import Texture, resolution
 from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
 
@@ -133,6 +134,8 @@ class NearStar:
     def _source_error(self, around: Surroundings, amplitude: Array, width: float) -> SourceError:
         """Return the error of the extended source in the window, and its change there."""
         scene = around.scene
+        if scene.rotations:
+            return self._turned_error(scene, amplitude, width)
         q, window = scene.oversample, self.window.finer(scene.oversample)
         # Twice the window, in which nothing wraps round; or the grid, on which it does.
         height, breadth = (min(2 * k, n) for k, n in zip(window.shape, scene.grid, strict=True))
@@ -154,6 +157,36 @@ class NearStar:
 
         return SourceError(forward, adjoint, amplitude, width)
 
+    def _turned_error(self, scene: Scene, amplitude: Array, width: float) -> SourceError:
+        """Return the same where images are turned against the sky."""
+        window, locals_ = self.window, []
+        for j in range(scene.n_images):
+            there = _in_image(scene, j, window)
+            rows, columns = (
+                range(first, first + k)
+                for first, k in zip((there.y, there.x), there.shape, strict=True)
+            )
+            locals_.append(LocalRotation(scene, j, rows, columns))
+        grids = [(len(local.rows), len(local.columns)) for local in locals_]
+        places = [
+            window.moved(-local.columns.start, -local.rows.start).of(grid)
+            for local, grid in zip(locals_, grids, strict=True)
+        ]
+
+        def forward(sky: Array) -> Array:
+            images = []
+            for local, grid, at in zip(locals_, grids, places, strict=True):
+                laid = np.zeros(grid)
+                laid[at] = sky
+                images.append(local.image(laid))
+            return np.array(images)
+
+        def adjoint(images: Iterable[Array]) -> Array:
+            back = zip(locals_, places, images, strict=True)
+            return np.asarray(sum(local.adjoint(image)[at] for local, at, image in back))
+
+        return SourceError(forward, adjoint, amplitude, width)
+
     def _linearise(
         self, around: Surroundings, j: int, held: NDArray[np.int_], beyond: Array
     ) -> LinearImage:
@@ -170,8 +203,9 @@ class NearStar:
         precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
         slopes = [_cut(scene.star_cutout(j, s), there, grid) for s in held]
         if around.moves:
-            offset, psfs = scene.observation.offsets[j], scene.star_field.psfs[j]
-            moved = [psfs[s].with_slopes(*(scene.stars[s] + offset)) for s in held]
+            psfs, places = scene.star_field.psfs[j], scene.star_field.places[j]
+            turn = scene.observation.turns[j]
+            moved = [along_sky(psfs[s].with_slopes(*places[s]), turn) for s in held]
             for axis in (1, 2):
                 for flux, each in zip(around.star_fluxes[held] / scene.unit, moved, strict=True):
                     slope = each._replace(values=flux * each.values[axis])
@@ -224,8 +258,10 @@ def _observed(scene: Scene, j: int, there: Window) -> tuple[Array, Array, Array]
 
 
 def _in_image(scene: Scene, j: int, window: Window) -> Window:
-    """Return where a window of an image without offset lies in image j, to the nearest pixel."""
-    dx, dy = np.round(scene.observation.offsets[j]).astype(int).tolist()
+    """Return where the middle of a window of the sky is in image j, to the nearest pixel."""
+    middle = np.array([window.x + window.shape[1] // 2, window.y + window.shape[0] // 2])
+    moves = scene.observation.places(j, middle) - middle
+    dx, dy = np.round(moves).astype(int).tolist()
     return window.moved(dx, dy)
 
 

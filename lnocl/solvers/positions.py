@@ -15,7 +15,15 @@ from lnocl.scene.detector import DetectorPsf
 from lnocl.scene.forward_model import ROUNDING, Model
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf
-from lnocl.scene.stars import MAX_SHIFT, Order, StarImages, covered_pixels, order_of, places
+from lnocl.scene.stars import (
+    MAX_SHIFT,
+    Order,
+    StarImages,
+    along_sky,
+    covered_pixels,
+    order_of,
+    places,
+)
 from lnocl.solvers.fluxes import MAX_FADING, StarLikelihood
 
 # The farthest that a star goes in one step, pixels: the likelihood is a parabola in a part of the
@@ -74,27 +82,32 @@ class StarFit:
     """
 
     def __init__(self, scene: Scene, model: Model, extended: Array, given: Array) -> None:
-        self._given, self._offsets = given, scene.observation.offsets
+        self._given, self._observation = given, scene.observation
+        n_images, turns = scene.n_images, scene.observation.turns
         part = _part(scene.scaled_psfs())
         shape = scene.observation.psfs[0][part].shape
         squares = [
-            [_square(shape, position + offset, scene) for position in given]
-            for offset in self._offsets
+            [_square(shape, place, scene) for place in self._observation.places(j, given)]
+            for j in range(n_images)
         ]
         covered = [covered_pixels(each, scene.image_grid) for each in squares]
         reached = [
-            (offset, cutouts)
-            for offset, *both in zip(self._offsets, scene.star_field.cutouts, squares, strict=True)
+            (places_there, cutouts)
+            for places_there, *both in zip(
+                scene.star_field.places, scene.star_field.cutouts, squares, strict=True
+            )
             for cutouts in both
         ]
-        order = order_of(scene.stars, reached, scene.image_grid)
+        is_turned = self._observation.is_turned
+        order = order_of(scene.stars, reached, scene.image_grid, is_turned)
         diffuse = model.forward(extended) + model.background
         self._likelihood = StarLikelihood.of_scene(scene, model, diffuse, covered)
         self._stars = [
-            _MovableStars(psfs, where, scene.stars + offset, whole, around, order)
-            for psfs, offset, where, whole, around in zip(
+            _MovableStars(psfs, turn, where, places_there, whole, around, order)
+            for psfs, turn, places_there, where, whole, around in zip(
                 scene.star_psfs(scene.stars, part),
-                self._offsets,
+                turns,
+                scene.star_field.places,
                 covered,
                 scene.star_field.cutouts,
                 squares,
@@ -104,8 +117,8 @@ class StarFit:
 
     def _try(self, stars: Stars) -> _Trial:
         images = [
-            movable.at(stars.positions + offset)
-            for movable, offset in zip(self._stars, self._offsets, strict=True)
+            movable.at(self._observation.places(j, stars.positions))
+            for j, movable in enumerate(self._stars)
         ]
         models = self._likelihood.models([each.light(stars.fluxes) for each in images])
         return _Trial(stars, images, models, self._likelihood.objective(models))
@@ -150,8 +163,8 @@ class StarFit:
 
     def _images_around(self, s: int, position: Array) -> list[Array]:
         return [
-            movable.image_around(s, position + offset)
-            for movable, offset in zip(self._stars, self._offsets, strict=True)
+            movable.image_around(s, self._observation.places(j, position))
+            for j, movable in enumerate(self._stars)
         ]
 
     def minimise(self, stars: Stars) -> Stars:
@@ -195,10 +208,12 @@ class _MovableStars:
     ----------
     psfs : sequence of MovablePsf or DetectorPsf
         The part of the PSF that moves with each star.
+    turn : ndarray of float64, shape (2, 2)
+        How the image is turned against the sky.
     covered : ndarray of bool, shape (Ny, Nx)
         The pixels.
     positions : ndarray of float64, shape (n, 2)
-        On the grid, where the stars have their whole PSF.
+        In the image, where the stars have their whole PSF.
     whole : sequence of Cutout
         That whole PSF, for each star.
     squares : sequence of Cutout
@@ -215,6 +230,7 @@ class _MovableStars:
     def __init__(
         self,
         psfs: Sequence[MovablePsf | DetectorPsf],
+        turn: Array,
         covered: NDArray[np.bool_],
         positions: Array,
         whole: Sequence[Cutout],
@@ -226,7 +242,7 @@ class _MovableStars:
             covered,
             order,
         )
-        self._psfs, self._places = psfs, places(covered)
+        self._psfs, self._turn, self._places = psfs, turn, places(covered)
         # One number more, which the dark pixels share: their place is -1.
         self._image = np.zeros(int(covered.sum()) + 1)
         self.around: list[NDArray[np.intp]] = []
@@ -252,8 +268,8 @@ class _MovableStars:
         return self._places[part.window(self._grid)]
 
     def _moving(self, s: int, position: Array) -> Cutout:
-        """Return the part of star s's PSF that moves, and its derivatives along x and y."""
-        return self._psfs[s].with_slopes(*position)
+        """Return the part of star s's PSF that moves, and its derivatives along the sky's x, y."""
+        return along_sky(self._psfs[s].with_slopes(*position), self._turn)
 
     def at(self, positions: Array) -> StarImages:
         """Return the images of the stars and their derivatives along x and y."""

@@ -18,6 +18,9 @@ from lnocl.verify.harness import KernelHarness, rounded
 # What a kernel made, and what its twin made of the same.
 Pairs = Iterator[tuple[NDArray, NDArray]]
 
+# Kernels of images that are turned.
+SHEARED = "irfft_sheared", "ratio_sheared", "rfft_sheared"
+
 # Worst element over largest: three times what was measured over all cases of the tests on PoCL,
 # 3.3e-7 and 1.2e-15. With divisions and roots as far off as OpenCL allows it is 5.8e-7 in single.
 ALLOWED = {np.float32: 1e-6, np.float64: 3.7e-15}
@@ -25,7 +28,8 @@ ALLOWED = {np.float32: 1e-6, np.float64: 3.7e-15}
 
 def kernels_of(scene: Mapping[str, Any]) -> list[str]:
     """Return the kernels that a program for a scene has, one of `lnocl.verify.harness.SCENES`."""
-    return [name for name in KERNELS if name != "smooth" or scene.get("has_smoothing")]
+    parts = {"smooth": "has_smoothing", **dict.fromkeys(SHEARED, "has_turns")}
+    return [name for name in KERNELS if name not in parts or scene.get(parts[name])]
 
 
 def deviation(harness: KernelHarness, given: SimpleNamespace, kernel: str) -> float:
@@ -110,25 +114,34 @@ def _run_otf_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 
 def _put_otfs(harness: KernelHarness, given: SimpleNamespace) -> dict[str, cl.Buffer]:
     parts = [harness.otf_parts(otf) for otf in given.otfs]
+    phases = [harness.layout.pack_phases(each) for each in given.rotations]
     return {
         "otfs": harness.put([columns for columns, _ in parts]),
         "otf_edges": harness.put([edge for _, edge in parts]),
+        "row_phases": harness.put(phases),
     }
+
+
+def _phases(given: SimpleNamespace) -> NDArray | None:
+    """Return the phases of the rows of images that are turned."""
+    phases = [rotation.row_phases() for rotation in given.rotations]
+    return np.array(phases) if phases else None
 
 
 def _run_convolve_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     others = np.full((given.p - 1, *given.spectrum.shape[1:]), np.nan)
     out = harness.put_spectra([*given.spectrum, *others])
     harness.launch("convolve_columns", spectra=out, **_put_otfs(harness, given))
-    oversample = harness.program.oversample
-    expected = reference.convolve_columns(given.spectrum[0], given.otfs, oversample)
+    oversample, phases = harness.program.oversample, _phases(given)
+    expected = reference.convolve_columns(given.spectrum[0], given.otfs, oversample, phases)
     yield harness.take_image_spectra(out, given.p), _real_edges(expected)
 
 
 def _run_correlate_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     out = harness.put_spectra(given.image_spectra)
     harness.launch("correlate_columns", spectra=out, **_put_otfs(harness, given))
-    expected = _real_edges(reference.correlate_columns(given.image_spectra, given.otfs))
+    found = reference.correlate_columns(given.image_spectra, given.otfs, _phases(given))
+    expected = _real_edges(found)
     yield harness.take_spectra(out)[0], expected
     others = harness.take_image_spectra(out, given.p)[1:]
     if not np.array_equal(others, _real_edges(given.image_spectra[1:])):
@@ -150,34 +163,98 @@ def _run_ratio_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         given.star_images,
         given.star_fluxes,
     )
+    out = harness.put_spectra(given.model_spectra)
+    observed = _put_observed(harness, given, given.star_images)
+    harness.launch("ratio_rows", spectra=out, **observed)
+    yield harness.take_image_spectra(out, given.p), _real_edges(spectra)
+    yield harness.take_sums(observed["ratio_sums"], 1), np.array([objective])
+    yield _take_star_sums(harness, given, observed["star_sums"]), star_sums
+
+
+def _put_observed(
+    harness: KernelHarness, given: SimpleNamespace, star_images: NDArray
+) -> dict[str, Any]:
+    """Return all that models are compared with, stars, and room for the sums."""
     images, exposure = given.images, {}
     if given.has_exposure_map:
         exposure = {"exposure": harness.put_pixels(given.weights)}
     elif given.weights is not None:
         images = np.where(given.weights, given.images, -1.0)
     put = harness.put_pixels if given.background.size > given.p else harness.put
-    out = harness.put_spectra(given.model_spectra)
-    sums = harness.put(np.full((harness.program.image_row_blocks * given.p, 2), np.nan))
     windows = given.star_windows
-    sums_of_stars = harness.put(np.full((given.n, given.p * windows.n_blocks, 2), np.nan))
-    harness.launch(
-        "ratio_rows",
-        spectra=out,
-        ratio_sums=sums,
-        star_sums=sums_of_stars,
-        images=harness.put_pixels(images),
-        background=put(given.background),
-        star_images=harness.put_windows(given.star_images, windows),
-        star_corners=harness.put(windows.corners, np.int32),
-        star_near=harness.put(windows.near, np.int32),
-        star_blocks=windows.n_blocks,
-        star_columns=windows.n_columns,
-        star_fluxes=harness.put(given.star_fluxes),
+    return {
+        "ratio_sums": harness.put(np.full((harness.program.image_row_blocks * given.p, 2), np.nan)),
+        "star_sums": harness.put(np.full((given.n, given.p * windows.n_blocks, 2), np.nan)),
+        "images": harness.put_pixels(images),
+        "background": put(given.background),
+        "star_images": harness.put_windows(star_images, windows),
+        "star_corners": harness.put(windows.corners, np.int32),
+        "star_near": harness.put(windows.near, np.int32),
+        "star_blocks": windows.n_blocks,
+        "star_columns": windows.n_columns,
+        "star_fluxes": harness.put(given.star_fluxes),
         **exposure,
+    }
+
+
+def _run_irfft_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
+    expected = reference.irfft_sheared(given.image_spectra)
+    out = harness.put(np.full(harness.program.columns_size, np.nan))
+    spectra = harness.put_spectra(given.image_spectra)
+    for j, pixels in enumerate(expected):
+        harness.launch("irfft_sheared", columns=out, spectra=spectra, image=j)
+        packed = harness.pack_columns(pixels)
+        yield harness.take(out, packed.shape), packed
+
+
+def _put_columns(harness: KernelHarness, given: SimpleNamespace) -> dict[str, cl.Buffer]:
+    return {
+        "column_shifts": harness.put([each.column_wholes for each in given.shears], np.int32),
+        "column_weights": harness.put([each.column_weights for each in given.shears]),
+    }
+
+
+def _run_ratio_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
+    # Those of the kernel lie with their rows rotated, so the twin has them turned back.
+    lying = {"images": given.images, "weights": given.weights, "background": given.background}
+    own = {
+        name: np.array([s.take_up(each) for s, each in zip(given.shears, arrays, strict=True)])
+        for name, arrays in {**lying, "stars": given.star_images.swapaxes(0, 1)}.items()
+    }
+    back, objective, star_sums = reference.ratio_sheared(
+        given.sheared,
+        np.array([each.column_shifts for each in given.rotations]),
+        np.array([each.image_shifts for each in given.rotations]),
+        own["images"],
+        own["weights"],
+        own["background"],
+        own["stars"].swapaxes(0, 1),
+        given.star_fluxes,
     )
-    yield harness.take_image_spectra(out, given.p), _real_edges(spectra)
-    yield harness.take_sums(sums, 1), np.array([objective])
-    yield _take_star_sums(harness, given, sums_of_stars), star_sums
+    observed = _put_observed(harness, given, given.star_images)
+    observed |= _put_columns(harness, given)
+    block = harness.program.tuning.block
+    weights = harness.put([each.pack_image_weights(block) for each in given.shears])
+    for j, pixels in enumerate(given.sheared):
+        out = harness.put(np.full(harness.program.columns_size, np.nan))
+        columns = harness.put(harness.pack_columns(pixels))
+        arrays = {"ratio_columns": out, "columns": columns, "image_weights": weights}
+        harness.launch("ratio_sheared", image=j, **arrays, **observed)
+        packed = harness.pack_columns(back[j])
+        yield harness.take(out, packed.shape), packed
+    yield harness.take_sums(observed["ratio_sums"], 1), np.array([objective])
+    yield _take_star_sums(harness, given, observed["star_sums"]), star_sums
+
+
+def _run_rfft_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
+    shifts = np.array([each.column_shifts for each in given.rotations])
+    expected = reference.rfft_sheared(given.sheared, shifts)
+    out = harness.put_spectra(np.full(given.image_spectra.shape, np.nan))
+    for j, pixels in enumerate(given.sheared):
+        columns = harness.put(harness.pack_columns(pixels))
+        arrays = {"spectra": out, "ratio_columns": columns}
+        harness.launch("rfft_sheared", image=j, **arrays, **_put_columns(harness, given))
+    yield harness.take_image_spectra(out, given.p), _real_edges(expected)
 
 
 def _take_star_sums(harness: KernelHarness, given: SimpleNamespace, sums: cl.Buffer) -> NDArray:
@@ -374,6 +451,9 @@ KERNELS: dict[str, Callable[[KernelHarness, SimpleNamespace], Pairs]] = {
     "convolve_columns": _run_convolve_columns,
     "correlate_columns": _run_correlate_columns,
     "ratio_rows": _run_ratio_rows,
+    "irfft_sheared": _run_irfft_sheared,
+    "ratio_sheared": _run_ratio_sheared,
+    "rfft_sheared": _run_rfft_sheared,
     "smooth": _run_smooth,
     "scale_rows": _run_scale_rows,
     "collect_sums": _run_collect_sums,

@@ -15,13 +15,16 @@ from lnocl.errors import DeviceError
 from lnocl.opencl.launch import READ_WRITE, Launcher
 from lnocl.opencl.layout import Layout, PixelLayout, reversed_order
 from lnocl.opencl.program import Program
+from lnocl.opencl.shears import Shears
 from lnocl.opencl.tuning import Tuning
 from lnocl.opencl.windows import stars_near
+from lnocl.scene.rotation import Rotation
 from lnocl.scene.scene import MIN_MODEL
 
 # Scenes with all parts, together, that a program can have.
 THREE_IMAGES = "three images, two stars, mask, background map, map of smoothing"
 TWICE_AS_FINE = "sky twice as fine, three images, two stars, mask, background map"
+TURNED = "three images turned, two stars, mask, background map"
 FOUR_TIMES_AS_FINE = "sky four times as fine, exposure map, mu"
 SCENES: dict[str, dict[str, Any]] = {
     "plain": {"n_images": 1},
@@ -55,6 +58,13 @@ SCENES: dict[str, dict[str, Any]] = {
         "has_background_map": True,
         "oversample": 2,
     },
+    TURNED: {
+        "n_images": 3,
+        "n_stars": 2,
+        "has_weights": True,
+        "has_background_map": True,
+        "has_turns": True,
+    },
     FOUR_TIMES_AS_FINE: {
         "n_images": 2,
         "n_stars": 1,
@@ -73,7 +83,7 @@ class Windows:
     """The windows of stars: see kernels/stars.cl.
 
     That of one star is the whole grid; of several, each is half of its blocks and three quarters
-    of its columns, the first star's round the edges.
+    of its columns, the first star's round the edges. Arrays of a star have them a column apart.
 
     Parameters
     ----------
@@ -81,24 +91,28 @@ class Windows:
         Of the arrays.
     n_stars : int
         Their number, at most 2.
+    n_arrays : int
+        Arrays of a star.
     """
 
-    def __init__(self, layout: PixelLayout, n_stars: int) -> None:
+    def __init__(self, layout: PixelLayout, n_stars: int, n_arrays: int) -> None:
         self.layout = layout
         row_blocks, nx = layout.pixels_shape[:2]
         self.n_blocks = row_blocks if n_stars < 2 else max(1, row_blocks // 2)
         self.n_columns = nx if n_stars < 2 else max(1, 3 * nx // 4)
-        self.corners = np.array([(row_blocks - 1, nx - 1), (0, 1 % nx)])[:n_stars]
+        first = np.array([(row_blocks - 1, nx - 1), (0, 1)])[:n_stars, None]
+        self.corners = first + np.array([0, 1]) * np.arange(n_arrays)[:, None]
+        self.corners %= (row_blocks, nx)
         self.near = stars_near(self.corners, self.n_blocks, row_blocks)
 
-    def rows(self, s: int) -> NDArray[np.int64]:
-        """Return the rows of a star's window."""
-        return self.layout.rows_of(self.corners[s, 0], self.n_blocks)
+    def rows(self, s: int, a: int) -> NDArray[np.int64]:
+        """Return the rows of a window of a star."""
+        return self.layout.rows_of(self.corners[s, a, 0], self.n_blocks)
 
-    def columns(self, s: int) -> NDArray[np.int64]:
-        """Return the columns of a star's window."""
+    def columns(self, s: int, a: int) -> NDArray[np.int64]:
+        """Return the columns of a window of a star."""
         nx = self.layout.grid[1]
-        return np.arange(self.corners[s, 1], self.corners[s, 1] + self.n_columns) % nx
+        return np.arange(self.corners[s, a, 1], self.corners[s, a, 1] + self.n_columns) % nx
 
 
 class KernelHarness:
@@ -180,10 +194,18 @@ class KernelHarness:
     def put_windows(self, arrays: NDArray, windows: Windows) -> cl.Buffer:
         """Return a buffer of windows of arrays, [n_stars] or [n_stars][n_images]."""
         return self.put_pixels(
-            each[np.ix_(windows.rows(s), windows.columns(s))]
+            each[np.ix_(windows.rows(s, a), windows.columns(s, a))]
             for s, stack in enumerate(arrays)
-            for each in np.reshape(stack, (-1, *windows.layout.grid))
+            for a, each in enumerate(np.reshape(stack, (-1, *windows.layout.grid)))
         )
+
+    def pack_columns(self, pixels: NDArray) -> NDArray:
+        """Return pixels (Ny, Nx) in pieces of columns, as kernels/turn.cl has them."""
+        pairs, (ny, nx) = self.program.column_pairs, self.grid
+        length = self.program.columns_size // (ny // pairs * nx)
+        pair = (np.arange(0, ny // 2, pairs)[:, None] + np.arange(length)) % (ny // 2)
+        rows = 2 * pair[:, None] + np.arange(2)[:, None]
+        return np.moveaxis(pixels[rows], -1, 1)
 
     def take_pixels(self, buffer: cl.Buffer) -> NDArray:
         """Return the one array of pixels (1, Ny, Nx) that a buffer holds."""
@@ -265,11 +287,19 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         weights = own(weights * rng.uniform(0.5, 2.0, weights.shape))
     star_images = own(rng.random((n, p, *image)))
     cross_information = own(rng.uniform(-0.1, 1.0, (n, ny, nx)))
-    star_windows = _cut_to_windows(star_images, harness.layout.images)
-    cross_windows = _cut_to_windows(cross_information, harness.layout)
+    star_windows = _cut_to_windows(star_images, harness.layout.images, p)
+    cross_windows = _cut_to_windows(cross_information, harness.layout, 1)
+    rotations = []
+    if harness.scene.get("has_turns"):
+        shifts = rng.uniform(-3.0, 3.0, (p, 2)) * np.array(harness.grid[::-1])
+        angles = np.linspace(-np.pi / 4, np.pi / 6, p)
+        rotations = [Rotation(a, at, image, image) for a, at in zip(angles, shifts, strict=True)]
     return SimpleNamespace(
         p=p,
         n=n,
+        rotations=rotations,
+        shears=[Shears(rotation) for rotation in rotations],
+        sheared=own(rng.uniform(0.5, 3.0, (p, ny, nx))),
         pixels=own(rng.normal(size=(1, ny, nx))),
         columns=own(rng.normal(size=(ny, nx // 2)) + 1j * rng.normal(size=(ny, nx // 2))),
         spectrum=half_spectra(1),
@@ -308,10 +338,12 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
     )
 
 
-def _cut_to_windows(arrays: NDArray, layout: PixelLayout) -> Windows:
+def _cut_to_windows(arrays: NDArray, layout: PixelLayout, n_arrays: int) -> Windows:
     """Set the arrays of each star to 0 beyond a window, and return the windows."""
-    windows = Windows(layout, len(arrays))
-    for s, each in enumerate(arrays):
-        each[..., np.setdiff1d(np.arange(layout.grid[0]), windows.rows(s)), :] = 0.0
-        each[..., np.setdiff1d(np.arange(layout.grid[1]), windows.columns(s))] = 0.0
+    stacks = arrays.reshape(len(arrays), n_arrays, *layout.grid)
+    windows = Windows(layout, len(arrays), n_arrays)
+    for s, stack in enumerate(stacks):
+        for a, each in enumerate(stack):
+            each[np.setdiff1d(np.arange(layout.grid[0]), windows.rows(s, a))] = 0.0
+            each[:, np.setdiff1d(np.arange(layout.grid[1]), windows.columns(s, a))] = 0.0
     return windows

@@ -21,7 +21,7 @@ from lnocl.runs.options import PAPER
 from lnocl.scene.observation import Observation
 from lnocl.simulation import Experiment, Star, load_target, simulate
 from lnocl.verify.comparison import ALLOWED, KERNELS, deviation, kernels_of, relative
-from lnocl.verify.harness import SCENES, THREE_IMAGES, TWICE_AS_FINE, KernelHarness, inputs
+from lnocl.verify.harness import SCENES, THREE_IMAGES, TURNED, TWICE_AS_FINE, KernelHarness, inputs
 
 DTYPES: dict[str, type[np.floating[Any]]] = {"single": np.float32, "double": np.float64}
 
@@ -33,6 +33,7 @@ CASES = (
     ((64, 64), THREE_IMAGES),
     ((256, 1024), "exposure map, mu"),
     ((128, 64), TWICE_AS_FINE),
+    ((128, 64), TURNED),
 )
 
 # What is deconvolved: the scene of the second case, which has built the kernels for it.

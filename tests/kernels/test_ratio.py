@@ -26,7 +26,7 @@ def launch_ratio_rows(harness, model, images, star_image):
         background=harness.put([1.0]),
         star_images=harness.put_pixels(star_image[None]),
         star_corners=harness.put([0, 0], np.int32),
-        star_near=harness.put(stars_near(np.zeros((1, 2), int), blocks, blocks), np.int32),
+        star_near=harness.put(stars_near(np.zeros((1, 1, 2), int), blocks, blocks), np.int32),
         star_fluxes=harness.put([0.0]),
         n_images=1,
         star_blocks=blocks,

@@ -489,6 +489,7 @@ def test_the_arrays_of_an_observation_are_read_only(maps):
         "mask",
         "exposure",
         "offsets",
+        "turns",
         "ideal_psfs",
         "psf_modes",
         "pupils",

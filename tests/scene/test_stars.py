@@ -112,7 +112,8 @@ def test_stars_that_share_pixels_are_near_in_their_order(goes_round):
         [Cutout(np.ones((k, 15)), int(y) - k // 2, int(x) - 7) for x, y in stars + offset]
         for k, offset in zip((21, 16), offsets, strict=True)
     ]
-    places, width = order_of(stars, zip(offsets, images, strict=True), grid)
+    there = [stars + offset for offset in offsets]
+    places, width = order_of(stars, zip(there, images, strict=True), grid)
     np.testing.assert_array_equal(np.sort(places), np.arange(200))
     for cutouts in images:
         dense = np.array([cutout.on_grid(grid).ravel() for cutout in cutouts])

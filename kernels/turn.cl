@@ -1,0 +1,212 @@
+/* Images that are turned against the sky: three shears, the first along x, the second along y, the
+ * third along x again (lnocl/scene/rotation.py). convolve.cl does the first, as phases of the rows.
+ * Here the others shift lines by TURN_TAPS weights each.
+ *
+ * Between the kernels the pixels of one image lie so that a shift along y is a shift in memory:
+ * [PIECES][NX][2][PIECE] reals, in pieces of the columns. A piece has COLUMN_PAIRS pairs of rows, the
+ * even ones and then the odd ones, each followed by a copy of the next ones.
+ *
+ * The rows of an image, and all that is its, lie rotated by the whole pixels of the third shear, so
+ * that fractions are left to shift by.
+ */
+
+#if HAS_TURNS
+
+/* Columns to the left and to the right of a row that a shift reaches; and the columns that a
+ * work-item shifts one after the other, by weights that it holds.
+ */
+#define TURN_MARGIN (TURN_TAPS / 2)
+#define TURN_POINTS (NX + 2 * TURN_MARGIN)
+#define RUN 16
+/* Blocks of rows that are copied: a shifted vector and its neighbours reach there. */
+#define COPIED_BLOCKS ((LANES + TURN_TAPS / 2 + BLOCK - 1) / BLOCK)
+#define PIECE (COLUMN_PAIRS + COPIED_BLOCKS * BLOCK)
+#define PIECES (NY / 2 / COLUMN_PAIRS)
+/* Columns lie far from each other in memory, as tiles do. */
+#define COLUMNS_AHEAD 16
+
+#if LANES == 1
+#define LOAD_UNALIGNED(p) (*(p))
+#else
+typedef vec unaligned_vec __attribute__((aligned(sizeof(real))));
+#define LOAD_UNALIGNED(p) (*(__global const unaligned_vec *)(p))
+#endif
+
+INLINE size_t piece_start(const int piece, const int x)
+{
+    return ((size_t)piece * NX + x) * 2 * PIECE;
+}
+
+/* Even rows of a block of row pairs in column x, part 0, or odd ones, part 1; lane: one vector. */
+INLINE void store_column(
+    __global real *columns, const int x, const int part, const int lane, const int block,
+    const vec value)
+{
+    const int blocks = COLUMN_PAIRS / BLOCK;
+    int piece = block / blocks;
+    for (int at = block % blocks; at < blocks + COPIED_BLOCKS; at += blocks) {
+        __global vec *to = (__global vec *)(columns + piece_start(piece, x) + part * PIECE);
+        to[at * SIDE + lane] = value;
+        piece = piece > 0 ? piece - 1 : PIECES - 1;
+    }
+}
+
+INLINE int in_row(const int x)
+{
+    return x < 0 ? x + NX : x < NX ? x : x - NX;
+}
+
+/* z <- columns shifted along y, from column -margin to NX - 1 + margin, round the edge: sign 1, or
+ * -1 for the adjoint, which shifts the other way, by the weights in reverse.
+ */
+INLINE void load_columns(
+    SCRATCH vec *z, __global const real *columns, __global const int *shifts,
+    __global const real *weights, const int block, const int sign, const int margin)
+{
+    FOR_EACH(piece, (NX + 2 * margin) * SIDE) {
+        const int place = piece / SIDE, lane = piece % SIDE, x = in_row(place - margin);
+        const int ahead = 2 * (block * BLOCK + lane * LANES);
+        const int from = ahead + (sign > 0 ? shifts[x] : 1 - TURN_TAPS - shifts[x]);
+        const int row = from < 0 ? from + NY : from < NY ? from : from - NY;
+        /* Row k of those from here on is in one half of the column for an even k, else in the other. */
+        const int odd = row % 2;
+        __global const real *column = columns + piece_start(row / (2 * COLUMN_PAIRS), x)
+            + row / 2 % COLUMN_PAIRS;
+        __global const real *halves[2] = {column + odd * PIECE, column + (1 - odd) * PIECE + odd};
+        UNROLL
+        for (int i = 0; i < 2; ++i) {
+            PREFETCH(halves[i] + COLUMNS_AHEAD * 2 * PIECE);
+            PREFETCH(halves[i] + COLUMNS_AHEAD * 2 * PIECE + LANES + TURN_TAPS / 2);
+        }
+        cvec total = {0, 0};
+        vec value = LOAD_UNALIGNED(halves[0]);
+        UNROLL
+        for (int k = 0; k < TURN_TAPS; ++k) {
+            const real w = weights[TURN_TAPS * x + (sign > 0 ? k : TURN_TAPS - 1 - k)];
+            total.re += w * value;
+            value = LOAD_UNALIGNED(halves[(k + 1) % 2] + (k + 1) / 2);
+            total.im += w * value;
+        }
+        STORE(z + lane, place, total);
+    }
+    BARRIER;
+}
+
+/* columns <- irfft_rows of the row spectra of an image.
+ * spectra: n_images arrays, const; that of `image` is read. columns: one array, as above.
+ * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.irfft_sheared.
+ */
+KERNEL void irfft_sheared(
+    __global real *restrict columns, __global const vec *restrict spectra, const int image,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+{
+    SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
+    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+        read_tiles(z, spectra + (size_t)image * SPECTRA_SIZE, block);
+        dit_inner(z, NX, row_roots);
+        FOR_EACH(piece, INNER(NX) * SIDE) {
+            const int x = piece / SIDE, lane = piece % SIDE;
+            cvec a[OUTER(NX)];
+            load_inverse(a, z + lane, x, NX, row_roots);
+            UNROLL
+            for (int q = 0; q < OUTER(NX); ++q) {
+                store_column(columns, q * INNER(NX) + x, 0, lane, block, a[q].re);
+                store_column(columns, q * INNER(NX) + x, 1, lane, block, a[q].im);
+            }
+        }
+        BARRIER;
+    }
+}
+
+/* The second and the third shear of `columns`, the ratio with the image, and the adjoint of the
+ * third: as ratio_rows, whose arguments are the same, for one image.
+ * columns, ratio_columns: one array each, in and out. column_shifts, column_weights: [n_images][NX],
+ * whole pixels less TURN_TAPS / 2 - 1, and [n_images][NX][TURN_TAPS]. image_weights: n_images arrays
+ * [IMAGE_ROW_BLOCKS][TURN_TAPS][2][BLOCK].
+ * Launch: up to IMAGE_ROW_BLOCKS groups. Out of place. Scratch: 2 TURN_POINTS.
+ * Twin: reference.ratio_sheared.
+ */
+KERNEL void ratio_sheared(
+    __global real *restrict ratio_columns, __global const real *restrict columns,
+    __global const int *restrict column_shifts, __global const real *restrict column_weights,
+    __global const vec *restrict image_weights, const int image,
+    __global real *restrict ratio_sums, __global real *restrict star_sums,
+    __global const vec *restrict images, __global const real *restrict background,
+    __global const vec *restrict exposure, __global const vec *restrict star_images,
+    __global const int *restrict star_corners, __global const int *restrict star_near,
+    __global const real *restrict star_fluxes, const int n_images, const int star_blocks,
+    const int star_columns, SCRATCH vec *restrict scratch)
+{
+    SHARED_SUMS(shared);
+    SCRATCH vec *sheared = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
+    SCRATCH vec *wide = sheared + 2 * SIDE * TURN_POINTS;
+    SCRATCH vec *z = wide + 2 * SIDE * TURN_MARGIN;
+    FOR_EACH_BLOCK(block, IMAGE_ROW_BLOCKS) {
+        __global const vec *w =
+            image_weights + ((size_t)image * IMAGE_ROW_BLOCKS + block) * TURN_TAPS * 2 * SIDE;
+        load_columns(
+            sheared, columns, column_shifts + image * NX, column_weights + image * NX * TURN_TAPS,
+            block, 1, TURN_MARGIN);
+        FOR_EACH(piece, NX / RUN * 2 * SIDE) {
+            const int part = piece % (2 * SIDE), start = piece / (2 * SIDE) * RUN;
+            vec own[TURN_TAPS];
+            UNROLL
+            for (int k = 0; k < TURN_TAPS; ++k)
+                own[k] = w[k * 2 * SIDE + part];
+            for (int x = start; x < start + RUN; ++x) {
+                vec total = 0;
+                UNROLL
+                for (int k = 0; k < TURN_TAPS; ++k)
+                    total += own[k] * sheared[(x + k + 1) * 2 * SIDE + part];
+                z[x * 2 * SIDE + part] = total;
+            }
+        }
+        BARRIER;
+        compare(
+            z, ratio_sums, star_sums, images, background, exposure, star_images, star_corners,
+            star_near, star_fluxes, n_images, star_blocks, star_columns, block, image, shared);
+        FOR_EACH(i, TURN_MARGIN * 2 * SIDE) {
+            wide[i] = z[i + (NX - TURN_MARGIN) * 2 * SIDE];
+            z[i + NX * 2 * SIDE] = z[i];
+        }
+        BARRIER;
+        FOR_EACH(piece, NX / RUN * 2 * SIDE) {
+            const int part = piece % (2 * SIDE), start = piece / (2 * SIDE) * RUN;
+            vec own[TURN_TAPS];
+            UNROLL
+            for (int k = 0; k < TURN_TAPS; ++k)
+                own[k] = w[k * 2 * SIDE + part];
+            for (int x = start; x < start + RUN; ++x) {
+                vec total = 0;
+                UNROLL
+                for (int k = 0; k < TURN_TAPS; ++k)
+                    total += own[k] * wide[(x + TURN_TAPS - 1 - k) * 2 * SIDE + part];
+                store_column(ratio_columns, x, part / SIDE, part % SIDE, block, total);
+            }
+        }
+        BARRIER;
+    }
+}
+
+/* spectra <- rfft_rows of the columns of an image after the adjoint of the second shear.
+ * spectra: n_images arrays; that of `image` is written, all of it but its padding. The rest as for
+ * ratio_sheared, const.
+ * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.rfft_sheared.
+ */
+KERNEL void rfft_sheared(
+    __global vec *restrict spectra, __global const real *restrict ratio_columns,
+    __global const int *restrict column_shifts, __global const real *restrict column_weights,
+    const int image, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+{
+    SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
+    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+        load_columns(
+            z, ratio_columns, column_shifts + image * NX, column_weights + image * NX * TURN_TAPS,
+            block, -1, 0);
+        begin_rows(z, NX, row_roots);
+        dif_inner(z, NX, row_roots);
+        write_tiles(spectra + (size_t)image * SPECTRA_SIZE, z, block, 1);
+    }
+}
+
+#endif

@@ -1,0 +1,173 @@
+"""Maps from the sky to its images: rotation, flip and shift; what of them is done by index."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lnocl.errors import InputError
+from lnocl.scene.arrays import Array, numbers
+
+# The farthest, pixels, that a map of an image may be from a rotation, with or without a flip.
+MAX_DISTORTION = 0.05
+# Angles that move no pixel of an image farther than this, pixels, are 0.
+MIN_MOVE = 1e-6
+
+# Quarter turns, and those of the flipped x axis.
+QUARTERS = [np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+QUARTERS += [quarter @ np.diag([-1, 1]) for quarter in QUARTERS]
+
+
+def rotations(angles: ArrayLike, centre: ArrayLike) -> Array:
+    """Return the `transforms` of images that are turned about one place.
+
+    Parameters
+    ----------
+    angles : array_like, shape (p,)
+        By how much each image shows the sky turned, degrees, from the x axis towards the y axis.
+        Where north is to be up, and east left, that is minus the position angle of the images' y
+        axis.
+    centre : array_like, shape (2,)
+        (x, y) of the place, pixels, in the sky and in all images.
+
+    Returns
+    -------
+    ndarray of float64, shape (p, 2, 3)
+        For `lnocl.Observation`.
+
+    Raises
+    ------
+    InputError
+        Angles or centre are no finite numbers, or of the wrong shape.
+
+    Examples
+    --------
+    >>> import lnocl
+    >>> lnocl.rotations([0.0, 90.0], centre=(10, 5)).round(12) + 0.0
+    array([[[ 1.,  0.,  0.],
+            [ 0.,  1.,  0.]],
+    <BLANKLINE>
+           [[ 0., -1., 15.],
+            [ 1.,  0., -5.]]])
+    """
+    turned, middle = np.radians(numbers("angles", angles)), numbers("centre", centre)
+    if turned.ndim != 1 or middle.shape != (2,):
+        raise InputError("give `angles` of shape (p,), and a `centre` (x, y)")
+    if not (np.isfinite(turned).all() and np.isfinite(middle).all()):
+        raise InputError("`angles` and `centre` must be finite")
+    linear = np.array([rotation(angle) for angle in turned]).reshape(-1, 2, 2)
+    return np.concatenate([linear, (middle - linear @ middle)[:, :, None]], axis=2)
+
+
+def rotation(angle: float) -> Array:
+    """Return the matrix of a rotation by an angle, radians, from the x axis towards the y axis."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def check_transforms(transforms: ArrayLike, n_images: int, shape: tuple[int, int]) -> Array:
+    """Return maps of images, shape (p, 2, 3), made exact rotations, with or without a flip.
+
+    Raises
+    ------
+    InputError
+        They have the wrong shape, are not finite, or scale or shear the images.
+    """
+    given = numbers("transforms", transforms)
+    if given.shape != (n_images, 2, 3):
+        raise InputError(
+            f"`transforms` has shape {given.shape}; give 2 x 3 numbers for each of the "
+            f"{n_images} images"
+        )
+    if not np.isfinite(given).all():
+        raise InputError("`transforms` must be finite")
+    ny, nx = shape
+    middle = np.array([nx - 1, ny - 1]) / 2.0
+    exact = given.copy()
+    for j, (linear, shift) in enumerate(zip(given[:, :, :2], given[:, :, 2], strict=True)):
+        u, scales, v = np.linalg.svd(linear)
+        farthest = float(abs(scales - 1.0).max() * np.hypot(*middle))
+        if farthest > MAX_DISTORTION:
+            raise InputError(
+                f"`transforms[{j}]` scales or shears an image of {nx} x {ny} pixels by "
+                f"{farthest:.2g} pixels at its corners; {MAX_DISTORTION:g} are allowed: rotations, "
+                "flips and shifts alone are modelled, so bring the images to one pixel scale"
+            )
+        nearest = u @ v
+        nearest = _without_rounding(nearest, np.hypot(*middle))
+        # The middle of the image stays where it is.
+        at = np.linalg.solve(linear, middle - shift)
+        moved = middle - nearest @ at
+        whole = np.round(moved)
+        exact[j, :, :2] = nearest
+        exact[j, :, 2] = np.where(abs(moved - whole) < MIN_MOVE, whole, moved)
+    return exact
+
+
+def _without_rounding(linear: Array, reach: float) -> Array:
+    for quarter in QUARTERS:
+        if abs(linear - quarter).max() * reach < MIN_MOVE:
+            return quarter.astype(float)
+    return linear
+
+
+class Orientation(NamedTuple):
+    """A quarter turn or a flip of an image: whether its axes are exchanged, which are reversed.
+
+    Attributes
+    ----------
+    swaps : bool
+        Whether rows become columns, before axes are reversed.
+    reversed : tuple of bool
+        Whether y is, and x.
+    """
+
+    swaps: bool
+    reversed: tuple[bool, bool]
+
+    @classmethod
+    def nearest(cls, linear: Array) -> tuple[Orientation, float]:
+        """Return what leaves least of a map's rotation, and the angle left, radians."""
+        # Of both that leave half a right angle, the first.
+        quarter = max(QUARTERS, key=lambda each: round(float((each * linear).sum()), 9))
+        left = quarter.T @ linear
+        back = quarter.T
+        swaps = bool(back[0, 0] == 0)
+        signs = back.sum(axis=1)
+        return cls(swaps, (bool(signs[1] < 0), bool(signs[0] < 0))), float(
+            np.arctan2(left[1, 0], left[0, 0])
+        )
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether it changes nothing."""
+        return not (self.swaps or any(self.reversed))
+
+    def of(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Return a view of an array whose last axes are (y, x)."""
+        return self._reversed(array.swapaxes(-1, -2) if self.swaps else array)
+
+    def back(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Return the inverse of `of`."""
+        array = self._reversed(array)
+        return array.swapaxes(-1, -2) if self.swaps else array
+
+    def _reversed(self, array: NDArray[Any]) -> NDArray[Any]:
+        y, x = (slice(None, None, -1 if each else 1) for each in self.reversed)
+        return array[..., y, x]
+
+    def place(self, position: Array, shape: tuple[int, int]) -> Array:
+        """Return where (x, y) of an image of a shape is in `of` it."""
+        x, y = position[::-1] if self.swaps else position
+        ny, nx = shape[::-1] if self.swaps else shape
+        is_y, is_x = self.reversed
+        return np.array([nx - 1 - x if is_x else x, ny - 1 - y if is_y else y])
+
+
+def enlarged(array: NDArray[Any], shape: tuple[int, int], fill: float = 0.0) -> NDArray[Any]:
+    """Return an array with rows and columns added at its end."""
+    missing = [n - k for n, k in zip(shape, array.shape[-2:], strict=True)]
+    widths = [(0, 0)] * (array.ndim - 2) + [(0, n) for n in missing]
+    return np.pad(array, widths, constant_values=fill) if any(missing) else array

@@ -1,0 +1,85 @@
+"""Rotation by three shears: its adjoint, flux, and error by spatial frequency; PSFs turned."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import worst
+from turned_scenes import gaussian
+
+from lnocl.scene.rotation import Rotation, shift_weights, turned_psf
+from lnocl.scene.transforms import rotation
+
+angles = st.floats(-45.0, 45.0).map(np.radians)
+sides = st.sampled_from([16, 48, 64, 80])
+
+
+@settings(max_examples=40)
+@given(angle=angles, ny=sides, nx=sides, seed=st.integers(0, 99))
+def test_adjoint_and_flux(angle, ny, nx, seed):
+    rng = np.random.default_rng(seed)
+    turn = Rotation(angle, rng.uniform(-200, 200, 2), (ny, nx), (ny - 5, nx - 5))
+    sky, image = rng.normal(size=(2, ny, nx))
+    forward, back = turn.forward(sky), turn.adjoint(image)
+    size = np.linalg.norm(forward) * np.linalg.norm(image)
+    assert abs((forward * image).sum() - (sky * back).sum()) <= 1e-14 * size
+    assert forward.sum() == pytest.approx(sky.sum(), abs=1e-11)
+    assert worst(turn.forward(np.ones((ny, nx))), np.ones((ny, nx))) <= 1e-14
+    assert worst(turn.adjoint(np.ones((ny, nx))), np.ones((ny, nx))) <= 1e-14
+
+
+# Cycles per pixel, and the largest error allowed, as a share of the wave's amplitude: about 1.5
+# times that measured over these angles.
+@pytest.mark.parametrize(
+    ("frequency", "allowed"),
+    [(0.02, 6e-5), (0.1, 9e-5), (0.2, 1.6e-4), (0.3, 2.7e-4), (0.35, 6e-4), (0.4, 1.6e-2)],
+)
+def test_waves(frequency, allowed):
+    """Waves in a round window, which no edge of the grid cuts, in eight directions."""
+    n, errors = 128, []
+    y, x = np.indices((n, n))
+    middle = np.array([64.0, 64.0])
+    for degrees in (-45.0, -20.0, 1.0, 10.0, 33.0, 45.0):
+        turn = rotation(np.radians(degrees))
+        shift = middle - turn @ middle + (0.3, -2.2)
+        each = Rotation(np.radians(degrees), shift, (n, n), (n, n))
+        for direction in np.arange(8) * np.pi / 8:
+            wave = frequency * np.array([np.cos(direction), np.sin(direction)])
+
+            def seen(u, v, wave=wave):
+                du, dv = u - middle[0], v - middle[1]
+                window = np.exp(-0.5 * (du**2 + dv**2) / 13.0**2)
+                return window * np.cos(2 * np.pi * (wave[0] * du + wave[1] * dv))
+
+            spectrum = np.fft.rfft2(seen(x, y)) * each.undone()
+            found = each.forward(np.fft.irfft2(spectrum, (n, n)))
+            u, v = np.einsum("ij,jyx->iyx", turn.T, np.array([x, y]) - shift[:, None, None])
+            errors.append(abs(found - seen(u, v)).max())
+    assert max(errors) <= allowed
+    assert max(errors) >= allowed / 2  # else the bound is too wide
+
+
+def test_no_turn_is_a_shift():
+    """Whole pixels move bit for bit."""
+    sky = np.random.default_rng(0).random((32, 48))
+    found = Rotation(0.0, np.array([5.0, -3.0]), (32, 48), (20, 30)).forward(sky)
+    weights = shift_weights(np.zeros(1))[0]  # that whole pixels have, too: the OTF undoes them
+    expected = np.roll(sky, (-3, 5), (0, 1))
+    expected = sum(w * np.roll(expected, 2 - k, 0) for k, w in enumerate(weights))
+    expected = sum(w * np.roll(expected, 2 - k, 1) for k, w in enumerate(weights))
+    assert worst(found, expected) <= 1e-15
+
+
+@pytest.mark.parametrize("degrees", [-45.0, -10.0, 20.0, 45.0])
+@pytest.mark.parametrize("shape", [(31, 31), (24, 37)])
+def test_a_psf_is_turned_about_its_centre(degrees, shape):
+    covariance = np.array([[5.0, 1.0], [1.0, 3.0]])
+    y, x = np.indices(shape)
+    psf = gaussian(x - shape[1] // 2, y - shape[0] // 2, covariance)
+    found = turned_psf(psf, np.radians(degrees))
+    n = len(found)
+    turn = rotation(np.radians(degrees))
+    v, u = np.indices((n, n)) - n // 2
+    expected = gaussian(*np.einsum("ij,jyx->iyx", turn, np.array([u, v])), covariance)
+    assert worst(found, expected) <= 2e-5  # the PSF is cut off at its edges
+    assert found.sum() == pytest.approx(psf.sum(), rel=1e-14)
