@@ -731,7 +731,7 @@ def saved_parts(result: Result) -> dict[str, Any]:
     parts: dict[str, Any] = {
         "history": result.history,
         "held_out": result.held_out if result.held_out.size else None,
-        "offsets": result._observation.offsets,
+        "transforms": result._observation.transforms,
         "oversample": result._observation.oversample,
         "cards": [],
     }
@@ -760,7 +760,8 @@ def view_of(result: Result) -> ResultView:
         images=observation.as_given(np.where(observation.mask, np.nan, observation.images)),
         models=models,
         residuals=result._residuals(models),
-        offsets=observation.offsets,
+        offsets=observation.transforms[:, :, 2],
+        turns=observation.transforms[:, :, :2] if observation.is_mapped else None,
         doubtful=None if result.psf_refinement is None else result.doubtful,
         unit=result._unit,
         oversample=observation.oversample,

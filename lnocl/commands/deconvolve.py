@@ -100,7 +100,8 @@ def _run(arguments: argparse.Namespace) -> None:
             )
             lines = [*summarise(arguments, result, frames, at_stars, overall), *verdict]
             measured = _measured(result, frames, overall, verdict)
-        wcs = fitsread.wcs_cards(frames.header)
+        # With field rotation the sky has north up, as no image has.
+        wcs = None if arguments.angle else fitsread.wcs_cards(frames.header)
         _write(arguments, result, frames, given, at_stars, view, wcs, measured, [*warned, *lines])
         lines.append(f"written to {arguments.output}")
         if arguments.plot is not None and view is not None:
@@ -119,7 +120,7 @@ def _write(
     given: Mapping[str, Any],
     at_stars: Sequence[StarResiduals],
     view: ResultView | None,
-    wcs: fits.Header,
+    wcs: fits.Header | None,
     measured: Sequence[Card],
     lines: Sequence[str],
 ) -> None:
@@ -128,7 +129,7 @@ def _write(
     from lnocl.io.headers import observed_cards
 
     primary = fitsread.read_contents(arguments.images[0]).primary
-    parts, offsets = saved_parts(result), frames.observation.offsets
+    parts, has_places = saved_parts(result), bool(arguments.align or arguments.angle)
     repeated = {**given, **_repeated(given, frames)}
     fitswrite.write_result(
         arguments.output,
@@ -145,7 +146,7 @@ def _write(
                 [
                     *measured,
                     *parts.pop("cards"),
-                    *(fitswrite.offset_cards(offsets) if arguments.align else []),
+                    *(fitswrite.place_cards(parts["transforms"]) if has_places else []),
                 ],
             ),
         ],

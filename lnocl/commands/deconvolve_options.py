@@ -128,8 +128,26 @@ OPTIONS = {
         option(
             "--align",
             choices=("wcs",),
-            help="take the offsets between the images from their sky coordinates (default: they "
-            "have none)",
+            help="take offsets, rotations and flips of the images against the first from their sky "
+            "coordinates (default: they have none)",
+        ),
+        option(
+            "--angle",
+            **SEVERAL,
+            type=number_or_word,
+            metavar="ANGLE",
+            checksum="ASUM",
+            help="parallactic angles of images of an altazimuth telescope without derotator, "
+            "degrees: a keyword of their headers such as PARANG, a file (FITS, or text with a "
+            "number a line), or one number for each image. The extended source has north up",
+        ),
+        option(
+            "--centre",
+            type=options.position,
+            metavar="X,Y",
+            card=("CENTRE", "where the field turns about, pixels"),
+            help="with --angle: where the field turns about, pixels (default: the middle, "
+            "nx // 2, ny // 2)",
         ),
     ],
     "stars": [

@@ -47,7 +47,7 @@ def write_result(
     unit: str = "electron",
     star_columns: Sequence[StarColumn] = (),
     cubes: Mapping[str, tuple[ArrayLike, str]] = MappingProxyType({}),
-    offsets: ArrayLike = (),
+    transforms: ArrayLike = (),
     oversample: int = 1,
     psf_fit: NDArray[np.void] | None = None,
     psfs: ArrayLike | None = None,
@@ -92,9 +92,9 @@ def write_result(
         Further columns of the table of stars.
     cubes : mapping of str to (array_like, str), optional
         Further images (p, ny, nx), by the name of their extension, with their unit.
-    offsets : array_like, shape (p, 2), optional
-        Offsets of these images, pixels. Where one is not 0, no coordinate system holds for all of a
-        cube: it has the cards of `offset_cards` instead.
+    transforms : array_like, shape (p, 2, 3), optional
+        Maps from the sky to these images, pixels. Where they are not all the same, no coordinate
+        system holds for all of a cube: it has the cards of `place_cards` instead.
     oversample : int, optional
         Pixels of the extended source to one of the images, along each axis.
     psf_fit : ndarray with fields ``image`` and those of the parameters, optional
@@ -114,7 +114,8 @@ def write_result(
         The file cannot be written, or exists and must not be overwritten.
     """
     coordinates = fits.Header() if wcs is None else wcs
-    shared = coordinates if not np.any(offsets) else fits.Header(offset_cards(offsets))
+    is_shared = not np.any(np.asarray(transforms).reshape(-1, 2, 3) - np.eye(2, 3))
+    shared = coordinates if is_shared else fits.Header(place_cards(transforms))
     of_sky = coordinates if oversample == 1 else finer_cards(coordinates, oversample)
     header = of_sky.copy()
     header["BUNIT"] = (unit, "per pixel")
@@ -203,12 +204,24 @@ def column_unit(unit: str) -> str:
     return unit.replace("electron", "ct")
 
 
-def offset_cards(offsets: ArrayLike) -> list[Card]:
-    """Return the cards OFFX1, OFFY1, OFFX2 ... of the offsets of images, shape (p, 2), pixels."""
-    return [
+def place_cards(transforms: ArrayLike) -> list[Card]:
+    """Return the cards of the maps of images, shape (p, 2, 3): OFFX1, OFFY1, OFFX2 ..., pixels.
+
+    Where an image is turned, also R11_1, R12_1, R21_1 ..., the matrices of rotations and flips.
+    """
+    maps = np.asarray(transforms).reshape(-1, 2, 3)
+    cards: list[Card] = [
         (f"OFF{axis}{j}", float(offset), "offset of the image, pixels")
-        for j, pair in enumerate(np.asarray(offsets), 1)
-        for axis, offset in zip("XY", pair, strict=True)
+        for j, each in enumerate(maps, 1)
+        for axis, offset in zip("XY", each[:, 2], strict=True)
+    ]
+    if (maps[:, :, :2] == np.eye(2)).all():
+        return cards
+    return cards + [
+        (f"R{a + 1}{b + 1}_{j}", float(each[a, b]), "rotation of the image")
+        for j, each in enumerate(maps, 1)
+        for a in (0, 1)
+        for b in (0, 1)
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.arrays import Array
 from lnocl.scene.observation import OVERSAMPLES, Observation, PsfCentre
+from lnocl.scene.transforms import rotations
 
 Mask = NDArray[np.bool_]
 
@@ -65,7 +67,12 @@ class Calibration(NamedTuple):
         variance of their counts, such as JWST's ``"VAR_POISSON"``. Counts per time stay counts per
         time.
     align : {"wcs"}, optional
-        Offsets from the headers' coordinates.
+        Offsets, rotations and flips from the headers' coordinates.
+    angle : sequence of float or str
+        Parallactic angles, degrees: one for each image, a keyword of the headers, or a file.
+    centre : tuple of float, optional
+        (x, y) of the place that the field turns about, pixels; by default the middle,
+        ``(nx // 2, ny // 2)``.
     psf_centre : {"check", "fit", "given"}
         As for `Observation`.
     oversample, effective_psfs : int, bool
@@ -85,6 +92,8 @@ class Calibration(NamedTuple):
     saturation: float | None = None
     gain: Word | None = None
     align: str | None = None
+    angle: Sequence[Word] = ()
+    centre: tuple[float, float] | None = None
     oversample: int = 1
     effective_psfs: bool = False
     psf_centre: PsfCentre = "check"
@@ -194,7 +203,7 @@ class _Reader:
             else noise.read_noise(counts, each, mask),
             mask=mask if mask.any() else None,
             exposure=1.0 if exposure is None else exposure,
-            offsets=self._offsets(),
+            **self._places(),
             oversample=self._calibration.oversample,
             effective_psfs=self._calibration.effective_psfs,
             psf_centre=self._calibration.psf_centre,
@@ -545,36 +554,84 @@ class _Reader:
 
         return self._maps.fill("read_noise", words, electrons)
 
-    def _offsets(self) -> Array | None:
+    def _places(self) -> dict[str, Array]:
+        """Return `offsets` or `transforms` of the images, where there are any."""
         images, headers = self._images.data, self._images.headers
+        if self._calibration.angle:
+            return {"transforms": self._field_rotation()}
         if self._calibration.align is None:
             if len(headers) > 1 and all(map(sky.has_celestial, headers)):
-                self._warn_of_offsets()
-            return None
+                self._warn_of_places()
+            return {}
         if len(headers) != len(images):
             raise InputError(
                 f"{self._paths[0]} is a cube, with one WCS for all its images; to align them give "
                 "a file for each"
             )
-        found = sky.offsets(headers, self._paths, images.shape[1:])
-        for j, (dx, dy) in enumerate(found[1:], 1):
-            note("`images[%d]`: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
+        found = sky.transforms(headers, self._paths, images.shape[1:])
+        is_turned = (found[:, :, :2] != np.eye(2)).any()
+        for j, (each, (dx, dy)) in enumerate(zip(found[1:], found[1:, :, 2], strict=True), 1):
+            if is_turned:
+                angle = sky.rotation_angle(each)
+                note("`images[%d]`: turned by %.3f degrees, from the WCS", j, angle)
+            else:
+                note("`images[%d]`: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
+        return {"transforms": found} if is_turned else {"offsets": found[:, :, 2]}
+
+    def _field_rotation(self) -> Array:
+        """Return the maps of images of the parallactic angles given, or of a file of these."""
+        calibration, (p, ny, nx) = self._calibration, self._images.data.shape
+        if calibration.align is not None:
+            raise InputError("give `angle` or `align`, not both: each has the rotation")
+        words = calibration.angle
+        if len(words) == 1 and isinstance(words[0], str) and os.path.isfile(words[0]):
+            angles, checksum = sky.read_angles(words[0])
+            self._sha256["angle"] = [checksum]
+        else:
+            if len(words) not in (1, p):
+                raise InputError(
+                    f"{counted(len(words), 'angle')} for {counted(p, 'image')}; give a keyword, a "
+                    "file of the angles, or one number for each image"
+                )
+            angles = np.array([self._angle(j, words[min(j, len(words) - 1)]) for j in range(p)])
+        if len(angles) != p:
+            raise InputError(f"{words[0]} has {len(angles)} angles for {counted(p, 'image')}")
+        centre = calibration.centre or (nx // 2, ny // 2)
+        # Field rotation turns north, and the sky with it, away from the y axis.
+        return rotations(-angles, centre)
+
+    def _angle(self, j: int, word: Word) -> float:
+        if isinstance(word, (int, float)):
+            return float(word)
+        found = self._from_header("angle", j, word, " degrees")
+        if found is None:
+            path = self._paths[min(j, len(self._paths) - 1)]
+            raise InputError(
+                f"{path} has no {word} in its header, and there is no such file; give `angle` as a "
+                "number, another keyword, or a file of the angles"
+            )
         return found
 
-    def _warn_of_offsets(self) -> None:
+    def _warn_of_places(self) -> None:
         """Warn of the first image that is not where the first is, by their coordinates."""
         try:
-            found = sky.offsets(self._images.headers, self._paths, self._images.data.shape[1:])
+            found = sky.transforms(self._images.headers, self._paths, self._images.data.shape[1:])
         except InputError as error:
             warn(error.message)
             return
-        for path, (dx, dy) in zip(self._paths, found, strict=True):
-            if max(abs(dx), abs(dy)) > sky.MAX_OFFSET_VARIATION:
-                warn(
-                    f"{path} lies ({dx:.2f}, {dy:.2f}) pixels off {self._paths[0]}, by their sky "
-                    "coordinates: give `align` wcs, unless their pixels were registered"
-                )
-                return
+        for path, each in zip(self._paths, found, strict=True):
+            dx, dy = each[:, 2]
+            if (each[:, :2] != np.eye(2)).any():
+                where = f"is turned by {sky.rotation_angle(each):.2f} degrees against"
+            elif max(abs(dx), abs(dy)) > sky.MAX_OFFSET_VARIATION:
+                where = f"lies ({dx:.2f}, {dy:.2f}) pixels off"
+            else:
+                continue
+            warn(
+                f"{path} {where} {self._paths[0]}, by their sky coordinates: give `align` wcs, "
+                "unless their pixels were registered"
+            )
+            return
 
 
 def _have(n: int) -> str:

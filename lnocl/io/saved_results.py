@@ -53,6 +53,8 @@ class SavedResult:
         ``MODELS`` and ``RESIDUALS``, where both are there.
     offsets : ndarray of float64, shape (p, 2)
         Of the images, pixels; 0 where the cubes have none.
+    turns : ndarray of float64, shape (p, 2, 2), or None
+        Rotations and flips of the images, where the cubes have them.
     doubtful : ndarray of bool, shape (ny, nx), or None
         The image ``DOUBTFUL``, where it is there.
     messages : list of str
@@ -65,6 +67,7 @@ class SavedResult:
     tables: dict[str, Columns]
     cubes: dict[str, NDArray[np.float64]]
     offsets: NDArray[np.float64]
+    turns: NDArray[np.float64] | None
     doubtful: NDArray[np.bool_] | None
     messages: list[str]
 
@@ -167,6 +170,9 @@ def read_result(path: str) -> SavedResult:
     offsets = [
         [number(path, cards, f"OFF{axis}{j}") or 0.0 for axis in "XY"] for j in range(1, p + 1)
     ]
+    names = [f"R{a}{b}_{j}" for j in range(1, p + 1) for a in (1, 2) for b in (1, 2)]
+    turns = [number(path, cards, name) for name in names]
+    is_turned = p > 0 and None not in turns
     return SavedResult(
         path,
         header,
@@ -174,6 +180,7 @@ def read_result(path: str) -> SavedResult:
         tables,
         cubes,
         np.reshape(offsets, (p, 2)),
+        np.array(turns, float).reshape(p, 2, 2) if is_turned else None,
         doubtful,
         messages,
     )

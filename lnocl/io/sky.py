@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 from codecs import BOM_UTF8
 from collections.abc import Callable, Sequence
@@ -326,6 +327,38 @@ def _read_table(path: str) -> Table:
         raise FileError(f"{path} cannot be read as a table: {reason}") from error
 
 
+def read_angles(path: str) -> tuple[NDArray[np.float64], str]:
+    """Return the angles in a file, one for each image, and its SHA-256 checksum.
+
+    Parameters
+    ----------
+    path : str
+        FITS, with an image of one dimension, or text with a number a line.
+
+    Raises
+    ------
+    FileError
+        The file cannot be read, or holds something else.
+    """
+    try:
+        with open_regular(path) as stream:
+            content = stream.read(MAX_MEBIBYTES * 2**20)
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path} cannot be read: {getattr(error, 'strerror', error)}") from error
+    if content.startswith(b"SIMPLE"):
+        with open_fits(path) as file:
+            images = [hdu for hdu in file.hdus() if len(getattr(hdu, "shape", ()) or ()) == 1]
+            values = np.array(images[0].data, np.float64) if images else np.zeros(0)
+    else:
+        try:
+            values = np.array(content.decode("ascii").split(), np.float64)
+        except ValueError as error:
+            raise FileError(f"{path} is no list of angles, a number a line") from error
+    if not (values.size and np.isfinite(values).all()):
+        raise FileError(f"{path} holds no list of angles, one for each image")
+    return values, hashlib.sha256(content).hexdigest()
+
+
 def _read_fits_table(path: str) -> Table:
     with open_fits(path, "cannot be read as a table") as file:
         hdus = fits.HDUList(list(file.hdus()))
@@ -364,29 +397,34 @@ def _check_votable(path: str, content: IO[bytes]) -> None:
     content.seek(0)
 
 
-def offsets(headers: Sequence[fits.Header], paths: Sequence[str], shape: tuple[int, int]) -> Pairs:
-    """Return the offset of each image from the first, shape (p, 2), in pixels (dx, dy).
+def transforms(
+    headers: Sequence[fits.Header], paths: Sequence[str], shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Return the map from the first image to each, shape (p, 2, 3), pixels.
 
-    The mean over the image of ``pixel_j(sky(pixel_1)) - pixel_1``.
+    It is a shift, the mean over the image of ``pixel_j(sky(pixel_1)) - pixel_1``, where that is the
+    same all over the image within a tenth of a pixel; else the nearest rotation, with or without a
+    flip, and shift.
 
     Raises
     ------
     InputError
         An image without sky coordinates; one that shows another part of the sky than the first;
-        one that is rotated or scaled against it, by so much that the offset is not the same over
-        the image within a tenth of a pixel.
+        one that no rotation and shift brings within a tenth of a pixel, as it has another scale.
     """
     first, *others = (
         celestial_wcs(header, path, "leave align out")
         for header, path in zip(headers, paths, strict=True)
     )
-    found = [np.zeros(2)]
+    found = [np.eye(2, 3)]
     for wcs, path in zip(others, paths[1:], strict=True):
-        found.append(_offset(first, wcs, paths[0], path, shape))
+        found.append(_transform(first, wcs, paths[0], path, shape))
     return np.array(found)
 
 
-def _offset(first: WCS, wcs: WCS, first_path: str, path: str, shape: tuple[int, int]) -> Pairs:
+def _transform(
+    first: WCS, wcs: WCS, first_path: str, path: str, shape: tuple[int, int]
+) -> NDArray[np.float64]:
     ny, nx = shape
     x, y = np.meshgrid(np.linspace(0, nx - 1, POINTS), np.linspace(0, ny - 1, POINTS))
     moved = _pixel_to(pixel_to_pixel, first, wcs, x, y)
@@ -397,14 +435,26 @@ def _offset(first: WCS, wcs: WCS, first_path: str, path: str, shape: tuple[int, 
             f"{path} shows another part of the sky than {first_path}, by its sky coordinates; "
             "leave one of them out"
         )
-    spread = abs(change - mean[:, None, None]).max()
-    if spread > MAX_OFFSET_VARIATION:
+    if abs(change - mean[:, None, None]).max() <= MAX_OFFSET_VARIATION:
+        return np.column_stack([np.eye(2), mean])
+    middle = np.array([nx - 1, ny - 1]) / 2.0
+    points = np.array([x, y]).reshape(2, -1) - middle[:, None]
+    there = moved.reshape(2, -1) - (middle + mean)[:, None]
+    u, _, v = np.linalg.svd(there @ points.T)
+    nearest = u @ v
+    left = abs(there - nearest @ points).max()
+    if left > MAX_OFFSET_VARIATION:
         raise InputError(
-            f"{path} is {_describe_turn(moved, nx)} relative to {first_path}, which moves pixels "
-            f"by up to {spread:.2g} besides the offset: images are never resampled; give only "
-            "images of one orientation and scale, or reduce them to one grid"
+            f"{path} is {_describe_turn(moved, nx)} relative to {first_path}, and after rotation "
+            f"and shift pixels are up to {left:.2g} off: images are never resampled; give only "
+            "images of one scale, or reduce them to one"
         )
-    return mean
+    return np.column_stack([nearest, middle + mean - nearest @ middle])
+
+
+def rotation_angle(transform: NDArray[np.float64]) -> float:
+    """Return by how many degrees a map turns, from the x axis towards the y axis."""
+    return float(np.degrees(np.arctan2(transform[1, 0], transform[0, 0])))
 
 
 def _describe_turn(moved: Pairs, nx: int) -> str:

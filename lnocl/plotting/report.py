@@ -108,7 +108,8 @@ def frame_step(view: ResultView) -> int:
 def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
     """Return the pictures of a region: image, model and residuals of each image, and the source."""
     images: list[list[dict[str, Any]]] = []
-    for j, offset in enumerate(view.offsets):
+    for j in range(len(view.images)):
+        offset = view.offset_at(j, region)
         there = region.slices(view.shape, offset)
         corner = _corner(there, view.shape, offset)
         if not view.images[j][there].size:  # not in this image

@@ -62,6 +62,8 @@ class ResultView:
         Unit of the extended source, per pixel of it.
     oversample : int
         Pixels of the extended source to one of the images, along each axis.
+    turns : ndarray of float64, shape (p, 2, 2), or None
+        Rotations and flips of the images; None where there are none.
     """
 
     extended: Array
@@ -77,6 +79,19 @@ class ResultView:
     doubtful: NDArray[np.bool_] | None = None
     unit: str = "electron"
     oversample: int = 1
+    turns: Array | None = None
+
+    def place(self, j: int, position: Sequence[float]) -> tuple[float, float]:
+        """Return where a position of the sky is in image j."""
+        there = np.asarray(position) if self.turns is None else self.turns[j] @ position
+        x, y = (there + self.offsets[j]).tolist()
+        return x, y
+
+    def offset_at(self, j: int, region: Region) -> tuple[float, float]:
+        """Return by how much the middle of a region is moved in image j."""
+        middle = region.middle or tuple((n - 1) / 2.0 for n in self.shape[::-1])
+        (x, y), (u, v) = self.place(j, middle), middle
+        return x - u, y - v
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -174,8 +189,8 @@ def draw_result(view: ResultView) -> Figure:
 def worst_image(view: ResultView, region: Region) -> int:
     """Return the image whose residuals in a region are largest, of those that see it."""
     squares = []
-    for values, offset in zip(view.residuals, view.offsets, strict=True):
-        there = values[region.slices(values.shape, offset)]
+    for j, values in enumerate(view.residuals):
+        there = values[region.slices(values.shape, view.offset_at(j, region))]
         good = there[np.isfinite(there)]
         squares.append(float(np.mean(good**2)) if good.size else -1.0)
     return int(np.argmax(squares))
@@ -208,8 +223,7 @@ def _draw_images(axes: Sequence[Axes], view: ResultView, region: Region) -> None
     from matplotlib.colors import AsinhNorm, Normalize
 
     j = worst_image(view, region)
-    offset = view.offsets[j]
-    there = region.slices(view.shape, offset)
+    there = region.slices(view.shape, view.offset_at(j, region))
     _, _, noise = image_limits(view.images[j])
     low, high, _ = image_limits(view.images[j][there])
     name = "image" if len(view.images) == 1 else f"image {j + 1} of {len(view.images)}"
@@ -228,7 +242,7 @@ def _draw_images(axes: Sequence[Axes], view: ResultView, region: Region) -> None
         label = "sigma" if cube is view.residuals else "electron"
         _add_bar(axis, shown, label)
         if cube is view.images:
-            _mark_stars(axis, view, offset)
+            _mark_stars(axis, [view.place(j, star) for star in view.stars])
 
 
 def draw_extended(
@@ -246,7 +260,7 @@ def draw_extended(
         title += f"\n{OUTLINED}"
     axis.set_title(title, fontsize=10)
     _add_bar(axis, shown, as_text(view.unit))
-    _mark_stars(axis, view)
+    _mark_stars(axis, view.stars)
 
 
 def outline(
@@ -314,13 +328,11 @@ def _add_bar(axis: Axes, shown: Any, label: str) -> None:
     axis.tick_params(labelsize=7)
 
 
-def _mark_stars(axis: Axes, view: ResultView, offset: Sequence[float] = (0.0, 0.0)) -> None:
+def _mark_stars(axis: Axes, stars: Sequence[tuple[float, float]]) -> None:
     """Circle the stars inside the axes, and number them where they are not too many."""
     (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
     inside = [
-        (s, x + offset[0], y + offset[1])
-        for s, (x, y) in enumerate(view.stars, 1)
-        if left <= x + offset[0] <= right and bottom <= y + offset[1] <= top
+        (s, x, y) for s, (x, y) in enumerate(stars, 1) if left <= x <= right and bottom <= y <= top
     ]
     if inside:
         _, x, y = np.transpose(inside)

@@ -332,6 +332,23 @@ class Observation:
         """Whether any image is turned against the sky."""
         return bool((self.turns != np.eye(2)).any())
 
+    @property
+    def transforms(self) -> Array:
+        """The map from the sky to each image as given, shape (p, 2, 3), pixels."""
+        if not self._orientations:
+            return np.concatenate([self.turns, self.offsets[:, :, None]], axis=2)
+        maps = np.empty((self.n_images, 2, 3))
+        for j, orientation in enumerate(self._orientations):
+            basis = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
+            at = [orientation.place_back(each, self.shape) for each in self.places(j, basis)]
+            maps[j] = np.array([at[1] - at[0], at[2] - at[0], at[0]]).T
+        return maps
+
+    @property
+    def is_mapped(self) -> bool:
+        """Whether any image is turned or flipped against the sky, as given."""
+        return self.is_turned or bool(self._orientations)
+
     def places(self, j: int, positions: Array) -> Array:
         """Return where positions (..., 2) of the sky are in image j."""
         if (self.turns[j] == np.eye(2)).all():

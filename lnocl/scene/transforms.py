@@ -165,6 +165,13 @@ class Orientation(NamedTuple):
         is_y, is_x = self.reversed
         return np.array([nx - 1 - x if is_x else x, ny - 1 - y if is_y else y])
 
+    def place_back(self, position: Array, shape: tuple[int, int]) -> Array:
+        """Return where (x, y) of `of` an image, of this shape, is in the image."""
+        x, y = position
+        (is_y, is_x), (ny, nx) = self.reversed, shape
+        x, y = nx - 1 - x if is_x else x, ny - 1 - y if is_y else y
+        return np.array([y, x] if self.swaps else [x, y])
+
 
 def enlarged(array: NDArray[Any], shape: tuple[int, int], fill: float = 0.0) -> NDArray[Any]:
     """Return an array with rows and columns added at its end."""

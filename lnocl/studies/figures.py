@@ -145,6 +145,7 @@ def view_of(saved: SavedResult) -> ResultView:
         models=models,
         residuals=residuals,
         offsets=saved.offsets,
+        turns=saved.turns,
         doubtful=saved.doubtful,
         unit=unit,
         oversample=q,

@@ -86,15 +86,22 @@ class TestWriting:
     def test_cubes_of_shifted_images_have_offsets_in_the_place_of_coordinates(self, tmp_path):
         wcs = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 4.5})
         cubes = {"MODELS": (np.ones((2, *IMAGE.shape)), "electron")}
-        offsets = [(0.0, 0.0), (7.0, -4.0)]
-        path = write(tmp_path / "out.fits", wcs=wcs, cubes=cubes, offsets=offsets)
+        maps = np.array([np.eye(2, 3)] * 2)
+        maps[1, :, 2] = 7.0, -4.0
+        path = write(tmp_path / "out.fits", wcs=wcs, cubes=cubes, transforms=maps)
         header = fits.getheader(path, "MODELS")
         assert not {"CTYPE1", "CTYPE2", "CRPIX1"} & set(header)
         assert [header[f"OFF{axis}"] for axis in ("X1", "Y1", "X2", "Y2")] == [0, 0, 7, -4]
         assert header["BUNIT"] == "electron"
         assert fits.getheader(path)["CRPIX1"] == 4.5
         assert fitscheck.main(["--compliance", path]) == 0
-        path = write(tmp_path / "same.fits", wcs=wcs, cubes=cubes, offsets=np.zeros((2, 2)))
+        assert "R11_1" not in header
+        maps[1, :, :2] = [[0.6, -0.8], [0.8, 0.6]]
+        path = write(tmp_path / "turned.fits", wcs=wcs, cubes=cubes, transforms=maps)
+        header = fits.getheader(path, "MODELS")
+        assert [header[f"R{ab}_2"] for ab in ("11", "12", "21", "22")] == [0.6, -0.8, 0.8, 0.6]
+        maps[:] = np.eye(2, 3)
+        path = write(tmp_path / "same.fits", wcs=wcs, cubes=cubes, transforms=maps)
         header = fits.getheader(path, "MODELS")
         assert header["CRPIX1"] == 4.5
         assert "OFFX1" not in header

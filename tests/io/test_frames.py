@@ -1,6 +1,7 @@
 """Observations from FITS files: exposures, backgrounds, noise, masks, offsets."""
 
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wcs_headers import NORTH_UP
 
+import lnocl
 from lnocl.errors import FileError, InputError, LnoclWarning, counted
 from lnocl.io.levels import sky_noise
 from lnocl.scene.noise_check import warn_of_noise
@@ -525,8 +527,54 @@ class TestOffsets:
         save("1.fits", IMAGES[0], **NORTH_UP)
         turned = {"PC1_1": 0.8, "PC1_2": 0.6, "PC2_1": -0.6, "PC2_2": 0.8}
         save("2.fits", IMAGES[1], **NORTH_UP, **turned)
-        with pytest.warns(LnoclWarning, match="2.fits is rotated by .* relative to 1.fits"):
-            observe()
+        with pytest.warns(LnoclWarning, match="2.fits is turned by 36.87 degrees against 1.fits"):
+            assert not observe().is_turned
+
+    def test_turned_images_by_the_wcs(self, log):
+        save("1.fits", IMAGES[0], **NORTH_UP)
+        turned = {"PC1_1": 0.8, "PC1_2": 0.6, "PC2_1": -0.6, "PC2_2": 0.8}
+        save("2.fits", IMAGES[1], **NORTH_UP, **turned)
+        observation = observe(align="wcs")
+        np.testing.assert_array_equal(observation.turns[0], np.eye(2))
+        np.testing.assert_allclose(observation.turns[1], [[0.8, -0.6], [0.6, 0.8]], atol=1e-6)
+        assert notes(log) == ["image 1: turned by 36.870 degrees, from the WCS"]
+
+    @pytest.mark.parametrize("kind", ["keyword", "numbers", "text", "fits"])
+    def test_field_rotation(self, kind):
+        for name, image, angle in zip(("1.fits", "2.fits"), IMAGES, (10.0, 25.0), strict=True):
+            save(name, image, PARANG=angle)
+        Path("angles.txt").write_text("10.0\n25.0\n", encoding="ascii")
+        fits.writeto("angles.fits", np.array([10.0, 25.0]))
+        given = {
+            "keyword": ["PARANG"],
+            "numbers": [10.0, 25.0],
+            "text": ["angles.txt"],
+            "fits": ["angles.fits"],
+        }
+        observation = observe(angle=given[kind], centre=(4.0, 3.0))
+        expected = lnocl.rotations([-10.0, -25.0], (4.0, 3.0))
+        np.testing.assert_allclose(observation.transforms, expected, atol=1e-12)
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"angle": ["PARANG"]}, "1.fits has no PARANG in its header, and there is no such"),
+            ({"angle": [1.0, 2.0, 3.0]}, "3 angles for 2 images; give a keyword, a file of the"),
+            ({"angle": ["few.txt"]}, "few.txt has 3 angles for 2 images"),
+            ({"angle": ["words.txt"]}, "words.txt is no list of angles, a number a line"),
+            ({"angle": ["image.fits"]}, "image.fits holds no list of angles, one for each image"),
+            ({"angle": [1.0], "align": "wcs"}, "give angle or align, not both"),
+        ],
+    )
+    def test_wrong_angles(self, given, message):
+        save("1.fits", IMAGES[0])
+        save("2.fits", IMAGES[1])
+        save("image.fits", IMAGES[0])
+        Path("few.txt").write_text("1 2 3", encoding="ascii")
+        Path("words.txt").write_text("north up", encoding="ascii")
+        with pytest.raises(lnocl.LnoclError) as caught:
+            observe(**given)
+        assert str(caught.value).startswith(message)
 
     def test_a_cube_has_one_wcs(self):
         save("cube.fits", IMAGES, **NORTH_UP)
