@@ -59,13 +59,20 @@ def make_psf(rng):
     radius = np.hypot(f[:, None], f) * 2.0 * RESOLUTION
     inside = np.clip((1.0 - radius) / (4.0 * RESOLUTION / fine) + 0.5, 0.0, 1.0)
     # Screens over the whole grid, with the power of what adaptive optics leaves: flat, then falling.
-    cycles = np.hypot(*np.meshgrid(*2 * [np.fft.fftfreq(fine, 1.0 / fine)])) / (2.0 * RESOLUTION)
-    spectrum = (1.0 + (cycles / 6.0) ** 2) ** -0.75
-    screens = [np.fft.ifft2(spectrum * np.fft.fft2(rng.normal(size=(fine, fine)))).real for _ in "ab"]
-    phase, amplitude = (rms * s / s[inside > 0.5].std() for rms, s in zip((0.5, 0.1), screens))
-    field = np.fft.fft2(inside * (1.0 + amplitude) * np.exp(1j * phase))
-    psf = np.fft.fftshift(abs(field) ** 2)[N // 2 : -N // 2, N // 2 : -N // 2]
-    psf *= np.cos(np.pi / 2.0 * np.clip((R - REACH + 12.0) / 12.0, 0.0, 1.0)) ** 2
+    cycles = np.hypot(*np.meshgrid(*2 * [np.fft.fftfreq(fine, 1.0 / fine)])) / RESOLUTION
+    spectrum = (1.0 + (cycles / 2.0) ** 2) ** -0.75
+    screens = [
+        np.fft.ifft2(spectrum * np.fft.fft2(rng.normal(size=(fine, fine)))).real for _ in "ab"
+    ]
+    phase, amplitude = (rms * s / s[inside > 0.5].std() for rms, s in zip((1.0, 0.1), screens))
+    field, window = inside * (1.0 + amplitude) * np.exp(1j * phase), np.exp(-((R / 2.5) ** 2))
+    for _ in range(8):
+        psf = abs(np.fft.fft2(field)) ** 2
+        psf = np.fft.fftshift(psf)[CENTRE : CENTRE + N, CENTRE : CENTRE + N]
+        core = psf * window
+        x, y = (core * X).sum() / core.sum(), (core * Y).sum() / core.sum()
+        field *= np.exp(-2j * np.pi * (x * f + y * f[:, None]))
+    psf *= np.cos(np.pi / 2.0 * np.clip((R - REACH) / 24.0 + 1.0, 0.0, 1.0)) ** 2
     return psf / psf.sum(), 2.0 * np.sqrt(np.count_nonzero(psf > psf.max() / 2.0) / np.pi)
 
 
@@ -211,7 +218,9 @@ def main():
             for kind in given.sources:
                 for seed in range(given.seeds[0], given.seeds[1] + 1):
                     for row in measure(name, contrast, kind, seed, given.device):
-                        words = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
+                        words = (
+                            f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()
+                        )
                         print("  ".join(words), flush=True)
                         rows.append(row)
     table = Table(rows)

@@ -40,6 +40,8 @@ CASES = {
         harness.FOUR_TIMES_AS_FINE,
         "sd",
     ),
+    "turned": ((16, 32), Tuning(4, 4), harness.TURNED, "sD"),
+    "group, turned": ((32, 48), Tuning(1, 4, group=4), harness.TURNED, "sd"),
     "group, exposure map": ((32, 16), Tuning(1, 8, group=4), "exposure map, mu", "s"),
     "group, mu": ((16, 16), ON_GPU, "two images, star, mu", "D"),
     "group, odd factors": ((36, 40), Tuning(1, 2, group=4), "mask, mu, smoothing", "sD"),
@@ -179,7 +181,7 @@ def plant(old, new):
 def tune_as_on_gpu():
     tune = program.tune
 
-    def tuned(device, dtype, grid, oversample):
+    def tuned(device, *scene):
         gpu = SimpleNamespace(
             type=cl.device_type.GPU,
             max_work_group_size=device.max_work_group_size,
@@ -189,7 +191,7 @@ def tune_as_on_gpu():
             platform=device.platform,
             driver_version=device.driver_version,
         )
-        return tune(gpu, dtype, grid, oversample)
+        return tune(gpu, *scene)
 
     program.tune = tuned
 

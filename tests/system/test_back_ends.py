@@ -17,7 +17,7 @@ from kernel_cases import of_gpu
 from lnocl.opencl import program
 from lnocl.opencl.device import choose, context_of
 from lnocl.opencl.sources import source
-from lnocl.verify.harness import FOUR_TIMES_AS_FINE, SCENES, THREE_IMAGES
+from lnocl.verify.harness import FOUR_TIMES_AS_FINE, SCENES, THREE_IMAGES, TURNED
 
 pytestmark = [pytest.mark.system]
 
@@ -36,6 +36,7 @@ CASES = {
     "4096": ((4096, 4096), "exposure map, mu"),
     "odd": ((144, 112), "mask, mu, smoothing"),
     "finer": ((256, 512), FOUR_TIMES_AS_FINE),
+    "turned": ((1024, 1024), TURNED),
 }
 # Most registers of 32 bits: 256 work-items of 128 leave room for another group on either processor.
 MAX_REGISTERS = {np.float32: 128, np.float64: 256}

@@ -26,7 +26,7 @@ HERE = Path(__file__).parents[1]
 DEFINITION = re.compile(r"\b(?:KERNEL|(?:__)?kernel)\s+void\s+(\w+)")
 REPORT = re.compile(r"^(\S.*)\n\tKernel: (\w+)$((?:\n\t.*)*)", re.MULTILINE)
 # Only transforms that are tested by themselves use them.
-NOT_IN_A_DECONVOLUTION = {"fft_columns", "ifft_columns"}
+NOT_IN_A_DECONVOLUTION = {"fft_columns", "ifft_columns", *comparison.SHEARED}
 
 # The one false report: where the host copies spectra, grind.py's kernel copies their padding too.
 # Nothing reads it, there or in the copy; a kernel that did would be reported.
