@@ -122,14 +122,15 @@ KERNEL void irfft_sheared(
  * third: as ratio_rows, whose arguments are the same, for one image.
  * columns, ratio_columns: one array each, in and out. column_shifts, column_weights: [n_images][NX],
  * whole pixels less TURN_TAPS / 2 - 1, and [n_images][NX][TURN_TAPS]. image_weights: n_images arrays
- * [IMAGE_ROW_BLOCKS][TURN_TAPS][2][BLOCK].
- * Launch: up to IMAGE_ROW_BLOCKS groups. Out of place. Scratch: 2 TURN_POINTS.
+ * [IMAGE_ROW_BLOCKS][TURN_TAPS][2][BLOCK]. Blocks from image_blocks on have no observed row: what
+ * they have in ratio_columns and the sums is left as it is, 0.
+ * Launch: up to image_blocks groups. Out of place. Scratch: 2 TURN_POINTS.
  * Twin: reference.ratio_sheared.
  */
 KERNEL void ratio_sheared(
     __global real *restrict ratio_columns, __global const real *restrict columns,
     __global const int *restrict column_shifts, __global const real *restrict column_weights,
-    __global const vec *restrict image_weights, const int image,
+    __global const vec *restrict image_weights, const int image, const int image_blocks,
     __global real *restrict ratio_sums, __global real *restrict star_sums,
     __global const vec *restrict images, __global const real *restrict background,
     __global const vec *restrict exposure, __global const vec *restrict star_images,
@@ -141,7 +142,7 @@ KERNEL void ratio_sheared(
     SCRATCH vec *sheared = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
     SCRATCH vec *wide = sheared + 2 * SIDE * TURN_POINTS;
     SCRATCH vec *z = wide + 2 * SIDE * TURN_MARGIN;
-    FOR_EACH_BLOCK(block, IMAGE_ROW_BLOCKS) {
+    FOR_EACH_BLOCK(block, image_blocks) {
         __global const vec *w =
             image_weights + ((size_t)image * IMAGE_ROW_BLOCKS + block) * TURN_TAPS * 2 * SIDE;
         load_columns(

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lnocl.errors import DivergedError, NotFiniteError, warn
+from lnocl.errors import DivergedError, NotFiniteError, note, warn
 from lnocl.result import Callback, Estimate, Iterating, Result, make_result
 from lnocl.runs.checkpoint import Checkpointer, describe
 from lnocl.runs.halves import Halves
@@ -328,8 +328,10 @@ def deconvolve(
     initial = read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
     Penalty(mu)  # a wrong weight is refused before any work
     is_auto = isinstance(smoothing, str) and smoothing == "auto" and len(positions) > 0
-    # Those are not judged.
-    is_auto = is_auto and not (observation.psf_fields or observation.is_turned)
+    is_auto = is_auto and not observation.psf_fields  # which are not judged
+    if is_auto and observation.is_turned:
+        note("PSFs are not judged, as the images are turned against the sky")
+        is_auto = False
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
     moves = refine_positions if is_auto else refine_positions is True
     setup = Setup(

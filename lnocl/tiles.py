@@ -271,6 +271,7 @@ def deconvolve_tiles(
     """
     check_parallel(parallel)
     check_observation(observation)
+    _refuse_turned(observation)
     check_length(n_iter, stop)
     _check_options(options)
     given = {"solver": "sgp", "precision": "single", "engine": "opencl", "device": None, **options}
@@ -330,6 +331,13 @@ def _pad(observation: Observation, pad: Any) -> int:
     if not (isinstance(pad, (int, np.integer)) and pad >= 0):
         raise InputError(f"`pad` must be a whole number, 0 or more, or auto; {pad} was given")
     return int(pad)
+
+
+def _refuse_turned(observation: Observation) -> None:
+    if observation.is_mapped:
+        raise InputError(
+            "tiles are of images that are not turned against the sky; take deconvolve for the whole"
+        )
 
 
 def _lay(observation: Observation, tile: int | None, pad: int) -> list[tuple[_Span, _Span]]:

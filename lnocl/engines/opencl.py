@@ -144,6 +144,11 @@ class OpenCLEngine:
     def _has_background_map(self) -> bool:
         return self.scene.has_exposure_map or self.scene.observation.background.ndim == 3
 
+    @property
+    def _observed_blocks(self) -> int:
+        """Blocks of row pairs of the images' grid that hold rows of the images."""
+        return -(-self.scene.observation.shape[0] // (2 * self.program.tuning.block))
+
     def _host_bytes(self) -> int:
         """Return about how many bytes the process takes on the host, besides the device's.
 
@@ -255,6 +260,7 @@ class OpenCLEngine:
             "alpha": 0.0,
             "share": 0.0,
             "image": 0,
+            "image_blocks": self._observed_blocks,
         }
         return self._launcher.bind(name, {**self._memory.buffers, **numbers}, **others)
 
@@ -303,6 +309,9 @@ class OpenCLEngine:
         memory.upload(
             "image_weights", np.array([each.pack_image_weights(block) for each in shears])
         )
+
+        for name in ("ratio_columns", "ratio_sums", "star_sums"):
+            memory.clear(name)  # where no row of a block was observed it stays so
 
     def _laid(self, images: Iterable[Array]) -> Iterator[Array]:
         """Yield images as they lie on the device: each row rotated by whole pixels, if turned."""

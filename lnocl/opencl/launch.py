@@ -159,7 +159,7 @@ class Launcher:
         if name == "collect_sums":
             return 1 + int(arguments["n_stars"]) // STARS_A_GROUP
         if name == "ratio_sheared":
-            return self.program.image_row_blocks
+            return int(arguments["image_blocks"])
         if name == "ratio_rows":
             return self.program.image_row_blocks * int(arguments["n_images"])
         return self.program.column_blocks if name.endswith("_columns") else self.program.row_blocks

@@ -239,7 +239,8 @@ def _run_ratio_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         out = harness.put(np.full(harness.program.columns_size, np.nan))
         columns = harness.put(harness.pack_columns(pixels))
         arrays = {"ratio_columns": out, "columns": columns, "image_weights": weights}
-        harness.launch("ratio_sheared", image=j, **arrays, **observed)
+        blocks = harness.program.image_row_blocks
+        harness.launch("ratio_sheared", image=j, image_blocks=blocks, **arrays, **observed)
         packed = harness.pack_columns(back[j])
         yield harness.take(out, packed.shape), packed
     yield harness.take_sums(observed["ratio_sums"], 1), np.array([objective])

@@ -245,12 +245,36 @@ def test_a_run_that_was_cut_off_goes_on(tmp_path):
     same(paper(*given, n_iter=12, resume=file), whole)
 
 
+def test_all_goes_wrong_in_one_line():
+    maps = scenes_turned.transforms()
+    cases = [
+        ({"offsets": np.zeros((3, 2))}, {}, "`transforms` are not taken beside offsets"),
+        ({"oversample": 2}, {}, "`transforms` are not taken beside oversample"),
+        ({"transforms": maps[:2]}, {}, "`transforms` has shape (2, 2, 3); give 2 x 3 numbers"),
+        ({"transforms": maps * np.nan}, {}, "`transforms` must be finite"),
+        ({"transforms": maps * 1.01}, {}, "`transforms[0]` scales or shears an image of 40 x 14"),
+        ({}, {"refine_psfs": ["jitter"]}, "`refine_psfs` and `psf_scatter` are for images that"),
+    ]
+    for changes, options, message in cases:
+        with pytest.raises(lnocl.LnoclError) as caught:
+            paper(observation(**changes), STARS, n_iter=1, engine="numpy", **options)
+        assert caught.value.message.startswith(message)
+    with pytest.raises(lnocl.LnoclError, match="tiles are of images that are not turned"):
+        lnocl.deconvolve_tiles(observation(), stop=None, n_iter=1, engine="numpy")
+    with pytest.raises(lnocl.LnoclError, match="`angles` and `centre` must be finite|angles and"):
+        lnocl.rotations([np.inf], (0, 0))
+    with pytest.raises(lnocl.LnoclError, match="of shape"):
+        lnocl.rotations(3.0, (0, 0))
+
+
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
-def test_defaults_and_errors():
+def test_defaults_and_errors(caplog):
     """Held-out counts, smoothing and errors take images that are turned."""
+    caplog.set_level("INFO", "lnocl")
     result = lnocl.deconvolve(observation(), STARS, engine="numpy")
     assert result.stop_reason in ("held-out", "converged")
     assert abs(result.star_fluxes - FLUXES).max() <= 5 * result.star_flux_errors.max()
+    assert "PSFs are not judged, as the images are turned against the sky" in caplog.messages
     assert 0.8 < np.nanstd(result.residuals()) < 1.1
     errors = result.bootstrap(10, seed=0).to_table()
     assert np.isfinite(errors["error"]).all()
