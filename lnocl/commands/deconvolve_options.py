@@ -143,9 +143,8 @@ OPTIONS = {
         ),
         option(
             "--centre",
-            type=options.position,
+            type=options.pixel,
             metavar="X,Y",
-            card=("CENTRE", "where the field turns about, pixels"),
             help="with --angle: where the field turns about, pixels (default: the middle, "
             "nx // 2, ny // 2)",
         ),

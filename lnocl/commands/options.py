@@ -185,6 +185,21 @@ def finite(text: str) -> float:
     return number
 
 
+def pixel(text: str) -> tuple[float, float]:
+    """Return the numbers of ``X,Y``.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        A text that is not two finite numbers.
+    """
+    try:
+        x, y = map(finite, text.split(","))
+    except (ValueError, argparse.ArgumentTypeError):
+        raise argparse.ArgumentTypeError(f"{text!r} is not X,Y in pixels") from None
+    return x, y
+
+
 def position(text: str) -> tuple[float, float] | str:
     """Return the numbers of ``X,Y``, or a text that is a position on the sky.
 

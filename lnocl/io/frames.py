@@ -610,7 +610,7 @@ class _Reader:
                 f"{path} has no {word} in its header, and there is no such file; give `angle` as a "
                 "number, another keyword, or a file of the angles"
             )
-        return found
+        return found + 0.0  # no negative zero
 
     def _warn_of_places(self) -> None:
         """Warn of the first image that is not where the first is, by their coordinates."""

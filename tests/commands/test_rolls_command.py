@@ -45,7 +45,11 @@ def frames(tmp_path, monkeypatch):
     return [f"{j}.fits" for j in range(3)]
 
 
-@pytest.mark.parametrize("places", [("--align", "wcs"), ("--angle", "PARANG")])
+@pytest.mark.parametrize(
+    "places",
+    [("--align", "wcs"), ("--angle", "PARANG"), ("--angle", "PARANG", "--centre", "24,24")],
+    ids=["wcs", "angle", "centre"],
+)
 def test_rolls(frames, places, capsys):
     command = ["deconvolve", *frames, "--psf", "psf.fits", "--background", "10", "--n-iter", "40"]
     command += ["--star", f"{STAR[0]},{STAR[1]}", "--stop", "none", "--engine", "numpy"]
@@ -72,3 +76,9 @@ def test_rolls(frames, places, capsys):
     image = view.images[2]
     y, x = np.unravel_index(int(image.argmax()), image.shape)
     assert np.hypot(x - there[0], y - there[1]) <= 1.0
+
+
+def test_a_centre_is_in_pixels(frames, capsys):
+    command = ["deconvolve", *frames, "--psf", "psf.fits", "--angle", "PARANG", "-o", "out.fits"]
+    assert cli.main([*command, "--centre", "4h20m,19d"]) == 2
+    assert "'4h20m,19d' is not X,Y in pixels" in capsys.readouterr().err
