@@ -101,6 +101,7 @@ def time_ratio(grid, solver, turns):
 
 
 def main():
+    """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--turns", type=int, default=25)
     parser.add_argument("--output")

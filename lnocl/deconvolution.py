@@ -329,8 +329,9 @@ def deconvolve(
     Penalty(mu)  # a wrong weight is refused before any work
     is_auto = isinstance(smoothing, str) and smoothing == "auto" and len(positions) > 0
     is_auto = is_auto and not observation.psf_fields  # which are not judged
-    if is_auto and observation.is_turned:
-        note("PSFs are not judged, as the images are turned against the sky")
+    are_told_last = is_auto and observation.is_turned
+    if are_told_last:
+        note("PSFs are not judged before the run, as the images are turned against the sky")
         is_auto = False
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
     moves = refine_positions if is_auto else refine_positions is True
@@ -358,7 +359,11 @@ def deconvolve(
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
     outcome = reconstruct(mended.setup, penalties, n_iter, stop, callback, progress, checkpoints)
-    if is_auto and mended.fits:
+    if are_told_last:
+        is_fit = not any(star.is_misfit for star in outcome.star_residuals())
+    else:
+        is_fit = is_auto and mended.fits
+    if is_fit:
         with _quietly(), Progress(None, "", bool(progress), "fitting star fluxes", stays=False):
             outcome = outcome.marginal()
     return make_result(replace(outcome, psf_refinement=mended.refinement))

@@ -21,6 +21,9 @@ Box = tuple[slice, slice]
 # A box is convolved by itself where what its PSF reaches is less than this share of the grid.
 SHARE_OF_GRID = 0.25
 
+# What weights and PSFs that are turned leave far from a star, as a share of its largest value. It
+# enters measures of steps alone.
+RINGING = 1e-4
 # Rounding of an FFT, as a share of the largest value.
 ROUNDING = 1e-16
 
@@ -135,14 +138,16 @@ class Model:
         """Return ``sum_j A_j^T x_j`` of images x_j that are 0 beyond a cutout, one an image.
 
         It is computed in the window that it lies in, where that is smaller than the grid. Outer
-        rows and columns below the rounding of its largest value are cut off.
+        rows and columns below the rounding of its largest value are cut off; where images are
+        turned, those below a ten thousandth of it.
         """
         given, q = cutouts, self.oversample
         cutouts = [Cutout(spread(each.values, q), q * each.y, q * each.x) for each in given]
         first, size = _window_of_correlations(cutouts, self._psfs)
         if self._scene.rotations or (size >= self.grid).any():
             total = self.adjoint(cutout.on_grid(self.shape[1:]) for cutout in given)
-            return _without_rounding(Cutout(total, 0, 0))
+            least = RINGING if self._scene.rotations else ROUNDING
+            return Cutout(total, 0, 0).trimmed(least * float(abs(total).max()))
         shape = tuple(scipy.fft.next_fast_len(int(n), real=True) for n in size)
         spectrum: Any = 0.0
         for j, (cutout, psf) in enumerate(zip(cutouts, self._psfs, strict=True)):
@@ -151,7 +156,8 @@ class Model:
             laid[y : y + cutout.values.shape[0], x : x + cutout.values.shape[1]] = cutout.values
             spectrum = spectrum + self._window_otf(j, shape).conj() * scipy.fft.rfft2(laid)
         total = scipy.fft.irfft2(spectrum, shape)[: size[0], : size[1]]
-        return _without_rounding(Cutout(total, int(first[0]), int(first[1])))
+        cutout = Cutout(total, int(first[0]), int(first[1]))
+        return cutout.trimmed(ROUNDING * float(abs(total).max()))
 
     def _window_otf(self, j: int, shape: tuple[int, ...]) -> NDArray[np.complex128]:
         if (j, shape) not in self._window_otfs:
@@ -359,20 +365,23 @@ class LocalRotation:
         nx, ny = (scipy.fft.next_fast_len(int(n), real=True) for n in needed)
         self.rows, self.columns = range(first[1], first[1] + ny), range(first[0], first[0] + nx)
         at = turn @ first + shift - (columns[0], rows[0])
-        self._rotation = Rotation(angle, at, (ny, nx), self._shape)
-        self._otf = scipy.fft.rfft2(psf.on_grid((ny, nx))) * self._rotation.undone()
+        rotation = Rotation(angle, at, (ny, nx), self._shape)
+        self._otf = scipy.fft.rfft2(psf.on_grid((ny, nx))) * rotation.undone()
+        self._phases, self._shears = rotation.row_phases(), rotation.matrix(self._shape)
 
     def image(self, sky: Array) -> Array:
         """Return the window of the image, from that of the sky."""
-        seen = scipy.fft.irfft2(self._otf * scipy.fft.rfft2(sky), sky.shape)
-        return self._rotation.forward(seen)[: self._shape[0], : self._shape[1]]
+        row_spectra = scipy.fft.ifft(self._otf * scipy.fft.rfft2(sky), axis=0)
+        sheared = scipy.fft.irfft(row_spectra * self._phases, sky.shape[1], axis=1)
+        return np.asarray((self._shears @ sheared.ravel()).reshape(self._shape))
 
     def adjoint(self, image: Array) -> Array:
         """Return the adjoint of `image`."""
         grid = len(self.rows), len(self.columns)
-        laid = Cutout(image, 0, 0).on_grid(grid)
-        spectrum = scipy.fft.rfft2(self._rotation.adjoint(laid))
-        return np.asarray(scipy.fft.irfft2(self._otf.conj() * spectrum, grid))
+        sheared = (self._shears.T @ image.ravel()).reshape(grid)
+        row_spectra = scipy.fft.rfft(sheared, axis=1) * self._phases.conj()
+        spectrum = self._otf.conj() * scipy.fft.fft(row_spectra, axis=0)
+        return np.asarray(scipy.fft.irfft2(spectrum, grid))
 
 
 def _illuminate(image: Array, background: Array | float, starlight: Array) -> None:
@@ -402,7 +411,3 @@ def largest_window(scene: Scene) -> tuple[int, int]:
         return grid
     height, width = (2 * (k + 2 * MARGIN + 2 * (scene.oversample - 1)) for k in psf_shape)
     return grid if height >= grid[0] or width >= grid[1] else (height, width)
-
-
-def _without_rounding(cutout: Cutout) -> Cutout:
-    return cutout.trimmed(ROUNDING * float(abs(cutout.values).max()))

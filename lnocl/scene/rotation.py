@@ -13,12 +13,15 @@ Quarter turns and flips are done by index.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 # Weights of a shift, and the parameter of their Kaiser-Bessel window: of the least error up to 0.35
 # cycles per pixel.
@@ -150,6 +153,24 @@ class Rotation:
         phases = (first[:, None] * then).reshape(self.grid[0], -1)
         phases[:, -1] = phases[:, -1].real
         return np.asarray(phases)
+
+    def matrix(self, shape: tuple[int, int]) -> csr_array:
+        """Return the second and the third shear as a matrix, for the first pixels of the image.
+
+        Its columns are the pixels of the grid, its rows those of a window of this shape.
+        """
+        from scipy.sparse import csr_array  # which takes its time to load
+
+        (ny, nx), (height, width) = self.grid, shape
+        along_x, x_weights = whole_and_weights(self.image_shifts[:height])
+        along_y, y_weights = whole_and_weights(self.column_shifts)
+        taps = np.arange(TAPS) - TAPS // 2 + 1
+        x = (np.arange(width)[:, None] + along_x[:, None, None] + taps) % nx
+        y = (np.arange(height)[:, None, None, None] + along_y[x][..., None] + taps) % ny
+        weights = x_weights[:, None, :, None] * y_weights[x]
+        starts = TAPS**2 * np.arange(height * width + 1)
+        places = (y * nx + x[..., None]).ravel()
+        return csr_array((weights.ravel(), places, starts), shape=(height * width, ny * nx))
 
     def undone(self) -> Array:
         """Return by what the effect of the weights on the sky is undone, for its rfft2."""

@@ -96,9 +96,9 @@ def reference(solver):
     ("solver", "precision", "allowed"),
     [
         ("sgm", "single", 3e-6),
-        ("sgp", "single", 4e-5),
+        ("sgp", "single", 2e-4),
         pytest.param("sgm", "double", 3e-14, marks=pytest.mark.exhaustive),
-        pytest.param("sgp", "double", 2e-13, marks=pytest.mark.exhaustive),
+        pytest.param("sgp", "double", 4e-13, marks=pytest.mark.exhaustive),
     ],
 )
 def test_engines_agree(solver, precision, allowed):
@@ -274,7 +274,10 @@ def test_defaults_and_errors(caplog):
     result = lnocl.deconvolve(observation(), STARS, engine="numpy")
     assert result.stop_reason in ("held-out", "converged")
     assert abs(result.star_fluxes - FLUXES).max() <= 5 * result.star_flux_errors.max()
-    assert "PSFs are not judged, as the images are turned against the sky" in caplog.messages
+    assert (
+        "PSFs are not judged before the run, as the images are turned against the sky"
+        in caplog.messages
+    )
     assert 0.8 < np.nanstd(result.residuals()) < 1.1
     errors = result.bootstrap(10, seed=0).to_table()
     assert np.isfinite(errors["error"]).all()

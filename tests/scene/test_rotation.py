@@ -59,6 +59,14 @@ def test_waves(frequency, allowed):
     assert max(errors) >= allowed / 2  # else the bound is too wide
 
 
+def test_its_matrix():
+    rng = np.random.default_rng(1)
+    turn, sky = Rotation(0.4, np.array([3.3, -40.2]), (48, 64), (20, 30)), rng.random((48, 64))
+    sheared = np.fft.irfft(np.fft.rfft(sky, axis=1) * turn.row_phases(), 64, axis=1)
+    found = (turn.matrix((20, 30)) @ sheared.ravel()).reshape(20, 30)
+    assert worst(found, turn.forward(sky)[:20, :30]) <= 1e-14
+
+
 def test_no_turn_is_a_shift():
     """Whole pixels move bit for bit."""
     sky = np.random.default_rng(0).random((32, 48))
