@@ -95,9 +95,10 @@ INLINE cvec shifted(
     }
     return b;
 }
-#define PHASES_OF(phases, image, block)              \
-    ((phases) + ((size_t)(image) * COLUMN_BLOCKS + (block)) \
-        * ((NY / PHASE_ROWS + PHASE_ROWS) * 2 * SIDE))
+#define PHASES_OF(phases, image, block)               \
+    ((phases)                                         \
+        + ((size_t)(image) * COLUMN_BLOCKS + (block)) \
+            * ((NY / PHASE_ROWS + PHASE_ROWS) * 2 * SIDE))
 #endif
 
 /* Point t of a column of an image, in reversed order: the sum of OVERSAMPLE points of otfs_j FFT(f).

@@ -101,19 +101,17 @@ INLINE SCRATCH vec *fold_rows(SCRATCH vec *z)
 
 /* z <- r_j - w_j, from A_j f in a block of rows of an image; ratio_sums and star_sums of the block. */
 INLINE void compare(
-    SCRATCH vec *z, __global real *ratio_sums, __global real *star_sums,
-    __global const vec *images, __global const real *background, __global const vec *exposure,
-    __global const vec *star_images, __global const int *star_corners,
-    __global const int *star_near, __global const real *star_fluxes, const int n_images,
-    const int star_blocks, const int star_columns, const int block, const int image,
-    __local real_sum *shared)
+    SCRATCH vec *z, __global real *ratio_sums, __global real *star_sums, __global const vec *images,
+    __global const real *background, __global const vec *exposure, __global const vec *star_images,
+    __global const int *star_corners, __global const int *star_near,
+    __global const real *star_fluxes, const int n_images, const int star_blocks,
+    const int star_columns, const int block, const int image, __local real_sum *shared)
 {
     const size_t at = (size_t)image * IMAGE_SIZE + (size_t)block * IMAGE_NX * 2 * SIDE;
     const int unit = image * IMAGE_ROW_BLOCKS + block;
     for (int i = star_near[unit]; i < star_near[unit + 1]; ++i) {
         const int s = star_near[i], w = s * n_images + image;
-        const int window =
-            window_block(star_corners, w, star_blocks, block, IMAGE_ROW_BLOCKS);
+        const int window = window_block(star_corners, w, star_blocks, block, IMAGE_ROW_BLOCKS);
         __global const vec *star = WINDOW_BLOCK(star_images, window, star_columns);
         const real flux = star_fluxes[s];
         FOR_EACH(piece, star_columns * SIDE) {
@@ -150,7 +148,8 @@ INLINE void compare(
     sum_products(
         star_sums, z, star_images, star_corners, star_near, n_images, image, star_blocks,
         star_columns, block, IMAGE_ROW_BLOCKS, IMAGE_NX, shared);
-    store_pair(ratio_sums + 2 * (block * n_images + image), sum_group(sum_lanes(objective), shared));
+    store_pair(
+        ratio_sums + 2 * (block * n_images + image), sum_group(sum_lanes(objective), shared));
 }
 
 /* m_j = A_j f + sum_s c_s P_js + b_j;  r_j = w_j g_j / m_j;  spectra <- row spectra of r_j - w_j;

@@ -70,8 +70,8 @@ INLINE void load_columns(
         const int row = from < 0 ? from + NY : from < NY ? from : from - NY;
         /* Row k of those from here on is in one half of the column for an even k, else in the other. */
         const int odd = row % 2;
-        __global const real *column = columns + piece_start(row / (2 * COLUMN_PAIRS), x)
-            + row / 2 % COLUMN_PAIRS;
+        __global const real *column =
+            columns + piece_start(row / (2 * COLUMN_PAIRS), x) + row / 2 % COLUMN_PAIRS;
         __global const real *halves[2] = {column + odd * PIECE, column + (1 - odd) * PIECE + odd};
         UNROLL
         for (int i = 0; i < 2; ++i) {

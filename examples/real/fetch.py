@@ -49,6 +49,13 @@ hst-quasar-j0005 mmechtley/psfMC 77b7b8a28760364ae2ea4dc88ac71ca703b54766
 lbti-fizeau-altair mwanakijiji/lbti_altair_fizeau f213cf37770e8fa70e74cd28aac61cf9f3f1d3dc
   673920 lm_180507_009030.fits
     bfe6777571be917a185a1b3a6f01b0c726bfb8a2d68a92af1634cff5fe1c0132
+naco-betapic carlgogo/VIP_extras a7ec7ac9aeabcb5df73b9ea57270c6d66f9e3f57
+  2494080 datasets/naco_betapic_cube.fits
+    5d7f7db98522128704c1e3a6ce3bc47e35ec469c44570d2f86533b242e9a5a79
+  5760 datasets/naco_betapic_pa.fits
+    1ebe4212da8dd0d02b19eefbcd473498c5c1ebc5ad348161ed2a9ade1eb8a519
+  11520 datasets/naco_betapic_psf.fits
+    ca4e0ad99c4119f3ad4e9b33fad9b157746343d8b54f4668681dfa1a398315be
 spitzer-glimpse astropy/photutils-datasets 8c97b4fa3a6c9e6ea072faeed2d49a20585658ba
   2113920 data/spitzer_example_image.fits spitzer_glimpse_irac2_l18.fits
     4b9cf15419de311fc683a9c378327a0b28bfee29d01e4fdbb9dc5780417f7ebc
