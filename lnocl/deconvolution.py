@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lnocl.errors import DivergedError, NotFiniteError, note, warn
+from lnocl.errors import DivergedError, InputError, NotFiniteError, note, warn
 from lnocl.result import Callback, Estimate, Iterating, Result, make_result
 from lnocl.runs.checkpoint import Checkpointer, describe
 from lnocl.runs.halves import Halves
@@ -329,11 +329,18 @@ def deconvolve(
     Penalty(mu)  # a wrong weight is refused before any work
     is_auto = isinstance(smoothing, str) and smoothing == "auto" and len(positions) > 0
     is_auto = is_auto and not observation.psf_fields  # which are not judged
-    are_told_last = is_auto and observation.is_turned
+    are_told_last = is_auto and (observation.is_turned or observation.n_epochs > 1)
     if are_told_last:
-        note("PSFs are not judged before the run, as the images are turned against the sky")
+        note(
+            "PSFs are not judged before the run, as the images are %s",
+            "turned against the sky" if observation.is_turned else "of several epochs",
+        )
         is_auto = False
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
+    if observation.n_epochs > 1 and refine_positions is True:
+        raise InputError(
+            "`refine_positions` moves stars of one epoch alone; leave it out, or `epochs`"
+        )
     moves = refine_positions if is_auto else refine_positions is True
     setup = Setup(
         observation, positions, pad, solver, precision, engine, device, moves is True, *initial

@@ -225,9 +225,11 @@ def judge_stars(scene: Scene, sky: Array, star_fluxes: Array) -> list[StarResidu
     width = min(fwhm(psf) for psf in scene.observation.psfs) if scene.n_stars else 0.0
     psfs = seen_psfs(scene.observation) if scene.n_stars else np.zeros((0, 0, 0))
     on_pixels = on_sky(scene.stars, scene.oversample)
-    for position, on_pixel, flux in zip(scene.stars, on_pixels, star_fluxes, strict=True):
+    stars = zip(scene.stars, on_pixels, star_fluxes, scene.shown, strict=True)
+    for position, on_pixel, flux, shown in stars:
         core, wings = Fit(), Fit()
-        for j, psf in enumerate(psfs):
+        for j in np.flatnonzero(shown).tolist():
+            psf = psfs[j]
             fits = _fits_at(scene, background[j], sky, star_fluxes, j, psf, position)
             core, wings = core.plus(fits[0]), wings.plus(fits[1])
         halo, light = _halo(sky[:ny, :nx], on_pixel, width)

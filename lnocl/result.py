@@ -403,7 +403,8 @@ class Result:
         astropy.table.QTable
             Columns ``x`` and ``y`` in pixels, 0-based, and ``flux`` and ``flux_error`` in
             electrons, per second where exposures were given. Where positions were refined, also
-            ``x_error`` and ``y_error``.
+            ``x_error`` and ``y_error``. With several epochs each star has a row in each, and
+            ``epoch`` is its number: rows of one star are its light curve.
 
         Examples
         --------
@@ -429,6 +430,8 @@ class Result:
             x_error, y_error = self.star_position_errors.T
             columns |= {"x_error": x_error * u.pix, "y_error": y_error * u.pix}
         columns["flux_error"] = self.star_flux_errors * unit
+        if (n_epochs := self._observation.n_epochs) > 1:
+            columns["epoch"] = np.arange(len(self.star_fluxes)) % n_epochs
         return QTable(columns)
 
     def bootstrap(
@@ -752,8 +755,9 @@ def view_of(result: Result) -> ResultView:
     models = result.models()
     return ResultView(
         extended=result.extended,
-        stars=[(x, y) for x, y in result.star_positions.tolist()],
-        star_fluxes=result.star_fluxes,
+        # Once each, whatever epochs there are.
+        stars=[(x, y) for x, y in result.star_positions[:: observation.n_epochs].tolist()],
+        star_fluxes=result.star_fluxes.reshape(-1, observation.n_epochs).mean(axis=1),
         n_iter=result.n_iter,
         history={name: result.history[name] for name in HISTORY_DTYPE.names or ()},
         held_out={name: result.held_out[name] for name in result.held_out.dtype.names or ()},

@@ -228,6 +228,9 @@ def _star_columns(
 
     header, flux_errors = frames.header, result.star_flux_errors / frames.electrons
     columns = error_columns(result.star_position_errors, flux_errors, frames.unit)
+    if (n_epochs := frames.observation.n_epochs) > 1:
+        epochs = [k % n_epochs for k in range(len(flux_errors))]
+        columns.append(StarColumn("epoch", epochs, "", "number of the epoch, from 0 on"))
     if sky.has_celestial(header):
         ra, dec = sky.to_sky(result.star_positions, header).T
         columns += [

@@ -142,6 +142,15 @@ OPTIONS = {
             "number a line), or one number for each image. The extended source has north up",
         ),
         option(
+            "--epoch",
+            **SEVERAL,
+            type=number_or_word,
+            metavar="EPOCH",
+            help="epochs of the images, in each of which a star has a flux of its own, as a quasar "
+            "that varies: each, for one an image; a keyword of their headers such as DATE-OBS; or "
+            "a label for each image (default: one epoch)",
+        ),
+        option(
             "--centre",
             type=options.pixel,
             metavar="X,Y",

@@ -54,7 +54,7 @@ def summarise(
     objective = result.history["objective"][-1]
     device, _, _ = result.device.partition(" (")  # the header has its platform and driver
     unit = _unit(frames)
-    stars = [
+    stars = _light_curves(result, frames) or [
         f"star at ({x:.7g}, {y:.7g}): {_flux(flux, error, frames)}; residuals "
         f"{_rms(found.core)} in its core, {_rms(found.wings)} in its wings, where noise gives 1"
         for (x, y), flux, error, found in zip(
@@ -74,6 +74,22 @@ def summarise(
         *_unnamed(result, frames),
         f"residuals {_rms(overall)} in all, where noise gives 1",
         *_shortness(arguments, result),
+    ]
+
+
+def _light_curves(result: Result, frames: Frames) -> list[str]:
+    """Return a line for each star that has a flux in each of several epochs."""
+    n = frames.observation.n_epochs
+    if n == 1:
+        return []
+    fluxes, errors = (
+        np.reshape(each, (-1, n)) / frames.electrons
+        for each in (result.star_fluxes, result.star_flux_errors)
+    )
+    return [
+        f"star at ({x:.7g}, {y:.7g}): {n} epochs, {flux.min():.5g} to {flux.max():.5g} "
+        f"{_unit(frames)}, with errors of {np.median(error):.2g} (median)"
+        for (x, y), flux, error in zip(result.star_positions[::n], fluxes, errors, strict=True)
     ]
 
 
@@ -167,11 +183,13 @@ def verdict_on(
 ) -> list[str]:
     """Return that the model fits, or else where it does not and what to do, a line each."""
     unfitted, lit, dark, lost = [], [], [], []
+    observation = frames.observation
+    given_stars = [star for star in given_stars for _ in range(observation.n_epochs)]
     for place, given, flux, found in zip(
         result.star_positions, given_stars, result.star_fluxes, at_stars, strict=True
     ):
         if not flux > 0:
-            where = _elsewhere(result.extended, place, frames.observation.oversample)
+            where = _elsewhere(result.extended, place, observation.oversample)
             dark.append(f"{_at(given)}{where}")
             continue
         if np.hypot(*(place - np.array(given))) > AT_LIMIT * MAX_SHIFT:
@@ -192,6 +210,7 @@ def verdict_on(
         by_default = [] if isinstance(arguments.smoothing, float) else ["pixels"]
         remedy = "leave --refine-psfs out" if by_default else "try --refine-psfs jitter pixels"
         may_free = "pixels" not in (arguments.refine_psfs or by_default)
+        may_free = may_free and not observation.is_turned and observation.n_epochs == 1
         verdict.append(
             f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
             f"{' '.join(unfitted[:3])}: give a better PSF" + (f", or {remedy}" if may_free else "")

@@ -111,6 +111,7 @@ class OpenCLEngine:
             [[scene.star_box(j, s) for j in range(scene.n_images)] for s in range(scene.n_stars)],
             scene.n_images,
             [each.roll for each in self._shears],
+            scene.shown,
         )
         self._cross = self._cross_windows()
         sizes = self._sizes(n_iter)
@@ -282,6 +283,7 @@ class OpenCLEngine:
         scene, memory = self.scene, self._memory
         if self._shears:
             self._upload_shears()
+        memory.clear("star_sums")  # in images that do not show a star they stay 0
         self.take_images()
         if scene.weights is not None and scene.has_exposure_map:
             memory.upload_pixels("exposure", self._laid(scene.weights))
@@ -310,7 +312,7 @@ class OpenCLEngine:
             "image_weights", np.array([each.pack_image_weights(block) for each in shears])
         )
 
-        for name in ("ratio_columns", "ratio_sums", "star_sums"):
+        for name in ("ratio_columns", "ratio_sums"):
             memory.clear(name)  # where no row of a block was observed it stays so
 
     def _laid(self, images: Iterable[Array]) -> Iterator[Array]:

@@ -70,6 +70,8 @@ class Calibration(NamedTuple):
         Offsets, rotations and flips from the headers' coordinates.
     angle : sequence of float or str
         Parallactic angles, degrees: one for each image, a keyword of the headers, or a file.
+    epoch : sequence of float or str
+        Labels of the epochs of the images: one for each, a keyword of their headers, or ``"each"``.
     centre : tuple of float, optional
         (x, y) of the place that the field turns about, pixels; by default the middle,
         ``(nx // 2, ny // 2)``.
@@ -94,6 +96,7 @@ class Calibration(NamedTuple):
     align: str | None = None
     angle: Sequence[Word] = ()
     centre: tuple[float, float] | None = None
+    epoch: Sequence[Word] = ()
     oversample: int = 1
     effective_psfs: bool = False
     psf_centre: PsfCentre = "check"
@@ -204,6 +207,7 @@ class _Reader:
             mask=mask if mask.any() else None,
             exposure=1.0 if exposure is None else exposure,
             **self._places(),
+            epochs=self._epochs(),
             oversample=self._calibration.oversample,
             effective_psfs=self._calibration.effective_psfs,
             psf_centre=self._calibration.psf_centre,
@@ -221,7 +225,7 @@ class _Reader:
             name += "/s"
         return Frames(
             observation,
-            self._images.header,
+            self._sky_header(),
             background,
             read_noise,
             sha256,
@@ -599,6 +603,41 @@ class _Reader:
         centre = calibration.centre or (nx // 2, ny // 2)
         # Field rotation turns north, and the sky with it, away from the y axis.
         return rotations(-angles, centre)
+
+    def _sky_header(self) -> fits.Header:
+        """Return the header of the first image; with field rotation without coordinates."""
+        header = self._images.header
+        if self._calibration.angle:  # north is up in the sky alone
+            header = header.copy()
+            for keyword in ("CTYPE1", "CTYPE2"):
+                header.remove(keyword, ignore_missing=True)
+        return header
+
+    def _epochs(self) -> list[Any] | None:
+        """Return the label of each image's epoch, where there are several."""
+        words, p = self._calibration.epoch, len(self._images.data)
+        if not words:
+            return None
+        if len(words) == p > 1:
+            return list(words)
+        if len(words) > 1:
+            raise InputError(
+                f"{counted(len(words), 'epoch')} for {counted(p, 'image')}; give each, a keyword, "
+                "or a label for each image"
+            )
+        if words[0] == "each":
+            return list(range(p))
+        labels = []
+        for j in range(p):
+            of_file = min(j, len(self._paths) - 1)  # a cube has one header
+            path, header = self._paths[of_file], self._images.headers[of_file]
+            labels.append(read_keyword(path, header, str(words[0])))
+            if labels[-1] is None:
+                raise InputError(
+                    f"{path} has no {words[0]} in its header; give `epoch` each, another keyword, "
+                    "or a label for each image"
+                )
+        return [str(label) for label in labels]
 
     def _angle(self, j: int, word: Word) -> float:
         if isinstance(word, (int, float)):

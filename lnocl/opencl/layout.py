@@ -26,8 +26,13 @@ def reversed_order(n: int) -> NDArray[np.int64]:
 
 
 def shortest_arc(held: NDArray[np.bool_]) -> tuple[int, int]:
-    """Return first and number of the shortest run of places, round the end, with all held ones."""
+    """Return first and number of the shortest run of places, round the end, with all held ones.
+
+    It is one place where none is held.
+    """
     at, n = np.flatnonzero(held), len(held)
+    if not at.size:
+        return 0, 1
     gaps = np.diff(at, append=at[0] + n)
     widest = int(np.argmax(gaps))
     return int(at[(widest + 1) % len(at)]), n - int(gaps[widest]) + 1

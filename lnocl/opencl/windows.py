@@ -13,7 +13,12 @@ from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import Covered
 
 
-def stars_near(corners: NDArray[np.integer], n_blocks: int, row_blocks: int) -> NDArray[np.int32]:
+def stars_near(
+    corners: NDArray[np.integer],
+    n_blocks: int,
+    row_blocks: int,
+    shown: NDArray[np.bool_] | None = None,
+) -> NDArray[np.int32]:
     """Return the stars of each block of row pairs, as kernels/stars.cl has them.
 
     Parameters
@@ -24,21 +29,26 @@ def stars_near(corners: NDArray[np.integer], n_blocks: int, row_blocks: int) -> 
         Blocks of a window.
     row_blocks : int
         Blocks of the grid.
+    shown : ndarray of bool, shape (n, n_arrays), optional
+        Which arrays hold each star; by default all.
 
     Returns
     -------
-    ndarray of int32, shape (n_arrays * row_blocks + 1 + n * n_arrays * n_blocks,)
+    ndarray of int32, shape (n_arrays * row_blocks + 1 + n * n_arrays * n_blocks,) or less
         Where the stars of each block of each array begin, and where the last ones end; then the
         stars.
     """
     n, n_arrays = corners.shape[:2]
     blocks = (corners[..., :1] + np.arange(n_blocks)) % row_blocks
     units = (blocks + row_blocks * np.arange(n_arrays)[:, None]).ravel()
+    stars = np.repeat(np.arange(n), n_arrays * n_blocks)
+    if shown is not None:
+        is_held = np.repeat(shown.ravel(), n_blocks)
+        units, stars = units[is_held], stars[is_held]
     order = np.argsort(units, kind="stable")
     n_units = n_arrays * row_blocks
     starts = n_units + 1 + np.searchsorted(units[order], np.arange(n_units + 1))
-    stars = np.repeat(np.arange(n), n_arrays * n_blocks)[order]
-    return np.concatenate([starts, stars]).astype(np.int32)
+    return np.concatenate([starts, stars[order]]).astype(np.int32)
 
 
 class StarWindows:
@@ -54,6 +64,8 @@ class StarWindows:
         Arrays of a star.
     rolls : sequence of ndarray of int, shape (Ny,), optional
         For each array the columns by which its rows are rotated.
+    shown : ndarray of bool, shape (n, n_arrays), optional
+        Which arrays hold each star; by default all.
     """
 
     def __init__(
@@ -62,6 +74,7 @@ class StarWindows:
         boxes: Sequence[Sequence[Covered]],
         n_arrays: int,
         rolls: Sequence[NDArray[np.int_]] = (),
+        shown: NDArray[np.bool_] | None = None,
     ) -> None:
         self._layout, self._rolls = layout, rolls
         blocks, columns = [], []
@@ -74,7 +87,7 @@ class StarWindows:
         ).reshape(-1, n_arrays, 2)
         self.n_blocks = max((count for _, count in blocks), default=1)
         self.n_columns = max((count for _, count in columns), default=1)
-        self.near = stars_near(self.corners, self.n_blocks, layout.pixels_shape[0])
+        self.near = stars_near(self.corners, self.n_blocks, layout.pixels_shape[0], shown)
 
     @property
     def n_blocks_of_all(self) -> int:
@@ -106,6 +119,6 @@ def _rolled_arc(box: Covered, roll: NDArray[np.int_]) -> tuple[int, int]:
     """Return first and number of the columns of a box, its rows being rotated by some columns."""
     nx = len(box.columns)
     first, count = shortest_arc(box.columns)
-    by = roll[box.rows]
+    by = roll[box.rows] if box.rows.any() else np.zeros(1, int)
     count = min(count + int(np.ptp(by)), nx)
     return (first + int(by.min())) % nx, count

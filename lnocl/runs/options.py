@@ -137,10 +137,11 @@ def check_families(
             "`refine_psfs` and `psf_scatter` are for PSFs that are the same all over the images; "
             "leave them out where PSFs vary over the field"
         )
-    if observation.is_turned and (found or len(observation.psf_scatter)):
+    several = observation.is_turned or observation.n_epochs > 1
+    if several and (found or len(observation.psf_scatter)):
         raise InputError(
-            "`refine_psfs` and `psf_scatter` are for images that are not turned against the sky; "
-            "leave them out"
+            "`refine_psfs` and `psf_scatter` are for images of one epoch that are not turned "
+            "against the sky; leave them out"
         )
     if found and not len(positions):
         raise InputError("`refine_psfs` needs a star, whose image shows the PSF; give stars")

@@ -142,15 +142,18 @@ class Model:
         turned, those below a ten thousandth of it.
         """
         given, q = cutouts, self.oversample
-        cutouts = [Cutout(spread(each.values, q), q * each.y, q * each.x) for each in given]
-        first, size = _window_of_correlations(cutouts, self._psfs)
+        # Stars are not in the images of other epochs.
+        lit = [j for j, each in enumerate(given) if each.values.any()] or [0]
+        cutouts = [Cutout(spread(given[j].values, q), q * given[j].y, q * given[j].x) for j in lit]
+        psfs = [self._psfs[j] for j in lit]
+        first, size = _window_of_correlations(cutouts, psfs)
         if self._scene.rotations or (size >= self.grid).any():
             total = self.adjoint(cutout.on_grid(self.shape[1:]) for cutout in given)
             least = RINGING if self._scene.rotations else ROUNDING
             return Cutout(total, 0, 0).trimmed(least * float(abs(total).max()))
         shape = tuple(scipy.fft.next_fast_len(int(n), real=True) for n in size)
         spectrum: Any = 0.0
-        for j, (cutout, psf) in enumerate(zip(cutouts, self._psfs, strict=True)):
+        for j, cutout, psf in zip(lit, cutouts, psfs, strict=True):
             laid = np.zeros(shape)
             y, x = cutout.y - psf.y - first[0], cutout.x - psf.x - first[1]
             laid[y : y + cutout.values.shape[0], x : x + cutout.values.shape[1]] = cutout.values

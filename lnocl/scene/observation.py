@@ -48,6 +48,8 @@ MUCH_NEGATIVE = 0.1
 # PSFs that may be left out.
 MAPS = "background", "read_noise", "exposure"
 OF_PSFS = "ideal_psfs", "pupils", "psf_scatter"
+# Arrays that are of another type, or checked otherwise.
+UNCHECKED = "mask", "offsets", "turns", "epochs"
 # Those that may be below 0.
 SIGNED = "psfs", "ideal_psfs", "psf_modes"
 
@@ -100,6 +102,9 @@ class Observation:
         at ``transforms[j] @ (x, y, 1)`` in the image. It is a rotation by any angle, with or
         without a flip, and a shift; `lnocl.rotations` makes those of field rotation. The sky is
         turned in the model; no counts are resampled. PSFs are as the images show them.
+    epochs : array_like, shape (p,), optional
+        The epoch of each image, such as its night: any labels. Stars have a flux in each epoch, the
+        rest of the sky is common. By default all images are of one epoch.
     oversample : {1, 2, 4}, optional
         Pixels of the sky, and of the PSFs, to one of the images along each axis. The model of a
         pixel is the sum over its pixels of the sky. It is meant for detectors with fewer than two
@@ -148,6 +153,8 @@ class Observation:
         As given, or 0; with `transforms` their shifts.
     turns : ndarray of float64, shape (p, 2, 2)
         The rotations and flips of `transforms`; without it those of no turn.
+    epochs : ndarray of int, shape (p,)
+        The number of each image's epoch, from 0 on, in the order of the labels.
     oversample : int
         As given.
     effective_psfs : bool
@@ -213,6 +220,7 @@ class Observation:
         exposure: ArrayLike | None = None,
         offsets: ArrayLike | None = None,
         transforms: ArrayLike | None = None,
+        epochs: ArrayLike | None = None,
         oversample: int = 1,
         effective_psfs: bool = False,
         psf_centre: PsfCentre = "check",
@@ -251,6 +259,7 @@ class Observation:
         self.psf_modes = check_modes(psf_modes, self.psfs)
         self.psf_scatter = check_pixels("psf_scatter", psf_scatter, self.psfs)
         self.turns, self.offsets = self._check_maps(offsets, transforms)
+        self.epochs = self._check_epochs(epochs)
         self._orientations: tuple[Orientation, ...] = ()
         self._frame = self.shape
         self._apply_mask(mask)
@@ -326,6 +335,11 @@ class Observation:
         (16, 18)
         """
         return self.oversample * self._frame[0], self.oversample * self._frame[1]
+
+    @property
+    def n_epochs(self) -> int:
+        """Number of epochs, in each of which stars have a flux."""
+        return int(self.epochs.max()) + 1
 
     @property
     def is_turned(self) -> bool:
@@ -441,7 +455,7 @@ class Observation:
         if not other._orientations:
             held["_frame"] = other.shape
         for name in changes:
-            if isinstance(held[name], np.ndarray) and name not in ("mask", "offsets", "turns"):
+            if isinstance(held[name], np.ndarray) and name not in UNCHECKED:
                 _refuse_out_of_range(name, held[name])
         if not (other.psfs.sum(axis=(1, 2)) > 0).all():
             raise InputError("psfs must have positive sums; give others")
@@ -627,6 +641,17 @@ class Observation:
             )
         return np.where(self.mask, masked, values)
 
+    def _check_epochs(self, epochs: ArrayLike | None) -> NDArray[np.intp]:
+        if epochs is None:
+            return np.zeros(self.n_images, np.intp)
+        labels = np.asarray(epochs)
+        if labels.shape != (self.n_images,):
+            raise InputError(
+                f"`epochs` has shape {labels.shape}; give a label for each of the "
+                f"{self.n_images} images"
+            )
+        return np.unique(labels, return_inverse=True)[1].astype(np.intp)
+
     def _check_maps(
         self, offsets: ArrayLike | None, transforms: ArrayLike | None
     ) -> tuple[Array, Array]:
@@ -690,7 +715,8 @@ def _read(name: str, values: Any) -> Any:
         return tuple(values)
     if values is None and name in (*OF_PSFS, "psf_modes"):
         return np.zeros(0)
-    array = (booleans if name == "mask" else partial(numbers, copy=False))(name, values).view()
+    readers = {"mask": booleans, "epochs": lambda _, given: np.asarray(given, np.intp)}
+    array = readers.get(name, partial(numbers, copy=False))(name, values).view()
     array.flags.writeable = False
     return array
 

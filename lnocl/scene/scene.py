@@ -78,7 +78,9 @@ class Scene:
     oversample : int
         Pixels of the sky to one of the images, along each axis.
     stars : ndarray of float64, shape (n, 2)
-        Positions.
+        Positions. With several epochs n counts each star in each epoch, star by star.
+    shown : ndarray of bool, shape (n, p)
+        Which images show a star: those of its epoch.
     rotations : list of Rotation
         How each image is turned against the sky; empty where none is.
     scale : float
@@ -128,6 +130,8 @@ class Scene:
         self.observation = observation = observation.upright()
         positions = check_positions(stars, observation)
         self._max_shift = max_shift
+        self.shown = self._shown(len(positions))
+        positions = np.repeat(positions, observation.n_epochs, axis=0)
         self.oversample = observation.oversample
         self.image_grid = grid_of(observation, pad)
         ny, nx = self.image_grid
@@ -154,6 +158,11 @@ class Scene:
         self._refuse_unobserved_stars(is_observed)
         self._warn_of_ringing()
         self._penalise(penalty)
+
+    def _shown(self, n: int) -> NDArray[np.bool_]:
+        """Return which images show each of n stars in each epoch, shape (n n_epochs, p)."""
+        epochs = self.observation.epochs
+        return np.tile(np.arange(self.observation.n_epochs), n)[:, None] == epochs
 
     def _rotations(self) -> list[Rotation]:
         observation = self.observation
@@ -260,11 +269,14 @@ class Scene:
 
     def observes(self, positions: Array) -> NDArray[np.bool_]:
         """Return which stars at these positions any image would observe."""
-        return self._weigh_stars(self._place_stars(positions))[1]
+        shown = np.ones((len(positions), self.n_images), bool)
+        psfs = self.star_psfs(positions)
+        field = StarField(psfs, self.observation, self.image_grid, positions, shown)
+        return self._weigh_stars(field)[1]
 
     def _place_stars(self, positions: Array) -> StarField:
         psfs = self.star_psfs(positions)
-        return StarField(psfs, self.observation, self.image_grid, positions)
+        return StarField(psfs, self.observation, self.image_grid, positions, self.shown)
 
     def star_psfs(
         self, positions: Array, part: tuple[slice, slice] | None = None
@@ -504,10 +516,11 @@ class Scene:
         of a PSF make negative counts as 0.
         """
         if self.weights is None:
-            light = np.ones((self.n_images, len(field)))
+            light = field.shown.T.astype(np.float64)
             # Samples of an effective PSF a pixel apart may sum to another number.
             if self.oversample > 1 and self.observation.effective_psfs:
-                light[:] = [[cutout.values.sum() for cutout in each] for each in field.cutouts]
+                sums = [[cutout.values.sum() for cutout in each] for each in field.cutouts]
+                light *= sums
             return light.sum(axis=0), np.ones(len(field), bool)
         total, is_observed = np.zeros(len(field)), np.zeros(len(field), bool)
         for j, weights in enumerate(self.weights):

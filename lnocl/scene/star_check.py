@@ -61,10 +61,11 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
     for j, psf in enumerate(seen_psfs(observation)):
         reach = int(np.clip(np.ceil(REACH * fwhm(psf)), LEAST_REACH, MOST_REACH))
         light = observation.images[j] - observation.background[j]
-        positions = scene.star_field.places[j]
+        shown = np.flatnonzero(scene.shown[:, j])
+        positions = scene.star_field.places[j][shown]
         nearest = KDTree(positions).query(positions, k=[2], p=np.inf)[0]  # infinite if alone
-        for s in np.flatnonzero(nearest >= 2 * reach).tolist():
-            position = positions[s]
+        for k in np.flatnonzero(nearest >= 2 * reach).tolist():
+            s, position = int(shown[k]), positions[k]
             x, y = np.round(position).astype(int)
             rows, columns = (slice(at - reach, at + reach + 1) for at in (y, x))
             star = light[max(rows.start, 0) : rows.stop, max(columns.start, 0) : columns.stop]
@@ -105,7 +106,7 @@ def _masked_stars(scene: Scene) -> Iterator[int]:
     for s, star in enumerate(scene.stars):
         places = [observation.places(j, star) for j in range(observation.n_images)]
         nearest = np.round(places).astype(int)
-        inside = ((nearest >= 0) & (nearest < size)).all(axis=1)
+        inside = ((nearest >= 0) & (nearest < size)).all(axis=1) & scene.shown[s]
         bad = [observation.mask[j][tuple(nearest[j][::-1])] for j in np.flatnonzero(inside)]
         if all(bad):
             yield s

@@ -75,7 +75,7 @@ class StarImages:
         self._covered = slice(None) if covered.all() else np.flatnonzero(covered)
         self._pieces, self._order = pieces, order
         self._cores = pieces if cores is None else cores
-        self._k = pieces[0][0].values.shape[0] if pieces else 1
+        self._k = next((each[0].values.shape[0] for each in pieces if each), 1)
 
     def light(self, fluxes: Array) -> Array:
         """Return ``sum_s c_s P_s`` at the pixels that are covered."""
@@ -226,6 +226,8 @@ class StarField:
         Shape (ny, nx) of the images' grid.
     positions : ndarray of float64, shape (n, 2)
         In the sky, pixels of the images.
+    shown : ndarray of bool, shape (n, p)
+        Which images show each star; in the others it is 0.
 
     Attributes
     ----------
@@ -239,8 +241,9 @@ class StarField:
         observation: Observation,
         grid: tuple[int, int],
         positions: Array,
+        shown: NDArray[np.bool_],
     ) -> None:
-        self.positions = positions
+        self.positions, self.shown = positions, shown
         self.psfs, self._grid, self._is_turned = psfs, grid, observation.is_turned
         self.places = [observation.places(j, positions) for j in range(len(psfs))]
 
@@ -252,10 +255,12 @@ class StarField:
         """P_js for each image j and star s."""
         return [
             [
-                psf.at(*place).aligned(self._grid)
-                for psf, place in zip(psfs, places_there, strict=True)
+                psf.at(*place).aligned(self._grid) if shown else _nothing_at(place)
+                for psf, place, shown in zip(psfs, places_there, shown_there, strict=True)
             ]
-            for psfs, places_there in zip(self.psfs, self.places, strict=True)
+            for psfs, places_there, shown_there in zip(
+                self.psfs, self.places, self.shown.T, strict=True
+            )
         ]
 
     @cached_property
@@ -303,10 +308,19 @@ class StarField:
     def images(self, j: int, covered: NDArray[np.bool_]) -> StarImages:
         """Return the P_js over these pixels, which must include all that cutouts of stars cover."""
         pieces, cores = (
-            [[cutout._replace(values=cutout.values[None])] for cutout in cutouts]
+            [
+                [cutout._replace(values=cutout.values[None])] if shown else []
+                for cutout, shown in zip(cutouts, self.shown[:, j], strict=True)
+            ]
             for cutouts in (self.cutouts[j], self.cores[j])
         )
         return StarImages(covered, pieces, self._order, cores)
+
+
+def _nothing_at(place: Array) -> Cutout:
+    """Return a pixel without light."""
+    x, y = np.floor(place + 0.5).astype(int).tolist()
+    return Cutout(np.zeros((1, 1)), y, x)
 
 
 def along_sky(star: Cutout, turn: Array) -> Cutout:

@@ -45,16 +45,24 @@ def marginal(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array
     """
     around = Surroundings(scene, sky, star_fluxes, False)
     after, fluxes = sky.copy(), star_fluxes.copy()
-    for star in np.flatnonzero(star_fluxes > 0).tolist():
-        near, flux = NearStar(around, star, FINISHED), star_fluxes[star]
-        if not np.isfinite(variances(near.fit.information)[0]):
+    n_epochs = scene.observation.n_epochs
+    for first in range(0, scene.n_stars, n_epochs):
+        # The star in all epochs; one without light in any, or not determined, stays.
+        star = np.arange(first, first + n_epochs)
+        if not (star_fluxes[star] > 0).any():
+            continue
+        near = NearStar(around, first, FINISHED)
+        at = [int(np.flatnonzero(near.held == s)[0]) for s in star]
+        is_free = np.isfinite(variances(near.fit.information)[at]) & (star_fluxes[star] > 0)
+        if not is_free.any():
             continue
         change, (x,) = near.fit.solve(np.zeros(near.n_held))
-        fluxes[star] = max(flux + change[0] * scene.unit, 0.0)
+        moved = np.maximum(star_fluxes[star] + change[at] * scene.unit, 0.0)
+        fluxes[star] = np.where(is_free, moved, star_fluxes[star])
         there = near.places(scene)
-        light = _core_of(near, scene, star) * (near.expected + near.source.of(x)) * scene.unit
+        light = _core_of(near, scene, first) * (near.expected + near.source.of(x)) * scene.unit
         light = np.maximum(light, -after[there])
-        after[there] += _at_most(light, flux - fluxes[star])
+        after[there] += _at_most(light, float((star_fluxes[star] - fluxes[star]).mean()))
     return after, fluxes
 
 

@@ -100,7 +100,7 @@ class NearStar:
     ----------
     window : Window
         The pixels of the images, without offset.
-    n_held : int
+    held : ndarray of int, shape (n_held,)
         Stars that are fitted: this, which is the first, and those near it.
     resolution : float
         What all images resolve together, pixels of the sky.
@@ -116,7 +116,8 @@ class NearStar:
         held = np.append(star, _neighbours(scene, star, width))
         there, texture = _texture_in(self.window, scene, sky, width)
         self.source = self._source_error(around, texture.amplitude[there], texture.width)
-        self.n_held, self.resolution, self._finished = len(held), width, finished
+        self.held, self.n_held, self.resolution = held, len(held), width
+        self._finished, self._moves = finished, around.moves
         self.expected = texture.mean[there] - sky[self.places(scene)] / scene.unit
         beyond = self.source.images_of(self.expected)
         self._images = [self._linearise(around, j, held, each) for j, each in enumerate(beyond)]
@@ -128,7 +129,7 @@ class NearStar:
     @cached_property
     def fit(self) -> LeastSquares:
         """The least squares: the unknowns are all fluxes, perhaps all x, and all y."""
-        k = len(self._images[0].slopes)
+        k = (3 if self._moves else 1) * self.n_held
         return LeastSquares(self._images, [self.source], np.zeros(k), N_STEPS, self._finished)
 
     def _source_error(self, around: Surroundings, amplitude: Array, width: float) -> SourceError:
@@ -201,17 +202,21 @@ class NearStar:
         add_to_window(model, scene, around.sky, around.star_fluxes, j, first)
         total = np.maximum(model, MIN_MODEL)
         precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
-        slopes = [_cut(scene.star_cutout(j, s), there, grid) for s in held]
+        lit = np.flatnonzero(scene.shown[held, j])
+        slopes = [_cut(scene.star_cutout(j, s), there, grid) for s in held[lit]]
         if around.moves:
             psfs, places = scene.star_field.psfs[j], scene.star_field.places[j]
             turn = scene.observation.turns[j]
-            moved = [along_sky(psfs[s].with_slopes(*places[s]), turn) for s in held]
+            moved = [along_sky(psfs[s].with_slopes(*places[s]), turn) for s in held[lit]]
             for axis in (1, 2):
-                for flux, each in zip(around.star_fluxes[held] / scene.unit, moved, strict=True):
+                fluxes = around.star_fluxes[held[lit]] / scene.unit
+                for flux, each in zip(fluxes, moved, strict=True):
                     slope = each._replace(values=flux * each.values[axis])
                     slopes.append(_cut(slope, there, grid))
-        k, left = len(slopes), counts - total - beyond
-        return LinearImage(np.array(slopes).reshape(k, -1), np.arange(k), left, precision)
+        n, k = self.n_held, len(slopes)
+        unknowns = np.concatenate([lit, lit + n, lit + 2 * n]) if around.moves else lit
+        left = counts - total - beyond
+        return LinearImage(np.array(slopes).reshape(k, counts.size), unknowns, left, precision)
 
 
 def _texture_in(

@@ -17,6 +17,7 @@ not where it is expected or iterations have ended early. The square of that is a
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.scene import Scene
@@ -49,21 +50,25 @@ def standard_errors(scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -
     """
     around = Surroundings(scene, sky, star_fluxes, moves)
     errors = np.full((scene.n_stars, 3), np.nan)
-    for star, row in enumerate(errors):
-        row[: 3 if moves else 1] = _errors_of_first(NearStar(around, star, FINISHED))
+    n_epochs, k = scene.observation.n_epochs, 3 if moves else 1
+    for first in range(0, scene.n_stars, n_epochs):  # which lies there in all epochs
+        near = NearStar(around, first, FINISHED)
+        there = range(first, first + n_epochs)
+        errors[first : first + n_epochs, :k] = _errors_of(near, np.isin(near.held, there))
     errors[:, 0] *= scene.unit
     return errors
 
 
-def _errors_of_first(near: NearStar) -> Array:
-    """Return the errors of the star, of its flux and perhaps x and y."""
+def _errors_of(near: NearStar, wanted: NDArray[np.bool_]) -> Array:
+    """Return the errors of stars that are fitted, of their fluxes and perhaps x and y."""
     fit, k = near.fit, len(near.fit.information)
+    unknowns = np.arange(k).reshape(-1, near.n_held)[:, wanted].T
     is_determined = np.isfinite(variances(fit.information))
     if not is_determined.any():
-        return np.full(k // near.n_held, np.nan)
+        return np.full(unknowns.shape, np.nan)
     change, _ = fit.solve(np.zeros(k))
     errors = [
         np.hypot(fit.variance(i) ** 0.5, change[i]) if is_determined[i] else np.nan
-        for i in range(0, k, near.n_held)
+        for i in unknowns.ravel().tolist()
     ]
-    return np.array(errors)
+    return np.reshape(errors, unknowns.shape)

@@ -133,11 +133,13 @@ def view_of(saved: SavedResult) -> ResultView:
     )
     # Electrons, as images and models are, whatever the unit of the file.
     alone = f"1 {saved.header.get('BUNIT', '')}"
+    # Of a star in several epochs the first.
+    first = saved.tables["STARS"].get("epoch", np.zeros(len(saved.stars))) == 0
     factor, _, unit = str(saved.header.get("ONEUNIT", alone)).partition(" ")
     return ResultView(
         extended=float(factor) * saved.extended,
-        stars=saved.stars,
-        star_fluxes=saved.star_fluxes,
+        stars=[star for star, is_first in zip(saved.stars, first, strict=True) if is_first],
+        star_fluxes=saved.star_fluxes[first],
         n_iter=int(saved.number("NITER") or 0),
         history=saved.tables.get("HISTORY", {}),
         held_out=saved.tables.get("HELDOUT", {}),

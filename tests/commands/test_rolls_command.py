@@ -15,7 +15,7 @@ from lnocl.studies.figures import view_of
 
 N = 48
 CENTRE = np.array([24.0, 24.0])
-BLOB, STAR = np.array([33.0, 15.0]), CENTRE + (0.2, -0.3)
+BLOB, STAR = np.array([33.0, 15.0]), np.add(CENTRE, (0.2, -0.3))
 ANGLES = [0.0, 12.0, 140.0]
 
 
@@ -82,3 +82,31 @@ def test_a_centre_is_in_pixels(frames, capsys):
     command = ["deconvolve", *frames, "--psf", "psf.fits", "--angle", "PARANG", "-o", "out.fits"]
     assert cli.main([*command, "--centre", "4h20m,19d"]) == 2
     assert "'4h20m,19d' is not X,Y in pixels" in capsys.readouterr().err
+
+
+def test_epochs(frames, capsys):
+    """Three nights, the star's flux in each in the table, and one line and one circle for it."""
+    command = ["deconvolve", *frames, "--psf", "psf.fits", "--background", "10", "--n-iter", "40"]
+    command += ["--star", f"{STAR[0]},{STAR[1]}", "--stop", "none", "--engine", "numpy"]
+    command += ["--align", "wcs", "--epoch", "each", "--residuals", "-o", "out.fits"]
+    assert cli.main(command) == 0
+    said = capsys.readouterr().out
+    assert said.count("star at (") == 1
+    assert "star at (24.2, 23.7): 3 epochs, " in said
+    stars = fits.getdata("out.fits", "STARS")
+    assert stars["epoch"].tolist() == [0, 1, 2]
+    assert stars["flux"] == pytest.approx(2e4, rel=0.04)
+    assert len(view_of(read_result("out.fits")).stars) == 1
+
+
+def test_epochs_by_a_keyword(frames, capsys):
+    for path, night in zip(frames, ("2026-01-01", "2026-01-02", "2026-01-01"), strict=True):
+        fits.setval(path, "DATE-OBS", value=night)
+    command = ["deconvolve", *frames, "--psf", "psf.fits", "--stop", "none", "--n-iter", "1"]
+    command += ["--star", "24,24", "--align", "wcs", "--engine", "numpy", "-o", "out.fits"]
+    assert cli.main([*command, "--epoch", "DATE-OBS"]) == 0
+    assert fits.getdata("out.fits", "STARS")["epoch"].tolist() == [0, 1]
+    assert cli.main([*command, "--epoch", "NIGHT", "--overwrite"]) == 2
+    assert "0.fits has no NIGHT in its header; give --epoch each" in capsys.readouterr().err
+    assert cli.main([*command, "--epoch", "1", "2", "--overwrite"]) == 2
+    assert "2 epochs for 3 images; give each, a keyword, or a label" in capsys.readouterr().err

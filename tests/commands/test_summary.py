@@ -63,10 +63,11 @@ def test_a_star_that_moved_as_far_as_stars_may_is_named_first():
     )
     bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.0, 0.0)
     arguments = SimpleNamespace(smoothing="auto", refine_psfs=None)
-    lines = verdict_on(arguments, result, None, [(10, 10)], [bad], Fit(), False)
+    frames = SimpleNamespace(observation=SimpleNamespace(n_epochs=1, is_turned=False))
+    lines = verdict_on(arguments, result, frames, [(10, 10)], [bad], Fit(), False)
     assert lines[0].startswith("1 star moved as far as stars may, 3 pixels, from (10, 10) to (10,")
     assert "does not fit" in lines[1]
-    near = verdict_on(arguments, result, None, [(10, 10.5)], [bad], Fit(), False)
+    near = verdict_on(arguments, result, frames, [(10, 10.5)], [bad], Fit(), False)
     assert len(near) == 1
 
 

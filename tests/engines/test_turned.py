@@ -115,7 +115,7 @@ def test_engines_agree_where_stars_move(engine):
     fluxes = 30.0 * FLUXES
     counts = np.random.default_rng(5).poisson(scenes_turned.means(fluxes)).astype(float)
     seen = observation(images=counts)
-    found = lnocl.deconvolve(seen, STARS + (0.4, -0.3), smoothing=0.0, **moved, **engine)
+    found = lnocl.deconvolve(seen, np.add(STARS, (0.4, -0.3)), smoothing=0.0, **moved, **engine)
     assert abs(found.star_positions - STARS).max() <= 0.05
     assert worst(found.star_fluxes, fluxes) <= 0.02
 
@@ -202,7 +202,7 @@ def test_derivatives_of_stars_are_along_the_skys_axes():
     model = Model(scene)
     extended = scenes_turned.sky() / scene.unit
     fit = StarFit(scene, model, extended, scene.stars)
-    stars = Stars(FLUXES / scene.unit, STARS + (0.3, -0.2))
+    stars = Stars(FLUXES / scene.unit, np.add(STARS, (0.3, -0.2)))
     gradient, _ = fit.derivatives(stars)
     step = 1e-4
     for index in range(2, 6):
@@ -253,7 +253,7 @@ def test_all_goes_wrong_in_one_line():
         ({"transforms": maps[:2]}, {}, "`transforms` has shape (2, 2, 3); give 2 x 3 numbers"),
         ({"transforms": maps * np.nan}, {}, "`transforms` must be finite"),
         ({"transforms": maps * 1.01}, {}, "`transforms[0]` scales or shears an image of 40 x 14"),
-        ({}, {"refine_psfs": ["jitter"]}, "`refine_psfs` and `psf_scatter` are for images that"),
+        ({}, {"refine_psfs": ["jitter"]}, "`refine_psfs` and `psf_scatter` are for images of"),
     ]
     for changes, options, message in cases:
         with pytest.raises(lnocl.LnoclError) as caught:
@@ -261,7 +261,7 @@ def test_all_goes_wrong_in_one_line():
         assert caught.value.message.startswith(message)
     with pytest.raises(lnocl.LnoclError, match="tiles are of images that are not turned"):
         lnocl.deconvolve_tiles(observation(), stop=None, n_iter=1, engine="numpy")
-    with pytest.raises(lnocl.LnoclError, match="`angles` and `centre` must be finite|angles and"):
+    with pytest.raises(lnocl.LnoclError, match=r"angles.* must be finite"):
         lnocl.rotations([np.inf], (0, 0))
     with pytest.raises(lnocl.LnoclError, match="of shape"):
         lnocl.rotations(3.0, (0, 0))

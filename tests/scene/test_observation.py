@@ -490,6 +490,7 @@ def test_the_arrays_of_an_observation_are_read_only(maps):
         "exposure",
         "offsets",
         "turns",
+        "epochs",
         "ideal_psfs",
         "psf_modes",
         "pupils",
