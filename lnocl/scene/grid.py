@@ -16,6 +16,9 @@ MAX_AXIS = 8192
 ODD_FACTORS = 1, 3, 5, 7, 9
 MIN_EVEN = 16
 
+# The least side of a grid of turned images: kernels/turn.cl shifts as many columns at once.
+LEAST_TURNED = 16
+
 LENGTHS = sorted(
     odd << k
     for odd in ODD_FACTORS
@@ -74,7 +77,7 @@ def extent(observation: Observation) -> tuple[int, int]:
     angles = np.arctan2(observation.turns[:, 1, 0], observation.turns[:, 0, 0])
     sheared = nx - 1.0 + float(abs(np.tan(angles / 2.0)).max()) * (ny - 1.0)
     x, y = np.ceil([max(size[0], sheared), size[1]]).astype(int).tolist()
-    return max(y + 1 + TAPS, ny), max(x + 1 + TAPS, nx)
+    return max(y + 1 + TAPS, ny, LEAST_TURNED), max(x + 1 + TAPS, nx, LEAST_TURNED)
 
 
 def length_for(n: int) -> int:

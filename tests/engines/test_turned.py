@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import turned_scenes as scenes_turned
 from scenes import FEWER_ENGINES, NUMPY_FIRST, make_psfs, paper, same, worst
-from turned_scenes import FLUXES, GRID, NX, NY, STARS, observation
+from turned_scenes import FLUXES, GRID, NX, NY, STARS, observation, psfs
 
 import lnocl
 from lnocl.scene.forward_model import Model, model_images
@@ -231,6 +231,17 @@ def test_errors_of_stars_are_those_of_images_that_are_not_turned():
         near = NearStar(around, 0, 1e-6)
         errors.append(np.sqrt(np.diag(near.fit.information)))
     assert worst(errors[0], errors[1]) <= 0.02
+
+
+@pytest.mark.parametrize("engine", NUMPY_FIRST)
+@pytest.mark.parametrize("shape", [(2, 3), (4, 5)])
+def test_images_of_few_pixels(engine, shape):
+    """The grid has sixteen rows and columns at least, and all light that is there."""
+    maps = lnocl.rotations([0.0, 30.0], ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
+    given = lnocl.Observation(np.full((2, *shape), 9.0), psfs()[0], transforms=maps)
+    assert min(Scene(given).grid) >= 16
+    result = paper(given, n_iter=20, **engine)
+    assert worst(result.models(), 9.0) <= 0.02
 
 
 def test_a_run_that_was_cut_off_goes_on(tmp_path):
