@@ -27,7 +27,7 @@ WRITE_EVERY = 10.0
 # Quantities whose errors are printed, unless more regions were given.
 MAX_LISTED = 12
 # Names of quantities of stars; others are of regions and profiles.
-_OF_STARS = re.compile(r"star \d+ (flux|x|y)")
+_OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)")
 
 
 def add_errors(

@@ -399,7 +399,11 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
     scene = outcome.scene
     n, (ny, nx) = scene.n_stars, scene.observation.sky_shape
     moves = outcome.moves
-    labels = [Label(f"star {s} flux", FLUX) for s in range(1, n + 1)]
+    n_epochs = scene.observation.n_epochs
+    epochs = [f" epoch {e}" for e in range(n_epochs)] if n_epochs > 1 else [""]
+    labels = [
+        Label(f"star {s + 1}{epoch} flux", FLUX) for s in range(n // n_epochs) for epoch in epochs
+    ]
     if moves:
         labels += [Label(f"star {s} {axis}", LENGTH) for s in range(1, n + 1) for axis in "xy"]
     labels += [label for part in parts for label in part.labels()]

@@ -115,6 +115,14 @@ def test_fluxes_of_nights_and_their_errors():
     assert table["x"].value.tolist() == np.repeat(stars[:, 0], 6).tolist()
 
 
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+def test_replicas_name_star_and_epoch():
+    given = observation(epochs=EPOCHS)
+    result = paper(given, STARS, n_iter=3, engine="numpy")
+    names = result.bootstrap(10, seed=0).to_table()["name"].tolist()
+    assert names == [f"star {s} epoch {e} flux" for s in (1, 2) for e in (0, 1)]
+
+
 def test_what_is_refused():
     with pytest.raises(lnocl.LnoclError, match=r"epochs`? has shape"):
         observation(epochs=[1, 2])
