@@ -161,6 +161,8 @@ class OpenCLEngine:
         of_device = self.bytes_needed if self._device_type & cl.device_type.CPU else 0
         frame = math.prod(self.scene.grid) * np.dtype(np.float64).itemsize
         to_come = COMPILER + max(2 * frame, 6 * frame - of_device)
+        if self._shears and self.scaling is None:  # else the host has made its model before
+            to_come += (self.scene.n_images + 2) * frame
         if self.scaling is not None:
             to_come += 2 * self.scaling.star_information.band.nbytes
         return max(held + to_come, most - of_device)
