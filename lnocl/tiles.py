@@ -334,9 +334,10 @@ def _pad(observation: Observation, pad: Any) -> int:
 
 
 def _refuse_turned(observation: Observation) -> None:
-    if observation.is_mapped:
+    if observation.is_mapped or observation.n_epochs > 1:
         raise InputError(
-            "tiles are of images that are not turned against the sky; take deconvolve for the whole"
+            "tiles are of images of one epoch that are not turned against the sky; take deconvolve "
+            "for the whole"
         )
 
 

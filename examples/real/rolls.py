@@ -47,7 +47,7 @@ PUT_IN = ((12.5, 290, 1000), (16.6, 150, 700), (22, 240, 400), (28, 10, 250), (3
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else FOLDER)
 if not (folder / "naco_betapic_cube.fits").is_file():
-    print(f"there is no data in {folder}: fetch.py fetches the set naco-betapic")
+    print(f"the data are missing from {folder}: fetch.py fetches the set naco-betapic")
     sys.exit()
 cube, angles, psf = (
     fits.getdata(folder / f"naco_betapic_{name}.fits").astype(float)

@@ -353,9 +353,9 @@ def read_angles(path: str) -> tuple[NDArray[np.float64], str]:
         try:
             values = np.array(content.decode("ascii").split(), np.float64)
         except ValueError as error:
-            raise FileError(f"{path} is no list of angles, a number a line") from error
+            raise FileError(f"{path} must hold numbers alone, an angle a line") from error
     if not (values.size and np.isfinite(values).all()):
-        raise FileError(f"{path} holds no list of angles, one for each image")
+        raise FileError(f"{path} must hold a finite angle for each image")
     return values, hashlib.sha256(content).hexdigest()
 
 

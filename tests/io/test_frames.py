@@ -561,8 +561,8 @@ class TestOffsets:
             ({"angle": ["PARANG"]}, "1.fits has no PARANG in its header, and there is no such"),
             ({"angle": [1.0, 2.0, 3.0]}, "3 angles for 2 images; give a keyword, a file of the"),
             ({"angle": ["few.txt"]}, "few.txt has 3 angles for 2 images"),
-            ({"angle": ["words.txt"]}, "words.txt is no list of angles, a number a line"),
-            ({"angle": ["image.fits"]}, "image.fits holds no list of angles, one for each image"),
+            ({"angle": ["words.txt"]}, "words.txt must hold numbers alone, an angle a line"),
+            ({"angle": ["image.fits"]}, "image.fits must hold a finite angle for each image"),
             ({"angle": [1.0], "align": "wcs"}, "give angle or align, not both"),
         ],
     )
