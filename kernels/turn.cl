@@ -8,6 +8,9 @@
  *
  * The rows of an image, and all that is its, lie rotated by the whole pixels of the third shear, so
  * that fractions are left to shift by.
+ *
+ * The pixels of an image may be larger than the sky's. Then sample_lines takes the rows of its row
+ * spectra, and the columns of its pixels, in steps of these, before the second shear.
  */
 
 #if HAS_TURNS
@@ -54,6 +57,37 @@ INLINE void store_column(
 INLINE int in_row(const int x)
 {
     return x < 0 ? x + NX : x < NX ? x : x - NX;
+}
+
+/* sampled = sum_k weights_ik given(firsts_i + k), 0 <= k < TURN_TAPS, for each line i, round the end: lines
+ * in the steps of larger pixels, or the adjoint.
+ * sampled, given: arrays [parts][stride][length] of vectors, of which lines, a multiple of RUN, are
+ * taken; of the const one that of a number is read. firsts: [..][lines], 0 to lines - 1, and weights,
+ * [..][lines][TURN_TAPS]: from line `table` on.
+ * Launch: up to parts * lines / RUN groups. Out of place. Twin: reference.sample_lines.
+ */
+KERNEL void sample_lines(
+    __global vec *restrict sampled, __global const vec *restrict given, const int array,
+    __global const int *restrict firsts, __global const real *restrict weights, const int table,
+    const int parts, const int lines, const int stride, const int length)
+{
+    const int runs = lines / RUN;
+    given += (size_t)array * parts * stride * length;
+    FOR_EACH_BLOCK(run, parts * runs) {
+        const size_t part = (size_t)(run / runs) * stride * length;
+        FOR_EACH(piece, RUN * length) {
+            const int line = run % runs * RUN + piece / length, place = piece % length;
+            const int first = firsts[table + line];
+            vec total = 0;
+            UNROLL
+            for (int k = 0; k < TURN_TAPS; ++k) {
+                const int at = first + k < lines ? first + k : first + k - lines;
+                total += weights[TURN_TAPS * (table + line) + k]
+                    * given[part + (size_t)at * length + place];
+            }
+            sampled[part + (size_t)line * length + place] = total;
+        }
+    }
 }
 
 /* z <- columns shifted along y, from column -margin to NX - 1 + margin, round the edge: sign 1, or
@@ -184,6 +218,29 @@ KERNEL void ratio_sheared(
                     total += own[k] * wide[(x + TURN_TAPS - 1 - k) * 2 * SIDE + part];
                 store_column(ratio_columns, x, part / SIDE, part % SIDE, block, total);
             }
+        }
+        BARRIER;
+    }
+}
+
+/* columns <- the columns of an image after the adjoint of the second shear, which larger pixels have
+ * apart: their columns are spread before the transform.
+ * columns, ratio_columns: one array each, out and const in. The rest as for ratio_sheared, const.
+ * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.unshear_columns.
+ */
+KERNEL void unshear_columns(
+    __global real *restrict columns, __global const real *restrict ratio_columns,
+    __global const int *restrict column_shifts, __global const real *restrict column_weights,
+    const int image, SCRATCH vec *restrict scratch)
+{
+    SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
+    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+        load_columns(
+            z, ratio_columns, column_shifts + image * NX, column_weights + image * NX * TURN_TAPS,
+            block, -1, 0);
+        FOR_EACH(piece, NX * 2 * SIDE) {
+            const int x = piece / (2 * SIDE), part = piece / SIDE % 2, lane = piece % SIDE;
+            store_column(columns, x, part, lane, block, z[piece]);
         }
         BARRIER;
     }

@@ -61,7 +61,7 @@ CASES = {
     "sky four times as fine": ((64, 32), None, FOUR_TIMES_AS_FINE, "SD"),
     "sky four times as fine, radices 8, 8, 4": ((64, 1024), None, FOUR_TIMES_AS_FINE, "SD"),
     "sky four times as fine, group": ((128, 64), Tuning(1, 8, group=4), FOUR_TIMES_AS_FINE, "S"),
-    "turned": ((32, 64), None, TURNED, "sD"),
+    "turned": ((64, 64), None, TURNED, "sD"),
     "turned, odd factors 3 and 5": ((48, 80), None, TURNED, "SD"),
     "turned, several vectors a block": ((64, 32), Tuning(4, 8), TURNED, "S"),
     "turned, several pieces a column": ((512, 16), None, TURNED, "SD"),

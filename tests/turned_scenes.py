@@ -8,11 +8,12 @@ import numpy as np
 
 import lnocl
 
-SHAPE = NY, NX = 14, 40
-GRID = 32, 64
+SHAPE = NY, NX = 22, 40
+GRID = 64, 64
 ANGLES = np.degrees([0.25, -0.2, 0.0])
-CENTRE = np.array([19.5, 6.5])
-STARS = np.array([(11.3, 5.2), (27.8, 8.4)])
+LARGER = 13, 23
+CENTRE = np.array([19.5, 10.5])
+STARS = np.array([(11.3, 8.2), (27.8, 12.4)])
 FLUXES = np.array([900.0, 600.0])
 # Covariances of the PSFs, pixels of the images.
 COVARIANCES = [np.array(each) for each in ([[2.6, 0.5], [0.5, 1.7]], [[1.8, 0], [0, 2.4]])]
@@ -36,6 +37,17 @@ def transforms(angles=ANGLES):
     """Return the maps of images turned about the middle, and then moved a little."""
     maps = lnocl.rotations(angles, CENTRE)
     maps[:, :, 2] += [(0.3 * j, -0.4 * j) for j in range(len(angles))]
+    return maps
+
+
+def scaled():
+    """Return the same maps, but that the last image is turned, and has pixels 1.7 times as large.
+
+    Its good pixels are `LARGER`.
+    """
+    maps = transforms()
+    turn = lnocl.rotations([10.0], CENTRE)[0, :, :2] / 1.7
+    maps[2] = np.column_stack([turn, (11.2, 6.1) - turn @ CENTRE])
     return maps
 
 
@@ -77,29 +89,32 @@ def background():
 def sky():
     """Return an extended source on the grid: two blobs and a faint floor."""
     y, x = np.indices(GRID)
-    first = 6000.0 * gaussian(x - 17, y - 8, np.diag([9.0, 4.0]))
-    return first + 3000.0 * gaussian(x - 30, y - 4, np.diag([4.0, 6.0])) + 0.5
+    first = 6000.0 * gaussian(x - 17, y - 12, np.diag([9.0, 4.0]))
+    return first + 3000.0 * gaussian(x - 30, y - 7, np.diag([4.0, 6.0])) + 0.5
 
 
-def means(fluxes=FLUXES):
+def means(fluxes=FLUXES, maps=None):
     """Return the expected counts, shape (3, ny, nx)."""
-    maps = transforms()
+    maps = transforms() if maps is None else maps
     light = matrix(maps) @ sky().ravel() + star_columns(maps) @ fluxes
     return light.reshape(3, *SHAPE) + background()
 
 
-def mask():
+def mask(maps=None):
     """Return a few bad pixels."""
-    return np.random.default_rng(1).random((3, *SHAPE)) < 0.04
+    bad = np.random.default_rng(1).random((3, *SHAPE)) < 0.04
+    if maps is not None:
+        bad[2, LARGER[0] :] = bad[2, :, LARGER[1] :] = True
+    return bad
 
 
-def observation(**changes):
-    """Return the scene's observation, or one with other arguments."""
+def observation(maps=None, **changes):
+    """Return the scene's observation, or one with other maps or arguments."""
     given = {
-        "images": np.random.default_rng(2).poisson(means()).astype(float),
+        "images": np.random.default_rng(2).poisson(means(maps=maps)).astype(float),
         "psfs": psfs(),
         "background": background(),
-        "mask": mask(),
-        "transforms": transforms(),
+        "mask": mask(maps),
+        "transforms": transforms() if maps is None else maps,
     }
     return lnocl.Observation(**(given | changes))

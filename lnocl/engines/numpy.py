@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from lnocl.reference.convolve import convolve_columns, correlate_columns, otf_columns
 from lnocl.reference.ratio import ratio_rows
-from lnocl.reference.rows import rfft_rows
+from lnocl.reference.rows import ComplexArray, rfft_rows
 from lnocl.reference.scale import scale_rows
 from lnocl.reference.smooth import smooth
 from lnocl.reference.step import gradient_rows, step_rows
 from lnocl.reference.sums import collect_sums
-from lnocl.reference.turn import irfft_sheared, ratio_sheared, rfft_sheared
+from lnocl.reference.turn import irfft_sheared, ratio_sheared, unshear_columns
 from lnocl.scene.arrays import Array
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
@@ -103,10 +105,7 @@ class ReferenceEngine:
                 row_spectra, *observed
             )
         else:
-            sheared, self._data_term, self._star_sums = ratio_sheared(
-                irfft_sheared(row_spectra), self._column_shifts, self._image_shifts, *observed
-            )
-            self._ratio_row_spectra = rfft_sheared(sheared, self._column_shifts)
+            self._ratio_turned(row_spectra, observed)
         smoothness = 0.0
         if self.scene.is_smoothed:
             weights = self.scene.smoothing_map
@@ -124,6 +123,25 @@ class ReferenceEngine:
             self.scene.mu,
         )
         self._objectives.append(objective)
+
+    def _ratio_turned(self, row_spectra: ComplexArray, observed: tuple[Any, ...]) -> None:
+        """Make the ratios of images that are turned, in the steps of their pixels."""
+        rotations = enumerate(self.scene.rotations)
+        sampled = [(j, *rotation.samplings) for j, rotation in rotations if rotation.samplings]
+        for j, rows, _ in sampled:
+            row_spectra[j] = rows.forward(row_spectra[j], 0)
+        pixels = irfft_sheared(row_spectra)
+        for j, _, columns in sampled:
+            pixels[j] = columns.forward(pixels[j], 1)
+        sheared, self._data_term, self._star_sums = ratio_sheared(
+            pixels, self._column_shifts, self._image_shifts, *observed
+        )
+        back = unshear_columns(sheared, self._column_shifts)
+        for j, _, columns in sampled:
+            back[j] = columns.adjoint(back[j], 1)
+        self._ratio_row_spectra = rfft_rows(back)
+        for j, rows, _ in sampled:
+            self._ratio_row_spectra[j] = rows.adjoint(self._ratio_row_spectra[j], 0)
 
     def correct(self) -> None:
         """Back-project the ratios to the correction."""

@@ -15,11 +15,10 @@ from lnocl.opencl.launch import Launch, Launcher
 from lnocl.opencl.layout import Layout
 from lnocl.opencl.memory import Memory, Transfer, announce, held_bytes, refuse_if_too_large
 from lnocl.opencl.program import Program
-from lnocl.opencl.shears import Shears
 from lnocl.opencl.tuning import Tuning, describe_tuning
+from lnocl.opencl.turned import TurnedImages
 from lnocl.opencl.windows import StarWindows
 from lnocl.scene.arrays import Array
-from lnocl.scene.rotation import TAPS
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.stars import covered_box
 from lnocl.solvers.engine import State
@@ -105,12 +104,12 @@ class OpenCLEngine:
         )
         self.rounding = ROUNDING if precision == "single" else 0.0
         self.layout = Layout(self.program)
-        self._shears = [Shears(rotation) for rotation in scene.rotations]
+        self._turned = self._turned_images()
         self._stars = StarWindows(
             self.layout.images,
             [[scene.star_box(j, s) for j in range(scene.n_images)] for s in range(scene.n_stars)],
             scene.n_images,
-            [each.roll for each in self._shears],
+            self._turned.rolls if self._turned else [],
             scene.shown,
         )
         self._cross = self._cross_windows()
@@ -135,6 +134,10 @@ class OpenCLEngine:
         self._bind_iteration()
         if scaling is not None:
             self._upload_scaling(scaling)
+
+    def _turned_images(self) -> TurnedImages | None:
+        rotations = self.scene.rotations
+        return TurnedImages(rotations, self.program, self.layout) if rotations else None
 
     @property
     def is_proven(self) -> bool:
@@ -161,7 +164,7 @@ class OpenCLEngine:
         of_device = self.bytes_needed if self._device_type & cl.device_type.CPU else 0
         frame = math.prod(self.scene.grid) * np.dtype(np.float64).itemsize
         to_come = COMPILER + max(2 * frame, 6 * frame - of_device)
-        if self._shears and self.scaling is None:  # else the host has made its model before
+        if self._turned and self.scaling is None:  # else the host has made its model before
             to_come += (self.scene.n_images + 2) * frame
         if self.scaling is not None:
             to_come += 2 * self.scaling.star_information.band.nbytes
@@ -210,8 +213,8 @@ class OpenCLEngine:
             "objectives": (n_iter + 1) * pair,
             "row_phases": item,
         }
-        if self._shears:
-            sizes |= self._shear_sizes()
+        if self._turned:
+            sizes |= self._turned.sizes()
         if self.scaling is None:
             return sizes
         return {
@@ -222,20 +225,6 @@ class OpenCLEngine:
             "change_sums": program.row_blocks * 2 * pair,
             "step_sums": program.row_blocks * pair,
             **self._cross_sizes(),
-        }
-
-    def _shear_sizes(self) -> dict[str, int]:
-        """Return the bytes of the buffers of images that are turned."""
-        p, item, (ny, nx) = self.scene.n_images, self.program.dtype.itemsize, self.program.grid
-        columns = self.program.columns_size * item
-        n_phases = ny // self.program.phase_rows + self.program.phase_rows
-        return {
-            "row_phases": p * n_phases * nx * item,
-            "columns": columns,
-            "ratio_columns": columns,
-            "column_shifts": p * nx * 4,
-            "column_weights": p * nx * TAPS * item,
-            "image_weights": p * ny * TAPS * item,
         }
 
     def _cross_sizes(self) -> dict[str, int]:
@@ -270,9 +259,8 @@ class OpenCLEngine:
     def _bind_iteration(self) -> None:
         """Bind the kernels of an iteration, in its order."""
         self._convolve = self._bind("convolve_columns")
-        if self._shears:
-            names = "irfft_sheared", "ratio_sheared", "rfft_sheared"
-            self._turned_ratio = [self._bind(name) for name in names]
+        if self._turned:
+            self._turned.bind(self._bind, self._memory, self._queue)
         else:
             self._ratio = self._bind("ratio_rows")
         if self.scene.is_smoothed:
@@ -283,8 +271,8 @@ class OpenCLEngine:
 
     def _upload_scene(self) -> None:
         scene, memory = self.scene, self._memory
-        if self._shears:
-            self._upload_shears()
+        if self._turned:
+            self._turned.upload(memory)
         memory.clear("star_sums")  # in images that do not show a star they stay 0
         self.take_images()
         if scene.weights is not None and scene.has_exposure_map:
@@ -303,27 +291,9 @@ class OpenCLEngine:
         if scene.weights is not None:
             self._invert(self._total_weight(scene.weights))
 
-    def _upload_shears(self) -> None:
-        memory, layout, shears = self._memory, self.layout, self._shears
-        phases = [layout.pack_phases(each) for each in self.scene.rotations]
-        memory.upload_raw("row_phases", np.array(phases))
-        memory.upload_integers("column_shifts", np.array([each.column_wholes for each in shears]))
-        memory.upload("column_weights", np.array([each.column_weights for each in shears]))
-        block = self.program.tuning.block
-        memory.upload(
-            "image_weights", np.array([each.pack_image_weights(block) for each in shears])
-        )
-
-        for name in ("ratio_columns", "ratio_sums"):
-            memory.clear(name)  # where no row of a block was observed it stays so
-
-    def _laid(self, images: Iterable[Array]) -> Iterator[Array]:
-        """Yield images as they lie on the device: each row rotated by whole pixels, if turned."""
-        if not self._shears:
-            yield from images
-            return
-        for shears, image in zip(self._shears, images, strict=True):
-            yield shears.lay(image)
+    def _laid(self, images: Iterable[Array]) -> Iterable[Array]:
+        """Return images as they lie on the device."""
+        return self._turned.laid(images) if self._turned else images
 
     def take_images(self) -> None:
         """Take the images that the scene has now, all else being as it was; forget the record."""
@@ -388,7 +358,7 @@ class OpenCLEngine:
 
     def _total_weight(self, weights: NDArray) -> Array:
         """Return sum_j A_j^T w_j."""
-        if self.scene.oversample > 1 or self._shears:  # rfft_rows takes no such images
+        if self.scene.oversample > 1 or self._turned:  # rfft_rows takes no such images
             from lnocl.scene.forward_model import Model  # which loads scipy
 
             model = Model(self.scene)
@@ -428,11 +398,8 @@ class OpenCLEngine:
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
-        if self._shears:
-            for image in range(self.scene.n_images):
-                for launch in self._turned_ratio:
-                    launch.set(image=image)
-                    launch()
+        if self._turned:
+            self._turned.make_ratios()
         else:
             self._ratio()
         if self.scene.is_smoothed:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from lnocl.opencl.layout import reversed_order
 from lnocl.opencl.program import Program
 
+# Lines that a work-group of sample_lines makes, as in kernels/turn.cl.
+RUN = 16
 # Stars that a work-group of collect_sums sums up one after the other.
 STARS_A_GROUP = 16
 READ_WRITE = cl.mem_flags.READ_WRITE
@@ -158,6 +160,8 @@ class Launcher:
         """Return the number of work-groups that a kernel has work for."""
         if name == "collect_sums":
             return 1 + int(arguments["n_stars"]) // STARS_A_GROUP
+        if name == "sample_lines":
+            return int(arguments["parts"]) * int(arguments["lines"]) // RUN
         if name == "ratio_sheared":
             return int(arguments["image_blocks"])
         if name == "ratio_rows":

@@ -119,7 +119,7 @@ class Layout(PixelLayout):
 
     def __init__(self, program: Program) -> None:
         super().__init__(program, program.grid)
-        self.images = PixelLayout(program, program.image_grid)
+        self.images, self._program = PixelLayout(program, program.image_grid), program
         nx, block = program.grid[1], program.tuning.block
         self.spectra_shape = (nx // 2 // block, program.rows, 2, block)
         column = np.arange(1, nx // 2)
@@ -128,6 +128,13 @@ class Layout(PixelLayout):
         wavenumber = reversed_order(nx)[column + shift]
         self._conjugated = wavenumber > nx // 2
         self._kept = np.where(self._conjugated, nx - wavenumber, wavenumber)
+
+    @property
+    def columns_shape(self) -> tuple[int, int, int, int]:
+        """Shape of an image between the kernels of kernels/turn.cl: [PIECES][NX][2][PIECE]."""
+        (ny, nx), pairs = self.grid, self._program.column_pairs
+        pieces = ny // 2 // pairs
+        return pieces, nx, 2, self._program.columns_size // (pieces * nx * 2)
 
     @property
     def spectra_bytes(self) -> int:

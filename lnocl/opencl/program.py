@@ -22,7 +22,8 @@ from lnocl.opencl.faults import after_fault, build_failure
 from lnocl.opencl.sources import source
 from lnocl.opencl.tuning import Tuning, odd_part, tune
 from lnocl.process import LOCK, ignored_warnings
-from lnocl.scene.rotation import PHASE_ROWS, TAPS
+from lnocl.scene.line_weights import TAPS
+from lnocl.scene.rotation import PHASE_ROWS
 
 # Groups a compute unit that have a scratch in global memory, where groups have several work-items.
 GROUPS_A_UNIT = 4

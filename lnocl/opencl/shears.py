@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
-from lnocl.scene.rotation import TAPS, Rotation, whole_and_weights
+from lnocl.scene.line_weights import TAPS, whole_and_weights
+from lnocl.scene.rotation import Rotation
 
 
 class Shears:
@@ -27,6 +28,9 @@ class Shears:
         Those of the latter.
     roll : ndarray of int, shape (Ny,)
         Columns by which the rows of the image are rotated, for its whole pixels.
+    line_firsts, line_weights : ndarray of int and of float64, shapes (n,) and (n, TAPS)
+        For `sample_lines`, where the image's pixels are larger than the sky's: of rows, of columns,
+        and of their adjoints; else n is 0.
     """
 
     def __init__(self, rotation: Rotation) -> None:
@@ -34,6 +38,11 @@ class Shears:
         ny = rotation.grid[0]
         self.column_wholes = (wholes + TAPS // 2) % ny - TAPS + 1
         self.roll, self.image_weights = whole_and_weights(rotation.image_shifts)
+        samplings = rotation.samplings
+        firsts = [each.firsts for each in samplings] + [each.back_firsts for each in samplings]
+        weights = [each.weights for each in samplings] + [each.back_weights for each in samplings]
+        self.line_firsts = np.concatenate([np.zeros(0, int), *firsts])
+        self.line_weights = np.concatenate([np.zeros((0, TAPS)), *weights])
 
     def pack_image_weights(self, block: int) -> Array:
         """Return the weights of the third shear as the kernel has them, for blocks of row pairs."""

@@ -15,7 +15,7 @@ import pyopencl as cl
 from lnocl.errors import FileError, warn
 from lnocl.opencl import kernel_cache
 from lnocl.opencl.device import describe
-from lnocl.scene.rotation import TAPS
+from lnocl.scene.line_weights import TAPS
 
 FILE = "tunings.json"
 MAX_BYTES = 2**16

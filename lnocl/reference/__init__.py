@@ -12,7 +12,13 @@ from lnocl.reference.scale import scale_rows
 from lnocl.reference.smooth import smooth
 from lnocl.reference.step import gradient_rows, step_rows
 from lnocl.reference.sums import collect_sums
-from lnocl.reference.turn import irfft_sheared, ratio_sheared, rfft_sheared
+from lnocl.reference.turn import (
+    irfft_sheared,
+    ratio_sheared,
+    rfft_sheared,
+    sample_lines,
+    unshear_columns,
+)
 
 __all__ = [
     "collect_sums",
@@ -28,7 +34,9 @@ __all__ = [
     "ratio_sheared",
     "rfft_rows",
     "rfft_sheared",
+    "sample_lines",
     "scale_rows",
     "smooth",
     "step_rows",
+    "unshear_columns",
 ]

@@ -1,7 +1,7 @@
 """The second and third shear of images that are turned: the twins of kernels/turn.cl.
 
 The first is in the phases of `convolve_columns` and `correlate_columns`; `lnocl.scene.rotation` has
-all three.
+all three, and the steps of larger pixels.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lnocl.reference.ratio import compare
 from lnocl.reference.rows import ComplexArray, irfft_rows, rfft_rows
 from lnocl.scene.arrays import Array
-from lnocl.scene.rotation import shifted
+from lnocl.scene.line_weights import shifted
 
 
 def irfft_sheared(row_spectra: ComplexArray) -> Array:
@@ -52,7 +52,23 @@ def ratio_sheared(
 
 def rfft_sheared(sheared: Array, column_shifts: Array) -> ComplexArray:
     """Return the row spectra of pixels after the adjoint of the second shear."""
+    return rfft_rows(unshear_columns(sheared, column_shifts))
+
+
+def unshear_columns(sheared: Array, column_shifts: Array) -> Array:
+    """Return pixels after the adjoint of the second shear."""
     back = [
         shifted(each.T, shifts, -1).T for each, shifts in zip(sheared, column_shifts, strict=True)
     ]
-    return rfft_rows(np.array(back))
+    return np.array(back)
+
+
+def sample_lines(
+    lines: NDArray[Any], firsts: NDArray[np.int_], weights: Array, axis: int
+) -> NDArray[Any]:
+    """Return sums of lines along an axis, round its end: ``sum_k w_ik x(firsts_i + k)``."""
+    n, taps = weights.shape
+    places = (firsts[:, None] + np.arange(taps)) % lines.shape[axis]
+    matrix = np.zeros((n, lines.shape[axis]))
+    np.add.at(matrix, (np.arange(n)[:, None], places), weights)
+    return np.moveaxis(np.tensordot(matrix, lines, axes=(1, axis)), 0, axis)

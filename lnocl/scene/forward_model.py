@@ -12,7 +12,8 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
-from lnocl.scene.rotation import TAPS, Rotation
+from lnocl.scene.line_weights import TAPS
+from lnocl.scene.rotation import Rotation
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Cutout
 
@@ -62,7 +63,7 @@ class Model:
         self._window_otfs: dict[Any, NDArray[np.complex128]] = {}
         self._psfs = [scene.psf_cutout(j) for j in range(scene.n_images)]
         self.sums = np.array([psf.values.sum() for psf in self._psfs])
-        self._back_sums = self.sums / scene.oversample**2
+        self._back_sums = self.sums / scene.areas
         weights = np.ones((1, 1, 1)) if scene.weights is None else scene.weights
         if not weights.strides[0]:  # all images share them
             weights = weights[:1]
@@ -363,12 +364,14 @@ class LocalRotation:
         last = np.ceil(seen.max(axis=0) + margin).astype(int)
         self._shape = len(rows), len(columns)
         angle = scene.rotations[j].angle
-        sheared = len(columns) + abs(math.tan(angle / 2.0)) * len(rows) + TAPS
+        scale = scene.rotations[j].scale
+        slope = abs(math.tan(angle / 2.0))
+        sheared = scale * (len(columns) + slope * len(rows) + TAPS) + TAPS
         needed = np.maximum(last - first + 1, (math.ceil(sheared), len(rows)))
         nx, ny = (scipy.fft.next_fast_len(int(n), real=True) for n in needed)
         self.rows, self.columns = range(first[1], first[1] + ny), range(first[0], first[0] + nx)
         at = turn @ first + shift - (columns[0], rows[0])
-        rotation = Rotation(angle, at, (ny, nx), self._shape)
+        self._rotation = rotation = Rotation(angle, at, (ny, nx), self._shape, scale)
         self._otf = scipy.fft.rfft2(psf.on_grid((ny, nx))) * rotation.undone()
         self._phases, self._shears = rotation.row_phases(), rotation.matrix(self._shape)
 
@@ -376,12 +379,13 @@ class LocalRotation:
         """Return the window of the image, from that of the sky."""
         row_spectra = scipy.fft.ifft(self._otf * scipy.fft.rfft2(sky), axis=0)
         sheared = scipy.fft.irfft(row_spectra * self._phases, sky.shape[1], axis=1)
-        return np.asarray((self._shears @ sheared.ravel()).reshape(self._shape))
+        sampled = self._rotation.sampled(sheared)
+        return np.asarray((self._shears @ sampled.ravel()).reshape(self._shape))
 
     def adjoint(self, image: Array) -> Array:
         """Return the adjoint of `image`."""
         grid = len(self.rows), len(self.columns)
-        sheared = (self._shears.T @ image.ravel()).reshape(grid)
+        sheared = self._rotation.spread((self._shears.T @ image.ravel()).reshape(grid))
         row_spectra = scipy.fft.rfft(sheared, axis=1) * self._phases.conj()
         spectrum = self._otf.conj() * scipy.fft.fft(row_spectra, axis=0)
         return np.asarray(scipy.fft.irfft2(spectrum, grid))

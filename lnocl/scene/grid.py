@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from lnocl.errors import InputError, note
+from lnocl.scene.line_weights import TAPS
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import choose_pad
-from lnocl.scene.rotation import TAPS
+from lnocl.scene.rotation import PHASE_ROWS
 
 MAX_AXIS = 8192
 # Odd factors of an axis, and the least power of two beside them: a transform takes blocks of 8
@@ -63,21 +66,23 @@ def extent(observation: Observation) -> tuple[int, int]:
     """Return the shape of what holds the sky of images that are turned, and what it passes through.
 
     That is the frame of the sky, the corners of all images in it, and what two of the three shears
-    leave of them (`lnocl.scene.rotation.Rotation`).
+    leave of each (`lnocl.scene.rotation.Rotation`): a grid is a period, and rows and columns that
+    an image needs lie on one side of its ends. The ends of rows are those of a block of phases.
     """
-    ny, nx = observation.shape
     height, width = observation.sky_shape
-    frame = [(0.0, 0.0), (width - 1.0, height - 1.0)]
-    corners = np.array([(x, y) for x in (0.0, nx - 1.0) for y in (0.0, ny - 1.0)])
-    seen = [
-        np.linalg.solve(turn, (corners - shift).T).T
-        for turn, shift in zip(observation.turns, observation.offsets, strict=True)
-    ]
-    size = np.ptp(np.concatenate([frame, *seen]), axis=0)
-    angles = np.arctan2(observation.turns[:, 1, 0], observation.turns[:, 0, 0])
-    sheared = nx - 1.0 + float(abs(np.tan(angles / 2.0)).max()) * (ny - 1.0)
-    x, y = np.ceil([max(size[0], sheared), size[1]]).astype(int).tolist()
-    return max(y + 1 + TAPS, ny, LEAST_TURNED), max(x + 1 + TAPS, nx, LEAST_TURNED)
+    corners, needed = [np.array([(0.0, 0.0), (width - 1.0, height - 1.0)])], np.zeros(2)
+    for j, (turn, shift) in enumerate(zip(observation.turns, observation.offsets, strict=True)):
+        rows, columns = observation.good_box(j)
+        seen = np.array([(x, y) for x in (0, columns[-1]) for y in (0, rows[-1])])
+        corners.append(np.linalg.solve(turn, (seen - shift).T).T)
+        scale, slope = observation.scales[j], abs(math.tan(math.atan2(turn[1, 0], turn[0, 0]) / 2))
+        sheared = scale * (columns[-1] + slope * rows[-1])
+        taps = TAPS * (1.0 if scale == 1.0 else 1.0 + scale)
+        needed = np.maximum(needed, (sheared + taps, np.ptp(corners[-1][:, 1]) + taps + PHASE_ROWS))
+    size = np.maximum(np.ptp(np.concatenate(corners), axis=0) + TAPS, needed)
+    x, y = (np.ceil(size).astype(int) + 1).tolist()
+    ny, nx = observation.shape
+    return max(y, ny, LEAST_TURNED), max(x, nx, LEAST_TURNED)
 
 
 def length_for(n: int) -> int:

@@ -18,7 +18,7 @@ from lnocl.scene.cores import centre, off_centre, peak
 from lnocl.scene.psf_errors import check_modes, check_pixels
 from lnocl.scene.psf_field import PsfField, read_fields
 from lnocl.scene.shifting import place
-from lnocl.scene.transforms import Orientation, check_transforms, enlarged, rotation
+from lnocl.scene.transforms import Orientation, check_transforms, enlarged, of_one_shape, rotation
 from lnocl.scene.uncertainties import is_uncertainty, without_source
 
 PsfCentre = Literal["check", "fit", "given"]
@@ -43,6 +43,9 @@ LITTLE_OFF_CENTRE, FAR_OFF_CENTRE = 0.25, 0.8
 # 0.3 % at most. Those of five stars with noisy wings have up to 8 % (benchmarks/own_frame.py), and
 # give the same light as PSFs without that noise.
 MUCH_NEGATIVE = 0.1
+
+# Rotations may be so far from a scale of 1.
+ROUNDING = 1e-12
 
 # Attributes that hold a number for each image or for each pixel, and a number for each pixel of
 # PSFs that may be left out.
@@ -100,8 +103,11 @@ class Observation:
     transforms : array_like, shape (p, 2, 3), optional
         The map from the sky to each image, in place of `offsets`: a source at (x, y) in the sky is
         at ``transforms[j] @ (x, y, 1)`` in the image. It is a rotation by any angle, with or
-        without a flip, and a shift; `lnocl.rotations` makes those of field rotation. The sky is
-        turned in the model; no counts are resampled. PSFs are as the images show them.
+        without a flip, a scale and a shift; `lnocl.rotations` makes those of field rotation. Pixels
+        of an image are as large as the sky's, or larger by the inverse of the scale. The sky is
+        turned and sampled in the model; no counts are resampled. PSFs are as the images show them,
+        on their pixels, and hold what a pixel collects. Images, and PSFs, of several shapes may be
+        given as lists of arrays, and maps with them; bad pixels are added to smaller ones.
     epochs : array_like, shape (p,), optional
         The epoch of each image, such as its night: any labels. Stars have a flux in each epoch, the
         rest of the sky is common. By default all images are of one epoch.
@@ -152,7 +158,7 @@ class Observation:
     offsets : ndarray of float64, shape (p, 2)
         As given, or 0; with `transforms` their shifts.
     turns : ndarray of float64, shape (p, 2, 2)
-        The rotations and flips of `transforms`; without it those of no turn.
+        The rotations, flips and scales of `transforms`; without it those of no turn.
     epochs : ndarray of int, shape (p,)
         The number of each image's epoch, from 0 on, in the order of the labels.
     oversample : int
@@ -175,8 +181,8 @@ class Observation:
         - A PSF or its sum is not finite, its sum is not positive, or its core is off its centre.
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
-        - `transforms` are given beside `offsets`, `oversample` or PSFs that vary over the field, or
-          scale or shear the images by more than 0.05 pixels.
+        - `transforms` are given beside `offsets`, `oversample` or PSFs that vary over the field,
+          shear the images by more than 0.05 pixels, or are for pixels smaller than the sky's.
 
     Warns
     -----
@@ -229,6 +235,11 @@ class Observation:
         psf_modes: ArrayLike | None = None,
         psf_scatter: ArrayLike | None = None,
     ) -> None:
+        if transforms is not None:
+            images, psfs = of_one_shape(images, np.nan), of_one_shape(psfs, 0.0, True)
+            mask = of_one_shape(mask, True)
+            background, read_noise = of_one_shape(background), of_one_shape(read_noise)
+            exposure = of_one_shape(exposure)
         self.oversample = _check_oversample(oversample)
         self.effective_psfs = flag("effective_psfs", effective_psfs)
         has_exposure = exposure is not None
@@ -343,8 +354,23 @@ class Observation:
 
     @property
     def is_turned(self) -> bool:
-        """Whether any image is turned against the sky."""
+        """Whether any image is turned against the sky, or has other pixels."""
         return bool((self.turns != np.eye(2)).any())
+
+    @property
+    def scales(self) -> Array:
+        """Pixels of the sky to one of each image, along each axis, by `turns`; shape (p,)."""
+        scales = 1.0 / np.sqrt(abs(np.linalg.det(self.turns)))
+        return np.where(abs(scales - 1.0) < ROUNDING, 1.0, scales)
+
+    def good_box(self, j: int) -> tuple[range, range]:
+        """Return the rows and columns of image j that hold its good pixels; all if it has none."""
+        good = ~self.mask[j]
+        if not good.any():
+            return range(self.shape[0]), range(self.shape[1])
+        held = (np.flatnonzero(good.any(axis=axis)) for axis in (1, 0))
+        rows, columns = (range(int(at[0]), int(at[-1]) + 1) for at in held)
+        return rows, columns
 
     @property
     def transforms(self) -> Array:
@@ -395,7 +421,8 @@ class Observation:
             held[name].flags.writeable = False
         places = zip(orientations, self.offsets, strict=True)
         held["offsets"] = np.array([each.place(at, shape) for each, at in places])
-        held["turns"] = np.array([rotation(angle) for _, angle in nearest])
+        left = np.array([rotation(angle) for _, angle in nearest])
+        held["turns"] = left / self.scales[:, None, None]
         held["_orientations"] = orientations
         return other
 
@@ -666,7 +693,8 @@ class Observation:
         ):
             if is_given:
                 raise InputError(f"`transforms` are not taken beside {name}; give one of them")
-        exact = check_transforms(transforms, self.n_images, self.shape)
+        boxes = [self.good_box(j) for j in range(self.n_images)]
+        exact = check_transforms(transforms, [(rows, columns) for rows, columns in boxes])
         return exact[:, :, :2].copy(), exact[:, :, 2].copy()
 
     def _check_offsets(self, offsets: ArrayLike | None) -> Array:

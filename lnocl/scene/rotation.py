@@ -1,11 +1,10 @@
-r"""Images that are turned against the sky: rotation by three shears.
+r"""Images that are turned against the sky, or have larger pixels: rotation by three shears.
 
 A rotation by up to 45 degrees is a shear along x, one along y, and one along x (Unser, Thevenaz &
 Yaroslavsky, IEEE Trans. Image Process. 4, 1371, 1995, Eq. 3). The first is a phase in the spectrum
-of each row, and exact. Each of the others shifts whole lines by one fraction of a pixel, by six
-weights. What these weights do to a frequency is undone before, in the OTF, as a transform on
-unequal points does it (Barnett, Magland & af Klinteberg, SIAM J. Sci. Comput. 41, C479, 2019). So
-they are right to 5e-5 up to 0.3 cycles per pixel, and to 1.3e-4 at 0.35.
+of each row, and exact. Each of the others shifts whole lines by one fraction of a pixel
+(`lnocl.scene.line_weights`). After the first shear, which larger pixels change as little as a
+change of scale changes any rotation, lines are taken in the steps of these pixels.
 
 Quarter turns and flips are done by index.
 """
@@ -19,62 +18,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.line_weights import TAPS, LineSampling, shifted, undone, whole_and_weights
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-# Weights of a shift, and the parameter of their Kaiser-Bessel window: of the least error up to 0.35
-# cycles per pixel.
-TAPS = 6
-BETA = 11.75
 # Rows whose phases are products of two that are tabled: that of the first row of so many, and that
 # of a row among them.
 PHASE_ROWS = 16
 # Pixels round a PSF that is turned, in which its ringing dies out, and the step of its side.
 MARGIN, STEP = 16, 32
-# Fractions of a pixel, and frequencies, on which the window's own effect is averaged.
-FRACTIONS, FREQUENCIES = 64, 513
-
-
-def shift_weights(fractions: Array) -> Array:
-    """Return the weights, shape (..., TAPS), that shift a line by fractions of a pixel, 0 to 1.
-
-    Point i becomes ``sum_k w_k f(i - TAPS / 2 + 1 + k)``. Their sum is 1, so that flux is kept.
-    """
-    distance = np.asarray(fractions)[..., None] + (TAPS / 2 - 1 - np.arange(TAPS))
-    window = np.i0(BETA * np.sqrt(np.clip(1.0 - (2.0 * distance / TAPS) ** 2, 0.0, None)))
-    return np.asarray(window / window.sum(axis=-1, keepdims=True))
-
-
-def _own_effect() -> tuple[Array, Array]:
-    """Return frequencies, cycles per pixel, and by what the weights' effect on them is undone.
-
-    It is the factor of least mean squared error over all fractions of a pixel.
-    """
-    frequencies = np.linspace(0.0, 0.5, FREQUENCIES)
-    fractions = (np.arange(FRACTIONS) + 0.5) / FRACTIONS
-    places = np.arange(TAPS) - TAPS / 2 + 1 - fractions[:, None]
-    phases = np.exp(2j * np.pi * frequencies * places[..., None])
-    gains = np.einsum("ik,ikf->if", shift_weights(fractions), phases)
-    return frequencies, gains.real.mean(axis=0) / (abs(gains) ** 2).mean(axis=0)
-
-
-_EFFECT = _own_effect()
-
-
-def _undone(frequencies: Array) -> Array:
-    return np.interp(abs(frequencies), *_EFFECT)
 
 
 class Rotation:
     """The map from a convolved sky to an image that is turned against it, and its adjoint.
 
-    A source at x in the sky is at ``X = M x + t`` in the image, M a rotation. So the image is
-    ``g(X) = f(M^-1 (X - t))``. With ``p = tan(a / 2)`` and ``q = -sin a``,
+    A source at x in the sky is at ``X = M x / s + t`` in the image, M a rotation. So the image is
+    ``g(X) = f(s M^-1 (X - t))``. With ``w = x / s``, ``p = tan(a / 2)`` and ``q = -sin a``,
 
     - rows y of the sky are shifted by ``p y``;
-    - columns w of that by ``q w - t_y``, which gives the rows Y of the image;
+    - of rows and columns those in steps of s are taken: rows and columns w;
+    - columns w of that are shifted by ``q w - t_y``, which gives the rows Y of the image;
     - rows Y of that by ``p (Y - t_y) - t_x``.
+
+    With s > 1 fractions of t are in the steps, not in the shears.
 
     Parameters
     ----------
@@ -86,6 +53,8 @@ class Rotation:
         Shape (Ny, Nx) of both, periodic.
     shape : tuple of int
         Shape of the image at the grid's origin; pixels beyond it are of no use.
+    scale : float
+        s, pixels of the sky to one of the image along each axis, 1 or more.
 
     Attributes
     ----------
@@ -95,15 +64,24 @@ class Rotation:
         Of the second.
     image_shifts : ndarray of float64, shape (Ny,)
         Of the third.
+    samplings : tuple of LineSampling
+        Of rows, and of columns; empty where s is 1.
     """
 
     def __init__(
-        self, angle: float, shift: Array, grid: tuple[int, int], shape: tuple[int, int]
+        self,
+        angle: float,
+        shift: Array,
+        grid: tuple[int, int],
+        shape: tuple[int, int],
+        scale: float = 1.0,
     ) -> None:
-        self.angle, self.grid = angle, grid
+        self.angle, self.scale, self.grid = angle, scale, grid
         ny, nx = grid
         p, q = math.tan(angle / 2.0), -math.sin(angle)
-        (x, y), rows = shift, np.arange(ny)
+        whole = shift if scale == 1.0 else np.round(shift)
+        lag_x, lag_y = scale * (_turn(-angle) @ (shift - whole))
+        (x, y), rows = whole, np.arange(ny)
         self.image_shifts = p * (rows - y) - x
         # The columns, and the rows, that the image is made of lie in the middle of a period.
         height, width = shape
@@ -114,11 +92,19 @@ class Rotation:
         used = q * np.array(w) - y
         middle = float(used.mean() + (height - 1) / 2.0)
         self.phase_rows = math.gcd(ny, PHASE_ROWS)
-        self.row_shifts = p * _signed(ny, middle, self.phase_rows)
+        of_sky = _signed(ny, scale * middle - lag_y, self.phase_rows)
+        self.row_shifts = p * (of_sky + lag_y)
+        self.samplings: tuple[LineSampling, ...] = ()
+        if scale != 1.0:
+            along_x = _signed(nx, scale * sum(w) / 2.0 - lag_x, 1)
+            self.samplings = (
+                LineSampling(scale * _signed(ny, middle, 1) - lag_y, int(of_sky.min())),
+                LineSampling(scale * columns - lag_x, int(along_x.min())),
+            )
 
     def forward(self, sky: Array) -> Array:
         """Return the image of a sky convolved with `spectrum`, both of shape (Ny, Nx)."""
-        sheared = self._phased(sky, self.row_phases())
+        sheared = self.sampled(self._phased(sky, self.row_phases()))
         sheared = shifted(sheared.T, self.column_shifts, 1).T
         return shifted(sheared, self.image_shifts, 1)
 
@@ -126,7 +112,19 @@ class Rotation:
         """Return the adjoint of `forward`."""
         sheared = shifted(image, self.image_shifts, -1)
         sheared = shifted(sheared.T, self.column_shifts, -1).T
-        return self._phased(sheared, self.row_phases().conj())
+        return self._phased(self.spread(sheared), self.row_phases().conj())
+
+    def sampled(self, sheared: Array) -> Array:
+        """Return what the image's pixels have of a sky after its first shear."""
+        for axis, sampling in enumerate(self.samplings):
+            sheared = sampling.forward(sheared, axis)
+        return sheared
+
+    def spread(self, sheared: Array) -> Array:
+        """Return the adjoint of `sampled`."""
+        for axis, sampling in enumerate(self.samplings):
+            sheared = sampling.adjoint(sheared, axis)
+        return sheared
 
     def _phased(self, rows: Array, phases: NDArray[np.complex128]) -> Array:
         return np.fft.irfft(np.fft.rfft(rows, axis=1) * phases, self.grid[1], axis=1)
@@ -177,8 +175,18 @@ class Rotation:
         ny, nx = self.grid
         u, v = np.fft.rfftfreq(nx)[None, :], np.fft.fftfreq(ny)[:, None]
         along_y = v + math.tan(self.angle / 2.0) * u
+        effect = np.ones(along_y.shape)
+        for sampling, frequencies in zip(self.samplings, (along_y, u), strict=bool(self.samplings)):
+            effect *= undone(sampling.places, frequencies)
+        along_y, u = self.scale * along_y, self.scale * u
         along_x = u - math.sin(self.angle) * along_y
-        return _undone(along_y) * _undone(along_x)
+        effect *= undone(self.column_shifts, along_y) * undone(self.image_shifts, along_x)
+        return effect
+
+
+def _turn(angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s], [s, c]])
 
 
 def _signed(n: int, middle: float, step: int) -> Array:
@@ -190,33 +198,18 @@ def _signed(n: int, middle: float, step: int) -> Array:
     return np.asarray((np.arange(n) - first) % n + first, float)
 
 
-def whole_and_weights(shifts: Array) -> tuple[NDArray[np.int64], Array]:
-    """Return the whole pixels of shifts, shape (n,), and the weights of what is left."""
-    whole = np.floor(shifts)
-    return whole.astype(int), shift_weights(shifts - whole)
+def turned_psf(psf: Array, angle: float, scale: float = 1.0) -> Array:
+    """Return a PSF as the sky sees it, ``K'(u) = K(M u / s) / s^2``, with its centre at ``n // 2``.
 
-
-def shifted(rows: Array, shifts: Array, sign: int) -> Array:
-    """Return rows, each shifted round its end; the adjoint for a sign of -1."""
-    whole, weights = whole_and_weights(shifts)
-    n = rows.shape[1]
-    total = np.zeros_like(rows)
-    for k in range(TAPS):
-        places = np.arange(n) + sign * (whole[:, None] - TAPS // 2 + 1 + k)
-        total += weights[:, k, None] * np.take_along_axis(rows, places % n, axis=1)
-    return total
-
-
-def turned_psf(psf: Array, angle: float) -> Array:
-    """Return a PSF as the sky sees it, ``K'(u) = K(M u)``, with its centre at ``n // 2``.
-
-    It is turned by the phases of its rows and columns, exactly where it is limited to the
-    frequencies that its pixels can hold.
+    It is made finer, and turned, by the phases of its rows and columns: exactly where it is limited
+    to the frequencies that its pixels can hold.
     """
     n = STEP * math.ceil((math.hypot(*psf.shape) + 2 * MARGIN) / STEP)
-    y, x = (n // 2 - k // 2 for k in psf.shape)
     laid = np.zeros((n, n))
+    y, x = (n // 2 - k // 2 for k in psf.shape)
     laid[y : y + psf.shape[0], x : x + psf.shape[1]] = psf
+    if scale != 1.0:
+        laid, n = _finer(laid, scale), STEP * math.ceil(n * scale / STEP)
     places = np.arange(n) - n // 2
     along_x, along_y = -math.tan(angle / 2.0), math.sin(angle)
     for slope, axis in ((along_x, 1), (along_y, 0), (along_x, 1)):
@@ -224,3 +217,17 @@ def turned_psf(psf: Array, angle: float) -> Array:
         spectra = np.fft.rfft(laid, axis=axis) * (phases if axis else phases.T)
         laid = np.fft.irfft(spectra, n, axis=axis)
     return laid
+
+
+def _finer(psf: Array, scale: float) -> Array:
+    """Return a PSF about the middle of a square on pixels that are smaller by a factor."""
+    n = len(psf)
+    n_finer = STEP * math.ceil(n * scale / STEP)
+    places = (np.arange(n_finer) - n_finer // 2) / scale
+    frequencies = np.fft.fftfreq(n)
+    # Its place in the middle, and that the highest frequency has no sign.
+    waves = np.exp(2j * np.pi * np.outer(places + n // 2, frequencies)) / n / scale
+    if n % 2 == 0:
+        waves[:, n // 2] = np.cos(np.pi * (places + n // 2)) / n / scale
+    waves[abs(places) > n / 2] = 0.0  # beyond, it begins anew
+    return np.asarray((waves @ np.fft.fft2(psf) @ waves.T).real)

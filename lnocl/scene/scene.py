@@ -83,6 +83,8 @@ class Scene:
         Which images show a star: those of its epoch.
     rotations : list of Rotation
         How each image is turned against the sky; empty where none is.
+    areas : ndarray of float64, shape (p,)
+        Pixels of the sky to one of each image.
     scale : float
         Electrons per unit of the images.
     unit : float
@@ -151,6 +153,7 @@ class Scene:
         relative = exposure / self._mean_exposure
         self.gains = np.ones(self.n_images) if has_map else relative
         self._psfs = movable_psfs(self.scaled_psfs(), observation, self.image_grid)
+        self.areas = (self.oversample * observation.scales) ** 2
         self.rotations = self._rotations()
         self.weights = self._weigh(relative if has_map else None)
         self._field = self._place_stars(positions)
@@ -170,16 +173,23 @@ class Scene:
             return []
         angles = np.arctan2(observation.turns[:, 1, 0], observation.turns[:, 0, 0])
         return [
-            Rotation(float(angle), shift, self.grid, observation.shape)
-            for angle, shift in zip(angles, observation.offsets, strict=True)
+            Rotation(float(angle), shift, self.grid, self._ends(j), float(observation.scales[j]))
+            for j, (angle, shift) in enumerate(zip(angles, observation.offsets, strict=True))
         ]
 
+    def _ends(self, j: int) -> tuple[int, int]:
+        """Return the shape of what of image j, from its origin on, holds its good pixels."""
+        rows, columns = self.observation.good_box(j)
+        return rows.stop, columns.stop
+
     def psfs_of_sky(self) -> list[Array]:
-        """Return the PSFs as the sky sees them: turned back where images are turned."""
+        """Return the PSFs as the sky sees them, of unit sum: turned back, on the sky's pixels."""
         if not self.rotations:
             return list(self.observation.psfs)
         psfs = zip(self.observation.psfs, self.rotations, strict=True)
-        return [turned_psf(psf, rotation.angle) for psf, rotation in psfs]
+        turned = [turned_psf(psf, rotation.angle, rotation.scale) for psf, rotation in psfs]
+        n = max(map(len, turned))  # all sides are multiples of 4
+        return [np.pad(psf, (n - len(psf)) // 2) for psf in turned]
 
     @cached_property
     def _psfs_of_sky(self) -> list[MovablePsf]:
@@ -363,10 +373,11 @@ class Scene:
 
         Its value at a pixel of the sky is what a pixel of the image that begins there sees of a
         source at the origin. Without oversampling it is the PSF with its peak at the offset. For an
-        image that is turned it is the PSF turned back.
+        image that is turned it is the PSF turned back, as bright as the image's pixels are large.
         """
         if self.rotations:
-            return self._psfs_of_sky[j].at(0.0, 0.0)
+            cutout = self._psfs_of_sky[j].at(0.0, 0.0)
+            return cutout._replace(values=self.areas[j] * cutout.values)
         return self._psfs[j].response(*self.observation.offsets[j])
 
     def star_image(self, j: int, s: int) -> Array:
@@ -448,9 +459,9 @@ class Scene:
             weights = np.ones(self.image_grid) if self.weights is None else self.weights[j]
             counts += float((weights * image).sum())
             excess += float((weights * (image - background)).sum())
-            exposures += float(self.gains[j] * weights.sum())
+            exposures += float(self.areas[j] * self.gains[j] * weights.sum())
         noise = math.sqrt(counts / self.scale)
-        most = (BRIGHTER * max(excess, 0.0) + FLOOR * noise) / exposures / self.oversample**2
+        most = (BRIGHTER * max(excess, 0.0) + FLOOR * noise) / exposures
         with np.errstate(over="ignore"):
             mean = float(extended.mean())
         if mean <= most:
@@ -481,7 +492,7 @@ class Scene:
     @cached_property
     def _rough_fit(self) -> tuple[Array, float]:
         """Star fluxes and the level of a flat extended source, by linear least squares."""
-        total, n_observed = 0.0, 0
+        total, n_observed, n_seen = 0.0, 0, 0.0  # pixels of images, and of the sky
         normal: BandMatrix | None = None
         moment, levels = np.zeros(self.n_stars), []
         background = self.background()
@@ -491,6 +502,7 @@ class Scene:
             excess[~observed] = 0.0
             light, n_there = float(excess.sum()), int(np.count_nonzero(observed))
             total, n_observed = total + light, n_observed + n_there
+            n_seen += self.areas[j] * n_there
             if not (self.n_stars and n_there):
                 continue
             covered = self._field.covered(j)
@@ -505,8 +517,8 @@ class Scene:
         least = max(1e-3 * mean, float(np.finfo(np.float32).eps))
         best = moment if normal is None else _solve_beside(normal, np.array(levels).T, moment)
         fluxes = np.maximum(best, least * math.prod(self.image_grid) / 100)
-        level = mean - float(fluxes @ self.star_weights) / n_observed
-        return fluxes, max(level, least) / self.oversample**2
+        level = (total - float(fluxes @ self.star_weights)) / n_seen
+        return fluxes, max(level, least * n_observed / n_seen)
 
     def _weigh_stars(self, field: StarField) -> tuple[Array, NDArray[np.bool_]]:
         """Return ``sum_j <P_js, w_j>`` for each star, and whether any image observed it.

@@ -1,7 +1,9 @@
-"""Maps from the sky to its images: rotation, flip and shift; what of them is done by index."""
+"""Maps from the sky to its images: rotation, flip, scale, shift; what is done by index."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,12 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl.errors import InputError
 from lnocl.scene.arrays import Array, numbers
 
-# The farthest, pixels, that a map of an image may be from a rotation, with or without a flip.
+# The farthest, pixels, that a map of an image may be from a rotation or flip, and one scale.
 MAX_DISTORTION = 0.05
 # Angles that move no pixel of an image farther than this, pixels, are 0.
 MIN_MOVE = 1e-6
 
 # Quarter turns, and those of the flipped x axis.
+PLAIN = np.ndarray, np.ma.MaskedArray
+
 QUARTERS = [np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
 QUARTERS += [quarter @ np.diag([-1, 1]) for quarter in QUARTERS]
 
@@ -67,36 +71,48 @@ def rotation(angle: float) -> Array:
     return np.array([[c, -s], [s, c]])
 
 
-def check_transforms(transforms: ArrayLike, n_images: int, shape: tuple[int, int]) -> Array:
-    """Return maps of images, shape (p, 2, 3), made exact rotations, with or without a flip.
+def check_transforms(transforms: ArrayLike, boxes: Sequence[tuple[range, range]]) -> Array:
+    """Return maps of images, shape (p, 2, 3), made exact: rotation, flip, scale and shift.
+
+    Parameters
+    ----------
+    transforms : array_like
+        As given.
+    boxes : sequence of p pairs of range
+        The rows and the columns that hold each image.
 
     Raises
     ------
     InputError
-        They have the wrong shape, are not finite, or scale or shear the images.
+        They have the wrong shape, are not finite, shear an image, or ask of it for finer pixels
+        than the sky has.
     """
     given = numbers("transforms", transforms)
-    if given.shape != (n_images, 2, 3):
+    if given.shape != (len(boxes), 2, 3):
         raise InputError(
             f"`transforms` has shape {given.shape}; give 2 x 3 numbers for each of the "
-            f"{n_images} images"
+            f"{len(boxes)} images"
         )
     if not np.isfinite(given).all():
         raise InputError("`transforms` must be finite")
-    ny, nx = shape
-    middle = np.array([nx - 1, ny - 1]) / 2.0
     exact = given.copy()
-    for j, (linear, shift) in enumerate(zip(given[:, :, :2], given[:, :, 2], strict=True)):
-        u, scales, v = np.linalg.svd(linear)
-        farthest = float(abs(scales - 1.0).max() * np.hypot(*middle))
-        if farthest > MAX_DISTORTION:
+    for j, (each, (rows, columns)) in enumerate(zip(given, boxes, strict=True)):
+        linear, shift = each[:, :2], each[:, 2]
+        middle = np.array([columns[0] + columns[-1], rows[0] + rows[-1]]) / 2.0
+        reach = math.hypot(len(columns) - 1, len(rows) - 1) / 2.0
+        turn, scale, left = _nearest_similarity(linear, reach)
+        if left > MAX_DISTORTION:
             raise InputError(
-                f"`transforms[{j}]` scales or shears an image of {nx} x {ny} pixels by "
-                f"{farthest:.2g} pixels at its corners; {MAX_DISTORTION:g} are allowed: rotations, "
-                "flips and shifts alone are modelled, so bring the images to one pixel scale"
+                f"`transforms[{j}]` shears an image of {len(columns)} x {len(rows)} pixels by "
+                f"{left:.2g} pixels at its corners; {MAX_DISTORTION:g} are allowed: rotations, "
+                "flips, one scale and shifts are modelled"
             )
-        nearest = u @ v
-        nearest = _without_rounding(nearest, np.hypot(*middle))
+        if scale > 1.0:
+            raise InputError(
+                f"`transforms[{j}]` is for pixels of {1 / scale:.4g} of the sky's side; the sky's "
+                "must be the smallest: take those of this image, and divide all maps by their scale"
+            )
+        nearest = scale * _without_rounding(turn, reach)
         # The middle of the image stays where it is.
         at = np.linalg.solve(linear, middle - shift)
         moved = middle - nearest @ at
@@ -104,6 +120,19 @@ def check_transforms(transforms: ArrayLike, n_images: int, shape: tuple[int, int
         exact[j, :, :2] = nearest
         exact[j, :, 2] = np.where(abs(moved - whole) < MIN_MOVE, whole, moved)
     return exact
+
+
+def _nearest_similarity(linear: Array, reach: float) -> tuple[Array, float, float]:
+    """Return the nearest rotation or flip, its scale, and how far off it is at such a distance.
+
+    The scale is 1 where that moves nothing by more than `MAX_DISTORTION`.
+    """
+    u, stretches, v = np.linalg.svd(linear)
+    scale = math.sqrt(stretches[0] * stretches[1])
+    if abs(stretches - 1.0).max() * reach <= MAX_DISTORTION:
+        scale = 1.0
+    left = math.inf if scale == 0 else float(abs(stretches / scale - 1.0).max() * reach)
+    return u @ v, scale, left
 
 
 def _without_rounding(linear: Array, reach: float) -> Array:
@@ -171,6 +200,27 @@ class Orientation(NamedTuple):
         (is_y, is_x), (ny, nx) = self.reversed, shape
         x, y = nx - 1 - x if is_x else x, ny - 1 - y if is_y else y
         return np.array([y, x] if self.swaps else [x, y])
+
+
+def of_one_shape(values: Any, fill: float = 0.0, about_centre: bool = False) -> Any:
+    """Return two-dimensional arrays of several shapes as a stack; all else as it is.
+
+    Smaller ones get rows and columns at their ends, or about their centre ``n // 2``. These hold a
+    value, and are masked where that is not a number.
+    """
+    is_sequence = isinstance(values, (list, tuple))
+    if not is_sequence or any(type(each) not in PLAIN or each.ndim != 2 for each in values):
+        return values
+    if len({each.shape for each in values}) < 2:
+        return values
+    shape = np.max([each.shape for each in values], axis=0)
+    dtype = np.result_type(*values, np.min_scalar_type(fill))
+    stack = np.ma.array(np.full((len(values), *shape), fill, dtype), mask=np.isnan(fill))
+    for whole, each in zip(stack, values, strict=True):
+        corner = shape // 2 - np.array(each.shape) // 2 if about_centre else (0, 0)
+        rows, columns = (slice(at, at + n) for at, n in zip(corner, each.shape, strict=True))
+        whole[rows, columns] = each
+    return stack if stack.mask.any() else stack.data
 
 
 def enlarged(array: NDArray[Any], shape: tuple[int, int], fill: float = 0.0) -> NDArray[Any]:

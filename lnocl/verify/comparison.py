@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +20,7 @@ from lnocl.verify.harness import KernelHarness, rounded
 Pairs = Iterator[tuple[NDArray, NDArray]]
 
 # Kernels of images that are turned.
-SHEARED = "irfft_sheared", "ratio_sheared", "rfft_sheared"
+SHEARED = "irfft_sheared", "ratio_sheared", "rfft_sheared", "unshear_columns", "sample_lines"
 
 # Worst element over largest: three times what was measured over all cases of the tests on PoCL,
 # 3.3e-7 and 1.2e-15. With divisions and roots as far off as OpenCL allows it is 5.8e-7 in single.
@@ -258,6 +259,45 @@ def _run_rfft_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     yield harness.take_image_spectra(out, given.p), _real_edges(expected)
 
 
+def _run_unshear_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
+    shifts = np.array([each.column_shifts for each in given.rotations])
+    expected = reference.unshear_columns(given.sheared, shifts)
+    arrays = _put_columns(harness, given)
+    for j, pixels in enumerate(given.sheared):
+        out = harness.put(np.full(harness.program.columns_size, np.nan))
+        columns = harness.put(harness.pack_columns(pixels))
+        harness.launch("unshear_columns", image=j, columns=out, ratio_columns=columns, **arrays)
+        packed = harness.pack_columns(expected[j])
+        yield harness.take(out, packed.shape), packed
+
+
+def _run_sample_lines(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
+    shears, layout = given.shears[-1], harness.layout
+    firsts, weights = shears.line_firsts, shears.line_weights
+    tables = {"firsts": harness.put(firsts, np.int32), "weights": harness.put(weights)}
+    (ny, nx), lanes = harness.grid, harness.program.tuning.lanes
+
+    def run(given: cl.Buffer, shape: tuple[int, ...], lines: int, table: int, array: int) -> Any:
+        parts, stride, *rest = shape
+        numbers = {"parts": parts, "lines": lines, "stride": stride}
+        numbers |= {"length": math.prod(rest) // lanes, "table": table, "array": array}
+        out = harness.put(np.full(shape, np.nan))
+        harness.launch("sample_lines", sampled=out, given=given, **numbers, **tables)
+        return out
+
+    last, spectra = given.p - 1, harness.put_spectra(given.image_spectra)
+    for table in (0, ny + nx):
+        own = firsts[table : table + ny], weights[table : table + ny]
+        expected = reference.sample_lines(given.image_spectra[last], *own, 0)
+        found = run(spectra, layout.spectra_shape, ny, table, last)
+        yield harness.take_spectra(found)[0], _real_edges(expected)
+        own = firsts[table + ny : table + ny + nx], weights[table + ny : table + ny + nx]
+        packed = harness.pack_columns(reference.sample_lines(given.sheared[last], *own, 1))
+        columns = harness.put(harness.pack_columns(given.sheared[last]))
+        found = run(columns, layout.columns_shape, nx, table + ny, 0)
+        yield harness.take(found, packed.shape), packed
+
+
 def _take_star_sums(harness: KernelHarness, given: SimpleNamespace, sums: cl.Buffer) -> NDArray:
     """Return for each star the sum of the pairs that the blocks of its window left."""
     if not given.n:
@@ -455,6 +495,8 @@ KERNELS: dict[str, Callable[[KernelHarness, SimpleNamespace], Pairs]] = {
     "irfft_sheared": _run_irfft_sheared,
     "ratio_sheared": _run_ratio_sheared,
     "rfft_sheared": _run_rfft_sheared,
+    "unshear_columns": _run_unshear_columns,
+    "sample_lines": _run_sample_lines,
     "smooth": _run_smooth,
     "scale_rows": _run_scale_rows,
     "collect_sums": _run_collect_sums,

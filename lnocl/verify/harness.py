@@ -293,7 +293,9 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
     if harness.scene.get("has_turns"):
         shifts = rng.uniform(-3.0, 3.0, (p, 2)) * np.array(harness.grid[::-1])
         angles = np.linspace(-np.pi / 4, np.pi / 6, p)
-        rotations = [Rotation(a, at, image, image) for a, at in zip(angles, shifts, strict=True)]
+        scales = [1.0] * (p - 1) + [1.7]
+        each = zip(angles, shifts, scales, strict=True)
+        rotations = [Rotation(a, at, image, image, scale) for a, at, scale in each]
     return SimpleNamespace(
         p=p,
         n=n,

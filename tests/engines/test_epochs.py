@@ -52,7 +52,7 @@ def test_iterations_are_those_of_the_matrix(engine):
 
 @pytest.mark.parametrize(
     ("precision", "allowed"),
-    [("single", 1e-4), pytest.param("double", 3e-13, marks=pytest.mark.exhaustive)],
+    [("single", 2e-4), pytest.param("double", 3e-13, marks=pytest.mark.exhaustive)],
 )
 def test_engines_agree(precision, allowed):
     given = {"solver": "sgp", "n_iter": 30, **START}
