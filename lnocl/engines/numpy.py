@@ -127,20 +127,20 @@ class ReferenceEngine:
     def _ratio_turned(self, row_spectra: ComplexArray, observed: tuple[Any, ...]) -> None:
         """Make the ratios of images that are turned, in the steps of their pixels."""
         rotations = enumerate(self.scene.rotations)
-        sampled = [(j, *rotation.samplings) for j, rotation in rotations if rotation.samplings]
-        for j, rows, _ in sampled:
+        sampled = {j: rotation.samplings for j, rotation in rotations if rotation.samplings}
+        for j, (rows, _) in sampled.items():
             row_spectra[j] = rows.forward(row_spectra[j], 0)
         pixels = irfft_sheared(row_spectra)
-        for j, _, columns in sampled:
+        for j, (_, columns) in sampled.items():
             pixels[j] = columns.forward(pixels[j], 1)
         sheared, self._data_term, self._star_sums = ratio_sheared(
             pixels, self._column_shifts, self._image_shifts, *observed
         )
         back = unshear_columns(sheared, self._column_shifts)
-        for j, _, columns in sampled:
+        for j, (_, columns) in sampled.items():
             back[j] = columns.adjoint(back[j], 1)
         self._ratio_row_spectra = rfft_rows(back)
-        for j, rows, _ in sampled:
+        for j, (rows, _) in sampled.items():
             self._ratio_row_spectra[j] = rows.adjoint(self._ratio_row_spectra[j], 0)
 
     def correct(self) -> None:

@@ -16,6 +16,7 @@ from lnocl.io.headers import finer_cards, make_wcs, quiet_log, readable
 from lnocl.io.names import parse_name
 from lnocl.io.selection import choose, describe, find, has_pixels, name_of, only
 from lnocl.process import ignored_warnings
+from lnocl.scene.transforms import enlarged
 
 # A last axis that is so short, with longer ones before it, is none of pixels.
 MAX_CHANNELS = 4
@@ -41,11 +42,14 @@ class Stack(NamedTuple):
         Header of each file.
     sha256 : list of str
         SHA-256 checksum of each file, in hexadecimal.
+    shapes : list of tuple of int
+        Shape (ny, nx) of each image. Pixels beyond that of a smaller one are NaN.
     """
 
     data: NDArray[np.float64]
     headers: list[fits.Header]
     sha256: list[str]
+    shapes: list[tuple[int, int]]
 
     @property
     def header(self) -> fits.Header:
@@ -53,7 +57,7 @@ class Stack(NamedTuple):
         return self.headers[0]
 
 
-def read_stack(paths: Sequence[str]) -> Stack:
+def read_stack(paths: Sequence[str], may_differ: bool = False) -> Stack:
     """Read images: one FITS file each, or one file with a cube.
 
     The image of a file is the one named, as in ``FILE[SCI,1]`` (`lnocl.io.names`); else the
@@ -67,6 +71,8 @@ def read_stack(paths: Sequence[str]) -> Stack:
     paths : sequence of str
         One file with an image (ny, nx) or a cube (p, ny, nx), or p files with an image each; first
         axes of length 1 are left out.
+    may_differ : bool
+        Whether images in several files may have several shapes.
 
     Returns
     -------
@@ -89,12 +95,15 @@ def read_stack(paths: Sequence[str]) -> Stack:
     """
     images, headers, sha256 = zip(*(_read_file(path) for path in paths), strict=True)
     for path, image in zip(paths, images, strict=True):
-        _check_shape(path, image.shape, paths[0], images[0].shape, alone=len(paths) == 1)
+        expected = image.shape if may_differ else images[0].shape
+        _check_shape(path, image.shape, paths[0], expected, alone=len(paths) == 1)
     if images[0].ndim == 3 and len(images[0]) > 1:
         _refuse_colours(paths[0], str(headers[0].get("CTYPE3", "")).strip().upper())
-    ny, nx = images[0].shape[-2:]
-    data = images[0] if len(images) == 1 else np.stack(images)
-    return Stack(data.reshape(-1, ny, nx), list(headers), list(sha256))
+    planes = list(images[0].reshape(-1, *images[0].shape[-2:])) if len(images) == 1 else images
+    shapes = [(plane.shape[0], plane.shape[1]) for plane in planes]
+    shape = max(ny for ny, _ in shapes), max(nx for _, nx in shapes)
+    data = np.stack([enlarged(plane, shape, np.nan) for plane in planes])
+    return Stack(data, list(headers), list(sha256), shapes)
 
 
 def read_single(path: str) -> Stack:
@@ -149,6 +158,29 @@ def read_keyword(path: str, header: fits.Header, keyword: str) -> str | float | 
     with ignored_warnings(), open_fits(parse_name(path).file) as file:
         primary = readable(next(file.hdus()).header)
     return primary.get(keyword)
+
+
+def keyword_number(
+    stack: Stack, paths: Sequence[str], name: str, j: int, keyword: str, unit: str = ""
+) -> float | None:
+    """Return the number that a keyword has for image j of a stack, or None; log it by a name.
+
+    Raises
+    ------
+    InputError
+        It is no number.
+    """
+    of_file = min(j, len(paths) - 1)  # a cube has one header
+    path = paths[of_file]
+    value = read_keyword(path, stack.headers[of_file], keyword)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(
+            f"{keyword} of {path} is {value!r}, not a number; give `{name}` as a number"
+        )
+    note("`images[%d]`: %s %g%s, from %s", j, name.replace("_", " "), value, unit, keyword)
+    return float(value)
 
 
 class Contents(NamedTuple):

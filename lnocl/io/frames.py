@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -14,17 +13,24 @@ from numpy.typing import NDArray
 
 from lnocl.errors import InputError, counted, note, warn
 from lnocl.io import sky
-from lnocl.io.fitsread import read_contents, read_extension, read_keyword, read_stack
+from lnocl.io.fitsread import (
+    keyword_number,
+    read_contents,
+    read_extension,
+    read_keyword,
+    read_stack,
+)
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
 from lnocl.io.levels import is_rate, sky_level, sky_noise
 from lnocl.io.maps import Maps, Word
 from lnocl.io.names import ERR, PSF_ERRORS, parse_kind
 from lnocl.io.noise import NoiseMap, electrons_by_variance, read_noise_map
+from lnocl.io.places import read_epochs, read_places
 from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.arrays import Array
 from lnocl.scene.observation import OVERSAMPLES, Observation, PsfCentre
-from lnocl.scene.transforms import rotations
+from lnocl.scene.transforms import enlarged, of_one_shape
 
 Mask = NDArray[np.bool_]
 
@@ -67,7 +73,8 @@ class Calibration(NamedTuple):
         variance of their counts, such as JWST's ``"VAR_POISSON"``. Counts per time stay counts per
         time.
     align : {"wcs"}, optional
-        Offsets, rotations and flips from the headers' coordinates.
+        Offsets, rotations, flips and scales from the headers' coordinates; images, and PSFs, may
+        then have several shapes.
     angle : sequence of float or str
         Parallactic angles, degrees: one for each image, a keyword of the headers, or a file.
     epoch : sequence of float or str
@@ -111,7 +118,7 @@ class Frames(NamedTuple):
     observation : Observation
         In electrons; its sky per second where exposures were given.
     header : astropy.io.fits.Header
-        Header of the first image.
+        Header of the sky: that of the first image, or of the one with the smallest pixels.
     background, read_noise : list of Word
         As given, with the numbers of keywords, and those that ``"auto"`` found.
     sha256 : dict of str to list of str
@@ -168,12 +175,13 @@ class _Reader:
         self, images: Sequence[str], psfs: Sequence[str], calibration: Calibration
     ) -> None:
         self._paths, self._calibration = images, calibration
-        self._images = read_stack(images)
-        self._psfs = read_stack(psfs)
+        may_differ = calibration.align is not None
+        self._images = read_stack(images, may_differ)
+        self._psfs = read_stack(psfs, may_differ)
         self._grids = [read_grid(path) for path in psfs if is_grid(path)]
         if len(self._grids) not in (0, len(psfs)):
             raise InputError("give grids of PSFs for all images, or for none")
-        self._maps = Maps(self._images.data.shape)
+        self._maps = Maps(self._images.data.shape, self._images.shapes)
         self._background_errors = np.zeros(len(self._images.data))
         self._sha256: dict[str, list[str]] = {}
 
@@ -197,17 +205,20 @@ class _Reader:
         background = self._background(counts, mask)
         levels = self._without_sky(counts, background)
         read_noise = self._read_noise_words(counts, mask)
+        places = read_places(self._images, self._paths, self._calibration)
+        if places.sha256:
+            self._sha256["angle"] = places.sha256
         observation = Observation(
             counts,
-            self._grids or self._psfs.data,
+            self._grids or self._psf_stack(),
             background=self._maps.combine("background", levels),
             read_noise=self._maps.combine("read_noise", read_noise)
             if noise is None
             else noise.read_noise(counts, each, mask),
             mask=mask if mask.any() else None,
             exposure=1.0 if exposure is None else exposure,
-            **self._places(),
-            epochs=self._epochs(),
+            **places.maps,
+            epochs=read_epochs(self._images, self._paths, self._calibration.epoch),
             oversample=self._calibration.oversample,
             effective_psfs=self._calibration.effective_psfs,
             psf_centre=self._calibration.psf_centre,
@@ -225,7 +236,7 @@ class _Reader:
             name += "/s"
         return Frames(
             observation,
-            self._sky_header(),
+            places.header,
             background,
             read_noise,
             sha256,
@@ -234,6 +245,13 @@ class _Reader:
             self._gain,
             self._background_errors,
         )
+
+    def _psf_stack(self) -> Array:
+        """Return the PSFs in one shape, smaller ones in the middle of it."""
+        cut = [
+            psf[:ny, :nx] for psf, (ny, nx) in zip(self._psfs.data, self._psfs.shapes, strict=True)
+        ]
+        return np.asarray(of_one_shape(cut, 0.0, about_centre=True))
 
     def _psf_errors(self) -> dict[str, Any]:
         """Return the ideal PSFs, pupils, modes and scatter that were given."""
@@ -422,19 +440,7 @@ class _Reader:
         return self._maps.combine("exposure", self._maps.fill("exposure", words, seconds))
 
     def _from_header(self, name: str, j: int, keyword: str, unit: str = "") -> float | None:
-        """Return the number that a keyword has for image j, or None."""
-        of_file = min(j, len(self._paths) - 1)  # a cube has one header
-        path = self._paths[of_file]
-        value = read_keyword(path, self._images.headers[of_file], keyword)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise InputError(
-                f"{keyword} of {path} is {value!r}, not a number; give `{name}` as a number"
-            )
-        noted = name.replace("_", " ")
-        note("`images[%d]`: %s %g%s, from %s", j, noted, value, unit, keyword)
-        return float(value)
+        return keyword_number(self._images, self._paths, name, j, keyword, unit)
 
     @cached_property
     def _noise_map(self) -> NoiseMap | None:
@@ -445,12 +451,14 @@ class _Reader:
 
     def _mask(self, exposure: Array | None, noise: NoiseMap | None) -> Mask:
         """Return which pixels are bad, and log their number, each pixel for its first reason."""
-        masked = np.zeros(self._images.data.shape, bool)
+        beyond = self._beyond()
+        masked = beyond.copy()
         for why, bad in self._bad_pixels(exposure, noise):
             for j, count in enumerate((bad & ~masked).sum(axis=(1, 2))):
                 note("`images[%d]`: %s masked %s", j, counted(count, "pixel"), why)
             masked |= bad
-        for j, share in enumerate(masked.mean(axis=(1, 2))):
+        n_masked, n_pixels = ((~beyond & each).sum(axis=(1, 2)) for each in (masked, ~beyond))
+        for j, share in enumerate(n_masked / n_pixels):
             if share > MUCH_MASKED:
                 warn(
                     f"{100 * share:.0f} % of `images[{j}]` are masked: look at why, above; leave "
@@ -458,6 +466,13 @@ class _Reader:
                     "good"
                 )
         return masked
+
+    def _beyond(self) -> Mask:
+        """Return which pixels are beyond images that are smaller than others."""
+        beyond = np.ones(self._images.data.shape, bool)
+        for each, (ny, nx) in zip(beyond, self._images.shapes, strict=True):
+            each[:ny, :nx] = False
+        return beyond
 
     def _bad_pixels(
         self, exposure: Array | None, noise: NoiseMap | None
@@ -500,22 +515,22 @@ class _Reader:
 
     def _extensions(self, name: str, instead: str) -> Array:
         """Return the extensions of this name beside the images, shape (p, ny, nx)."""
-        images = self._images.data
-        # A file holds one image, or a cube of all images.
-        shapes = images.shape[1:], images.shape if len(self._paths) == 1 else images.shape[1:]
+        images, shapes = self._images.data, self._images.shapes
         found = []
-        for path in self._paths:
+        for path, shape in zip(self._paths, shapes, strict=False):
             values = read_extension(path, name)
             if values is None:
                 raise InputError(
                     f"{path} has no extension {name}; give `{instead}` as a file, or leave it out"
                 )
-            if values.shape not in shapes:
+            # A file holds one image, or a cube of all images.
+            of_cube = images.shape if len(self._paths) == 1 else shape
+            if values.shape not in (shape, of_cube):
                 raise InputError(
                     f"the extension {name} of {path} has the shape {values.shape}, its image "
-                    f"{shapes[-1]}; give `{instead}` as a file"
+                    f"{of_cube}; give `{instead}` as a file"
                 )
-            found.append(values)
+            found.append(enlarged(values, images.shape[1:]))
         return np.broadcast_to(np.array(found).reshape(-1, *images.shape[1:]), images.shape)
 
     def _background(self, counts: Array, mask: Mask) -> list[Word]:
@@ -557,120 +572,6 @@ class _Reader:
             return self._from_header("read_noise", j, word, " electrons")
 
         return self._maps.fill("read_noise", words, electrons)
-
-    def _places(self) -> dict[str, Array]:
-        """Return `offsets` or `transforms` of the images, where there are any."""
-        images, headers = self._images.data, self._images.headers
-        if self._calibration.angle:
-            return {"transforms": self._field_rotation()}
-        if self._calibration.align is None:
-            if len(headers) > 1 and all(map(sky.has_celestial, headers)):
-                self._warn_of_places()
-            return {}
-        if len(headers) != len(images):
-            raise InputError(
-                f"{self._paths[0]} is a cube, with one WCS for all its images; to align them give "
-                "a file for each"
-            )
-        found = sky.transforms(headers, self._paths, images.shape[1:])
-        is_turned = (found[:, :, :2] != np.eye(2)).any()
-        for j, (each, (dx, dy)) in enumerate(zip(found[1:], found[1:, :, 2], strict=True), 1):
-            if is_turned:
-                angle = sky.rotation_angle(each)
-                note("`images[%d]`: turned by %.3f degrees, from the WCS", j, angle)
-            else:
-                note("`images[%d]`: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
-        return {"transforms": found} if is_turned else {"offsets": found[:, :, 2]}
-
-    def _field_rotation(self) -> Array:
-        """Return the maps of images of the parallactic angles given, or of a file of these."""
-        calibration, (p, ny, nx) = self._calibration, self._images.data.shape
-        if calibration.align is not None:
-            raise InputError("give `angle` or `align`, not both: each has the rotation")
-        words = calibration.angle
-        if len(words) == 1 and isinstance(words[0], str) and os.path.isfile(words[0]):
-            angles, checksum = sky.read_angles(words[0])
-            self._sha256["angle"] = [checksum]
-        else:
-            if len(words) not in (1, p):
-                raise InputError(
-                    f"{counted(len(words), 'angle')} for {counted(p, 'image')}; give a keyword, a "
-                    "file of the angles, or one number for each image"
-                )
-            angles = np.array([self._angle(j, words[min(j, len(words) - 1)]) for j in range(p)])
-        if len(angles) != p:
-            raise InputError(f"{words[0]} has {len(angles)} angles for {counted(p, 'image')}")
-        centre = calibration.centre or (nx // 2, ny // 2)
-        # Field rotation turns north, and the sky with it, away from the y axis.
-        return rotations(-angles, centre)
-
-    def _sky_header(self) -> fits.Header:
-        """Return the header of the first image; with field rotation without coordinates."""
-        header = self._images.header
-        if self._calibration.angle:  # north is up in the sky alone
-            header = header.copy()
-            for keyword in ("CTYPE1", "CTYPE2"):
-                header.remove(keyword, ignore_missing=True)
-        return header
-
-    def _epochs(self) -> list[Any] | None:
-        """Return the label of each image's epoch, where there are several."""
-        words, p = self._calibration.epoch, len(self._images.data)
-        if not words:
-            return None
-        if len(words) == p > 1:
-            return list(words)
-        if len(words) > 1:
-            raise InputError(
-                f"{counted(len(words), 'epoch')} for {counted(p, 'image')}; give each, a keyword, "
-                "or a label for each image"
-            )
-        if words[0] == "each":
-            return list(range(p))
-        labels = []
-        for j in range(p):
-            of_file = min(j, len(self._paths) - 1)  # a cube has one header
-            path, header = self._paths[of_file], self._images.headers[of_file]
-            labels.append(read_keyword(path, header, str(words[0])))
-            if labels[-1] is None:
-                raise InputError(
-                    f"{path} has no {words[0]} in its header; give `epoch` each, another keyword, "
-                    "or a label for each image"
-                )
-        return [str(label) for label in labels]
-
-    def _angle(self, j: int, word: Word) -> float:
-        if isinstance(word, (int, float)):
-            return float(word)
-        found = self._from_header("angle", j, word, " degrees")
-        if found is None:
-            path = self._paths[min(j, len(self._paths) - 1)]
-            raise InputError(
-                f"{path} has no {word} in its header, and there is no such file; give `angle` as a "
-                "number, another keyword, or a file of the angles"
-            )
-        return found + 0.0  # no negative zero
-
-    def _warn_of_places(self) -> None:
-        """Warn of the first image that is not where the first is, by their coordinates."""
-        try:
-            found = sky.transforms(self._images.headers, self._paths, self._images.data.shape[1:])
-        except InputError as error:
-            warn(error.message)
-            return
-        for path, each in zip(self._paths, found, strict=True):
-            dx, dy = each[:, 2]
-            if (each[:, :2] != np.eye(2)).any():
-                where = f"is turned by {sky.rotation_angle(each):.2f} degrees against"
-            elif max(abs(dx), abs(dy)) > sky.MAX_OFFSET_VARIATION:
-                where = f"lies ({dx:.2f}, {dy:.2f}) pixels off"
-            else:
-                continue
-            warn(
-                f"{path} {where} {self._paths[0]}, by their sky coordinates: give `align` wcs, "
-                "unless their pixels were registered"
-            )
-            return
 
 
 def _have(n: int) -> str:

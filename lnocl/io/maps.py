@@ -12,6 +12,7 @@ from lnocl.io.fitsread import read_stack
 from lnocl.io.names import file_of
 from lnocl.scene import units
 from lnocl.scene.arrays import Array
+from lnocl.scene.transforms import enlarged
 
 Word = str | float
 
@@ -33,6 +34,8 @@ class Maps:
     ----------
     shape : tuple of int
         (p, ny, nx) of the images.
+    shapes : sequence of tuple of int
+        Of each of them, where some are smaller.
 
     Attributes
     ----------
@@ -40,8 +43,8 @@ class Maps:
         Checksums of the files read, by quantity.
     """
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self._shape = shape
+    def __init__(self, shape: tuple[int, int, int], shapes: Sequence[tuple[int, int]] = ()) -> None:
+        self._shape, self._shapes = shape, shapes or [(shape[1], shape[2])] * shape[0]
         self.sha256: dict[str, list[str]] = {}
 
     def fill(
@@ -122,9 +125,12 @@ class Maps:
         return np.broadcast_to(maps, self._shape)
 
     def _read(self, name: str, paths: Sequence[str], numbers: Sequence[int]) -> Array:
-        stack = read_stack(paths)
-        n, *shape = stack.data.shape
-        if tuple(shape) != self._shape[1:] or n not in numbers:
+        may_differ = len(set(self._shapes)) > 1
+        stack = read_stack(paths, may_differ)
+        n = len(stack.data)
+        is_each = n == self._shape[0] and stack.shapes == list(self._shapes)
+        is_one = set(stack.shapes) == {self._shape[1:]}
+        if not (is_each or is_one) or n not in numbers:
             raise InputError(
                 f"`{name}` {paths[0]} has the shape {stack.data.shape} and the images "
                 f"{self._shape}; give one map that fits all images, or one for each"
@@ -132,7 +138,10 @@ class Maps:
         self.sha256.setdefault(name, []).extend(stack.sha256)
         for path, header in zip(paths, stack.headers, strict=True):
             _refuse_other_unit(name, path, str(header.get("BUNIT", "")))
-        return stack.data
+        if not may_differ:
+            return stack.data
+        own = zip(stack.data, stack.shapes, strict=True)
+        return np.array([enlarged(each[:ny, :nx], self._shape[1:]) for each, (ny, nx) in own])
 
 
 def _refuse_other_unit(name: str, path: str, bunit: str) -> None:

@@ -398,58 +398,66 @@ def _check_votable(path: str, content: IO[bytes]) -> None:
 
 
 def transforms(
-    headers: Sequence[fits.Header], paths: Sequence[str], shape: tuple[int, int]
+    headers: Sequence[fits.Header], paths: Sequence[str], shapes: Sequence[tuple[int, int]]
 ) -> NDArray[np.float64]:
     """Return the map from the first image to each, shape (p, 2, 3), pixels.
 
     It is a shift, the mean over the image of ``pixel_j(sky(pixel_1)) - pixel_1``, where that is the
     same all over the image within a tenth of a pixel; else the nearest rotation, with or without a
-    flip, and shift.
+    flip, and shift; with a scale where that leaves more.
 
     Raises
     ------
     InputError
         An image without sky coordinates; one that shows another part of the sky than the first;
-        one that no rotation and shift brings within a tenth of a pixel, as it has another scale.
+        one that no rotation, scale and shift brings within a tenth of a pixel.
     """
     first, *others = (
         celestial_wcs(header, path, "leave align out")
         for header, path in zip(headers, paths, strict=True)
     )
     found = [np.eye(2, 3)]
-    for wcs, path in zip(others, paths[1:], strict=True):
-        found.append(_transform(first, wcs, paths[0], path, shape))
+    for wcs, path, shape in zip(others, paths[1:], shapes[1:], strict=True):
+        found.append(_transform(first, wcs, paths[0], path, shapes[0], shape))
     return np.array(found)
 
 
 def _transform(
-    first: WCS, wcs: WCS, first_path: str, path: str, shape: tuple[int, int]
+    first: WCS,
+    wcs: WCS,
+    first_path: str,
+    path: str,
+    first_shape: tuple[int, int],
+    shape: tuple[int, int],
 ) -> NDArray[np.float64]:
-    ny, nx = shape
+    (ny, nx), size = first_shape, np.array(shape[::-1])
     x, y = np.meshgrid(np.linspace(0, nx - 1, POINTS), np.linspace(0, ny - 1, POINTS))
     moved = _pixel_to(pixel_to_pixel, first, wcs, x, y)
-    change = moved - (x, y)
-    mean = change.mean(axis=(1, 2))
-    if not (abs(mean) < (nx, ny)).all():  # NaN is where a projection has no pixel
+    # NaN is where a projection has no pixel.
+    meets = np.isfinite(moved).all() and (moved.max(axis=(1, 2)) > -0.5).all()
+    if not (meets and (moved.min(axis=(1, 2)) < size - 0.5).all()):
         raise InputError(
             f"{path} shows another part of the sky than {first_path}, by its sky coordinates; "
             "leave one of them out"
         )
+    change = moved - (x, y)
+    mean = change.mean(axis=(1, 2))
     if abs(change - mean[:, None, None]).max() <= MAX_OFFSET_VARIATION:
         return np.column_stack([np.eye(2), mean])
     middle = np.array([nx - 1, ny - 1]) / 2.0
     points = np.array([x, y]).reshape(2, -1) - middle[:, None]
     there = moved.reshape(2, -1) - (middle + mean)[:, None]
-    u, _, v = np.linalg.svd(there @ points.T)
-    nearest = u @ v
-    left = abs(there - nearest @ points).max()
-    if left > MAX_OFFSET_VARIATION:
-        raise InputError(
-            f"{path} is {_describe_turn(moved, nx)} relative to {first_path}, and after rotation "
-            f"and shift pixels are up to {left:.2g} off: images are never resampled; give only "
-            "images of one scale, or reduce them to one"
-        )
-    return np.column_stack([nearest, middle + mean - nearest @ middle])
+    u, stretches, v = np.linalg.svd(there @ points.T)
+    for scale in (1.0, stretches.sum() / (points**2).sum()):
+        nearest = scale * (u @ v)
+        left = abs(there - nearest @ points).max()
+        if left <= MAX_OFFSET_VARIATION:
+            return np.column_stack([nearest, middle + mean - nearest @ middle])
+    raise InputError(
+        f"{path} is {_describe_turn(moved, nx)} relative to {first_path}, and after rotation, "
+        f"scale and shift pixels are up to {left:.2g} off: images are never resampled; cut them to "
+        "where it is less"
+    )
 
 
 def rotation_angle(transform: NDArray[np.float64]) -> float:

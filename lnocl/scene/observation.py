@@ -18,7 +18,14 @@ from lnocl.scene.cores import centre, off_centre, peak
 from lnocl.scene.psf_errors import check_modes, check_pixels
 from lnocl.scene.psf_field import PsfField, read_fields
 from lnocl.scene.shifting import place
-from lnocl.scene.transforms import Orientation, check_transforms, enlarged, of_one_shape, rotation
+from lnocl.scene.transforms import (
+    Orientation,
+    check_transforms,
+    enlarged,
+    of_one_shape,
+    rotation,
+    scale_of,
+)
 from lnocl.scene.uncertainties import is_uncertainty, without_source
 
 PsfCentre = Literal["check", "fit", "given"]
@@ -43,9 +50,6 @@ LITTLE_OFF_CENTRE, FAR_OFF_CENTRE = 0.25, 0.8
 # 0.3 % at most. Those of five stars with noisy wings have up to 8 % (benchmarks/own_frame.py), and
 # give the same light as PSFs without that noise.
 MUCH_NEGATIVE = 0.1
-
-# Rotations may be so far from a scale of 1.
-ROUNDING = 1e-12
 
 # Attributes that hold a number for each image or for each pixel, and a number for each pixel of
 # PSFs that may be left out.
@@ -360,8 +364,7 @@ class Observation:
     @property
     def scales(self) -> Array:
         """Pixels of the sky to one of each image, along each axis, by `turns`; shape (p,)."""
-        scales = 1.0 / np.sqrt(abs(np.linalg.det(self.turns)))
-        return np.where(abs(scales - 1.0) < ROUNDING, 1.0, scales)
+        return np.array([scale_of(turn) for turn in self.turns])
 
     def good_box(self, j: int) -> tuple[range, range]:
         """Return the rows and columns of image j that hold its good pixels; all if it has none."""

@@ -14,6 +14,8 @@ from lnocl.scene.arrays import Array, numbers
 
 # The farthest, pixels, that a map of an image may be from a rotation or flip, and one scale.
 MAX_DISTORTION = 0.05
+# Rotations may be so far from a scale of 1.
+ROUNDING = 1e-12
 # Angles that move no pixel of an image farther than this, pixels, are 0.
 MIN_MOVE = 1e-6
 
@@ -69,6 +71,21 @@ def rotation(angle: float) -> Array:
     """Return the matrix of a rotation by an angle, radians, from the x axis towards the y axis."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s], [s, c]])
+
+
+def scale_of(transform: Array) -> float:
+    """Return how many pixels of the sky, along each axis, are one of an image."""
+    scale = 1.0 / math.sqrt(abs(np.linalg.det(transform[:, :2])))
+    return 1.0 if abs(scale - 1.0) < ROUNDING else scale
+
+
+def relative_to(transforms: Array, first: int) -> Array:
+    """Return maps of images, shape (p, 2, 3), from one of these to all."""
+    linear, shift = transforms[:, :, :2], transforms[:, :, 2]
+    of_sky = linear @ np.linalg.inv(linear[first])
+    maps = np.concatenate([of_sky, (shift - of_sky @ shift[first])[:, :, None]], axis=2)
+    maps[first] = np.eye(2, 3)
+    return maps
 
 
 def check_transforms(transforms: ArrayLike, boxes: Sequence[tuple[range, range]]) -> Array:

@@ -58,6 +58,28 @@ def test_model_is_that_of_the_matrix(scene, maps):
     assert worst(counts[good], scenes_turned.means(maps=maps)[good]) <= 3e-4
 
 
+@pytest.mark.parametrize("scale", [1.0, 1.6])
+@pytest.mark.parametrize(("n", "degrees"), [(60, -33.0), (70, 20.0), (106, 45.0)])
+def test_corners_are_on_one_side_of_the_period(n, degrees, scale):
+    """What the corners of an image see of the sky is where the shears leave it."""
+    middle = (n - 1) / 2.0
+    maps = lnocl.rotations([0.0, degrees], (middle, middle))
+    maps[1] = np.column_stack([maps[1, :, :2] / scale, maps[1, :, 2] + (-5.1, -9.2)])
+    psf = scenes_turned.gaussian(*(np.indices((15, 15)) - 7), scenes_turned.COVARIANCES[0])
+    scene = Scene(lnocl.Observation(np.ones((2, n, n)), psf, transforms=maps))
+    ends = (0.0, middle, n - 1.0)
+    seen = np.array([(x, y) for x in ends for y in ends]) - maps[1, :, 2]
+    places = np.round(np.linalg.solve(maps[1, :, :2], seen.T).T).astype(int)
+    sky = np.zeros(scene.grid)
+    np.add.at(sky, tuple((places % scene.grid[::-1]).T[::-1]), 1.0)
+    y, x = np.indices((n, n))
+    expected = 0.0
+    for u, v in places @ maps[1, :, :2].T + maps[1, :, 2]:
+        expected = expected + scenes_turned.gaussian(y - v, x - u, scenes_turned.COVARIANCES[0])
+    found = Model(scene).forward(sky)[1, :n, :n]
+    assert worst(found, expected) <= 1e-3
+
+
 def test_model_and_its_adjoint(scene):
     rng = np.random.default_rng(3)
     model = Model(scene)

@@ -1,0 +1,188 @@
+"""Where images lie in the sky, from their headers; and the epochs that they are of."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from astropy.io import fits
+
+from lnocl.errors import InputError, counted, note, warn
+from lnocl.io import sky
+from lnocl.io.fitsread import Stack, keyword_number, read_keyword
+from lnocl.scene.arrays import Array
+from lnocl.scene.transforms import relative_to, rotations, scale_of
+
+if TYPE_CHECKING:
+    from lnocl.io.frames import Calibration
+    from lnocl.io.maps import Word
+
+
+class Places(NamedTuple):
+    """Where images lie.
+
+    Attributes
+    ----------
+    maps : dict of str to ndarray
+        `offsets` or `transforms`, where there are any.
+    header : astropy.io.fits.Header
+        That of the sky: of the image whose pixels it has; with field rotation without coordinates.
+    sha256 : list of str
+        Checksum of the file of angles, where there is one.
+    """
+
+    maps: dict[str, Array]
+    header: fits.Header
+    sha256: list[str]
+
+
+def read_places(stack: Stack, paths: Sequence[str], calibration: Calibration) -> Places:
+    """Return where images lie by `align` or `angle`; warn of what neither heeds.
+
+    Raises
+    ------
+    FileError, InputError
+        Both are given; a cube is to be aligned; coordinates or angles are missing, or unusable.
+    """
+    if calibration.angle:
+        if calibration.align is not None:
+            raise InputError("give `angle` or `align`, not both: each has the rotation")
+        transforms, sha256 = _field_rotation(stack, paths, calibration)
+        return Places({"transforms": transforms}, _without_coordinates(stack.header), sha256)
+    if calibration.align is None:
+        if len(stack.headers) > 1 and all(map(sky.has_celestial, stack.headers)):
+            _warn_of_places(stack, paths)
+        return Places({}, stack.header, [])
+    if len(stack.headers) != len(stack.data):
+        raise InputError(
+            f"{paths[0]} is a cube, with one WCS for all its images; to align them give a file for "
+            "each"
+        )
+    return _by_coordinates(stack, paths)
+
+
+def _by_coordinates(stack: Stack, paths: Sequence[str]) -> Places:
+    found = sky.transforms(stack.headers, paths, stack.shapes)
+    scales = [scale_of(each) for each in found]
+    finest = int(np.argmin(scales))
+    if scales[finest] < 1.0:
+        found = relative_to(found, finest)
+        note("the sky has the pixels of %s, the smallest: positions are in these", paths[finest])
+    else:
+        finest = 0
+    is_turned = (found[:, :, :2] != np.eye(2)).any()
+    for j, each in enumerate(found):
+        if j == finest:
+            continue
+        larger = f", pixels {scale:.4g} times as large" if (scale := scale_of(each)) > 1 else ""
+        if is_turned:
+            angle = sky.rotation_angle(each)
+            note("`images[%d]`: turned by %.3f degrees%s, from the WCS", j, angle, larger)
+        else:
+            dx, dy = each[:, 2]
+            note("`images[%d]`: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
+    maps = {"transforms": found} if is_turned else {"offsets": found[:, :, 2]}
+    return Places(maps, stack.headers[finest], [])
+
+
+def _field_rotation(
+    stack: Stack, paths: Sequence[str], calibration: Calibration
+) -> tuple[Array, list[str]]:
+    """Return the maps of images of the parallactic angles given, or of a file of these."""
+    words, (p, ny, nx) = calibration.angle, stack.data.shape
+    sha256 = list[str]()
+    if len(words) == 1 and isinstance(words[0], str) and os.path.isfile(words[0]):
+        angles, checksum = sky.read_angles(words[0])
+        sha256.append(checksum)
+    else:
+        if len(words) not in (1, p):
+            raise InputError(
+                f"{counted(len(words), 'angle')} for {counted(p, 'image')}; give a keyword, a "
+                "file of the angles, or one number for each image"
+            )
+        each = (words[min(j, len(words) - 1)] for j in range(p))
+        angles = np.array([_angle(stack, paths, j, word) for j, word in enumerate(each)])
+    if len(angles) != p:
+        raise InputError(f"{words[0]} has {len(angles)} angles for {counted(p, 'image')}")
+    centre = calibration.centre or (nx // 2, ny // 2)
+    # Field rotation turns north, and the sky with it, away from the y axis.
+    return rotations(-angles, centre), sha256
+
+
+def _angle(stack: Stack, paths: Sequence[str], j: int, word: Word) -> float:
+    if isinstance(word, (int, float)):
+        return float(word)
+    found = keyword_number(stack, paths, "angle", j, word, " degrees")
+    if found is None:
+        path = paths[min(j, len(paths) - 1)]
+        raise InputError(
+            f"{path} has no {word} in its header, and there is no such file; give `angle` as a "
+            "number, another keyword, or a file of the angles"
+        )
+    return found + 0.0  # no negative zero
+
+
+def _without_coordinates(header: fits.Header) -> fits.Header:
+    """Return the header of an image with field rotation: north is up in the sky alone."""
+    header = header.copy()
+    for keyword in ("CTYPE1", "CTYPE2"):
+        header.remove(keyword, ignore_missing=True)
+    return header
+
+
+def _warn_of_places(stack: Stack, paths: Sequence[str]) -> None:
+    """Warn of the first image that is not where the first is, by their coordinates."""
+    try:
+        found = sky.transforms(stack.headers, paths, stack.shapes)
+    except InputError as error:
+        warn(error.message)
+        return
+    for path, each in zip(paths, found, strict=True):
+        dx, dy = each[:, 2]
+        if scale_of(each) != 1.0:
+            where = f"has pixels {scale_of(each):.4g} times as large as"
+        elif (each[:, :2] != np.eye(2)).any():
+            where = f"is turned by {sky.rotation_angle(each):.2f} degrees against"
+        elif max(abs(dx), abs(dy)) > sky.MAX_OFFSET_VARIATION:
+            where = f"lies ({dx:.2f}, {dy:.2f}) pixels off"
+        else:
+            continue
+        warn(
+            f"{path} {where} {paths[0]}, by their sky coordinates: give `align` wcs, "
+            "unless their pixels were registered"
+        )
+        return
+
+
+def read_epochs(stack: Stack, paths: Sequence[str], words: Sequence[Word]) -> list[Any] | None:
+    """Return the label of each image's epoch, where there are several.
+
+    Raises
+    ------
+    InputError
+        There are too few or too many, or a header lacks the keyword.
+    """
+    p = len(stack.data)
+    if not words:
+        return None
+    if len(words) == p > 1:
+        return list(words)
+    if len(words) > 1:
+        raise InputError(
+            f"{counted(len(words), 'epoch')} for {counted(p, 'image')}; give each, a keyword, "
+            "or a label for each image"
+        )
+    if words[0] == "each":
+        return list(range(p))
+    labels = []
+    for j in range(p):
+        of_file = min(j, len(paths) - 1)  # a cube has one header
+        labels.append(read_keyword(paths[of_file], stack.headers[of_file], str(words[0])))
+        if labels[-1] is None:
+            raise InputError(
+                f"{paths[of_file]} has no {words[0]} in its header; give `epoch` each, another "
+                "keyword, or a label for each image"
+            )
+    return [str(label) for label in labels]
