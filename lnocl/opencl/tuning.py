@@ -136,7 +136,7 @@ def candidates(device: cl.Device, dtype: np.dtype) -> list[Tuning]:
         lanes = (n_bytes // dtype.itemsize for n_bytes in (32, 64))
         return [Tuning(n, n, scratch_blocks=2) for n in lanes]
     most = _power_of_2_up_to(device.max_work_group_size)
-    groups = dict.fromkeys(min(n, most) for n in (256, 128, 64))
+    groups = dict.fromkeys(min(n, most) for n in (256, 512, 128, 64))
     return [Tuning(1, block, group) for block in (8, 2) for group in groups]
 
 

@@ -108,8 +108,8 @@ def test_steps_lower_the_objective_to_one_minimum(engine):
     weights = (~made.mask).ravel()
     ratio = np.where(weights, made.images.ravel() / (made.matrix @ x + background) - 1.0, 0.0)
     gradient = -made.matrix.T @ ratio
-    # Measured 4.7e-4 and -0.002 at most, of ratios that scatter by 0.3.
-    assert abs(gradient @ x) / x.sum() < 1e-3
+    # Measured 4.7e-4 and -0.002 at most on CPUs, 1.3e-3 on a GPU, of ratios that scatter by 0.3.
+    assert abs(gradient @ x) / x.sum() < 3e-3
     assert gradient.min() > -0.006
 
 
