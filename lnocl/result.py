@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lnocl.errors import InputError
 from lnocl.notebook import html_card
+from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import ResultView, draw_result
 from lnocl.residuals import Fit, StarResiduals, judge, residuals
 from lnocl.runs.outcome import Outcome, PsfRefinement
@@ -769,4 +770,10 @@ def view_of(result: Result) -> ResultView:
         doubtful=None if result.psf_refinement is None else result.doubtful,
         unit=result._unit,
         oversample=observation.oversample,
+        light_curves=light_curves(
+            result.star_fluxes,
+            result.star_flux_errors,
+            np.tile(np.arange(observation.n_epochs), len(result.star_fluxes)),
+            result._unit,
+        ),
     )

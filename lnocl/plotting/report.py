@@ -24,6 +24,7 @@ from lnocl.plotting.result import (
     ResultView,
     brightest,
     draw_choice,
+    draw_light_curves,
     finer_slices,
     image_limits,
     worst_image,
@@ -190,8 +191,12 @@ def _palette(name: str) -> str:
 
 
 def _curve(view: ResultView) -> str:
-    figure = new_figure(8.5, 3.0)
-    draw_choice(figure.subplots(), view)
+    n = 2 if view.light_curves else 1
+    figure = new_figure(8.5, 3.0 * n)
+    axes = figure.subplots(n, squeeze=False)[:, 0]
+    draw_choice(axes[0], view)
+    if n > 1:
+        draw_light_curves(axes[1], view)
     with io.BytesIO() as stream:
         figure.savefig(stream, format="png", dpi=DPI, pil_kwargs={"optimize": True})
         return base64.b64encode(stream.getvalue()).decode("ascii")

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+from lnocl.plotting import light_curves
 from lnocl.plotting.figure import COLOUR_MAP, as_text, line_style, new_figure
+from lnocl.plotting.light_curves import LightCurves
 from lnocl.scene.arrays import Array
 
 # Stars that are shown enlarged, the brightest; more are not numbered from as many on.
@@ -64,6 +66,8 @@ class ResultView:
         Pixels of the extended source to one of the images, along each axis.
     turns : ndarray of float64, shape (p, 2, 2), or None
         Rotations and flips of the images; None where there are none.
+    light_curves : LightCurves or None
+        Of the stars, where there are several epochs.
     """
 
     extended: Array
@@ -80,6 +84,7 @@ class ResultView:
     unit: str = "electron"
     oversample: int = 1
     turns: Array | None = None
+    light_curves: LightCurves | None = None
 
     def place(self, j: int, position: Sequence[float]) -> tuple[float, float]:
         """Return where a position of the sky is in image j."""
@@ -151,7 +156,8 @@ def draw_result(view: ResultView) -> Figure:
     matplotlib.figure.Figure
         A row for the whole frame and one for each of the six brightest stars: image, model,
         residuals and extended source. With several images, each row shows that whose residuals are
-        largest there. Below them the errors that held-out counts estimate, or else the objective.
+        largest there. Below them the errors that held-out counts estimate, or else the objective;
+        and light curves of the stars where there are several epochs.
 
     Raises
     ------
@@ -164,8 +170,10 @@ def draw_result(view: ResultView) -> Figure:
     has_images = len(view.images) > 0
     shape = (len(regions), 4) if has_images else (-(-len(regions) // 4), min(len(regions), 4))
     height = PANEL * shape[0]
-    figure = new_figure(max(3.0 * shape[1], 6.0), height + CURVE_HEIGHT + 0.6)
-    parts: Any = figure.subfigures(2, 1, height_ratios=(height, CURVE_HEIGHT))
+    below = [draw_choice, *([draw_light_curves] if view.light_curves else [])]
+    heights = height, *(CURVE_HEIGHT for _ in below)
+    figure = new_figure(max(3.0 * shape[1], 6.0), sum(heights) + 0.6)
+    parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights)
     axes = parts[0].subplots(*shape, squeeze=False)
     if has_images:
         for row, region in zip(axes, regions, strict=True):
@@ -182,7 +190,8 @@ def draw_result(view: ResultView) -> Figure:
         axis.set_ylabel("y (pixels)", fontsize=9)
     if len(view.stars) > len(stars):
         parts[0].suptitle(f"enlarged: the {len(stars)} brightest of {len(view.stars)} stars")
-    draw_choice(parts[1].subplots(), view)
+    for part, draw in zip(parts[1:], below, strict=True):
+        draw(part.subplots(), view)
     return figure
 
 
@@ -343,6 +352,12 @@ def _mark_stars(axis: Axes, stars: Sequence[tuple[float, float]]) -> None:
             f"{s}", (left_of, below), (6, 6), textcoords="offset points", color="white", fontsize=8
         )
     axis.set(xlim=(left, right), ylim=(bottom, top))
+
+
+def draw_light_curves(axis: Axes, view: ResultView) -> None:
+    """Draw the light curves of a view that has some."""
+    if view.light_curves is not None:
+        light_curves.draw(axis, view.light_curves)
 
 
 def draw_choice(axis: Axes, view: ResultView) -> None:

@@ -14,6 +14,7 @@ from lnocl.io.fitserrors import read_errors
 from lnocl.io.saved_results import SavedResult, read_result
 from lnocl.plotting.beside import draw_beside
 from lnocl.plotting.figure import check_matplotlib, save_figure
+from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.profiles import draw_bands
 from lnocl.plotting.report import make_report
 from lnocl.plotting.result import ResultView, draw_result
@@ -134,7 +135,9 @@ def view_of(saved: SavedResult) -> ResultView:
     # Electrons, as images and models are, whatever the unit of the file.
     alone = f"1 {saved.header.get('BUNIT', '')}"
     # Of a star in several epochs the first.
-    first = saved.tables["STARS"].get("epoch", np.zeros(len(saved.stars))) == 0
+    table = saved.tables["STARS"]
+    epochs = table.get("epoch", np.zeros(len(saved.stars), int))
+    first = epochs == 0
     factor, _, unit = str(saved.header.get("ONEUNIT", alone)).partition(" ")
     return ResultView(
         extended=float(factor) * saved.extended,
@@ -151,6 +154,12 @@ def view_of(saved: SavedResult) -> ResultView:
         doubtful=saved.doubtful,
         unit=unit,
         oversample=q,
+        light_curves=light_curves(
+            saved.star_fluxes,
+            table.get("flux_error", np.full(len(epochs), np.nan)),
+            epochs,
+            str(saved.header.get("BUNIT", "")),
+        ),
     )
 
 

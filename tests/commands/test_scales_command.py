@@ -12,7 +12,7 @@ from lnocl.io.saved_results import read_result
 SCALE, DEGREES, BRIGHTER = 2.5, 8.0, 4.0
 SHARP, COARSE = 56, 24
 MIDDLE = np.array([(SHARP - 1) / 2.0] * 2)
-BLOB, STAR = MIDDLE + (8.3, -5.2), MIDDLE + (-6.4, 4.1)
+BLOB, STAR = np.add(MIDDLE, (8.3, -5.2)), np.add(MIDDLE, (-6.4, 4.1))
 # Covariances of the PSFs, pixels of their image.
 OF_SHARP, OF_COARSE = 1.6 * np.eye(2), np.array([[2.4, 0.3], [0.3, 1.8]])
 

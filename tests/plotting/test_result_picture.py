@@ -9,6 +9,7 @@ from result_views import make_view
 from scenes import Recipe
 
 from lnocl.io.saved_results import read_result
+from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import (
     MAX_SIGMA,
     MAX_ZOOMS,
@@ -118,6 +119,21 @@ def test_of_many_stars_the_brightest_are_enlarged():
     assert titles[1:] == [f"image, star {s}" for s in (1, 2, 3, 4, 5, 9)]
     assert len(titles) == 1 + MAX_ZOOMS
     assert "6 brightest of 9 stars" in figure.subfigs[0].get_suptitle()
+
+
+def test_light_curves_are_below():
+    fluxes = np.array([[9.0, 11.0, 10.0], [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+    table = fluxes.ravel(), np.full(9, 0.5), np.tile(np.arange(3), 3)
+    curves = light_curves(*table, "electron")
+    axis = draw_result(make_view(p=1, light_curves=curves)).subfigs[-1].axes[0]
+    assert axis.get_title() == "light curves"
+    drawn = [container.lines[0].get_ydata() for container in axis.containers]
+    np.testing.assert_allclose(drawn, [[0.9, 1.1, 1.0], [0.5, 1.0, 1.5]])  # one has no light
+    assert [text.get_text() for text in axis.get_legend().texts] == [
+        "star 1, mean 10 electron",
+        "star 3, mean 2 electron",
+    ]
+    assert light_curves(np.ones(2), np.ones(2), np.zeros(2, int), "") is None
 
 
 def test_stars_are_circled_in_image_and_source():
