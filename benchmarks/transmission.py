@@ -3,10 +3,10 @@
     python benchmarks/transmission.py [--output STEM]
 
 A mask in the focal plane dims the sky before the PSF blurs it: the image is ``K * (T f)``. lnocl
-has a map after the PSF, `exposure`: ``T (K * f)``. The mask is round,
-``T = (1 - (2 J1(x) / x)^2)^2``, as NIRCam's 335R is. The PSF is an Airy pattern,
-of a width of 1/12 to 1/3 of the radius at which T is 1/2. The table has the flux that a source of flux 1 then gets at some radii, by least squares in
-the noise of a background.
+has a map after the PSF, `exposure`: ``T (K * f)``. The mask is that of NIRCam's 335R,
+``(1 - (2 J1(x) / x)^2)^2``. The PSF is an Airy pattern, of a width of 1/12 to 1/3 of the radius at
+which T is 1/2. The table has the flux that a source of flux 1 then gets at some radii, by least
+squares in the noise of a background.
 """
 
 import argparse

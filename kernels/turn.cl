@@ -35,6 +35,9 @@ typedef vec unaligned_vec __attribute__((aligned(sizeof(real))));
 #define LOAD_UNALIGNED(p) (*(__global const unaligned_vec *)(p))
 #endif
 
+/* Reals that the columns of one image take. */
+#define COLUMNS_SIZE ((size_t)PIECES * NX * 2 * PIECE)
+
 INLINE size_t piece_start(const int piece, const int x)
 {
     return ((size_t)piece * NX + x) * 2 * PIECE;
@@ -127,16 +130,19 @@ INLINE void load_columns(
 }
 
 /* columns <- irfft_rows of the row spectra of an image.
- * spectra: n_images arrays, const; that of `image` is read. columns: one array, as above.
- * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.irfft_sheared.
+ * spectra: n_images arrays, const; `count` of them from `image` on are read. columns: as many, as
+ * above.
+ * Launch: up to count * ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.irfft_sheared.
  */
 KERNEL void irfft_sheared(
     __global real *restrict columns, __global const vec *restrict spectra, const int image,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const int count, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
-        read_tiles(z, spectra + (size_t)image * SPECTRA_SIZE, block);
+    FOR_EACH_BLOCK(unit, count * ROW_BLOCKS) {
+        const int block = unit % ROW_BLOCKS, place = unit / ROW_BLOCKS;
+        __global real *own = columns + place * COLUMNS_SIZE;
+        read_tiles(z, spectra + (size_t)(image + place) * SPECTRA_SIZE, block);
         dit_inner(z, NX, row_roots);
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
@@ -144,8 +150,8 @@ KERNEL void irfft_sheared(
             load_inverse(a, z + lane, x, NX, row_roots);
             UNROLL
             for (int q = 0; q < OUTER(NX); ++q) {
-                store_column(columns, q * INNER(NX) + x, 0, lane, block, a[q].re);
-                store_column(columns, q * INNER(NX) + x, 1, lane, block, a[q].im);
+                store_column(own, q * INNER(NX) + x, 0, lane, block, a[q].re);
+                store_column(own, q * INNER(NX) + x, 1, lane, block, a[q].im);
             }
         }
         BARRIER;
@@ -153,19 +159,19 @@ KERNEL void irfft_sheared(
 }
 
 /* The second and the third shear of `columns`, the ratio with the image, and the adjoint of the
- * third: as ratio_rows, whose arguments are the same, for one image.
- * columns, ratio_columns: one array each, in and out. column_shifts, column_weights: [n_images][NX],
+ * third: as ratio_rows, whose arguments are the same, for `count` images from `image` on.
+ * columns, ratio_columns: as many arrays each, in and out. column_shifts, column_weights: [n_images][NX],
  * whole pixels less TURN_TAPS / 2 - 1, and [n_images][NX][TURN_TAPS]. image_weights: n_images arrays
  * [IMAGE_ROW_BLOCKS][TURN_TAPS][2][BLOCK]. Blocks from image_blocks on have no observed row: what
  * they have in ratio_columns and the sums is left as it is, 0.
- * Launch: up to image_blocks groups. Out of place. Scratch: 2 TURN_POINTS.
+ * Launch: up to count * image_blocks groups. Out of place. Scratch: 2 TURN_POINTS.
  * Twin: reference.ratio_sheared.
  */
 KERNEL void ratio_sheared(
     __global real *restrict ratio_columns, __global const real *restrict columns,
     __global const int *restrict column_shifts, __global const real *restrict column_weights,
-    __global const vec *restrict image_weights, const int image, const int image_blocks,
-    __global real *restrict ratio_sums, __global real *restrict star_sums,
+    __global const vec *restrict image_weights, const int image, const int count,
+    const int image_blocks, __global real *restrict ratio_sums, __global real *restrict star_sums,
     __global const vec *restrict images, __global const real *restrict background,
     __global const vec *restrict exposure, __global const vec *restrict star_images,
     __global const int *restrict star_corners, __global const int *restrict star_near,
@@ -176,12 +182,13 @@ KERNEL void ratio_sheared(
     SCRATCH vec *sheared = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
     SCRATCH vec *wide = sheared + 2 * SIDE * TURN_POINTS;
     SCRATCH vec *z = wide + 2 * SIDE * TURN_MARGIN;
-    FOR_EACH_BLOCK(block, image_blocks) {
+    FOR_EACH_BLOCK(unit, count * image_blocks) {
+        const int block = unit % image_blocks, place = unit / image_blocks, turn = image + place;
         __global const vec *w =
-            image_weights + ((size_t)image * IMAGE_ROW_BLOCKS + block) * TURN_TAPS * 2 * SIDE;
+            image_weights + ((size_t)turn * IMAGE_ROW_BLOCKS + block) * TURN_TAPS * 2 * SIDE;
         load_columns(
-            sheared, columns, column_shifts + image * NX, column_weights + image * NX * TURN_TAPS,
-            block, 1, TURN_MARGIN);
+            sheared, columns + place * COLUMNS_SIZE, column_shifts + turn * NX,
+            column_weights + turn * NX * TURN_TAPS, block, 1, TURN_MARGIN);
         FOR_EACH(piece, NX / RUN * 2 * SIDE) {
             const int part = piece % (2 * SIDE), start = piece / (2 * SIDE) * RUN;
             vec own[TURN_TAPS];
@@ -199,7 +206,7 @@ KERNEL void ratio_sheared(
         BARRIER;
         compare(
             z, ratio_sums, star_sums, images, background, exposure, star_images, star_corners,
-            star_near, star_fluxes, n_images, star_blocks, star_columns, block, image, shared);
+            star_near, star_fluxes, n_images, star_blocks, star_columns, block, turn, shared);
         FOR_EACH(i, TURN_MARGIN * 2 * SIDE) {
             wide[i] = z[i + (NX - TURN_MARGIN) * 2 * SIDE];
             z[i + NX * 2 * SIDE] = z[i];
@@ -216,7 +223,9 @@ KERNEL void ratio_sheared(
                 UNROLL
                 for (int k = 0; k < TURN_TAPS; ++k)
                     total += own[k] * wide[(x + TURN_TAPS - 1 - k) * 2 * SIDE + part];
-                store_column(ratio_columns, x, part / SIDE, part % SIDE, block, total);
+                store_column(
+                    ratio_columns + place * COLUMNS_SIZE, x, part / SIDE, part % SIDE, block,
+                    total);
             }
         }
         BARRIER;
@@ -247,23 +256,25 @@ KERNEL void unshear_columns(
 }
 
 /* spectra <- rfft_rows of the columns of an image after the adjoint of the second shear.
- * spectra: n_images arrays; that of `image` is written, all of it but its padding. The rest as for
- * ratio_sheared, const.
- * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.rfft_sheared.
+ * spectra: n_images arrays; `count` of them from `image` on are written, all of them but their padding.
+ * The rest as for ratio_sheared, const.
+ * Launch: up to count * ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.rfft_sheared.
  */
 KERNEL void rfft_sheared(
     __global vec *restrict spectra, __global const real *restrict ratio_columns,
     __global const int *restrict column_shifts, __global const real *restrict column_weights,
-    const int image, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const int image, const int count, __global const real *restrict row_roots,
+    SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+    FOR_EACH_BLOCK(unit, count * ROW_BLOCKS) {
+        const int block = unit % ROW_BLOCKS, place = unit / ROW_BLOCKS, turn = image + place;
         load_columns(
-            z, ratio_columns, column_shifts + image * NX, column_weights + image * NX * TURN_TAPS,
-            block, -1, 0);
+            z, ratio_columns + place * COLUMNS_SIZE, column_shifts + turn * NX,
+            column_weights + turn * NX * TURN_TAPS, block, -1, 0);
         begin_rows(z, NX, row_roots);
         dif_inner(z, NX, row_roots);
-        write_tiles(spectra + (size_t)image * SPECTRA_SIZE, z, block, 1);
+        write_tiles(spectra + (size_t)turn * SPECTRA_SIZE, z, block, 1);
     }
 }
 

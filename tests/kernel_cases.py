@@ -65,7 +65,7 @@ CASES = {
     "turned, odd factors 3 and 5": ((48, 80), None, TURNED, "SD"),
     "turned, several vectors a block": ((64, 32), Tuning(4, 8), TURNED, "S"),
     "turned, several pieces a column": ((512, 16), None, TURNED, "SD"),
-    "turned, group": ((64, 96), Tuning(1, 8, group=4), TURNED, "S"),
+    "turned, group": ((64, 64), Tuning(1, 8, group=4), TURNED, "S"),
     "turned, blocks of 1": ((64, 32), Tuning(1, 1, group=4), TURNED, "S"),
     "turned, global scratch": ((64, 32), Tuning(4, 4, scratch_is_global=True), TURNED, "S"),
     "turned, GPU": ((512, 64), of_gpu(512, 64), TURNED, "S"),

@@ -163,7 +163,9 @@ class Launcher:
         if name == "sample_lines":
             return int(arguments["parts"]) * int(arguments["lines"]) // RUN
         if name == "ratio_sheared":
-            return int(arguments["image_blocks"])
+            return int(arguments["image_blocks"]) * int(arguments["count"])
+        if name in ("irfft_sheared", "rfft_sheared"):
+            return self.program.row_blocks * int(arguments["count"])
         if name == "ratio_rows":
             return self.program.image_row_blocks * int(arguments["n_images"])
         return self.program.column_blocks if name.endswith("_columns") else self.program.row_blocks

@@ -44,12 +44,31 @@ class TurnedImages:
         self.rolls = [each.roll for each in self.shears]
         # Lines of the tables of images of larger pixels.
         self._n_lines = sum(len(each.line_firsts) for each in self.shears)
+        self._runs = self._runs_of_images()
+
+    def _runs_of_images(self) -> list[tuple[int, int]]:
+        """Return first and number of images that are launched together.
+
+        On a CPU and where pixels are larger it is one, so that what one kernel leaves lies in the
+        cache for the next; else all in a row, which keep a GPU busy.
+        """
+        runs = list[tuple[int, int]]()
+        was_whole = False
+        for j, each in enumerate(self.shears):
+            is_whole = self._program.tuning.group > 1 and not len(each.line_firsts)
+            if is_whole and was_whole:
+                runs[-1] = runs[-1][0], runs[-1][1] + 1
+            else:
+                runs.append((j, 1))
+            was_whole = is_whole
+        return runs
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of the buffers, by the names that kernels have for them."""
         (ny, nx), p = self._program.grid, len(self.shears)
         item, n_lines = self._program.dtype.itemsize, self._n_lines
-        columns = self._program.columns_size * item
+        one = self._program.columns_size * item
+        columns = max(count for _, count in self._runs) * one
         n_phases = ny // self._program.phase_rows + self._program.phase_rows
         sizes = {
             "row_phases": p * n_phases * nx * item,
@@ -64,7 +83,7 @@ class TurnedImages:
         either = max(columns, self._layout.spectra_bytes)  # they hold spectra too
         return sizes | {
             "columns": either,
-            "sampled": either,
+            "sampled": max(one, self._layout.spectra_bytes),
             "firsts": n_lines * 4,
             "weights": n_lines * TAPS * item,
             "still_shifts": p * nx * 4,
@@ -98,7 +117,8 @@ class TurnedImages:
         """Bind the kernels; `bind` does so by a kernel's name to what all images share."""
         self._buffers, self._queue = memory.buffers, queue
         self._kernels = {
-            name: bind(name) for name in ("irfft_sheared", "ratio_sheared", "rfft_sheared")
+            name: bind(name, count=max(count for _, count in self._runs))
+            for name in ("irfft_sheared", "ratio_sheared", "rfft_sheared")
         }
         if self._n_lines:
             self._kernels["unshear_columns"] = bind("unshear_columns")
@@ -118,29 +138,30 @@ class TurnedImages:
     def make_ratios(self) -> None:
         """Make the ratios of all images."""
         table = 0
-        for image, shears in enumerate(self.shears):
-            if len(shears.line_firsts):
+        for image, count in self._runs:
+            if n_lines := len(self.shears[image].line_firsts):
                 self._make_sampled(image, table)
-                table += len(shears.line_firsts)
-            else:
-                self._launch("irfft_sheared", spectra="spectra", image=image)
-                self._launch("ratio_sheared", columns="columns", image=image)
-                self._launch(
-                    "rfft_sheared",
-                    ratio_columns="ratio_columns",
-                    column_shifts="column_shifts",
-                    column_weights="column_weights",
-                    image=image,
-                )
+                table += n_lines
+                continue
+            images = {"image": image, "count": count}
+            self._launch("irfft_sheared", spectra="spectra", **images)
+            self._launch("ratio_sheared", columns="columns", **images)
+            self._launch(
+                "rfft_sheared",
+                ratio_columns="ratio_columns",
+                column_shifts="column_shifts",
+                column_weights="column_weights",
+                **images,
+            )
 
     def _make_sampled(self, image: int, table: int) -> None:
         """Make the ratio of an image of larger pixels, whose tables begin at a line."""
         (ny, nx), rows, columns = self._program.grid, self._rows, self._columns
         back = table + ny + nx
         self._sample("spectra", table, rows, image)
-        self._launch("irfft_sheared", spectra="sampled", image=0)
+        self._launch("irfft_sheared", spectra="sampled", image=0, count=1)
         self._sample("columns", table + ny, columns)
-        self._launch("ratio_sheared", columns="sampled", image=image)
+        self._launch("ratio_sheared", columns="sampled", image=image, count=1)
         self._launch("unshear_columns", image=image)
         self._sample("columns", back + ny, columns)
         self._launch(
@@ -149,6 +170,7 @@ class TurnedImages:
             column_shifts="still_shifts",
             column_weights="still_weights",
             image=image,
+            count=1,
         )
         self._sample("spectra", back, rows, image)
         size, (spectra, sampled) = (

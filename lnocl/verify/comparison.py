@@ -198,13 +198,18 @@ def _put_observed(
     }
 
 
+def _two_launches(given: SimpleNamespace) -> list[tuple[int, int]]:
+    """Return first and number of images of a launch for one, and of another for the rest."""
+    return [(0, 1), (1, given.p - 1)]
+
+
 def _run_irfft_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     expected = reference.irfft_sheared(given.image_spectra)
-    out = harness.put(np.full(harness.program.columns_size, np.nan))
     spectra = harness.put_spectra(given.image_spectra)
-    for j, pixels in enumerate(expected):
-        harness.launch("irfft_sheared", columns=out, spectra=spectra, image=j)
-        packed = harness.pack_columns(pixels)
+    for first, count in _two_launches(given):
+        out = harness.put(np.full(count * harness.program.columns_size, np.nan))
+        harness.launch("irfft_sheared", columns=out, spectra=spectra, image=first, count=count)
+        packed = np.array([harness.pack_columns(each) for each in expected[first : first + count]])
         yield harness.take(out, packed.shape), packed
 
 
@@ -236,13 +241,15 @@ def _run_ratio_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     observed |= _put_columns(harness, given)
     block = harness.program.tuning.block
     weights = harness.put([each.pack_image_weights(block) for each in given.shears])
-    for j, pixels in enumerate(given.sheared):
-        out = harness.put(np.full(harness.program.columns_size, np.nan))
-        columns = harness.put(harness.pack_columns(pixels))
+    for first, count in _two_launches(given):
+        out = harness.put(np.full(count * harness.program.columns_size, np.nan))
+        some = slice(first, first + count)
+        columns = harness.put([harness.pack_columns(each) for each in given.sheared[some]])
         arrays = {"ratio_columns": out, "columns": columns, "image_weights": weights}
-        blocks = harness.program.image_row_blocks
-        harness.launch("ratio_sheared", image=j, image_blocks=blocks, **arrays, **observed)
-        packed = harness.pack_columns(back[j])
+        numbers = {"image": first, "count": count}
+        numbers["image_blocks"] = harness.program.image_row_blocks
+        harness.launch("ratio_sheared", **numbers, **arrays, **observed)
+        packed = np.array([harness.pack_columns(each) for each in back[some]])
         yield harness.take(out, packed.shape), packed
     yield harness.take_sums(observed["ratio_sums"], 1), np.array([objective])
     yield _take_star_sums(harness, given, observed["star_sums"]), star_sums
@@ -252,10 +259,11 @@ def _run_rfft_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     shifts = np.array([each.column_shifts for each in given.rotations])
     expected = reference.rfft_sheared(given.sheared, shifts)
     out = harness.put_spectra(np.full(given.image_spectra.shape, np.nan))
-    for j, pixels in enumerate(given.sheared):
-        columns = harness.put(harness.pack_columns(pixels))
-        arrays = {"spectra": out, "ratio_columns": columns}
-        harness.launch("rfft_sheared", image=j, **arrays, **_put_columns(harness, given))
+    for first, count in _two_launches(given):
+        sheared = given.sheared[first : first + count]
+        columns = harness.put([harness.pack_columns(each) for each in sheared])
+        arrays = {"spectra": out, "ratio_columns": columns, **_put_columns(harness, given)}
+        harness.launch("rfft_sheared", image=first, count=count, **arrays)
     yield harness.take_image_spectra(out, given.p), _real_edges(expected)
 
 

@@ -13,6 +13,8 @@ from scenes import FEWER_ENGINES, NUMPY_FIRST, make_psfs, paper, same, worst
 from turned_scenes import FLUXES, GRID, NX, NY, STARS, observation, psfs
 
 import lnocl
+from lnocl.engines.opencl import OpenCLEngine
+from lnocl.opencl.tuning import Tuning
 from lnocl.scene.forward_model import Model, model_images
 from lnocl.scene.scene import Scene
 from lnocl.scene.stars import MAX_SHIFT
@@ -138,6 +140,25 @@ def test_engines_agree(name, solver, precision, allowed):
     assert worst(found.extended, expected.extended) <= allowed
     assert worst(found.star_fluxes, expected.star_fluxes) <= allowed
     assert worst(found.history["objective"], expected.history["objective"]) <= allowed
+
+
+def test_images_that_are_launched_together(maps):
+    """A GPU has one launch for all images that are turned; those of larger pixels have their own.
+
+    The program is that of the case "turned, group" of tests/kernel_cases.py.
+    """
+    found = []
+    for tuning in (None, Tuning(1, 8, group=4)):
+        scene = Scene(observation(maps), STARS)
+        engine = OpenCLEngine(scene, "single", None, 20, tuning)
+        engine.start(*scene.start(None, None))
+        for _ in range(8):
+            engine.ratio()
+            engine.correct()
+            engine.scale()
+        found.append(engine)
+    assert worst(found[1].extended(), found[0].extended()) <= 3e-6
+    assert worst(found[1].objectives(), found[0].objectives()) <= 3e-6
 
 
 @pytest.mark.parametrize("engine", FEWER_ENGINES)
