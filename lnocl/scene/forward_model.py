@@ -350,6 +350,8 @@ class LocalRotation:
 
     Attributes
     ----------
+    shape : tuple of int
+        Of the window.
     rows, columns : range
         What of the sky's grid, round its edges, reaches the window.
     """
@@ -362,7 +364,7 @@ class LocalRotation:
         margin = np.array(psf.values.shape[::-1]) // 2 + TAPS
         first = np.floor(seen.min(axis=0) - margin).astype(int)
         last = np.ceil(seen.max(axis=0) + margin).astype(int)
-        self._shape = len(rows), len(columns)
+        self.shape = len(rows), len(columns)
         angle = scene.rotations[j].angle
         scale = scene.rotations[j].scale
         slope = abs(math.tan(angle / 2.0))
@@ -371,16 +373,16 @@ class LocalRotation:
         nx, ny = (scipy.fft.next_fast_len(int(n), real=True) for n in needed)
         self.rows, self.columns = range(first[1], first[1] + ny), range(first[0], first[0] + nx)
         at = turn @ first + shift - (columns[0], rows[0])
-        self._rotation = rotation = Rotation(angle, at, (ny, nx), self._shape, scale)
+        self._rotation = rotation = Rotation(angle, at, (ny, nx), self.shape, scale)
         self._otf = scipy.fft.rfft2(psf.on_grid((ny, nx))) * rotation.undone()
-        self._phases, self._shears = rotation.row_phases(), rotation.matrix(self._shape)
+        self._phases, self._shears = rotation.row_phases(), rotation.matrix(self.shape)
 
     def image(self, sky: Array) -> Array:
         """Return the window of the image, from that of the sky."""
         row_spectra = scipy.fft.ifft(self._otf * scipy.fft.rfft2(sky), axis=0)
         sheared = scipy.fft.irfft(row_spectra * self._phases, sky.shape[1], axis=1)
         sampled = self._rotation.sampled(sheared)
-        return np.asarray((self._shears @ sampled.ravel()).reshape(self._shape))
+        return np.asarray((self._shears @ sampled.ravel()).reshape(self.shape))
 
     def adjoint(self, image: Array) -> Array:
         """Return the adjoint of `image`."""

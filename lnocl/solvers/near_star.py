@@ -6,6 +6,7 @@ and positions of stars, and their errors, depend on no iteration.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from functools import cached_property
 from typing import NamedTuple
@@ -179,12 +180,15 @@ class NearStar:
             for local, grid, at in zip(locals_, grids, places, strict=True):
                 laid = np.zeros(grid)
                 laid[at] = sky
-                images.append(local.image(laid))
+                images.append(_padded(local.image(laid), window.shape))
             return np.array(images)
 
         def adjoint(images: Iterable[Array]) -> Array:
-            back = zip(locals_, places, images, strict=True)
-            return np.asarray(sum(local.adjoint(image)[at] for local, at, image in back))
+            back = (
+                local.adjoint(image[: local.shape[0], : local.shape[1]])[at]
+                for local, at, image in zip(locals_, places, images, strict=True)
+            )
+            return np.asarray(sum(back))
 
         return SourceError(forward, adjoint, amplitude, width)
 
@@ -199,6 +203,7 @@ class NearStar:
         there = _in_image(scene, j, self.window)
         counts, background, weights = _observed(scene, j, there)
         model, first = background.copy(), (there.y % grid[0], there.x % grid[1])
+        shape = self.window.shape
         add_to_window(model, scene, around.sky, around.star_fluxes, j, first)
         total = np.maximum(model, MIN_MODEL)
         precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
@@ -215,8 +220,10 @@ class NearStar:
                     slopes.append(_cut(slope, there, grid))
         n, k = self.n_held, len(slopes)
         unknowns = np.concatenate([lit, lit + n, lit + 2 * n]) if around.moves else lit
-        left = counts - total - beyond
-        return LinearImage(np.array(slopes).reshape(k, counts.size), unknowns, left, precision)
+        left = _padded(counts - total, shape) - beyond
+        laid = np.array([_padded(slope, shape) for slope in slopes])
+        precision = _padded(precision, shape)
+        return LinearImage(laid.reshape(k, left.size), unknowns, left, precision)
 
 
 def _texture_in(
@@ -263,11 +270,22 @@ def _observed(scene: Scene, j: int, there: Window) -> tuple[Array, Array, Array]
 
 
 def _in_image(scene: Scene, j: int, window: Window) -> Window:
-    """Return where the middle of a window of the sky is in image j, to the nearest pixel."""
-    middle = np.array([window.x + window.shape[1] // 2, window.y + window.shape[0] // 2])
-    moves = scene.observation.places(j, middle) - middle
-    dx, dy = np.round(moves).astype(int).tolist()
-    return window.moved(dx, dy)
+    """Return the pixels of image j round the middle of a window of the sky, as wide as that."""
+    height, width = window.shape
+    middle = np.array([window.x + width // 2, window.y + height // 2])
+    x, y = np.round(scene.observation.places(j, middle)).astype(int).tolist()
+    # Larger pixels are fewer.
+    ny, nx = (math.ceil(n / scene.observation.scales[j]) for n in window.shape)
+    return Window(y - ny // 2, x - nx // 2, (ny, nx))
+
+
+def _padded(image: Array, shape: tuple[int, int]) -> Array:
+    """Return the pixels of a window of an image in an array of the shape of the largest."""
+    if image.shape == shape:
+        return image
+    laid = np.zeros(shape)
+    laid[: image.shape[0], : image.shape[1]] = image
+    return laid
 
 
 def _window_round(scene: Scene, star: Array, resolution: float) -> Window:

@@ -18,6 +18,7 @@ from lnocl.opencl.tuning import Tuning
 from lnocl.scene.forward_model import Model, model_images
 from lnocl.scene.scene import Scene
 from lnocl.scene.stars import MAX_SHIFT
+from lnocl.solvers.marginal import marginal
 from lnocl.solvers.near_star import NearStar, Surroundings
 from lnocl.solvers.positions import StarFit, Stars
 
@@ -283,6 +284,34 @@ def test_errors_of_stars_are_those_of_images_that_are_not_turned():
         near = NearStar(around, 0, 1e-6)
         errors.append(np.sqrt(np.diag(near.fit.information)))
     assert worst(errors[0], errors[1]) <= 0.02
+
+
+@pytest.mark.parametrize(("degrees", "scale"), [(0.0, 5.6), (20.0, 4.0)])
+def test_stars_in_larger_pixels_are_marginal(degrees, scale):
+    """Where sky and fluxes are right, the step of stars leaves them, but for the texture's pull."""
+    n, side = 128, round(128 / scale)
+    turn = lnocl.rotations([degrees], (0, 0))[0, :, :2] / scale
+    transform = np.column_stack([turn, (side - 1) / 2 - turn @ [63.5, 63.5]])
+    star, blob, covariance = np.array([61.3, 66.8]), np.array([75.0, 60.0]), 2.2 * np.eye(2)
+    blurred = covariance + turn @ turn.T * 100.0  # a blob of 10 pixels of the sky
+    y, x = np.indices((side, side))
+    means = 20.0 * scale**2 + np.zeros((side, side))
+    for at, flux, width in ((star, 1e6, covariance), (blob, 1e6, blurred)):
+        u, v = turn @ at + transform[:, 2]
+        means += flux * scenes_turned.gaussian(x - u, y - v, width)
+    bad = np.arange(2)[:, None, None] < np.ones((1, n, n))  # the image that has the sky's pixels
+    given = lnocl.Observation(
+        [np.zeros((n, n)), means],
+        scenes_turned.gaussian(*(np.indices((21, 21)) - 10), covariance),
+        background=[0.0, 20.0 * scale**2],
+        transforms=np.array([np.eye(2, 3), transform]),
+        mask=[bad[0], np.zeros((side, side), bool)],
+    )
+    scene = Scene(given, [star])
+    y, x = np.indices(scene.grid)
+    sky = 1e6 * scenes_turned.gaussian(x - blob[0], y - blob[1], 100.0 * np.eye(2))
+    _, fluxes = marginal(scene, sky, np.array([1e6]))
+    assert fluxes == pytest.approx(1e6, rel=0.03)
 
 
 @pytest.mark.parametrize("engine", NUMPY_FIRST)
