@@ -34,6 +34,19 @@ chandra-sgra-pair astrostat/pylira 9348762a079fe040a7adcbdf0cab40ef04be14d1
     098ce23a4ba8e21a04cfac5c2f93987648b995735db9d6ed461559d6d7be9269
   7525 pylira/data/files/chandra-psf-obs-id-4684.fits.gz
     ff479843a47303a0f784456d1794cba301e64172f953f5bf75536a24a96dee9f
+hst-hsc-cosmos pmelchior/scarlet 998ca34cf7441bc372280302178de2568990babb
+  103680 data/test_resampling/Cut_HSC.fits
+    d54772cd0d3e79e794269e2cec7a6f5659d9295fc199328a125ebbc8b591fb2b
+  103680 data/test_resampling/Cut_HSC1.fits
+    110fcd8594402988cf5e2856d13eb99186fcb2f85dc94bb914d2446ec2e31790
+  253440 data/test_resampling/Cut_HST.fits
+    7d9cee2c99175489104567d4a52b8423b56ece3235ff8d9257008e502dfacbba
+  253440 data/test_resampling/Cut_HST1.fits
+    cbbee12490705aa54d80317a688e5d02f903fad6482ccbfba0f74274fc4514e7
+  43200 data/test_resampling/PSF_HSC.fits
+    de1206236ff9628829d26aa43eddf9aab49c0b3ff83eb689340d7aab43e1f454
+  262080 data/test_resampling/PSF_HST.fits
+    8d3a000d6871c74b4124389738a2f70345fa7e4d4bd7099d73b0b6e4aa86b379
 hst-lensed-quasar ajshajib/dolphin 4c2cbf2d7dbdc2afa2b9a8c95c290b38dc4d0822
   119352 io_directory_example/data/lensed_quasar/image_lensed_quasar_F814W.h5
     73ecf4ff0216a1c5b20578ccad7cc3aeaa794113f12af2e1fcc1a09981fcea5c
