@@ -592,6 +592,8 @@ class Scene:
         """
         if self.weights is None:
             light = field.shown.T.astype(np.float64)
+            if self.observation.n_epochs > 1:  # else a star is in all images, of mean exposure 1
+                light[:, : len(field.positions)] *= self.gains[:, None]
             # Samples of an effective PSF a pixel apart may sum to another number.
             if self.oversample > 1 and self.observation.effective_psfs:
                 sums = [[cutout.values.sum() for cutout in each] for each in field.cutouts]
