@@ -2,7 +2,7 @@ r"""Amounts of halos with the extended source not known, and their standard erro
 
 A sky that is positive and free follows the noise. It takes up the light above the lower envelope of
 the counts, which smooth halos lose: 2 to 8 % of them, with more iterations more. So after the last
-iteration halos take a step of Newton to where least squares have them,
+iteration halos take steps of Newton to where least squares have them,
 
 .. math:: a_{kj} \gets \max(a_{kj} + \Delta a_{kj}, 0),
 
@@ -34,6 +34,8 @@ from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
 # Conjugate gradients end at this share of the gradient, or after so many steps. The error of a
 # variance is of second order in it.
 FINISHED, N_STEPS = 0.02, 100
+# Steps at most; they end where all are less than this share of the noise of counts.
+STEPS, SETTLED = 4, 0.1
 # Images of a halo whose variances are computed.
 MOST_IMAGES = 4
 # More stars are taken as known, the faintest of them.
@@ -97,7 +99,7 @@ class _Joint:
 
 
 def marginal_halos(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array]:
-    """Return the extended source and the fluxes after that step, the stars held.
+    """Return the extended source and the fluxes after such steps, the stars held.
 
     Parameters
     ----------
@@ -108,16 +110,19 @@ def marginal_halos(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array,
     star_fluxes : ndarray of float64, shape (n_fluxes,)
         Those of stars and halos, electrons.
     """
-    model = Model(scene)
-    is_lit = _significant(scene, model, sky / scene.unit, star_fluxes / scene.unit)
-    joint = _Joint(scene, model, sky, star_fluxes, is_lit)
-    is_known = np.diag(joint.fit.information)[joint.first :] > 0
-    change = np.where(is_known, joint.change(), 0.0) * scene.unit
-    fluxes = star_fluxes.copy()
+    model, fluxes = Model(scene), star_fluxes.copy()
     halos = fluxes[scene.n_stars :]  # a view
-    change = np.maximum(change, -halos)
-    halos += change
-    return _without(scene, model, sky, np.append(np.zeros(scene.n_stars), change)), fluxes
+    for _ in range(STEPS):
+        is_lit = _significant(scene, model, sky / scene.unit, fluxes / scene.unit)
+        joint = _Joint(scene, model, sky, fluxes, is_lit)
+        information = np.diag(joint.fit.information)[joint.first :]
+        change = np.where(information > 0, joint.change(), 0.0) * scene.unit
+        change = np.maximum(change, -halos)
+        halos += change
+        sky = _without(scene, model, sky, np.append(np.zeros(scene.n_stars), change))
+        if (abs(change) * np.sqrt(information) < SETTLED * scene.unit).all():
+            break
+    return sky, fluxes
 
 
 def _significant(scene: Scene, model: Model, extended: Array, fluxes: Array) -> NDArray[np.bool_]:
