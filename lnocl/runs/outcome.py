@@ -244,9 +244,10 @@ class Outcome:
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of fluxes and positions, the extended source not known.
 
-        Fluxes are those of stars and halos. `lnocl.solvers.star_errors` has the equation. The relative error that the PSFs still have is
-        that of each flux too, added in quadrature. NaN for positions that were not fitted, and
-        where the images do not determine them.
+        Fluxes are those of stars and halos. `lnocl.solvers.star_errors` has the equation. The
+        relative error that the PSFs still have is that of each star's flux too, added in
+        quadrature. NaN for positions that were not fitted, and where the images do not determine
+        them.
 
         Warns
         -----

@@ -1,7 +1,7 @@
 r"""Amounts of halos with the extended source not known, and their standard errors.
 
 A sky that is positive and free follows the noise. It takes up the light above the lower envelope of
-the counts, which smooth halos lose: 2 to 8 % of them, with more iterations more. So after the last
+the counts, which smooth halos lose: 1 to 20 % of theirs, with more iterations more. So after the last
 iteration halos take steps of Newton to where least squares have them,
 
 .. math:: a_{kj} \gets \max(a_{kj} + \Delta a_{kj}, 0),
@@ -39,7 +39,7 @@ STEPS, SETTLED = 4, 0.1
 # Images of a halo whose variances are computed.
 MOST_IMAGES = 4
 # More stars are taken as known, the faintest of them.
-MOST_STARS = 16
+MOST_STARS = 4
 # The extended source is significant where its light in a resolution is so many times the noise, and
 # so many resolutions round it.
 SIGNIFICANT, ROUND = 7.0, 0.5
