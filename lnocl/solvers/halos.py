@@ -1,8 +1,8 @@
 r"""Amounts of halos with the extended source not known, and their standard errors.
 
 A sky that is positive and free follows the noise. It takes up the light above the lower envelope of
-the counts, which smooth halos lose: 1 to 20 % of theirs, with more iterations more. So after the last
-iteration halos take steps of Newton to where least squares have them,
+the counts, which smooth halos lose: 1 to 20 % of theirs, with more iterations more. So after the
+last iteration halos take steps of Newton to where least squares have them,
 
 .. math:: a_{kj} \gets \max(a_{kj} + \Delta a_{kj}, 0),
 
