@@ -135,7 +135,8 @@ def _significant(scene: Scene, model: Model, extended: Array, fluxes: Array) -> 
     width = resolution(scene)
     # The light in a resolution over its noise: both are nearly flat over one.
     smooth = gaussian_filter(extended, width / FWHM, mode="wrap")
-    precision = np.maximum(model.adjoint(precisions), 0.0)
+    # A pixel of an image has the noise of all pixels of the sky in it.
+    precision = scene.oversample**2 * np.maximum(model.adjoint(precisions), 0.0)
     area = 4.0 * np.pi * (width / FWHM) ** 2
     is_lit = smooth * np.sqrt(area * precision) > SIGNIFICANT
     return np.asarray(maximum_filter(is_lit, 2 * int(np.ceil(ROUND * width)) + 1, mode="wrap"))

@@ -307,3 +307,15 @@ def test_a_run_resumes_bit_for_bit(tmp_path, stop):
     other = given.replace(halos=given.halos[:, ::-1].copy())
     with pytest.raises(lnocl.InputError, match="halos differs"):
         lnocl.deconvolve(other, [STAR], resume=path, **options)
+
+
+def test_amounts_beside_a_finer_sky():
+    """Pixels of the sky share the noise of an image's, of which light is told from nothing."""
+    v, u = np.indices((39, 39)) - 19
+    psfs = np.exp(-(u**2 + v**2) / (8.0 * halo_scenes.WIDTHS[:, None, None] ** 2))
+    given = observation().images, psfs
+    finer = lnocl.Observation(*given, background=20.0, halos=halo_scenes.speckles(), oversample=2)
+    result = lnocl.deconvolve(finer, [STAR], engine="numpy")
+    assert (abs(result.halo_fluxes - AMOUNTS) <= 3.0 * result.halo_flux_errors).all()
+    flux, error = result.extended_flux
+    assert abs(flux - halo_scenes.BLOB) <= 4 * error
