@@ -258,7 +258,7 @@ class Result:
         """Standard errors of the amounts of halos, electrons, shape (n_halos, p).
 
         They follow from the joint Fisher information of halos, stars and the extended source
-        (`lnocl.solvers.halo_errors`), and are computed as `star_flux_errors` are. They are NaN
+        (`lnocl.solvers.halos`), and are computed as `star_flux_errors` are. They are NaN
         where the images do not determine an amount.
 
         Warns
