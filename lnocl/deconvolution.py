@@ -81,10 +81,11 @@ def deconvolve(
 
     for images :math:`g_j` of pixels n, with the models
 
-    .. math:: m_j = e_j \left( A_j f + \sum_s c_s P_{js} \right) + b_j .
+    .. math:: m_j = e_j \left( A_j f + \sum_s c_s P_{js} \right) + \sum_k a_{kj} H_{kj} + b_j .
 
     Here :math:`A_j` convolves with PSF j, and :math:`P_{js}` is the image of star s for flux 1. The
-    background is :math:`b_j`, and the exposure :math:`e_j`, by default 1. The weights μ and λ of
+    background is :math:`b_j`, and the exposure :math:`e_j`, by default 1. Halos :math:`H_{kj}`, if
+    any, have amounts :math:`a_{kj}` that are fitted in each image. The weights μ and λ of
     the penalties are `mu` and `smoothing`; the last sum is over pairs of neighbouring pixels. The
     sky may be finer than the images (``oversample`` of the observation). :math:`A_j` then sums over
     the pixels of the sky that a pixel of the image holds.
@@ -327,14 +328,19 @@ def deconvolve(
     observation = observation.upright()
     initial = read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
     Penalty(mu)  # a wrong weight is refused before any work
-    is_auto = isinstance(smoothing, str) and smoothing == "auto" and len(positions) > 0
+    is_auto = isinstance(smoothing, str) and smoothing == "auto"
+    has_halos = is_auto and len(observation.halos) > 0
+    is_auto = is_auto and len(positions) > 0
     is_auto = is_auto and not observation.psf_fields  # which are not judged
-    are_told_last = is_auto and (observation.is_turned or observation.n_epochs > 1)
+    reasons = {
+        "are turned against the sky": observation.is_turned,
+        "are of several epochs": observation.n_epochs > 1,
+        "have halos": len(observation.halos) > 0,
+    }
+    found = [reason for reason, holds in reasons.items() if holds]
+    are_told_last = is_auto and bool(found)
     if are_told_last:
-        note(
-            "PSFs are not judged before the run, as the images are %s",
-            "turned against the sky" if observation.is_turned else "of several epochs",
-        )
+        note("PSFs are not judged before the run, as the images %s", found[0])
         is_auto = False
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
     if observation.n_epochs > 1 and refine_positions is True:
@@ -342,9 +348,8 @@ def deconvolve(
             "`refine_positions` moves stars of one epoch alone; leave it out, or `epochs`"
         )
     moves = refine_positions if is_auto else refine_positions is True
-    setup = Setup(
-        observation, positions, pad, solver, precision, engine, device, moves is True, *initial
-    )
+    shared = observation, positions, pad, solver, precision, engine, device
+    setup = Setup(*shared, moves is True, *initial, settles_halos=has_halos)
     mended = Mended(setup)
     if is_auto or families or len(observation.psf_scatter):
         is_asked = bool(families) and not isinstance(refine_psfs, str)
@@ -370,9 +375,10 @@ def deconvolve(
         is_fit = not any(star.is_misfit for star in outcome.star_residuals())
     else:
         is_fit = is_auto and mended.fits
-    if is_fit:
-        with _quietly(), Progress(None, "", bool(progress), "fitting star fluxes", stays=False):
-            outcome = outcome.marginal()
+    if is_fit or has_halos:
+        what = "fitting stars and halos" if has_halos else "fitting star fluxes"
+        with _quietly(), Progress(None, "", bool(progress), what, stays=False):
+            outcome = outcome.marginal(is_fit, has_halos)
     return make_result(replace(outcome, psf_refinement=mended.refinement))
 
 
@@ -420,6 +426,10 @@ def reconstruct(
     with _quietly():
         with Progress(None, "", bool(progress), "measuring steps", stays=False):
             start = make_start(setup, penalties[0])
+            if setup.settles_halos:
+                from lnocl.runs.halos import settle_halos  # which loads scipy
+
+                start = settle_halos(start)
         warn_of_noise(setup.observation)
         warn_of_stars(start.scene, setup.refine_positions)
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes

@@ -225,7 +225,8 @@ def judge_stars(scene: Scene, sky: Array, star_fluxes: Array) -> list[StarResidu
     width = min(fwhm(psf) for psf in scene.observation.psfs) if scene.n_stars else 0.0
     psfs = seen_psfs(scene.observation) if scene.n_stars else np.zeros((0, 0, 0))
     on_pixels = on_sky(scene.stars, scene.oversample)
-    stars = zip(scene.stars, on_pixels, star_fluxes, scene.shown, strict=True)
+    n = scene.n_stars
+    stars = zip(scene.stars, on_pixels, star_fluxes[:n], scene.shown[:n], strict=True)
     for position, on_pixel, flux, shown in stars:
         core, wings = Fit(), Fit()
         for j in np.flatnonzero(shown).tolist():

@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 # Stars that a notebook lists.
 MAX_LISTED = 10
 
+HALOS_DTYPE = np.dtype(
+    [("halo", np.int64), ("image", np.int64), ("flux", np.float64), ("flux_error", np.float64)]
+)
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
 
@@ -42,7 +45,7 @@ class Iterating(Protocol):
         """Return the extended source, electrons per pixel, shape (ny, nx)."""
 
     def star_fluxes(self) -> Array:
-        """Return the star fluxes, electrons."""
+        """Return the fluxes of stars, and then of halos, electrons."""
 
     def star_positions(self) -> Array:
         """Return the star positions, pixels, shape (n, 2)."""
@@ -59,7 +62,10 @@ class Findings(Protocol):
         """Yield the m_j, electrons per pixel, shape (ny, nx)."""
 
     def star_errors(self) -> tuple[Array, Array]:
-        """Return the standard errors of star fluxes and positions."""
+        """Return the standard errors of the fluxes of stars and halos, and of positions."""
+
+    def of_halos(self, fluxes: Array) -> Array:
+        """Return those of fluxes that are of halos, electrons of each image, shape (n_halos, p)."""
 
     def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
         """Return the light of the extended source and its standard error, electrons."""
@@ -110,7 +116,8 @@ class Estimate:
     @cached_property
     def star_fluxes(self) -> Array:
         """Star fluxes, electrons, shape (n,)."""
-        return self._live().star_fluxes()
+        run = self._live()
+        return run.star_fluxes()[: len(run.star_positions())]
 
     @cached_property
     def star_positions(self) -> Array:
@@ -174,6 +181,9 @@ class Result:
     psf_refinement : PsfRefinement or None
         The outcome for PSFs that were to be refined, or whose scatter was given
         (`lnocl.runs.outcome.PsfRefinement`); None without either.
+    halo_fluxes : ndarray of float64, shape (n_halos, p)
+        The amounts of the observation's `halos` in each image: electrons on its good pixels, not
+        per exposure.
 
     See Also
     --------
@@ -206,6 +216,7 @@ class Result:
     smoothing: float
     held_out: NDArray[np.void]
     psf_refinement: PsfRefinement | None
+    halo_fluxes: Array
     _findings: Findings = field(repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -241,7 +252,38 @@ class Result:
         >>> bool(32 < result.star_flux_errors[0] < 100)
         True
         """
-        return self._star_errors[0]
+        return self._star_errors[0][: len(self.star_fluxes)]
+
+    @property
+    def halo_flux_errors(self) -> Array:
+        """Standard errors of the amounts of halos, electrons, shape (n_halos, p).
+
+        They follow from the joint Fisher information of halos, stars and the extended source
+        (`lnocl.solvers.halos`), and are computed as `star_flux_errors` are. They are NaN
+        where the images do not determine an amount.
+
+        Warns
+        -----
+        LnoclWarning
+            The images do not determine the amount of a halo.
+
+        Examples
+        --------
+        A halo of 40000 electrons of which the shape is known:
+
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((32, 32)) - 16
+        >>> halo = 1 / (1 + np.hypot(x, y))
+        >>> counts = np.random.default_rng(0).poisson(40000 * halo / halo.sum() + 2)
+        >>> observation = lnocl.Observation(counts, np.ones((5, 5)), background=2, halos=halo)
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
+        >>> bool(abs(result.halo_fluxes[0, 0] - 40000) < 3 * result.halo_flux_errors[0, 0])
+        True
+        >>> bool(190 < result.halo_flux_errors[0, 0] < 400)
+        True
+        """
+        return self._findings.of_halos(self._star_errors[0])
 
     @property
     def star_position_errors(self) -> Array:
@@ -299,7 +341,7 @@ class Result:
         >>> bool(result.extended.sum() > 3 * error)
         True
         """
-        return self._findings.extended_flux(self.star_flux_errors)
+        return self._findings.extended_flux(self._star_errors[0])
 
     @property
     def _outcome(self) -> Outcome:
@@ -652,6 +694,7 @@ class Result:
             "iterations": f"{self.n_iter} ({self.stop_reason})",
             "stars": "\n".join(shown) or "none",
             "extended source": "{:.5g} +- {:.2g}".format(*self.extended_flux),
+            **({"halos": "\n".join(self._halo_lines())} if self.halo_fluxes.size else {}),
             "device": self.device,
         }
         return html_card("lnocl.Result", rows, self.extended)
@@ -659,6 +702,28 @@ class Result:
     @property
     def _unit(self) -> str:
         return "electron" if (self._observation.exposure == 1.0).all() else "electron/s"
+
+    def _halo_table(self) -> NDArray[np.void]:
+        """Return the amounts of halos, a row for each halo and image, both counted from 1."""
+        rows = np.zeros(self.halo_fluxes.size, HALOS_DTYPE)
+        rows["halo"], rows["image"] = np.indices(self.halo_fluxes.shape).reshape(2, -1) + 1
+        rows["flux"], rows["flux_error"] = self.halo_fluxes.ravel(), self.halo_flux_errors.ravel()
+        return rows
+
+    def _halo_lines(self) -> list[str]:
+        """Return the amounts of each halo in words, electrons."""
+        lines = []
+        pairs = zip(self.halo_fluxes, self.halo_flux_errors, strict=True)
+        for k, (fluxes, errors) in enumerate(pairs, 1):
+            if len(fluxes) == 1:
+                amount = f"{fluxes[0]:.6g} +- {errors[0]:.2g} electrons"
+            else:
+                amount = (
+                    f"{fluxes.min():.6g} to {fluxes.max():.6g} electrons in "
+                    f"{len(fluxes)} images, with errors of {np.median(errors):.2g} (median)"
+                )
+            lines.append(f"halo {k}: {amount}")
+        return lines
 
     def fit(self) -> Fit:
         """Return how well the model fits all good pixels.
@@ -715,7 +780,7 @@ def make_result(outcome: Outcome) -> Result:
     ny, nx = scene.observation.sky_shape
     return Result(
         extended=outcome.sky[:ny, :nx],
-        star_fluxes=outcome.star_fluxes,
+        star_fluxes=outcome.star_fluxes[: scene.n_stars].copy(),
         star_positions=scene.stars,
         n_iter=len(history) - 1,
         stop_reason=outcome.stop_reason,
@@ -725,6 +790,7 @@ def make_result(outcome: Outcome) -> Result:
         smoothing=scene.penalty.smoothing,
         held_out=outcome.curve,
         psf_refinement=outcome.psf_refinement,
+        halo_fluxes=outcome.of_halos(outcome.star_fluxes),
         _findings=outcome,
     )
 
@@ -737,6 +803,7 @@ def saved_parts(result: Result) -> dict[str, Any]:
         "held_out": result.held_out if result.held_out.size else None,
         "transforms": result._observation.transforms,
         "oversample": result._observation.oversample,
+        "halos": result._halo_table() if result.halo_fluxes.size else None,
         "cards": [],
     }
     if refinement is not None:

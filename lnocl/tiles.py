@@ -334,6 +334,11 @@ def _pad(observation: Observation, pad: Any) -> int:
 
 
 def _refuse_turned(observation: Observation) -> None:
+    if len(observation.halos):
+        raise InputError(
+            "the amounts of `halos` are those in whole images, which tiles do not see; take "
+            "deconvolve for the whole, or leave `halos` out"
+        )
     if observation.is_mapped or observation.n_epochs > 1:
         raise InputError(
             "tiles are of images of one epoch that are not turned against the sky; take deconvolve "
@@ -575,6 +580,7 @@ class _Mosaic:
             smoothing=penalty.smoothing,
             held_out=curve,
             psf_refinement=None,
+            halo_fluxes=self.of_halos(np.zeros(0)),
             _findings=self,
             tiles=np.array(self._tiles, TILE_DTYPE),
         )
@@ -586,6 +592,10 @@ class _Mosaic:
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of star fluxes and positions."""
         return self._stars[:, 3], self._stars[:, 4:]
+
+    def of_halos(self, fluxes: Array) -> Array:
+        """Return the amounts of halos, which tiles do not have."""
+        return np.zeros((0, self.observation.n_images))
 
     def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
         """Return the light of the extended source and its standard error, electrons."""

@@ -103,7 +103,7 @@ def test_units_of_a_start(name):
             begin(numbers * unit)
 
 
-ARRAYS = {"extended", "star_fluxes", "star_positions", "history", "held_out"}
+ARRAYS = {"extended", "star_fluxes", "star_positions", "history", "held_out", "halo_fluxes"}
 
 
 def test_arrays_of_a_result_are_read_only():

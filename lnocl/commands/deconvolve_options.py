@@ -79,7 +79,20 @@ OPTIONS = {
         options.QUIET,
     ],
     "calibration": [
-        options.BACKGROUND,
+        options.BACKGROUND.but(
+            help=f"{options.BACKGROUND.keywords['help']}; it is taken as known, where the amount "
+            "of --halo is fitted"
+        ),
+        option(
+            "--halo",
+            action="append",
+            dest="halos",
+            metavar="FILE",
+            checksum="HSUM",
+            help="light of known shape and unknown amount, such as the speckles round a star, of "
+            "which the amount is fitted in each image: a FITS file with its image, or a cube of "
+            "one for each; or flat, a level of the background; may be repeated",
+        ),
         options.READ_NOISE,
         option(
             "--exposure",

@@ -69,6 +69,7 @@ def summarise(
         f"{counted(result.n_iter, 'iteration')} on {device}, objective {objective:.6g}",
         REASONS[result.stop_reason],
         *stars,
+        *(["; ".join(lines)] if (lines := result._halo_lines()) else []),
         f"extended source: {_flux(*extended_flux(result, frames), frames)} in the whole frame",
         *_floor(result, frames, unit),
         *_unnamed(result, frames),

@@ -68,8 +68,8 @@ class ReferenceEngine:
         """Put the stars where the scene has them now."""
         scene = self.scene
         self._star_images = np.array(
-            [[scene.star_image(j, s) for j in range(scene.n_images)] for s in range(scene.n_stars)]
-        ).reshape(scene.n_stars, *self._images.shape)
+            [[scene.star_image(j, s) for j in range(scene.n_images)] for s in range(scene.n_fluxes)]
+        ).reshape(scene.n_fluxes, *self._images.shape)
 
     def _invert_weight(self) -> Array | float:
         if self.scene.weights is None:

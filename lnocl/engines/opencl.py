@@ -107,7 +107,7 @@ class OpenCLEngine:
         self._turned = self._turned_images()
         self._stars = StarWindows(
             self.layout.images,
-            [[scene.star_box(j, s) for j in range(scene.n_images)] for s in range(scene.n_stars)],
+            [[scene.star_box(j, s) for j in range(scene.n_images)] for s in range(scene.n_fluxes)],
             scene.n_images,
             self._turned.rolls if self._turned else [],
             scene.shown,
@@ -184,7 +184,7 @@ class OpenCLEngine:
     def _sizes(self, n_iter: int) -> dict[str, int]:
         """Return the bytes of each buffer, by the name that the kernels have for it."""
         scene, program, layout = self.scene, self.program, self.layout
-        p, n, item = scene.n_images, scene.n_stars, program.dtype.itemsize
+        p, n, item = scene.n_images, scene.n_fluxes, program.dtype.itemsize
         pixels, image, pair = layout.pixels_bytes, layout.images.pixels_bytes, 2 * item
         sizes = {
             "images": p * image,
@@ -231,7 +231,7 @@ class OpenCLEngine:
         item = self.program.dtype.itemsize
         return {
             "cross_information": max(self._cross.bytes, item),
-            "cross_corners": max(self.scene.n_stars, 1) * 8,
+            "cross_corners": max(self.scene.n_fluxes, 1) * 8,
             "cross_near": self._cross.near.nbytes,
             "coupling_sums": max(self._cross.n_blocks_of_all, 1) * 2 * item,
         }
@@ -240,7 +240,7 @@ class OpenCLEngine:
         scene = self.scene
         numbers = {
             "n_images": scene.n_images,
-            "n_stars": scene.n_stars,
+            "n_stars": scene.n_fluxes,
             "star_blocks": self._stars.n_blocks,
             "star_columns": self._stars.n_columns,
             "cross_blocks": self._cross.n_blocks,
@@ -341,7 +341,7 @@ class OpenCLEngine:
             "star_images",
             (
                 self._stars.cut(s, j, scene.star_cutout(j, s))
-                for s in range(scene.n_stars)
+                for s in range(scene.n_fluxes)
                 for j in range(scene.n_images)
             ),
         )
@@ -451,7 +451,7 @@ class OpenCLEngine:
 
     def star_gradient(self) -> Array:
         """Return the gradient of the objective in the star fluxes."""
-        if not self.scene.n_stars:
+        if not self.scene.n_fluxes:
             return np.zeros(0)  # without waiting for the device
         return -self._wait_for_objective()[2]
 
@@ -464,7 +464,7 @@ class OpenCLEngine:
         transfer = self._memory.fetch("step_sums", "coupling_sums")
         self._convolve()  # which the host need not wait for
         slope, couplings = transfer.wait()
-        n = self.scene.n_stars
+        n = self.scene.n_fluxes
         return float(slope.sum()), couplings.reshape(n, -1).sum(axis=1) if n else np.zeros(0)
 
     def set_star_fluxes(self, star_fluxes: Array) -> None:
@@ -480,7 +480,7 @@ class OpenCLEngine:
         if self._pending_objective is None:
             self._pending_objective = self._fetch_objective()
         objective, data_term, stars = self._pending_objective.wait()
-        star_sums = stars.reshape(-1, 2).sum(axis=1)[: self.scene.n_stars]
+        star_sums = stars.reshape(-1, 2).sum(axis=1)[: self.scene.n_fluxes]
         return float(objective.sum()), float(data_term.sum()), star_sums
 
     def _fetch_objective(self) -> Transfer:
@@ -501,7 +501,7 @@ class OpenCLEngine:
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes, scaled."""
-        return self._memory.download("star_fluxes", self.scene.n_stars)
+        return self._memory.download("star_fluxes", self.scene.n_fluxes)
 
     def data_term(self) -> float:
         """Return the data term of the objective recorded last, scaled."""
@@ -521,7 +521,7 @@ class OpenCLEngine:
         """Return the arrays that `restore` needs, between iterations, as they lie on the device."""
         state = {name: self._memory.download_raw(name) for name in self._stateful}
         state["objectives"] = state["objectives"].reshape(-1, 2)[: self._n_objectives]
-        state["star_fluxes"] = state["star_fluxes"][: self.scene.n_stars]
+        state["star_fluxes"] = state["star_fluxes"][: self.scene.n_fluxes]
         return state
 
     @property

@@ -54,13 +54,15 @@ def write_result(
     psf_errors: NDArray[np.void] | None = None,
     doubtful: ArrayLike | None = None,
     messages: Sequence[str] = (),
+    halos: NDArray[np.void] | None = None,
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
     The primary HDU holds the extended source, the table ``STARS`` the columns x, y, flux and any
     others given, the table ``HISTORY`` iteration and objective, the table ``CURVE`` iteration,
     rho, rho_star and magnitude, the table ``HELDOUT`` mu, smoothing, iteration and error, the table
-    ``PSFFIT`` parameters of PSFs, ``PSFS`` the PSFs. All have CHECKSUM and DATASUM.
+    ``PSFFIT`` parameters of PSFs, ``PSFS`` the PSFs, the table ``HALOS`` the amounts of halos. All
+    have CHECKSUM and DATASUM.
 
     Parameters
     ----------
@@ -107,6 +109,8 @@ def write_result(
         Pixels in which errors of the PSFs may have faked all there is.
     messages : sequence of str, optional
         The messages of the run, a line each: the table ``MESSAGES``.
+    halos : ndarray with fields ``halo``, ``image``, ``flux`` and ``flux_error``, optional
+        The amounts of halos, electrons of their image.
 
     Raises
     ------
@@ -127,6 +131,7 @@ def write_result(
         [
             fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
             _star_table(stars, star_fluxes, unit, star_columns),
+            *([] if halos is None else [_table("HALOS", halos)]),
             *([] if history is None else [_table("HISTORY", history)]),
             *([] if curve is None else [_table("CURVE", curve)]),
             *([] if held_out is None else [_table("HELDOUT", held_out)]),

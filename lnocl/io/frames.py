@@ -38,6 +38,8 @@ Mask = NDArray[np.bool_]
 MAX_SCALE_ERROR = 0.02
 # Of more masked pixels than this share of an image it is warned.
 MUCH_MASKED = 0.1
+# The word for a halo that is the same in all pixels.
+FLAT = "flat"
 # Of images with more negative pixels than this share the sky was subtracted.
 SUBTRACTED = 0.01
 
@@ -86,6 +88,9 @@ class Calibration(NamedTuple):
         As for `Observation`.
     oversample, effective_psfs : int, bool
         As for `Observation`.
+    halos : sequence of str
+        Shapes of halos, as for `Observation`: files with one for all images, or one for each; or
+        ``"flat"``.
     psf_errors : sequence of str
         Files that tell how PSFs may be wrong, as ``KIND=FILE`` with a kind of `names.PSF_ERRORS`,
         as for `Observation`: the extension that is called as the kind, such as the SCATTER that
@@ -108,6 +113,7 @@ class Calibration(NamedTuple):
     effective_psfs: bool = False
     psf_centre: PsfCentre = "check"
     psf_errors: Sequence[str] = ()
+    halos: Sequence[str] = ()
 
 
 class Frames(NamedTuple):
@@ -223,6 +229,7 @@ class _Reader:
             effective_psfs=self._calibration.effective_psfs,
             psf_centre=self._calibration.psf_centre,
             **self._psf_errors(),
+            halos=self._halos(),
         )
         sha256 = {
             "images": self._images.sha256,
@@ -252,6 +259,15 @@ class _Reader:
             psf[:ny, :nx] for psf, (ny, nx) in zip(self._psfs.data, self._psfs.shapes, strict=True)
         ]
         return np.asarray(of_one_shape(cut, 0.0, about_centre=True))
+
+    def _halos(self) -> Array | None:
+        """Return the shapes of halos that were given."""
+        shape, words = self._images.data.shape, self._calibration.halos
+        if not words:
+            return None
+        return np.array(
+            [np.ones(shape) if word == FLAT else self._maps.read("halos", [word]) for word in words]
+        )
 
     def _psf_errors(self) -> dict[str, Any]:
         """Return the ideal PSFs, pupils, modes and scatter that were given."""

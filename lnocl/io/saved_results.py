@@ -24,6 +24,7 @@ Columns = dict[str, NDArray[np.float64]]
 # The columns that a table must have.
 TABLES = {
     "STARS": ("x", "y", "flux"),
+    "HALOS": ("halo", "image", "flux", "flux_error"),
     "HISTORY": ("iteration", "objective"),
     "CURVE": ("iteration", "rho", "rho_star", "magnitude"),
     "HELDOUT": ("smoothing", "iteration", "error"),

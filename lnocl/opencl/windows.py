@@ -18,6 +18,7 @@ def stars_near(
     n_blocks: int,
     row_blocks: int,
     shown: NDArray[np.bool_] | None = None,
+    counts: NDArray[np.integer] | None = None,
 ) -> NDArray[np.int32]:
     """Return the stars of each block of row pairs, as kernels/stars.cl has them.
 
@@ -31,6 +32,8 @@ def stars_near(
         Blocks of the grid.
     shown : ndarray of bool, shape (n, n_arrays), optional
         Which arrays hold each star; by default all.
+    counts : ndarray of int, shape (n, n_arrays), optional
+        Blocks of each window that are not 0, the first of it; by default all.
 
     Returns
     -------
@@ -42,9 +45,12 @@ def stars_near(
     blocks = (corners[..., :1] + np.arange(n_blocks)) % row_blocks
     units = (blocks + row_blocks * np.arange(n_arrays)[:, None]).ravel()
     stars = np.repeat(np.arange(n), n_arrays * n_blocks)
+    is_held = np.ones((n, n_arrays, n_blocks), bool)
     if shown is not None:
-        is_held = np.repeat(shown.ravel(), n_blocks)
-        units, stars = units[is_held], stars[is_held]
+        is_held &= shown[..., None]
+    if counts is not None:
+        is_held &= np.arange(n_blocks) < counts[..., None]
+    units, stars = units[is_held.ravel()], stars[is_held.ravel()]
     order = np.argsort(units, kind="stable")
     n_units = n_arrays * row_blocks
     starts = n_units + 1 + np.searchsorted(units[order], np.arange(n_units + 1))
@@ -65,7 +71,7 @@ class StarWindows:
     rolls : sequence of ndarray of int, shape (Ny,), optional
         For each array the columns by which its rows are rotated.
     shown : ndarray of bool, shape (n, n_arrays), optional
-        Which arrays hold each star; by default all.
+        Which arrays hold each star; by default all. With it sums over other blocks are not written.
     """
 
     def __init__(
@@ -87,7 +93,15 @@ class StarWindows:
         ).reshape(-1, n_arrays, 2)
         self.n_blocks = max((count for _, count in blocks), default=1)
         self.n_columns = max((count for _, count in columns), default=1)
-        self.near = stars_near(self.corners, self.n_blocks, layout.pixels_shape[0], shown)
+        # Windows are as large as the largest, which may be a halo's.
+        counts = np.array([count for _, count in blocks], int).reshape(-1, n_arrays)
+        self.near = stars_near(
+            self.corners,
+            self.n_blocks,
+            layout.pixels_shape[0],
+            shown,
+            None if shown is None else counts,
+        )
 
     @property
     def n_blocks_of_all(self) -> int:

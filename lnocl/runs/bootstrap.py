@@ -16,7 +16,7 @@ from lnocl.parallel import Parallel, work
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.progress import Progress
 from lnocl.runs.replicas import Replicas, Sky
-from lnocl.scene.apertures import FLUX, FWHM, LENGTH, Aperture, Label, Profile
+from lnocl.scene.apertures import AMOUNT, FLUX, FWHM, LENGTH, Aperture, Label, Profile
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
@@ -44,7 +44,7 @@ class Quantity(NamedTuple):
     name : str
         Its name, such as "star 1 flux".
     kind : str
-        "flux", in electrons, or "length", in pixels.
+        "flux", in electrons, "length", in pixels, or "halo", in electrons of one image.
     value : float
         Its value in the reconstruction.
     note : str
@@ -83,8 +83,8 @@ class Bootstrap:
     Attributes
     ----------
     quantities : tuple of k Quantity
-        Fluxes of stars, their positions where these were refined, the light of the extended source
-        in regions, light and widths along profiles.
+        Fluxes of stars, amounts of halos, positions of stars where these were refined, the light of
+        the extended source in regions, light and widths along profiles.
     errors : ndarray of float64, shape (n, k)
         The errors of each replica, in electrons or pixels. Those of the PSFs are included where
         their scatter is known.
@@ -99,9 +99,10 @@ class Bootstrap:
         Of the replicas.
     unit : str
         Of light: ``electron``, or ``electron/s`` where exposures were given.
-    stated : ndarray of float64, shape (n_stars,)
-        Standard errors of the star fluxes, `lnocl.Result.star_flux_errors`.
-    shares : ndarray of float64, shape (k, n_stars)
+    stated : ndarray of float64, shape (n_fluxes,)
+        Standard errors of stars and halos, `lnocl.Result.star_flux_errors` and
+        `lnocl.Result.halo_flux_errors`.
+    shares : ndarray of float64, shape (k, n_fluxes)
         The share of each star's light that each quantity holds, 1 for its own flux.
 
     See Also
@@ -246,6 +247,7 @@ class Bootstrap:
         if len(self.of_psfs):
             columns["error_noise"] = (self.errors - self.of_psfs).std(axis=0, ddof=1)
             columns["error_psf"] = self.of_psfs.std(axis=0, ddof=1)
+        units = {FLUX: unit or self.unit, AMOUNT: "electron"}
         for level in LEVELS:
             low, high = self.interval(level)
             columns |= {f"low{level * 100:.0f}": low, f"high{level * 100:.0f}": high}
@@ -253,9 +255,7 @@ class Bootstrap:
             {
                 "name": [each.name for each in self.quantities],
                 "at": [np.nan if each.at is None else each.at for each in self.quantities],
-                "unit": [
-                    (unit or self.unit) if each.kind == FLUX else "pix" for each in self.quantities
-                ],
+                "unit": [units.get(each.kind, "pix") for each in self.quantities],
                 **{name: values / self.units(electrons) for name, values in columns.items()},
                 "note": [each.note for each in self.quantities],
             }
@@ -321,7 +321,7 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     """Return the quantities of a reconstruction, measured on itself, without replicas."""
     width = resolution(outcome.scene)
     quantities = _quantities(outcome, parts, width)
-    stated = np.nan_to_num(outcome.star_errors()[0])
+    stated = np.nan_to_num(_in_electrons(outcome, outcome.star_errors()[0]))
     pixels = np.zeros((2, *outcome.scene.observation.sky_shape))
     none = np.zeros((0, len(quantities)))
     is_rate = (outcome.scene.observation.exposure != 1.0).any()
@@ -359,18 +359,18 @@ class _Measuring:
     """Makes a replica by its number, and measures it."""
 
     def __init__(self, outcome: Outcome, parts: Sequence[Part], seed: int, width: float) -> None:
-        self._moves, self._parts, self._width = outcome.moves, parts, width
+        self._outcome, self._parts, self._width = outcome, parts, width
         self._replicas = Replicas(outcome, seed)
 
     def __call__(self, k: int) -> _Measured:
         from scipy.ndimage import gaussian_filter
 
         replica = self._replicas.reconstruct(k)
-        drawn, seen = (_measure(sky, self._parts, self._moves) for sky in replica[:2])
+        drawn, seen = (_measure(self._outcome, sky, self._parts) for sky in replica[:2])
         last, of_psfs = replica.found, np.zeros((0, len(seen)))
         if replica.found_with_psfs is not None:
             last = replica.found_with_psfs
-            of_psfs = (_measure(last, self._parts, self._moves) - seen)[None]
+            of_psfs = (_measure(self._outcome, last, self._parts) - seen)[None]
             seen = seen + of_psfs[0]
         pixels = last.extended - replica.drawn.extended
         smooth = gaussian_filter(pixels, self._width / FWHM, mode="nearest")
@@ -387,11 +387,17 @@ def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
     )
 
 
-def _measure(sky: Sky, parts: Sequence[Part], moves: bool) -> Array:
-    positions = sky.star_positions.ravel() if moves else np.zeros(0)
+def _measure(outcome: Outcome, sky: Sky, parts: Sequence[Part]) -> Array:
+    fluxes = _in_electrons(outcome, sky.star_fluxes)
+    positions = sky.star_positions.ravel() if outcome.moves else np.zeros(0)
     return np.concatenate(
-        [sky.star_fluxes, positions, *(part.measure(sky.extended, sky.light) for part in parts)]
+        [fluxes, positions, *(part.measure(sky.extended, sky.light) for part in parts)]
     )
+
+
+def _in_electrons(outcome: Outcome, fluxes: Array) -> Array:
+    """Return the fluxes of stars, and those of halos in electrons of their images."""
+    return np.append(fluxes[: outcome.scene.n_stars], outcome.of_halos(fluxes).ravel())
 
 
 def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[Quantity, ...]:
@@ -404,16 +410,21 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
     labels = [
         Label(f"star {s + 1}{epoch} flux", FLUX) for s in range(n // n_epochs) for epoch in epochs
     ]
+    labels += [
+        Label(f"halo {k + 1} image {j + 1}", AMOUNT)
+        for k in range(len(scene.observation.halos))
+        for j in range(scene.n_images)
+    ]
     if moves:
         labels += [Label(f"star {s} {axis}", LENGTH) for s in range(1, n + 1) for axis in "xy"]
     labels += [label for part in parts for label in part.labels()]
-    notes = [""] * (3 * n if moves else n)
+    notes = [""] * (scene.n_fluxes + 2 * n * moves)
     observed = _observed(scene)[:ny, :nx] if parts else np.ones((0, 0), bool)
     stars = on_sky(scene.stars, scene.oversample)
     notes += [note for part in parts for note in _notes(part, stars, width, observed)]
     light = outcome.light().sky() if parts else outcome.sky
     sky = Sky(outcome.sky[:ny, :nx], light, outcome.star_fluxes, scene.stars)
-    values = _measure(sky, parts, moves).tolist()
+    values = _measure(outcome, sky, parts).tolist()
     return tuple(
         Quantity(label.name, label.kind, value, note, label.at)
         for label, value, note in zip(labels, values, notes, strict=True)
@@ -423,11 +434,10 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
 def _shares(outcome: Outcome, parts: Sequence[Part], n_quantities: int) -> Array:
     """Return the share of each star's light in each quantity, in the order of `_measure`."""
     scene = outcome.scene
-    shares = np.zeros((n_quantities, scene.n_stars))
+    shares = np.eye(n_quantities, scene.n_fluxes)
     for s in range(scene.n_stars):
-        shares[s, s] = 1.0
         cutouts = [scene.psf_on_sky(j, s) for j in range(scene.n_images)]
-        k = 3 * scene.n_stars if outcome.moves else scene.n_stars
+        k = scene.n_fluxes + 2 * scene.n_stars * outcome.moves
         for part in parts:
             slices = part.slices if isinstance(part, Profile) else [part]
             shares[k : k + len(slices), s] = [

@@ -26,7 +26,7 @@ from lnocl.solvers.engine import State
 
 OBSERVED = (
     *("images", "psfs", "background", "mask", "exposure", "offsets", "turns"),
-    "epochs",
+    *("epochs", "halos"),
     *("oversample", "effective_psfs"),
 )
 # The widest value: a SHA-256 in hexadecimal, or the repr of a parameter or name of a device.

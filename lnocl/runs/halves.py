@@ -197,14 +197,15 @@ def take(saved: Saved, name: str, start: Start, n_iter: int) -> list[Snapshot]:
         No such halves have such snapshots within `n_iter` iterations.
     """
     reach = MAX_SHIFT * (1.0 + 1e-9) if start.refines else 0.0  # which rounding may exceed
-    low, high = start.setup.stars - reach, start.setup.stars + reach
+    stars = np.repeat(start.setup.stars, start.scene.observation.n_epochs, axis=0)
+    low, high = stars - reach, stars + reach
     whole, double = np.dtype(np.int64), np.dtype(np.float64)
     iterations = saved.take(f"{name}_iteration", whole, (range(1, n_iter + 1),), 1, n_iter)
-    k, n = len(iterations), len(low)
+    k, n, n_fluxes = len(iterations), len(low), start.scene.n_fluxes
     extended = saved.take(
         f"{name}_extended", _dtype(start), (k, 2, *start.scene.grid), 0.0, LARGEST
     )
-    star_fluxes = saved.take(f"{name}_star_fluxes", double, (k, 2, n), 0.0, LARGEST)
+    star_fluxes = saved.take(f"{name}_star_fluxes", double, (k, 2, n_fluxes), 0.0, LARGEST)
     positions = saved.take(f"{name}_positions", double, (k, 2, n, 2), low, high)
     return list(map(Snapshot, iterations.tolist(), extended, star_fluxes, positions))
 

@@ -337,6 +337,6 @@ def most_bytes(start: Start, n_iter: int) -> int:
     n_snapshots, due = 4, 1
     while due <= n_iter:
         n_snapshots, due = n_snapshots + 1, next_snapshot(due)
-    numbers = 2 * math.prod(start.scene.grid) + 6 * start.scene.n_stars + 1
+    numbers = 2 * math.prod(start.scene.grid) + 6 * start.scene.n_fluxes + 1
     snapshots = (n_snapshots * (numbers + 99) + 2 * n_iter) * np.dtype(np.float64).itemsize
     return 2 * most_bytes_of_run(start, n_iter) + snapshots

@@ -143,6 +143,10 @@ def check_families(
             "`refine_psfs` and `psf_scatter` are for images of one epoch that are not turned "
             "against the sky; leave them out"
         )
+    if len(observation.halos) and (found or len(observation.psf_scatter)):
+        raise InputError(
+            "`refine_psfs` and `psf_scatter` are for images without `halos`; leave one of them out"
+        )
     if found and not len(positions):
         raise InputError("`refine_psfs` needs a star, whose image shows the PSF; give stars")
     for name, needed in NEEDS.items():

@@ -137,6 +137,24 @@ class Mended(NamedTuple):
     fits: bool = False
 
 
+def marginalise(
+    scene: Scene, sky: Array, star_fluxes: Array, stars: bool, halos: bool
+) -> tuple[Array, Array]:
+    """Return extended source and fluxes, those of halos and of stars marginal where wanted.
+
+    `lnocl.solvers.halos` and `lnocl.solvers.marginal` have the equations.
+    """
+    if halos:
+        from lnocl.solvers.halos import marginal_halos
+
+        sky, star_fluxes = marginal_halos(scene, sky, star_fluxes)
+    if stars:
+        from lnocl.solvers.marginal import marginal
+
+        sky, star_fluxes = marginal(scene, sky, star_fluxes)
+    return sky, star_fluxes
+
+
 @dataclass(frozen=True)
 class Outcome:
     """The estimate that a reconstruction ended with, and how it came there.
@@ -149,8 +167,8 @@ class Outcome:
         The model of the observation, with the stars where they are now.
     sky : ndarray of float64, shape (Ny, Nx)
         Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n,)
-        Electrons.
+    star_fluxes : ndarray of float64, shape (n_fluxes,)
+        Electrons, of the stars and then of the halos, as `Scene` has them.
     objectives : ndarray of float64, shape (n_iter + 1,)
         Objectives of the start and after each iteration; not scaled.
     stop_reason : str
@@ -161,6 +179,8 @@ class Outcome:
         None where the PSFs were not to be refined.
     is_marginal : bool
         Whether the star fluxes are those of `marginal`, and so those of replicas.
+    has_marginal_halos : bool
+        Whether the amounts of halos are, likewise.
     """
 
     setup: Setup
@@ -172,18 +192,24 @@ class Outcome:
     curve: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
     psf_refinement: PsfRefinement | None = None
     is_marginal: bool = False
+    has_marginal_halos: bool = False
 
     @property
     def moves(self) -> bool:
         """Whether stars were moved."""
         return self.setup.refine_positions and self.scene.n_stars > 0
 
-    def marginal(self) -> Outcome:
-        """Return the outcome with marginal star fluxes, as `lnocl.solvers.marginal` has them."""
-        from lnocl.solvers.marginal import marginal
+    def marginal(self, stars: bool, halos: bool) -> Outcome:
+        """Return the outcome with marginal star fluxes, or amounts of halos, or both."""
+        sky, fluxes = marginalise(self.scene, self.sky, self.star_fluxes, stars, halos)
+        return replace(
+            self, sky=sky, star_fluxes=fluxes, is_marginal=stars, has_marginal_halos=halos
+        )
 
-        sky, star_fluxes = marginal(self.scene, self.sky, self.star_fluxes)
-        return replace(self, sky=sky, star_fluxes=star_fluxes, is_marginal=True)
+    def of_halos(self, fluxes: Array) -> Array:
+        """Return those of fluxes that are of halos, electrons of each image, shape (n_halos, p)."""
+        of_halos = fluxes[self.scene.n_stars :] * self.scene.mean_exposure
+        return of_halos.reshape(-1, self.scene.n_images)
 
     @property
     def observation(self) -> Observation:
@@ -216,22 +242,24 @@ class Outcome:
         return Light(self.scene, self.sky, self.star_fluxes)
 
     def star_errors(self) -> tuple[Array, Array]:
-        """Return the standard errors of star fluxes and positions, the extended source not known.
+        """Return the standard errors of fluxes and positions, the extended source not known.
 
-        `lnocl.solvers.star_errors` has the equation. The relative error that the PSFs still have is
-        that of each flux too, added in quadrature. NaN for positions that were not fitted, and
-        where the images do not determine them.
+        Fluxes are those of stars and halos. `lnocl.solvers.star_errors` has the equation. The
+        relative error that the PSFs still have is that of each star's flux too, added in
+        quadrature. NaN for positions that were not fitted, and where the images do not determine
+        them.
 
         Warns
         -----
         LnoclWarning
-            The images do not determine flux and position of a star.
+            The images do not determine flux and position of a star, or the amount of a halo.
         """
         from lnocl.solvers.star_errors import standard_errors
 
         scene, moves = self.scene, self.moves
+        star_fluxes = self.star_fluxes[: scene.n_stars]
         errors = standard_errors(scene, self.sky, self.star_fluxes, moves)
-        is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (self.star_fluxes > 0)
+        is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (star_fluxes > 0)
         if is_lost.any():
             named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in scene.stars[is_lost])
             warn(
@@ -241,7 +269,21 @@ class Outcome:
         if self.psf_refinement is not None:
             refinement = self.psf_refinement
             of_psfs = np.hypot(refinement.psf_error, refinement.hidden_error)
-            errors[:, 0] = np.hypot(errors[:, 0], of_psfs * self.star_fluxes)
+            errors[:, 0] = np.hypot(errors[:, 0], of_psfs * star_fluxes)
         positions = errors[:, 1:]
         positions[positions > MAX_SHIFT] = np.nan  # no star is moved farther
-        return errors[:, 0], positions
+        return np.append(errors[:, 0], self._halo_errors()), positions
+
+    def _halo_errors(self) -> Array:
+        """Return the standard errors of halos."""
+        if not self.scene.n_halos:
+            return np.zeros(0)
+        from lnocl.solvers.halos import halo_errors
+
+        errors = halo_errors(self.scene, self.sky, self.star_fluxes)
+        if np.isnan(errors).any():
+            warn(
+                "the images do not determine the amounts of all halos, whose errors are NaN; leave "
+                "out halos that others can stand in for"
+            )
+        return errors

@@ -9,7 +9,8 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from lnocl.process import ignored_warnings
-from lnocl.runs.outcome import Outcome
+from lnocl.runs.halos import settle_halos
+from lnocl.runs.outcome import Outcome, marginalise
 from lnocl.runs.run import Run
 from lnocl.runs.start import make_start
 from lnocl.scene.arrays import Array
@@ -18,7 +19,6 @@ from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.texture import Texture, resolution
 from lnocl.solvers.light import Light
-from lnocl.solvers.marginal import marginal
 
 
 class Sky(NamedTuple):
@@ -84,7 +84,7 @@ class Replicas:
                 observation.psfs, observation.psf_scatter, observation.oversample
             )
         with ignored_warnings():  # those of the reconstruction are the same
-            self._start = make_start(outcome.setup, outcome.scene.penalty)
+            self._start = settle_halos(make_start(outcome.setup, outcome.scene.penalty))
         self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
 
     def reconstruct(self, k: int) -> Replica:
@@ -122,8 +122,8 @@ class Replicas:
                 pass
         scene, (ny, nx) = run.scene, observation.sky_shape
         sky, star_fluxes = run.engine.extended() * scene.unit, run.star_fluxes()
-        if self._outcome.is_marginal:
-            sky, star_fluxes = marginal(scene, sky, star_fluxes)
+        wanted = self._outcome.is_marginal, self._outcome.has_marginal_halos
+        sky, star_fluxes = marginalise(scene, sky, star_fluxes, *wanted)
         light = Light(scene, sky, star_fluxes).sky()
         return Sky(sky[:ny, :nx], light, star_fluxes, run.star_positions())
 

@@ -175,12 +175,12 @@ class Run:
         if self.engine.scaling is not None:
             state["cross_windows"] = windows = self._take_windows(saved, own["cross_windows"])
             shapes["cross_values"] = (int(windows[:, 2:].prod(axis=1).sum()),)
-            n_stars = self.scene.n_stars
-            shapes["star_information"] = n_stars, range(1, max(n_stars, 1) + 1)
+            n = self.scene.n_fluxes
+            shapes["star_information"] = n, range(1, max(n, 1) + 1)
         bounds: dict[str, tuple[ArrayLike, ArrayLike]] = {
             "steps": ALPHA_BOUNDS,
             "positions": self._bounds_of_stars(),
-            "star_order": (0, max(self.scene.n_stars - 1, 0)),
+            "star_order": (0, max(self.scene.n_fluxes - 1, 0)),
             **dict.fromkeys(("extended", "previous", "shift", "star_fluxes"), (0.0, LARGEST)),
         }
         for name in [name for name in own if name not in state]:
@@ -203,7 +203,7 @@ class Run:
         if self._refines:
             from lnocl.scene.forward_model import largest_window
 
-            size = largest_window(self.scene)
+            size = self.scene.grid if self.scene.n_halos else largest_window(self.scene)
             low, high = [-LARGEST, -LARGEST, 1, 1], [LARGEST, LARGEST, *size]
         return saved.take("cross_windows", own.dtype, own.shape, low, high)
 
@@ -341,10 +341,10 @@ def _make_engine(
 
 def most_bytes(start: Start, n_iter: int) -> int:
     """Return the most bytes that the state of a run may take."""
-    from lnocl.scene.forward_model import largest_window
+    from lnocl.solvers.scaling import most_cross_values
 
     scene = start.scene
-    window = largest_window(scene)
-    n, pixels = scene.n_stars, math.prod(scene.grid)
-    numbers = 4 * pixels + 2 * scene.grid[0] + n * (math.prod(window) + n + 8) + 2 * n_iter + 64
+    n, pixels = scene.n_fluxes, math.prod(scene.grid)
+    numbers = 4 * pixels + 2 * scene.grid[0] + most_cross_values(scene) + n * (n + 8)
+    numbers += 2 * n_iter + 64
     return np.dtype(np.float64).itemsize * numbers

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 class Setup:
     """The observation and the parameters that all runs of one call of `deconvolve` share.
 
-    Attributes are the arguments of `deconvolve`, checked; `stars` are the positions as given.
+    Attributes are the arguments of `deconvolve`, checked; `stars` are the positions as given, and
+    `settles_halos` whether halos are held at what `lnocl.runs.halos` finds.
     """
 
     observation: Observation
@@ -37,6 +38,7 @@ class Setup:
     refine_positions: bool = False
     initial_extended: Array | None = None
     initial_star_fluxes: Array | None = None
+    settles_halos: bool = False
 
     def engine_name(self) -> str:
         """Return the name of the engine: the device, its platform and driver.
@@ -79,8 +81,8 @@ class Start:
         The model of the observation, with the stars where they start.
     extended : ndarray of float64, shape (Ny, Nx)
         Extended source.
-    star_fluxes : ndarray of float64, shape (n,)
-        Star fluxes.
+    star_fluxes : ndarray of float64, shape (n_fluxes,)
+        Fluxes of stars and halos.
     scaling : Scaling or None
         For the scaled gradient projection method.
     """
@@ -167,12 +169,13 @@ def move_stars(
     """Move the stars of a scene to where they are most likely; return their fluxes there."""
     from lnocl.solvers.positions import StarFit, Stars
 
-    fit = StarFit(scene, model, extended, setup.stars)
+    star_fluxes, halos = np.split(star_fluxes, [scene.n_stars])
+    fit = StarFit(scene, model, extended, setup.stars, halos)
     current = Stars(star_fluxes, scene.stars)
     starts = [current, fit.look_round(current)] if look_round else [current]
     stars = min(map(fit.minimise, starts), key=fit.objective)
     scene.move_stars(stars.positions)
-    return stars.fluxes
+    return np.concatenate([stars.fluxes, halos])
 
 
 def measure_steps(

@@ -10,8 +10,8 @@ import numpy as np
 
 from lnocl.scene.arrays import Array
 
-# What is measured: light, in electrons, or lengths, in pixels.
-FLUX, LENGTH = "flux", "length"
+# What is measured: light, in electrons, lengths, in pixels, or light of one image, in electrons.
+FLUX, LENGTH, AMOUNT = "flux", "length", "halo"
 # A full width at half maximum in standard deviations, of a Gaussian.
 FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -36,6 +37,8 @@ class Model:
 
     Attributes
     ----------
+    scene : Scene
+        The scene.
     shape : tuple of int
         (p, ny, nx), of the images on their grid.
     grid : tuple of int
@@ -57,7 +60,7 @@ class Model:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self._scene = scene
+        self.scene = scene
         self.shape = (scene.n_images, *scene.image_grid)
         self.grid, self.oversample = scene.grid, scene.oversample
         self._window_otfs: dict[Any, NDArray[np.complex128]] = {}
@@ -71,10 +74,16 @@ class Model:
         background = scene.background()
         self.background = background if background.ndim == 3 else background[:, None, None]
 
+    def with_background(self, scene: Scene, more: Sequence[Array]) -> Model:
+        """Return the model of a scene with the same sky, and more background in each image."""
+        other = copy(self)
+        other.scene, other.background = scene, self.background + np.array(more)
+        return other
+
     @cached_property
     def _otfs(self) -> list[NDArray[np.complex128]]:
         p = self.shape[0]
-        return [scipy.fft.rfft2(self._scene.psf(j), workers=-1) for j in range(p)]
+        return [scipy.fft.rfft2(self.scene.psf(j), workers=-1) for j in range(p)]
 
     def forward(self, extended: Array) -> Array:
         """Return the ``A_j f``, shape (p, ny, nx)."""
@@ -91,7 +100,7 @@ class Model:
         spectrum = scipy.fft.rfft2(extended, workers=-1)
         for j, otf in enumerate(self._otfs):
             sky = scipy.fft.irfft2(otf * spectrum, self.grid, workers=-1, overwrite_x=True)
-            yield turned(self._scene, j, sky)
+            yield turned(self.scene, j, sky)
 
     def adjoint(self, arrays: Iterable[Array]) -> Array:
         """Return ``sum_j A_j^T x_j``, shape (Ny, Nx)."""
@@ -104,7 +113,7 @@ class Model:
         It may be read-only: of arrays of one value each it is a view of one value, too.
         """
         flat, spectra = np.zeros(len(factors)), list[NDArray[np.complex128]]()
-        rotations = self._scene.rotations
+        rotations = self.scene.rotations
         runs = _runs(arrays) if not rotations else ((each, [j]) for j, each in enumerate(arrays))
         for array, members in runs:
             shares = factors[:, members]
@@ -148,9 +157,12 @@ class Model:
         cutouts = [Cutout(spread(given[j].values, q), q * given[j].y, q * given[j].x) for j in lit]
         psfs = [self._psfs[j] for j in lit]
         first, size = _window_of_correlations(cutouts, psfs)
-        if self._scene.rotations or (size >= self.grid).any():
-            total = self.adjoint(cutout.on_grid(self.shape[1:]) for cutout in given)
-            least = RINGING if self._scene.rotations else ROUNDING
+        if self.scene.rotations or (size >= self.grid).any():
+            dark = np.broadcast_to(0.0, self.shape[1:])
+            total = self.adjoint(
+                given[j].on_grid(self.shape[1:]) if j in lit else dark for j in range(len(given))
+            )
+            least = RINGING if self.scene.rotations else ROUNDING
             return Cutout(total, 0, 0).trimmed(least * float(abs(total).max()))
         shape = tuple(scipy.fft.next_fast_len(int(n), real=True) for n in size)
         spectrum: Any = 0.0
@@ -169,9 +181,9 @@ class Model:
         return self._window_otfs[j, shape]
 
     def starlight(self, star_fluxes: Array) -> Iterator[Array]:
-        """Yield ``sum_s c_s P_js`` of each image, shape (ny, nx), the stars where they are now."""
+        """Yield the light of stars, where they are now, and halos in each image, (ny, nx)."""
         for j in range(self.shape[0]):
-            yield self._scene.star_field.light(j, star_fluxes)
+            yield self.scene.star_field.light(j, star_fluxes)
 
     def images(self, extended: Array, star_fluxes: Array) -> Array:
         """Return the m_j, not below 0."""
@@ -185,8 +197,8 @@ class Model:
     def images_at(self, boxes: Sequence[Box], extended: Array) -> Array:
         """Return the m_j without stars in a box of each; beyond it they may be 0."""
         flat = is_flat(extended)
-        if not flat and (self._scene.rotations or self.are_large(boxes)):
-            return self.images(extended, np.zeros(self._scene.n_stars))
+        if not flat and (self.scene.rotations or self.are_large(boxes)):
+            return self.images(extended, np.zeros(self.scene.n_fluxes))
         images = np.zeros(self.shape)
         for j, (image, box) in enumerate(zip(images, boxes, strict=True)):
             rows, columns = (range(side.start, side.stop) for side in box)
@@ -304,7 +316,7 @@ def images_of_sky(scene: Scene, extended: Array) -> Iterator[Array]:
 def add_to_window(
     image: Array, scene: Scene, sky: Array, star_fluxes: Array, j: int, first: tuple[int, int]
 ) -> None:
-    """Add ``A_j f + sum_s c_s P_js``, scaled, to an image of a window of the images' grid.
+    """Add sky, stars and halos, scaled, to an image of a window of the images' grid.
 
     Parameters
     ----------

@@ -15,6 +15,7 @@ from lnocl.notebook import html_card
 from lnocl.scene import containers
 from lnocl.scene.arrays import Array, booleans, flag, numbers, refuse_masked, values_and_mask
 from lnocl.scene.cores import centre, off_centre, peak
+from lnocl.scene.halos import check_halos, refuse_dark
 from lnocl.scene.psf_errors import check_modes, check_pixels
 from lnocl.scene.psf_field import PsfField, read_fields
 from lnocl.scene.shifting import place
@@ -68,7 +69,8 @@ class Observation:
 
     ``images[j] ~ Poisson(exposure[j] (psfs[j] * sky) + background[j]) + Normal(0, read_noise[j])``,
 
-    with * a convolution and the sky moved by ``offsets[j]``. All input is checked and copied once,
+    with * a convolution and the sky moved by ``offsets[j]``. With `halos` each adds its own amount
+    of them, which is fitted. All input is checked and copied once,
     and held in read-only arrays. With `oversample` the sky is finer than the pixels of the images.
 
     Parameters
@@ -112,6 +114,12 @@ class Observation:
         turned and sampled in the model; no counts are resampled. PSFs are as the images show them,
         on their pixels, and hold what a pixel collects. Images, and PSFs, of several shapes may be
         given as lists of arrays, and maps with them; bad pixels are added to smaller ones.
+    halos : array_like, shape (n, p, ny, nx), (n, 1, ny, nx), (p, ny, nx) or (ny, nx), optional
+        Light of known shape and unknown amount, such as the speckles of a star behind a
+        coronagraph: n shapes in each image, or one in each, or one for all images. Finite and zero
+        or more where a pixel is good, and not zero everywhere. Only the shape counts. The amount in
+        each image is fitted with the stars and the extended source, and is zero or more. A flat
+        halo, ``np.ones((ny, nx))``, is a level of the background that is fitted in each image.
     epochs : array_like, shape (p,), optional
         The epoch of each image, such as its night: any labels. Stars have a flux in each epoch, the
         rest of the sky is common. By default all images are of one epoch.
@@ -163,6 +171,8 @@ class Observation:
         As given, or 0; with `transforms` their shifts.
     turns : ndarray of float64, shape (p, 2, 2)
         The rotations, flips and scales of `transforms`; without it those of no turn.
+    halos : ndarray of float64, shape (n, p, ny, nx)
+        Of unit sum in each image, 0 where a pixel is bad; n is 0 where none were given.
     epochs : ndarray of int, shape (p,)
         The number of each image's epoch, from 0 on, in the order of the labels.
     oversample : int
@@ -185,6 +195,7 @@ class Observation:
         - A PSF or its sum is not finite, its sum is not positive, or its core is off its centre.
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
+        - A halo is 0 on all good pixels of an image.
         - `transforms` are given beside `offsets`, `oversample` or PSFs that vary over the field,
           shear the images by more than 0.05 pixels, or are for pixels smaller than the sky's.
 
@@ -230,6 +241,7 @@ class Observation:
         exposure: ArrayLike | None = None,
         offsets: ArrayLike | None = None,
         transforms: ArrayLike | None = None,
+        halos: ArrayLike | None = None,
         epochs: ArrayLike | None = None,
         oversample: int = 1,
         effective_psfs: bool = False,
@@ -292,6 +304,7 @@ class Observation:
             self._add_read_noise()
         self._refuse_overflow()
         self._clip_negative()
+        self.halos = check_halos(halos, self.mask)
         for values in self._arrays().values():
             values.flags.writeable = False
         self._is_checked = True
@@ -415,12 +428,15 @@ class Observation:
         for name, values in self._arrays().items():
             if name == "turns" or values.ndim < 3 or not values.size:
                 continue
+            if name == "halos":  # whose first axis is not that of the images
+                values = np.moveaxis(values, 1, 0)
             if name in ("psfs", "psf_modes", *OF_PSFS):
                 values = _about_centre(values, swaps)
             else:
                 values = enlarged(values, shape, float(name == "mask"))
             pairs = zip(orientations, values, strict=True)
-            held[name] = np.array([orientation.of(array) for orientation, array in pairs])
+            upright = np.array([orientation.of(array) for orientation, array in pairs])
+            held[name] = np.moveaxis(upright, 0, 1) if name == "halos" else upright
             held[name].flags.writeable = False
         places = zip(orientations, self.offsets, strict=True)
         held["offsets"] = np.array([each.place(at, shape) for each, at in places])
@@ -451,7 +467,7 @@ class Observation:
         **changes : array_like, int, bool or None
             Values by the name of their attribute. Arrays of the attribute's type are not copied, so
             leave them as they are. New `psfs` are the same all over the images. None stands for no
-            `ideal_psfs`, `pupils`, `psf_modes` or `psf_scatter`.
+            `ideal_psfs`, `pupils`, `psf_modes`, `psf_scatter` or `halos`.
 
         Returns
         -------
@@ -487,6 +503,7 @@ class Observation:
         for name in changes:
             if isinstance(held[name], np.ndarray) and name not in UNCHECKED:
                 _refuse_out_of_range(name, held[name])
+        refuse_dark(other.halos, other.mask)
         if not (other.psfs.sum(axis=(1, 2)) > 0).all():
             raise InputError("psfs must have positive sums; give others")
         if "offsets" in changes and not other.is_turned:
@@ -506,6 +523,8 @@ class Observation:
                 vars(self)[name] = np.zeros((0, *psf))
         if not self.psf_modes.size:
             vars(self)["psf_modes"] = np.zeros((n, 0, *psf))
+        if not self.halos.size:
+            vars(self)["halos"] = np.zeros((0, *images))
         shapes = {
             "images": [(n, *images[-2:])],
             "mask": [images],
@@ -513,6 +532,7 @@ class Observation:
             "psfs": [(n, *self.psfs.shape[-2:])],
             **{name: [(n, *psf), (0, *psf)] for name in OF_PSFS},
             "psf_modes": [(n, *self.psf_modes.shape[1:2], *psf)],
+            "halos": [(len(self.halos), *images)],
         }
         for name, known in shapes.items():
             shape = getattr(self, name).shape
@@ -535,9 +555,9 @@ class Observation:
 
         PSFs that vary are those of a place (x, y) there, by default of its middle.
         """
-        inside = np.s_[:, rows.start : rows.stop, columns.start : columns.stop]
-        held = {name: getattr(self, name) for name in ("images", "mask", *MAPS)}
-        changes: dict[str, Any] = {k: each[inside] for k, each in held.items() if each.ndim == 3}
+        inside = np.s_[..., rows.start : rows.stop, columns.start : columns.stop]
+        held = {name: getattr(self, name) for name in ("images", "mask", "halos", *MAPS)}
+        changes: dict[str, Any] = {k: each[inside] for k, each in held.items() if each.ndim > 2}
         if self.psf_fields:
             fields = [field.moved(-columns.start, -rows.start) for field in self.psf_fields]
             x, y = middle or ((len(columns) - 1) / 2.0, (len(rows) - 1) / 2.0)
@@ -567,6 +587,8 @@ class Observation:
         }
         if (self.exposure != 1.0).any():
             rows["exposure"] = _range(self.exposure)
+        if len(self.halos):
+            rows["halos"] = f"{len(self.halos)}, fitted in each image"
         image = np.where(self.mask[0], np.nan, self.images[0])
         return html_card("lnocl.Observation", rows, image)
 
@@ -744,7 +766,7 @@ def _read(name: str, values: Any) -> Any:
         return _check_oversample(values) if name == "oversample" else flag(name, values)
     if name == "psf_fields":
         return tuple(values)
-    if values is None and name in (*OF_PSFS, "psf_modes"):
+    if values is None and name in (*OF_PSFS, "psf_modes", "halos"):
         return np.zeros(0)
     readers = {"mask": booleans, "epochs": lambda _, given: np.asarray(given, np.intp)}
     array = readers.get(name, partial(numbers, copy=False))(name, values).view()

@@ -6,6 +6,7 @@ import numpy as np
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import seen_psfs
+from lnocl.scene.halos import rough_halos
 from lnocl.scene.observation import Observation
 
 # Share of a PSF's light within the radius that is enough for a pad, and the share of the shorter
@@ -76,7 +77,8 @@ def runs_over_the_edge(observation: Observation) -> bool:
     True
     """
     for j, (image, mask) in enumerate(zip(observation.images, observation.mask, strict=True)):
-        level = np.broadcast_to(observation.background[j], image.shape)
+        level = observation.background[j] + rough_halos(observation, j)
+        level = np.broadcast_to(level, image.shape)
         for edge in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
             good, starts = ~mask[edge], range(0, len(image[edge]), STRETCH)
             excess = np.add.reduceat(np.where(good, image[edge] - level[edge], 0.0), starts)

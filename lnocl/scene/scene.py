@@ -16,6 +16,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
 from lnocl.scene.grid import grid_of
+from lnocl.scene.halos import halo_cutouts
 from lnocl.scene.observation import Observation, numbers
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
 from lnocl.scene.rotation import Rotation, turned_psf
@@ -37,6 +38,9 @@ MAX_VARIATION = 0.2
 # taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
 MIN_MODEL = 2.0**-64
 
+# The weight of halos that are held: it leaves nothing of their corrections.
+HELD = 1e30
+
 NO_PENALTY = Penalty()
 
 # A start may be so many times as bright as the images, beside so many times the noise of their sum,
@@ -53,6 +57,9 @@ class Scene:
     are taken relative to their mean: as ``m_j = e_j (A_j f + sum_s c_s P_js) + b_j`` is linear,
     one of a whole image goes into its PSF, and a map e_j(n) into the weights, with images and
     background divided by it, which leaves the objective as it is but for the weights.
+
+    A halo in an image is to solvers and engines what a star is: light of known shape, in that image
+    alone, whose flux is fitted. So halos come after the stars wherever there are fluxes.
 
     Parameters
     ----------
@@ -79,8 +86,8 @@ class Scene:
         Pixels of the sky to one of the images, along each axis.
     stars : ndarray of float64, shape (n, 2)
         Positions. With several epochs n counts each star in each epoch, star by star.
-    shown : ndarray of bool, shape (n, p)
-        Which images show a star: those of its epoch.
+    shown : ndarray of bool, shape (n_fluxes, p)
+        Which images show a star, those of its epoch; then which a halo, that which it is of.
     rotations : list of Rotation
         How each image is turned against the sky; empty where none is.
     areas : ndarray of float64, shape (p,)
@@ -89,6 +96,8 @@ class Scene:
         Electrons per unit of the images.
     unit : float
         Electrons per exposure and unit of the estimate.
+    mean_exposure : float
+        Electrons of a halo to one of a star of the same flux.
     penalty : Penalty
         On the extended source.
     mu, smoothing : float
@@ -103,9 +112,11 @@ class Scene:
         where all were observed alike.
     gains : ndarray of float64, shape (p,)
         Relative exposures where they are numbers, else 1; the PSFs are multiplied by them.
-    star_weights : ndarray of float64, shape (n,)
+    star_weights : ndarray of float64, shape (n_fluxes,)
         ``sum_j <P_js, w_j>``, of each image not less than 0: the shares of the star's light that
-        were observed, summed.
+        were observed, summed; likewise of halos, or `HELD`.
+    holds_halos : bool
+        Whether halos keep their fluxes.
 
     Raises
     ------
@@ -148,24 +159,32 @@ class Scene:
         exposure = observation.exposure
         has_map = exposure.ndim == 3
         seen = exposure[~observation.mask] if has_map else exposure
-        self._mean_exposure = _mean_exposure(seen)
-        self.unit = self._sky_unit(self._mean_exposure)
-        relative = exposure / self._mean_exposure
+        self.mean_exposure = _mean_exposure(seen)
+        self.unit = self._sky_unit(self.mean_exposure)
+        relative = exposure / self.mean_exposure
         self.gains = np.ones(self.n_images) if has_map else relative
         self._psfs = movable_psfs(self.scaled_psfs(), observation, self.image_grid)
         self.areas = (self.oversample * observation.scales) ** 2
         self.rotations = self._rotations()
         self.weights = self._weigh(relative if has_map else None)
+        self._halos = (
+            halo_cutouts(observation.halos, self.weights, has_map, self.image_grid)
+            if len(observation.halos)
+            else []
+        )
         self._field = self._place_stars(positions)
         self.star_weights, is_observed = self._weigh_stars(self._field)
         self._refuse_unobserved_stars(is_observed)
+        self.holds_halos = False
         self._warn_of_ringing()
         self._penalise(penalty)
 
     def _shown(self, n: int) -> NDArray[np.bool_]:
-        """Return which images show each of n stars in each epoch, shape (n n_epochs, p)."""
-        epochs = self.observation.epochs
-        return np.tile(np.arange(self.observation.n_epochs), n)[:, None] == epochs
+        """Return which images show each of n stars in each epoch, and then each halo."""
+        observation, p = self.observation, self.n_images
+        stars = np.tile(np.arange(observation.n_epochs), n)[:, None] == observation.epochs
+        halos = np.tile(np.eye(p, dtype=bool), (len(observation.halos), 1))
+        return np.concatenate([stars, halos])
 
     def _rotations(self) -> list[Rotation]:
         observation = self.observation
@@ -199,8 +218,8 @@ class Scene:
 
     def _penalise(self, penalty: Penalty) -> None:
         self.penalty = penalty
-        self.mu = self._scaled("mu", penalty.mu, self.unit / self._mean_exposure)
-        self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / self._mean_exposure)
+        self.mu = self._scaled("mu", penalty.mu, self.unit / self.mean_exposure)
+        self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / self.mean_exposure)
         self.smoothing_map = self._smoothing_map(penalty)
         self.edge = self._edge(penalty) if self.is_smoothed else 0.0
 
@@ -215,7 +234,7 @@ class Scene:
             return None
         ny, nx = self.observation.sky_shape
         total = np.full(self.grid, self.smoothing)
-        total[:ny, :nx] += penalty.near_stars / self._mean_exposure
+        total[:ny, :nx] += penalty.near_stars / self.mean_exposure
         return total
 
     def _edge(self, penalty: Penalty) -> float:
@@ -273,8 +292,11 @@ class Scene:
         before, weights = self.stars, self.star_weights
         self._field = self._place_stars(numbers("stars", stars))
         self.star_weights, is_observed = self._weigh_stars(self._field)
+        if self.holds_halos:
+            self.star_weights[self.n_stars :] = HELD
         if not is_observed.all():
-            self._field = self._place_stars(np.where(is_observed[:, None], self.stars, before))
+            is_seen = is_observed[: self.n_stars, None]
+            self._field = self._place_stars(np.where(is_seen, self.stars, before))
             self.star_weights = np.where(is_observed, self.star_weights, weights)
 
     def observes(self, positions: Array) -> NDArray[np.bool_]:
@@ -286,7 +308,9 @@ class Scene:
 
     def _place_stars(self, positions: Array) -> StarField:
         psfs = self.star_psfs(positions)
-        return StarField(psfs, self.observation, self.image_grid, positions, self.shown)
+        return StarField(
+            psfs, self.observation, self.image_grid, positions, self.shown, self._halos
+        )
 
     def star_psfs(
         self, positions: Array, part: tuple[slice, slice] | None = None
@@ -321,8 +345,35 @@ class Scene:
 
     @property
     def n_stars(self) -> int:
-        """Number of point sources."""
+        """Number of point sources; with several epochs of each in each."""
         return len(self.stars)
+
+    @property
+    def n_halos(self) -> int:
+        """Number of halos of all images together."""
+        return self.n_fluxes - self.n_stars
+
+    @property
+    def n_fluxes(self) -> int:
+        """Number of fluxes: of the stars, and then of the halos, shape by shape."""
+        return len(self.shown)
+
+    def holding(self, fluxes: Array, penalty: Penalty) -> Scene:
+        """Return this scene with its halos held, and the start that fluxes, scaled, leave."""
+        other = copy(self)
+        other._rough_fit = fluxes, self._level_beside(fluxes)
+        other.star_weights = np.append(self.star_weights[: self.n_stars], [HELD] * self.n_halos)
+        other.holds_halos = True
+        other._penalise(penalty)
+        return other
+
+    def of_stars(self) -> Scene:
+        """Return this scene without its halos."""
+        other, n = copy(self), self.n_stars
+        other.shown, other.star_weights = self.shown[:n], self.star_weights[:n]
+        other._halos, other.holds_halos = [], False
+        other._field = other._place_stars(self.stars)
+        return other
 
     def images(self) -> Iterator[Array]:
         """Yield each image on its grid, scaled, shape (ny, nx); 0 where not observed."""
@@ -381,7 +432,7 @@ class Scene:
         return self._psfs[j].response(*self.observation.offsets[j])
 
     def star_image(self, j: int, s: int) -> Array:
-        """Return P_js, the PSF of image j centred on star s, shape (ny, nx)."""
+        """Return P_js, the PSF of image j centred on star s, or a halo, shape (ny, nx)."""
         return self.star_cutout(j, s).on_grid(self.image_grid)
 
     def star_cutout(self, j: int, s: int) -> Cutout:
@@ -409,7 +460,8 @@ class Scene:
 
     def star_box(self, j: int, s: int) -> Covered:
         """Return the rows and columns of the images' grid that star s may light in image j."""
-        return covered_box([self.star_cutout(j, s)], self.image_grid, self._max_shift)
+        max_shift = self._max_shift if s < self.n_stars else 0.0
+        return covered_box([self.star_cutout(j, s)], self.image_grid, max_shift)
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
         """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""
@@ -428,7 +480,7 @@ class Scene:
             that is far brighter than the images is made as bright as that.
         star_fluxes : array_like, shape (n,), optional
             Electrons, finite and not negative. By default a least-squares fit of the star
-            images and one constant to the images.
+            images and one constant to the images; of halos, where there are any, instead of that.
 
         Raises
         ------
@@ -439,7 +491,9 @@ class Scene:
         if star_fluxes is None:
             fluxes = self._rough_fit[0].copy()
         else:
-            fluxes = _check_start("initial_star_fluxes", star_fluxes, (self.n_stars,)) / self.unit
+            shape = (self.n_stars,)
+            fluxes = _check_start("initial_star_fluxes", star_fluxes, shape) / self.unit
+            fluxes = np.append(fluxes, self._rough_fit[0][self.n_stars :])
         if extended is None:
             level = self._rough_fit[1]
             self._refuse_if_too_bright(level * math.prod(self.grid) + float(fluxes.sum()))
@@ -491,10 +545,13 @@ class Scene:
 
     @cached_property
     def _rough_fit(self) -> tuple[Array, float]:
-        """Star fluxes and the level of a flat extended source, by linear least squares."""
+        """Star fluxes and the level of a flat extended source, by linear least squares.
+
+        Halos stand in for the level: what a flat one has in common with the sky goes to the halo.
+        """
         total, n_observed, n_seen = 0.0, 0, 0.0  # pixels of images, and of the sky
         normal: BandMatrix | None = None
-        moment, levels = np.zeros(self.n_stars), []
+        moment, levels = np.zeros(self.n_fluxes), []
         background = self.background()
         for j, excess in enumerate(self.images()):
             excess -= background[j]
@@ -503,7 +560,7 @@ class Scene:
             light, n_there = float(excess.sum()), int(np.count_nonzero(observed))
             total, n_observed = total + light, n_observed + n_there
             n_seen += self.areas[j] * n_there
-            if not (self.n_stars and n_there):
+            if not (self.n_fluxes and n_there):
                 continue
             covered = self._field.covered(j)
             stars, weights = self._field.images(j, covered), observed[covered].astype(np.float64)
@@ -511,14 +568,31 @@ class Scene:
             information = stars.information(weights)
             normal = information if normal is None else normal + information
             levels.append(sums / np.sqrt(n_there))
-            moment += stars.products(weights * (excess[covered] - light / n_there))[0]
+            level = 0.0 if self.n_halos else light / n_there
+            moment += stars.products(weights * (excess[covered] - level))[0]
         mean = total / n_observed
         # A star or a sky that starts at zero stays there, so each keeps a small share.
         least = max(1e-3 * mean, float(np.finfo(np.float32).eps))
-        best = moment if normal is None else _solve_beside(normal, np.array(levels).T, moment)
+        if normal is None:
+            best = moment
+        elif self.n_halos:
+            best = normal.solve(moment)
+        else:
+            best = _solve_beside(normal, np.array(levels).T, moment)
         fluxes = np.maximum(best, least * math.prod(self.image_grid) / 100)
         level = (total - float(fluxes @ self.star_weights)) / n_seen
         return fluxes, max(level, least * n_observed / n_seen)
+
+    def _level_beside(self, fluxes: Array) -> float:
+        """Return the level of a flat extended source beside stars and halos of these fluxes."""
+        total, n_observed, n_seen = 0.0, 0, 0.0
+        for j, (image, background) in enumerate(zip(self.images(), self.background(), strict=True)):
+            observed = np.ones(image.shape, bool) if self.weights is None else self.weights[j] > 0
+            n_there = int(np.count_nonzero(observed))
+            total += float((image - background)[observed].sum())
+            n_observed, n_seen = n_observed + n_there, n_seen + self.areas[j] * n_there
+        least = max(1e-3 * total, n_observed * float(np.finfo(np.float32).eps))
+        return max(total - float(fluxes @ self.star_weights), least) / n_seen
 
     def _weigh_stars(self, field: StarField) -> tuple[Array, NDArray[np.bool_]]:
         """Return ``sum_j <P_js, w_j>`` for each star, and whether any image observed it.
@@ -529,6 +603,8 @@ class Scene:
         """
         if self.weights is None:
             light = field.shown.T.astype(np.float64)
+            if self.observation.n_epochs > 1:  # else a star is in all images, of mean exposure 1
+                light[:, : len(field.positions)] *= self.gains[:, None]
             # Samples of an effective PSF a pixel apart may sum to another number.
             if self.oversample > 1 and self.observation.effective_psfs:
                 sums = [[cutout.values.sum() for cutout in each] for each in field.cutouts]
@@ -546,7 +622,7 @@ class Scene:
         return total, is_observed
 
     def _refuse_unobserved_stars(self, is_observed: NDArray[np.bool_]) -> None:
-        for x, y in self.stars[~is_observed]:
+        for x, y in self.stars[~is_observed[: self.n_stars]]:
             raise InputError(
                 f"the star at ({x:g}, {y:g}) lies where all images are masked; "
                 "leave it out or mend the mask"

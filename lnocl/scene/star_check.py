@@ -61,7 +61,7 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
     for j, psf in enumerate(seen_psfs(observation)):
         reach = int(np.clip(np.ceil(REACH * fwhm(psf)), LEAST_REACH, MOST_REACH))
         light = observation.images[j] - observation.background[j]
-        shown = np.flatnonzero(scene.shown[:, j])
+        shown = np.flatnonzero(scene.shown[: scene.n_stars, j])
         positions = scene.star_field.places[j][shown]
         nearest = KDTree(positions).query(positions, k=[2], p=np.inf)[0]  # infinite if alone
         for k in np.flatnonzero(nearest >= 2 * reach).tolist():

@@ -226,8 +226,10 @@ class StarField:
         Shape (ny, nx) of the images' grid.
     positions : ndarray of float64, shape (n, 2)
         In the sky, pixels of the images.
-    shown : ndarray of bool, shape (n, p)
-        Which images show each star; in the others it is 0.
+    shown : ndarray of bool, shape (n + n_fixed, p)
+        Which images show each star, and what is fixed; in the others it is 0.
+    fixed : sequence of p sequences of n_fixed Cutout, optional
+        Light of each image that lies where it is, as that of halos: it comes after the stars.
 
     Attributes
     ----------
@@ -242,26 +244,31 @@ class StarField:
         grid: tuple[int, int],
         positions: Array,
         shown: NDArray[np.bool_],
+        fixed: Sequence[Sequence[Cutout]] = (),
     ) -> None:
-        self.positions, self.shown = positions, shown
+        self.positions, self.shown, self._fixed = positions, shown, fixed
         self.psfs, self._grid, self._is_turned = psfs, grid, observation.is_turned
         self.places = [observation.places(j, positions) for j in range(len(psfs))]
 
     def __len__(self) -> int:
-        return len(self.positions)
+        return len(self.shown)
 
     @cached_property
     def cutouts(self) -> list[list[Cutout]]:
-        """P_js for each image j and star s."""
-        return [
+        """P_js for each image j and star s, then what is fixed."""
+        n = len(self.positions)
+        stars = [
             [
                 psf.at(*place).aligned(self._grid) if shown else _nothing_at(place)
                 for psf, place, shown in zip(psfs, places_there, shown_there, strict=True)
             ]
             for psfs, places_there, shown_there in zip(
-                self.psfs, self.places, self.shown.T, strict=True
+                self.psfs, self.places, self.shown[:n].T, strict=True
             )
         ]
+        if not self._fixed:
+            return stars
+        return [[*of_stars, *others] for of_stars, others in zip(stars, self._fixed, strict=True)]
 
     @cached_property
     def cores(self) -> list[list[Cutout]]:
@@ -273,6 +280,8 @@ class StarField:
 
     @cached_property
     def _order(self) -> Order:
+        if self._fixed:  # which fills the images, and so meets all stars
+            return Order(np.arange(len(self)), len(self) - 1)
         images = zip(self.places, self.cores, strict=True)
         return order_of(self.positions, images, self._grid, self._is_turned)
 

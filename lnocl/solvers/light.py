@@ -69,22 +69,27 @@ class Light:
         """Return the sum of `sky` times shares of its pixels, and its standard error, electrons.
 
         What stars are in error there the extended source is too, with the other sign. The photons
-        of a star, which scatter its flux and the sum alike, have no part in it.
+        of a star, which scatter its flux and the sum alike, have no part in it. A halo is in error
+        by the share of it that the sum takes for light of the sky.
 
         Parameters
         ----------
         shares : ndarray of float64, shape (ny, nx)
             The share of each pixel of the observed sky that is summed.
-        star_flux_errors : ndarray of float64, shape (n,)
-            Standard errors of the stars, electrons.
+        star_flux_errors : ndarray of float64, shape (n_fluxes,)
+            Standard errors of the stars and halos, electrons.
         """
         scene, (ny, nx) = self._scene, shares.shape
         inside, star_fluxes = self._inside(shares), self._star_fluxes / scene.unit
+        errors = star_flux_errors.copy()
         of_counts, variances = 0.0, np.zeros(3)  # of the background, of all but stars, of stars
         factors = list(self._factors(shares))
         for j, (factor, image) in enumerate(zip(factors, scene.images(), strict=True)):
             stars = scene.star_field.light(j, np.where(inside, star_fluxes, 0.0))
             image -= stars
+            for k in range(scene.n_stars + j, scene.n_fluxes, scene.n_images):
+                halo = scene.star_cutout(j, k)
+                errors[k] *= np.vdot(factor[halo.window(factor.shape)], halo.values)
             # A count estimates its variance; both are per relative exposure, which is the weight.
             noise = _quotient(factor, self._map.weights[j])
             background = np.broadcast_to(self._map.background[j], image.shape)
@@ -97,7 +102,7 @@ class Light:
         of_sky = np.einsum("yx,yx", shares, self._sky[:ny, :nx])
         of_sky -= np.einsum("yx,yx", self._map.adjoint(factors), self._sky)
         least, rest, photons = variances * scene.unit**2 / scene.scale
-        of_stars = (star_flux_errors[inside] ** 2).sum() - photons
+        of_stars = (errors[inside] ** 2).sum() - photons
         error = np.sqrt(max(rest, least) + max(of_stars, 0.0))
         return float(of_sky + of_counts * scene.unit), float(error)
 
@@ -121,12 +126,12 @@ class Light:
                 yield weights * seen / total
 
     def _inside(self, shares: Array) -> NDArray[np.bool_]:
-        """Return which stars lie in pixels that are summed."""
+        """Return which stars lie in pixels that are summed, as all halos are taken to."""
         (ny, nx), scene = shares.shape, self._scene
         x, y = np.floor(on_sky(scene.stars, scene.oversample) + 0.5).astype(int).T
         inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
         inside[inside] = shares[y[inside], x[inside]] > 0
-        return inside
+        return np.append(inside, np.ones(scene.n_halos, bool))
 
 
 def _quotient(factor: Array, weights: Array) -> Array:

@@ -79,9 +79,18 @@ class StarFit:
         Extended source, on the grid and scaled.
     given : ndarray of float64, shape (n, 2)
         Positions that the stars must stay within `MAX_SHIFT` of.
+    halos : ndarray of float64, shape (n_halos,), optional
+        Fluxes of the halos, which are held.
     """
 
-    def __init__(self, scene: Scene, model: Model, extended: Array, given: Array) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        model: Model,
+        extended: Array,
+        given: Array,
+        halos: Array | None = None,
+    ) -> None:
         self._given, self._observation = given, scene.observation
         n_images, turns = scene.n_images, scene.observation.turns
         part = _part(scene.scaled_psfs())
@@ -91,16 +100,20 @@ class StarFit:
             for j in range(n_images)
         ]
         covered = [covered_pixels(each, scene.image_grid) for each in squares]
+        stars_of_images = [each[: scene.n_stars] for each in scene.star_field.cutouts]
         reached = [
             (places_there, cutouts)
             for places_there, *both in zip(
-                scene.star_field.places, scene.star_field.cutouts, squares, strict=True
+                scene.star_field.places, stars_of_images, squares, strict=True
             )
             for cutouts in both
         ]
         is_turned = self._observation.is_turned
         order = order_of(scene.stars, reached, scene.image_grid, is_turned)
         diffuse = model.forward(extended) + model.background
+        if halos is not None and len(halos):
+            held = np.append(np.zeros(scene.n_stars), halos)
+            diffuse += np.array(list(model.starlight(held)))
         self._likelihood = StarLikelihood.of_scene(scene, model, diffuse, covered)
         self._stars = [
             _MovableStars(psfs, turn, where, places_there, whole, around, order)
@@ -109,7 +122,7 @@ class StarFit:
                 turns,
                 scene.star_field.places,
                 covered,
-                scene.star_field.cutouts,
+                stars_of_images,
                 squares,
                 strict=True,
             )

@@ -25,6 +25,10 @@ SHIFT = 0.1
 # Least light of stars and background in a pixel, as a share of the images' mean.
 MIN_BACKGROUND = 2.0**-20
 
+# Information that leaves nothing of a step, and the window of no cross information.
+HELD = 1e38
+NOTHING = np.array([[0, 0, 1, 1]], np.int32)
+
 
 @dataclass(frozen=True)
 class Scaling:
@@ -87,6 +91,19 @@ class Scaling:
         """
         return bounded_step(self.star_information, gradient + coupling, fluxes)
 
+    def holding(self, n: int) -> Scaling:
+        """Return this scaling with so many fluxes more, which stay as they are."""
+        before = self.star_information
+        m = len(before.places)
+        band = np.zeros((len(before.band), m + n), order="F")
+        band[:, :m], band[0, m:] = before.band, HELD
+        return Scaling(
+            self.shift,
+            BandMatrix(band, np.append(before.places, np.arange(m, m + n))),
+            np.append(self.cross_values, np.zeros(n)),
+            np.append(self.cross_windows, np.tile(NOTHING, (n, 1)), axis=0),
+        )
+
     def is_usable(self) -> bool:
         """Return whether the star information can be inverted, as that of any scene can."""
         diagonal, places = self.star_information.diagonal, self.star_information.places
@@ -119,10 +136,16 @@ def prepare(
     star_fluxes : ndarray of float64, shape (n,)
         Where the fluxes are sought from, scaled.
     """
+    if scene.holds_halos:
+        stars, halos = np.split(star_fluxes, [scene.n_stars])
+        held = np.append(np.zeros_like(stars), halos)
+        known = model.with_background(scene.of_stars(), list(model.starlight(held)))
+        stars, scaling = prepare(known.scene, known, extended, stars)
+        return np.append(stars, halos), scaling.holding(len(halos))
     total_weight, inverse = _back_projections(model)
     information = BandMatrix(np.zeros((1, 0)), np.zeros(0, int))
     values, windows = np.zeros(0), np.zeros((0, 4), np.int32)
-    if scene.n_stars:
+    if scene.n_fluxes:
         covered = [scene.star_field.covered(j) for j in range(scene.n_images)]
         boxes = [_box(each) for each in covered]
         observed = np.where(scene.observed(total_weight), extended, 0.0)
@@ -192,8 +215,8 @@ def _cross_information(
 ) -> tuple[Array, NDArray[np.int32]]:
     """Return the values and the windows of the cross information."""
     # Memory is taken where values are written, and a list of them would take it twice.
-    values = np.empty(scene.n_stars * math.prod(largest_window(scene)))
-    windows, end = np.empty((scene.n_stars, 4), np.int32), 0
+    values = np.empty(most_cross_values(scene))
+    windows, end = np.empty((scene.n_fluxes, 4), np.int32), 0
     for s, at in enumerate(windows):
         cutout = model.adjoint_of_cutouts(
             [_times(cores[s], w) for cores, w in zip(scene.star_field.cores, ratios, strict=True)]
@@ -202,6 +225,12 @@ def _cross_information(
         begin, end = end, end + cutout.values.size
         values[begin:end] = cutout.values.ravel()
     return values[:end], windows
+
+
+def most_cross_values(scene: Scene) -> int:
+    """Return the most values that the cross information may have."""
+    of_stars = scene.n_stars * math.prod(largest_window(scene))
+    return of_stars + scene.n_halos * math.prod(scene.grid)
 
 
 def _box(covered: NDArray[np.bool_]) -> Box:

@@ -85,6 +85,28 @@ def test_a_star_is_in_the_images_of_its_epoch_alone():
     np.testing.assert_allclose(total, plain.star_weights, rtol=1e-14)
 
 
+def test_exposures_of_epochs_weigh_their_stars():
+    """Else the split-gradient method would overstep in epochs of long exposures."""
+    y, x = np.indices((32, 32))
+    psf = gaussian(*(np.indices((9, 9)) - 4), 2.0 * np.eye(2))
+    light, exposure = 900.0 * gaussian(x - 12, y - 11, 2.0 * np.eye(2)), np.array([1.0, 9.0])
+    images = exposure[:, None, None] * (light + 1.0)
+    given = lnocl.Observation(images, psf, exposure=exposure, epochs=[0, 1])
+    scene = Scene(given, [(12, 11)])
+    np.testing.assert_allclose(scene.star_weights, [0.2, 1.8], rtol=1e-14)
+    result = paper(given, [(12, 11)], n_iter=60, engine="numpy")
+    assert worst(result.star_fluxes, 900.0) <= 0.02
+
+
+def test_held_out_counts_of_epochs_resume(tmp_path):
+    options = {"n_iter": 12, "engine": "numpy", "checkpoint": str(tmp_path / "run.fits")}
+    given = observation(epochs=EPOCHS)
+    lnocl.deconvolve(given, STARS, callback=lambda iteration, _: iteration == 4, **options)
+    found = lnocl.deconvolve(given, STARS, resume=options["checkpoint"], **options)
+    whole = lnocl.deconvolve(given, STARS, **{**options, "checkpoint": None})
+    same(found, whole)
+
+
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 def test_fluxes_of_nights_and_their_errors():
     """A star of six nights beside a second one on a common host: pulls of 8 seeds."""

@@ -491,6 +491,7 @@ def test_the_arrays_of_an_observation_are_read_only(maps):
         "offsets",
         "turns",
         "epochs",
+        "halos",
         "ideal_psfs",
         "psf_modes",
         "pupils",
