@@ -39,7 +39,7 @@ def wave_errors(frequency, n=128):
     for degrees in DEGREES:
         turn = rotation(np.radians(degrees))
         shift = middle - turn @ middle + (0.3, -2.2)
-        each = Rotation(np.radians(degrees), shift, (n, n), (n, n))
+        each = Rotation(np.radians(degrees), shift, (n, n), (range(n), range(n)))
         u, v = np.einsum("ij,jyx->iyx", turn.T, np.array([x, y]) - shift[:, None, None])
         for direction in np.arange(DIRECTIONS) * np.pi / DIRECTIONS:
             along = 2 * np.pi * frequency * np.array([np.cos(direction), np.sin(direction)])

@@ -14,6 +14,7 @@ from lnocl.errors import counted
 from lnocl.residuals import Fit, StarResiduals, sharp_sources
 from lnocl.result import Result
 from lnocl.scene.detector import on_sky
+from lnocl.scene.observation import Observation
 from lnocl.scene.stars import MAX_SHIFT
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ def _shortness(arguments: argparse.Namespace, result: Result) -> list[str]:
 def _unnamed(result: Result, frames: Frames) -> list[str]:
     """Return a line on sources in the extended source that are as sharp as stars."""
     observation = frames.observation
-    background = float(_means(observation.background).sum()) / observation.oversample**2
+    background = float((_means(observation.background) / _areas(observation)).sum())
     exposure = float(_means(observation.exposure).sum())  # of all images, whose noise tells
     found = sharp_sources(result.extended * exposure, background, observation.oversample)
     found = found / (1.0, 1.0, exposure)
@@ -126,13 +127,18 @@ def _floor(result: Result, frames: Frames, unit: str) -> list[str]:
     """Return a line where the extended source is nowhere dark."""
     observation = frames.observation
     darkest = float(np.quantile(result.extended, DARK_SHARE))
-    counts = darkest * observation.oversample**2 * _means(observation.exposure)
+    counts = darkest * _areas(observation) * _means(observation.exposure)
     if not (counts > FLOOR * np.sqrt(_means(observation.background) + counts)).any():
         return []
     return [
         f"the extended source is hardly darker anywhere than {darkest / frames.electrons:.3g} "
         f"{unit} a pixel: the background is too low by that, or light fills the frame"
     ]
+
+
+def _areas(observation: Observation) -> NDArray[np.float64]:
+    """Return how many pixels of the sky are one of each image."""
+    return np.asarray((observation.oversample * observation.scales) ** 2)
 
 
 def _means(values: NDArray[np.float64]) -> NDArray[np.float64]:

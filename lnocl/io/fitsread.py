@@ -102,7 +102,10 @@ def read_stack(paths: Sequence[str], may_differ: bool = False) -> Stack:
     planes = list(images[0].reshape(-1, *images[0].shape[-2:])) if len(images) == 1 else images
     shapes = [(plane.shape[0], plane.shape[1]) for plane in planes]
     shape = max(ny for ny, _ in shapes), max(nx for _, nx in shapes)
-    data = np.stack([enlarged(plane, shape, np.nan) for plane in planes])
+    if len(images) == 1:
+        data = images[0].reshape(-1, *shape)
+    else:
+        data = np.stack([enlarged(plane, shape, np.nan) for plane in planes])
     return Stack(data, list(headers), list(sha256), shapes)
 
 

@@ -215,7 +215,7 @@ class _Reader:
         if places.sha256:
             self._sha256["angle"] = places.sha256
         observation = Observation(
-            counts,
+            self._in_own_shapes(counts),
             self._grids or self._psf_stack(),
             background=self._maps.combine("background", levels),
             read_noise=self._maps.combine("read_noise", read_noise)
@@ -252,6 +252,13 @@ class _Reader:
             self._gain,
             self._background_errors,
         )
+
+    def _in_own_shapes(self, counts: Array) -> Array | list[Array]:
+        """Return images as a stack, or of several shapes as a list."""
+        shapes = self._images.shapes
+        if len(set(shapes)) == 1:
+            return counts
+        return [image[:ny, :nx] for image, (ny, nx) in zip(counts, shapes, strict=True)]
 
     def _psf_stack(self) -> Array:
         """Return the PSFs in one shape, smaller ones in the middle of it."""

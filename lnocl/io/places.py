@@ -13,7 +13,7 @@ from lnocl.errors import InputError, counted, note, warn
 from lnocl.io import sky
 from lnocl.io.fitsread import Stack, keyword_number, read_keyword
 from lnocl.scene.arrays import Array
-from lnocl.scene.transforms import relative_to, rotations, scale_of
+from lnocl.scene.transforms import rotations, scale_of
 
 if TYPE_CHECKING:
     from lnocl.io.frames import Calibration
@@ -64,19 +64,15 @@ def read_places(stack: Stack, paths: Sequence[str], calibration: Calibration) ->
 
 
 def _by_coordinates(stack: Stack, paths: Sequence[str]) -> Places:
-    found = sky.transforms(stack.headers, paths, stack.shapes)
-    scales = [scale_of(each) for each in found]
-    finest = int(np.argmin(scales))
-    if scales[finest] < 1.0:
-        found = relative_to(found, finest)
+    finest = sky.finest(stack.headers, paths, stack.shapes)
+    found = sky.transforms(stack.headers, paths, stack.shapes, finest)
+    if finest:
         note("the sky has the pixels of %s, the smallest: positions are in these", paths[finest])
-    else:
-        finest = 0
     is_turned = (found[:, :, :2] != np.eye(2)).any()
     for j, each in enumerate(found):
         if j == finest:
             continue
-        larger = f", pixels {scale:.4g} times as large" if (scale := scale_of(each)) > 1 else ""
+        larger = f", pixels {scale:.6g} times as large" if (scale := scale_of(each)) > 1 else ""
         if is_turned:
             angle = sky.rotation_angle(each)
             note("`images[%d]`: turned by %.3f degrees%s, from the WCS", j, angle, larger)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import math
 from codecs import BOM_UTF8
 from collections.abc import Callable, Sequence
 from typing import IO, Any
@@ -397,28 +398,53 @@ def _check_votable(path: str, content: IO[bytes]) -> None:
     content.seek(0)
 
 
-def transforms(
+def finest(
     headers: Sequence[fits.Header], paths: Sequence[str], shapes: Sequence[tuple[int, int]]
-) -> NDArray[np.float64]:
-    """Return the map from the first image to each, shape (p, 2, 3), pixels.
+) -> int:
+    """Return which image has the smallest pixels: the first, unless others differ over an image.
 
-    It is a shift, the mean over the image of ``pixel_j(sky(pixel_1)) - pixel_1``, where that is the
+    Raises
+    ------
+    InputError
+        An image without sky coordinates.
+    """
+    scales = []
+    for header, path in zip(headers, paths, strict=True):
+        area = celestial_wcs(header, path, "leave align out").proj_plane_pixel_area()
+        scales.append(float(np.sqrt(area.to_value("arcsec2"))))
+    smallest = int(np.argmin(scales))
+    change = (scales[0] / scales[smallest] - 1.0) * math.hypot(*shapes[smallest]) / 2.0
+    return smallest if change > MAX_OFFSET_VARIATION else 0
+
+
+def transforms(
+    headers: Sequence[fits.Header],
+    paths: Sequence[str],
+    shapes: Sequence[tuple[int, int]],
+    of_sky: int = 0,
+) -> NDArray[np.float64]:
+    """Return the map from one image, by default the first, to each, shape (p, 2, 3), pixels.
+
+    It is a shift, the mean over that image of ``pixel_j(sky(pixel)) - pixel``, where this is the
     same all over the image within a tenth of a pixel; else the nearest rotation, with or without a
     flip, and shift; with a scale where that leaves more.
 
     Raises
     ------
     InputError
-        An image without sky coordinates; one that shows another part of the sky than the first;
+        An image without sky coordinates; one that shows another part of the sky than that one;
         one that no rotation, scale and shift brings within a tenth of a pixel.
     """
-    first, *others = (
+    all_wcs = [
         celestial_wcs(header, path, "leave align out")
         for header, path in zip(headers, paths, strict=True)
-    )
-    found = [np.eye(2, 3)]
-    for wcs, path, shape in zip(others, paths[1:], shapes[1:], strict=True):
-        found.append(_transform(first, wcs, paths[0], path, shapes[0], shape))
+    ]
+    found = [
+        np.eye(2, 3)
+        if j == of_sky
+        else _transform(all_wcs[of_sky], wcs, paths[of_sky], path, shapes[of_sky], shape)
+        for j, (wcs, path, shape) in enumerate(zip(all_wcs, paths, shapes, strict=True))
+    ]
     return np.array(found)
 
 

@@ -111,8 +111,9 @@ def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
     images: list[list[dict[str, Any]]] = []
     for j in range(len(view.images)):
         offset = view.offset_at(j, region)
-        there = region.slices(view.shape, offset)
-        corner = _corner(there, view.shape, offset)
+        shape = view.images[j].shape
+        there = region.slices(shape, offset)
+        corner = _corner(there, shape, offset)
         if not view.images[j][there].size:  # not in this image
             images.append([])
             continue

@@ -100,7 +100,7 @@ class ResultView:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape (ny, nx) of the images."""
+        """Shape (ny, nx) of the sky in pixels of the images."""
         ny, nx = self.extended.shape
         return ny // self.oversample, nx // self.oversample
 
@@ -232,7 +232,7 @@ def _draw_images(axes: Sequence[Axes], view: ResultView, region: Region) -> None
     from matplotlib.colors import AsinhNorm, Normalize
 
     j = worst_image(view, region)
-    there = region.slices(view.shape, view.offset_at(j, region))
+    there = region.slices(view.images[j].shape, view.offset_at(j, region))
     _, _, noise = image_limits(view.images[j])
     low, high, _ = image_limits(view.images[j][there])
     name = "image" if len(view.images) == 1 else f"image {j + 1} of {len(view.images)}"

@@ -385,7 +385,8 @@ class LocalRotation:
         nx, ny = (scipy.fft.next_fast_len(int(n), real=True) for n in needed)
         self.rows, self.columns = range(first[1], first[1] + ny), range(first[0], first[0] + nx)
         at = turn @ first + shift - (columns[0], rows[0])
-        self._rotation = rotation = Rotation(angle, at, (ny, nx), self.shape, scale)
+        box = range(self.shape[0]), range(self.shape[1])
+        self._rotation = rotation = Rotation(angle, at, (ny, nx), box, scale)
         self._otf = scipy.fft.rfft2(psf.on_grid((ny, nx))) * rotation.undone()
         self._phases, self._shears = rotation.row_phases(), rotation.matrix(self.shape)
 

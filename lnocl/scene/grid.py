@@ -50,13 +50,14 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
         raise InputError(f"`pad` must be a whole number, 0 or more, or auto; {pad} was given")
     # Light that is farther from its source than the images are wide reaches none of them.
     most = MAX_AXIS // observation.oversample
-    sizes = (-(-k // observation.oversample) for k in observation.psfs.shape[1:])
+    finer = float(observation.scales.max()) / observation.oversample
+    sizes = (math.ceil(k * finer) for k in observation.psfs.shape[1:])
     reach = (min(k, 2 * n, most) for n, k in zip(shape, sizes, strict=True))
     ny, nx = (max(n + 2 * int(pad), k) for n, k in zip(shape, reach, strict=True))
     if max(ny, nx) > most:
-        finer = f" and oversample={observation.oversample}" if observation.oversample > 1 else ""
+        also = f" and oversample={observation.oversample}" if observation.oversample > 1 else ""
         raise InputError(
-            f"images of {shape} with `pad`={pad}{finer} need a grid of {(ny, nx)}; "
+            f"images of {shape} with `pad`={pad}{also} need a grid of {(ny, nx)}; "
             f"the largest axis is {most}: cut the images or pad less"
         )
     return length_for(ny), length_for(nx)
@@ -73,10 +74,10 @@ def extent(observation: Observation) -> tuple[int, int]:
     corners, needed = [np.array([(0.0, 0.0), (width - 1.0, height - 1.0)])], np.zeros(2)
     for j, (turn, shift) in enumerate(zip(observation.turns, observation.offsets, strict=True)):
         rows, columns = observation.good_box(j)
-        seen = np.array([(x, y) for x in (0, columns[-1]) for y in (0, rows[-1])])
-        corners.append(np.linalg.solve(turn, (seen - shift).T).T)
+        ends = [(x, y) for x in (columns[0], columns[-1]) for y in (rows[0], rows[-1])]
+        corners.append(np.linalg.solve(turn, (np.array(ends) - shift).T).T)
         scale, slope = observation.scales[j], abs(math.tan(math.atan2(turn[1, 0], turn[0, 0]) / 2))
-        sheared = scale * (columns[-1] + slope * rows[-1])
+        sheared = scale * (len(columns) + slope * len(rows))
         taps = TAPS * (1.0 if scale == 1.0 else 1.0 + scale)
         needed = np.maximum(needed, (sheared + taps, np.ptp(corners[-1][:, 1]) + taps + PHASE_ROWS))
     size = np.maximum(np.ptp(np.concatenate(corners), axis=0) + TAPS, needed)

@@ -24,8 +24,10 @@ from lnocl.scene.transforms import (
     check_transforms,
     enlarged,
     of_one_shape,
+    refuse_other_shapes,
     rotation,
     scale_of,
+    shapes_of,
 )
 from lnocl.scene.uncertainties import is_uncertainty, without_source
 
@@ -251,11 +253,15 @@ class Observation:
         psf_modes: ArrayLike | None = None,
         psf_scatter: ArrayLike | None = None,
     ) -> None:
+        shapes = shapes_of(images) if transforms is not None else []
+        if len(set(shapes)) > 1:
+            maps = {"background": background, "read_noise": read_noise, "exposure": exposure}
+            for name, values in {**maps, "mask": mask}.items():
+                refuse_other_shapes(name, values, shapes)
+            images, mask = of_one_shape(images, np.nan), of_one_shape(mask, True)
+            background, read_noise, exposure = map(of_one_shape, maps.values())
         if transforms is not None:
-            images, psfs = of_one_shape(images, np.nan), of_one_shape(psfs, 0.0, True)
-            mask = of_one_shape(mask, True)
-            background, read_noise = of_one_shape(background), of_one_shape(read_noise)
-            exposure = of_one_shape(exposure)
+            psfs = of_one_shape(psfs, 0.0, about_centre=True)
         self.oversample = _check_oversample(oversample)
         self.effective_psfs = flag("effective_psfs", effective_psfs)
         has_exposure = exposure is not None
@@ -288,7 +294,8 @@ class Observation:
         self.turns, self.offsets = self._check_maps(offsets, transforms)
         self.epochs = self._check_epochs(epochs)
         self._orientations: tuple[Orientation, ...] = ()
-        self._frame = self.shape
+        self._given_shape = self.shape
+        self._frame = self._shape_of_sky(shapes)
         self._apply_mask(mask)
         self.exposure = self._check_exposure(1.0 if exposure is None else exposure)
         self._refuse_all_masked()
@@ -354,6 +361,8 @@ class Observation:
     @property
     def sky_shape(self) -> tuple[int, int]:
         """Shape of the extended source: that of an image, times `oversample` along each axis.
+
+        Of images of several shapes it is that whose `transforms` changes nothing.
 
         Examples
         --------
@@ -452,7 +461,7 @@ class Observation:
         """
         if not self._orientations:
             return images
-        ny, nx = self._frame if cut else images.shape[1:]
+        ny, nx = self._given_shape if cut else images.shape[1:]
         pairs = zip(self._orientations, images, strict=True)
         return np.array([orientation.back(image)[:ny, :nx] for orientation, image in pairs])
 
@@ -498,8 +507,8 @@ class Observation:
             changes = {"psf_fields": (), **changes}
         held |= {name: _read(name, values) for name, values in changes.items()}
         other._refuse_other_shapes()
-        if not other._orientations:
-            held["_frame"] = other.shape
+        if other.shape != self.shape and not other._orientations:
+            held["_given_shape"] = held["_frame"] = other.shape
         for name in changes:
             if isinstance(held[name], np.ndarray) and name not in UNCHECKED:
                 _refuse_out_of_range(name, held[name])
@@ -718,9 +727,21 @@ class Observation:
         ):
             if is_given:
                 raise InputError(f"`transforms` are not taken beside {name}; give one of them")
-        boxes = [self.good_box(j) for j in range(self.n_images)]
-        exact = check_transforms(transforms, [(rows, columns) for rows, columns in boxes])
+        exact = check_transforms(transforms, [self.good_box(j) for j in range(self.n_images)])
+        scales = [scale_of(each) for each in exact]
+        if self.n_images > 1 and self.psfs.strides[0] == 0 and min(scales) < max(scales):
+            raise InputError(
+                f"one PSF is given for images whose pixels are {min(scales):.4g} and "
+                f"{max(scales):.4g} times the sky's; give one for each image, on its own pixels"
+            )
         return exact[:, :, :2].copy(), exact[:, :, 2].copy()
+
+    def _shape_of_sky(self, shapes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+        """Return the shape of the image whose pixels the sky has, of images of several shapes."""
+        whole = np.eye(2, 3)
+        maps = np.concatenate([self.turns, self.offsets[:, :, None]], axis=2)
+        own = (shape for shape, each in zip(shapes, maps, strict=False) if (each == whole).all())
+        return next(own, self.shape)
 
     def _check_offsets(self, offsets: ArrayLike | None) -> Array:
         if offsets is None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from lnocl.scene.arrays import Array
@@ -46,7 +48,9 @@ def recommend_pad(observation: Observation) -> int:
 
     Examples
     --------
-    >>> import numpy as np
+    >>> import math
+
+    import numpy as np
     >>> import lnocl
     >>> from lnocl.scene.padding import recommend_pad
     >>> y, x = np.indices((31, 31)) - 15
@@ -55,7 +59,8 @@ def recommend_pad(observation: Observation) -> int:
     7
     """
     most = max(1, int(SHARE_OF_SIDE * min(observation.shape)))
-    return min(max(1, *(_radius(psf, LIGHT) for psf in seen_psfs(observation))), most)
+    psfs = zip(seen_psfs(observation), observation.scales, strict=True)
+    return min(max(1, *(math.ceil(_radius(psf, LIGHT) * scale) for psf, scale in psfs)), most)
 
 
 def runs_over_the_edge(observation: Observation) -> bool:
@@ -66,7 +71,9 @@ def runs_over_the_edge(observation: Observation) -> bool:
 
     Examples
     --------
-    >>> import numpy as np
+    >>> import math
+
+    import numpy as np
     >>> import lnocl
     >>> from lnocl.scene.padding import runs_over_the_edge
     >>> image = np.full((64, 64), 90.0)
@@ -79,7 +86,8 @@ def runs_over_the_edge(observation: Observation) -> bool:
     for j, (image, mask) in enumerate(zip(observation.images, observation.mask, strict=True)):
         level = observation.background[j] + rough_halos(observation, j)
         level = np.broadcast_to(level, image.shape)
-        for edge in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+        rows, columns = observation.good_box(j)
+        for edge in (np.s_[rows[0]], np.s_[rows[-1]], np.s_[:, columns[0]], np.s_[:, columns[-1]]):
             good, starts = ~mask[edge], range(0, len(image[edge]), STRETCH)
             excess = np.add.reduceat(np.where(good, image[edge] - level[edge], 0.0), starts)
             variance = np.add.reduceat(np.where(good, image[edge], 0.0), starts)

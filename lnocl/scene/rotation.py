@@ -51,8 +51,8 @@ class Rotation:
         t, pixels.
     grid : tuple of int
         Shape (Ny, Nx) of both, periodic.
-    shape : tuple of int
-        Shape of the image at the grid's origin; pixels beyond it are of no use.
+    box : tuple of range
+        Rows and columns of the image whose pixels are used.
     scale : float
         s, pixels of the sky to one of the image along each axis, 1 or more.
 
@@ -73,7 +73,7 @@ class Rotation:
         angle: float,
         shift: Array,
         grid: tuple[int, int],
-        shape: tuple[int, int],
+        box: tuple[range, range],
         scale: float = 1.0,
     ) -> None:
         self.angle, self.scale, self.grid = angle, scale, grid
@@ -84,19 +84,17 @@ class Rotation:
         (x, y), rows = whole, np.arange(ny)
         self.image_shifts = p * (rows - y) - x
         # The columns, and the rows, that the image is made of lie in the middle of a period.
-        height, width = shape
-        first, last = p * -y - x, p * (height - 1 - y) - x
-        w = min(first, last), width - 1 + max(first, last)
-        columns = _signed(nx, sum(w) / 2.0, 1)
+        (top, bottom), (left, right) = ((each[0], each[-1]) for each in box)
+        w = left + right + p * (top + bottom - 2 * y) - 2 * x  # of its corners, twice
+        columns = _signed(nx, w / 2.0, 1)
         self.column_shifts = q * columns - y
-        used = q * np.array(w) - y
-        middle = float(used.mean() + (height - 1) / 2.0)
+        middle = q * w / 2.0 - y + (top + bottom) / 2.0
         self.phase_rows = math.gcd(ny, PHASE_ROWS)
         of_sky = _signed(ny, scale * middle - lag_y, self.phase_rows)
         self.row_shifts = p * (of_sky + lag_y)
         self.samplings: tuple[LineSampling, ...] = ()
         if scale != 1.0:
-            along_x = _signed(nx, scale * sum(w) / 2.0 - lag_x, 1)
+            along_x = _signed(nx, scale * w / 2.0 - lag_x, 1)
             self.samplings = (
                 LineSampling(scale * _signed(ny, middle, 1) - lag_y, int(of_sky.min())),
                 LineSampling(scale * columns - lag_x, int(along_x.min())),

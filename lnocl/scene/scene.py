@@ -190,25 +190,19 @@ class Scene:
         observation = self.observation
         if not observation.is_turned:
             return []
-        angles = np.arctan2(observation.turns[:, 1, 0], observation.turns[:, 0, 0])
+        angles = np.arctan2(observation.turns[:, 1, 0], observation.turns[:, 0, 0]).tolist()
+        scales = observation.scales.tolist()
         return [
-            Rotation(float(angle), shift, self.grid, self._ends(j), float(observation.scales[j]))
-            for j, (angle, shift) in enumerate(zip(angles, observation.offsets, strict=True))
+            Rotation(angles[j], shift, self.grid, observation.good_box(j), scales[j])
+            for j, shift in enumerate(observation.offsets)
         ]
-
-    def _ends(self, j: int) -> tuple[int, int]:
-        """Return the shape of what of image j, from its origin on, holds its good pixels."""
-        rows, columns = self.observation.good_box(j)
-        return rows.stop, columns.stop
 
     def psfs_of_sky(self) -> list[Array]:
         """Return the PSFs as the sky sees them, of unit sum: turned back, on the sky's pixels."""
         if not self.rotations:
             return list(self.observation.psfs)
         psfs = zip(self.observation.psfs, self.rotations, strict=True)
-        turned = [turned_psf(psf, rotation.angle, rotation.scale) for psf, rotation in psfs]
-        n = max(map(len, turned))  # all sides are multiples of 4
-        return [np.pad(psf, (n - len(psf)) // 2) for psf in turned]
+        return [turned_psf(psf, rotation.angle, rotation.scale) for psf, rotation in psfs]
 
     @cached_property
     def _psfs_of_sky(self) -> list[MovablePsf]:
@@ -684,7 +678,8 @@ class Scene:
                 )
 
     def _warn_of_large_psf(self) -> None:
-        psf_shape = self.observation.psfs.shape[1:]
+        finer = float(self.observation.scales.max())
+        psf_shape = tuple(math.ceil(finer * k) for k in self.observation.psfs.shape[1:])
         if any(k > n for k, n in zip(psf_shape, self.grid, strict=True)):
             warn(
                 f"the psf {psf_shape} is larger than the grid {self.grid}: its wings wrap "

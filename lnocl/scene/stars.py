@@ -174,7 +174,7 @@ def order_of(
     stars: Array,
     images: Iterable[tuple[Array, Sequence[Cutout]]],
     grid: tuple[int, int],
-    is_turned: bool = False,
+    scales: Array | None = None,
 ) -> Order:
     """Return the order of stars along the axis that leaves the least of them between neighbours.
 
@@ -186,18 +186,20 @@ def order_of(
         For each image where the stars are in it, and what they may light there.
     grid : tuple of int
         Shape of the images' grid, which is periodic.
-    is_turned : bool
-        Whether images are turned, so that squares in them reach farther along the sky's axes.
+    scales : ndarray of float64, shape (p,), optional
+        Pixels of the sky to one of each image, where images are turned, so that squares in them
+        reach farther along the sky's axes.
     """
     n = len(stars)
     reach = np.zeros((n, 2))
-    for places_there, cutouts in images:
+    for j, (places_there, cutouts) in enumerate(images):
+        scale = 1.0 if scales is None else scales[j]
         first = np.array([cutout[1:] for cutout in cutouts]).reshape(n, 2)
         size = np.array([cutout.values.shape for cutout in cutouts]).reshape(n, 2)
         away = places_there[:, ::-1] - first
         is_whole = size >= grid
-        reach = np.maximum(reach, np.where(is_whole, grid, np.maximum(away, size - away)))
-    if is_turned:
+        reach = np.maximum(reach, np.where(is_whole, grid, scale * np.maximum(away, size - away)))
+    if scales is not None:
         farthest = np.minimum(math.sqrt(2.0) * reach.max(axis=1), max(grid))
         reach = np.stack([farthest, farthest], axis=1)
     orders = []
@@ -247,7 +249,8 @@ class StarField:
         fixed: Sequence[Sequence[Cutout]] = (),
     ) -> None:
         self.positions, self.shown, self._fixed = positions, shown, fixed
-        self.psfs, self._grid, self._is_turned = psfs, grid, observation.is_turned
+        self.psfs, self._grid = psfs, grid
+        self._scales = observation.scales if observation.is_turned else None
         self.places = [observation.places(j, positions) for j in range(len(psfs))]
 
     def __len__(self) -> int:
@@ -283,7 +286,7 @@ class StarField:
         if self._fixed:  # which fills the images, and so meets all stars
             return Order(np.arange(len(self)), len(self) - 1)
         images = zip(self.places, self.cores, strict=True)
-        return order_of(self.positions, images, self._grid, self._is_turned)
+        return order_of(self.positions, images, self._grid, self._scales)
 
     def light(self, j: int, fluxes: Array) -> Array:
         """Return ``sum_s c_s P_js``, shape (Ny, Nx)."""

@@ -102,6 +102,9 @@ def resolution(scene: Scene) -> float:
     response of the images' pixels, in pixels of the sky.
     """
     psfs, observation = scene.psfs_of_sky(), scene.observation
+    if scene.rotations:  # squares, whose sides are even
+        n = max(map(len, psfs))
+        psfs = [np.pad(psf, (n - len(psf)) // 2) for psf in psfs]
     v, u = (np.fft.fftfreq(n) for n in psfs[0].shape)
     pixel = abs(pixel_spectrum(v[:, None], u, observation)) / observation.oversample**2
     power = np.mean([abs(scipy.fft.fft2(psf) * pixel) ** 2 for psf in psfs], axis=0)

@@ -14,14 +14,17 @@ from lnocl.scene.arrays import Array, numbers
 
 # The farthest, pixels, that a map of an image may be from a rotation or flip, and one scale.
 MAX_DISTORTION = 0.05
+# By this share a pixel may be larger than the sky's where it counts as one.
+MAX_BRIGHTER = 2e-3
 # Rotations may be so far from a scale of 1.
 ROUNDING = 1e-12
 # Angles that move no pixel of an image farther than this, pixels, are 0.
 MIN_MOVE = 1e-6
 
-# Quarter turns, and those of the flipped x axis.
+# What has no unit and no meaning beyond its numbers.
 PLAIN = np.ndarray, np.ma.MaskedArray
 
+# Quarter turns, and those of the flipped x axis.
 QUARTERS = [np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
 QUARTERS += [quarter @ np.diag([-1, 1]) for quarter in QUARTERS]
 
@@ -79,15 +82,6 @@ def scale_of(transform: Array) -> float:
     return 1.0 if abs(scale - 1.0) < ROUNDING else scale
 
 
-def relative_to(transforms: Array, first: int) -> Array:
-    """Return maps of images, shape (p, 2, 3), from one of these to all."""
-    linear, shift = transforms[:, :, :2], transforms[:, :, 2]
-    of_sky = linear @ np.linalg.inv(linear[first])
-    maps = np.concatenate([of_sky, (shift - of_sky @ shift[first])[:, :, None]], axis=2)
-    maps[first] = np.eye(2, 3)
-    return maps
-
-
 def check_transforms(transforms: ArrayLike, boxes: Sequence[tuple[range, range]]) -> Array:
     """Return maps of images, shape (p, 2, 3), made exact: rotation, flip, scale and shift.
 
@@ -142,11 +136,12 @@ def check_transforms(transforms: ArrayLike, boxes: Sequence[tuple[range, range]]
 def _nearest_similarity(linear: Array, reach: float) -> tuple[Array, float, float]:
     """Return the nearest rotation or flip, its scale, and how far off it is at such a distance.
 
-    The scale is 1 where that moves nothing by more than `MAX_DISTORTION`.
+    The scale is 1 where that moves nothing by more than `MAX_DISTORTION`, and brightens nothing.
     """
     u, stretches, v = np.linalg.svd(linear)
     scale = math.sqrt(stretches[0] * stretches[1])
-    if abs(stretches - 1.0).max() * reach <= MAX_DISTORTION:
+    is_near = abs(stretches - 1.0).max() * reach <= MAX_DISTORTION
+    if is_near and abs(scale**2 - 1.0) <= MAX_BRIGHTER:
         scale = 1.0
     left = math.inf if scale == 0 else float(abs(stretches / scale - 1.0).max() * reach)
     return u @ v, scale, left
@@ -219,16 +214,21 @@ class Orientation(NamedTuple):
         return np.array([y, x] if self.swaps else [x, y])
 
 
+def shapes_of(values: Any) -> list[tuple[int, int]]:
+    """Return the shapes of two-dimensional arrays in a sequence; none of anything else."""
+    is_sequence = isinstance(values, (list, tuple))
+    if not is_sequence or any(type(each) not in PLAIN or each.ndim != 2 for each in values):
+        return []
+    return [each.shape for each in values]
+
+
 def of_one_shape(values: Any, fill: float = 0.0, about_centre: bool = False) -> Any:
     """Return two-dimensional arrays of several shapes as a stack; all else as it is.
 
     Smaller ones get rows and columns at their ends, or about their centre ``n // 2``. These hold a
     value, and are masked where that is not a number.
     """
-    is_sequence = isinstance(values, (list, tuple))
-    if not is_sequence or any(type(each) not in PLAIN or each.ndim != 2 for each in values):
-        return values
-    if len({each.shape for each in values}) < 2:
+    if len(set(shapes_of(values))) < 2:
         return values
     shape = np.max([each.shape for each in values], axis=0)
     dtype = np.result_type(*values, np.min_scalar_type(fill))
@@ -238,6 +238,16 @@ def of_one_shape(values: Any, fill: float = 0.0, about_centre: bool = False) -> 
         rows, columns = (slice(at, at + n) for at, n in zip(corner, each.shape, strict=True))
         whole[rows, columns] = each
     return stack if stack.mask.any() else stack.data
+
+
+def refuse_other_shapes(name: str, values: Any, shapes: Sequence[tuple[int, int]]) -> None:
+    """Refuse maps in a list that have not the shapes of their images."""
+    for j, (found, shape) in enumerate(zip(shapes_of(values), shapes, strict=False)):
+        if found != shape:
+            raise InputError(
+                f"`{name}[{j}]` has shape {found}, and `images[{j}]` {shape}; give each map in the "
+                "shape of its image"
+            )
 
 
 def enlarged(array: NDArray[Any], shape: tuple[int, int], fill: float = 0.0) -> NDArray[Any]:

@@ -202,8 +202,8 @@ class NearStar:
         scene, grid = around.scene, around.scene.image_grid
         there = _in_image(scene, j, self.window)
         counts, background, weights = _observed(scene, j, there)
-        model, first = background.copy(), (there.y % grid[0], there.x % grid[1])
-        shape = self.window.shape
+        # Of images that are turned the grid is no period, so the window is not moved into it.
+        model, first, shape = background.copy(), (there.y, there.x), self.window.shape
         add_to_window(model, scene, around.sky, around.star_fluxes, j, first)
         total = np.maximum(model, MIN_MODEL)
         precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)

@@ -109,7 +109,8 @@ class StarFit:
             for cutouts in both
         ]
         is_turned = self._observation.is_turned
-        order = order_of(scene.stars, reached, scene.image_grid, is_turned)
+        scales = np.repeat(self._observation.scales, 2) if is_turned else None
+        order = order_of(scene.stars, reached, scene.image_grid, scales)
         diffuse = model.forward(extended) + model.background
         if halos is not None and len(halos):
             held = np.append(np.zeros(scene.n_stars), halos)

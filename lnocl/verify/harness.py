@@ -295,7 +295,8 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         angles = np.linspace(-np.pi / 4, np.pi / 6, p)
         scales = [1.0] * (p - 1) + [1.7]
         each = zip(angles, shifts, scales, strict=True)
-        rotations = [Rotation(a, at, image, image, scale) for a, at, scale in each]
+        box = range(image[0]), range(image[1])
+        rotations = [Rotation(a, at, image, box, scale) for a, at, scale in each]
     return SimpleNamespace(
         p=p,
         n=n,

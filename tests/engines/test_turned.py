@@ -15,7 +15,8 @@ from turned_scenes import FLUXES, GRID, NX, NY, STARS, observation, psfs
 import lnocl
 from lnocl.engines.opencl import OpenCLEngine
 from lnocl.opencl.tuning import Tuning
-from lnocl.scene.forward_model import Model, model_images
+from lnocl.scene.forward_model import Model, add_to_window, model_images
+from lnocl.scene.padding import recommend_pad
 from lnocl.scene.scene import Scene
 from lnocl.scene.stars import MAX_SHIFT
 from lnocl.solvers.marginal import marginal
@@ -69,7 +70,7 @@ def test_corners_are_on_one_side_of_the_period(n, degrees, scale):
     maps = lnocl.rotations([0.0, degrees], (middle, middle))
     maps[1] = np.column_stack([maps[1, :, :2] / scale, maps[1, :, 2] + (-5.1, -9.2)])
     psf = scenes_turned.gaussian(*(np.indices((15, 15)) - 7), scenes_turned.COVARIANCES[0])
-    scene = Scene(lnocl.Observation(np.ones((2, n, n)), psf, transforms=maps))
+    scene = Scene(lnocl.Observation(np.ones((2, n, n)), [psf, psf], transforms=maps))
     ends = (0.0, middle, n - 1.0)
     seen = np.array([(x, y) for x in ends for y in ends]) - maps[1, :, 2]
     places = np.round(np.linalg.solve(maps[1, :, :2], seen.T).T).astype(int)
@@ -143,6 +144,7 @@ def test_engines_agree(name, solver, precision, allowed):
     assert worst(found.history["objective"], expected.history["objective"]) <= allowed
 
 
+@pytest.mark.exhaustive
 def test_images_that_are_launched_together(maps):
     """A GPU has one launch for all images that are turned; those of larger pixels have their own.
 
@@ -286,6 +288,103 @@ def test_errors_of_stars_are_those_of_images_that_are_not_turned():
     assert worst(errors[0], errors[1]) <= 0.02
 
 
+def coarse_and_fine(n, side, scale, degrees, is_flipped=False, half=9):
+    """Return an image of the sky's pixels and one of larger ones, about one middle."""
+    turn = lnocl.rotations([degrees], (0, 0))[0, :, :2] / scale
+    turn = turn @ np.diag([-1.0, 1.0]) if is_flipped else turn
+    middle = np.full(2, (n - 1) / 2)
+    maps = np.array([np.eye(2, 3), np.column_stack([turn, (side - 1) / 2 - turn @ middle])])
+    psf = scenes_turned.gaussian(*(np.indices((2 * half + 1,) * 2) - half), 1.6 * np.eye(2))
+    images = [np.full((n, n), 9.0), np.full((side, side), 9.0 * scale**2)]
+    return lnocl.Observation(images, [psf, psf], transforms=maps)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_windows_over_an_edge(scale):
+    """A turned image is no period: a window that begins before it sees what lies there."""
+    scene = Scene(coarse_and_fine(60, round(60 / scale), scale, 20.0))
+    sky = np.random.default_rng(0).random(scene.grid)
+    image = list(model_images(scene, sky, np.zeros(0)))[1]
+    for first in ((0, 0), (-8, -8)):
+        window = np.zeros((20, 20))
+        add_to_window(window, scene, sky * scene.unit, np.zeros(0), 1, first)
+        rows, columns = (slice(max(-at, 0), None) for at in first)
+        expected = image[: 20 + min(first[0], 0), : 20 + min(first[1], 0)]
+        assert worst(window[rows, columns], expected) <= 2e-3
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_errors_of_a_star_near_an_edge(scale):
+    """Bad rows and columns before the image change nothing of a star that lies there."""
+    n, side, room = 60, round(60 / scale), 40
+    given, star = coarse_and_fine(n, side, scale, 20.0), np.array([8.0, 9.0])
+    found = []
+    for before in (0, room):
+        width = (before, 0), (before, 0)
+        maps = given.transforms
+        maps[:, :, 2] += before - np.einsum("jxy,y->jx", maps[:, :, :2], np.full(2, before))
+        images = [
+            np.pad(image[:size, :size], width)
+            for image, size in zip(given.images, (n, side), strict=True)
+        ]
+        bad = [
+            np.pad(np.zeros((size, size), bool), width, constant_values=True) for size in (n, side)
+        ]
+        wider = lnocl.Observation(images, list(given.psfs), transforms=maps, mask=bad)
+        scene = Scene(wider, [star + before])
+        y, x = np.indices(scene.grid) - (12 + before)
+        sky = 9.0 + 2e4 * scenes_turned.gaussian(x, y, 16.0 * np.eye(2))
+        around = Surroundings(scene, sky, np.array([3000.0]), False)
+        found.append(np.sqrt(np.diag(NearStar(around, 0, 1e-6).fit.information)))
+    assert worst(found[0], found[1]) <= 0.02
+
+
+def test_a_small_image_has_a_small_grid_however_it_lies():
+    grids = {
+        Scene(coarse_and_fine(120, 20, 6.0, degrees, is_flipped)).grid
+        for degrees in (5.0, 95.0, 185.0)
+        for is_flipped in (False, True)
+    }
+    assert max(max(grid) for grid in grids) <= 200
+
+
+def test_stars_that_only_larger_pixels_blend():
+    """Their images overlap though they are far apart on the sky."""
+    given = coarse_and_fine(200, 10, 20.0, 10.0)
+    field = Scene(given, [(70.0, 100.0), (130.0, 101.0), (100.0, 160.0)]).star_field
+    shape = Scene(given).image_grid
+    images = np.array([field.cutouts[1][s].on_grid(shape).ravel() for s in range(3)])
+    found = field.images(1, np.ones(shape, bool)).information(np.ones(images[0].size))
+    moments = np.array([1.0, 2.0, 3.0])
+    assert worst(found.solve(moments), np.linalg.solve(images @ images.T, moments)) <= 1e-4
+
+
+def test_a_grid_holds_the_psf_of_larger_pixels():
+    given = coarse_and_fine(60, 20, 3.0, 0.0, half=20)
+    assert min(Scene(given).grid) >= 3 * 41
+    assert recommend_pad(given) >= 3 * 2
+
+
+def test_the_sky_has_the_frame_of_its_image():
+    assert coarse_and_fine(20, 30, 2.0, 0.0).sky_shape == (20, 20)
+    assert coarse_and_fine(20, 30, 2.0, 0.0).shape == (30, 30)
+
+
+def test_lists_go_wrong_in_one_line():
+    maps = coarse_and_fine(32, 16, 2.0, 10.0).transforms
+    images = [np.full((32, 32), 9.0), np.full((16, 16), 36.0)]
+    psf = scenes_turned.gaussian(*(np.indices((9, 9)) - 4), np.eye(2))
+    cases = [
+        ({"mask": [np.zeros((16, 16), bool), np.zeros((32, 32), bool)]}, "`mask[0]` has shape"),
+        ({"background": [np.ones((32, 32)), np.ones((10, 10))]}, "`background[1]` has shape (10"),
+        ({"psfs": psf}, "one PSF is given for images whose pixels are 1 and 2 times"),
+    ]
+    for changes, message in cases:
+        with pytest.raises(lnocl.InputError) as caught:
+            lnocl.Observation(images, **{"psfs": [psf, psf], "transforms": maps, **changes})
+        assert caught.value.message.startswith(message)
+
+
 @pytest.mark.parametrize(("degrees", "scale"), [(0.0, 5.6), (20.0, 4.0)])
 def test_stars_in_larger_pixels_are_marginal(degrees, scale):
     """Where sky and fluxes are right, the step of stars leaves them, but for the texture's pull."""
@@ -302,7 +401,7 @@ def test_stars_in_larger_pixels_are_marginal(degrees, scale):
     bad = np.arange(2)[:, None, None] < np.ones((1, n, n))  # the image that has the sky's pixels
     given = lnocl.Observation(
         [np.zeros((n, n)), means],
-        scenes_turned.gaussian(*(np.indices((21, 21)) - 10), covariance),
+        [scenes_turned.gaussian(*(np.indices((21, 21)) - 10), covariance)] * 2,
         background=[0.0, 20.0 * scale**2],
         transforms=np.array([np.eye(2, 3), transform]),
         mask=[bad[0], np.zeros((side, side), bool)],

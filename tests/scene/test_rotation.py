@@ -12,6 +12,12 @@ from turned_scenes import gaussian
 from lnocl.scene.rotation import Rotation, turned_psf
 from lnocl.scene.transforms import rotation
 
+
+def box(ny, nx):
+    """Return the rows and columns of an image of this shape."""
+    return range(ny), range(nx)
+
+
 angles = st.floats(-45.0, 45.0).map(np.radians)
 sides = st.sampled_from([16, 48, 64, 80])
 
@@ -20,7 +26,7 @@ sides = st.sampled_from([16, 48, 64, 80])
 @given(angle=angles, ny=sides, nx=sides, seed=st.integers(0, 99))
 def test_adjoint_and_flux(angle, ny, nx, seed):
     rng = np.random.default_rng(seed)
-    turn = Rotation(angle, rng.uniform(-200, 200, 2), (ny, nx), (ny - 5, nx - 5))
+    turn = Rotation(angle, rng.uniform(-200, 200, 2), (ny, nx), box(ny - 5, nx - 5))
     sky, image = rng.normal(size=(2, ny, nx))
     forward, back = turn.forward(sky), turn.adjoint(image)
     size = np.linalg.norm(forward) * np.linalg.norm(image)
@@ -44,7 +50,7 @@ def test_waves(frequency, allowed):
     for degrees in (-45.0, -20.0, 1.0, 10.0, 33.0, 45.0):
         turn = rotation(np.radians(degrees))
         shift = middle - turn @ middle + (0.3, -2.2)
-        each = Rotation(np.radians(degrees), shift, (n, n), (n, n))
+        each = Rotation(np.radians(degrees), shift, (n, n), box(n, n))
         for direction in np.arange(8) * np.pi / 8:
             wave = frequency * np.array([np.cos(direction), np.sin(direction)])
 
@@ -63,7 +69,7 @@ def test_waves(frequency, allowed):
 
 def test_its_matrix():
     rng = np.random.default_rng(1)
-    turn, sky = Rotation(0.4, np.array([3.3, -40.2]), (48, 64), (20, 30)), rng.random((48, 64))
+    turn, sky = Rotation(0.4, np.array([3.3, -40.2]), (48, 64), box(20, 30)), rng.random((48, 64))
     sheared = np.fft.irfft(np.fft.rfft(sky, axis=1) * turn.row_phases(), 64, axis=1)
     found = (turn.matrix((20, 30)) @ sheared.ravel()).reshape(20, 30)
     assert worst(found, turn.forward(sky)[:20, :30]) <= 1e-14
@@ -72,12 +78,12 @@ def test_its_matrix():
 def test_no_turn_is_a_shift():
     """Whole pixels move bit for bit, and pixels of twice the side are every second."""
     sky = np.random.default_rng(0).random((32, 48))
-    still = Rotation(0.0, np.array([5.0, -3.0]), (32, 48), (20, 30))
+    still = Rotation(0.0, np.array([5.0, -3.0]), (32, 48), box(20, 30))
     np.testing.assert_array_equal(still.column_shifts, 3.0)
     expected = np.roll(sky, (-3, 5), (0, 1))
     assert worst(still.forward(sky), expected) <= 1e-15  # of the transform of the first shear
     assert (still.undone() == 1.0).all()
-    larger = Rotation(0.0, np.array([2.0, 1.0]), (64, 64), (10, 12), 2.0)
+    larger = Rotation(0.0, np.array([2.0, 1.0]), (64, 64), box(10, 12), 2.0)
     sky = np.random.default_rng(1).random((64, 64))
     assert worst(larger.forward(sky)[1:10, 2:12], sky[0:18:2, 0:20:2]) <= 1e-15
     assert (larger.undone() == 1.0).all()
@@ -87,8 +93,8 @@ def test_no_turn_is_a_shift():
 @given(angle=angles, scale=st.floats(1.01, 8.0), ny=sides, nx=sides, seed=st.integers(0, 99))
 def test_adjoint_of_larger_pixels(angle, scale, ny, nx, seed):
     rng = np.random.default_rng(seed)
-    shape = math.ceil(ny / scale), math.ceil(nx / scale)
-    turn = Rotation(angle, rng.uniform(-200, 200, 2), (ny, nx), shape, scale)
+    used = box(math.ceil(ny / scale), math.ceil(nx / scale))
+    turn = Rotation(angle, rng.uniform(-200, 200, 2), (ny, nx), used, scale)
     sky, image = rng.normal(size=(2, ny, nx))
     forward, back = turn.forward(sky), turn.adjoint(image)
     size = np.linalg.norm(forward) * np.linalg.norm(image)
@@ -107,7 +113,7 @@ def test_larger_pixels(scale, degrees, allowed):
     turn = rotation(np.radians(degrees)) / scale
     m = math.ceil(144 / scale)
     shift = np.array([m / 2, m / 2]) + 0.37 - turn @ [n / 2, n / 2]
-    each = Rotation(np.radians(degrees), shift, (n, n), (m, m), scale)
+    each = Rotation(np.radians(degrees), shift, (n, n), box(m, m), scale)
     stars = np.array([(120.3, 131.2), (90.0, 100.4), (150.0, 140.0)])
     y, x = np.indices((n, n))
     back = np.linalg.inv(turn)
