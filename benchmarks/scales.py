@@ -197,7 +197,7 @@ def make_engine(degrees=0.0, scale=1.0):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lnocl.LnoclWarning)
         observation = lnocl.Observation(
-            images if is_mapped else np.array(images), psf, background=50.0, **transforms
+            images if is_mapped else np.array(images), [psf] * 2, background=50.0, **transforms
         )
         for pad in range(0, (GRID - SIDE) // 2 + 1, 4):
             setup = Setup(observation, middle[None] + 0.2, pad, "sgp", "single", "opencl", None)

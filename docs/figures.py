@@ -69,6 +69,11 @@ RECIPES = {
         "-o $OUT/psf_lbti.png",
         same("validation", "psf_lbti"),
     ),
+    "scales": Recipe(
+        "3 min",
+        "python examples/real/scales.py $DATA/hst-hsc-cosmos --field 1 --picture $OUT/scales.png",
+        {"validation/scales.png": "scales.png"},
+    ),
     "ranks": Recipe(
         "10 h",
         "python benchmarks/coverage.py --seeds 2000 2024 --output $OUT && "

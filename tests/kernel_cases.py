@@ -114,7 +114,13 @@ def kernels_in(file):
 @functools.cache
 def harness_of(case, dtype):
     grid, tuning, scene, _ = CASES[case]
-    return KernelHarness(context_of(choose().device), grid, dtype, tuning, **SCENES[scene])
+    device = choose().device
+    if tuning is not None and not tuning.scratch_is_global:
+        oversample, has_turns = (SCENES[scene].get(key, 0) for key in ("oversample", "has_turns"))
+        needed = tuning.local_bytes(grid, oversample or 1, np.dtype(dtype), bool(has_turns))
+        if needed > device.local_mem_size:
+            pytest.skip("the device has too little local memory for this cut")
+    return KernelHarness(context_of(device), grid, dtype, tuning, **SCENES[scene])
 
 
 def agree_with_twins(file):
