@@ -141,8 +141,9 @@ OPTIONS = {
         option(
             "--align",
             choices=("wcs",),
-            help="take offsets, rotations and flips of the images against the first from their sky "
-            "coordinates (default: they have none)",
+            help="take offsets, rotations, flips and scales of the images from their sky "
+            "coordinates (default: they have none); the sky has the pixels of the first image, or "
+            "of one whose pixels are smaller, and images may have several shapes",
         ),
         option(
             "--angle",

@@ -44,7 +44,7 @@ class Maps:
     """
 
     def __init__(self, shape: tuple[int, int, int], shapes: Sequence[tuple[int, int]] = ()) -> None:
-        self._shape, self._shapes = shape, shapes or [(shape[1], shape[2])] * shape[0]
+        self._shape, self._shapes = shape, list(shapes) or [(shape[1], shape[2])] * shape[0]
         self.sha256: dict[str, list[str]] = {}
 
     def fill(
@@ -98,7 +98,8 @@ class Maps:
         self._check_count(name, words)
         if all(isinstance(word, str) for word in words):
             return self.read(name, [str(word) for word in words])
-        return np.array([self._spread(name, word) for word in words])
+        each = list(words) * self._shape[0] if len(words) == 1 else list(words)
+        return np.array([self._spread(name, j, word) for j, word in enumerate(each)])
 
     def _check_count(self, name: str, words: Sequence[Word]) -> None:
         """Refuse several words, not all of them numbers, that are not one for each image."""
@@ -108,10 +109,11 @@ class Maps:
                 "one, or one for each"
             )
 
-    def _spread(self, name: str, word: Word) -> Array:
+    def _spread(self, name: str, j: int, word: Word) -> Array:
+        """Return the map of image j."""
         if isinstance(word, float):
             return np.full(self._shape[1:], word)
-        return self._read(name, [word], (1,))[0]
+        return self._read(name, [word], [self._shapes[j]])[0]
 
     def read(self, name: str, paths: Sequence[str]) -> Array:
         """Return maps for all images, shape (p, ny, nx), from files with one, or one for each.
@@ -121,27 +123,48 @@ class Maps:
         FileError, InputError
             As `fitsread.read_stack`; maps that do not fit the images.
         """
-        maps = self._read(name, paths, (1, self._shape[0]))
+        is_one = len(set(self._shapes)) == 1 and len(paths) == 1
+        maps = self._read(name, paths, self._shapes, is_one)
         return np.broadcast_to(maps, self._shape)
 
-    def _read(self, name: str, paths: Sequence[str], numbers: Sequence[int]) -> Array:
-        may_differ = len(set(self._shapes)) > 1
-        stack = read_stack(paths, may_differ)
-        n = len(stack.data)
-        is_each = n == self._shape[0] and stack.shapes == list(self._shapes)
-        is_one = set(stack.shapes) == {self._shape[1:]}
-        if not (is_each or is_one) or n not in numbers:
-            raise InputError(
-                f"`{name}` {paths[0]} has the shape {stack.data.shape} and the images "
-                f"{self._shape}; give one map that fits all images, or one for each"
-            )
+    def _read(
+        self,
+        name: str,
+        paths: Sequence[str],
+        shapes: Sequence[tuple[int, int]],
+        may_be_one: bool = False,
+    ) -> Array:
+        """Return maps in the shapes of images, or perhaps one for all, enlarged to one shape."""
+        stack = read_stack(paths, len(set(self._shapes)) > 1)
+        found = stack.shapes
+        if found != list(shapes) and not (may_be_one and found == list(shapes[:1])):
+            raise InputError(self._misfit(name, paths, found, shapes))
         self.sha256.setdefault(name, []).extend(stack.sha256)
         for path, header in zip(paths, stack.headers, strict=True):
             _refuse_other_unit(name, path, str(header.get("BUNIT", "")))
-        if not may_differ:
+        if len(set(self._shapes)) == 1:
             return stack.data
-        own = zip(stack.data, stack.shapes, strict=True)
-        return np.array([enlarged(each[:ny, :nx], self._shape[1:]) for each, (ny, nx) in own])
+        own = zip(stack.data, found, strict=True)
+        ny, nx = self._shape[1:]
+        return np.array([enlarged(each[:h, :w], (ny, nx)) for each, (h, w) in own])
+
+    def _misfit(
+        self,
+        name: str,
+        paths: Sequence[str],
+        found: Sequence[tuple[int, int]],
+        shapes: Sequence[tuple[int, int]],
+    ) -> str:
+        """Say which map does not fit its image."""
+        if len(found) == len(shapes) == len(paths):
+            pairs = zip(paths, found, shapes, strict=True)
+            path, own, shape = next(each for each in pairs if each[1] != each[2])
+            return f"`{name}` {path} has the shape {own} and its image {shape}; give one that fits"
+        ny, nx = found[0]
+        return (
+            f"`{name}` {paths[0]} has the shape {(len(found), ny, nx)} and the images "
+            f"{self._shape}; give one map that fits all images, or one for each"
+        )
 
 
 def _refuse_other_unit(name: str, path: str, bunit: str) -> None:

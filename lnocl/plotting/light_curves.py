@@ -63,5 +63,6 @@ def draw(axis: Axes, curves: LightCurves) -> None:
     axis.set_xlabel("epoch")
     axis.set_ylabel("flux / mean", fontsize=9)
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axis.legend(fontsize=8)
+    if axis.containers:
+        axis.legend(fontsize=8)
     axis.grid(alpha=0.3)

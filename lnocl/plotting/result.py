@@ -65,7 +65,7 @@ class ResultView:
     oversample : int
         Pixels of the extended source to one of the images, along each axis.
     turns : ndarray of float64, shape (p, 2, 2), or None
-        Rotations and flips of the images; None where there are none.
+        Rotations, flips and scales of the images; None where there are none.
     light_curves : LightCurves or None
         Of the stars, where there are several epochs.
     """

@@ -89,3 +89,16 @@ def test_several_shapes_need_coordinates(frames, capsys):
     command = ["deconvolve", *frames, "--psf", "sharp_psf.fits", "-o", "out.fits"]
     assert cli.main(command) == 2
     assert "sharp.fits has the shape (56, 56) and coarse.fits (24, 24)" in capsys.readouterr().err
+
+
+def test_maps_are_those_of_their_images(frames, capsys):
+    command = ["deconvolve", *frames, "--psf", "coarse_psf.fits", "sharp_psf.fits", "--n-iter", "1"]
+    command += ["--stop", "none", "--align", "wcs", "--engine", "numpy", "-o", "out.fits"]
+    assert cli.main([*command, "--mask", "sharp_bad.fits", "coarse_bad.fits"]) == 2
+    assert (
+        "--mask sharp_bad.fits has the shape (56, 56) and its image (24, 24); give one that fits"
+        in capsys.readouterr().err
+    )
+    assert cli.main([*command, "--mask", "sharp_bad.fits"]) == 2
+    assert "give one map that fits all images, or one for each" in capsys.readouterr().err
+    assert cli.main([*command, "--background", "coarse_bad.fits", "10"]) == 0
