@@ -3,8 +3,8 @@ r"""Images that are turned against the sky, or have larger pixels: rotation by t
 A rotation by up to 45 degrees is a shear along x, one along y, and one along x (Unser, Thevenaz &
 Yaroslavsky, IEEE Trans. Image Process. 4, 1371, 1995, Eq. 3). The first is a phase in the spectrum
 of each row, and exact. Each of the others shifts whole lines by one fraction of a pixel
-(`lnocl.scene.line_weights`). After the first shear, which larger pixels change as little as a
-change of scale changes any rotation, lines are taken in the steps of these pixels.
+(`lnocl.scene.line_weights`). A change of scale goes with any shear, so after the first of them the
+rows and columns are taken in the steps of an image's larger pixels.
 
 Quarter turns and flips are done by index.
 """
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.line_weights import TAPS, LineSampling, shifted, undone, whole_and_weights
+from lnocl.scene.transforms import rotation
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -80,7 +81,7 @@ class Rotation:
         ny, nx = grid
         p, q = math.tan(angle / 2.0), -math.sin(angle)
         whole = shift if scale == 1.0 else np.round(shift)
-        lag_x, lag_y = scale * (_turn(-angle) @ (shift - whole))
+        lag_x, lag_y = scale * (rotation(-angle) @ (shift - whole))
         (x, y), rows = whole, np.arange(ny)
         self.image_shifts = p * (rows - y) - x
         # The columns, and the rows, that the image is made of lie in the middle of a period.
@@ -180,11 +181,6 @@ class Rotation:
         along_x = u - math.sin(self.angle) * along_y
         effect *= undone(self.column_shifts, along_y) * undone(self.image_shifts, along_x)
         return effect
-
-
-def _turn(angle: float) -> Array:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s], [s, c]])
 
 
 def _signed(n: int, middle: float, step: int) -> Array:
