@@ -171,7 +171,7 @@ def keyword_number(
     Raises
     ------
     InputError
-        It is no number.
+        The value is not a number.
     """
     of_file = min(j, len(paths) - 1)  # a cube has one header
     path = paths[of_file]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lnocl.reference.ratio import compare
 from lnocl.reference.rows import ComplexArray, irfft_rows, rfft_rows
 from lnocl.scene.arrays import Array
-from lnocl.scene.line_weights import shifted
+from lnocl.scene.line_weights import shifted, sums_of_lines
 
 
 def irfft_sheared(row_spectra: ComplexArray) -> Array:
@@ -67,8 +67,4 @@ def sample_lines(
     lines: NDArray[Any], firsts: NDArray[np.int_], weights: Array, axis: int
 ) -> NDArray[Any]:
     """Return sums of lines along an axis, round its end: ``sum_k w_ik x(firsts_i + k)``."""
-    n, taps = weights.shape
-    places = (firsts[:, None] + np.arange(taps)) % lines.shape[axis]
-    matrix = np.zeros((n, lines.shape[axis]))
-    np.add.at(matrix, (np.arange(n)[:, None], places), weights)
-    return np.moveaxis(np.tensordot(matrix, lines, axes=(1, axis)), 0, axis)
+    return sums_of_lines(lines, firsts, weights, axis)

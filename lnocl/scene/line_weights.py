@@ -81,6 +81,19 @@ def shifted(rows: Array, shifts: Array, sign: int) -> Array:
     return total
 
 
+def sums_of_lines(
+    lines: NDArray[Any], firsts: NDArray[np.int_], weights: Array, axis: int
+) -> NDArray[Any]:
+    """Return ``sum_k w_ik x(firsts_i + k)`` along an axis, round its end."""
+    shape = [1] * lines.ndim
+    shape[axis] = len(firsts)
+    terms = (
+        weights[:, k].reshape(shape) * lines.take(firsts + k, axis, mode="wrap")
+        for k in range(TAPS)
+    )
+    return np.asarray(sum(terms))
+
+
 class LineSampling:
     """Points of a line of the sky in steps of an image's larger pixels, and the adjoint.
 
@@ -127,19 +140,8 @@ class LineSampling:
 
     def forward(self, lines: NDArray[Any], axis: int) -> NDArray[Any]:
         """Return the points of lines."""
-        return _sums(lines, self.firsts, self.weights, axis)
+        return sums_of_lines(lines, self.firsts, self.weights, axis)
 
     def adjoint(self, points: NDArray[Any], axis: int) -> NDArray[Any]:
         """Return the adjoint of `forward`."""
-        return _sums(points, self.back_firsts, self.back_weights, axis)
-
-
-def _sums(lines: NDArray[Any], firsts: NDArray[np.int_], weights: Array, axis: int) -> NDArray[Any]:
-    """Return ``sum_k w_ik x(firsts_i + k)`` along an axis, round its end."""
-    shape = [1] * lines.ndim
-    shape[axis] = len(firsts)
-    terms = (
-        weights[:, k].reshape(shape) * lines.take(firsts + k, axis, mode="wrap")
-        for k in range(TAPS)
-    )
-    return np.asarray(sum(terms))
+        return sums_of_lines(points, self.back_firsts, self.back_weights, axis)

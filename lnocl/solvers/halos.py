@@ -128,15 +128,15 @@ def marginal_halos(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array,
 def _significant(scene: Scene, model: Model, extended: Array, fluxes: Array) -> NDArray[np.bool_]:
     """Return where the extended source is far above the noise of all images, and round there."""
     models = model_images(scene, extended, fluxes)
+    # A pixel of an image has the noise of all pixels of the sky in it.
     precisions = [
-        np.where(mean > MIN_MODEL, scene.scale * w / np.maximum(mean, MIN_MODEL), 0.0)
-        for mean, w in zip(models, model.weights, strict=True)
+        np.where(mean > MIN_MODEL, area * scene.scale * w / np.maximum(mean, MIN_MODEL), 0.0)
+        for mean, w, area in zip(models, model.weights, scene.areas, strict=True)
     ]
     width = resolution(scene)
     # The light in a resolution over its noise: both are nearly flat over one.
     smooth = gaussian_filter(extended, width / FWHM, mode="wrap")
-    # A pixel of an image has the noise of all pixels of the sky in it.
-    precision = scene.oversample**2 * np.maximum(model.adjoint(precisions), 0.0)
+    precision = np.maximum(model.adjoint(precisions), 0.0)
     area = 4.0 * np.pi * (width / FWHM) ** 2
     is_lit = smooth * np.sqrt(area * precision) > SIGNIFICANT
     return np.asarray(maximum_filter(is_lit, 2 * int(np.ceil(ROUND * width)) + 1, mode="wrap"))
