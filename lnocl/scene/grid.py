@@ -10,7 +10,7 @@ from lnocl.errors import InputError, note
 from lnocl.scene.line_weights import TAPS
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import choose_pad
-from lnocl.scene.rotation import PHASE_ROWS
+from lnocl.scene.rotation import PHASE_ROWS, cropped
 
 MAX_AXIS = 8192
 # Odd factors of an axis, and the least power of two beside them: a transform takes blocks of 8
@@ -50,8 +50,7 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
         raise InputError(f"`pad` must be a whole number, 0 or more, or auto; {pad} was given")
     # Light that is farther from its source than the images are wide reaches none of them.
     most = MAX_AXIS // observation.oversample
-    finer = float(observation.scales.max()) / observation.oversample
-    sizes = (math.ceil(k * finer) for k in observation.psfs.shape[1:])
+    sizes = (-(-k // observation.oversample) for k in psf_shape(observation))
     reach = (min(k, 2 * n, most) for n, k in zip(shape, sizes, strict=True))
     ny, nx = (max(n + 2 * int(pad), k) for n, k in zip(shape, reach, strict=True))
     if max(ny, nx) > most:
@@ -61,6 +60,19 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
             f"the largest axis is {most}: cut the images or pad less"
         )
     return length_for(ny), length_for(nx)
+
+
+def psf_shape(observation: Observation) -> tuple[int, int]:
+    """Return the shape of what holds all PSFs, pixels of the sky.
+
+    Where images have several scales that is what is not 0 of each, times its scale.
+    """
+    shape, scales = observation.psfs.shape[1:], observation.scales
+    if (scales == 1.0).all():
+        return shape[0], shape[1]
+    psfs = zip(observation.psfs, scales, strict=True)
+    ky, kx = np.ceil(np.max([scale * np.array(cropped(psf).shape) for psf, scale in psfs], axis=0))
+    return int(ky), int(kx)
 
 
 def extent(observation: Observation) -> tuple[int, int]:

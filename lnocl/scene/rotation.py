@@ -192,12 +192,21 @@ def _signed(n: int, middle: float, step: int) -> Array:
     return np.asarray((np.arange(n) - first) % n + first, float)
 
 
+def cropped(psf: Array) -> Array:
+    """Return a PSF without the rows and columns of 0 round it, its centre at ``n // 2``."""
+    y, x = (k // 2 for k in psf.shape)
+    rows, columns = np.nonzero(psf)
+    down, along = int(abs(rows - y).max()), int(abs(columns - x).max())
+    return psf[max(y - down, 0) : y + down + 1, max(x - along, 0) : x + along + 1]
+
+
 def turned_psf(psf: Array, angle: float, scale: float = 1.0) -> Array:
     """Return a PSF as the sky sees it, ``K'(u) = K(M u / s) / s^2``, with its centre at ``n // 2``.
 
     It is made finer, and turned, by the phases of its rows and columns: exactly where it is limited
     to the frequencies that its pixels can hold.
     """
+    psf = psf if scale == 1.0 else cropped(psf)
     n = STEP * math.ceil((math.hypot(*psf.shape) + 2 * MARGIN) / STEP)
     laid = np.zeros((n, n))
     y, x = (n // 2 - k // 2 for k in psf.shape)

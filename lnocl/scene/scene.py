@@ -15,7 +15,7 @@ from lnocl.errors import InputError, warn
 from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
-from lnocl.scene.grid import grid_of
+from lnocl.scene.grid import grid_of, psf_shape
 from lnocl.scene.halos import halo_cutouts
 from lnocl.scene.observation import Observation, numbers
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
@@ -678,11 +678,10 @@ class Scene:
                 )
 
     def _warn_of_large_psf(self) -> None:
-        finer = float(self.observation.scales.max())
-        psf_shape = tuple(math.ceil(finer * k) for k in self.observation.psfs.shape[1:])
-        if any(k > n for k, n in zip(psf_shape, self.grid, strict=True)):
+        shape = psf_shape(self.observation)
+        if any(k > n for k, n in zip(shape, self.grid, strict=True)):
             warn(
-                f"the psf {psf_shape} is larger than the grid {self.grid}: its wings wrap "
+                f"the psf {shape} is larger than the grid {self.grid}: its wings wrap "
                 "round; crop it, or give `pad` to enlarge the grid"
             )
 

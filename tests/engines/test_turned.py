@@ -365,6 +365,19 @@ def test_a_grid_holds_the_psf_of_larger_pixels():
     assert recommend_pad(given) >= 3 * 2
 
 
+def test_rows_that_a_small_psf_was_given_do_not_count(recwarn):
+    """A PSF of few large pixels beside one of many small ones, in one array."""
+    given = coarse_and_fine(120, 20, 6.0, 0.0)
+    wide = scenes_turned.gaussian(*(np.indices((81, 81)) - 40), 1.6 * np.eye(2))
+    both = lnocl.Observation(
+        [given.images[0], given.images[1, :20, :20]],
+        [wide, given.psfs[1]],
+        transforms=given.transforms,
+    )
+    assert Scene(both).grid == Scene(given).grid == (192, 192)
+    assert not recwarn.list
+
+
 def test_the_sky_has_the_frame_of_its_image():
     assert coarse_and_fine(20, 30, 2.0, 0.0).sky_shape == (20, 20)
     assert coarse_and_fine(20, 30, 2.0, 0.0).shape == (30, 30)
