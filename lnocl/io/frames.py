@@ -30,7 +30,7 @@ from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.arrays import Array
 from lnocl.scene.observation import OVERSAMPLES, Observation, PsfCentre
-from lnocl.scene.transforms import enlarged, of_one_shape
+from lnocl.scene.transforms import enlarged
 
 Mask = NDArray[np.bool_]
 
@@ -215,8 +215,8 @@ class _Reader:
         if places.sha256:
             self._sha256["angle"] = places.sha256
         observation = Observation(
-            self._in_own_shapes(counts),
-            self._grids or self._psf_stack(),
+            _in_own_shapes(counts, self._images.shapes),
+            self._grids or _in_own_shapes(self._psfs.data, self._psfs.shapes),
             background=self._maps.combine("background", levels),
             read_noise=self._maps.combine("read_noise", read_noise)
             if noise is None
@@ -252,20 +252,6 @@ class _Reader:
             self._gain,
             self._background_errors,
         )
-
-    def _in_own_shapes(self, counts: Array) -> Array | list[Array]:
-        """Return images as a stack, or of several shapes as a list."""
-        shapes = self._images.shapes
-        if len(set(shapes)) == 1:
-            return counts
-        return [image[:ny, :nx] for image, (ny, nx) in zip(counts, shapes, strict=True)]
-
-    def _psf_stack(self) -> Array:
-        """Return the PSFs in one shape, smaller ones in the middle of it."""
-        cut = [
-            psf[:ny, :nx] for psf, (ny, nx) in zip(self._psfs.data, self._psfs.shapes, strict=True)
-        ]
-        return np.asarray(of_one_shape(cut, 0.0, about_centre=True))
 
     def _halos(self) -> Array | None:
         """Return the shapes of halos that were given."""
@@ -595,6 +581,13 @@ class _Reader:
             return self._from_header("read_noise", j, word, " electrons")
 
         return self._maps.fill("read_noise", words, electrons)
+
+
+def _in_own_shapes(stack: Array, shapes: Sequence[tuple[int, int]]) -> Array | list[Array]:
+    """Return a stack, or of several shapes a list."""
+    if len(set(shapes)) == 1:
+        return stack
+    return [each[:ny, :nx] for each, (ny, nx) in zip(stack, shapes, strict=True)]
 
 
 def _have(n: int) -> str:

@@ -21,6 +21,7 @@ from lnocl.scene.psf_field import PsfField, read_fields
 from lnocl.scene.shifting import place
 from lnocl.scene.transforms import (
     Orientation,
+    about_centre,
     check_transforms,
     enlarged,
     of_one_shape,
@@ -260,8 +261,7 @@ class Observation:
                 refuse_other_shapes(name, values, shapes)
             images, mask = of_one_shape(images, np.nan), of_one_shape(mask, True)
             background, read_noise, exposure = map(of_one_shape, maps.values())
-        if transforms is not None:
-            psfs = of_one_shape(psfs, 0.0, about_centre=True)
+        own_psfs, psfs = shapes_of(psfs), of_one_shape(psfs, 0.0, about_centre=True)
         self.oversample = _check_oversample(oversample)
         self.effective_psfs = flag("effective_psfs", effective_psfs)
         has_exposure = exposure is not None
@@ -286,7 +286,8 @@ class Observation:
             y, x = (np.array(self.shape) - 1) / 2.0
             self.psfs = np.array([field.at(x, y) for field in self.psf_fields])
         else:
-            self.psfs = _check_psfs(containers.bare("psfs", psfs), self.n_images, psf_centre)
+            given_psfs = containers.bare("psfs", psfs)
+            self.psfs = _check_psfs(given_psfs, self.n_images, psf_centre, own_psfs)
         self.pupils = check_pixels("pupils", pupils, self.psfs)
         self.ideal_psfs = self._check_ideals(ideal_psfs, psf_centre)
         self.psf_modes = check_modes(psf_modes, self.psfs)
@@ -863,7 +864,16 @@ def _about_centre(psfs: Array, is_square: bool) -> Array:
     return laid
 
 
-def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:
+def _check_psfs(
+    psfs: ArrayLike,
+    n_images: int,
+    psf_centre: str,
+    shapes: Sequence[tuple[int, int]] = (),
+) -> Array:
+    """Return PSFs of unit sum, their cores at their centres where asked for.
+
+    Those that were enlarged from their own shapes are moved within these.
+    """
     stack = _stack("psfs", psfs)
     if stack.shape[0] not in (1, n_images):
         raise InputError(
@@ -894,7 +904,9 @@ def _check_psfs(psfs: ArrayLike, n_images: int, psf_centre: str) -> Array:
         words = _pixels(n_negative, "psf", "negative", "kept")
         tell(f"{words}: {100 * share:.2g} % of the light of a PSF at most")
     if psf_centre == "fit":
-        stack = np.array([_centred(psf) for psf in stack])
+        for psf, shape in zip(stack, shapes or [stack.shape[1:]] * len(stack), strict=True):
+            own = about_centre(psf, shape)
+            own[:] = _centred(own)
     elif psf_centre == "check":
         _refuse_off_centre(stack)
     elif psf_centre != "given":

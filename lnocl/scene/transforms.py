@@ -240,6 +240,12 @@ def of_one_shape(values: Any, fill: float = 0.0, about_centre: bool = False) -> 
     return stack if stack.mask.any() else stack.data
 
 
+def about_centre(array: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
+    """Return a view of what `of_one_shape` has enlarged from this shape about its centre."""
+    y, x = (n // 2 - k // 2 for n, k in zip(array.shape, shape, strict=True))
+    return array[y : y + shape[0], x : x + shape[1]]
+
+
 def refuse_other_shapes(name: str, values: Any, shapes: Sequence[tuple[int, int]]) -> None:
     """Refuse maps in a list that have not the shapes of their images."""
     for j, (found, shape) in enumerate(zip(shapes_of(values), shapes, strict=False)):

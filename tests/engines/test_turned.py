@@ -373,6 +373,7 @@ def test_rows_that_a_small_psf_was_given_do_not_count(recwarn):
         [given.images[0], given.images[1, :20, :20]],
         [wide, given.psfs[1]],
         transforms=given.transforms,
+        psf_centre="fit",
     )
     assert Scene(both).grid == Scene(given).grid == (192, 192)
     assert not recwarn.list
