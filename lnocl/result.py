@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from lnocl.parallel import Parallel
     from lnocl.runs.bootstrap import Bootstrap, Part
+    from lnocl.significance import Significance
 
 # Stars that a notebook lists.
 MAX_LISTED = 10
@@ -576,6 +577,44 @@ class Result:
             listed = given if isinstance(given, (str, os.PathLike)) else list(given)
             parts += read(listed, header, shape) if listed else []
         return bootstrap(outcome, n, parts, seed, progress, earlier, callback, parallel)
+
+    def significance(self, width: float = 0.0, false_alarms: float = 0.01) -> Significance:
+        """Return which sources there are beside the stars, at a rate of false alarms.
+
+        Each place of the sky is tested for a source, under the model without it: stars, background
+        and a smooth level. What noise, PSF errors and the extended source could be is allowed for
+        (`lnocl.significance`). It takes about as long as a few iterations on the host.
+
+        Parameters
+        ----------
+        width : float, optional
+            Full width at half maximum of the source, pixels of the images; 0 for a point.
+        false_alarms : float, optional
+            Number of false alarms expected in the whole field, above 0 and at most 10.
+
+        Returns
+        -------
+        Significance
+            Maps and detections, `lnocl.significance.Significance`.
+
+        Raises
+        ------
+        InputError
+            A width or number of false alarms out of range; or the result is of tiles.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> images = np.random.default_rng(1).poisson(10.0, (64, 64))
+        >>> observation = lnocl.Observation(images, np.ones((5, 5)), background=10)
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
+        >>> len(result.significance().detections)
+        0
+        """
+        from lnocl.significance import significance  # which loads scipy
+
+        return significance(self._outcome, width, false_alarms)
 
     def plot(self) -> Figure:
         """Return a picture of the result, whole and at each of the brightest stars.

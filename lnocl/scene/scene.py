@@ -369,6 +369,16 @@ class Scene:
         other._field = other._place_stars(self.stars)
         return other
 
+    def with_star(self, place: Array) -> Scene:
+        """Return this scene with one more star, the last, at (x, y)."""
+        other, n, n_epochs = copy(self), self.n_stars, self.observation.n_epochs
+        shown = np.arange(n_epochs)[:, None] == self.observation.epochs
+        other.shown = np.insert(self.shown, [n] * n_epochs, shown, axis=0)
+        positions = np.concatenate([self.stars, np.tile(place, (n_epochs, 1))])
+        other._field = other._place_stars(positions)
+        other.star_weights, _ = other._weigh_stars(other._field)
+        return other
+
     def images(self) -> Iterator[Array]:
         """Yield each image on its grid, scaled, shape (ny, nx); 0 where not observed."""
         ny, nx = self.observation.shape

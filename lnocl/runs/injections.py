@@ -1,0 +1,114 @@
+"""Sources that are put into the images of a reconstruction, which is then made again."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+from scipy import ndimage
+
+from lnocl.process import ignored_warnings
+from lnocl.runs.halos import settle_halos
+from lnocl.runs.outcome import Outcome, marginalise
+from lnocl.runs.run import Run
+from lnocl.runs.start import make_start
+from lnocl.scene.apertures import FWHM
+from lnocl.scene.arrays import Array
+from lnocl.scene.shifting import Cutout
+
+# Sources of one image lie so many resolutions apart, so that none is in the level round another.
+APART = 9.0
+# Places that are tried for one more source.
+TRIES = 50
+
+
+class Injections:
+    """Reconstructions of the same images with more sources in them.
+
+    They are made by as many iterations, with the same penalty and PSFs, from the same start. All
+    use the buffers and programs of one run.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        The reconstruction.
+    width : float
+        Full width at half maximum of the sources, pixels of the sky; 0 for points.
+    """
+
+    def __init__(self, outcome: Outcome, width: float) -> None:
+        self._outcome, self._width = outcome, width
+        with ignored_warnings():  # those of the reconstruction are the same
+            self._start = settle_halos(make_start(outcome.setup, outcome.scene.penalty))
+        self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
+
+    def reconstruct(self, places: Array, fluxes: Array, rng: np.random.Generator) -> Outcome:
+        """Return the reconstruction with sources at these places, pixels of the images.
+
+        Parameters
+        ----------
+        places : ndarray of float64, shape (n, 2)
+            (x, y).
+        fluxes : ndarray of float64, shape (n,)
+            Electrons.
+        rng : numpy.random.Generator
+            Of the counts of the sources.
+        """
+        observation, run = self._outcome.scene.observation, self._run
+        images = observation.images + self._counts(places, fluxes, rng)
+        run.repeat(self._start, observation.replace(images=images))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in run:
+                pass
+        scene = run.scene
+        sky, star_fluxes = run.engine.extended() * scene.unit, run.star_fluxes()
+        wanted = self._outcome.is_marginal, self._outcome.has_marginal_halos
+        sky, star_fluxes = marginalise(scene, sky, star_fluxes, *wanted)
+        return dataclasses.replace(
+            self._outcome, scene=scene, sky=sky, star_fluxes=star_fluxes
+        )
+
+    def _counts(self, places: Array, fluxes: Array, rng: np.random.Generator) -> Array:
+        """Return counts of sources in each image, 0 in bad pixels."""
+        scene, observation = self._outcome.scene, self._outcome.scene.observation
+        ny, nx = observation.shape
+        light = np.zeros((scene.n_images, *scene.image_grid))
+        for place, flux in zip(places, fluxes, strict=True):
+            other = scene.with_star(place)
+            for j in range(scene.n_images):
+                for s in range(scene.n_stars, scene.n_stars + observation.n_epochs):
+                    cutout = self._wide(other.star_cutout(j, s), j)
+                    light[j][cutout.window(scene.image_grid)] += (
+                        flux / scene.unit * cutout.values
+                    )
+        means = [scene.in_electrons(each, j)[:ny, :nx] for j, each in enumerate(light)]
+        counts = rng.poisson(np.maximum(means, 0.0)).astype(np.float64)
+        return np.where(observation.mask, 0.0, counts)
+
+    def _wide(self, cutout: Cutout, j: int) -> Cutout:
+        """Return the image of a source as wide as these, given that of a point."""
+        if not self._width or not cutout.values.any():
+            return cutout
+        scene = self._outcome.scene
+        scale = float(scene.observation.scales[j])
+        deviation = self._width / (scene.oversample * scale * FWHM)
+        margin = int(np.ceil(4.0 * deviation))
+        values = ndimage.gaussian_filter(np.pad(cutout.values, margin), deviation)
+        return Cutout(values, cutout.y - margin, cutout.x - margin)
+
+
+def spread_places(
+    allowed: Array, n: int, apart: float, rng: np.random.Generator
+) -> Iterator[tuple[int, int]]:
+    """Yield rows and columns of allowed pixels at random, farther apart than given; n at most."""
+    y, x = np.nonzero(allowed)
+    taken: list[tuple[int, int]] = []
+    for _ in range(TRIES * n):
+        if len(taken) == n or not len(y):
+            return
+        i = int(rng.integers(len(y)))
+        place = int(y[i]), int(x[i])
+        if all(np.hypot(place[0] - a, place[1] - b) > apart for a, b in taken):
+            taken.append(place)
+            yield place

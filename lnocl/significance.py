@@ -1,0 +1,571 @@
+"""Whether there is a source at a place, and how faint one would have been found.
+
+The signal-to-noise of a source at each place follows from its score under the model without it
+(`lnocl.solvers.score`). Errors of PSFs and noise that neighbours share are part of it
+(`lnocl.solvers.score_noise`). The threshold follows from the false alarms that are allowed in the
+whole field (`lnocl.solvers.false_alarms`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lnocl.errors import InputError
+from lnocl.runs.outcome import Outcome
+from lnocl.scene.arrays import Array
+from lnocl.scene.detector import on_sky
+from lnocl.scene.texture import SHARE_NEAR
+from lnocl.solvers.completeness import needed, values_at
+from lnocl.solvers.false_alarms import Rarity, of_student, threshold
+from lnocl.solvers.point_test import point_flux
+from lnocl.solvers.score import Null
+from lnocl.solvers.score_noise import MANY, noise_of
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+    from matplotlib.figure import Figure
+
+# A point is told from the extended source where it is so many errors above what that may be.
+POINT = 3.0
+# The extended source is looked for in a ring, resolutions, and is there from this value on.
+AROUND, THERE = (0.85, 1.65), 3.0
+# A source that was put in is found by a detection within so many resolutions.
+NEAR = 0.7
+# Of more false alarms in a field the number is not what the threshold says.
+MOST_ALARMS = 10.0
+POINT_SOURCE, EXTENDED = "point", "extended"
+
+
+class Map:
+    """The score of a source of one width at each place, in units of its noise.
+
+    Parameters
+    ----------
+    null : Null
+        The model without it.
+    width : float
+        Its full width at half maximum, pixels of the sky; 0 for a point.
+    """
+
+    def __init__(self, null: Null, width: float) -> None:
+        self.score, self.width = null.score(width), width
+        scene = null.scene
+        self.noise = noise_of(self.score, ~null.is_structured, null.rings)
+        self._rarity = Rarity(null._kernel(0, width))
+        self.unit = scene.unit
+        self.values = self.score.score / np.sqrt(self.score.variance) / self.noise.scatter
+        self.values[~self.score.is_tested] = 0.0
+
+    def rarity(self, values: Array, at: tuple[NDArray[np.int_], ...]) -> Array:
+        """Return the Gaussian values of values at these rows and columns."""
+        gaussian = self._rarity(values, self.score.skewness[at] / self.noise.scatter[at])
+        degrees = self.noise.degrees[at]
+        is_few = degrees < MANY
+        gaussian[is_few] = of_student(gaussian[is_few], degrees[is_few])
+        return gaussian
+
+    @cached_property
+    def significance(self) -> Array:
+        """Gaussian values as rare as the score of each place; NaN where none is tested."""
+        y, x = np.nonzero(self.score.is_tested)
+        found = np.full(self.values.shape, np.nan)
+        found[y, x] = self.rarity(self.values[y, x], (y, x))
+        return found
+
+    @property
+    def fluxes(self) -> Array:
+        """Fluxes, electrons."""
+        return self._where_tested(self.score.score, self.score.information) * self.unit
+
+    @property
+    def errors(self) -> Array:
+        """Standard errors of the fluxes, electrons."""
+        deviations = np.sqrt(self.score.variance) * self.noise.scatter
+        return self._where_tested(deviations, self.score.information) * self.unit
+
+    def _where_tested(self, values: Array, divisor: Array) -> Array:
+        found = np.full(values.shape, np.nan)
+        return np.divide(values, divisor, out=found, where=self.score.is_tested)
+
+    def threshold(self, alarms: float) -> float:
+        """Return the value that noise exceeds in so many places of the field, on average."""
+        area = float(np.count_nonzero(self.score.is_tested))
+        return threshold(alarms, area, self.score.curvature)
+
+    def needed(self, least: float, probability: float) -> Array:
+        """Return the fluxes, electrons, that exceed a threshold with this probability."""
+        at = np.nonzero(self.score.is_tested)
+        skewness = self.score.skewness[at] / self.noise.scatter[at]
+        values = values_at(least, lambda each: self.rarity(each, at), len(at[0]))
+        found = np.full(self.values.shape, np.nan)
+        found[at] = needed(values, skewness, probability) * self.errors[at]
+        return found
+
+    def light_round(self, place: Array, value: float, resolution: float) -> float:
+        """Return the largest value in a ring round a place, less a point of a value that is there.
+
+        Parameters
+        ----------
+        place : ndarray of float64, shape (2,)
+            (x, y), pixels of the sky.
+        value : float
+            In units of the noise.
+        resolution : float
+            Pixels of the sky.
+        """
+        rows, columns = self.values.shape
+        half = int(math.ceil(AROUND[1] * resolution)) + 1
+        x, y = np.round(place).astype(int).tolist()
+        side = np.arange(-half, half + 1)
+        there = np.ix_((y + side) % rows, (x + side) % columns)
+        dx, dy = (place - (x, y)).tolist()
+        away = np.meshgrid(side - dy, side - dx, indexing="ij")
+        point = ndimage.map_coordinates(self.score.correlation, away, order=3, mode="grid-wrap")
+        distance = np.hypot(*away) / resolution
+        is_round = (distance >= AROUND[0]) & (distance <= AROUND[1])
+        return float((self.values[there] - value * point)[is_round].max(initial=0.0))
+
+    def maxima(self, least: float) -> tuple[Array, Array, Array]:
+        """Return maxima whose Gaussian values are above one, highest first.
+
+        Returns
+        -------
+        places : ndarray of float64, shape (n, 2)
+            (x, y), pixels of the sky.
+        values, gaussian : ndarray of float64, shape (n,)
+            In units of the noise, and as Gaussian values.
+        """
+        u = self.values
+        is_maximum = (u == ndimage.maximum_filter(u, 3, mode="wrap")) & (u > 0)
+        y, x = np.nonzero(is_maximum)
+        rows, columns = u.shape
+        near = [
+            [u[(y + dy) % rows, (x + dx) % columns] for dx in (-1, 0, 1)] for dy in (-1, 0, 1)
+        ]
+        moves, higher = _vertices(np.array(near))
+        gaussian = self.rarity(higher, (y, x))
+        order = np.flatnonzero(gaussian > least)
+        order = order[np.argsort(-gaussian[order])]
+        return np.stack([x, y], axis=1)[order] + moves[order], higher[order], gaussian[order]
+
+
+def _vertices(near: Array) -> tuple[Array, Array]:
+    """Return where parabolas through 3 x 3 values have their maxima, (n, 2), and their values."""
+    middle = near[1, 1]
+    slope = np.stack([near[1, 2] - near[1, 0], near[2, 1] - near[0, 1]], axis=1) / 2.0
+    xx, yy = near[1, 2] + near[1, 0] - 2 * middle, near[2, 1] + near[0, 1] - 2 * middle
+    xy = (near[2, 2] + near[0, 0] - near[0, 2] - near[2, 0]) / 4.0
+    determinant = xx * yy - xy**2
+    is_peak = (determinant > 0) & (xx < 0)
+    safe = np.where(is_peak, determinant, 1.0)
+    moves = -np.stack([yy * slope[:, 0] - xy * slope[:, 1], xx * slope[:, 1] - xy * slope[:, 0]],
+                      axis=1) / safe[:, None]  # fmt: skip
+    moves = np.where(is_peak[:, None], moves, 0.0).clip(-0.7, 0.7)
+    return moves, middle + (slope * moves).sum(axis=1) / 2.0
+
+
+def null_of(outcome: Outcome) -> Null:
+    """Return the model of a reconstruction without sources beside its stars."""
+    refinement = outcome.psf_refinement
+    errors = np.zeros(1), np.zeros(0)
+    if refinement is not None and refinement.psf_error:
+        errors = refinement.edges, refinement.errors_in_rings
+    return Null(outcome.scene, outcome.sky, outcome.star_fluxes, outcome.moves, errors)
+
+
+@dataclass(frozen=True, eq=False)
+class Significance:
+    r"""Sources beside the stars of a reconstruction, and what noise alone would look like.
+
+    Attributes
+    ----------
+    signal_to_noise : ndarray of float64, of the shape of the extended source
+        Of a source at each place: the value of a Gaussian that is as rare. NaN where the images do
+        not tell a source from stars.
+    flux, flux_error : ndarray of float64, of the same shape
+        Its flux and standard error, electrons; NaN there.
+    threshold : float
+        The signal-to-noise that noise exceeds in `false_alarms` places of the field, on average.
+    false_alarms : float
+        Expected number of false alarms in the whole field.
+    width : float
+        Full width at half maximum of the source, pixels of the images; 0 for a point.
+    resolution : float
+        Full width at half maximum of what all images resolve together, in the same pixels.
+    detections : astropy.table.QTable
+        The maxima above the threshold, most significant first: ``x``, ``y`` and their errors,
+        pixels of the images; ``flux`` and ``flux_error``, electrons; ``significance``; the nearest
+        ``star``, counted from 1, or 0, and its ``distance``, pixels; and ``kind``. That is "point"
+        for a point source, and "extended" where the extended source could be it. The flux of that
+        is what a point has beside what the extended source is expected to have there.
+
+    See Also
+    --------
+    lnocl.Result.significance : Returns it.
+
+    Notes
+    -----
+    A source is "extended" where there is light round it, between 0.85 and 1.65 resolutions, and the
+    least squares of a point on an extended source that goes on as it is round it
+    (`lnocl.solvers.point_test`) leave it less than three errors. All sources wider than a point are
+    "extended". How often noise alone raises an alarm was measured: :doc:`/validation/detections`.
+
+    Examples
+    --------
+    A source of 300 electrons at (40, 20), on a sky of 10 electrons per pixel:
+
+    >>> import numpy as np
+    >>> import lnocl
+    >>> y, x = np.indices((33, 33)) - 16
+    >>> psf = np.exp(-(x**2 + y**2) / 4)
+    >>> mean = np.full((64, 64), 10.0)
+    >>> mean[4:37, 24:57] += 300 * psf / psf.sum()
+    >>> images = np.random.default_rng(0).poisson(mean)
+    >>> observation = lnocl.Observation(images, psf, background=10)
+    >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
+    >>> found = result.significance()
+    >>> [source] = found.detections
+    >>> source["x"].round(), source["y"].round(), source["kind"]
+    (<Quantity 40. pix>, <Quantity 20. pix>, np.str_('point'))
+    >>> bool(abs(source["flux"].value - 300) < 2 * source["flux_error"].value)
+    True
+    >>> bool(4 < found.threshold < 5)
+    True
+    """
+
+    signal_to_noise: Array
+    flux: Array
+    flux_error: Array
+    threshold: float
+    false_alarms: float
+    width: float
+    resolution: float
+    detections: QTable
+    _null: Null = field(repr=False)
+    _map: Map = field(repr=False)
+    _outcome: Outcome = field(repr=False)
+
+    def __post_init__(self) -> None:
+        for values in (self.signal_to_noise, self.flux, self.flux_error):
+            values.flags.writeable = False
+
+    def limit(self, completeness: float = 0.5) -> Array:
+        """Return the flux of a source that would be found with some probability at each place.
+
+        Parameters
+        ----------
+        completeness : float, optional
+            That probability, between 0 and 1.
+
+        Returns
+        -------
+        ndarray of float64, of the shape of the extended source
+            Electrons; NaN where the images do not tell a source from stars. The extended source is
+            allowed for where it is: a point has to be three errors above what that may be.
+
+        Raises
+        ------
+        InputError
+            The probability is not between 0 and 1.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> images = np.random.default_rng(1).poisson(10.0, (64, 64))
+        >>> observation = lnocl.Observation(images, np.ones((5, 5)), background=10)
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
+        >>> found = result.significance()
+        >>> half, most = (found.limit(share)[32, 32] for share in (0.5, 0.9))
+        >>> bool(60 < half < 90), bool(half < most < 1.5 * half)
+        (True, True)
+        """
+        check_completeness(completeness)
+        found, outcome = self._map, self._outcome
+        fluxes = found.needed(self.threshold, completeness)
+        if not found.width:
+            fluxes = np.maximum(fluxes, POINT * self._in_source())
+        ny, nx = outcome.observation.sky_shape
+        return np.asarray(fluxes[:ny, :nx])
+
+    def inject(self, n: int = 100, completeness: float = 0.5, seed: int = 0) -> QTable:
+        """Put sources into the images, and return which of them are found.
+
+        They lie at random where sources are tested, with fluxes that `limit` says are found with
+        this probability. A few at a time, the reconstruction is made again with them.
+
+        Parameters
+        ----------
+        n : int, optional
+            Sources, 1 or more.
+        completeness : float, optional
+            The probability, between 0 and 1.
+        seed : int, optional
+            Zero or more.
+
+        Returns
+        -------
+        astropy.table.QTable
+            A row for each source: ``x`` and ``y``, pixels of the images; ``flux``, electrons; and
+            ``found``, whether a detection lies within 0.7 resolutions; a point, where points are
+            put in.
+
+        Raises
+        ------
+        InputError
+            A number, probability or seed out of range; or nothing is tested.
+        DeviceError
+            As `lnocl.deconvolve`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> images = np.random.default_rng(1).poisson(10.0, (64, 64))
+        >>> observation = lnocl.Observation(images, np.ones((5, 5)), background=10)
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
+        >>> sources = result.significance().inject(4, completeness=0.999)
+        >>> len(sources), bool(sources["found"].sum() > 2)
+        (4, True)
+        """
+        from astropy.table import QTable
+        from astropy.units import electron, pix
+
+        from lnocl.runs.injections import APART, Injections, spread_places
+
+        check_injections(n, seed)
+        limits, observation = self.limit(completeness), self._outcome.observation
+        allowed = np.isfinite(limits)
+        if not allowed.any():
+            raise InputError("sources are tested nowhere, so that none can be put in")
+        q, rng = observation.oversample, np.random.default_rng(seed)
+        injections = Injections(self._outcome, self.width * q)
+        rows: list[tuple[float, float, float, bool]] = []
+        while len(rows) < n:
+            apart = APART * self.resolution * q
+            pixels = np.array(list(spread_places(allowed, n - len(rows), apart, rng)))
+            fluxes = limits[pixels[:, 0], pixels[:, 1]]
+            places = pixels[:, ::-1] + rng.uniform(-0.5, 0.5, pixels.shape)
+            places = (places - (q - 1) / 2.0) / q
+            outcome = injections.reconstruct(places, fluxes, rng)
+            found = significance(outcome, self.width, self.false_alarms).detections
+            if not self.width:
+                found = found[found["kind"] == POINT_SOURCE]
+            for (x, y), flux in zip(places.tolist(), fluxes.tolist(), strict=True):
+                away = np.hypot(found["x"].value - x, found["y"].value - y)
+                rows.append((x, y, flux, bool((away < NEAR * self.resolution).any())))
+        x, y, flux, is_found = zip(*rows, strict=True)
+        return QTable(
+            {
+                "x": np.array(x) * pix,
+                "y": np.array(y) * pix,
+                "flux": np.array(flux) * electron,
+                "found": np.array(is_found),
+            }
+        )
+
+    def _in_source(self) -> Array:
+        """Return the flux of a point that the extended source may be, where there is any.
+
+        It is `lnocl.scene.texture`'s expectation of the brightest round a star, seen by a point.
+        """
+        null = self._null
+        bright = null.brightest_structure()
+        return np.asarray(SHARE_NEAR * bright * self._map.unit)
+
+    def contrast_curve(
+        self, star: int = 1, completeness: Sequence[float] = (0.5, 0.9, 0.95)
+    ) -> QTable:
+        """Return the faintest sources that would be found, against the distance from a star.
+
+        Parameters
+        ----------
+        star : int, optional
+            Which star, counted from 1.
+        completeness : sequence of float, optional
+            Probabilities of being found, between 0 and 1.
+
+        Returns
+        -------
+        astropy.table.QTable
+            A row for each ring, a resolution wide: its mean ``distance``, pixels of the images, and
+            ``share``, how much of it is tested. Then the medians of `limit` in it: ``flux50``,
+            electrons; ``contrast50``, over the flux of the star; and ``magnitudes50``, fainter than
+            the star; likewise for other probabilities.
+
+        Raises
+        ------
+        InputError
+            There is no such star; or a probability is not between 0 and 1.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((65, 65)) - 32
+        >>> psf = np.exp(-(x**2 + y**2) / 4)
+        >>> images = np.random.default_rng(0).poisson(10 + 1e5 * psf / psf.sum())
+        >>> observation = lnocl.Observation(images, psf, background=10)
+        >>> result = lnocl.deconvolve(observation, [(32, 32)], n_iter=20, engine="numpy")
+        >>> curve = result.significance().contrast_curve()
+        >>> curve.colnames[:4], bool(curve["magnitudes50"][-1].value > 6)
+        (['distance', 'share', 'flux50', 'contrast50'], True)
+        """
+        from astropy.table import QTable
+        from astropy.units import electron, mag, pix
+
+        observation, scene = self._outcome.observation, self._outcome.scene
+        n = len(scene.stars) // observation.n_epochs
+        if not (isinstance(star, (int, np.integer)) and 1 <= star <= n):
+            raise InputError(f"`star` is the number of a star, from 1 to {n}; {star} was given")
+        at = (star - 1) * observation.n_epochs
+        flux = float(self._outcome.star_fluxes[at : at + observation.n_epochs].mean())
+        x, y = on_sky(scene.stars[at : at + 1], observation.oversample)[0]
+        rows, columns = np.indices(observation.sky_shape)
+        distance = np.hypot(rows - y, columns - x) / observation.oversample
+        ring = (distance / self.resolution).astype(int)
+        is_tested = np.isfinite(self.signal_to_noise)
+        counts = np.bincount(ring.ravel())
+        tested = np.bincount(ring[is_tested], minlength=len(counts))
+        shown = np.flatnonzero(tested)
+        middles = np.bincount(ring[is_tested], distance[is_tested])[shown] / tested[shown]
+        columns_ = {"distance": middles * pix, "share": tested[shown] / counts[shown]}
+        for probability in completeness:
+            limits = self.limit(probability)
+            values = np.array([np.median(limits[is_tested & (ring == k)]) for k in shown])
+            name = f"{100 * probability:g}"
+            columns_[f"flux{name}"] = values * electron
+            columns_[f"contrast{name}"] = values / flux if flux > 0 else np.full(len(shown), np.nan)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                fainter = -2.5 * np.log10(columns_[f"contrast{name}"])
+            columns_[f"magnitudes{name}"] = fainter * mag
+        return QTable(columns_)
+
+
+def significance(outcome: Outcome, width: float, false_alarms: float) -> Significance:
+    """Return the sources beside the stars of a reconstruction, `lnocl.Result.significance`."""
+    check_width(width)
+    check_alarms(false_alarms)
+    observation = outcome.observation
+    null = null_of(outcome)
+    found = Map(null, width * observation.oversample)
+    ny, nx = observation.sky_shape
+    least = found.threshold(false_alarms)
+    return Significance(
+        found.significance[:ny, :nx],
+        found.fluxes[:ny, :nx],
+        found.errors[:ny, :nx],
+        least,
+        false_alarms,
+        width,
+        null.resolution / observation.oversample,
+        _detections(outcome, null, found, least),
+        null,
+        found,
+        outcome,
+    )
+
+
+def check_width(width: object) -> None:
+    """Refuse a width that is none.
+
+    Raises
+    ------
+    InputError
+        It is not a finite number of 0 or more.
+    """
+    if not (isinstance(width, (int, float, np.number)) and 0 <= width < math.inf):
+        raise InputError(f"`width` must be a finite number of pixels, 0 or more; {width} was given")
+
+
+def check_alarms(false_alarms: object) -> None:
+    """Refuse a number of false alarms that no threshold has.
+
+    Raises
+    ------
+    InputError
+        It is not a number above 0 and at most 10.
+    """
+    if not (isinstance(false_alarms, (int, float, np.number)) and 0 < false_alarms <= MOST_ALARMS):
+        raise InputError(
+            "`false_alarms` is the number expected in the whole field, above 0 and at most "
+            f"{MOST_ALARMS:g}, such as 0.01; {false_alarms} was given"
+        )
+
+
+def check_injections(n: object, seed: object) -> None:
+    """Refuse a number of sources or a seed that is out of range.
+
+    Raises
+    ------
+    InputError
+        n is not a whole number of 1 or more, or the seed not one of 0 or more.
+    """
+    if not (isinstance(n, (int, np.integer)) and n >= 1):
+        raise InputError(f"`injections` must be a whole number, 1 or more; {n} was given")
+    if not (isinstance(seed, (int, np.integer)) and seed >= 0):
+        raise InputError(f"`seed` must be a whole number, 0 or more; {seed} was given")
+
+
+def check_completeness(completeness: object) -> None:
+    """Refuse a probability of being found that is none.
+
+    Raises
+    ------
+    InputError
+        It is not a number between 0 and 1.
+    """
+    if not (isinstance(completeness, (int, float, np.number)) and 0 < completeness < 1):
+        raise InputError(f"`completeness` lies between 0 and 1; {completeness} was given")
+
+
+def _detections(outcome: Outcome, null: Null, found: Map, least: float) -> QTable:
+    from astropy.table import QTable
+    from astropy.units import electron, pix
+
+    places, values, gaussian = found.maxima(least)
+    scene, q = outcome.scene, outcome.observation.oversample
+    x, y = np.round(places).astype(int).T
+    rows, columns = found.values.shape
+    at = y % rows, x % columns
+    errors = found.errors[at]
+    fluxes = values * errors
+    kinds = np.full(len(places), POINT_SOURCE, dtype="U8")
+    pixels = (places - (q - 1) / 2.0) / q
+    for i, place in enumerate(places):
+        if found.width:
+            kinds[i] = EXTENDED
+        elif found.light_round(place, values[i], null.resolution) > THERE:
+            known = scene, outcome.sky, outcome.star_fluxes
+            fluxes[i], errors[i] = point_flux(*known, pixels[i], fluxes[i], outcome.moves)
+            kinds[i] = POINT_SOURCE if fluxes[i] > POINT * errors[i] else EXTENDED
+    # Position errors of a maximum whose height is its signal-to-noise.
+    spread = np.sqrt(np.diag(np.linalg.inv(found.score.curvature)))[::-1]
+    moved = spread / np.maximum(values, 1.0)[:, None] / q
+    stars = scene.stars[:: outcome.observation.n_epochs]
+    nearest, distance = np.zeros(len(places), int), np.full(len(places), np.inf)
+    if len(stars) and len(places):
+        away = np.hypot(*(pixels[:, None] - stars).transpose(2, 0, 1))
+        nearest, distance = away.argmin(axis=1) + 1, away.min(axis=1)
+    return QTable(
+        {
+            "x": pixels[:, 0] * pix,
+            "y": pixels[:, 1] * pix,
+            "x_error": moved[:, 0] * pix,
+            "y_error": moved[:, 1] * pix,
+            "flux": fluxes * electron,
+            "flux_error": errors * electron,
+            "significance": gaussian,
+            "star": nearest,
+            "distance": distance * pix,
+            "kind": kinds,
+        }
+    )

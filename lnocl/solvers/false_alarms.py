@@ -1,0 +1,120 @@
+r"""How often noise alone exceeds a value somewhere in a field, and what a value of counts is worth.
+
+A field of unit variance and curvature Lambda exceeds a high value u, over an area A, in about
+
+.. math:: E(u) = A \sqrt{\det \Lambda} \, (2 \pi)^{-3/2} \, u \, e^{-u^2 / 2}
+
+places (the Euler characteristic of its excursion set: Adler, R. J., "The Geometry of Random
+Fields", 1981, theorem 5.4.1). Sums of few counts are skewed: a saddlepoint approximation
+(Lugannani, R., Rice, S., 1980, Adv. Appl. Probab. 12, 475) says which Gaussian value is as rare.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import scipy.special
+from scipy import optimize
+from scipy.interpolate import RegularGridInterpolator
+
+from lnocl.scene.arrays import Array
+
+# Values that are worth translating, at most and at least.
+LOWEST, HIGHEST = 1.0, 60.0
+# Skewness: less changes nothing, and there is no more of it in the table.
+GAUSSIAN, MOST = 1e-3, 10.0
+# Of the profile what is above this share of its peak matters.
+FAINT = 1e-4
+
+
+def threshold(alarms: float, area: float, curvature: Array) -> float:
+    """Return the value that noise exceeds in so many places of a field, on average.
+
+    Parameters
+    ----------
+    alarms : float
+        Expected number of places.
+    area : float
+        Pixels.
+    curvature : ndarray of float64, shape (2, 2)
+        Lambda, 1 / pixel^2.
+    """
+    density = area * math.sqrt(max(float(np.linalg.det(curvature)), 0.0)) * (2 * math.pi) ** -1.5
+    if density * math.exp(-0.5) <= alarms:  # where the number falls, from 1 on
+        return 1.0
+    return float(
+        optimize.brentq(
+            lambda u: math.log(density * u / alarms) - u * u / 2.0, 1.0, 2.0 + math.sqrt(
+                2.0 * math.log(density / alarms) + 20.0)
+        )
+    )
+
+
+class Rarity:
+    """The Gaussian values that are as rare as those of sums of counts with a profile.
+
+    Parameters
+    ----------
+    profile : ndarray of float64
+        Weights of the counts, of any shape.
+    """
+
+    def __init__(self, profile: Array) -> None:
+        weights = profile.ravel()
+        weights = weights[abs(weights) > FAINT * abs(weights).max()]
+        # Of one count a pixel.
+        skewness = float((weights**3).sum() / (weights**2).sum() ** 1.5)
+        if skewness <= 0:
+            self._table = None
+            return
+        skews = np.geomspace(GAUSSIAN, MOST, 25)
+        values = np.geomspace(LOWEST, HIGHEST, 40)
+        rows = [
+            _gaussian_values(weights, (skewness / each) ** 2, values) for each in skews.tolist()
+        ]
+        self._table = RegularGridInterpolator((np.log(skews), np.log(values)), np.log(rows))
+
+    def __call__(self, values: Array, skewness: Array) -> Array:
+        """Return the Gaussian values for values of unit variance and their skewness."""
+        out = np.array(values, np.float64)
+        is_high = (values > LOWEST) & (skewness > GAUSSIAN)
+        if self._table is None or not is_high.any():
+            return out
+        at = np.log(np.clip(skewness[is_high], GAUSSIAN, MOST))
+        out[is_high] = np.exp(self._table((at, np.log(np.minimum(values[is_high], HIGHEST)))))
+        return out
+
+
+def _gaussian_values(weights: Array, level: float, values: Array) -> Array:
+    """Return the Gaussian values as rare as these, of weights with so many counts a pixel."""
+    scaled = weights / math.sqrt(level * float((weights**2).sum()))
+
+    def slopes(t: float) -> tuple[float, float, float]:
+        with np.errstate(over="ignore"):
+            grown = np.expm1(t * scaled)
+        cumulant = level * float((grown - t * scaled).sum())
+        return cumulant, level * float((scaled * grown).sum()), level * float(
+            (scaled**2 * (grown + 1.0)).sum())
+
+    found = []
+    for value in values.tolist():
+        high = 1.0 / scaled.max()
+        while slopes(high)[1] < value:
+            high *= 1.5
+        t = optimize.brentq(lambda t: slopes(t)[1] - value, 0.0, high)
+        cumulant, _, second = slopes(t)
+        root = math.sqrt(2.0 * max(t * value - cumulant, 0.0))
+        other = t * math.sqrt(second)
+        found.append(root + math.log(other / root) / root if root > 0 else value)
+    return np.maximum.accumulate(np.maximum(found, 1e-3))
+
+
+def of_student(values: Array, degrees: Array) -> Array:
+    """Return the Gaussian values as rare as these of Student's distribution.
+
+    A million degrees of freedom and more are Gaussian.
+    """
+    tail = scipy.special.stdtr(degrees, -np.abs(values))
+    rare = np.maximum(tail, np.finfo(float).tiny)
+    return np.asarray(np.sign(values) * -scipy.special.ndtri(rare))

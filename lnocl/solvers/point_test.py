@@ -1,0 +1,62 @@
+r"""Whether the extended source could be what a place holds, by the least squares of a point there.
+
+A point takes the place of the light of the estimate within a resolution, where the extended source
+is expected to go on inwards as it is round it (`lnocl.scene.texture`). Flux and error follow from
+the least squares of `lnocl.solvers.near_star`, with stars near it and the extended source
+marginalised.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lnocl.scene.arrays import Array
+from lnocl.scene.detector import on_sky
+from lnocl.scene.scene import Scene
+from lnocl.scene.texture import Texture, resolution
+from lnocl.solvers.fluxes import variances
+from lnocl.solvers.near_star import NearStar, Surroundings
+
+# The share of the gradient at which conjugate gradients end.
+FINISHED = 1e-4
+
+
+def point_flux(
+    scene: Scene, sky: Array, star_fluxes: Array, place: Array, flux: float, moves: bool
+) -> tuple[float, float]:
+    """Return the flux of a point at a place and its standard error, electrons.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is modelled.
+    sky : ndarray of float64, shape (Ny, Nx)
+        Extended source on the grid, electrons per pixel.
+    star_fluxes : ndarray of float64, shape (n_fluxes,)
+        Electrons, of stars and halos.
+    place : ndarray of float64, shape (2,)
+        (x, y), pixels of the images.
+    flux : float
+        About that of the point, electrons.
+    moves : bool
+        Whether positions of stars are unknown.
+    """
+    n, n_epochs = scene.n_stars, scene.observation.n_epochs
+    width = resolution(scene)
+    there = on_sky(np.array([place]), scene.oversample)
+    # The light of the point is in the estimate of the extended source, and its own now.
+    without = Texture(sky, there, width).mean
+    other = scene.with_star(place)
+    fluxes = np.insert(star_fluxes, n, [max(flux, 0.0)] * n_epochs)
+    near = NearStar(Surroundings(other, without, fluxes, moves), n, FINISHED)
+    at = [int(np.flatnonzero(near.held == s)[0]) for s in range(n, n + n_epochs)]
+    known = variances(near.fit.information)[at]
+    change, _ = near.fit.solve(np.zeros(len(near.fit.information)))
+    found = [(fluxes[n] + change[i] * scene.unit, near.fit.variance(i)) for i, v
+             in zip(at, known, strict=True) if np.isfinite(v)]  # fmt: skip
+    if not found:
+        return 0.0, np.inf
+    values, squares = np.array(found).T
+    weights = 1.0 / squares
+    mean = float((weights * values).sum() / weights.sum())
+    return mean, float(weights.sum() ** -0.5) * scene.unit

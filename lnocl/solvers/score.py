@@ -1,0 +1,485 @@
+r"""The score of a source at each place of the sky, under a model that does not have it.
+
+A source of flux c at place x adds ``c P_jx`` to image j. Under the model m_j without it, score and
+Fisher information of c are
+
+.. math::
+    T(x) = \sum_j \langle P_{jx}, w_j (g_j - m_j) / v_j \rangle, \qquad
+    F(x) = \sum_j \langle P_{jx}^2, w_j / v_j \rangle,
+
+v_j the variance of the counts. The stars and a level of the sky round x are not known either. Schur
+complements take out what the source has in common with them,
+
+.. math::
+    T' = T - B^T G^{-1} T_s, \qquad F' = F - B^T G^{-1} B, \qquad W' = W - B^T G^{-1} W_s, \\
+    T'' = T' - W' \frac{\overline{T'}}{\overline{W'}}, \qquad
+    F'' = F' - \frac{W'^2}{n_D \overline{W'}},
+
+where G is the information of the stars, B what they share with the source, W with a flat sky, and
+the bars are means over a disc of n_D pixels, three resolutions in radius.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy.fft
+import scipy.linalg
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lnocl.scene.arrays import Array
+from lnocl.scene.detector import on_sky
+from lnocl.scene.forward_model import Model, spread
+from lnocl.scene.psf_pixels import CORRELATED
+from lnocl.scene.scene import MIN_MODEL, Scene
+from lnocl.scene.shifting import Cutout
+from lnocl.scene.smooth_field import SmoothField
+from lnocl.scene.stars import along_sky
+from lnocl.scene.texture import resolution
+
+# Radius of the disc whose level is taken out, and full width of the Gaussian that smooths the
+# estimate for the model without sources, resolutions.
+DISC, SMOOTHED = 3.0, 12.0
+# What is brighter than so many times the smoothed estimate is no part of the level.
+PEAKED = 3.0
+# Where less than this share of what lies round a place is level, it has none.
+FAR = 1e-3
+# Structure is where the score is so many of its errors.
+STRUCTURED = 5.0
+# Nothing is tested where stars and level leave less than this share of the information, or where
+# less was observed than this share of the most.
+LEFT, SEEN = 0.5, 0.05
+# Stars and sources share nothing farther apart than so many resolutions.
+APART = 4.0
+# Combinations of stars with less than this share of their information tell nothing.
+SAME = 1e-6
+# Side of the squares of the sky whose stars are taken out together, resolutions.
+TILE = 8.0
+# Width of rings round stars, resolutions.
+RING = 1.0
+
+
+class Score(NamedTuple):
+    """The score of a source at each place of the sky, stars and level marginalised.
+
+    Attributes
+    ----------
+    score, information, variance : ndarray of float64, shape (Ny, Nx)
+        T'', what a unit of flux adds to it, and its variance by noise; of scaled units.
+    skewness : ndarray of float64, shape (Ny, Nx)
+        Of the score, for Poisson counts.
+    of_psfs : ndarray of float64, shape (Ny, Nx)
+        Its variance by the errors of PSFs that the run has found, over that by noise.
+    starlit : ndarray of float64, shape (Ny, Nx)
+        The same for PSFs whose relative error is 1.
+    is_tested : ndarray of bool, shape (Ny, Nx)
+        Where the images tell a source from stars and level.
+    correlation : ndarray of float64, shape (Ny, Nx)
+        Between the scores at the origin and at each place, of a level sky that is known.
+    curvature : ndarray of float64, shape (2, 2)
+        The mean of ``grad u grad u^T`` for noise u of unit variance, along y and x.
+    """
+
+    score: Array
+    information: Array
+    variance: Array
+    skewness: Array
+    of_psfs: Array
+    starlit: Array
+    is_tested: NDArray[np.bool_]
+    correlation: Array
+    curvature: Array
+
+
+class Null:
+    """The model without a source: stars, background and a smooth level.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is modelled, with the stars where they are.
+    sky : ndarray of float64, shape (Ny, Nx)
+        Extended source on the grid, electrons per pixel.
+    star_fluxes : ndarray of float64, shape (n_fluxes,)
+        Electrons, of stars and halos.
+    moves : bool
+        Whether positions of stars were fitted.
+    psf_errors : tuple of ndarray of float64
+        Radii at which rings round stars begin and end, pixels of the images, and the relative error
+        of the PSFs in each; of lengths k + 1 and k.
+
+    Attributes
+    ----------
+    resolution : float
+        That of all images together, pixels of the sky.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        sky: Array,
+        star_fluxes: Array,
+        moves: bool,
+        psf_errors: tuple[Array, Array],
+    ) -> None:
+        self.scene, self._model, self._moves = scene, Model(scene), moves
+        self.resolution = resolution(scene)
+        self._psf_errors = psf_errors
+        self._fluxes = np.asarray(star_fluxes) / scene.unit
+        self._starlight = list(self._model.starlight(self._fluxes))
+        self._sky = sky / scene.unit
+        self.is_structured = np.zeros(scene.grid, bool)
+        self._model_sky()
+        self.is_structured = self._find_structure()
+        if self.is_structured.any():
+            self._model_sky()
+
+    def _model_sky(self) -> None:
+        """Model the sky by its level, and what is structured apart from it."""
+        structured = self.is_structured
+        smooth = _level(self._sky, ~structured, SMOOTHED * self.resolution / 2.355)
+        structure = np.where(structured, self._sky - smooth, 0.0)
+        light = self._model.forward(structure)
+        means = self._means(smooth)
+        self._linearise(means, self._means(smooth + structure), light)
+        # The level as the counts have it: the estimate may hold less or more.
+        excess = self._mean_in_disc(
+            self._adjoint(self._residuals) - self._adjoint(self._apart)
+        )
+        response = self._mean_in_disc(self._flat_response())
+        excess = np.divide(excess, response, out=np.zeros_like(excess), where=response > 0)
+        level = np.maximum(smooth + self._mean_in_disc(excess, 2.0), 0.0)
+        self._linearise(means, self._means(level + structure), light)
+
+    def _find_structure(self) -> NDArray[np.bool_]:
+        """Return where the sky has more than noise, and a resolution round it."""
+        score = self.score()
+        values = score.score / np.sqrt(score.variance)
+        radius = int(np.ceil(self.resolution))
+        disc = np.hypot(*np.ogrid[-radius : radius + 1, -radius : radius + 1]) <= radius
+        found = ndimage.binary_dilation(values > STRUCTURED, disc)
+        return np.asarray(found)
+
+    def _means(self, level: Array) -> list[Array]:
+        images = self._model.forward(level)
+        parts = zip(images, self._model.background, self._starlight, strict=True)
+        return [np.maximum(image + known + light, MIN_MODEL) for image, known, light in parts]
+
+    def _linearise(
+        self, means: Sequence[Array], variances: Sequence[Array], light: Array
+    ) -> None:
+        weights = self._model.weights
+        each = zip(self.scene.images(), means, variances, weights, strict=True)
+        self._residuals = [w * (image - mean) / v for image, mean, v, w in each]
+        self._precisions = [w / v for v, w in zip(variances, weights, strict=True)]
+        self._apart = [p * each for p, each in zip(self._precisions, light, strict=True)]
+        self._variances = variances
+
+    def _adjoint(self, images: Sequence[Array], power: int = 1, width: float = 0.0) -> Array:
+        """Return ``sum_j <P_jx^power, x_j>`` at each place x of the grid."""
+        scene, total = self.scene, 0.0
+        for j, image in enumerate(images):
+            kernel = self._kernel(j, width) ** power
+            seen = scene.rotations[j].adjoint(image) if scene.rotations else image
+            spectrum = scipy.fft.rfft2(spread(seen, scene.oversample), workers=-1)
+            total = total + np.conj(scipy.fft.rfft2(kernel, workers=-1)) * spectrum
+        return np.asarray(scipy.fft.irfft2(total, scene.grid, workers=-1))
+
+    def _kernel(self, j: int, width: float) -> Array:
+        """Return what image j shows of a source at the origin, as wide as given."""
+        psf = self.scene.psf(j)
+        return _blurred(psf, width) if width else psf
+
+    def _flat_response(self, width: float = 0.0) -> Array:
+        sums = self._model.sums
+        flat = [each * total for each, total in zip(self._precisions, sums, strict=True)]
+        return self._adjoint(flat, width=width)
+
+    def _mean_in_disc(self, sky: Array, larger: float = 1.0) -> Array:
+        disc = np.conj(scipy.fft.rfft2(self._disc(larger)))
+        return np.asarray(scipy.fft.irfft2(scipy.fft.rfft2(sky) * disc, sky.shape))
+
+    def _disc(self, larger: float = 1.0) -> Array:
+        y, x = (np.fft.fftfreq(n, 1.0 / n) for n in self.scene.grid)
+        disc = (np.hypot(y[:, None], x) <= larger * DISC * self.resolution).astype(np.float64)
+        return np.asarray(disc / disc.sum())
+
+    def score(self, width: float = 0.0) -> Score:
+        """Return the score of a Gaussian source of this full width at half maximum, pixels.
+
+        A width of 0 is a point.
+        """
+        scale = self.scene.scale
+        score = scale * self._adjoint(self._residuals, width=width)
+        raw = np.maximum(scale * self._adjoint(self._precisions, 2, width), 0.0)
+        flat = scale * self._flat_response(width)
+        score, information, flat = self._without_stars(score, raw, flat, width)
+        is_level = ~self.is_structured
+        in_disc = np.maximum(self._mean_in_disc(flat * is_level), np.finfo(float).tiny)
+        gain, spread_, power, noise = self._spectral_shares(width)
+        shared = flat**2 / in_disc / np.count_nonzero(self._disc())
+        # Sources are tested without those elsewhere, and have no part in the level round others.
+        beside = score - scale * self._adjoint(self._apart, width=width)
+        score = np.where(self.is_structured, score, beside)
+        score -= flat * self._mean_in_disc(beside * is_level) / in_disc
+        left = information - gain * shared
+        seen = self._adjoint(list(self._model.weights), 2, width)
+        is_tested = (left > LEFT * raw) & (seen > SEEN * seen.max())
+        is_tested &= self._is_inside()
+        # The level has no part in sources that it was found without.
+        left = np.where(self.is_structured, information, left)
+        left = np.where(is_tested, left, np.inf)
+        variance = np.where(is_tested, information - spread_ * shared, np.inf)
+        third = scale * self._adjoint(self._third_moments(), 3, width)
+        of_psfs, starlit = self._of_psfs(width)
+        return Score(
+            score,
+            left,
+            variance,
+            np.maximum(third, 0.0) / np.maximum(variance, np.finfo(float).tiny) ** 1.5,
+            of_psfs / variance,
+            starlit / variance,
+            is_tested,
+            np.asarray(scipy.fft.ifft2(power).real * power.size),
+            _curvature(noise),
+        )
+
+    def _is_inside(self) -> NDArray[np.bool_]:
+        """Return the places of the frame, less its edges along which the grid is periodic."""
+        scene, edge = self.scene, math.ceil(self.resolution / 2.0)
+        inside = []
+        for n, size in zip(scene.observation.sky_shape, scene.grid, strict=True):
+            at = np.arange(size)
+            first, last = (edge, n - edge) if n == size else (0, n)
+            inside.append((at >= first) & (at < last))
+        return np.asarray(inside[0][:, None] & inside[1])
+
+    def _third_moments(self) -> list[Array]:
+        """Return the third moments of the counts' Poisson part, over the cube of their variance."""
+        observation, scene = self.scene.observation, self.scene
+        moments = []
+        for j, (v, w) in enumerate(zip(self._variances, self._model.weights, strict=True)):
+            read = observation.read_noise[j] ** 2 / scene.scale
+            poisson = np.maximum(v - read, 0.0) if np.ndim(read) == 0 else v
+            moments.append(w * poisson / v**3)
+        return moments
+
+    def _spectral_shares(self, width: float) -> tuple[float, float, Array, Array]:
+        """Return the shares of the level in information and variance, and two spectra.
+
+        Shares are of ``W^2 / (n_D mean W)``, and exact where the noise is the same everywhere. The
+        spectra, of unit sum, are of the score before and after the level is taken out.
+        """
+        grid = self.scene.grid
+        power = sum(
+            abs(scipy.fft.fft2(self._kernel(j, width))) ** 2 for j in range(self.scene.n_images)
+        )
+        high = 1.0 - scipy.fft.fft2(self._disc()).real
+        total = power.sum()
+        taken = power[0, 0] * np.prod(grid) / np.count_nonzero(self._disc())
+        gain = (total - (power * high).sum()) / taken
+        spread_ = (total - (power * high**2).sum()) / taken
+        noise = power * high**2
+        return float(gain), float(spread_), power / total, noise / noise.sum()
+
+    def _of_psfs(self, width: float) -> tuple[Array, Array]:
+        """Return the variance of the score by errors of PSFs, as found and by relative errors of 1."""
+        scene = self.scene
+        if not scene.n_stars or not self._fluxes[: scene.n_stars].any():
+            nothing = np.zeros(scene.grid)
+            return nothing, nothing
+        found, whole = [], []
+        edges, errors = self._psf_errors
+        for j, precision in enumerate(self._precisions):
+            known, all_ = np.zeros((2, *scene.image_grid))
+            for s in range(scene.n_stars):
+                cutout, flux = scene.star_cutout(j, s), self._fluxes[s]
+                there = cutout.window(scene.image_grid)
+                light = flux * cutout.values * precision[there]
+                all_[there] += light**2
+                if len(errors):
+                    x, y = scene.observation.places(j, scene.stars[s])
+                    rows, columns = (first + np.arange(n) for first, n in
+                                     zip(cutout[1:], light.shape, strict=True))  # fmt: skip
+                    ring = np.digitize(np.hypot((rows - y)[:, None], columns - x), edges) - 1
+                    known[there] += (errors[np.minimum(ring, len(errors) - 1)] * light) ** 2
+            found.append(known)
+            whole.append(all_)
+        # Errors of pixels are correlated over less than a PSF.
+        size = min(64, *scene.image_grid)
+        together = float(SmoothField((size, size), CORRELATED).apply(np.ones((size, size)))[0, 0])
+        factor = (scene.scale * together) ** 2
+        return tuple(factor * self._adjoint(each, 2, width) for each in (found, whole))  # type: ignore[return-value]
+
+    def brightest_structure(self) -> Array:
+        """Return the flux that the brightest structure round each place has in a resolution."""
+        if not self.is_structured.any():
+            return np.zeros(self.scene.grid)
+        structure = np.where(self.is_structured, self._sky, 0.0)
+        area = math.pi / (4.0 * math.log(2.0)) * self.resolution**2
+        seen = area * ndimage.gaussian_filter(structure, self.resolution / 2.355, mode="wrap")
+        return np.asarray(ndimage.maximum_filter(seen, round(2 * self.resolution) + 1, mode="wrap"))
+
+    @cached_property
+    def rings(self) -> NDArray[np.int_]:
+        """The ring that each place lies in, round the star that lights it most."""
+        scene = self.scene
+        brightest, ring = np.zeros(scene.grid), np.zeros(scene.grid, int)
+        for s in range(scene.n_stars):
+            cutout = scene.psf_on_sky(0, s)
+            there = cutout.window(scene.grid)
+            x, y = on_sky(scene.stars[s], scene.oversample)
+            rows, columns = (first + np.arange(n) for first, n in
+                             zip(cutout[1:], cutout.values.shape, strict=True))  # fmt: skip
+            distance = np.hypot((rows - y)[:, None], columns - x)
+            light = self._fluxes[s] * cutout.values
+            is_brighter = light > brightest[there]
+            found = (distance / (RING * self.resolution)).astype(int)
+            ring[there] = np.where(is_brighter, found, ring[there])
+            brightest[there] = np.where(is_brighter, light, brightest[there])
+        return ring
+
+    def _without_stars(
+        self, score: Array, information: Array, flat: Array, width: float
+    ) -> tuple[Array, Array, Array]:
+        """Return score, information and response to a flat sky without what stars share."""
+        scene, q = self.scene, self.scene.oversample
+        if not scene.n_stars:
+            return score, information, flat
+        images, owners = self._star_images()
+        scores = np.zeros((2, len(images)))
+        shared: list[Cutout] = []
+        half = int(np.ceil(APART * self.resolution))
+        for k, of_images in enumerate(images):
+            weighed = []
+            for j, cutout in enumerate(of_images):
+                there = cutout.window(scene.image_grid)
+                values = cutout.values * self._precisions[j][there]
+                scores[0, k] += float((cutout.values * self._residuals[j][there]).sum())
+                scores[1, k] += float(values.sum() * self._model.sums[j])
+                weighed.append(cutout._replace(values=values))
+            common = self._model.adjoint_of_cutouts(weighed)
+            common = _cut_round(common, on_sky(scene.stars, q)[owners[k]], half, scene.grid)
+            if width:
+                blurred = ndimage.gaussian_filter(common.values, width / 2.355, mode="constant")
+                common = common._replace(values=blurred)
+            shared.append(common)
+        gram = self._gram(images, owners)
+        tile = int(np.ceil(TILE * self.resolution))
+        score, information, flat = score.copy(), information.copy(), flat.copy()
+        scale = scene.scale
+        ny, nx = scene.grid
+        for top in range(0, ny, tile):
+            for left in range(0, nx, tile):
+                here = slice(top, min(top + tile, ny)), slice(left, min(left + tile, nx))
+                shape = here[0].stop - top, here[1].stop - left
+                near = [
+                    k for k, each in enumerate(shared)
+                    if _overlaps(each, (top, left), shape, scene.grid)
+                ]  # fmt: skip
+                if not near:
+                    continue
+                laid = np.array([
+                    shared[k].add_to(np.zeros(shape), (top, left), scene.grid).ravel()
+                    for k in near
+                ])  # fmt: skip
+                diagonal = np.maximum(np.diag(gram)[near], np.finfo(float).tiny)
+                units = 1.0 / np.sqrt(diagonal)
+                laid *= units[:, None]
+                matrix = gram[np.ix_(near, near)] * units * units[:, None]
+                # Stars at one place are one.
+                solved = scipy.linalg.pinvh(matrix, atol=SAME) @ laid
+                of_score, of_flat = scores[:, near] * units @ solved
+                score[here] -= scale * of_score.reshape(shape)
+                flat[here] -= scale * of_flat.reshape(shape)
+                information[here] -= scale * (laid * solved).sum(axis=0).reshape(shape)
+        return score, np.maximum(information, 0.0), flat
+
+    def _star_images(self) -> tuple[list[list[Cutout]], list[int]]:
+        """Return what each unknown of stars adds to each image, and the star that it is of."""
+        scene, field = self.scene, self.scene.star_field
+        images: list[list[Cutout]] = []
+        owners: list[int] = []
+        for s in range(scene.n_stars):
+            images.append([scene.star_cutout(j, s) for j in range(scene.n_images)])
+            owners.append(s)
+            if not self._moves:
+                continue
+            slopes = []
+            for j in range(scene.n_images):
+                moved = field.psfs[j][s].with_slopes(*field.places[j][s])
+                moved = along_sky(moved, scene.observation.turns[j])
+                slopes.append(moved._replace(values=moved.values * scene.shown[s, j]))
+            for axis in (1, 2):
+                images.append([each._replace(values=each.values[axis]) for each in slopes])
+                owners.append(s)
+        return images, owners
+
+    def _gram(self, images: list[list[Cutout]], owners: list[int]) -> Array:
+        """Return the information of the unknowns of stars that lie near each other."""
+        scene = self.scene
+        grid, n = scene.image_grid, len(images)
+        gram = np.zeros((n, n))
+        places = on_sky(scene.stars, scene.oversample)[owners]
+        away = places[:, None] - places
+        size = np.array(scene.grid[::-1])
+        away = (away + size / 2) % size - size / 2
+        is_near = np.hypot(away[..., 0], away[..., 1]) <= (2 * APART + TILE) * self.resolution
+        for j in range(scene.n_images):
+            for k in range(n):
+                cutout = images[k][j]
+                values = cutout.values * self._precisions[j][cutout.window(grid)]
+                for other in np.flatnonzero(is_near[k, : k + 1]).tolist():
+                    there = images[other][j].add_to(np.zeros(values.shape), cutout[1:], grid)
+                    gram[k, other] += float((values * there).sum())
+        return np.asarray(gram + np.tril(gram, -1).T)
+
+
+def _curvature(noise: Array) -> Array:
+    """Return the mean of ``grad u grad u^T`` for noise of this power spectrum, of unit sum."""
+    ky, kx = (2.0 * np.pi * np.fft.fftfreq(n) for n in noise.shape)
+    axes = ky[:, None], kx
+    return np.array([[float((noise * a * b).sum()) for a in axes] for b in axes])
+
+
+def _level(sky: Array, is_level: NDArray[np.bool_], width: float) -> Array:
+    """Return the level of a sky by those of its pixels, without what is narrow in it."""
+    share = ndimage.gaussian_filter(is_level.astype(np.float64), width, mode="wrap")
+    smooth = ndimage.gaussian_filter(np.where(is_level, sky, 0.0), width, mode="wrap")
+    smooth = np.divide(smooth, share, out=np.zeros_like(smooth), where=share > FAR)
+    capped = np.where(is_level, np.minimum(sky, PEAKED * smooth), 0.0)
+    smooth = ndimage.gaussian_filter(capped, width, mode="wrap")
+    return np.divide(smooth, share, out=np.zeros_like(smooth), where=share > FAR)
+
+
+def _blurred(psf: Array, width: float) -> Array:
+    """Return a periodic array convolved with a Gaussian of this full width at half maximum."""
+    root = math.pi * width / 2.355
+    v, u = (np.fft.fftfreq(n) for n in psf.shape)
+    transfer = np.exp(-2.0 * root**2 * (v[:, None] ** 2 + u**2))
+    return np.asarray(scipy.fft.ifft2(scipy.fft.fft2(psf) * transfer).real)
+
+
+def _cut_round(cutout: Cutout, place: Array, half: int, grid: tuple[int, int]) -> Cutout:
+    """Return the values within so many pixels of a place."""
+    x, y = np.round(place).astype(int).tolist()
+    height, width = (min(2 * half + 1, n) for n in grid)
+    first = y - height // 2, x - width // 2
+    return Cutout(cutout.add_to(np.zeros((height, width)), first, grid), *first)
+
+
+def _overlaps(
+    cutout: Cutout, first: tuple[int, int], shape: tuple[int, int], grid: tuple[int, int]
+) -> bool:
+    """Return whether a cutout reaches into a window of the periodic grid."""
+    return all(
+        (at - start) % n < size or (start - at) % n < length
+        for at, start, n, size, length in zip(
+            first, cutout[1:], grid, cutout.values.shape, shape, strict=True
+        )
+    )
