@@ -29,6 +29,8 @@ DARKER = 0.1587
 CLEARLY = 4.0
 # Rings are looked at where PSFs that are wrong by so much would add this share of the noise.
 POSSIBLE, TELLING = 0.1, 0.1
+# What the run has found of the PSFs counts as so many values of a ring.
+KNOWN = 10.0
 # Degrees of freedom that are as many as infinite.
 MANY = 1e6
 
@@ -82,7 +84,8 @@ def noise_of(score: Score, empty: NDArray[np.bool_], rings: NDArray[np.int_]) ->
         square, variance = _error_in((values[y[at], x[at]] / shared) ** 2, light[at], independent)
         total = 1.0 + np.maximum(square * light[at], known[at])
         scatter[y[at], x[at]] = shared * np.sqrt(total)
-        degrees[y[at], x[at]] = np.minimum(2.0 * (total / light[at]) ** 2 / variance, MANY)
+        told = KNOWN + 2.0 * (total / light[at]) ** 2 / variance
+        degrees[y[at], x[at]] = np.minimum(told, MANY)
     return Noise(scatter, degrees)
 
 
