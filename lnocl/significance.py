@@ -58,7 +58,7 @@ class Map:
     def __init__(self, null: Null, width: float) -> None:
         self.score, self.width = null.score(width), width
         scene = null.scene
-        self.noise = noise_of(self.score, ~null.is_structured, null.rings)
+        self.noise = noise_of(self.score, null.rings, ~null.is_structured)
         self._rarity = Rarity(null._kernel(0, width))
         self.unit = scene.unit
         self.values = self.score.score / np.sqrt(self.score.variance) / self.noise.scatter

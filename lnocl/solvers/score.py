@@ -41,6 +41,7 @@ from lnocl.scene.shifting import Cutout
 from lnocl.scene.smooth_field import SmoothField
 from lnocl.scene.stars import along_sky
 from lnocl.scene.texture import resolution
+from lnocl.solvers.score_noise import noise_of
 
 # Radius of the disc whose level is taken out, and full width of the Gaussian that smooths the
 # estimate for the model without sources, resolutions.
@@ -49,7 +50,7 @@ DISC, SMOOTHED = 3.0, 12.0
 PEAKED = 3.0
 # Where less than this share of what lies round a place is level, it has none.
 FAR = 1e-3
-# Structure is where the score is so many of its errors.
+# Structure is where the score is so many times its noise.
 STRUCTURED = 5.0
 # Nothing is tested where stars and level leave less than this share of the information, or where
 # less was observed than this share of the most.
@@ -159,7 +160,8 @@ class Null:
     def _find_structure(self) -> NDArray[np.bool_]:
         """Return where the sky has more than noise, and a resolution round it."""
         score = self.score()
-        values = score.score / np.sqrt(score.variance)
+        noise = noise_of(score, self.rings, None)
+        values = score.score / np.sqrt(score.variance) / noise.scatter
         radius = int(np.ceil(self.resolution))
         disc = np.hypot(*np.ogrid[-radius : radius + 1, -radius : radius + 1]) <= radius
         found = ndimage.binary_dilation(values > STRUCTURED, disc)

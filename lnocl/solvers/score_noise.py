@@ -14,14 +14,16 @@ distribution, as contrasts near a star do (Mawet, D., et al., 2014, ApJ 792, 97)
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
 from lnocl.scene.arrays import Array
-from lnocl.solvers.score import Score
+
+if TYPE_CHECKING:
+    from lnocl.solvers.score import Score
 
 # A Gaussian is one standard deviation below its median in this share of all.
 DARKER = 0.1587
@@ -31,6 +33,8 @@ CLEARLY = 4.0
 POSSIBLE, TELLING = 0.1, 0.1
 # What the run has found of the PSFs counts as so many values of a ring.
 KNOWN = 10.0
+# The median of squares of a Gaussian.
+MEDIAN_SQUARE = 0.4549
 # Degrees of freedom that are as many as infinite.
 MANY = 1e6
 
@@ -50,59 +54,61 @@ class Noise(NamedTuple):
     degrees: Array
 
 
-def noise_of(score: Score, empty: NDArray[np.bool_], rings: NDArray[np.int_]) -> Noise:
+def noise_of(score: Score, rings: NDArray[np.int_], empty: NDArray[np.bool_] | None) -> Noise:
     """Return the noise of a score near stars, and of its whole field.
 
     Parameters
     ----------
     score : Score
         The score of a source.
-    empty : ndarray of bool, shape (Ny, Nx)
-        Where no structure was found.
     rings : ndarray of int, shape (Ny, Nx)
         The ring round a star that each place lies in.
+    empty : ndarray of bool, shape (Ny, Nx), or None
+        Where no structure was found; None where it is not known yet, so that medians stand for
+        means.
     """
     values = score.score / np.sqrt(score.variance)
-    tested = values[score.is_tested & empty]
+    is_empty = score.is_tested if empty is None else score.is_tested & empty
     independent = 1.0 / float((score.correlation**2).sum())
-    shared = 1.0
-    if tested.size:
-        shared = float(np.median(tested) - np.quantile(tested, DARKER))
-        if shared < 1.0 + CLEARLY / math.sqrt(independent * tested.size):
-            shared = 1.0
+    shared = _shared(values[is_empty], independent)
     scatter = shared * np.sqrt(1.0 + score.of_psfs)
     degrees = np.full(values.shape, MANY)
-    near = (POSSIBLE**2 * score.starlit > TELLING) & score.is_tested & empty
-    if not near.any():
-        return Noise(scatter, degrees)
-    y, x = np.nonzero(near)
-    light, known = score.starlit[y, x], score.of_psfs[y, x]
+    y, x = np.nonzero((POSSIBLE**2 * score.starlit > TELLING) & score.is_tested)
     _, ring = np.unique(rings[y, x], return_inverse=True)
-    order = np.argsort(ring, kind="stable")
     ends = np.cumsum(np.bincount(ring))[:-1]
-    for at in np.split(order, ends):
-        square, variance = _error_in((values[y[at], x[at]] / shared) ** 2, light[at], independent)
-        total = 1.0 + np.maximum(square * light[at], known[at])
-        scatter[y[at], x[at]] = shared * np.sqrt(total)
-        told = KNOWN + 2.0 * (total / light[at]) ** 2 / variance
-        degrees[y[at], x[at]] = np.minimum(told, MANY)
+    for at in np.split(np.argsort(ring, kind="stable"), ends) if len(y) else []:
+        there = y[at], x[at]
+        told_by = is_empty[there]
+        squares, light = (values[there] / shared) ** 2, score.starlit[there]
+        square, told = 0.0, 0.0
+        if told_by.any():
+            square = _error_in(squares[told_by], light[told_by], empty is None)
+            shares = light[told_by] / (1.0 + square * light[told_by])
+            told = independent * float((shares**2).sum())
+        total = 1.0 + np.maximum(square * light, score.of_psfs[there])
+        scatter[there] = shared * np.sqrt(total)
+        degrees[there] = np.minimum(KNOWN + (total / light) ** 2 * told, MANY)
     return Noise(scatter, degrees)
 
 
-def _error_in(squares: Array, light: Array, independent: float) -> tuple[float, float]:
-    """Return the square of the PSFs' relative error that a ring shows, and its variance.
+def _shared(values: Array, independent: float) -> float:
+    """Return how much more than counts a whole field scatters, by its darker half."""
+    if not values.size:
+        return 1.0
+    found = float(np.median(values) - np.quantile(values, DARKER))
+    return found if found > 1.0 + CLEARLY / math.sqrt(independent * values.size) else 1.0
 
-    The mean of ``u^2 / (1 + e^2 X)`` is 1 for the error e.
-    """
+
+def _error_in(squares: Array, light: Array, by_median: bool) -> float:
+    """Return the square of the PSFs' relative error that a ring shows."""
+    middle, expected = (np.median, MEDIAN_SQUARE) if by_median else (np.mean, 1.0)
 
     def excess(square: float) -> float:
-        return float((squares / (1.0 + square * light)).mean()) - 1.0
+        return float(middle(squares / (1.0 + square * light))) - expected
 
-    square = 0.0
-    if excess(0.0) > 0:
-        high = 1.0 / light.max()
-        while excess(high) > 0:
-            high *= 4.0
-        square = float(optimize.brentq(excess, 0.0, high))
-    told = independent * float(((light / (1.0 + square * light)) ** 2).sum())
-    return square, 2.0 / told
+    if excess(0.0) <= 0:
+        return 0.0
+    high = 1.0 / light.max()
+    while excess(high) > 0:
+        high *= 4.0
+    return float(optimize.brentq(excess, 0.0, high))
