@@ -346,9 +346,12 @@ class Result:
 
     @property
     def _outcome(self) -> Outcome:
-        """The outcome that replicas are of."""
+        """The outcome that replicas, detections and limits are of."""
         if not isinstance(self._findings, Outcome):
-            raise InputError("replicas are of one run, and this result is of tiles: they have none")
+            raise InputError(
+                "replicas are of one run, as detections and limits are, and this result is of "
+                "tiles: deconvolve a cut-out without tiles"
+            )
         return self._findings
 
     @property

@@ -9,8 +9,8 @@ whole field (`lnocl.solvers.false_alarms`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lnocl.errors import InputError
+from lnocl.plotting.significance import SignificanceView, draw_significance
 from lnocl.runs.outcome import Outcome
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
@@ -381,6 +382,203 @@ class Significance:
         bright = null.brightest_structure()
         return np.asarray(SHARE_NEAR * bright * self._map.unit)
 
+    def contrast_curves(self, completeness: Sequence[float] = (0.5, 0.9, 0.95)) -> QTable:
+        """Return the faintest sources that would be found, against the distance from each star.
+
+        Parameters
+        ----------
+        completeness : sequence of float, optional
+            Probabilities of being found, between 0 and 1.
+
+        Returns
+        -------
+        astropy.table.QTable
+            A row for each ring round each ``star``, counted from 1. Rings are a resolution wide:
+            their mean ``distance``, pixels of the images, and ``share``, how much of each is
+            tested. Then the medians of `limit` in it: ``flux50``, electrons; ``contrast50``, over
+            the flux of the star; and ``magnitudes50``, fainter than the star; likewise for other
+            probabilities.
+
+        Raises
+        ------
+        InputError
+            A probability is not between 0 and 1.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((65, 65)) - 32
+        >>> psf = np.exp(-(x**2 + y**2) / 4)
+        >>> images = np.random.default_rng(0).poisson(10 + 1e5 * psf / psf.sum())
+        >>> observation = lnocl.Observation(images, psf, background=10)
+        >>> result = lnocl.deconvolve(observation, [(32, 32)], n_iter=20, engine="numpy")
+        >>> curves = result.significance().contrast_curves()
+        >>> curves.colnames[:4], bool(curves["magnitudes50"][-1].value > 6)
+        (['star', 'distance', 'share', 'flux50'], True)
+        """
+        from astropy.table import QTable
+        from astropy.units import electron, mag, pix
+
+        limits = {f"{100 * each:g}": self.limit(each) for each in completeness}
+        observation, scene = self._outcome.observation, self._outcome.scene
+        n_epochs = observation.n_epochs
+        fluxes = self._outcome.star_fluxes[: scene.n_stars].reshape(-1, n_epochs).mean(axis=1)
+        rows: list[tuple[float, ...]] = []
+        for s, place in enumerate(on_sky(scene.stars[::n_epochs], observation.oversample)):
+            rows += [(float(s + 1), *ring, float(fluxes[s])) for ring in self._rings(place, limits)]
+        names = ["star", "distance", "share", *(f"flux{name}" for name in limits), "of_star"]
+        columns = dict(zip(names, np.reshape(rows, (-1, len(names))).T, strict=True))
+        table = QTable({
+            "star": columns["star"].astype(int),
+            "distance": columns["distance"] * pix,
+            "share": columns["share"],
+        })  # fmt: skip
+        of_star = np.where(columns["of_star"] > 0, columns["of_star"], np.nan)
+        for name in limits:
+            table[f"flux{name}"] = columns[f"flux{name}"] * electron
+            table[f"contrast{name}"] = columns[f"flux{name}"] / of_star
+            table[f"magnitudes{name}"] = -2.5 * np.log10(table[f"contrast{name}"]) * mag
+        return table
+
+    def _rings(self, place: Array, limits: Mapping[str, Array]) -> Iterator[tuple[float, ...]]:
+        """Yield distance, share that is tested, and medians of limits of rings round a place."""
+        q = self._outcome.observation.oversample
+        rows, columns = np.indices(self.signal_to_noise.shape)
+        distance = np.hypot(rows - place[1], columns - place[0]) / q
+        ring = (distance / self.resolution).astype(int)
+        is_tested = np.isfinite(self.signal_to_noise)
+        sizes = np.bincount(ring.ravel())
+        order = np.argsort(ring[is_tested], kind="stable")
+        numbers, first = np.unique(ring[is_tested][order], return_index=True)
+        parts = [
+            np.split(each[is_tested][order], first[1:]) for each in (distance, *limits.values())
+        ]
+        for k, (away, *values) in zip(numbers.tolist(), zip(*parts, strict=True), strict=True):
+            medians = (float(np.median(each)) for each in values)
+            yield float(away.mean()), len(away) / float(sizes[k]), *medians
+
+    def view(self, curves: QTable | None = None) -> SignificanceView:
+        """Return what the picture of detections, and of limits with their curves, shows."""
+        observation, scene = self._outcome.observation, self._outcome.scene
+        stars = [(x, y) for x, y in scene.stars[:: observation.n_epochs].tolist()]
+        shown = stars, observation.oversample, self.threshold, self.width, "electron"
+        if curves is None:
+            return SignificanceView(*shown, self.signal_to_noise, _plain(self.detections))
+        return SignificanceView(*shown, limit=self.limit(), curves=_plain(curves))
+
+    def plot(self) -> Figure:
+        """Return a picture of the map with the detections, and of the limits and their curves.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Its ``savefig`` writes a file.
+
+        Raises
+        ------
+        LnoclError
+            matplotlib is missing.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> images = np.random.default_rng(1).poisson(10.0, (64, 64))
+        >>> observation = lnocl.Observation(images, np.ones((5, 5)), background=10)
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
+        >>> [axes.get_title()[:9] for axes in result.significance().plot().axes[:1]]
+        ['points: 0']
+        """
+        curves = self.contrast_curves()
+        view = replace(self.view(), limit=self.limit(), curves=_plain(curves))
+        return draw_significance(view)
+
+    def inject(self, n: int = 100, completeness: float = 0.5, seed: int = 0) -> QTable:
+        """Put sources into the images, and return which of them are found.
+
+        They lie at random where sources are tested, with fluxes that `limit` says are found with
+        this probability. A few at a time, the reconstruction is made again with them.
+
+        Parameters
+        ----------
+        n : int, optional
+            Sources, 1 or more.
+        completeness : float, optional
+            The probability, between 0 and 1.
+        seed : int, optional
+            Zero or more.
+
+        Returns
+        -------
+        astropy.table.QTable
+            A row for each source: ``x`` and ``y``, pixels of the images; ``flux``, electrons; and
+            ``found``, whether a detection lies within 0.7 resolutions; a point, where points are
+            put in.
+
+        Raises
+        ------
+        InputError
+            A number, probability or seed out of range; or nothing is tested.
+        DeviceError
+            As `lnocl.deconvolve`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> images = np.random.default_rng(1).poisson(10.0, (64, 64))
+        >>> observation = lnocl.Observation(images, np.ones((5, 5)), background=10)
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
+        >>> sources = result.significance().inject(4, completeness=0.999)
+        >>> len(sources), bool(sources["found"].sum() > 2)
+        (4, True)
+        """
+        from astropy.table import QTable
+        from astropy.units import electron, pix
+
+        from lnocl.runs.injections import APART, Injections, spread_places
+
+        check_injections(n, seed)
+        limits, observation = self.limit(completeness), self._outcome.observation
+        allowed = np.isfinite(limits)
+        if not allowed.any():
+            raise InputError("sources are tested nowhere, so that none can be put in")
+        q, rng = observation.oversample, np.random.default_rng(seed)
+        injections = Injections(self._outcome, self.width * q)
+        rows: list[tuple[float, float, float, bool]] = []
+        while len(rows) < n:
+            apart = APART * self.resolution * q
+            pixels = np.array(list(spread_places(allowed, n - len(rows), apart, rng)))
+            fluxes = limits[pixels[:, 0], pixels[:, 1]]
+            places = pixels[:, ::-1] + rng.uniform(-0.5, 0.5, pixels.shape)
+            places = (places - (q - 1) / 2.0) / q
+            outcome = injections.reconstruct(places, fluxes, rng)
+            found = significance(outcome, self.width, self.false_alarms).detections
+            if not self.width:
+                found = found[found["kind"] == POINT_SOURCE]
+            for (x, y), flux in zip(places.tolist(), fluxes.tolist(), strict=True):
+                away = np.hypot(found["x"].value - x, found["y"].value - y)
+                rows.append((x, y, flux, bool((away < NEAR * self.resolution).any())))
+        x, y, flux, is_found = zip(*rows, strict=True)
+        return QTable(
+            {
+                "x": np.array(x) * pix,
+                "y": np.array(y) * pix,
+                "flux": np.array(flux) * electron,
+                "found": np.array(is_found),
+            }
+        )
+
+    def _in_source(self) -> Array:
+        """Return the flux of a point that the extended source may be, where there is any.
+
+        It is `lnocl.scene.texture`'s expectation of the brightest round a star, seen by a point.
+        """
+        null = self._null
+        bright = null.brightest_structure()
+        return np.asarray(SHARE_NEAR * bright * self._map.unit)
+
     def contrast_curve(
         self, star: int = 1, completeness: Sequence[float] = (0.5, 0.9, 0.95)
     ) -> QTable:
@@ -472,6 +670,11 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
         found,
         outcome,
     )
+
+
+def _plain(table: QTable) -> dict[str, Array]:
+    """Return the columns of a table as arrays, without units."""
+    return {name: np.asarray(table[name]) for name in table.colnames}
 
 
 def check_width(width: object) -> None:

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import os
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from lnocl.commands import bootstrap, deconvolve, messages, options
+from lnocl.commands import bootstrap, messages, options
+from lnocl.commands.again import Again
 from lnocl.commands.options import option
-from lnocl.commands.parser import Command, Parser
-from lnocl.errors import FileError, InputError, note
-from lnocl.process import ignored_warnings
+from lnocl.commands.parser import Command
+from lnocl.errors import note
 
 if TYPE_CHECKING:
     from lnocl.io.frames import Frames
-    from lnocl.io.saved_results import SavedResult
     from lnocl.runs.bootstrap import Part
-
-# The run is taken for the same where pixels and fluxes are to this share of them, and pixels to
-# this share of the brightest: another device rounds otherwise.
-SAME, ROUNDING = 1e-3, 1e-5
 
 OPTIONS = [
     option(
@@ -72,53 +63,19 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.io import atomic
-    from lnocl.io.saved_results import read_result
     from lnocl.parallel import check_parallel
     from lnocl.runs.bootstrap import check_number
 
     check_parallel(arguments.parallel)
     check_number(arguments.bootstrap, arguments.seed)
-    saved = read_result(arguments.result)
-    atomic.check_fits_output(arguments.result, overwrite=True)
-    if saved.header.get("STOPPED") == "interrupt":
-        raise InputError(
-            f"the run of {arguments.result} was interrupted, and its command gives another result: "
-            "deconvolve to the end"
-        )
-    folder, run = _run_of(saved)
-    run.quiet = arguments.quiet
-    try:
-        with contextlib.chdir(folder), ignored_warnings():  # which were shown once
-            frames, given = deconvolve.read(run)
-    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
-        raise FileError(
-            f"{folder}, where {arguments.result} was made, is not there: deconvolve again"
-        ) from error
-    if run.tile is not None or frames.observation.psf_fields:
-        raise InputError(
-            f"{arguments.result} was made in tiles, and replicas are of one run: deconvolve a "
-            "cut-out without tiles"
-        )
-    with messages.shown_log(run.quiet, COMMAND.flags()):
-        parts = _parts(arguments, frames)
+    again = Again.read(arguments.result, arguments.quiet)
+    with messages.shown_log(arguments.quiet, COMMAND.flags()):
+        parts = _parts(arguments, again.frames)
         if not arguments.overwrite:
             bootstrap.check_earlier(arguments.result, arguments.seed, parts)
-    with messages.shown_log(run.quiet, name=messages.PROGRESS), ignored_warnings():
-        found = deconvolve.solve(run, frames, given)
-    expected = saved.extended * frames.electrons
-    fluxes = saved.star_fluxes * frames.electrons
-    if (
-        found.extended.shape != expected.shape
-        or not np.allclose(found.extended, expected, SAME, ROUNDING * abs(expected).max())
-        or not np.allclose(found.star_fluxes, fluxes, SAME)
-    ):
-        raise InputError(
-            f"the run of {arguments.result} gives another result now: its images, PSFs or options "
-            "have changed; deconvolve again"
-        )
-    with messages.shown_log(run.quiet, name=messages.PROGRESS):
-        lines = bootstrap.add_errors(arguments, found, frames, parts)
+    found = again.solve()
+    with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
+        lines = bootstrap.add_errors(arguments, found, again.frames, parts)
     if not arguments.quiet:
         messages.say([*lines, f"added to {arguments.result}"])
 
@@ -140,21 +97,6 @@ def _parts(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
     apertures = [] if arguments.regions is None else read_apertures(arguments.regions, *where)
     profiles = [] if arguments.profiles is None else read_profiles(arguments.profiles, *where)
     return [*apertures, *profiles]
-
-
-def _run_of(saved: SavedResult) -> tuple[str, argparse.Namespace]:
-    """Return the folder that a result was made in, and the arguments of its run."""
-    parser = Parser(prog="lnocl")
-    deconvolve.COMMAND.add_arguments(parser)
-    lines = saved.command_words()
-    folder = next((words[1] for words in lines if words[:1] == ["cd"]), os.curdir)
-    words = next((words for words in lines if words[:2] == ["lnocl", "deconvolve"]), None)
-    if words is None:
-        raise InputError(
-            f"{saved.path} has no command of lnocl deconvolve in its header; in Python, "
-            "Result.bootstrap gives errors"
-        )
-    return folder, parser.parse_args(words[2:])
 
 
 COMMAND = Command(

@@ -34,7 +34,8 @@ def check(arguments: argparse.Namespace, inputs: Iterable[str]) -> None:
         raise InputError(
             f"the picture is a PNG file; give --plot a name ending in .png, not {arguments.plot}"
         )
-    if os.path.realpath(arguments.plot) == os.path.realpath(arguments.output):
+    output = arguments.output
+    if output is not None and os.path.realpath(arguments.plot) == os.path.realpath(output):
         raise InputError(f"the picture {arguments.plot} is the output too; give it another name")
     atomic.check_output(arguments.plot, arguments.overwrite, inputs)
     check_matplotlib()

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import io
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,6 @@ from lnocl.errors import InputError, counted
 
 if TYPE_CHECKING:
     from astropy.table import Table
-
-# The formats of tables, by their endings, as astropy names them.
-FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
 
 OPTIONS = [
     option("image", metavar="IMAGE", is_input=True, help="FITS file with an image"),
@@ -63,14 +59,9 @@ OPTIONS = [
 
 def _run(arguments: argparse.Namespace) -> None:
     from lnocl.detection import find_stars
-    from lnocl.io import atomic, fitsread, sky
+    from lnocl.io import atomic, fitsread, sky, tables
 
-    ending = next((end for end in FORMATS if arguments.output.lower().endswith(end)), None)
-    if ending is None:
-        raise InputError(
-            f"the table of stars is ECSV, CSV or FITS; give it a name ending in .ecsv, .csv or "
-            f".fits, not {arguments.output}"
-        )
+    tables.format_of(arguments.output, "stars")
     inputs = options.input_paths(OPTIONS, vars(arguments))
     atomic.check_output(arguments.output, arguments.overwrite, inputs)
     pictures.check(arguments, inputs)
@@ -97,8 +88,7 @@ def _run(arguments: argparse.Namespace) -> None:
         stars[name].format, stars[name].unit = ".3f", "pix"
     for name in ("peak", "significance", "width"):
         stars[name].format = ".5g"
-    with atomic.whole_file(arguments.output, arguments.overwrite) as stream:
-        _write(stars, stream, FORMATS[ending])
+    tables.write_table(stars, arguments.output, "stars", arguments.overwrite)
     lines = [*_told(stars, n_extended), f"written to {arguments.output}"]
     if arguments.plot is not None:
         from lnocl.plotting.stars import draw_stars
@@ -130,16 +120,6 @@ def _mask(arguments: argparse.Namespace) -> NDArray[np.bool_] | None:
     if not colon:
         good_bits = flags.good_bits_of(*map(contents.value, ("TELESCOP", "INSTRUME", "DETECTOR")))
     return flags.bad_pixels(values, good_bits, arguments.image)
-
-
-def _write(stars: Table, stream: IO[bytes], kind: str) -> None:
-    """Write the table; astropy writes texts to text streams."""
-    if kind == "fits":
-        stars.write(stream, format=kind)
-        return
-    text = io.StringIO()
-    stars.write(text, format=kind)
-    stream.write(text.getvalue().encode())
 
 
 def _told(stars: Table, n_extended: int) -> list[str]:

@@ -10,9 +10,8 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError
-from lnocl.io.atomic import whole_file
+from lnocl.io.fitsadd import add_hdus
 from lnocl.io.fitsfile import open_fits
-from lnocl.io.fitsread import wcs_cards
 from lnocl.io.fitswrite import ascii_of
 
 if TYPE_CHECKING:
@@ -86,18 +85,7 @@ def write_errors(
     for hdu, name in zip(added, NAMES, strict=True):
         hdu.name = name
         hdu.header.extend(cards)
-    try:
-        with fits.open(path, memmap=False) as hdus:
-            for hdu in added:
-                if hdu.name in (ERROR, BIAS):
-                    hdu.header.extend(wcs_cards(hdus[0].header))
-                    hdu.header["BUNIT"] = (unit, "per pixel")
-            # As they are: a copy of a table loses the comments of its columns.
-            rest = [hdu for hdu in hdus if hdu.name not in NAMES]
-            with whole_file(path, overwrite=True) as stream:
-                fits.HDUList([*rest, *added]).writeto(stream, checksum=True)
-    except OSError as error:
-        raise FileError(f"{path} cannot be read again: {error}") from error
+    add_hdus(path, added, {ERROR: unit, BIAS: unit})
 
 
 def _in_ascii(table: QTable) -> QTable:

@@ -282,7 +282,7 @@ def test_a_file_of_no_command_is_refused(tmp_path, monkeypatch, capsys):
 def test_replicas_of_tiles_are_refused(words, capsys):
     assert cli.main([*words, "--tile", "64"]) == 0
     assert cli.main([*ERRORS, "10"]) == 2
-    assert "out.fits was made in tiles, and replicas are of one run" in capsys.readouterr().err
+    assert "out.fits was made in tiles, and this is of one run" in capsys.readouterr().err
 
 
 @pytest.mark.system

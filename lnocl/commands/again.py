@@ -1,0 +1,122 @@
+"""The run of a result, made again by its command."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lnocl.commands import deconvolve, messages
+from lnocl.commands.parser import Parser
+from lnocl.errors import FileError, InputError
+from lnocl.process import ignored_warnings
+
+if TYPE_CHECKING:
+    from lnocl.io.frames import Frames
+    from lnocl.io.saved_results import SavedResult
+    from lnocl.result import Result
+
+# The run is taken for the same where pixels and fluxes are to this share of them, and pixels to
+# this share of the brightest: another device rounds otherwise.
+SAME, ROUNDING = 1e-3, 1e-5
+
+
+@dataclass(frozen=True)
+class Again:
+    """A result in a file, and what its run was made of.
+
+    Attributes
+    ----------
+    saved : SavedResult
+        The result.
+    frames : Frames
+        Its images.
+    run : Namespace
+        The arguments of its run.
+    given : object
+        What else was read for it.
+    """
+
+    saved: SavedResult
+    frames: Frames
+    run: argparse.Namespace
+    given: Any
+
+    @classmethod
+    def read(cls, path: str, quiet: bool) -> Again:
+        """Read a result and its images.
+
+        Raises
+        ------
+        InputError
+            The run was interrupted, was made in tiles, or its command is not known.
+        FileError
+            The result cannot be read or written, or its folder is not there.
+        """
+        from lnocl.io import atomic
+        from lnocl.io.saved_results import read_result
+
+        saved = read_result(path)
+        atomic.check_fits_output(path, overwrite=True)
+        if saved.header.get("STOPPED") == "interrupt":
+            raise InputError(
+                f"the run of {path} was interrupted, and its command gives another result: "
+                "deconvolve to the end"
+            )
+        folder, run = _run_of(saved)
+        run.quiet = quiet
+        try:
+            with contextlib.chdir(folder), ignored_warnings():  # which were shown once
+                frames, given = deconvolve.read(run)
+        except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
+            raise FileError(
+                f"{folder}, where {path} was made, is not there: deconvolve again"
+            ) from error
+        if run.tile is not None or frames.observation.psf_fields:
+            raise InputError(
+                f"{path} was made in tiles, and this is of one run: deconvolve a cut-out without "
+                "tiles"
+            )
+        return cls(saved, frames, run, given)
+
+    def solve(self) -> Result:
+        """Return the result of the run.
+
+        Raises
+        ------
+        InputError
+            It is not that of the file.
+        """
+        with messages.shown_log(self.run.quiet, name=messages.PROGRESS), ignored_warnings():
+            found = deconvolve.solve(self.run, self.frames, self.given)
+        expected = self.saved.extended * self.frames.electrons
+        fluxes = self.saved.star_fluxes * self.frames.electrons
+        if (
+            found.extended.shape != expected.shape
+            or not np.allclose(found.extended, expected, SAME, ROUNDING * abs(expected).max())
+            or not np.allclose(found.star_fluxes, fluxes, SAME)
+        ):
+            raise InputError(
+                f"the run of {self.saved.path} gives another result now: its images, PSFs or "
+                "options have changed; deconvolve again"
+            )
+        return found
+
+
+def _run_of(saved: SavedResult) -> tuple[str, argparse.Namespace]:
+    """Return the folder that a result was made in, and the arguments of its run."""
+    parser = Parser(prog="lnocl")
+    deconvolve.COMMAND.add_arguments(parser)
+    lines = saved.command_words()
+    folder = next((words[1] for words in lines if words[:1] == ["cd"]), os.curdir)
+    words = next((words for words in lines if words[:2] == ["lnocl", "deconvolve"]), None)
+    if words is None:
+        raise InputError(
+            f"{saved.path} has no command of lnocl deconvolve in its header; in Python, the "
+            "methods of Result do the same"
+        )
+    return folder, parser.parse_args(words[2:])

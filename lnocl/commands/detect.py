@@ -1,0 +1,163 @@
+"""The command ``detect``: sources beside the stars of a result, at a rate of false alarms."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lnocl.commands import messages, options, pictures
+from lnocl.commands.again import Again
+from lnocl.commands.options import option
+from lnocl.commands.parser import Command
+from lnocl.errors import counted
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from lnocl.io.frames import Frames
+    from lnocl.significance import Significance
+
+# Detections that are printed.
+MAX_LISTED = 12
+
+WIDTH = option(
+    "--width",
+    type=float,
+    default=0.0,
+    metavar="FWHM",
+    help="full width at half maximum of the sources, pixels of the images (default: %(default)s, "
+    "points)",
+)
+FALSE_ALARMS = option(
+    "--false-alarms",
+    type=float,
+    default=0.01,
+    metavar="N",
+    help="number of false alarms expected in the whole field, from which the threshold follows "
+    "(default: %(default)s)",
+)
+OPTIONS = [
+    option(
+        "result",
+        metavar="RESULT.fits",
+        is_input=True,
+        help="file that lnocl deconvolve has written; the detections and the map of "
+        "signal-to-noise are added to it",
+    ),
+    WIDTH,
+    FALSE_ALARMS,
+    option(
+        "-o",
+        "--output",
+        metavar="TABLE.ecsv",
+        help="table of the detections too, in a format by its ending: .ecsv, .csv or .fits",
+    ),
+    options.PICTURE.but(help="picture of the map with the detections and their numbers"),
+    options.OVERWRITE.but(help="replace TABLE and FILE.png if they exist"),
+    options.QUIET,
+]
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    found, frames = find(arguments, "detections")
+    table = in_unit(found.detections, frames)
+    write(arguments, found, table, frames)
+    lines = [*_told(found, table), *output(arguments, table, "detections")]
+    if arguments.plot is not None:
+        from lnocl.plotting.significance import draw_significance
+
+        lines.append(pictures.draw(arguments, draw_significance(found.view())))
+    if not arguments.quiet:
+        messages.say(lines)
+
+
+def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Frames]:
+    """Return the significance of sources in a result, whose run is made again, and its images."""
+    from lnocl.io import atomic, tables
+    from lnocl.significance import check_alarms, check_width
+
+    check_width(arguments.width)
+    check_alarms(arguments.false_alarms)
+    if arguments.output is not None:
+        tables.format_of(arguments.output, content)
+        atomic.check_output(arguments.output, arguments.overwrite, [arguments.result])
+    pictures.check(arguments, [arguments.result])
+    again = Again.read(arguments.result, arguments.quiet)
+    return again.solve().significance(arguments.width, arguments.false_alarms), again.frames
+
+
+def in_unit(table: QTable, frames: Frames) -> QTable:
+    """Return a table with its fluxes in the unit of the images, and places on the sky if known."""
+    from astropy import units as u
+
+    from lnocl.io import sky
+
+    table = table.copy()
+    for name in table.colnames:
+        if name.startswith("flux"):
+            table[name] = table[name].value / frames.electrons * u.Unit(frames.unit)
+    if "x" in table.colnames and len(table) and sky.has_celestial(frames.header):
+        places = np.array([table["x"].value, table["y"].value]).T
+        table["ra"], table["dec"] = sky.to_sky(places, frames.header).T * u.deg
+    return table
+
+
+def write(arguments: argparse.Namespace, found: Significance, table: QTable, frames: Frames) -> None:
+    """Add the detections to the file of the result."""
+    from lnocl.io.fitsfindings import DETECTIONS, SIGNAL, write_findings
+
+    maps = {SIGNAL: (found.signal_to_noise, "")}
+    write_findings(arguments.result, DETECTIONS, table, maps, cards(found))
+
+
+def cards(found: Significance) -> list[tuple[str, Any, str]]:
+    """Return the header cards that say what was looked for."""
+    return [
+        ("SRCWIDTH", found.width, "FWHM of the sources, pixels; 0: points"),
+        ("FALSALRM", found.false_alarms, "false alarms expected in the field"),
+        ("THRESHOL", found.threshold, "signal-to-noise of detections"),
+    ]
+
+
+def output(arguments: argparse.Namespace, table: QTable, content: str) -> list[str]:
+    """Write a table to a file of its own, where one is asked for; return what was written."""
+    lines = [f"added to {arguments.result}"]
+    if arguments.output is not None:
+        from lnocl.io.tables import write_table
+
+        table.meta["ORIGIN"] = "x and y begin at 0"
+        write_table(table, arguments.output, content, arguments.overwrite)
+        lines.append(f"written to {arguments.output}")
+    return lines
+
+
+def _told(found: Significance, table: QTable) -> list[str]:
+    """Return a line for the field and one for each of the most significant detections."""
+    what = f"source {found.width:g} pixels wide" if found.width else "point"
+    lines = [
+        f"{counted(len(table), 'detection')} above {found.threshold:.2f} standard deviations, "
+        f"which noise exceeds {found.false_alarms:g} times in such a field (each place was tested "
+        f"for a {what})"
+    ]
+    for k, row in enumerate(table[:MAX_LISTED], 1):
+        flux, error = row["flux"], row["flux_error"]
+        where = f" at {row['distance'].value:.1f} pixels from star {row['star']}" if row["star"] else ""
+        kind = "" if row["kind"] == "point" or found.width else ": the extended source could be it"
+        lines.append(
+            f"{k}: ({row['x'].value:.2f}, {row['y'].value:.2f}){where}, signal-to-noise "
+            f"{row['significance']:.1f}, flux {flux.value:.4g} +- {error.value:.2g} "
+            f"{flux.unit}{kind}"
+        )
+    if len(table) > MAX_LISTED:
+        lines.append(f"and {len(table) - MAX_LISTED} more in the table DETECTIONS")
+    return lines
+
+
+COMMAND = Command(
+    "find sources beside the stars of a result, at a stated rate of false alarms",
+    {"": OPTIONS},
+    _run,
+    "A detection is called a point, or something that the extended source could be.",
+)

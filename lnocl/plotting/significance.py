@@ -1,0 +1,160 @@
+"""Detections and limits: the map of signal-to-noise, that of limits, and their curves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+from lnocl.plotting.figure import COLOURS, STYLES, as_text, new_figure
+from lnocl.scene.arrays import Array
+
+# The map of signal-to-noise is shown up to so many thresholds.
+SHOWN = 1.5
+# Stars whose curves are drawn, the first, and detections that are numbered.
+MOST_CURVES, MOST_NUMBERED = 6, 40
+
+
+@dataclass(frozen=True)
+class SignificanceView:
+    """What the picture of detections and limits shows.
+
+    Attributes
+    ----------
+    stars : sequence of (x, y)
+        Known stars, pixels of the images.
+    oversample : int
+        Pixels of the maps to one of the images, along each axis.
+    threshold, width : float
+        Of signal-to-noise, and of the sources, pixels of the images.
+    unit : str
+        Of fluxes.
+    signal : ndarray of float64, shape (ny, nx), or None
+        Signal-to-noise of a source at each place.
+    detections : mapping of str to array_like, or None
+        Columns ``x``, ``y`` and ``kind``.
+    limit : ndarray of float64, shape (ny, nx), or None
+        Flux that is found with a probability of a half.
+    curves : mapping of str to array_like, or None
+        Columns ``star``, ``distance``, and ``magnitudes`` and ``flux`` with the probabilities,
+        percent.
+    """
+
+    stars: Sequence[tuple[float, float]]
+    oversample: int
+    threshold: float
+    width: float
+    unit: str
+    signal: Array | None = None
+    detections: Mapping[str, Any] | None = None
+    limit: Array | None = None
+    curves: Mapping[str, Any] | None = None
+
+
+def draw_significance(view: SignificanceView) -> Figure:
+    """Draw the maps that there are beside each other, and the curves of limits below them.
+
+    Raises
+    ------
+    LnoclError
+        matplotlib is missing.
+    """
+    maps = [each for each in (view.signal, view.limit) if each is not None]
+    has_curve = view.curves is not None and len(view.curves["distance"]) > 0
+    figure = new_figure(5.6 * max(len(maps), 1 + has_curve), 4.6 + 3.2 * has_curve)
+    grid = figure.add_gridspec(1 + has_curve, max(len(maps), 1), height_ratios=[4.6, 3.2][: 1 + has_curve])
+    at = 0
+    if view.signal is not None:
+        _draw_signal(figure.add_subplot(grid[0, at]), view, view.signal)
+        at += 1
+    if view.limit is not None:
+        _draw_limit(figure.add_subplot(grid[0, at]), view, view.limit)
+    if has_curve:
+        _draw_curves(figure.add_subplot(grid[1, :]), view)
+    return figure
+
+
+def _draw_signal(axis: Axes, view: SignificanceView, signal: Array) -> None:
+    from matplotlib import colormaps
+
+    most = SHOWN * view.threshold
+    shown = axis.imshow(
+        signal, cmap=colormaps["RdBu_r"].with_extremes(bad="0.6"), vmin=-most, vmax=most,
+        origin="lower", interpolation="nearest", extent=_extent(signal, view.oversample),
+    )  # fmt: skip
+    axis.figure.colorbar(shown, ax=axis, label="signal-to-noise")
+    _mark_stars(axis, view)
+    n = 0
+    if view.detections is not None:
+        x, y = (np.asarray(view.detections[name], float) for name in "xy")
+        is_point = np.asarray(view.detections["kind"]) == "point"
+        n = len(x)
+        for chosen, marker in ((is_point, "o"), (~is_point, "s")):
+            axis.plot(x[chosen], y[chosen], marker, ms=11, mfc="none", mec="k", mew=1.2)
+        for i in range(min(n, MOST_NUMBERED)):
+            axis.annotate(f"{i + 1}", (x[i], y[i]), (6, 6), textcoords="offset points", fontsize=8)
+    what = "points" if not view.width else f"sources {view.width:g} pixels wide"
+    axis.set_title(
+        f"{what}: {n} above {view.threshold:.2f}\ncircles: points; squares: perhaps extended",
+        fontsize=9,
+    )
+
+
+def _draw_limit(axis: Axes, view: SignificanceView, limit: Array) -> None:
+    from matplotlib import colormaps
+    from matplotlib.colors import LogNorm
+
+    good = limit[np.isfinite(limit) & (limit > 0)]
+    low, high = (good.min(), np.quantile(good, 0.999)) if good.size else (1.0, 10.0)
+    shown = axis.imshow(
+        limit, cmap=colormaps["viridis"].with_extremes(bad="0.6"),
+        norm=LogNorm(low, max(high, 1.01 * low)), origin="lower", interpolation="nearest",
+        extent=_extent(limit, view.oversample),
+    )  # fmt: skip
+    axis.figure.colorbar(shown, ax=axis, label=f"flux ({as_text(view.unit)})")
+    _mark_stars(axis, view)
+    axis.set_title("found with a probability of 50 %", fontsize=9)
+
+
+def _draw_curves(axis: Axes, view: SignificanceView) -> None:
+    assert view.curves is not None
+    stars = np.asarray(view.curves["star"], int)
+    levels = [name[10:] for name in view.curves if name.startswith("magnitudes")]
+    quantity = "magnitudes" if len(levels) and stars.any() else "flux"
+    for i, star in enumerate(np.unique(stars)[:MOST_CURVES]):
+        chosen = stars == star
+        distance = np.asarray(view.curves["distance"], float)[chosen]
+        for k, level in enumerate(levels):
+            values = np.asarray(view.curves[f"{quantity}{level}"], float)[chosen]
+            label = f"star {star}, {level} %" if k == 0 or i == 0 else None
+            axis.plot(
+                distance, values, label=label,
+                color=COLOURS[i % len(COLOURS)], linestyle=STYLES[k % len(STYLES)], lw=1.2,
+            )  # fmt: skip
+    axis.set_xlabel("distance from the star (pixels)")
+    if quantity == "magnitudes":
+        axis.set_ylabel("limit (magnitudes below the star)")
+        axis.invert_yaxis()
+    else:
+        axis.set_ylabel(f"limit ({as_text(view.unit)})")
+        axis.set_yscale("log")
+    axis.set_xscale("log")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
+
+
+def _extent(values: Array, oversample: int) -> tuple[float, float, float, float]:
+    ny, nx = (n / oversample for n in values.shape)
+    return -0.5, nx - 0.5, -0.5, ny - 0.5
+
+
+def _mark_stars(axis: Axes, view: SignificanceView) -> None:
+    for x, y in view.stars:
+        axis.plot(x, y, "+", ms=7, mew=1.0, color=COLOURS[4])
+    axis.set(xlabel="x (pixels)", ylabel="y (pixels)")
