@@ -11,12 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import ndimage
 
 from lnocl.errors import InputError
 from lnocl.plotting.significance import SignificanceView, draw_significance
@@ -24,11 +21,9 @@ from lnocl.runs.outcome import Outcome
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.texture import SHARE_NEAR
-from lnocl.solvers.completeness import needed, values_at
-from lnocl.solvers.false_alarms import Rarity, of_student, threshold
 from lnocl.solvers.point_test import point_flux
 from lnocl.solvers.score import Null
-from lnocl.solvers.score_noise import MANY, noise_of
+from lnocl.solvers.score_map import ScoreMap
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -36,141 +31,13 @@ if TYPE_CHECKING:
 
 # A point is told from the extended source where it is so many errors above what that may be.
 POINT = 3.0
-# The extended source is looked for in a ring, resolutions, and is there from this value on.
-AROUND, THERE = (0.85, 1.65), 3.0
+# There is light round a place where the score there is so many times its noise.
+THERE = 3.0
 # A source that was put in is found by a detection within so many resolutions.
 NEAR = 0.7
 # Of more false alarms in a field the number is not what the threshold says.
 MOST_ALARMS = 10.0
 POINT_SOURCE, EXTENDED = "point", "extended"
-
-
-class Map:
-    """The score of a source of one width at each place, in units of its noise.
-
-    Parameters
-    ----------
-    null : Null
-        The model without it.
-    width : float
-        Its full width at half maximum, pixels of the sky; 0 for a point.
-    """
-
-    def __init__(self, null: Null, width: float) -> None:
-        self.score, self.width = null.score(width), width
-        scene = null.scene
-        self.noise = noise_of(self.score, null.rings, ~null.is_structured)
-        self._rarity = Rarity(null._kernel(0, width))
-        self.unit = scene.unit
-        self.values = self.score.score / np.sqrt(self.score.variance) / self.noise.scatter
-        self.values[~self.score.is_tested] = 0.0
-
-    def rarity(self, values: Array, at: tuple[NDArray[np.int_], ...]) -> Array:
-        """Return the Gaussian values of values at these rows and columns."""
-        gaussian = self._rarity(values, self.score.skewness[at] / self.noise.scatter[at])
-        degrees = self.noise.degrees[at]
-        is_few = degrees < MANY
-        gaussian[is_few] = of_student(gaussian[is_few], degrees[is_few])
-        return gaussian
-
-    @cached_property
-    def significance(self) -> Array:
-        """Gaussian values as rare as the score of each place; NaN where none is tested."""
-        y, x = np.nonzero(self.score.is_tested)
-        found = np.full(self.values.shape, np.nan)
-        found[y, x] = self.rarity(self.values[y, x], (y, x))
-        return found
-
-    @property
-    def fluxes(self) -> Array:
-        """Fluxes, electrons."""
-        return self._where_tested(self.score.score, self.score.information) * self.unit
-
-    @property
-    def errors(self) -> Array:
-        """Standard errors of the fluxes, electrons."""
-        deviations = np.sqrt(self.score.variance) * self.noise.scatter
-        return self._where_tested(deviations, self.score.information) * self.unit
-
-    def _where_tested(self, values: Array, divisor: Array) -> Array:
-        found = np.full(values.shape, np.nan)
-        return np.divide(values, divisor, out=found, where=self.score.is_tested)
-
-    def threshold(self, alarms: float) -> float:
-        """Return the value that noise exceeds in so many places of the field, on average."""
-        area = float(np.count_nonzero(self.score.is_tested))
-        return threshold(alarms, area, self.score.curvature)
-
-    def needed(self, least: float, probability: float) -> Array:
-        """Return the fluxes, electrons, that exceed a threshold with this probability."""
-        at = np.nonzero(self.score.is_tested)
-        skewness = self.score.skewness[at] / self.noise.scatter[at]
-        values = values_at(least, lambda each: self.rarity(each, at), len(at[0]))
-        found = np.full(self.values.shape, np.nan)
-        found[at] = needed(values, skewness, probability) * self.errors[at]
-        return found
-
-    def light_round(self, place: Array, value: float, resolution: float) -> float:
-        """Return the largest value in a ring round a place, less a point of a value that is there.
-
-        Parameters
-        ----------
-        place : ndarray of float64, shape (2,)
-            (x, y), pixels of the sky.
-        value : float
-            In units of the noise.
-        resolution : float
-            Pixels of the sky.
-        """
-        rows, columns = self.values.shape
-        half = int(math.ceil(AROUND[1] * resolution)) + 1
-        x, y = np.round(place).astype(int).tolist()
-        side = np.arange(-half, half + 1)
-        there = np.ix_((y + side) % rows, (x + side) % columns)
-        dx, dy = (place - (x, y)).tolist()
-        away = np.meshgrid(side - dy, side - dx, indexing="ij")
-        point = ndimage.map_coordinates(self.score.correlation, away, order=3, mode="grid-wrap")
-        distance = np.hypot(*away) / resolution
-        is_round = (distance >= AROUND[0]) & (distance <= AROUND[1])
-        return float((self.values[there] - value * point)[is_round].max(initial=0.0))
-
-    def maxima(self, least: float) -> tuple[Array, Array, Array]:
-        """Return maxima whose Gaussian values are above one, highest first.
-
-        Returns
-        -------
-        places : ndarray of float64, shape (n, 2)
-            (x, y), pixels of the sky.
-        values, gaussian : ndarray of float64, shape (n,)
-            In units of the noise, and as Gaussian values.
-        """
-        u = self.values
-        is_maximum = (u == ndimage.maximum_filter(u, 3, mode="wrap")) & (u > 0)
-        y, x = np.nonzero(is_maximum)
-        rows, columns = u.shape
-        near = [
-            [u[(y + dy) % rows, (x + dx) % columns] for dx in (-1, 0, 1)] for dy in (-1, 0, 1)
-        ]
-        moves, higher = _vertices(np.array(near))
-        gaussian = self.rarity(higher, (y, x))
-        order = np.flatnonzero(gaussian > least)
-        order = order[np.argsort(-gaussian[order])]
-        return np.stack([x, y], axis=1)[order] + moves[order], higher[order], gaussian[order]
-
-
-def _vertices(near: Array) -> tuple[Array, Array]:
-    """Return where parabolas through 3 x 3 values have their maxima, (n, 2), and their values."""
-    middle = near[1, 1]
-    slope = np.stack([near[1, 2] - near[1, 0], near[2, 1] - near[0, 1]], axis=1) / 2.0
-    xx, yy = near[1, 2] + near[1, 0] - 2 * middle, near[2, 1] + near[0, 1] - 2 * middle
-    xy = (near[2, 2] + near[0, 0] - near[0, 2] - near[2, 0]) / 4.0
-    determinant = xx * yy - xy**2
-    is_peak = (determinant > 0) & (xx < 0)
-    safe = np.where(is_peak, determinant, 1.0)
-    moves = -np.stack([yy * slope[:, 0] - xy * slope[:, 1], xx * slope[:, 1] - xy * slope[:, 0]],
-                      axis=1) / safe[:, None]  # fmt: skip
-    moves = np.where(is_peak[:, None], moves, 0.0).clip(-0.7, 0.7)
-    return moves, middle + (slope * moves).sum(axis=1) / 2.0
 
 
 def null_of(outcome: Outcome) -> Null:
@@ -251,7 +118,7 @@ class Significance:
     resolution: float
     detections: QTable
     _null: Null = field(repr=False)
-    _map: Map = field(repr=False)
+    _map: ScoreMap = field(repr=False)
     _outcome: Outcome = field(repr=False)
 
     def __post_init__(self) -> None:
@@ -494,159 +361,6 @@ class Significance:
         view = replace(self.view(), limit=self.limit(), curves=_plain(curves))
         return draw_significance(view)
 
-    def inject(self, n: int = 100, completeness: float = 0.5, seed: int = 0) -> QTable:
-        """Put sources into the images, and return which of them are found.
-
-        They lie at random where sources are tested, with fluxes that `limit` says are found with
-        this probability. A few at a time, the reconstruction is made again with them.
-
-        Parameters
-        ----------
-        n : int, optional
-            Sources, 1 or more.
-        completeness : float, optional
-            The probability, between 0 and 1.
-        seed : int, optional
-            Zero or more.
-
-        Returns
-        -------
-        astropy.table.QTable
-            A row for each source: ``x`` and ``y``, pixels of the images; ``flux``, electrons; and
-            ``found``, whether a detection lies within 0.7 resolutions; a point, where points are
-            put in.
-
-        Raises
-        ------
-        InputError
-            A number, probability or seed out of range; or nothing is tested.
-        DeviceError
-            As `lnocl.deconvolve`.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import lnocl
-        >>> images = np.random.default_rng(1).poisson(10.0, (64, 64))
-        >>> observation = lnocl.Observation(images, np.ones((5, 5)), background=10)
-        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
-        >>> sources = result.significance().inject(4, completeness=0.999)
-        >>> len(sources), bool(sources["found"].sum() > 2)
-        (4, True)
-        """
-        from astropy.table import QTable
-        from astropy.units import electron, pix
-
-        from lnocl.runs.injections import APART, Injections, spread_places
-
-        check_injections(n, seed)
-        limits, observation = self.limit(completeness), self._outcome.observation
-        allowed = np.isfinite(limits)
-        if not allowed.any():
-            raise InputError("sources are tested nowhere, so that none can be put in")
-        q, rng = observation.oversample, np.random.default_rng(seed)
-        injections = Injections(self._outcome, self.width * q)
-        rows: list[tuple[float, float, float, bool]] = []
-        while len(rows) < n:
-            apart = APART * self.resolution * q
-            pixels = np.array(list(spread_places(allowed, n - len(rows), apart, rng)))
-            fluxes = limits[pixels[:, 0], pixels[:, 1]]
-            places = pixels[:, ::-1] + rng.uniform(-0.5, 0.5, pixels.shape)
-            places = (places - (q - 1) / 2.0) / q
-            outcome = injections.reconstruct(places, fluxes, rng)
-            found = significance(outcome, self.width, self.false_alarms).detections
-            if not self.width:
-                found = found[found["kind"] == POINT_SOURCE]
-            for (x, y), flux in zip(places.tolist(), fluxes.tolist(), strict=True):
-                away = np.hypot(found["x"].value - x, found["y"].value - y)
-                rows.append((x, y, flux, bool((away < NEAR * self.resolution).any())))
-        x, y, flux, is_found = zip(*rows, strict=True)
-        return QTable(
-            {
-                "x": np.array(x) * pix,
-                "y": np.array(y) * pix,
-                "flux": np.array(flux) * electron,
-                "found": np.array(is_found),
-            }
-        )
-
-    def _in_source(self) -> Array:
-        """Return the flux of a point that the extended source may be, where there is any.
-
-        It is `lnocl.scene.texture`'s expectation of the brightest round a star, seen by a point.
-        """
-        null = self._null
-        bright = null.brightest_structure()
-        return np.asarray(SHARE_NEAR * bright * self._map.unit)
-
-    def contrast_curve(
-        self, star: int = 1, completeness: Sequence[float] = (0.5, 0.9, 0.95)
-    ) -> QTable:
-        """Return the faintest sources that would be found, against the distance from a star.
-
-        Parameters
-        ----------
-        star : int, optional
-            Which star, counted from 1.
-        completeness : sequence of float, optional
-            Probabilities of being found, between 0 and 1.
-
-        Returns
-        -------
-        astropy.table.QTable
-            A row for each ring, a resolution wide: its mean ``distance``, pixels of the images, and
-            ``share``, how much of it is tested. Then the medians of `limit` in it: ``flux50``,
-            electrons; ``contrast50``, over the flux of the star; and ``magnitudes50``, fainter than
-            the star; likewise for other probabilities.
-
-        Raises
-        ------
-        InputError
-            There is no such star; or a probability is not between 0 and 1.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import lnocl
-        >>> y, x = np.indices((65, 65)) - 32
-        >>> psf = np.exp(-(x**2 + y**2) / 4)
-        >>> images = np.random.default_rng(0).poisson(10 + 1e5 * psf / psf.sum())
-        >>> observation = lnocl.Observation(images, psf, background=10)
-        >>> result = lnocl.deconvolve(observation, [(32, 32)], n_iter=20, engine="numpy")
-        >>> curve = result.significance().contrast_curve()
-        >>> curve.colnames[:4], bool(curve["magnitudes50"][-1].value > 6)
-        (['distance', 'share', 'flux50', 'contrast50'], True)
-        """
-        from astropy.table import QTable
-        from astropy.units import electron, mag, pix
-
-        observation, scene = self._outcome.observation, self._outcome.scene
-        n = len(scene.stars) // observation.n_epochs
-        if not (isinstance(star, (int, np.integer)) and 1 <= star <= n):
-            raise InputError(f"`star` is the number of a star, from 1 to {n}; {star} was given")
-        at = (star - 1) * observation.n_epochs
-        flux = float(self._outcome.star_fluxes[at : at + observation.n_epochs].mean())
-        x, y = on_sky(scene.stars[at : at + 1], observation.oversample)[0]
-        rows, columns = np.indices(observation.sky_shape)
-        distance = np.hypot(rows - y, columns - x) / observation.oversample
-        ring = (distance / self.resolution).astype(int)
-        is_tested = np.isfinite(self.signal_to_noise)
-        counts = np.bincount(ring.ravel())
-        tested = np.bincount(ring[is_tested], minlength=len(counts))
-        shown = np.flatnonzero(tested)
-        middles = np.bincount(ring[is_tested], distance[is_tested])[shown] / tested[shown]
-        columns_ = {"distance": middles * pix, "share": tested[shown] / counts[shown]}
-        for probability in completeness:
-            limits = self.limit(probability)
-            values = np.array([np.median(limits[is_tested & (ring == k)]) for k in shown])
-            name = f"{100 * probability:g}"
-            columns_[f"flux{name}"] = values * electron
-            columns_[f"contrast{name}"] = values / flux if flux > 0 else np.full(len(shown), np.nan)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                fainter = -2.5 * np.log10(columns_[f"contrast{name}"])
-            columns_[f"magnitudes{name}"] = fainter * mag
-        return QTable(columns_)
-
 
 def significance(outcome: Outcome, width: float, false_alarms: float) -> Significance:
     """Return the sources beside the stars of a reconstruction, `lnocl.Result.significance`."""
@@ -654,7 +368,7 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
     check_alarms(false_alarms)
     observation = outcome.observation
     null = null_of(outcome)
-    found = Map(null, width * observation.oversample)
+    found = ScoreMap(null, width * observation.oversample)
     ny, nx = observation.sky_shape
     least = found.threshold(false_alarms)
     return Significance(
@@ -730,7 +444,7 @@ def check_completeness(completeness: object) -> None:
         raise InputError(f"`completeness` lies between 0 and 1; {completeness} was given")
 
 
-def _detections(outcome: Outcome, null: Null, found: Map, least: float) -> QTable:
+def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> QTable:
     from astropy.table import QTable
     from astropy.units import electron, pix
 

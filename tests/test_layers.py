@@ -15,6 +15,7 @@ FLOORS = [
     {"simulation", "plotting"},
     {"engines"},
     {"runs"},
+    {"significance"},
     {"result"},
     {"deconvolution"},
     {"tiles"},

@@ -137,7 +137,11 @@ def _write(path: str, found: Bootstrap, parts: Sequence[Part], frames: Frames) -
         path,
         quantities,
         _table_of(_regions(parts), quantities[[each.at is None for each in found.quantities]]),
-        (found.error_map / frames.electrons, found.bias_map / frames.electrons),
+        (
+            found.error_map / frames.electrons,
+            found.bias_map / frames.electrons,
+            found.share_map,
+        ),
         found.errors,
         found.of_psfs,
         found.sums,
@@ -165,7 +169,7 @@ def _table_of(regions: Sequence[Aperture], measured: QTable) -> QTable:
     table = QTable(columns, dtype=(str, float, float, float))
     of_regions = measured[len(measured) - len(regions) :]
     table["flux"] = of_regions["value"] - of_regions["bias"]
-    for name in ("error", "unit", "note"):
+    for name in ("error", "share", "unit", "note"):
         table[name] = of_regions[name]
     return table
 
@@ -179,6 +183,8 @@ def _summarise(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[
     lines = [f"errors by {found.n} replicas, less their bias; in brackets 95 %:"]
     for row in table[:n_listed]:
         note = f"; {row['note']}: do not trust its error" if row["note"] else ""
+        if not _OF_STARS.fullmatch(row["name"]) and np.isfinite(row["share"]):
+            note = f"; there in {100 * row['share']:.0f} % of replicas{note}"
         if len(found.of_psfs):
             note += f"; noise {row['error_noise']:.2g}, PSF {row['error_psf']:.2g}"
         lines.append(

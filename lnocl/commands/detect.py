@@ -63,7 +63,7 @@ OPTIONS = [
 def _run(arguments: argparse.Namespace) -> None:
     found, frames = find(arguments, "detections")
     table = in_unit(found.detections, frames)
-    write(arguments, found, table, frames)
+    _write(arguments.result, found, table)
     lines = [*_told(found, table), *output(arguments, table, "detections")]
     if arguments.plot is not None:
         from lnocl.plotting.significance import draw_significance
@@ -104,12 +104,12 @@ def in_unit(table: QTable, frames: Frames) -> QTable:
     return table
 
 
-def write(arguments: argparse.Namespace, found: Significance, table: QTable, frames: Frames) -> None:
+def _write(path: str, found: Significance, table: QTable) -> None:
     """Add the detections to the file of the result."""
     from lnocl.io.fitsfindings import DETECTIONS, SIGNAL, write_findings
 
     maps = {SIGNAL: (found.signal_to_noise, "")}
-    write_findings(arguments.result, DETECTIONS, table, maps, cards(found))
+    write_findings(path, DETECTIONS, table, maps, cards(found))
 
 
 def cards(found: Significance) -> list[tuple[str, Any, str]]:
@@ -143,7 +143,9 @@ def _told(found: Significance, table: QTable) -> list[str]:
     ]
     for k, row in enumerate(table[:MAX_LISTED], 1):
         flux, error = row["flux"], row["flux_error"]
-        where = f" at {row['distance'].value:.1f} pixels from star {row['star']}" if row["star"] else ""
+        where = (
+            f" at {row['distance'].value:.1f} pixels from star {row['star']}" if row["star"] else ""
+        )
         kind = "" if row["kind"] == "point" or found.width else ": the extended source could be it"
         lines.append(
             f"{k}: ({row['x'].value:.2f}, {row['y'].value:.2f}){where}, signal-to-noise "

@@ -10,10 +10,10 @@ from lnocl.errors import FileError
 from lnocl.io.atomic import whole_file
 from lnocl.io.fitsread import wcs_cards
 
-HDU = fits.BinTableHDU | fits.ImageHDU
 
-
-def add_hdus(path: str, added: Sequence[HDU], maps: Mapping[str, str]) -> None:
+def add_hdus(
+    path: str, added: Sequence[fits.BinTableHDU | fits.ImageHDU], maps: Mapping[str, str]
+) -> None:
     """Add HDUs to a file, or replace those of the same names.
 
     Parameters

@@ -17,18 +17,18 @@ from lnocl.io.fitswrite import ascii_of
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-# The extensions: what was measured, the regions, the standard error and bias of each pixel, and
-# what it takes to continue.
-ERRORS, REGIONS, ERROR, BIAS = "ERRORS", "REGIONS", "ERROR", "BIAS"
+# The extensions: what was measured, the regions, the standard error and bias of each pixel, the
+# share of replicas in which it has light, and what it takes to continue.
+ERRORS, REGIONS, ERROR, BIAS, SHARE = "ERRORS", "REGIONS", "ERROR", "BIAS", "SHARE"
 REPLICAS, SUMS = "REPLICAS", "REPLSUMS"
-NAMES = ERRORS, REGIONS, ERROR, BIAS, REPLICAS, SUMS
+NAMES = ERRORS, REGIONS, ERROR, BIAS, SHARE, REPLICAS, SUMS
 
 
 def write_errors(
     path: str,
     quantities: QTable,
     regions: QTable,
-    maps: tuple[NDArray[np.float64], NDArray[np.float64]],
+    maps: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     replicas: NDArray[np.float64],
     of_psfs: NDArray[np.float64],
     sums: NDArray[np.float64],
@@ -44,12 +44,14 @@ def write_errors(
         The file; it is replaced once the new one is complete.
     quantities, regions : QTable
         What was measured, and the regions.
-    maps : two ndarray of float64, shape (ny, nx)
-        Standard error and bias of each pixel at the resolution, in this unit.
+    maps : three ndarray of float64, shape (ny, nx)
+        Standard error and bias of each pixel at the resolution, in this unit, and the share of
+        replicas in which it has light.
     replicas, of_psfs : ndarray of float64, shapes (n, k), and (n, k) or (0, k)
         The errors of each replica, and the part of them that comes from PSFs.
-    sums : ndarray of float64, shape (2, ny, nx)
-        The sums of the errors of pixels, and of their squares, electrons.
+    sums : ndarray of float64, shape (3, ny, nx)
+        The sums of the errors of pixels, and of their squares, electrons; and the number of
+        replicas in which they have light.
     seed : int
         Of the replicas.
     resolution : float
@@ -85,7 +87,7 @@ def write_errors(
     for hdu, name in zip(added, NAMES, strict=True):
         hdu.name = name
         hdu.header.extend(cards)
-    add_hdus(path, added, {ERROR: unit, BIAS: unit})
+    add_hdus(path, added, {ERROR: unit, BIAS: unit, SHARE: ""})
 
 
 def _in_ascii(table: QTable) -> QTable:

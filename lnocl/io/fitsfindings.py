@@ -9,7 +9,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from lnocl.io.fitsadd import HDU, add_hdus
+from lnocl.io.fitsadd import add_hdus
 from lnocl.io.fitsfile import open_fits
 from lnocl.scene.arrays import Array
 
@@ -18,11 +18,13 @@ DETECTIONS, SIGNAL = "DETECTIONS", "SIGNAL"
 LIMITS, LIMIT = "LIMITS", "LIMIT"
 COMPLETENESS = 50, 90, 95
 
-Card = tuple[str, Any, str]
-
 
 def write_findings(
-    path: str, name: str, table: QTable, maps: Mapping[str, tuple[Array, str]], cards: Sequence[tuple[str, Any, str]]
+    path: str,
+    name: str,
+    table: QTable,
+    maps: Mapping[str, tuple[Array, str]],
+    cards: Sequence[tuple[str, Any, str]],
 ) -> None:
     """Add a table and maps of the sky to the file of a result, or replace those it has.
 
@@ -45,11 +47,14 @@ def write_findings(
         The file cannot be read or written.
     """
     columns = [_column(table, each) for each in table.colnames]
-    added: list[HDU] = [fits.BinTableHDU.from_columns(columns, name=name)]
+    added: list[fits.BinTableHDU | fits.ImageHDU] = [
+        fits.BinTableHDU.from_columns(columns, name=name)
+    ]
     for key, (values, _) in maps.items():
         added.append(fits.ImageHDU(np.asarray(values, np.float32), name=key))
+    unit = next((str(table[each].unit) for each in table.colnames if each.startswith("flux")), "")
     for hdu in added:
-        hdu.header.extend(cards)
+        hdu.header.extend([*cards, ("FLUXUNIT", unit, "unit of fluxes")])
     add_hdus(path, added, {key: unit for key, (_, unit) in maps.items()})
 
 
@@ -99,23 +104,28 @@ def read_findings(path: str) -> Findings | None:
     with open_fits(path) as file:
         for hdu in file.hdus():
             if hdu.name in (DETECTIONS, LIMITS) and isinstance(hdu, fits.BinTableHDU):
-                tables[hdu.name] = Table.read(hdu)
+                tables[hdu.name] = _table(hdu)
                 cards = hdu.header
+                unit = str(cards.get("FLUXUNIT", ""))
             if hdu.name in (SIGNAL, f"{LIMIT}{COMPLETENESS[0]}"):
                 maps[hdu.name] = file.pixels(hdu)
-                unit = unit if hdu.name == SIGNAL else str(hdu.header.get("BUNIT", ""))
     if not tables:
         return None
-    detections, limits = tables.get(DETECTIONS), tables.get(LIMITS)
-    if detections is not None:
-        detections["kind"] = [str(each).strip() for each in detections["kind"]]
-        unit = unit or str(detections["flux"].unit or "")
     return Findings(
-        detections,
-        limits,
+        tables.get(DETECTIONS),
+        tables.get(LIMITS),
         maps.get(SIGNAL),
         maps.get(f"{LIMIT}{COMPLETENESS[0]}"),
         float(cards.get("THRESHOL", np.nan)),
         float(cards.get("SRCWIDTH", 0.0)),
         unit,
     )
+
+
+def _table(hdu: fits.BinTableHDU) -> Table:
+    """Return the columns of a table without units, of which astropy would not know electrons."""
+    columns = {}
+    for name in hdu.columns.names:
+        values = np.asarray(hdu.data[name])
+        columns[name] = np.char.strip(values) if values.dtype.kind in "SU" else values
+    return Table(columns)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from string import Template
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,11 @@ from lnocl.plotting.result import (
     image_limits,
     worst_image,
 )
+from lnocl.plotting.significance import SignificanceView, draw_significance
 from lnocl.scene.arrays import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Bytes of the whole frame's pictures, about: an image and its residuals are noise, of a byte a
 # pixel each, a model takes a third, the extended source a half; in base64 four for three.
@@ -48,6 +52,7 @@ def make_report(
     stars: Mapping[str, Sequence[float]] | None = None,
     cards: Sequence[tuple[str, Any, str]] = (),
     commands: str = "",
+    found: SignificanceView | None = None,
 ) -> str:
     """Return a page with images to blink and stretch, messages of the run, tables and the command.
 
@@ -65,6 +70,8 @@ def make_report(
         Header cards.
     commands : str, optional
         Commands that repeat the run.
+    found : SignificanceView, optional
+        Detections and limits.
 
     Raises
     ------
@@ -91,7 +98,8 @@ def make_report(
     return template.substitute(
         title=html.escape(title),
         messages=_list(messages),
-        stars=_table(stars or {}),
+        stars=_table(stars or {}, "star"),
+        found=_found(found),
         curve=_curve(view),
         commands=html.escape(commands),
         cards=_cards(cards),
@@ -198,6 +206,10 @@ def _curve(view: ResultView) -> str:
     draw_choice(axes[0], view)
     if n > 1:
         draw_light_curves(axes[1], view)
+    return _picture(figure)
+
+
+def _picture(figure: Figure) -> str:
     with io.BytesIO() as stream:
         figure.savefig(stream, format="png", dpi=DPI, pil_kwargs={"optimize": True})
         return base64.b64encode(stream.getvalue()).decode("ascii")
@@ -213,16 +225,39 @@ def _list(lines: Sequence[str]) -> str:
     return f"<ul>{''.join(items)}</ul>"
 
 
-def _table(columns: Mapping[str, Sequence[float]]) -> str:
+def _found(view: SignificanceView | None) -> str:
+    """Return the section of detections and limits; nothing where the file has none."""
+    if view is None:
+        return ""
+    parts = ["<h2>Detections and limits</h2>"]
+    if view.signal is not None or view.limit is not None:
+        picture = _picture(draw_significance(view))
+        parts.append(
+            f'<img alt="detections and limits" src="data:image/png;base64,{picture}" '
+            'style="max-width:100%">'
+        )
+    if view.detections is not None:
+        parts.append(_table(view.detections, "detection"))
+    if view.curves is not None:
+        rows = _table(view.curves, "ring")
+        parts.append(f"<details><summary>Limits round each star</summary>{rows}</details>")
+    return "\n".join(parts)
+
+
+def _table(columns: Mapping[str, Sequence[Any]], what: str) -> str:
     n = len(next(iter(columns.values()), ()))
     if not n:
         return "<p>None.</p>"
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in ("star", *columns))
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in (what, *columns))
     rows = (
-        "".join(f"<td>{cell}</td>" for cell in (s + 1, *(f"{c[s]:.7g}" for c in columns.values())))
+        "".join(f"<td>{cell}</td>" for cell in (s + 1, *(_cell(c[s]) for c in columns.values())))
         for s in range(n)
     )
     return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+
+
+def _cell(value: Any) -> str:
+    return html.escape(value) if isinstance(value, str) else f"{value:.7g}"
 
 
 def _cards(cards: Sequence[tuple[str, Any, str]]) -> str:

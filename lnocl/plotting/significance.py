@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -42,8 +42,7 @@ class SignificanceView:
     limit : ndarray of float64, shape (ny, nx), or None
         Flux that is found with a probability of a half.
     curves : mapping of str to array_like, or None
-        Columns ``star``, ``distance``, and ``magnitudes`` and ``flux`` with the probabilities,
-        percent.
+        Columns ``star``, ``distance``, and ``magnitudes`` with the probabilities, percent.
     """
 
     stars: Sequence[tuple[float, float]]
@@ -58,31 +57,30 @@ class SignificanceView:
 
 
 def draw_significance(view: SignificanceView) -> Figure:
-    """Draw the maps that there are beside each other, and the curves of limits below them.
+    """Draw the maps that there are, and the curves of limits, beside each other.
 
     Raises
     ------
     LnoclError
         matplotlib is missing.
     """
-    maps = [each for each in (view.signal, view.limit) if each is not None]
-    has_curve = view.curves is not None and len(view.curves["distance"]) > 0
-    figure = new_figure(5.6 * max(len(maps), 1 + has_curve), 4.6 + 3.2 * has_curve)
-    grid = figure.add_gridspec(1 + has_curve, max(len(maps), 1), height_ratios=[4.6, 3.2][: 1 + has_curve])
-    at = 0
+    panels: list[Callable[[Axes, SignificanceView], None]] = []
     if view.signal is not None:
-        _draw_signal(figure.add_subplot(grid[0, at]), view, view.signal)
-        at += 1
+        panels.append(_draw_signal)
     if view.limit is not None:
-        _draw_limit(figure.add_subplot(grid[0, at]), view, view.limit)
-    if has_curve:
-        _draw_curves(figure.add_subplot(grid[1, :]), view)
+        panels.append(_draw_limit)
+    if view.curves is not None and len(view.curves["distance"]):
+        panels.append(_draw_curves)
+    figure = new_figure(6.2 * len(panels), 4.8)
+    for axis, draw in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        draw(axis, view)
     return figure
 
 
-def _draw_signal(axis: Axes, view: SignificanceView, signal: Array) -> None:
+def _draw_signal(axis: Axes, view: SignificanceView) -> None:
     from matplotlib import colormaps
 
+    signal = np.asarray(view.signal)
     most = SHOWN * view.threshold
     shown = axis.imshow(
         signal, cmap=colormaps["RdBu_r"].with_extremes(bad="0.6"), vmin=-most, vmax=most,
@@ -106,10 +104,11 @@ def _draw_signal(axis: Axes, view: SignificanceView, signal: Array) -> None:
     )
 
 
-def _draw_limit(axis: Axes, view: SignificanceView, limit: Array) -> None:
+def _draw_limit(axis: Axes, view: SignificanceView) -> None:
     from matplotlib import colormaps
     from matplotlib.colors import LogNorm
 
+    limit = np.asarray(view.limit)
     good = limit[np.isfinite(limit) & (limit > 0)]
     low, high = (good.min(), np.quantile(good, 0.999)) if good.size else (1.0, 10.0)
     shown = axis.imshow(
@@ -123,29 +122,30 @@ def _draw_limit(axis: Axes, view: SignificanceView, limit: Array) -> None:
 
 
 def _draw_curves(axis: Axes, view: SignificanceView) -> None:
-    assert view.curves is not None
-    stars = np.asarray(view.curves["star"], int)
-    levels = [name[10:] for name in view.curves if name.startswith("magnitudes")]
-    quantity = "magnitudes" if len(levels) and stars.any() else "flux"
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    curves = view.curves or {}
+    stars = np.asarray(curves["star"], int)
+    levels = [name[10:] for name in curves if name.startswith("magnitudes")]
     for i, star in enumerate(np.unique(stars)[:MOST_CURVES]):
         chosen = stars == star
-        distance = np.asarray(view.curves["distance"], float)[chosen]
+        distance = np.asarray(curves["distance"], float)[chosen]
         for k, level in enumerate(levels):
-            values = np.asarray(view.curves[f"{quantity}{level}"], float)[chosen]
-            label = f"star {star}, {level} %" if k == 0 or i == 0 else None
+            values = np.asarray(curves[f"magnitudes{level}"], float)[chosen]
+            label = f"star {star}, {level} %" if not k or not i else None
             axis.plot(
                 distance, values, label=label,
                 color=COLOURS[i % len(COLOURS)], linestyle=STYLES[k % len(STYLES)], lw=1.2,
             )  # fmt: skip
     axis.set_xlabel("distance from the star (pixels)")
-    if quantity == "magnitudes":
-        axis.set_ylabel("limit (magnitudes below the star)")
-        axis.invert_yaxis()
-    else:
-        axis.set_ylabel(f"limit ({as_text(view.unit)})")
-        axis.set_yscale("log")
+    axis.set_ylabel("limit (magnitudes below the star)")
+    axis.invert_yaxis()
     axis.set_xscale("log")
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.xaxis.set_minor_locator(NullLocator())
     axis.grid(alpha=0.3)
+    axis.set_title("limits and the probability of being found", fontsize=9)
     axis.legend(fontsize=8)
 
 

@@ -90,9 +90,9 @@ class Bootstrap:
         their scatter is known.
     of_psfs : ndarray of float64, shape (n, k) or (0, k)
         The part of the errors that comes from PSFs; of length 0 where their scatter is not known.
-    sums : ndarray of float64, shape (2, ny, nx)
+    sums : ndarray of float64, shape (3, ny, nx)
         The sums over replicas of the errors of the extended source and of their squares, electrons
-        per pixel, smoothed to the resolution.
+        per pixel, smoothed to the resolution; and the number of replicas in which there is light.
     resolution : float
         Full width at half maximum of that smoothing, pixels: the resolution of all images together.
     seed : int
@@ -192,7 +192,7 @@ class Bootstrap:
         >>> import numpy as np
         >>> from lnocl.runs.bootstrap import Bootstrap, Quantity
         >>> flux, errors = Quantity("star 1 flux", "flux", 100.0), np.tile([[-3.0], [3.0]], (5, 1))
-        >>> found = Bootstrap((flux,), errors, errors[:0], np.zeros((2, 8, 8)), 2.0, seed=0)
+        >>> found = Bootstrap((flux,), errors, errors[:0], np.zeros((3, 8, 8)), 2.0, seed=0)
         >>> found.interval(0.68).ravel().round(1)
         array([ 96.5, 103.5])
         """
@@ -203,6 +203,21 @@ class Bootstrap:
         half = t.ppf((1.0 + level) / 2.0, self.n - 1) * np.sqrt(1.0 + 1.0 / self.n)
         middle, width = self.values - self.bias, half * self.standard_errors
         return np.array([middle - width, middle + width])
+
+    @property
+    def shares_there(self) -> Array:
+        """The share of replicas in which light is there, shape (k,); NaN for positions and widths.
+
+        It is there where the value less the error of the replica is above 0.
+        """
+        is_light = np.array([each.kind in (FLUX, AMOUNT) for each in self.quantities])
+        shares = np.mean(self.values - self.errors > 0, axis=0)
+        return np.where(is_light, shares, np.nan)
+
+    @property
+    def share_map(self) -> Array:
+        """The share of replicas in which each pixel has light, at the resolution."""
+        return np.asarray(self.sums[2] / self.n)
 
     @property
     def bias_map(self) -> Array:
@@ -229,15 +244,16 @@ class Bootstrap:
         -------
         astropy.table.QTable
             Columns ``name``, ``at`` and ``unit``; ``value``, ``bias`` and ``error``; ``low68``,
-            ``high68``, ``low95`` and ``high95``, the intervals; and ``note``. Where the scatter of
-            the PSFs is known, ``error_psf`` is its part of the error, and ``error_noise`` the rest.
+            ``high68``, ``low95`` and ``high95``, the intervals; ``share``, that of replicas with
+            the light; and ``note``. Where the scatter of the PSFs is known, ``error_psf`` is its
+            part of the error, and ``error_noise`` the rest.
 
         Examples
         --------
         >>> import numpy as np
         >>> from lnocl.runs.bootstrap import Bootstrap, Quantity
         >>> flux, errors = Quantity("star 1 flux", "flux", 100.0), np.tile([[-3.0], [3.0]], (5, 1))
-        >>> found = Bootstrap((flux,), errors, errors[:0], np.zeros((2, 8, 8)), 2.0, seed=0)
+        >>> found = Bootstrap((flux,), errors, errors[:0], np.zeros((3, 8, 8)), 2.0, seed=0)
         >>> print(found.to_table()["name", "value", "error"][0]["error"].round(2))
         3.16
         """
@@ -257,6 +273,7 @@ class Bootstrap:
                 "at": [np.nan if each.at is None else each.at for each in self.quantities],
                 "unit": [units.get(each.kind, "pix") for each in self.quantities],
                 **{name: values / self.units(electrons) for name, values in columns.items()},
+                "share": self.shares_there,
                 "note": [each.note for each in self.quantities],
             }
         )
@@ -322,7 +339,7 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     width = resolution(outcome.scene)
     quantities = _quantities(outcome, parts, width)
     stated = np.nan_to_num(_in_electrons(outcome, outcome.star_errors()[0]))
-    pixels = np.zeros((2, *outcome.scene.observation.sky_shape))
+    pixels = np.zeros((3, *outcome.scene.observation.sky_shape))
     none = np.zeros((0, len(quantities)))
     is_rate = (outcome.scene.observation.exposure != 1.0).any()
     unit = "electron/s" if is_rate else "electron"
@@ -348,11 +365,15 @@ def check_number(n: object, seed: object) -> None:
 
 
 class _Measured(NamedTuple):
-    """Errors in a replica: of the quantities, those that PSFs add, and of the smoothed pixels."""
+    """Errors in a replica: of the quantities, those that PSFs add, and of the smoothed pixels.
+
+    And in which of these there is light, as the answer is brighter than the error.
+    """
 
     errors: Array
     of_psfs: Array
     pixels: Array
+    is_there: NDArray[np.bool_]
 
 
 class _Measuring:
@@ -361,10 +382,16 @@ class _Measuring:
     def __init__(self, outcome: Outcome, parts: Sequence[Part], seed: int, width: float) -> None:
         self._outcome, self._parts, self._width = outcome, parts, width
         self._replicas = Replicas(outcome, seed)
+        ny, nx = outcome.observation.sky_shape
+        self._smooth_answer = self._smooth(outcome.sky[:ny, :nx])
 
-    def __call__(self, k: int) -> _Measured:
+    def _smooth(self, sky: Array) -> Array:
+        """Return a sky at the resolution."""
         from scipy.ndimage import gaussian_filter
 
+        return np.asarray(gaussian_filter(sky, self._width / FWHM, mode="nearest"))
+
+    def __call__(self, k: int) -> _Measured:
         replica = self._replicas.reconstruct(k)
         drawn, seen = (_measure(self._outcome, sky, self._parts) for sky in replica[:2])
         last, of_psfs = replica.found, np.zeros((0, len(seen)))
@@ -372,9 +399,8 @@ class _Measuring:
             last = replica.found_with_psfs
             of_psfs = (_measure(self._outcome, last, self._parts) - seen)[None]
             seen = seen + of_psfs[0]
-        pixels = last.extended - replica.drawn.extended
-        smooth = gaussian_filter(pixels, self._width / FWHM, mode="nearest")
-        return _Measured((seen - drawn)[None], of_psfs, smooth)
+        smooth = self._smooth(last.extended - replica.drawn.extended)
+        return _Measured((seen - drawn)[None], of_psfs, smooth, self._smooth_answer > smooth)
 
 
 def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
@@ -383,7 +409,7 @@ def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
         found,
         errors=np.concatenate([found.errors, measured.errors]),
         of_psfs=np.concatenate([found.of_psfs, measured.of_psfs]),
-        sums=found.sums + np.array([measured.pixels, measured.pixels**2]),
+        sums=found.sums + np.array([measured.pixels, measured.pixels**2, measured.is_there]),
     )
 
 

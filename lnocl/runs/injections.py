@@ -65,9 +65,7 @@ class Injections:
         sky, star_fluxes = run.engine.extended() * scene.unit, run.star_fluxes()
         wanted = self._outcome.is_marginal, self._outcome.has_marginal_halos
         sky, star_fluxes = marginalise(scene, sky, star_fluxes, *wanted)
-        return dataclasses.replace(
-            self._outcome, scene=scene, sky=sky, star_fluxes=star_fluxes
-        )
+        return dataclasses.replace(self._outcome, scene=scene, sky=sky, star_fluxes=star_fluxes)
 
     def _counts(self, places: Array, fluxes: Array, rng: np.random.Generator) -> Array:
         """Return counts of sources in each image, 0 in bad pixels."""
@@ -79,9 +77,7 @@ class Injections:
             for j in range(scene.n_images):
                 for s in range(scene.n_stars, scene.n_stars + observation.n_epochs):
                     cutout = self._wide(other.star_cutout(j, s), j)
-                    light[j][cutout.window(scene.image_grid)] += (
-                        flux / scene.unit * cutout.values
-                    )
+                    light[j][cutout.window(scene.image_grid)] += flux / scene.unit * cutout.values
         means = [scene.in_electrons(each, j)[:ny, :nx] for j, each in enumerate(light)]
         counts = rng.poisson(np.maximum(means, 0.0)).astype(np.float64)
         return np.where(observation.mask, 0.0, counts)

@@ -45,8 +45,9 @@ def threshold(alarms: float, area: float, curvature: Array) -> float:
         return 1.0
     return float(
         optimize.brentq(
-            lambda u: math.log(density * u / alarms) - u * u / 2.0, 1.0, 2.0 + math.sqrt(
-                2.0 * math.log(density / alarms) + 20.0)
+            lambda u: math.log(density * u / alarms) - u * u / 2.0,
+            1.0,
+            2.0 + math.sqrt(2.0 * math.log(density / alarms) + 20.0),
         )
     )
 
@@ -94,11 +95,13 @@ def _gaussian_values(weights: Array, level: float, values: Array) -> Array:
         with np.errstate(over="ignore"):
             grown = np.expm1(t * scaled)
         cumulant = level * float((grown - t * scaled).sum())
-        return cumulant, level * float((scaled * grown).sum()), level * float(
-            (scaled**2 * (grown + 1.0)).sum())
+        return (
+            cumulant,
+            level * float((scaled * grown).sum()),
+            level * float((scaled**2 * (grown + 1.0)).sum()),
+        )
 
-    found = []
-    for value in values.tolist():
+    def gaussian(value: float) -> float:
         high = 1.0 / scaled.max()
         while slopes(high)[1] < value:
             high *= 1.5
@@ -106,7 +109,9 @@ def _gaussian_values(weights: Array, level: float, values: Array) -> Array:
         cumulant, _, second = slopes(t)
         root = math.sqrt(2.0 * max(t * value - cumulant, 0.0))
         other = t * math.sqrt(second)
-        found.append(root + math.log(other / root) / root if root > 0 else value)
+        return root + math.log(other / root) / root if root > 0 else value
+
+    found = [gaussian(value) for value in values.tolist()]
     return np.maximum.accumulate(np.maximum(found, 1e-3))
 
 

@@ -149,9 +149,7 @@ class Null:
         means = self._means(smooth)
         self._linearise(means, self._means(smooth + structure), light)
         # The level as the counts have it: the estimate may hold less or more.
-        excess = self._mean_in_disc(
-            self._adjoint(self._residuals) - self._adjoint(self._apart)
-        )
+        excess = self._mean_in_disc(self._adjoint(self._residuals) - self._adjoint(self._apart))
         response = self._mean_in_disc(self._flat_response())
         excess = np.divide(excess, response, out=np.zeros_like(excess), where=response > 0)
         level = np.maximum(smooth + self._mean_in_disc(excess, 2.0), 0.0)
@@ -172,9 +170,7 @@ class Null:
         parts = zip(images, self._model.background, self._starlight, strict=True)
         return [np.maximum(image + known + light, MIN_MODEL) for image, known, light in parts]
 
-    def _linearise(
-        self, means: Sequence[Array], variances: Sequence[Array], light: Array
-    ) -> None:
+    def _linearise(self, means: Sequence[Array], variances: Sequence[Array], light: Array) -> None:
         weights = self._model.weights
         each = zip(self.scene.images(), means, variances, weights, strict=True)
         self._residuals = [w * (image - mean) / v for image, mean, v, w in each]
@@ -186,13 +182,13 @@ class Null:
         """Return ``sum_j <P_jx^power, x_j>`` at each place x of the grid."""
         scene, total = self.scene, 0.0
         for j, image in enumerate(images):
-            kernel = self._kernel(j, width) ** power
+            kernel = self.kernel(j, width) ** power
             seen = scene.rotations[j].adjoint(image) if scene.rotations else image
             spectrum = scipy.fft.rfft2(spread(seen, scene.oversample), workers=-1)
             total = total + np.conj(scipy.fft.rfft2(kernel, workers=-1)) * spectrum
         return np.asarray(scipy.fft.irfft2(total, scene.grid, workers=-1))
 
-    def _kernel(self, j: int, width: float) -> Array:
+    def kernel(self, j: int, width: float) -> Array:
         """Return what image j shows of a source at the origin, as wide as given."""
         psf = self.scene.psf(j)
         return _blurred(psf, width) if width else psf
@@ -279,7 +275,7 @@ class Null:
         """
         grid = self.scene.grid
         power = sum(
-            abs(scipy.fft.fft2(self._kernel(j, width))) ** 2 for j in range(self.scene.n_images)
+            abs(scipy.fft.fft2(self.kernel(j, width))) ** 2 for j in range(self.scene.n_images)
         )
         high = 1.0 - scipy.fft.fft2(self._disc()).real
         total = power.sum()
@@ -290,7 +286,7 @@ class Null:
         return float(gain), float(spread_), power / total, noise / noise.sum()
 
     def _of_psfs(self, width: float) -> tuple[Array, Array]:
-        """Return the variance of the score by errors of PSFs, as found and by relative errors of 1."""
+        """Return the variance of the score by errors of PSFs: those found, and relative ones of 1."""
         scene = self.scene
         if not scene.n_stars or not self._fluxes[: scene.n_stars].any():
             nothing = np.zeros(scene.grid)

@@ -11,6 +11,7 @@ import numpy as np
 from lnocl.errors import InputError
 from lnocl.io import atomic
 from lnocl.io.fitserrors import read_errors
+from lnocl.io.fitsfindings import read_findings
 from lnocl.io.saved_results import SavedResult, read_result
 from lnocl.plotting.beside import draw_beside
 from lnocl.plotting.figure import check_matplotlib, save_figure
@@ -18,6 +19,7 @@ from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.profiles import draw_bands
 from lnocl.plotting.report import make_report
 from lnocl.plotting.result import ResultView, draw_result
+from lnocl.plotting.significance import SignificanceView
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -121,7 +123,22 @@ def report(path: str) -> str:
         if card.keyword not in ("", "COMMENT", "HISTORY", "SIMPLE", "BITPIX", "EXTEND")
     ]
     stars = {name: column.tolist() for name, column in saved.tables["STARS"].items()}
-    return make_report(view_of(saved), title, saved.messages, stars, cards, saved.commands())
+    found = _found(path, saved)
+    return make_report(view_of(saved), title, saved.messages, stars, cards, saved.commands(), found)
+
+
+def _found(path: str, saved: SavedResult) -> SignificanceView | None:
+    """Return the detections and limits of a saved result; None where it has none."""
+    found = read_findings(path)
+    if found is None:
+        return None
+    detections, curves = (
+        None if table is None else {name: table[name].tolist() for name in table.colnames}
+        for table in (found.detections, found.limits)
+    )
+    stars = list(dict.fromkeys(saved.stars))  # of a star in several epochs one
+    shown = stars, saved.oversample, found.threshold, found.width, found.unit
+    return SignificanceView(*shown, found.signal, detections, found.limit, curves)
 
 
 def view_of(saved: SavedResult) -> ResultView:

@@ -22,7 +22,7 @@ NAMES = ["star 1 flux", "round", "region 2", "dot"]
 WCS = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 30.0, "CDELT1": -1e-4,
        "CDELT2": 1e-4}  # fmt: skip
 ERRORS = ["errors", "out.fits", "--regions", "jet é.reg", "--bootstrap"]
-EXTENSIONS = ["ERRORS", "REGIONS", "ERROR", "BIAS", "REPLICAS", "REPLSUMS"]
+EXTENSIONS = ["ERRORS", "REGIONS", "ERROR", "BIAS", "SHARE", "REPLICAS", "REPLSUMS"]
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_errors_are_added_to_the_file(words, capsys):
     assert "errors by 10 replicas, less their bias; in brackets 95 %:\nround: " in said
     assert "below the resolution: do not trust its error)" in said
     found = held()
-    assert list(found)[-6:] == EXTENSIONS
+    assert list(found)[-len(EXTENSIONS) :] == EXTENSIONS
     table = found["ERRORS"].data
     assert table["name"].tolist() == NAMES
     assert table["note"].tolist() == ["", "", "", "below the resolution"]

@@ -127,7 +127,7 @@ def run_bootstrap(outcome, n, **changes):
 def test_stated_errors_of_stars_are_those_of_what_is_round_them():
     flux, light = Quantity("star 1 flux", "flux", 100.0), Quantity("a", "flux", 50.0)
     errors = np.tile([[-3.0, -4.0], [3.0, 4.0]], (5, 1))
-    alone = Bootstrap((flux, light), errors, errors[:0], np.zeros((2, 8, 8)), 2.0, 0)
+    alone = Bootstrap((flux, light), errors, errors[:0], np.zeros((3, 8, 8)), 2.0, 0)
     of_star, of_light = alone.standard_errors
     shares = np.array([[1.0], [0.5]])
     stated = dataclasses.replace(alone, stated=np.array([10.0]), shares=shares)

@@ -1,0 +1,147 @@
+"""The score of a source at each place of the sky, in units of its noise, and its maxima."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lnocl.scene.arrays import Array
+from lnocl.solvers.completeness import needed, values_at
+from lnocl.solvers.false_alarms import Rarity, of_student, threshold
+from lnocl.solvers.score import Null
+from lnocl.solvers.score_noise import MANY, noise_of
+
+# The extended source is looked for in a ring round a place, resolutions.
+AROUND = 0.85, 1.65
+# A maximum lies at most so far from the middle of its pixel, pixels.
+FARTHEST = 0.7
+
+
+class ScoreMap:
+    """The score of a source of one width at each place, in units of its noise.
+
+    Parameters
+    ----------
+    null : Null
+        The model without it.
+    width : float
+        Its full width at half maximum, pixels of the sky; 0 for a point.
+    """
+
+    def __init__(self, null: Null, width: float) -> None:
+        self.score, self.width = null.score(width), width
+        scene = null.scene
+        self.noise = noise_of(self.score, null.rings, ~null.is_structured)
+        self._rarity = Rarity(null.kernel(0, width))
+        self.unit = scene.unit
+        self.values = self.score.score / np.sqrt(self.score.variance) / self.noise.scatter
+        self.values[~self.score.is_tested] = 0.0
+
+    def rarity(self, values: Array, at: tuple[NDArray[np.int_], ...]) -> Array:
+        """Return the Gaussian values of values at these rows and columns."""
+        gaussian = self._rarity(values, self.score.skewness[at] / self.noise.scatter[at])
+        degrees = self.noise.degrees[at]
+        is_few = degrees < MANY
+        gaussian[is_few] = of_student(gaussian[is_few], degrees[is_few])
+        return gaussian
+
+    @cached_property
+    def significance(self) -> Array:
+        """Gaussian values as rare as the score of each place; NaN where none is tested."""
+        y, x = np.nonzero(self.score.is_tested)
+        found = np.full(self.values.shape, np.nan)
+        found[y, x] = self.rarity(self.values[y, x], (y, x))
+        return found
+
+    @property
+    def fluxes(self) -> Array:
+        """Fluxes, electrons."""
+        return self._where_tested(self.score.score, self.score.information) * self.unit
+
+    @property
+    def errors(self) -> Array:
+        """Standard errors of the fluxes, electrons."""
+        deviations = np.sqrt(self.score.variance) * self.noise.scatter
+        return self._where_tested(deviations, self.score.information) * self.unit
+
+    def _where_tested(self, values: Array, divisor: Array) -> Array:
+        found = np.full(values.shape, np.nan)
+        return np.divide(values, divisor, out=found, where=self.score.is_tested)
+
+    def threshold(self, alarms: float) -> float:
+        """Return the value that noise exceeds in so many places of the field, on average."""
+        area = float(np.count_nonzero(self.score.is_tested))
+        return threshold(alarms, area, self.score.curvature)
+
+    def needed(self, least: float, probability: float) -> Array:
+        """Return the fluxes, electrons, that exceed a threshold with this probability."""
+        at = np.nonzero(self.score.is_tested)
+        skewness = self.score.skewness[at] / self.noise.scatter[at]
+        values = values_at(least, lambda each: self.rarity(each, at), len(at[0]))
+        found = np.full(self.values.shape, np.nan)
+        found[at] = needed(values, skewness, probability) * self.errors[at]
+        return found
+
+    def light_round(self, place: Array, value: float, resolution: float) -> float:
+        """Return the largest value in a ring round a place, less a point of a value that is there.
+
+        Parameters
+        ----------
+        place : ndarray of float64, shape (2,)
+            (x, y), pixels of the sky.
+        value : float
+            In units of the noise.
+        resolution : float
+            Pixels of the sky.
+        """
+        rows, columns = self.values.shape
+        half = math.ceil(AROUND[1] * resolution) + 1
+        x, y = np.round(place).astype(int).tolist()
+        side = np.arange(-half, half + 1)
+        there = np.ix_((y + side) % rows, (x + side) % columns)
+        dx, dy = (place - (x, y)).tolist()
+        away = np.meshgrid(side - dy, side - dx, indexing="ij")
+        point = ndimage.map_coordinates(self.score.correlation, away, order=3, mode="grid-wrap")
+        distance = np.hypot(*away) / resolution
+        is_round = (distance >= AROUND[0]) & (distance <= AROUND[1])
+        return float((self.values[there] - value * point)[is_round].max(initial=0.0))
+
+    def maxima(self, least: float) -> tuple[Array, Array, Array]:
+        """Return maxima whose Gaussian values are above one, highest first.
+
+        Returns
+        -------
+        places : ndarray of float64, shape (n, 2)
+            (x, y), pixels of the sky.
+        values, gaussian : ndarray of float64, shape (n,)
+            In units of the noise, and as Gaussian values.
+        """
+        u = self.values
+        is_maximum = (u == ndimage.maximum_filter(u, 3, mode="wrap")) & (u > 0)
+        y, x = np.nonzero(is_maximum)
+        rows, columns = u.shape
+        near = [[u[(y + dy) % rows, (x + dx) % columns] for dx in (-1, 0, 1)] for dy in (-1, 0, 1)]
+        moves, higher = _vertices(np.array(near))
+        gaussian = self.rarity(higher, (y, x))
+        order = np.flatnonzero(gaussian > least)
+        order = order[np.argsort(-gaussian[order])]
+        return np.stack([x, y], axis=1)[order] + moves[order], higher[order], gaussian[order]
+
+
+def _vertices(near: Array) -> tuple[Array, Array]:
+    """Return where parabolas through 3 x 3 values have their maxima, (n, 2), and their values."""
+    middle = near[1, 1]
+    slope = np.stack([near[1, 2] - near[1, 0], near[2, 1] - near[0, 1]], axis=1) / 2.0
+    xx, yy = near[1, 2] + near[1, 0] - 2 * middle, near[2, 1] + near[0, 1] - 2 * middle
+    xy = (near[2, 2] + near[0, 0] - near[0, 2] - near[2, 0]) / 4.0
+    determinant = xx * yy - xy**2
+    is_peak = (determinant > 0) & (xx < 0)
+    safe = np.where(is_peak, determinant, 1.0)
+    moves = -np.stack([yy * slope[:, 0] - xy * slope[:, 1], xx * slope[:, 1] - xy * slope[:, 0]],
+                      axis=1) / safe[:, None]  # fmt: skip
+    moves = np.where(is_peak[:, None], moves, 0.0).clip(-FARTHEST, FARTHEST)
+    return moves, middle + (slope * moves).sum(axis=1) / 2.0
