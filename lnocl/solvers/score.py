@@ -23,24 +23,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
-import scipy.linalg
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
-from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model, spread
 from lnocl.scene.psf_pixels import CORRELATED
 from lnocl.scene.scene import MIN_MODEL, Scene
-from lnocl.scene.shifting import Cutout
 from lnocl.scene.smooth_field import SmoothField
-from lnocl.scene.stars import along_sky
-from lnocl.scene.texture import resolution
+from lnocl.scene.texture import ROUND, resolution
+from lnocl.solvers.known_stars import KnownStars, Shared
 from lnocl.solvers.score_noise import noise_of
 
 # Radius of the disc whose level is taken out, and full width of the Gaussian that smooths the
@@ -55,12 +52,6 @@ STRUCTURED = 5.0
 # Nothing is tested where stars and level leave less than this share of the information, or where
 # less was observed than this share of the most.
 LEFT, SEEN = 0.5, 0.05
-# Stars and sources share nothing farther apart than so many resolutions.
-APART = 4.0
-# Combinations of stars with less than this share of their information tell nothing.
-SAME = 1e-6
-# Side of the squares of the sky whose stars are taken out together, resolutions.
-TILE = 8.0
 # Width of rings round stars, resolutions.
 RING = 1.0
 
@@ -118,6 +109,12 @@ class Null:
     ----------
     resolution : float
         That of all images together, pixels of the sky.
+    stars : KnownStars
+        Of the model.
+    rings : ndarray of int, shape (Ny, Nx)
+        The ring that each place lies in, round the star that lights it most.
+    is_structured : ndarray of bool, shape (Ny, Nx)
+        Where the sky has more than its level.
     """
 
     def __init__(
@@ -128,13 +125,15 @@ class Null:
         moves: bool,
         psf_errors: tuple[Array, Array],
     ) -> None:
-        self.scene, self._model, self._moves = scene, Model(scene), moves
+        self.scene, self._model = scene, Model(scene)
         self.resolution = resolution(scene)
         self._psf_errors = psf_errors
-        self._fluxes = np.asarray(star_fluxes) / scene.unit
-        self._starlight = list(self._model.starlight(self._fluxes))
+        fluxes = np.asarray(star_fluxes) / scene.unit
+        self.stars = KnownStars(self._model, fluxes[: scene.n_stars], moves)
+        self._starlight = list(self._model.starlight(fluxes))
         self._sky = sky / scene.unit
         self.is_structured = np.zeros(scene.grid, bool)
+        self.rings = self.stars.rings(RING * self.resolution)
         self._model_sky()
         self.is_structured = self._find_structure()
         if self.is_structured.any():
@@ -143,7 +142,7 @@ class Null:
     def _model_sky(self) -> None:
         """Model the sky by its level, and what is structured apart from it."""
         structured = self.is_structured
-        smooth = _level(self._sky, ~structured, SMOOTHED * self.resolution / 2.355)
+        smooth = _level(self._sky, ~structured, SMOOTHED * self.resolution / FWHM)
         structure = np.where(structured, self._sky - smooth, 0.0)
         light = self._model.forward(structure)
         means = self._means(smooth)
@@ -216,7 +215,9 @@ class Null:
         score = scale * self._adjoint(self._residuals, width=width)
         raw = np.maximum(scale * self._adjoint(self._precisions, 2, width), 0.0)
         flat = scale * self._flat_response(width)
-        score, information, flat = self._without_stars(score, raw, flat, width)
+        taken = self._of_stars(width)
+        score, flat = score - scale * taken.score, flat - scale * taken.flat
+        information = np.maximum(raw - scale * taken.information, 0.0)
         is_level = ~self.is_structured
         in_disc = np.maximum(self._mean_in_disc(flat * is_level), np.finfo(float).tiny)
         gain, spread_, power, noise = self._spectral_shares(width)
@@ -247,6 +248,11 @@ class Null:
             _curvature(noise),
         )
 
+    def _of_stars(self, width: float) -> Shared:
+        """Return what stars have in common with a source."""
+        weighed = self._residuals, self._precisions
+        return self.stars.shared(*weighed, width, self.resolution)
+
     def _is_inside(self) -> NDArray[np.bool_]:
         """Return the places of the frame, less its edges along which the grid is periodic."""
         scene, edge = self.scene, math.ceil(self.resolution / 2.0)
@@ -260,11 +266,13 @@ class Null:
     def _third_moments(self) -> list[Array]:
         """Return the third moments of the counts' Poisson part, over the cube of their variance."""
         observation, scene = self.scene.observation, self.scene
+        ny, nx = observation.shape
         moments = []
         for j, (v, w) in enumerate(zip(self._variances, self._model.weights, strict=True)):
-            read = observation.read_noise[j] ** 2 / scene.scale
-            poisson = np.maximum(v - read, 0.0) if np.ndim(read) == 0 else v
-            moments.append(w * poisson / v**3)
+            of_reading = np.zeros(scene.image_grid)
+            of_reading[:ny, :nx] = observation.read_noise[j] ** 2 / scene.scale
+            of_reading = np.divide(of_reading, w, out=np.zeros_like(v), where=w > 0)
+            moments.append(w * np.maximum(v - of_reading, 0.0) / v**3)
         return moments
 
     def _spectral_shares(self, width: float) -> tuple[float, float, Array, Array]:
@@ -286,33 +294,16 @@ class Null:
         return float(gain), float(spread_), power / total, noise / noise.sum()
 
     def _of_psfs(self, width: float) -> tuple[Array, Array]:
-        """Return the variance of the score by errors of PSFs: those found, and relative ones of 1."""
-        scene = self.scene
-        if not scene.n_stars or not self._fluxes[: scene.n_stars].any():
-            nothing = np.zeros(scene.grid)
-            return nothing, nothing
-        found, whole = [], []
-        edges, errors = self._psf_errors
-        for j, precision in enumerate(self._precisions):
-            known, all_ = np.zeros((2, *scene.image_grid))
-            for s in range(scene.n_stars):
-                cutout, flux = scene.star_cutout(j, s), self._fluxes[s]
-                there = cutout.window(scene.image_grid)
-                light = flux * cutout.values * precision[there]
-                all_[there] += light**2
-                if len(errors):
-                    x, y = scene.observation.places(j, scene.stars[s])
-                    rows, columns = (first + np.arange(n) for first, n in
-                                     zip(cutout[1:], light.shape, strict=True))  # fmt: skip
-                    ring = np.digitize(np.hypot((rows - y)[:, None], columns - x), edges) - 1
-                    known[there] += (errors[np.minimum(ring, len(errors) - 1)] * light) ** 2
-            found.append(known)
-            whole.append(all_)
+        """Return the variance of the score by PSF errors: those found, and relative ones of 1."""
         # Errors of pixels are correlated over less than a PSF.
-        size = min(64, *scene.image_grid)
+        size = min(64, *self.scene.image_grid)
         together = float(SmoothField((size, size), CORRELATED).apply(np.ones((size, size)))[0, 0])
-        factor = (scene.scale * together) ** 2
-        return tuple(factor * self._adjoint(each, 2, width) for each in (found, whole))  # type: ignore[return-value]
+        factor = (self.scene.scale * together) ** 2
+        found, whole = (
+            factor * self._adjoint(each, 2, width)
+            for each in self.stars.squares(self._precisions, *self._psf_errors)
+        )
+        return found, whole
 
     def brightest_structure(self) -> Array:
         """Return the flux that the brightest structure round each place has in a resolution."""
@@ -320,122 +311,10 @@ class Null:
             return np.zeros(self.scene.grid)
         structure = np.where(self.is_structured, self._sky, 0.0)
         area = math.pi / (4.0 * math.log(2.0)) * self.resolution**2
-        seen = area * ndimage.gaussian_filter(structure, self.resolution / 2.355, mode="wrap")
-        return np.asarray(ndimage.maximum_filter(seen, round(2 * self.resolution) + 1, mode="wrap"))
-
-    @cached_property
-    def rings(self) -> NDArray[np.int_]:
-        """The ring that each place lies in, round the star that lights it most."""
-        scene = self.scene
-        brightest, ring = np.zeros(scene.grid), np.zeros(scene.grid, int)
-        for s in range(scene.n_stars):
-            cutout = scene.psf_on_sky(0, s)
-            there = cutout.window(scene.grid)
-            x, y = on_sky(scene.stars[s], scene.oversample)
-            rows, columns = (first + np.arange(n) for first, n in
-                             zip(cutout[1:], cutout.values.shape, strict=True))  # fmt: skip
-            distance = np.hypot((rows - y)[:, None], columns - x)
-            light = self._fluxes[s] * cutout.values
-            is_brighter = light > brightest[there]
-            found = (distance / (RING * self.resolution)).astype(int)
-            ring[there] = np.where(is_brighter, found, ring[there])
-            brightest[there] = np.where(is_brighter, light, brightest[there])
-        return ring
-
-    def _without_stars(
-        self, score: Array, information: Array, flat: Array, width: float
-    ) -> tuple[Array, Array, Array]:
-        """Return score, information and response to a flat sky without what stars share."""
-        scene, q = self.scene, self.scene.oversample
-        if not scene.n_stars:
-            return score, information, flat
-        images, owners = self._star_images()
-        scores = np.zeros((2, len(images)))
-        shared: list[Cutout] = []
-        half = int(np.ceil(APART * self.resolution))
-        for k, of_images in enumerate(images):
-            weighed = []
-            for j, cutout in enumerate(of_images):
-                there = cutout.window(scene.image_grid)
-                values = cutout.values * self._precisions[j][there]
-                scores[0, k] += float((cutout.values * self._residuals[j][there]).sum())
-                scores[1, k] += float(values.sum() * self._model.sums[j])
-                weighed.append(cutout._replace(values=values))
-            common = self._model.adjoint_of_cutouts(weighed)
-            common = _cut_round(common, on_sky(scene.stars, q)[owners[k]], half, scene.grid)
-            if width:
-                blurred = ndimage.gaussian_filter(common.values, width / 2.355, mode="constant")
-                common = common._replace(values=blurred)
-            shared.append(common)
-        gram = self._gram(images, owners)
-        tile = int(np.ceil(TILE * self.resolution))
-        score, information, flat = score.copy(), information.copy(), flat.copy()
-        scale = scene.scale
-        ny, nx = scene.grid
-        for top in range(0, ny, tile):
-            for left in range(0, nx, tile):
-                here = slice(top, min(top + tile, ny)), slice(left, min(left + tile, nx))
-                shape = here[0].stop - top, here[1].stop - left
-                near = [
-                    k for k, each in enumerate(shared)
-                    if _overlaps(each, (top, left), shape, scene.grid)
-                ]  # fmt: skip
-                if not near:
-                    continue
-                laid = np.array([
-                    shared[k].add_to(np.zeros(shape), (top, left), scene.grid).ravel()
-                    for k in near
-                ])  # fmt: skip
-                diagonal = np.maximum(np.diag(gram)[near], np.finfo(float).tiny)
-                units = 1.0 / np.sqrt(diagonal)
-                laid *= units[:, None]
-                matrix = gram[np.ix_(near, near)] * units * units[:, None]
-                # Stars at one place are one.
-                solved = scipy.linalg.pinvh(matrix, atol=SAME) @ laid
-                of_score, of_flat = scores[:, near] * units @ solved
-                score[here] -= scale * of_score.reshape(shape)
-                flat[here] -= scale * of_flat.reshape(shape)
-                information[here] -= scale * (laid * solved).sum(axis=0).reshape(shape)
-        return score, np.maximum(information, 0.0), flat
-
-    def _star_images(self) -> tuple[list[list[Cutout]], list[int]]:
-        """Return what each unknown of stars adds to each image, and the star that it is of."""
-        scene, field = self.scene, self.scene.star_field
-        images: list[list[Cutout]] = []
-        owners: list[int] = []
-        for s in range(scene.n_stars):
-            images.append([scene.star_cutout(j, s) for j in range(scene.n_images)])
-            owners.append(s)
-            if not self._moves:
-                continue
-            slopes = []
-            for j in range(scene.n_images):
-                moved = field.psfs[j][s].with_slopes(*field.places[j][s])
-                moved = along_sky(moved, scene.observation.turns[j])
-                slopes.append(moved._replace(values=moved.values * scene.shown[s, j]))
-            for axis in (1, 2):
-                images.append([each._replace(values=each.values[axis]) for each in slopes])
-                owners.append(s)
-        return images, owners
-
-    def _gram(self, images: list[list[Cutout]], owners: list[int]) -> Array:
-        """Return the information of the unknowns of stars that lie near each other."""
-        scene = self.scene
-        grid, n = scene.image_grid, len(images)
-        gram = np.zeros((n, n))
-        places = on_sky(scene.stars, scene.oversample)[owners]
-        away = places[:, None] - places
-        size = np.array(scene.grid[::-1])
-        away = (away + size / 2) % size - size / 2
-        is_near = np.hypot(away[..., 0], away[..., 1]) <= (2 * APART + TILE) * self.resolution
-        for j in range(scene.n_images):
-            for k in range(n):
-                cutout = images[k][j]
-                values = cutout.values * self._precisions[j][cutout.window(grid)]
-                for other in np.flatnonzero(is_near[k, : k + 1]).tolist():
-                    there = images[other][j].add_to(np.zeros(values.shape), cutout[1:], grid)
-                    gram[k, other] += float((values * there).sum())
-        return np.asarray(gram + np.tril(gram, -1).T)
+        seen = area * ndimage.gaussian_filter(structure, self.resolution / FWHM, mode="wrap")
+        return np.asarray(
+            ndimage.maximum_filter(seen, round(2.0 * ROUND * self.resolution) + 1, mode="wrap")
+        )
 
 
 def _curvature(noise: Array) -> Array:
@@ -457,27 +336,7 @@ def _level(sky: Array, is_level: NDArray[np.bool_], width: float) -> Array:
 
 def _blurred(psf: Array, width: float) -> Array:
     """Return a periodic array convolved with a Gaussian of this full width at half maximum."""
-    root = math.pi * width / 2.355
+    root = math.pi * width / FWHM
     v, u = (np.fft.fftfreq(n) for n in psf.shape)
     transfer = np.exp(-2.0 * root**2 * (v[:, None] ** 2 + u**2))
     return np.asarray(scipy.fft.ifft2(scipy.fft.fft2(psf) * transfer).real)
-
-
-def _cut_round(cutout: Cutout, place: Array, half: int, grid: tuple[int, int]) -> Cutout:
-    """Return the values within so many pixels of a place."""
-    x, y = np.round(place).astype(int).tolist()
-    height, width = (min(2 * half + 1, n) for n in grid)
-    first = y - height // 2, x - width // 2
-    return Cutout(cutout.add_to(np.zeros((height, width)), first, grid), *first)
-
-
-def _overlaps(
-    cutout: Cutout, first: tuple[int, int], shape: tuple[int, int], grid: tuple[int, int]
-) -> bool:
-    """Return whether a cutout reaches into a window of the periodic grid."""
-    return all(
-        (at - start) % n < size or (start - at) % n < length
-        for at, start, n, size, length in zip(
-            first, cutout[1:], grid, cutout.values.shape, shape, strict=True
-        )
-    )

@@ -1,0 +1,236 @@
+"""What the stars of a model have in common with a source at each place of the sky."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lnocl.scene.apertures import FWHM
+from lnocl.scene.arrays import Array
+from lnocl.scene.detector import on_sky
+from lnocl.scene.forward_model import Model
+from lnocl.scene.shifting import Cutout
+from lnocl.scene.stars import along_sky
+
+# Stars and sources share nothing farther apart than so many resolutions.
+APART = 4.0
+# Combinations of stars with less than this share of their information tell nothing.
+SAME = 1e-6
+# Side of the squares of the sky whose stars are taken out together, resolutions.
+TILE = 8.0
+
+
+class Shared(NamedTuple):
+    """What stars share with a source at each place, each of shape (Ny, Nx).
+
+    Attributes
+    ----------
+    score, flat, information : ndarray of float64
+        ``B^T G^-1 T_s``, ``B^T G^-1 W_s`` and ``B^T G^-1 B`` of `lnocl.solvers.score`.
+    """
+
+    score: Array
+    flat: Array
+    information: Array
+
+
+class KnownStars:
+    """The stars of a model: their fluxes, and perhaps their positions, are unknowns.
+
+    Parameters
+    ----------
+    model : Model
+        The model.
+    fluxes : ndarray of float64, shape (n,)
+        Scaled.
+    moves : bool
+        Whether positions were fitted.
+    """
+
+    def __init__(self, model: Model, fluxes: Array, moves: bool) -> None:
+        self._model, self._scene, self._fluxes = model, model.scene, fluxes
+        self._images, self._owners = self._unknowns(moves)
+
+    def _unknowns(self, moves: bool) -> tuple[list[list[Cutout]], list[int]]:
+        """Return what each unknown adds to each image, and the star that it is of."""
+        scene, field = self._scene, self._scene.star_field
+        images: list[list[Cutout]] = []
+        for s in range(scene.n_stars):
+            images.append([scene.star_cutout(j, s) for j in range(scene.n_images)])
+            if not moves:
+                continue
+            slopes = []
+            for j in range(scene.n_images):
+                moved = field.psfs[j][s].with_slopes(*field.places[j][s])
+                moved = along_sky(moved, scene.observation.turns[j])
+                slopes.append(moved._replace(values=moved.values * scene.shown[s, j]))
+            for axis in (1, 2):
+                images.append([each._replace(values=each.values[axis]) for each in slopes])
+        each = 3 if moves else 1
+        return images, [k // each for k in range(len(images))]
+
+    def shared(
+        self,
+        residuals: Sequence[Array],
+        precisions: Sequence[Array],
+        width: float,
+        resolution: float,
+    ) -> Shared:
+        """Return what they share with a source.
+
+        Parameters
+        ----------
+        residuals, precisions : sequence of p ndarray of float64, shape (ny, nx)
+            ``w_j (g_j - m_j) / v_j`` and ``w_j / v_j``.
+        width : float
+            Full width at half maximum of the source, pixels of the sky; 0 for a point.
+        resolution : float
+            That of all images together, pixels of the sky.
+        """
+        grid, n = self._scene.grid, len(self._images)
+        found = Shared(*np.zeros((3, *grid)))
+        common, moments = [], np.zeros((2, n))
+        half = int(np.ceil(APART * resolution))
+        for k in range(n):
+            each, moments[:, k] = self._with_source(k, residuals, precisions, half)
+            common.append(_wider(each, width))
+        gram = self._gram(precisions, (2.0 * APART + TILE) * resolution)
+        for here in _tiles(grid, int(np.ceil(TILE * resolution))):
+            first, shape = (here[0].start, here[1].start), _shape(here)
+            near = [k for k in range(n) if _overlaps(common[k], first, shape, grid)]
+            if not near:
+                continue
+            laid = np.array([common[k].add_to(np.zeros(shape), first, grid) for k in near])
+            of_source = laid.reshape(len(near), -1)
+            solved = _inverse(gram[np.ix_(near, near)]) @ of_source
+            found.score[here], found.flat[here] = (moments[:, near] @ solved).reshape(2, *shape)
+            found.information[here] = (of_source * solved).sum(axis=0).reshape(shape)
+        return found
+
+    def _with_source(
+        self, k: int, residuals: Sequence[Array], precisions: Sequence[Array], half: int
+    ) -> tuple[Cutout, tuple[float, float]]:
+        """Return what an unknown shares with a point round its star, its score and response."""
+        scene, weighed, score, flat = self._scene, [], 0.0, 0.0
+        for j, cutout in enumerate(self._images[k]):
+            there = cutout.window(scene.image_grid)
+            values = cutout.values * precisions[j][there]
+            score += float((cutout.values * residuals[j][there]).sum())
+            flat += float(values.sum() * self._model.sums[j])
+            weighed.append(cutout._replace(values=values))
+        common = self._model.adjoint_of_cutouts(weighed)
+        place = on_sky(scene.stars, scene.oversample)[self._owners[k]]
+        return _cut_round(common, place, half, scene.grid), (score, flat)
+
+    def _gram(self, precisions: Sequence[Array], reach: float) -> Array:
+        """Return the information of unknowns of stars no farther apart than this."""
+        scene = self._scene
+        grid, n = scene.image_grid, len(self._images)
+        gram = np.zeros((n, n))
+        places = on_sky(scene.stars, scene.oversample)[self._owners]
+        size = np.array(scene.grid[::-1])
+        away = (places[:, None] - places + size / 2) % size - size / 2
+        is_near = np.hypot(away[..., 0], away[..., 1]) <= reach
+        for j in range(scene.n_images):
+            for k in range(n):
+                cutout = self._images[k][j]
+                values = cutout.values * precisions[j][cutout.window(grid)]
+                for other in np.flatnonzero(is_near[k, : k + 1]).tolist():
+                    there = self._images[other][j].add_to(np.zeros(values.shape), cutout[1:], grid)
+                    gram[k, other] += float((values * there).sum())
+        return np.asarray(gram + np.tril(gram, -1).T)
+
+    def squares(
+        self, precisions: Sequence[Array], edges: Array, errors: Array
+    ) -> tuple[list[Array], list[Array]]:
+        """Return the squares of errors of starlight over the variance of the counts, per image.
+
+        The first are of the relative errors of PSFs in rings with these edges, pixels of the
+        images; the second of relative errors of 1.
+        """
+        scene = self._scene
+        found, whole = np.zeros((2, scene.n_images, *scene.image_grid))
+        for j, precision in enumerate(precisions):
+            for s, flux in enumerate(self._fluxes):
+                cutout = scene.star_cutout(j, s)
+                there = cutout.window(scene.image_grid)
+                squares = (flux * cutout.values * precision[there]) ** 2
+                whole[j][there] += squares
+                if len(errors):
+                    distance = _distance(cutout, scene.observation.places(j, scene.stars[s]))
+                    ring = np.digitize(distance, edges) - 1
+                    found[j][there] += errors[np.minimum(ring, len(errors) - 1)] ** 2 * squares
+        return list(found), list(whole)
+
+    def rings(self, width: float) -> NDArray[np.int_]:
+        """Return the ring, so many pixels wide, round the star that lights each place most."""
+        scene = self._scene
+        brightest, ring = np.zeros(scene.grid), np.zeros(scene.grid, int)
+        for s, flux in enumerate(self._fluxes):
+            cutout = scene.psf_on_sky(0, s)
+            there = cutout.window(scene.grid)
+            distance = _distance(cutout, on_sky(scene.stars[s], scene.oversample))
+            light = flux * cutout.values
+            is_brighter = light > brightest[there]
+            ring[there] = np.where(is_brighter, (distance / width).astype(int), ring[there])
+            brightest[there] = np.maximum(brightest[there], light)
+        return ring
+
+
+def _inverse(matrix: Array) -> Array:
+    """Return the inverse of an information matrix, in which stars at one place are one."""
+    units = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    scaled = matrix * units * units[:, None]
+    return np.asarray(scipy.linalg.pinvh(scaled, atol=SAME) * units * units[:, None])
+
+
+def _distance(cutout: Cutout, place: Array) -> Array:
+    """Return the distances of the pixels of a cutout from a place, (x, y)."""
+    rows, columns = (
+        first + np.arange(n) for first, n in zip(cutout[1:], cutout.values.shape, strict=True)
+    )
+    return np.asarray(np.hypot((rows - place[1])[:, None], columns - place[0]))
+
+
+def _wider(cutout: Cutout, width: float) -> Cutout:
+    """Return what a Gaussian source shares, given what a point does."""
+    if not width:
+        return cutout
+    blurred = ndimage.gaussian_filter(cutout.values, width / FWHM, mode="constant")
+    return cutout._replace(values=blurred)
+
+
+def _tiles(grid: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
+    for top in range(0, grid[0], side):
+        for left in range(0, grid[1], side):
+            yield slice(top, min(top + side, grid[0])), slice(left, min(left + side, grid[1]))
+
+
+def _shape(window: tuple[slice, slice]) -> tuple[int, int]:
+    rows, columns = (side.stop - side.start for side in window)
+    return rows, columns
+
+
+def _cut_round(cutout: Cutout, place: Array, half: int, grid: tuple[int, int]) -> Cutout:
+    """Return the values within so many pixels of a place."""
+    x, y = np.round(place).astype(int).tolist()
+    height, width = (min(2 * half + 1, n) for n in grid)
+    first = y - height // 2, x - width // 2
+    return Cutout(cutout.add_to(np.zeros((height, width)), first, grid), *first)
+
+
+def _overlaps(
+    cutout: Cutout, first: tuple[int, int], shape: tuple[int, int], grid: tuple[int, int]
+) -> bool:
+    """Return whether a cutout reaches into a window of the periodic grid."""
+    return all(
+        (at - start) % n < size or (start - at) % n < length
+        for at, start, n, size, length in zip(
+            first, cutout[1:], grid, cutout.values.shape, shape, strict=True
+        )
+    )
