@@ -453,8 +453,8 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
     x, y = np.round(places).astype(int).T
     rows, columns = found.values.shape
     at = y % rows, x % columns
-    errors = found.errors[at]
-    fluxes = values * errors
+    # Of a maximum between pixels the flux is as much more as its value.
+    errors, fluxes = found.errors[at], found.fluxes[at] * values / found.values[at]
     kinds = np.full(len(places), POINT_SOURCE, dtype="U8")
     pixels = (places - (q - 1) / 2.0) / q
     for i, place in enumerate(places):

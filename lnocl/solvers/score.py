@@ -16,7 +16,9 @@ complements take out what the source has in common with them,
     F'' = F' - \frac{W'^2}{n_D \overline{W'}},
 
 where G is the information of the stars, B what they share with the source, W with a flat sky, and
-the bars are means over a disc of n_D pixels, three resolutions in radius.
+the bars are means over a disc of n_D pixels, three resolutions in radius. What is found to be
+structure has no part in them: a source there keeps all of F', and ``W'^2 / (n_D mean W')`` is added
+to the variance of its score.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from lnocl.scene.psf_pixels import CORRELATED
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.smooth_field import SmoothField
 from lnocl.scene.texture import ROUND, resolution
-from lnocl.solvers.known_stars import KnownStars, Shared
+from lnocl.solvers.known_stars import KnownStars
 from lnocl.solvers.score_noise import noise_of
 
 # Radius of the disc whose level is taken out, and full width of the Gaussian that smooths the
@@ -47,11 +49,13 @@ DISC, SMOOTHED = 3.0, 12.0
 PEAKED = 3.0
 # Where less than this share of what lies round a place is level, it has none.
 FAR = 1e-3
+# A level is known where so much of the disc is level.
+SOME_LEVEL = 0.1
 # Structure is where the score is so many times its noise.
 STRUCTURED = 5.0
-# Nothing is tested where stars and level leave less than this share of the information, or where
-# less was observed than this share of the most.
-LEFT, SEEN = 0.5, 0.05
+# Nothing is tested where stars, or the level, leave less than this share of the information, or
+# where less was observed than this share of the most.
+LEFT, LEFT_BY_LEVEL, SEEN = 0.5, 0.2, 0.05
 # Width of rings round stars, resolutions.
 RING = 1.0
 
@@ -61,8 +65,11 @@ class Score(NamedTuple):
 
     Attributes
     ----------
+    values : ndarray of float64, shape (Ny, Nx)
+        The score over its standard deviation for counts of the model without the source.
     score, information, variance : ndarray of float64, shape (Ny, Nx)
-        T'', what a unit of flux adds to it, and its variance by noise; of scaled units.
+        T'', what a unit of flux adds to it, and its variance by noise; of scaled units. That has
+        the counts of structure too, where there is some.
     skewness : ndarray of float64, shape (Ny, Nx)
         Of the score, for Poisson counts.
     of_psfs : ndarray of float64, shape (Ny, Nx)
@@ -77,6 +84,7 @@ class Score(NamedTuple):
         The mean of ``grad u grad u^T`` for noise u of unit variance, along y and x.
     """
 
+    values: Array
     score: Array
     information: Array
     variance: Array
@@ -86,6 +94,23 @@ class Score(NamedTuple):
     is_tested: NDArray[np.bool_]
     correlation: Array
     curvature: Array
+
+
+class _Linear(NamedTuple):
+    """Images and their model without a source, with one variance of the counts or another.
+
+    Attributes
+    ----------
+    residuals, precisions, variances : list of p ndarray of float64, shape (ny, nx)
+        ``w_j (g_j - m_j) / v_j``, ``w_j / v_j`` and v_j.
+    apart : list of p ndarray of float64
+        What of the residuals is structure.
+    """
+
+    residuals: list[Array]
+    precisions: list[Array]
+    variances: list[Array]
+    apart: list[Array]
 
 
 class Null:
@@ -144,21 +169,22 @@ class Null:
         structured = self.is_structured
         smooth = _level(self._sky, ~structured, SMOOTHED * self.resolution / FWHM)
         structure = np.where(structured, self._sky - smooth, 0.0)
-        light = self._model.forward(structure)
-        means = self._means(smooth)
-        self._linearise(means, self._means(smooth + structure), light)
+        means, light = self._means(smooth), self._model.forward(structure)
+        first = self._linearise(means, self._means(smooth + structure), light)
         # The level as the counts have it: the estimate may hold less or more.
-        excess = self._mean_in_disc(self._adjoint(self._residuals) - self._adjoint(self._apart))
-        response = self._mean_in_disc(self._flat_response())
+        excess = self._adjoint(first.residuals) - self._adjoint(first.apart)
+        excess, response = map(self._mean_in_disc, (excess, self._flat_response(first)))
         excess = np.divide(excess, response, out=np.zeros_like(excess), where=response > 0)
         level = np.maximum(smooth + self._mean_in_disc(excess, 2.0), 0.0)
-        self._linearise(means, self._means(level + structure), light)
+        self._linear = self._linearise(means, self._means(level + structure), light)
+        # Whether there is anything is asked of counts of the level alone.
+        self._bare = self._linearise(means, self._means(level), light)
 
     def _find_structure(self) -> NDArray[np.bool_]:
         """Return where the sky has more than noise, and a resolution round it."""
         score = self.score()
         noise = noise_of(score, self.rings, None)
-        values = score.score / np.sqrt(score.variance) / noise.scatter
+        values = score.values / noise.scatter
         radius = int(np.ceil(self.resolution))
         disc = np.hypot(*np.ogrid[-radius : radius + 1, -radius : radius + 1]) <= radius
         found = ndimage.binary_dilation(values > STRUCTURED, disc)
@@ -169,13 +195,13 @@ class Null:
         parts = zip(images, self._model.background, self._starlight, strict=True)
         return [np.maximum(image + known + light, MIN_MODEL) for image, known, light in parts]
 
-    def _linearise(self, means: Sequence[Array], variances: Sequence[Array], light: Array) -> None:
+    def _linearise(self, means: Sequence[Array], variances: list[Array], light: Array) -> _Linear:
         weights = self._model.weights
         each = zip(self.scene.images(), means, variances, weights, strict=True)
-        self._residuals = [w * (image - mean) / v for image, mean, v, w in each]
-        self._precisions = [w / v for v, w in zip(variances, weights, strict=True)]
-        self._apart = [p * each for p, each in zip(self._precisions, light, strict=True)]
-        self._variances = variances
+        residuals = [w * (image - mean) / v for image, mean, v, w in each]
+        precisions = [w / v for v, w in zip(variances, weights, strict=True)]
+        apart = [p * each for p, each in zip(precisions, light, strict=True)]
+        return _Linear(residuals, precisions, variances, apart)
 
     def _adjoint(self, images: Sequence[Array], power: int = 1, width: float = 0.0) -> Array:
         """Return ``sum_j <P_jx^power, x_j>`` at each place x of the grid."""
@@ -192,9 +218,9 @@ class Null:
         psf = self.scene.psf(j)
         return _blurred(psf, width) if width else psf
 
-    def _flat_response(self, width: float = 0.0) -> Array:
+    def _flat_response(self, linear: _Linear, width: float = 0.0) -> Array:
         sums = self._model.sums
-        flat = [each * total for each, total in zip(self._precisions, sums, strict=True)]
+        flat = [each * total for each, total in zip(linear.precisions, sums, strict=True)]
         return self._adjoint(flat, width=width)
 
     def _mean_in_disc(self, sky: Array, larger: float = 1.0) -> Array:
@@ -211,34 +237,46 @@ class Null:
 
         A width of 0 is a point.
         """
+        found = self._score(self._linear, width)
+        if not self.is_structured.any():
+            return found
+        bare, structured = self._score(self._bare, width), self.is_structured
+        pairs = zip(bare, found, strict=True)
+        parts = dict(zip(Score._fields, pairs, strict=True))
+        of_bare = ("values", "skewness", "of_psfs", "starlit")
+        return found._replace(**{name: np.where(structured, *parts[name]) for name in of_bare})
+
+    def _score(self, linear: _Linear, width: float) -> Score:
         scale = self.scene.scale
-        score = scale * self._adjoint(self._residuals, width=width)
-        raw = np.maximum(scale * self._adjoint(self._precisions, 2, width), 0.0)
-        flat = scale * self._flat_response(width)
-        taken = self._of_stars(width)
+        score = scale * self._adjoint(linear.residuals, width=width)
+        raw = np.maximum(scale * self._adjoint(linear.precisions, 2, width), 0.0)
+        flat = scale * self._flat_response(linear, width)
+        taken = self.stars.shared(linear.residuals, linear.precisions, width, self.resolution)
         score, flat = score - scale * taken.score, flat - scale * taken.flat
         information = np.maximum(raw - scale * taken.information, 0.0)
-        is_level = ~self.is_structured
-        in_disc = np.maximum(self._mean_in_disc(flat * is_level), np.finfo(float).tiny)
         gain, spread_, power, noise = self._spectral_shares(width)
-        shared = flat**2 / in_disc / np.count_nonzero(self._disc())
         # Sources are tested without those elsewhere, and have no part in the level round others.
-        beside = score - scale * self._adjoint(self._apart, width=width)
-        score = np.where(self.is_structured, score, beside)
+        beside = score - scale * self._adjoint(linear.apart, width=width)
+        is_level = ~self.is_structured
+        least = SOME_LEVEL * self._mean_in_disc(flat)
+        in_disc = np.maximum(self._mean_in_disc(flat * is_level), least)
+        in_disc = np.maximum(in_disc, FAR * in_disc.max())
+        shared = flat**2 / in_disc / np.count_nonzero(self._disc())
+        score = np.where(is_level, beside, score)
         score -= flat * self._mean_in_disc(beside * is_level) / in_disc
-        left = information - gain * shared
+        left = np.where(is_level, information - gain * shared, information)
+        variance = np.where(is_level, information - spread_ * shared, information + shared)
         seen = self._adjoint(list(self._model.weights), 2, width)
-        is_tested = (left > LEFT * raw) & (seen > SEEN * seen.max())
-        is_tested &= self._is_inside()
-        # The level has no part in sources that it was found without.
-        left = np.where(self.is_structured, information, left)
-        left = np.where(is_tested, left, np.inf)
-        variance = np.where(is_tested, information - spread_ * shared, np.inf)
-        third = scale * self._adjoint(self._third_moments(), 3, width)
-        of_psfs, starlit = self._of_psfs(width)
+        is_tested = information > LEFT * raw
+        is_tested &= left * abs(left) > LEFT_BY_LEVEL * information * variance
+        is_tested &= self._is_inside() & (seen > SEEN * seen.max())
+        variance = np.where(is_tested, variance, np.inf)
+        third = scale * self._adjoint(self._third_moments(linear), 3, width)
+        of_psfs, starlit = self._of_psfs(linear, width)
         return Score(
+            score / np.sqrt(variance),
             score,
-            left,
+            np.where(is_tested, left, np.inf),
             variance,
             np.maximum(third, 0.0) / np.maximum(variance, np.finfo(float).tiny) ** 1.5,
             of_psfs / variance,
@@ -247,11 +285,6 @@ class Null:
             np.asarray(scipy.fft.ifft2(power).real * power.size),
             _curvature(noise),
         )
-
-    def _of_stars(self, width: float) -> Shared:
-        """Return what stars have in common with a source."""
-        weighed = self._residuals, self._precisions
-        return self.stars.shared(*weighed, width, self.resolution)
 
     def _is_inside(self) -> NDArray[np.bool_]:
         """Return the places of the frame, less its edges along which the grid is periodic."""
@@ -263,12 +296,12 @@ class Null:
             inside.append((at >= first) & (at < last))
         return np.asarray(inside[0][:, None] & inside[1])
 
-    def _third_moments(self) -> list[Array]:
+    def _third_moments(self, linear: _Linear) -> list[Array]:
         """Return the third moments of the counts' Poisson part, over the cube of their variance."""
         observation, scene = self.scene.observation, self.scene
         ny, nx = observation.shape
         moments = []
-        for j, (v, w) in enumerate(zip(self._variances, self._model.weights, strict=True)):
+        for j, (v, w) in enumerate(zip(linear.variances, self._model.weights, strict=True)):
             of_reading = np.zeros(scene.image_grid)
             of_reading[:ny, :nx] = observation.read_noise[j] ** 2 / scene.scale
             of_reading = np.divide(of_reading, w, out=np.zeros_like(v), where=w > 0)
@@ -293,7 +326,7 @@ class Null:
         noise = power * high**2
         return float(gain), float(spread_), power / total, noise / noise.sum()
 
-    def _of_psfs(self, width: float) -> tuple[Array, Array]:
+    def _of_psfs(self, linear: _Linear, width: float) -> tuple[Array, Array]:
         """Return the variance of the score by PSF errors: those found, and relative ones of 1."""
         # Errors of pixels are correlated over less than a PSF.
         size = min(64, *self.scene.image_grid)
@@ -301,7 +334,7 @@ class Null:
         factor = (self.scene.scale * together) ** 2
         found, whole = (
             factor * self._adjoint(each, 2, width)
-            for each in self.stars.squares(self._precisions, *self._psf_errors)
+            for each in self.stars.squares(linear.precisions, *self._psf_errors)
         )
         return found, whole
 

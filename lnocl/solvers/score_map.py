@@ -38,7 +38,7 @@ class ScoreMap:
         self.noise = noise_of(self.score, null.rings, ~null.is_structured)
         self._rarity = Rarity(null.kernel(0, width))
         self.unit = scene.unit
-        self.values = self.score.score / np.sqrt(self.score.variance) / self.noise.scatter
+        self.values = self.score.values / self.noise.scatter
         self.values[~self.score.is_tested] = 0.0
 
     def rarity(self, values: Array, at: tuple[NDArray[np.int_], ...]) -> Array:

@@ -67,7 +67,7 @@ def noise_of(score: Score, rings: NDArray[np.int_], empty: NDArray[np.bool_] | N
         Where no structure was found; None where it is not known yet, so that medians stand for
         means.
     """
-    values = score.score / np.sqrt(score.variance)
+    values = score.values
     is_empty = score.is_tested if empty is None else score.is_tested & empty
     independent = 1.0 / float((score.correlation**2).sum())
     shared = _shared(values[is_empty], independent)

@@ -1,0 +1,246 @@
+"""The score of a source, its noise and its threshold, against matrices, formulae and counts."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import scipy.stats
+from scipy import ndimage
+
+import lnocl
+from lnocl.scene.scene import Scene
+from lnocl.solvers.completeness import needed
+from lnocl.solvers.false_alarms import Rarity, of_student, threshold
+from lnocl.solvers.score import DISC, Null
+from lnocl.solvers.score_map import ScoreMap
+from lnocl.solvers.score_noise import noise_of
+
+NO_ERRORS = np.zeros(1), np.zeros(0)
+ROWS, COLUMNS = np.indices((9, 9)) - 4
+PSFS = np.array([np.exp(-(ROWS**2 + COLUMNS**2 + 0.3 * k * ROWS * COLUMNS) / 3) for k in (0, 1)])
+STARS = [(10.2, 9.7), (14.0, 12.5)]
+FLUXES = np.array([3000.0, 800.0])
+N = 32
+
+
+def scene_of(stars=STARS, exposure=1.0, **more):
+    rng = np.random.default_rng(3)
+    images = rng.poisson(30.0, (2, N, N)).astype(float)
+    observation = lnocl.Observation(images, PSFS, background=5.0, exposure=exposure, **more)
+    for j in range(2):
+        for s, star in enumerate(Scene(observation, stars).star_field.cutouts[j]):
+            images[j][star.window((N, N))] += rng.poisson(FLUXES[s] * star.values.clip(0))
+    observation = lnocl.Observation(images, PSFS, background=5.0, exposure=exposure, **more)
+    return Scene(observation, stars)
+
+
+def matrices(scene):
+    """Return what a point at each place, and each star, adds to the images: dense, in electrons."""
+    points = np.zeros((2, N, N, N, N))
+    for j in range(2):
+        psf = scene.psf(j)
+        for y in range(N):
+            for x in range(N):
+                points[j, :, :, y, x] = np.roll(psf, (y, x), (0, 1))
+    stars = np.array([[scene.star_image(j, s) for s in range(2)] for j in range(2)])
+    return points.reshape(2 * N * N, N * N), stars.transpose(0, 2, 3, 1).reshape(2 * N * N, 2)
+
+
+@pytest.mark.parametrize("sky", [np.zeros((N, N)), np.full((N, N), 25.0)])
+def test_score_and_information_are_those_of_matrices(sky):
+    """Stars and level are projected out of the design, with the weights that the null has."""
+    scene = scene_of()
+    null = Null(scene, sky, FLUXES, False, NO_ERRORS)
+    assert not null.is_structured.any()
+    found = null.score()
+    points, stars = matrices(scene)
+    precision = np.concatenate([each.ravel() for each in null._linear.precisions]) * scene.scale
+    left = np.concatenate([each.ravel() for each in null._linear.residuals]) * scene.scale
+    gram = stars.T @ (precision[:, None] * stars)
+    shared = stars.T @ (precision[:, None] * points)
+    solved = np.linalg.solve(gram, shared)
+    score = points.T @ left - solved.T @ (stars.T @ left)
+    information = (points**2).T @ precision - (shared * solved).sum(axis=0)
+    flat = points.T @ precision - solved.T @ (stars.T @ precision)
+    distance = np.hypot(*(np.minimum(each, N - each) for each in np.indices((N, N))))
+    disc = distance <= DISC * null.resolution
+    mean = (
+        np.array([np.roll(disc, divmod(k, N), (0, 1)).ravel() for k in range(N * N)]) / disc.sum()
+    )
+    expected = score - flat * (mean @ score) / (mean @ flat)
+    tested = found.is_tested.ravel()
+    assert 0.6 * N * N < tested.sum() < N * N
+    np.testing.assert_allclose(found.score.ravel()[tested], expected[tested], atol=2e-3)
+    # Shares of the level are those of even noise: 1 and 2 - (its own spread).
+    level = flat**2 / (mean @ flat) / disc.sum()
+    ratio = (information - found.information.ravel())[tested] / level[tested]
+    assert ratio.min() > 0.9
+    assert ratio.max() < 1.1
+
+
+def test_the_score_is_that_of_units_and_exposures():
+    """Twice the exposure on half the flux is the same score, in units of its noise."""
+    one, other = (
+        ScoreMap(Null(scene_of(exposure=e), np.zeros((N, N)), FLUXES / e, False, NO_ERRORS), 0.0)
+        for e in (1.0, 2.0)
+    )
+    np.testing.assert_allclose(one.values, other.values, atol=1e-6)
+    np.testing.assert_allclose(one.errors, 2.0 * other.errors, rtol=1e-6)
+
+
+def test_permuted_images_have_the_same_score():
+    scene = scene_of()
+    observation = scene.observation
+    swapped = lnocl.Observation(observation.images[::-1], PSFS[::-1], background=5.0)
+    one, other = (
+        ScoreMap(Null(each, np.zeros((N, N)), FLUXES, False, NO_ERRORS), 0.0).values
+        for each in (scene, Scene(swapped, STARS))
+    )
+    np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_stars_that_moved_take_more_of_the_information():
+    found = [
+        Null(scene_of(), np.zeros((N, N)), FLUXES, moves, NO_ERRORS).score().information
+        for moves in (False, True)
+    ]
+    held, moved = found
+    both = np.isfinite(held) & np.isfinite(moved)
+    assert np.isfinite(moved).sum() < np.isfinite(held).sum()
+    assert (moved[both] < held[both] * (1 + 1e-3)).all()  # of the level there is a little less
+    assert (moved[both] < 0.95 * held[both]).any()
+
+
+def test_stars_at_one_place_are_one():
+    scene = scene_of([STARS[0], STARS[1]])
+    scene.move_stars([STARS[0], STARS[0]])
+    found = Null(scene, np.zeros((N, N)), FLUXES, False, NO_ERRORS).score()
+    alone = Null(scene_of([STARS[0]]), np.zeros((N, N)), FLUXES[:1], False, NO_ERRORS).score()
+    assert np.isfinite(found.score).all()
+    assert (found.is_tested == alone.is_tested).mean() > 0.95
+
+
+def test_a_bright_source_is_no_part_of_the_level_round_others():
+    """Without that it leaves a hole of three resolutions."""
+    rng = np.random.default_rng(5)
+    psf = PSFS[:1]
+    bright = np.zeros((64, 64))
+    bright[28:37, 28:37] = 3e4 * psf[0] / psf.sum()
+    observation = lnocl.Observation(rng.poisson(20.0 + bright).astype(float), psf, background=20.0)
+    result = lnocl.deconvolve(observation, stop=None, n_iter=100, engine="numpy")
+    outcome = result._outcome
+    null = Null(outcome.scene, outcome.sky, np.zeros(0), False, NO_ERRORS)
+    assert null.is_structured[32, 32]
+    assert null.is_structured.mean() < 0.05
+    values = ScoreMap(null, 0.0).values
+    distance = np.hypot(*(np.indices((64, 64)) - 32))
+    ring = values[(distance > 6) & (distance < 10)]
+    assert abs(ring.mean()) < 0.35
+    assert values[32, 32] > 50
+
+
+@pytest.mark.parametrize("alarms", [0.1, 1.0])
+def test_noise_exceeds_the_threshold_as_often_as_stated(alarms):
+    """White Gaussian noise, smoothed: 400 fields, of which nothing is known but its spectrum."""
+    rng, n, sigma = np.random.default_rng(1), 64, 2.0
+    curvature = np.eye(2) / (2.0 * sigma**2)
+    least = threshold(alarms, n * n, curvature)
+    found = 0
+    for _ in range(400):
+        field = ndimage.gaussian_filter(rng.standard_normal((n, n)), sigma, mode="wrap")
+        field *= 2.0 * sigma * np.sqrt(np.pi)
+        is_peak = field == ndimage.maximum_filter(field, 3, mode="wrap")
+        found += np.count_nonzero(is_peak & (field > least))
+    assert abs(found / 400 - alarms) < 4 * np.sqrt(alarms / 400) + 0.05 * alarms
+
+
+def test_a_threshold_falls_with_the_alarms_and_ends_at_1():
+    found = [threshold(alarms, 4096, np.eye(2)) for alarms in (1e-3, 0.01, 1.0, 1e6)]
+    assert found == sorted(found, reverse=True)
+    assert found[-1] == 1.0
+    density = 4096 * (2 * np.pi) ** -1.5
+    assert density * found[0] * np.exp(-(found[0] ** 2) / 2) == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("level", [0.3, 3.0, 300.0])
+def test_rare_counts_are_as_rare_as_those_of_poisson(level):
+    """Equal weights: the sum is Poisson, whose tail scipy has; the continuous one lies between."""
+    rarity, n = Rarity(np.ones(25)), 25
+    mean = n * level
+    counts = np.arange(np.ceil(mean + 2.5 * np.sqrt(mean)), np.ceil(mean + 7 * np.sqrt(mean)))
+    values = (counts - mean) / np.sqrt(mean)
+    found = rarity(values, np.full(values.shape, mean**-0.5))
+    low, high = (scipy.stats.norm.isf(scipy.stats.poisson.sf(counts - k, mean)) for k in (1, 0))
+    assert (found > low - 0.01).all()
+    assert (found < high + 0.01).all()
+
+
+def test_values_without_skewness_are_gaussian():
+    values = np.array([-3.0, 0.5, 4.0])
+    np.testing.assert_array_equal(Rarity(np.ones(4))(values, np.zeros(3)), values)
+    np.testing.assert_array_equal(Rarity(-np.ones(4))(values, np.ones(3)), values)
+
+
+@pytest.mark.parametrize("degrees", [3.0, 30.0])
+def test_values_of_student_are_as_rare(degrees):
+    values = np.array([-4.0, 1.0, 5.0])
+    expected = scipy.stats.norm.isf(scipy.stats.t.sf(values, degrees))
+    np.testing.assert_allclose(of_student(values, np.full(3, degrees)), expected, rtol=1e-9)
+    assert np.isfinite(of_student(np.array([1e4]), np.array([1e3]))).all()
+
+
+@pytest.mark.parametrize("probability", [0.5, 0.9, 0.95])
+def test_sources_exceed_a_value_as_often_as_asked(probability):
+    values, skewness = np.array([4.0, 5.0]), np.array([0.0, 0.2])
+    found = needed(values, skewness, probability)
+    exceeds = scipy.stats.norm.sf((values - found - 1.0 / found) / np.sqrt(1.0 + skewness * found))
+    np.testing.assert_allclose(exceeds, probability, rtol=1e-6)
+
+
+class _Score(NamedTuple):
+    values: np.ndarray
+    of_psfs: np.ndarray
+    starlit: np.ndarray
+    is_tested: np.ndarray
+    correlation: np.ndarray
+
+
+def noisy(error, told=0.0, shared=1.0, seed=0):
+    """A score whose values are independent, near a star whose PSF is wrong."""
+    n = 128
+    distance = np.hypot(*(np.indices((n, n)) - n // 2))
+    light = 1e4 * np.exp(-distance / 4.0)
+    u = np.random.default_rng(seed).standard_normal((n, n)) * shared
+    u *= np.sqrt(1.0 + error**2 * light)
+    correlation = np.zeros((n, n))
+    correlation[0, 0] = 1.0
+    is_tested = np.ones((n, n), bool)
+    score = _Score(u, told**2 * light, light, is_tested, correlation)
+    return score, (distance / 3).astype(int), light
+
+
+@pytest.mark.parametrize("by_median", [False, True])
+@pytest.mark.parametrize("error", [0.0, 0.05, 0.3])
+def test_rings_show_the_error_of_psfs(error, by_median):
+    score, rings, light = noisy(error)
+    found = noise_of(score, rings, None if by_median else score.is_tested)
+    expected = np.sqrt(1.0 + error**2 * light)
+    near = (rings >= 2) & (rings <= 8)
+    assert np.median(found.scatter[near] / expected[near]) == pytest.approx(1.0, abs=0.12)
+    assert (found.scatter >= 1.0).all()
+    assert found.degrees[rings == 1].max() < 200
+    assert (found.degrees[light < 1.0] == 1e6).all()
+
+
+def test_what_the_run_has_found_of_psfs_is_the_least():
+    score, rings, light = noisy(0.0, told=0.1)
+    found = noise_of(score, rings, score.is_tested)
+    assert (found.scatter >= np.sqrt(1.0 + 0.01 * light) - 1e-9).all()
+
+
+def test_noise_that_is_shared_scatters_the_whole_field():
+    score, rings, _ = noisy(0.0, shared=1.5)
+    found = noise_of(score, rings, score.is_tested)
+    assert np.median(found.scatter) == pytest.approx(1.5, rel=0.05)
+    score, rings, _ = noisy(0.0, shared=1.0)
+    assert np.median(noise_of(score, rings, score.is_tested).scatter) == 1.0

@@ -1,0 +1,228 @@
+"""Sources beside the stars of a result: found, called a point or extended, and limited."""
+
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+from scipy import ndimage
+
+import lnocl
+from lnocl.errors import InputError
+from lnocl.runs.injections import Injections, spread_places
+from lnocl.significance import significance
+
+ROWS, COLUMNS = np.indices((33, 33)) - 16
+RADIUS = np.hypot(ROWS, COLUMNS)
+PSF = np.exp(-(RADIUS**2) / 4.5) + 0.02 * np.exp(-(RADIUS**2) / 50)
+PSF /= PSF.sum()
+N, SKY = 64, 20.0
+STAR = (40.3, 22.6)
+
+
+def point(x, y, flux, psf=PSF, n=N):
+    """Return the light of a point, whose PSF is a sum of Gaussians, in a frame."""
+    rows, columns = np.indices((n, n))
+    distance = np.hypot(rows - y, columns - x)
+    light = np.exp(-(distance**2) / 4.5) + 0.02 * np.exp(-(distance**2) / 50)
+    return flux * light / (np.exp(-(RADIUS**2) / 4.5) + 0.02 * np.exp(-(RADIUS**2) / 50)).sum()
+
+
+def seen(sky):
+    """Return a sky as the PSF spreads it, round the edges of the frame."""
+    kernel = np.fft.rfft2(np.fft.ifftshift(point(N // 2, N // 2, 1.0)))
+    return np.fft.irfft2(np.fft.rfft2(sky) * kernel, (N, N)).clip(0)
+
+
+def solve(light, stars=(), seed=0, **more):
+    counts = np.random.default_rng(seed).poisson(SKY + light).astype(float)
+    observation = lnocl.Observation(counts, PSF, background=SKY)
+    options = {"stop": None, "n_iter": 15, "engine": "numpy", **more}
+    return lnocl.deconvolve(observation, stars, **options)
+
+
+@pytest.fixture(scope="module")
+def result():
+    """A star with a companion, a faint source, and a jet."""
+    light = point(*STAR, 2e5) + point(52.4, 40.2, 2000) + point(12.7, 12.2, 700)
+    rows, columns = np.indices((N, N))
+    jet = (abs(rows - 46) < 1.5) * (columns > 8) * (columns < 34) * 1.0
+    jet = ndimage.gaussian_filter(jet, 1.0)
+    return solve(light + seen(8000 * jet / jet.sum()), [STAR], n_iter=60)
+
+
+@pytest.fixture(scope="module")
+def found(result):
+    return result.significance()
+
+
+def near(table, x, y, reach=1.5):
+    return table[np.hypot(table["x"].value - x, table["y"].value - y) < reach]
+
+
+@pytest.mark.parametrize(("x", "y", "flux"), [(52.4, 40.2, 2000), (12.7, 12.2, 700)])
+def test_points_are_found_with_their_fluxes_and_places(found, x, y, flux):
+    [source] = near(found.detections, x, y)
+    assert source["kind"] == "point"
+    assert abs(source["flux"].value - flux) < 3 * source["flux_error"].value
+    assert source["flux_error"].value < flux / 5
+    for axis, at in (("x", x), ("y", y)):
+        assert abs(source[axis].value - at) < 4 * source[f"{axis}_error"].value
+        assert source[f"{axis}_error"].value < 0.3
+    assert source["star"] == 1
+    assert source["distance"].value == pytest.approx(np.hypot(x - STAR[0], y - STAR[1]), abs=0.5)
+
+
+def test_a_jet_is_called_extended(found):
+    table = found.detections
+    on_jet = abs(table["y"].value - 46) < 3
+    assert on_jet.sum() >= 1
+    assert (table["kind"][on_jet] == "extended").all()
+    assert (table["kind"] == "point").sum() == 2
+
+
+def test_detections_are_above_the_threshold_and_in_order(found):
+    values = found.detections["significance"]
+    assert (values > found.threshold).all()
+    assert (np.diff(values) <= 0).all()
+    assert np.isnan(found.signal_to_noise[23, 40])  # under the star
+    assert np.isfinite(found.signal_to_noise).mean() > 0.85
+    assert not found.signal_to_noise.flags.writeable
+
+
+def test_all_wider_sources_are_called_extended(result):
+    found = result.significance(width=5.0)
+    assert len(found.detections)
+    assert set(found.detections["kind"]) == {"extended"}
+    assert near(found.detections, 20, 46, 14)["significance"].max() > 30
+
+
+def test_a_wide_source_has_its_flux_at_its_width():
+    rows, columns = np.indices((N, N))
+    blob = np.exp(-((rows - 30) ** 2 + (columns - 33) ** 2) / (2 * 2.5**2))
+    found = solve(seen(3000 * blob / blob.sum())).significance(width=2.5 * 2.3548)
+    [source] = near(found.detections, 33, 30)
+    assert source["flux"].value == pytest.approx(3000, rel=0.1)
+
+
+def test_more_false_alarms_have_a_lower_threshold(result, found):
+    lower = result.significance(false_alarms=1.0)
+    assert 3 < lower.threshold < found.threshold
+    assert len(lower.detections) >= len(found.detections)
+
+
+def test_limits_rise_with_completeness_and_towards_the_star(found):
+    half, most = found.limit(0.5), found.limit(0.95)
+    tested = np.isfinite(half)
+    assert (most[tested] >= half[tested]).all()
+    curves = found.contrast_curves((0.5,))
+    assert (curves["star"] == 1).all()
+    assert curves["flux50"][0] > 3 * curves["flux50"][-1]
+    expected = -2.5 * np.log10(curves["flux50"].value / found._outcome.star_fluxes[0])
+    np.testing.assert_allclose(curves["magnitudes50"].value, expected)
+    assert (np.diff(curves["distance"].value) > 0).all()
+
+
+def test_the_limit_of_a_half_is_about_the_threshold(found):
+    flat = np.s_[4:10, 50:60]
+    snr = found.limit(0.5)[flat] / found.flux_error[flat]
+    assert (abs(snr - found.threshold) < 1.0).all()
+
+
+def test_a_jet_limits_points_on_it(found):
+    limits = found.limit(0.5)
+    assert limits[46, 20] > 3 * limits[6, 55]
+
+
+def test_sources_at_the_limit_are_found_as_often_as_it_says():
+    """40 of them, so that the share has an error of 8 %; a limit twice as faint finds few."""
+    found = solve(point(*STAR, 1e5), [STAR], 1).significance(false_alarms=0.1)
+    table = found.inject(40, 0.5, seed=3)
+    assert 0.3 <= table["found"].mean() <= 0.7
+    assert found.inject(40, 0.97, seed=4)["found"].mean() > 0.85
+
+
+def test_sources_that_are_put_in_have_their_counts(result):
+    injections = Injections(result._outcome, 0.0)
+    rng = np.random.default_rng(0)
+    counts = injections._counts(np.array([[20.3, 30.8]]), np.array([1e6]), rng)
+    assert counts.shape == (1, N, N)
+    np.testing.assert_allclose(counts[0], point(20.3, 30.8, 1e6), atol=1200)
+    assert counts.sum() == pytest.approx(1e6, rel=0.01)
+    wide = Injections(result._outcome, 4.0)._counts(np.array([[20.3, 30.8]]), np.array([1e6]), rng)
+    assert wide.max() < 0.7 * counts.max()
+    assert wide.sum() == pytest.approx(1e6, rel=0.01)
+
+
+def test_places_lie_apart_and_where_they_may():
+    allowed = np.zeros((50, 60), bool)
+    allowed[5:40, 5:50] = True
+    places = np.array(list(spread_places(allowed, 6, 10.0, np.random.default_rng(2))))
+    assert allowed[tuple(places.T)].all()
+    away = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
+    assert (away[np.triu_indices(len(places), 1)] > 10).all()
+    assert not list(spread_places(allowed & False, 6, 10.0, np.random.default_rng(2)))
+
+
+def test_bad_pixels_and_a_finer_sky():
+    counts = np.random.default_rng(0).poisson(SKY + point(20.2, 40.6, 900)).astype(float)
+    mask = np.zeros((N, N), bool)
+    mask[:, 44:] = True
+    mask[40, 20] = True
+    psf = np.zeros((66, 66))
+    rows, columns = np.indices((66, 66)) - 33
+    radius = np.hypot(rows, columns) / 2
+    psf = np.exp(-(radius**2) / 4.5) + 0.02 * np.exp(-(radius**2) / 50)
+    observation = lnocl.Observation(counts, psf, background=SKY, mask=mask, oversample=2)
+    result = lnocl.deconvolve(observation, stop=None, n_iter=15, engine="numpy")
+    found = result.significance()
+    assert found.signal_to_noise.shape == (2 * N, 2 * N)
+    assert np.isnan(found.signal_to_noise[:, 100:]).all()
+    [source] = near(found.detections, 20.2, 40.6, 1.0)
+    assert abs(source["flux"].value - 900) < 3 * source["flux_error"].value
+
+
+def test_turned_images_find_what_is_in_all(result):
+    angle = np.deg2rad(30.0)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    middle = np.full(2, (N - 1) / 2)
+    there = turn @ (np.array([24.0, 36.0]) - middle) + middle
+    rng = np.random.default_rng(4)
+    images = [rng.poisson(SKY + point(*at, 900)) for at in ((24.0, 36.0), there)]
+    maps = [np.hstack([t, (middle - t @ middle)[:, None]]) for t in (np.eye(2), turn)]
+    observation = lnocl.Observation(np.array(images), PSF, background=SKY, transforms=maps)
+    outcome = lnocl.deconvolve(observation, stop=None, n_iter=10, engine="numpy")
+    [source] = near(outcome.significance().detections, 24.0, 36.0)
+    assert source["flux"].value == pytest.approx(900, abs=3 * source["flux_error"].value)
+    assert source["significance"] > 10
+
+
+def test_the_picture_has_the_map_the_limits_and_the_curves(found):
+    figure = found.plot()
+    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    assert titles[0].startswith(f"points: {len(found.detections)} above {found.threshold:.2f}")
+    assert titles[1:] == [
+        "found with a probability of 50 %",
+        "limits and the probability of being found",
+    ]
+    plt.close("all")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda r: r.significance(width=-1), "width must be a finite number of pixels, 0 or more"),
+        (lambda r: r.significance(width=np.inf), "width must be"),
+        (lambda r: r.significance(false_alarms=0), "above 0 and at most 10, such as 0.01; 0 was"),
+        (lambda r: r.significance(false_alarms=11), "above 0 and at most 10"),
+        (lambda r: r.significance().limit(1.0), "completeness lies between 0 and 1; 1.0"),
+        (lambda r: r.significance().inject(0), "injections must be a whole number, 1 or more"),
+        (lambda r: r.significance().inject(3, 0.5, -1), "seed must be a whole number"),
+    ],
+)
+def test_wrong_arguments_are_refused(result, call, message):
+    with pytest.raises(InputError, match=message):
+        call(result)
+
+
+def test_the_function_is_that_of_the_method(result, found):
+    again = significance(result._outcome, 0.0, 0.01)
+    np.testing.assert_array_equal(again.signal_to_noise, found.signal_to_noise)
