@@ -228,7 +228,9 @@ def look_at_rolls(folder):
             fluxes = [
                 at(limits, place(r, theta)) / np.interp(r, RADII, throughput) for r, theta in polar
             ]
-            planets = (f * rolls.planet(place(*each)) for f, each in zip(fluxes, polar, strict=True))
+            planets = (
+                f * rolls.planet(place(*each)) for f, each in zip(fluxes, polar, strict=True)
+            )
             seen = rolls.significance(frames + sum(planets)).detections
             seen = seen[seen["kind"] == "point"]
             for r, theta in polar:

@@ -125,11 +125,23 @@ class ScoreMap:
         y, x = np.nonzero(is_maximum)
         rows, columns = u.shape
         near = [[u[(y + dy) % rows, (x + dx) % columns] for dx in (-1, 0, 1)] for dy in (-1, 0, 1)]
-        moves, higher = _vertices(np.array(near))
+        moves, higher = _peaks(np.array(near))
         gaussian = self.rarity(higher, (y, x))
         order = np.flatnonzero(gaussian > least)
         order = order[np.argsort(-gaussian[order])]
         return np.stack([x, y], axis=1)[order] + moves[order], higher[order], gaussian[order]
+
+
+def _peaks(near: Array) -> tuple[Array, Array]:
+    """Return where Gaussians through 3 x 3 values have their maxima, (n, 2), and their values.
+
+    Where a value is not positive they are parabolas.
+    """
+    moves, higher = _vertices(near)
+    is_positive = (near > 0).all(axis=(0, 1))
+    of_logs, logs = _vertices(np.log(np.where(is_positive, near, 1.0)))
+    moves = np.where(is_positive[:, None], of_logs, moves)
+    return moves, np.where(is_positive, np.exp(logs), higher)
 
 
 def _vertices(near: Array) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from lnocl.scene.scene import Scene
 from lnocl.solvers.completeness import needed
 from lnocl.solvers.false_alarms import Rarity, of_student, threshold
 from lnocl.solvers.score import DISC, Null
-from lnocl.solvers.score_map import ScoreMap
+from lnocl.solvers.score_map import ScoreMap, _peaks
 from lnocl.solvers.score_noise import noise_of
 
 NO_ERRORS = np.zeros(1), np.zeros(0)
@@ -244,3 +244,15 @@ def test_noise_that_is_shared_scatters_the_whole_field():
     assert np.median(found.scatter) == pytest.approx(1.5, rel=0.05)
     score, rings, _ = noisy(0.0, shared=1.0)
     assert np.median(noise_of(score, rings, score.is_tested).scatter) == 1.0
+
+
+def test_the_peak_of_a_gaussian_is_found_between_pixels():
+    rows, columns = np.indices((3, 3)) - 1.0
+    dx, dy = np.array([0.3, -0.45]), np.array([-0.2, 0.1])
+    near = np.exp(-((rows[..., None] - dy) ** 2 + (columns[..., None] - dx) ** 2) / 4) * 7.0
+    moves, values = _peaks(near)
+    np.testing.assert_allclose(moves, np.stack([dx, dy], axis=1), atol=1e-12)
+    np.testing.assert_allclose(values, 7.0)
+    moves, values = _peaks(near - 6.0)  # of which some are negative
+    assert abs(moves - np.stack([dx, dy], axis=1)).max() < 0.1
+    assert abs(values - 1.0).max() < 0.1

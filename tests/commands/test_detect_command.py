@@ -1,0 +1,156 @@
+"""``lnocl detect`` and ``lnocl limit``: what they write, say and refuse."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from commandline import gaussian
+
+from lnocl.commands import cli
+from lnocl.io.fitsfindings import read_findings
+
+N = 64
+WCS = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 15.25, "CRVAL2": -3.0,
+       "CRPIX1": 32.0, "CRPIX2": 32.0, "CDELT1": -1e-4, "CDELT2": 1e-4}  # fmt: skip
+MAPS = ["LIMIT50", "LIMIT90", "LIMIT95"]
+
+
+@pytest.fixture(autouse=True)
+def result(tmp_path, monkeypatch):
+    """A star at (20.3, 40.1) and a source that is not named, at (45, 18.6)."""
+    monkeypatch.chdir(tmp_path)
+    light = 50.0 + 3e4 * gaussian(N, 20.3, 40.1) + 3e3 * gaussian(N, 45.0, 18.6)
+    counts = np.random.default_rng(1).poisson(light).astype(float)
+    fits.writeto("image.fits", counts, fits.Header(WCS))
+    fits.writeto("psf.fits", gaussian(25, 12, 12))
+    words = ["deconvolve", "image.fits", "--psf", "psf.fits", "--background", "50"]
+    words += ["--star", "20.3,40.1", "--stop", "none", "--n-iter", "15", "--engine", "numpy"]
+    assert cli.main([*words, "--residuals", "-o", "out.fits", "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("output", ["found.ecsv", "found.csv", "found.fits"])
+def test_detections_are_said_written_and_added(output, capsys):
+    assert cli.main(["detect", "out.fits", "-o", output]) == 0
+    captured = capsys.readouterr()
+    assert "warning" not in captured.err
+    said = captured.out.splitlines()
+    assert said[0].startswith("1 detection above 4.")
+    assert (
+        "which noise exceeds 0.01 times in such a field (each place was tested for a point)"
+        in (said[0])
+    )
+    assert said[1].startswith(("1: (44.9", "1: (45.0"))
+    assert " pixels from star 1, signal-to-noise " in said[1]
+    assert said[-2:] == ["added to out.fits", f"written to {output}"]
+    table = Table.read(output)
+    assert table["kind"].tolist() == ["point"]
+    assert abs(table["flux"][0] - 3000) < 4 * table["flux_error"][0]
+    assert table["ra"][0] == pytest.approx(15.25 - 14e-4, abs=2e-5)
+    held = read_findings("out.fits")
+    assert held.threshold == pytest.approx(float(said[0].split()[3]), abs=0.01)
+    assert held.detections["x"][0] == pytest.approx(table["x"][0])
+    assert held.detections["kind"].tolist() == ["point"]
+    assert held.signal[19, 45] > 10
+    with fits.open("out.fits") as hdus:
+        assert [hdu.name for hdu in hdus][-2:] == ["DETECTIONS", "SIGNAL"]
+        assert hdus["SIGNAL"].header["CRVAL1"] == 15.25
+        assert hdus["DETECTIONS"].header["FALSALRM"] == 0.01
+
+
+def test_detections_replace_those_that_are_there(capsys):
+    for alarms in ("0.01", "1"):
+        assert cli.main(["detect", "out.fits", "--false-alarms", alarms, "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+    with fits.open("out.fits") as hdus:
+        names = [hdu.name for hdu in hdus]
+        assert names.count("DETECTIONS") == 1
+        assert hdus["DETECTIONS"].header["FALSALRM"] == 1.0
+
+
+def test_limits_are_said_written_added_and_checked(capsys):
+    words = ["limit", "out.fits", "-o", "limits.ecsv", "--injections", "12"]
+    assert cli.main(words) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("a point of ")
+    assert said[0].endswith("at 0.01 false alarms in the field")
+    assert said[1].startswith("star 1: magnitudes below it, at pixels from it: ")
+    assert said[2].startswith("of 6 sources put in at the limit of 50 %, ")
+    assert said[3].startswith("of 6 sources put in at the limit of 90 %, ")
+    assert said[4:] == ["added to out.fits", "written to limits.ecsv"]
+    table = Table.read("limits.ecsv")
+    assert {"star", "distance", "flux50", "contrast90", "magnitudes95"} <= set(table.colnames)
+    assert (table["flux95"] > table["flux50"]).all()
+    held = read_findings("out.fits")
+    assert held.limit.shape == (N, N)
+    with fits.open("out.fits") as hdus:
+        assert [hdu.name for hdu in hdus][-4:] == ["LIMITS", *MAPS]
+        assert hdus["LIMIT50"].header["BUNIT"] == "electron"
+
+
+def test_no_sources_are_put_in_where_none_are_wanted(capsys):
+    assert cli.main(["limit", "out.fits", "--injections", "0"]) == 0
+    assert "put in" not in capsys.readouterr().out
+
+
+def test_a_limit_that_is_too_faint_is_told(capsys, monkeypatch):
+    from lnocl.significance import Significance
+
+    before = Significance.limit
+    monkeypatch.setattr(Significance, "limit", lambda *args: before(*args) / 4)
+    assert cli.main(["limit", "out.fits", "--injections", "40"]) == 0
+    assert "the limit of 90 % is too faint: of 20 sources put in" in capsys.readouterr().err
+
+
+def test_pictures_and_the_report_show_them(capsys):
+    pytest.importorskip("matplotlib")
+    assert cli.main(["detect", "out.fits", "--plot", "found.png"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "drew found.png"
+    words = ["limit", "out.fits", "--plot", "limits.png", "--injections", "0"]
+    assert cli.main(words) == 0
+    for name in ("found.png", "limits.png"):
+        assert Path(name).read_bytes().startswith(b"\x89PNG")
+    assert cli.main(["report", "out.fits", "-o", "page.html"]) == 0
+    page = Path("page.html").read_text()
+    assert "<h2>Detections and limits</h2>" in page
+    assert "<th>detection</th><th>x</th>" in page
+    assert "<td>point</td>" in page
+    assert "Limits round each star" in page
+
+
+def test_a_report_without_them_has_no_section():
+    pytest.importorskip("matplotlib")
+    assert cli.main(["report", "out.fits", "-o", "page.html"]) == 0
+    assert "Detections and limits" not in Path("page.html").read_text()
+
+
+def test_fluxes_are_in_the_unit_of_the_images(capsys):
+    with fits.open("image.fits", mode="update") as hdus:
+        hdus[0].data /= 10.0
+        hdus[0].header["BUNIT"] = "adu"
+    words = ["deconvolve", "image.fits", "--psf", "psf.fits", "--background", "5", "--gain", "10"]
+    words += ["--star", "20.3,40.1", "--stop", "none", "--n-iter", "15", "--engine", "numpy"]
+    assert cli.main([*words, "-o", "adu.fits", "--quiet"]) == 0
+    assert cli.main(["detect", "adu.fits", "-o", "found.ecsv"]) == 0
+    said = capsys.readouterr().out
+    assert " adu" in said
+    table = Table.read("found.ecsv")
+    assert abs(table["flux"][0] - 300) < 4 * table["flux_error"][0]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["detect", "out.fits", "--width", "-2"], "--width must be a finite number of pixels"),
+        (["detect", "out.fits", "--false-alarms", "0"], "--false-alarms is the number expected"),
+        (["detect", "out.fits", "-o", "found.reg"], "the table of detections is ECSV, CSV or FITS"),
+        (["limit", "out.fits", "-o", "found.reg"], "the table of limits is ECSV, CSV or FITS"),
+        (["limit", "out.fits", "--injections", "-3"], "--injections must be a whole number"),
+        (["detect", "out.fits", "--plot", "found.pdf"], "the picture is a PNG file"),
+        (["detect", "image.fits"], "is not a result or truth written by lnocl"),
+    ],
+)
+def test_wrong_words_are_refused_before_the_run(words, message, capsys):
+    assert cli.main(words) != 0
+    assert message in capsys.readouterr().err
