@@ -33,15 +33,16 @@ from scipy.special import j1
 
 N, AROUND, SKY, WIDTH, OBSTRUCTED = 96, 24, 20.0, 3.0, 0.2
 STAR, JET, STARS = 3e5, 2e4, 40
+EDGE = 32.5  # that of the PSF's array: what it lacks would be an error of it
 KINDS = "sky", "star", "jet", "crowded"
 CORRELATED = 0.6
 
 
 def airy(distance):
-    """Return the Airy pattern of an obstructed pupil at distances in pixels."""
+    """Return the Airy pattern of an obstructed pupil at distances in pixels, to 32 of them."""
     v = np.maximum(np.pi * distance / WIDTH, 1e-6)
     amplitude = (2 * j1(v) - OBSTRUCTED**2 * 2 * j1(OBSTRUCTED * v) / OBSTRUCTED) / v
-    return amplitude**2
+    return np.where(distance < EDGE, amplitude**2, 0.0)
 
 
 def psf_at(x, y, size):

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from matplotlib import pyplot as plt
 from scipy import ndimage
 
 import lnocl
@@ -203,7 +202,6 @@ def test_the_picture_has_the_map_the_limits_and_the_curves(found):
         "found with a probability of 50 %",
         "limits and the probability of being found",
     ]
-    plt.close("all")
 
 
 @pytest.mark.parametrize(
