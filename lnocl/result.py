@@ -603,7 +603,8 @@ class Result:
         Raises
         ------
         InputError
-            A width or number of false alarms out of range; or the result is of tiles.
+            - A width or number of false alarms is out of range.
+            - The result is of tiles, or of PSFs that vary over the field.
 
         Examples
         --------

@@ -35,6 +35,8 @@ POINT = 3.0
 THERE = 3.0
 # A source that was put in is found by a detection within so many resolutions.
 NEAR = 0.7
+# Error of a place between pixels, pixels of the sky.
+INTERPOLATED = 0.02
 # Of more false alarms in a field the number is not what the threshold says.
 MOST_ALARMS = 10.0
 POINT_SOURCE, EXTENDED = "point", "extended"
@@ -367,6 +369,11 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
     check_width(width)
     check_alarms(false_alarms)
     observation = outcome.observation
+    if observation.psf_fields:
+        raise InputError(
+            "sources are tested with one PSF for each image, and these vary over the field: "
+            "deconvolve a cut-out with the PSF of its middle"
+        )
     null = null_of(outcome)
     found = ScoreMap(null, width * observation.oversample)
     ny, nx = observation.sky_shape
@@ -453,8 +460,7 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
     x, y = np.round(places).astype(int).T
     rows, columns = found.values.shape
     at = y % rows, x % columns
-    # Of a maximum between pixels the flux is as much more as its value.
-    errors, fluxes = found.errors[at], found.fluxes[at] * values / found.values[at]
+    errors, fluxes = found.errors[at], found.peak_fluxes(*at)
     kinds = np.full(len(places), POINT_SOURCE, dtype="U8")
     pixels = (places - (q - 1) / 2.0) / q
     for i, place in enumerate(places):
@@ -464,9 +470,10 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
             known = scene, outcome.sky, outcome.star_fluxes
             fluxes[i], errors[i] = point_flux(*known, pixels[i], fluxes[i], outcome.moves)
             kinds[i] = POINT_SOURCE if fluxes[i] > POINT * errors[i] else EXTENDED
-    # Position errors of a maximum whose height is its signal-to-noise.
+    # Of a maximum between pixels the place errs by its noise, and by how it is interpolated.
     spread = np.sqrt(np.diag(np.linalg.inv(found.score.curvature)))[::-1]
-    moved = spread / np.maximum(values, 1.0)[:, None] / q
+    ratio = np.maximum(found.fluxes[at] / found.errors[at], 1.0)
+    moved = np.hypot(spread / ratio[:, None], INTERPOLATED) / q
     stars = scene.stars[:: outcome.observation.n_epochs]
     nearest, distance = np.zeros(len(places), int), np.full(len(places), np.inf)
     if len(stars) and len(places):

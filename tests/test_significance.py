@@ -224,3 +224,11 @@ def test_wrong_arguments_are_refused(result, call, message):
 def test_the_function_is_that_of_the_method(result, found):
     again = significance(result._outcome, 0.0, 0.01)
     np.testing.assert_array_equal(again.signal_to_noise, found.signal_to_noise)
+
+
+def test_psfs_that_vary_over_the_field_are_refused():
+    field = lnocl.PsfField(np.array([PSF] * 4), [(0, 0), (N, 0), (0, N), (N, N)])
+    observation = lnocl.Observation(np.full((N, N), SKY), field, background=SKY)
+    result = lnocl.deconvolve(observation, stop=None, n_iter=2, engine="numpy")
+    with pytest.raises(InputError, match="these vary over the field: deconvolve a cut-out"):
+        result.significance()

@@ -110,6 +110,10 @@ class ScoreMap:
         is_round = (distance >= AROUND[0]) & (distance <= AROUND[1])
         return float((self.values[there] - value * point)[is_round].max(initial=0.0))
 
+    def peak_fluxes(self, y: NDArray[np.int_], x: NDArray[np.int_]) -> Array:
+        """Return the fluxes, electrons, of maxima between pixels, at these rows and columns."""
+        return _peaks(_near(np.nan_to_num(self.fluxes), y, x))[1]
+
     def maxima(self, least: float) -> tuple[Array, Array, Array]:
         """Return maxima whose Gaussian values are above one, highest first.
 
@@ -121,15 +125,20 @@ class ScoreMap:
             In units of the noise, and as Gaussian values.
         """
         u = self.values
-        is_maximum = (u == ndimage.maximum_filter(u, 3, mode="wrap")) & (u > 0)
-        y, x = np.nonzero(is_maximum)
-        rows, columns = u.shape
-        near = [[u[(y + dy) % rows, (x + dx) % columns] for dx in (-1, 0, 1)] for dy in (-1, 0, 1)]
-        moves, higher = _peaks(np.array(near))
+        y, x = np.nonzero((u == ndimage.maximum_filter(u, 3, mode="wrap")) & (u > 0))
+        moves, higher = _peaks(_near(u, y, x))
         gaussian = self.rarity(higher, (y, x))
         order = np.flatnonzero(gaussian > least)
         order = order[np.argsort(-gaussian[order])]
         return np.stack([x, y], axis=1)[order] + moves[order], higher[order], gaussian[order]
+
+
+def _near(values: Array, y: NDArray[np.int_], x: NDArray[np.int_]) -> Array:
+    """Return the 3 x 3 values round each of n places of the periodic grid, shape (3, 3, n)."""
+    rows, columns = values.shape
+    steps = (-1, 0, 1)
+    near = [[values[(y + dy) % rows, (x + dx) % columns] for dx in steps] for dy in steps]
+    return np.array(near)
 
 
 def _peaks(near: Array) -> tuple[Array, Array]:
@@ -138,7 +147,7 @@ def _peaks(near: Array) -> tuple[Array, Array]:
     Where a value is not positive they are parabolas.
     """
     moves, higher = _vertices(near)
-    is_positive = (near > 0).all(axis=(0, 1))
+    is_positive = np.all(near > 0, axis=(0, 1))
     of_logs, logs = _vertices(np.log(np.where(is_positive, near, 1.0)))
     moves = np.where(is_positive[:, None], of_logs, moves)
     return moves, np.where(is_positive, np.exp(logs), higher)
