@@ -228,7 +228,8 @@ def test_the_function_is_that_of_the_method(result, found):
 
 def test_psfs_that_vary_over_the_field_are_refused():
     field = lnocl.PsfField(np.array([PSF] * 4), [(0, 0), (N, 0), (0, N), (N, N)])
-    observation = lnocl.Observation(np.full((N, N), SKY), field, background=SKY)
+    images = np.random.default_rng(0).poisson(SKY, (N, N))
+    observation = lnocl.Observation(images, field, background=SKY)
     result = lnocl.deconvolve(observation, stop=None, n_iter=2, engine="numpy")
     with pytest.raises(InputError, match="these vary over the field: deconvolve a cut-out"):
         result.significance()

@@ -149,6 +149,30 @@ def test_shares_of_stars_are_their_light_in_each_region():
     np.testing.assert_allclose(found.stated, outcome.star_errors()[0])
 
 
+def test_light_is_there_in_the_replicas_whose_errors_leave_some():
+    light, width = Quantity("a", "flux", 5.0), Quantity("b", "length", 5.0)
+    errors = np.array([[4.0, 0.0], [6.0, 0.0], [5.0, 0.0], [-9.0, 0.0]])
+    sums = np.stack([np.zeros((8, 8)), np.zeros((8, 8)), np.full((8, 8), 3.0)])
+    found = Bootstrap((light, width), errors, errors[:0], sums, 2.0, 0)
+    np.testing.assert_array_equal(found.shares_there, [0.5, np.nan])
+    assert (found.share_map == 0.75).all()
+    np.testing.assert_array_equal(found.to_table()["share"], [0.5, np.nan])
+
+
+def test_pixels_have_light_where_they_are_brighter_than_their_errors():
+    outcome = solved()._outcome
+    found = run_bootstrap(outcome, 10)
+    replicas = [Replicas(outcome, 7).reconstruct(k) for k in range(10)]
+    width = found.resolution / np.sqrt(8 * np.log(2))
+    answer = gaussian_filter(outcome.sky[:32, :32], width, mode="nearest")
+    there = [
+        answer > gaussian_filter(each.found.extended - each.drawn.extended, width, mode="nearest")
+        for each in replicas
+    ]
+    np.testing.assert_array_equal(found.share_map, np.mean(there, axis=0))
+    assert found.share_map.max() == 1.0
+
+
 def test_errors_are_found_less_drawn():
     outcome = solved(refine_positions=True)._outcome
     found = run_bootstrap(outcome, 10)
