@@ -8,6 +8,7 @@ import lnocl
 from lnocl.errors import InputError
 from lnocl.runs.injections import Injections, spread_places
 from lnocl.significance import significance
+from lnocl.solvers.point_test import point_flux
 
 ROWS, COLUMNS = np.indices((33, 33)) - 16
 RADIUS = np.hypot(ROWS, COLUMNS)
@@ -76,6 +77,18 @@ def test_a_jet_is_called_extended(found):
     assert on_jet.sum() >= 1
     assert (table["kind"][on_jet] == "extended").all()
     assert (table["kind"] == "point").sum() == 2
+
+
+@pytest.mark.parametrize(("place", "is_point"), [((52.4, 40.2), True), ((20.0, 46.0), False)])
+def test_the_extended_source_may_be_a_jet_but_no_point(result, place, is_point):
+    """Nothing of a point is expected of the light round it; on the jet there is as much."""
+    outcome = result._outcome
+    known = outcome.scene, outcome.sky, outcome.star_fluxes
+    flux, error = point_flux(*known, np.array(place), 1000.0, False)
+    assert (flux > 5 * error) == is_point
+    assert (flux > 3 * error) == is_point
+    if is_point:
+        assert flux == pytest.approx(2000, rel=0.15)
 
 
 def test_detections_are_above_the_threshold_and_in_order(found):

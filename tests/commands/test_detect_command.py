@@ -53,6 +53,7 @@ def test_detections_are_said_written_and_added(output, capsys):
     assert held.detections["x"][0] == pytest.approx(table["x"][0])
     assert held.detections["kind"].tolist() == ["point"]
     assert held.signal[19, 45] > 10
+    assert held.unit == "electron"
     with fits.open("out.fits") as hdus:
         assert [hdu.name for hdu in hdus][-2:] == ["DETECTIONS", "SIGNAL"]
         assert hdus["SIGNAL"].header["CRVAL1"] == 15.25
@@ -137,6 +138,7 @@ def test_fluxes_are_in_the_unit_of_the_images(capsys):
     assert " adu" in said
     table = Table.read("found.ecsv")
     assert abs(table["flux"][0] - 300) < 4 * table["flux_error"][0]
+    assert read_findings("adu.fits").unit == "adu"
 
 
 @pytest.mark.parametrize(
