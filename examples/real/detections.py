@@ -12,7 +12,8 @@ rolls.py finds. Planets that are put into the raw frames, before the background 
 throughput. Limits over throughput are contrasts, and those of VIP stand beside them. In the end
 planets of the fluxes of these limits are put in, and those found are counted.
 
-The threshold is 5, and rings near the star have few resolutions. Contrasts are therefore raised, as
+The threshold is 5. Contrasts are those of sources five standard deviations of their ring bright, as
+measured without b. Rings near the star have few resolutions. Contrasts are therefore raised, as
 VIP's are, to where Student's distribution has as few false alarms as a Gaussian beyond 5.
 
 The folder hst-quasar-j0005 has one frame of a quasar of redshift 5.85 (HST, F125W) and the PSF of a
@@ -48,8 +49,9 @@ ROUNDS = 7  # for each completeness, of planets put in together
 TOGETHER = 6
 
 # Contrasts by VIP 2.1.1 at RADII, of the same frames without beta Pictoris b, 99 x 99 pixels round
-# the star. `contrast_curve` with the PSF normalised to a FWHM of 4.6, sigma=5, nbranch=3 and the
-# correction for few resolutions (student) made them, and put fake companions in by itself.
+# the star. Its `contrast_curve` made them, which puts fake companions in by itself: of the PSF
+# normalised to a FWHM of 4.6, with sigma=5, nbranch=3, imlib="vip-fft" and student=True. The names
+# have the numbers of components; `pca_annular` had asize=8, radius_int=8 and delta_rot=0.
 VIP = {
     "median_sub": (4.579e-3, 2.854e-3, 1.810e-3, 1.257e-3, 7.897e-4, 4.184e-4, 2.797e-4, 1.787e-4,
                    1.226e-4, 8.463e-5),
@@ -131,6 +133,7 @@ class Rolls:
         with warnings.catch_warnings():
             # A pixel's noise is below the read noise given, as that is meant for a whole planet.
             warnings.filterwarnings("ignore", "the (noise|background) of image")
+            warnings.filterwarnings("ignore", "overflow encountered")
             observation = lnocl.Observation(
                 GAIN * images, self.psf, background=GAIN * background, read_noise=read_noise,
                 mask=self.mask, transforms=self.transforms,
@@ -194,9 +197,12 @@ def look_at_rolls(folder):
     deviations = found.signal_to_noise[: rolls.n, : rolls.n][inside]
     print(f"  its signal-to-noise: {np.nanmean(deviations):.2f} +- {np.nanstd(deviations):.2f}")
 
-    # Every other radius at a time, so that planets stay apart; as bright as twice what is found.
+    # Every other radius at a time, so that planets stay apart; about as bright as what is found.
     limits = found.limit()[: rolls.n, : rolls.n] * unit
-    limit = np.array([np.nanmedian(limits[abs(rolls.radius - r) < FWHM / 2]) for r in RADII])
+    of_ratio = found.signal_to_noise[: rolls.n, : rolls.n]
+    rings = [abs(rolls.radius - r) < FWHM / 2 for r in RADII]
+    limit = np.array([np.nanmedian(limits[ring]) for ring in rings])
+    spread = np.array([np.nanstd(of_ratio[ring]) for ring in rings])
     shares = np.zeros((TURNS, len(RADII)))
     for turn in range(TURNS):
         for first in (0, 1):
@@ -210,12 +216,13 @@ def look_at_rolls(folder):
                 shares[turn, i] = at(other.flux - found.flux, where) * unit / fluxes[i]
     throughput = shares.mean(axis=0)
     print("contrasts, 5 sigma:")
-    print("   r  throughput     lnocl  " + "  ".join(f"{name:>10}" for name in VIP) + "  student")
+    print("   r  share found  scatter     lnocl  " + "  ".join(f"{name:>10}" for name in VIP) + "  student")
     for i, r in enumerate(RADII):
-        contrast = limit[i] / throughput[i] * few_resolutions(r) / STAR
+        contrast = spread[i] * limit[i] / throughput[i] * few_resolutions(r) / STAR
         others = "  ".join(f"{curve[i]:10.2e}" for curve in VIP.values())
         print(
-            f"{r:4}  {throughput[i]:.2f} +- {shares[:, i].std():.2f}  {contrast:8.2e}  {others}"
+            f"{r:4}  {throughput[i]:.3f} +- {shares[:, i].std():.3f}  {spread[i]:.2f}  "
+            f"{contrast:8.2e}  {others}"
             f"  {few_resolutions(r):7.2f}"
         )
 
