@@ -44,7 +44,7 @@ PLANET, FLUX = (16.583, 44.721), 634.4  # the flux that rolls.py finds, VIP's un
 EDGE = 46  # no planet is farther from the star, pixels
 ALARMS = 0.0485  # false alarms that make the threshold 5
 RADII = (10, 12, 14, 16.6, 20, 24, 28, 32, 36, 40)  # of contrasts, pixels
-TURNS = 4  # angles at which planets give the throughput
+TURNS = 3  # angles at which planets give the throughput
 ROUNDS = 7  # for each completeness, of planets put in together
 TOGETHER = 6
 
@@ -216,7 +216,11 @@ def look_at_rolls(folder):
                 shares[turn, i] = at(other.flux - found.flux, where) * unit / fluxes[i]
     throughput = shares.mean(axis=0)
     print("contrasts, 5 sigma:")
-    print("   r  share found  scatter     lnocl  " + "  ".join(f"{name:>10}" for name in VIP) + "  student")
+    print(
+        "   r  share found  scatter     lnocl  "
+        + "  ".join(f"{name:>10}" for name in VIP)
+        + "  student"
+    )
     for i, r in enumerate(RADII):
         contrast = spread[i] * limit[i] / throughput[i] * few_resolutions(r) / STAR
         others = "  ".join(f"{curve[i]:10.2e}" for curve in VIP.values())
