@@ -17,7 +17,8 @@ import scipy.special
 
 from lnocl.scene.arrays import Array
 
-ROUNDS = 30
+# Rounds of the two fixed points; a value is found to 1e-3 of it.
+ROUNDS, EXACT = 30, 1e-3
 # A source that is found has at least this signal-to-noise.
 LEAST = 1.0
 
@@ -26,7 +27,10 @@ def values_at(threshold: float, rarity: Callable[[Array], Array], n: int) -> Arr
     """Return the values at n places whose Gaussian values, `rarity`, are a threshold."""
     values = np.full(n, threshold)
     for _ in range(ROUNDS):
-        values *= (threshold / np.maximum(rarity(values), 0.1)).clip(0.5, 2.0)
+        ratio = (threshold / np.maximum(rarity(values), 0.1)).clip(0.5, 2.0)
+        values *= ratio
+        if (abs(ratio - 1.0) < EXACT).all():
+            break
     return values
 
 

@@ -167,7 +167,7 @@ class Null:
     def _model_sky(self) -> None:
         """Model the sky by its level, and what is structured apart from it."""
         structured = self.is_structured
-        smooth = _level(self._sky, ~structured, SMOOTHED * self.resolution / FWHM)
+        smooth = _level(self._sky, ~structured, SMOOTHED * self.resolution)
         structure = np.where(structured, self._sky - smooth, 0.0)
         means, light = self._means(smooth), self._model.forward(structure)
         first = self._linearise(means, self._means(smooth + structure), light)
@@ -359,17 +359,20 @@ def _curvature(noise: Array) -> Array:
 
 def _level(sky: Array, is_level: NDArray[np.bool_], width: float) -> Array:
     """Return the level of a sky by those of its pixels, without what is narrow in it."""
-    share = ndimage.gaussian_filter(is_level.astype(np.float64), width, mode="wrap")
-    smooth = ndimage.gaussian_filter(np.where(is_level, sky, 0.0), width, mode="wrap")
-    smooth = np.divide(smooth, share, out=np.zeros_like(smooth), where=share > FAR)
-    capped = np.where(is_level, np.minimum(sky, PEAKED * smooth), 0.0)
-    smooth = ndimage.gaussian_filter(capped, width, mode="wrap")
-    return np.divide(smooth, share, out=np.zeros_like(smooth), where=share > FAR)
+    share = _blurred(is_level.astype(np.float64), width)
+    capped = np.where(is_level, sky, 0.0)
+    for most in (PEAKED, None):
+        smooth = np.maximum(_blurred(capped, width), 0.0)
+        smooth = np.divide(smooth, share, out=np.zeros_like(smooth), where=share > FAR)
+        if most is not None:
+            capped = np.minimum(capped, most * smooth)
+    return smooth
 
 
-def _blurred(psf: Array, width: float) -> Array:
+def _blurred(values: Array, width: float) -> Array:
     """Return a periodic array convolved with a Gaussian of this full width at half maximum."""
-    root = math.pi * width / FWHM
-    v, u = (np.fft.fftfreq(n) for n in psf.shape)
-    transfer = np.exp(-2.0 * root**2 * (v[:, None] ** 2 + u**2))
-    return np.asarray(scipy.fft.ifft2(scipy.fft.fft2(psf) * transfer).real)
+    deviation = width / FWHM
+    v, u = np.fft.fftfreq(values.shape[0])[:, None], np.fft.rfftfreq(values.shape[1])
+    transfer = np.exp(-2.0 * (math.pi * deviation) ** 2 * (v**2 + u**2))
+    spectrum = scipy.fft.rfft2(values, workers=-1) * transfer
+    return np.asarray(scipy.fft.irfft2(spectrum, values.shape, workers=-1))
