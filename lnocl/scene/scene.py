@@ -423,6 +423,16 @@ class Scene:
         spectrum = scipy.fft.rfft2(psf) * self.rotations[j].undone()
         return np.asarray(scipy.fft.irfft2(spectrum, self.grid))
 
+    def point_response(self, j: int) -> Array:
+        """Return what image j shows of a point at the origin, on the sky's grid, shape (Ny, Nx).
+
+        Where images are turned `psf` has what their weights need besides; its squares mean nothing.
+        """
+        if not self.rotations:
+            return self.psf(j)
+        cutout = self._psfs_of_sky[j].at(0.0, 0.0)
+        return float(self.areas[j]) * cutout.on_grid(self.grid)
+
     def psf_cutout(self, j: int) -> Cutout:
         """Return the response of image j where it is not 0, the sky moved by the offset.
 

@@ -207,7 +207,7 @@ class Null:
         """Return ``sum_j <P_jx^power, x_j>`` at each place x of the grid."""
         scene, total = self.scene, 0.0
         for j, image in enumerate(images):
-            kernel = self.kernel(j, width) ** power
+            kernel = self.kernel(j, width) ** power if power > 1 else self._psf(j, width)
             seen = scene.rotations[j].adjoint(image) if scene.rotations else image
             spectrum = scipy.fft.rfft2(spread(seen, scene.oversample), workers=-1)
             total = total + np.conj(scipy.fft.rfft2(kernel, workers=-1)) * spectrum
@@ -215,6 +215,11 @@ class Null:
 
     def kernel(self, j: int, width: float) -> Array:
         """Return what image j shows of a source at the origin, as wide as given."""
+        response = self.scene.point_response(j)
+        return _blurred(response, width) if width else response
+
+    def _psf(self, j: int, width: float) -> Array:
+        """Return what the sky is convolved with for image j and a source as wide as given."""
         psf = self.scene.psf(j)
         return _blurred(psf, width) if width else psf
 

@@ -120,6 +120,35 @@ def test_stars_at_one_place_are_one():
     assert (found.is_tested == alone.is_tested).mean() > 0.95
 
 
+@pytest.mark.parametrize(("degrees", "scale"), [(0.0, 1.0), (20.0, 1.0), (44.0, 1.0), (20.0, 2.0)])
+def test_values_of_turned_images_scatter_as_noise_does(degrees, scale):
+    """With a PSF that has wings and is cut off, which shears make ring; and fluxes are right."""
+    n, angle = 64, np.deg2rad(degrees)
+    rows, columns = np.indices((25, 25)) - 12
+    radius = np.hypot(rows, columns)
+    psf = np.exp(-(radius**2) / 6) + 0.02 * np.exp(-(radius**2) / 50)
+    psf /= psf.sum()
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) / scale
+    middle = np.full(2, (n - 1) / 2)
+    maps = [np.hstack([turn, (middle - turn @ middle)[:, None]])]
+    place = np.array([38.0, 27.0])
+    values, fluxes = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        images = rng.poisson(50.0, (1, n, n)).astype(float)
+        observation = lnocl.Observation(images, psf, background=50.0, transforms=maps)
+        scene = Scene(observation, [])
+        score = Null(scene, np.zeros(scene.grid), np.zeros(0), False, NO_ERRORS).score()
+        values.append(np.where(score.is_tested, score.values, np.nan))
+        star = scene.with_star(place).star_image(0, 0)[:n, :n]
+        images[0] += rng.poisson(900.0 * star.clip(0))
+        found = lnocl.Observation(images, psf, background=50.0, transforms=maps)
+        null = Null(Scene(found, []), np.zeros(scene.grid), np.zeros(0), False, NO_ERRORS)
+        fluxes.append(ScoreMap(null, 0.0).fluxes[27, 38])
+    assert np.nanmean(np.square(values)) == pytest.approx(1.0, abs=0.08)
+    assert np.mean(fluxes) == pytest.approx(900.0, rel=0.06)
+
+
 def test_values_scatter_as_noise_does():
     """The variance of 40 fields, near stars and away from them; their mean is 0."""
     values = []
