@@ -168,7 +168,7 @@ class Null:
         """Model the sky by its level, and what is structured apart from it."""
         structured = self.is_structured
         smooth = _level(self._sky, ~structured, SMOOTHED * self.resolution)
-        structure = np.where(structured, self._sky - smooth, 0.0)
+        structure = np.where(structured, np.maximum(self._sky - smooth, 0.0), 0.0)
         means, light = self._means(smooth), self._model.forward(structure)
         first = self._linearise(means, self._means(smooth + structure), light)
         # The level as the counts have it: the estimate may hold less or more.
@@ -272,7 +272,7 @@ class Null:
         left = np.where(is_level, information - gain * shared, information)
         variance = np.where(is_level, information - spread_ * shared, information + shared)
         seen = self._adjoint(list(self._model.weights), 2, width)
-        is_tested = information > LEFT * raw
+        is_tested = (information > LEFT * raw) & (variance > 0)
         is_tested &= left * abs(left) > LEFT_BY_LEVEL * information * variance
         is_tested &= self._is_inside() & (seen > SEEN * seen.max())
         variance = np.where(is_tested, variance, np.inf)

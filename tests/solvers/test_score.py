@@ -184,6 +184,18 @@ def test_a_bright_source_is_no_part_of_what_lies_round_it():
     assert values[32, 32] > 50
 
 
+def test_an_estimate_below_the_level_takes_nothing_from_the_variance():
+    """Round a bright source it may be dark where the level of the counts is not."""
+    images = np.random.default_rng(0).poisson(26.0, (1, 64, 64)).astype(float)
+    images[0, 28:37, 28:37] += 3000 * PSFS[0] / PSFS[0].sum()
+    scene = Scene(lnocl.Observation(images, PSFS[:1], background=1.0), [])
+    sky = np.full((64, 64), 25.0)
+    sky[26:39, 26:39] = 0.0
+    null = Null(scene, sky, np.zeros(0), False, NO_ERRORS)
+    assert null.is_structured[32, 32]
+    assert null._linear.variances[0].min() * scene.scale > 10.0
+
+
 @pytest.mark.parametrize("alarms", [0.1, 1.0])
 def test_noise_exceeds_the_threshold_as_often_as_stated(alarms):
     """White Gaussian noise, smoothed: 400 fields, of which nothing is known but its spectrum."""
