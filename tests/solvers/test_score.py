@@ -189,8 +189,8 @@ def test_an_estimate_below_the_level_takes_nothing_from_the_variance():
     images = np.random.default_rng(0).poisson(26.0, (1, 64, 64)).astype(float)
     images[0, 28:37, 28:37] += 3000 * PSFS[0] / PSFS[0].sum()
     scene = Scene(lnocl.Observation(images, PSFS[:1], background=1.0), [])
-    sky = np.full((64, 64), 25.0)
-    sky[26:39, 26:39] = 0.0
+    sky = np.full((64, 64), 100.0)
+    sky[24:41, 24:41] = 0.0
     null = Null(scene, sky, np.zeros(0), False, NO_ERRORS)
     assert null.is_structured[32, 32]
     assert null._linear.variances[0].min() * scene.scale > 10.0
