@@ -1,5 +1,6 @@
 """False alarms in empty fields, over the number that is stated.
 
+    python benchmarks/false_alarms.py --formula
     python benchmarks/false_alarms.py [--kinds sky star jet crowded] [--errors 0 0.03]
         [--fields N] [--alarms A] [--first SEED] [--processes P] [--output TABLE.ecsv]
 
@@ -17,6 +18,9 @@ that is called a point, or one that is called extended where the jet, as seen, h
 hundredth of its peak. The columns are the stated number of alarms a field, that found and its
 standard error, the median of the PSF error that the runs have found, and the medians of the times
 of a run and of its map.
+
+With --formula the threshold is tried on noise alone, of a level that is known: 1000 fields of 64 x
+64 pixels with so many counts a pixel, with and without the correction for few counts.
 """
 
 import argparse
@@ -28,7 +32,7 @@ import warnings
 import numpy as np
 import scipy.fft
 from astropy.table import Table
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.special import j1
 
 N, AROUND, SKY, WIDTH, OBSTRUCTED = 96, 24, 20.0, 3.0, 0.2
@@ -117,6 +121,31 @@ def measure(job):
     return wrong, known, middle - begin, end - middle
 
 
+def try_formula(alarms, fields=1000, n=64):
+    """Print the alarms of noise of known levels."""
+    from lnocl.solvers.false_alarms import Rarity, threshold
+    from lnocl.solvers.score import _curvature
+    from lnocl.solvers.score_map import _near, _peaks
+
+    psf = np.fft.ifftshift(psf_at(n // 2, n // 2, n))
+    otf, squares = scipy.fft.rfft2(psf).conj(), (psf**2).sum()
+    power = abs(scipy.fft.fft2(psf)) ** 2
+    least = threshold(alarms, n * n, _curvature(power / power.sum()))
+    rarity, skewness = Rarity(psf), (psf**3).sum() / squares**1.5
+    for level in (1e4, 10.0, 1.0):
+        found = np.zeros(2)
+        for seed in range(fields):
+            counts = np.random.default_rng(seed).poisson(level, (n, n)) - level
+            values = scipy.fft.irfft2(scipy.fft.rfft2(counts) * otf, (n, n))
+            values /= np.sqrt(level * squares)
+            y, x = np.nonzero((values == maximum_filter(values, 3, mode="wrap")) & (values > 2))
+            peaks = _peaks(_near(values, y, x))[1]
+            gaussian = rarity(peaks, np.full(peaks.shape, skewness / np.sqrt(level)))
+            found += (gaussian > least).sum(), (peaks > least).sum()
+        corrected, plain = found / fields
+        print(f"{level:g} counts: {corrected:.3f} of {alarms:g}, {plain:.3f} without correction")
+
+
 def main():
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -127,7 +156,11 @@ def main():
     parser.add_argument("--first", type=int, default=7000)
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--output")
+    parser.add_argument("--formula", action="store_true")
     given = parser.parse_args()
+    if given.formula:
+        try_formula(given.alarms)
+        return
     rows = []
     with multiprocessing.get_context("spawn").Pool(given.processes) as pool:
         for error in given.errors:
