@@ -132,7 +132,7 @@ def try_formula(alarms, fields=1000, n=64):
     power = abs(scipy.fft.fft2(psf)) ** 2
     least = threshold(alarms, n * n, _curvature(power / power.sum()))
     rarity, skewness = Rarity(psf), (psf**3).sum() / squares**1.5
-    for level in (1e4, 10.0, 1.0):
+    for level in (1e4, 10.0, 1.0, 0.1, 0.01, 0.001):
         found = np.zeros(2)
         for seed in range(fields):
             counts = np.random.default_rng(seed).poisson(level, (n, n)) - level

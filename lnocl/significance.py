@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -74,8 +75,8 @@ class Significance:
         The maxima above the threshold, most significant first: ``x``, ``y`` and their errors,
         pixels of the images; ``flux`` and ``flux_error``, electrons; ``significance``; the nearest
         ``star``, counted from 1, or 0, and its ``distance``, pixels; and ``kind``. That is "point"
-        for a point source, and "extended" where the extended source could be it. The flux of that
-        is what a point has beside what the extended source is expected to have there.
+        for a point source, and "extended" where the extended source could be it. The flux of
+        the latter is that of a point there, beside an extended source as bright as it is round it.
 
     See Also
     --------
@@ -83,9 +84,9 @@ class Significance:
 
     Notes
     -----
-    A source is "extended" where there is light round it, between 0.85 and 1.65 resolutions, and the
-    least squares of a point on an extended source that goes on as it is round it
-    (`lnocl.solvers.point_test`) leave it less than three errors. All sources wider than a point are
+    A source is "extended" where two things hold. There is light round it, between 0.85 and 1.65
+    resolutions. And a point is fitted together with an extended source as bright as that light
+    (`lnocl.solvers.point_test`), and has less than three errors. All sources wider than a point are
     "extended". How often noise alone raises an alarm was measured: :doc:`/validation/detections`.
 
     Examples
@@ -160,13 +161,17 @@ class Significance:
         """
         check_completeness(completeness)
         found, outcome = self._map, self._outcome
-        fluxes = found.needed(self.threshold, completeness)
-        if not found.width:
-            fluxes = np.maximum(fluxes, POINT * self._in_source())
+        fluxes = np.maximum(found.needed(self._at_threshold, completeness), self._told_from_source)
         ny, nx = outcome.observation.sky_shape
         return np.asarray(fluxes[:ny, :nx])
 
-    def inject(self, n: int = 100, completeness: float = 0.5, seed: int = 0) -> QTable:
+    def inject(
+        self,
+        n: int = 100,
+        completeness: float = 0.5,
+        seed: int = 0,
+        progress: bool = False,
+    ) -> QTable:
         """Put sources into the images, and return which of them are found.
 
         They lie at random where sources are tested, with fluxes that `limit` says are found with
@@ -180,6 +185,8 @@ class Significance:
             The probability, between 0 and 1.
         seed : int, optional
             Zero or more.
+        progress : bool, optional
+            Show progress, as `lnocl.deconvolve` does.
 
         Returns
         -------
@@ -210,6 +217,7 @@ class Significance:
         from astropy.units import electron, pix
 
         from lnocl.runs.injections import APART, Injections, spread_places
+        from lnocl.runs.progress import Progress
 
         check_injections(n, seed)
         limits, observation = self.limit(completeness), self._outcome.observation
@@ -219,37 +227,41 @@ class Significance:
         q, rng = observation.oversample, np.random.default_rng(seed)
         injections = Injections(self._outcome, self.width * q)
         rows: list[tuple[float, float, float, bool]] = []
-        while len(rows) < n:
-            apart = APART * self.resolution * q
-            pixels = np.array(list(spread_places(allowed, n - len(rows), apart, rng)))
-            fluxes = limits[pixels[:, 0], pixels[:, 1]]
-            places = pixels[:, ::-1] + rng.uniform(-0.5, 0.5, pixels.shape)
-            places = (places - (q - 1) / 2.0) / q
-            outcome = injections.reconstruct(places, fluxes, rng)
-            found = significance(outcome, self.width, self.false_alarms).detections
-            if not self.width:
-                found = found[found["kind"] == POINT_SOURCE]
-            for (x, y), flux in zip(places.tolist(), fluxes.tolist(), strict=True):
-                away = np.hypot(found["x"].value - x, found["y"].value - y)
-                rows.append((x, y, flux, bool((away < NEAR * self.resolution).any())))
-        x, y, flux, is_found = zip(*rows, strict=True)
-        return QTable(
-            {
-                "x": np.array(x) * pix,
-                "y": np.array(y) * pix,
-                "flux": np.array(flux) * electron,
-                "found": np.array(is_found),
-            }
-        )
+        apart = APART * self.resolution * q
+        with Progress(n, "source", progress, "sources put in") as bar:
+            while len(rows) < n:
+                pixels = np.array(list(spread_places(allowed, n - len(rows), apart, rng)))
+                fluxes = limits[pixels[:, 0], pixels[:, 1]]
+                places = pixels[:, ::-1] + rng.uniform(-0.5, 0.5, pixels.shape)
+                places = (places - (q - 1) / 2.0) / q
+                is_found = self._finds(places, injections.reconstruct(places, fluxes, rng))
+                rows += zip(*places.T.tolist(), fluxes.tolist(), is_found, strict=True)
+                bar.update(len(places))
+        x, y, flux, found = map(np.array, zip(*rows, strict=True))
+        return QTable({"x": x * pix, "y": y * pix, "flux": flux * electron, "found": found})
 
-    def _in_source(self) -> Array:
-        """Return the flux of a point that the extended source may be, where there is any.
+    def _finds(self, places: Array, outcome: Outcome) -> list[bool]:
+        """Return whether there is a detection at each of some places of a reconstruction."""
+        found = significance(outcome, self.width, self.false_alarms).detections
+        if not self.width:
+            found = found[found["kind"] == POINT_SOURCE]
+        away = [np.hypot(found["x"].value - x, found["y"].value - y) for x, y in places]
+        return [bool((each < NEAR * self.resolution).any()) for each in away]
 
-        It is `lnocl.scene.texture`'s expectation of the brightest round a star, seen by a point.
+    @cached_property
+    def _at_threshold(self) -> Array:
+        """The values of tested places that are worth the threshold, in units of their noise."""
+        return self._map.values_at(self.threshold)
+
+    @cached_property
+    def _told_from_source(self) -> Array:
+        """The flux of a point that is told from the extended source, where there is any.
+
+        That varies by as much as `lnocl.scene.texture` expects of the brightest round a star.
         """
-        null = self._null
-        bright = null.brightest_structure()
-        return np.asarray(SHARE_NEAR * bright * self._map.unit)
+        if self._map.width:
+            return np.zeros(self._map.values.shape)
+        return np.asarray(POINT * SHARE_NEAR * self._null.brightest_structure() * self._map.unit)
 
     def contrast_curves(self, completeness: Sequence[float] = (0.5, 0.9, 0.95)) -> QTable:
         """Return the faintest sources that would be found, against the distance from each star.

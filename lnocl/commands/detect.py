@@ -94,10 +94,10 @@ def in_unit(table: QTable, frames: Frames) -> QTable:
 
     from lnocl.io import sky
 
-    table = table.copy()
+    table, unit = table.copy(), u.Unit(frames.unit, parse_strict="silent")  # files may have any
     for name in table.colnames:
         if name.startswith("flux"):
-            table[name] = table[name].value / frames.electrons * u.Unit(frames.unit)
+            table[name] = table[name].value / frames.electrons * unit
     if "x" in table.colnames and len(table) and sky.has_celestial(frames.header):
         places = np.array([table["x"].value, table["y"].value]).T
         table["ra"], table["dec"] = sky.to_sky(places, frames.header).T * u.deg

@@ -107,9 +107,11 @@ def _checked(found: Significance, arguments: argparse.Namespace) -> list[str]:
     from scipy.stats import binom
 
     lines = []
-    n = arguments.injections // 2
-    for share in PUT_IN if n else ():
-        sources = found.inject(n, share, arguments.seed)
+    numbers = (arguments.injections + 1) // 2, arguments.injections // 2
+    for n, share in zip(numbers, PUT_IN, strict=True):
+        if not n:
+            continue
+        sources = found.inject(n, share, arguments.seed, not arguments.quiet)
         k = int(sources["found"].sum())
         error = np.sqrt(share * (1.0 - share) / n)
         lines.append(

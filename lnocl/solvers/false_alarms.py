@@ -21,11 +21,15 @@ from scipy.interpolate import RegularGridInterpolator
 from lnocl.scene.arrays import Array
 
 # Values that are worth translating, at most and at least.
-LOWEST, HIGHEST = 1.0, 60.0
-# Skewness: less changes nothing, and there is no more of it in the table.
-GAUSSIAN, MOST = 1e-3, 10.0
+LOWEST, HIGHEST = 1.0, 1e4
+# The range of skewness in the table; what is less skewed counts as Gaussian.
+GAUSSIAN, MOST = 1e-3, 100.0
 # Tilts in the table, and the largest exponent in them.
-N_TILTS, LARGEST = 200, 300.0
+N_TILTS, LARGEST = 400, 300.0
+# A Gaussian value in the table is this or more.
+LEAST = 1e-3
+# Rarer probabilities are lost in rounding.
+RAREST = 1e-300
 # Of the profile what is above this share of its peak matters.
 FAINT = 1e-4
 
@@ -71,8 +75,8 @@ class Rarity:
         if skewness <= 0:
             self._table = None
             return
-        skews = np.geomspace(GAUSSIAN, MOST, 25)
-        values = np.geomspace(LOWEST, HIGHEST, 40)
+        skews = np.geomspace(GAUSSIAN, MOST, 26)
+        values = np.geomspace(LOWEST, HIGHEST, 80)
         rows = [
             _gaussian_values(weights, (skewness / each) ** 2, values) for each in skews.tolist()
         ]
@@ -95,8 +99,8 @@ def _gaussian_values(weights: Array, level: float, values: Array) -> Array:
     Each tilt t of the distribution has the value whose saddlepoint it is.
     """
     scaled = weights / math.sqrt(level * float((weights**2).sum()))
-    # From a tenth of the lowest value on; a value grows faster than its tilt.
-    tilts = np.geomspace(0.1 * LOWEST, HIGHEST, N_TILTS)
+    # A value grows faster than its tilt, far faster where counts are few.
+    tilts = np.geomspace(1e-3 * LOWEST, HIGHEST, N_TILTS)
     tilts = tilts[tilts * scaled.max() < LARGEST]
     grown = np.expm1(tilts[:, None] * scaled)
     cumulants = level * (grown - tilts[:, None] * scaled).sum(axis=1)
@@ -104,14 +108,17 @@ def _gaussian_values(weights: Array, level: float, values: Array) -> Array:
     curvatures = level * ((grown + 1.0) @ scaled**2)
     roots = np.sqrt(2.0 * (tilts * slopes - cumulants))
     found = roots + np.log(tilts * np.sqrt(curvatures) / roots) / roots
+    found = np.maximum(found, LEAST)  # near the mean it may be negative
     return np.exp(np.interp(np.log(values), np.log(slopes), np.log(found)))
 
 
 def of_student(values: Array, degrees: Array) -> Array:
     """Return the Gaussian values as rare as these of Student's distribution.
 
-    A million degrees of freedom and more are Gaussian.
+    What is rarer than a number holds has the logarithm of its density for its rarity.
     """
-    tail = scipy.special.stdtr(degrees, -np.abs(values))
-    rare = np.maximum(tail, np.finfo(float).tiny)
-    return np.asarray(np.sign(values) * -scipy.special.ndtri(rare))
+    sizes = np.abs(values)
+    tail = scipy.special.stdtr(degrees, -sizes)
+    far = np.sqrt(degrees * np.log1p(sizes**2 / degrees))
+    rare = np.maximum(tail, RAREST)
+    return np.asarray(np.sign(values) * np.where(tail > RAREST, -scipy.special.ndtri(rare), far))

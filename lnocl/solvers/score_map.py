@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,20 +77,18 @@ class ScoreMap:
         area = float(np.count_nonzero(self.score.is_tested))
         return threshold(alarms, area, self.score.curvature)
 
-    def needed(self, least: float, probability: float) -> Array:
-        """Return the fluxes, electrons, that exceed a threshold with this probability."""
+    def values_at(self, least: float) -> Array:
+        """Return the values of tested places whose Gaussian values are a threshold, shape (n,)."""
+        at = np.nonzero(self.score.is_tested)
+        return values_at(least, lambda each: self.rarity(each, at), len(at[0]))
+
+    def needed(self, values: Array, probability: float) -> Array:
+        """Return the fluxes, electrons, that exceed such values with this probability."""
         at = np.nonzero(self.score.is_tested)
         skewness = self.score.skewness[at] / self.noise.scatter[at]
-        values = self._values_at(least)
         found = np.full(self.values.shape, np.nan)
         found[at] = needed(values, skewness, probability) * self.errors[at]
         return found
-
-    @lru_cache(maxsize=1)  # noqa: B019 - the maps that it belongs to are much larger
-    def _values_at(self, least: float) -> Array:
-        """Return the values of tested places whose Gaussian values are a threshold."""
-        at = np.nonzero(self.score.is_tested)
-        return values_at(least, lambda each: self.rarity(each, at), len(at[0]))
 
     def light_round(self, place: Array, value: float, resolution: float) -> float:
         """Return the largest value in a ring round a place, less a point of a value that is there.
