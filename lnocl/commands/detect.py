@@ -94,7 +94,7 @@ def in_unit(table: QTable, frames: Frames) -> QTable:
 
     from lnocl.io import sky
 
-    table, unit = table.copy(), u.Unit(frames.unit, parse_strict="silent")  # files may have any
+    table, unit = table.copy(), u.Unit(frames.unit)
     for name in table.colnames:
         if name.startswith("flux"):
             table[name] = table[name].value / frames.electrons * unit

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
 from scipy import ndimage
 
-from lnocl.process import ignored_warnings
-from lnocl.runs.halos import settle_halos
-from lnocl.runs.outcome import Outcome, marginalise
-from lnocl.runs.run import Run
-from lnocl.runs.start import make_start
+from lnocl.runs.outcome import Outcome
+from lnocl.runs.repeated import Repeated
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
 from lnocl.scene.shifting import Cutout
@@ -26,9 +22,6 @@ TRIES = 50
 class Injections:
     """Reconstructions of the same images with more sources in them.
 
-    They are made by as many iterations, with the same penalty and PSFs, from the same start. All
-    use the buffers and programs of one run.
-
     Parameters
     ----------
     outcome : Outcome
@@ -39,9 +32,7 @@ class Injections:
 
     def __init__(self, outcome: Outcome, width: float) -> None:
         self._outcome, self._width = outcome, width
-        with ignored_warnings():  # those of the reconstruction are the same
-            self._start = settle_halos(make_start(outcome.setup, outcome.scene.penalty))
-        self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
+        self._repeated = Repeated(outcome)
 
     def reconstruct(self, places: Array, fluxes: Array, rng: np.random.Generator) -> Outcome:
         """Return the reconstruction with sources at these places, pixels of the images.
@@ -55,17 +46,8 @@ class Injections:
         rng : numpy.random.Generator
             Of the counts of the sources.
         """
-        observation, run = self._outcome.scene.observation, self._run
-        images = observation.images + self._counts(places, fluxes, rng)
-        run.repeat(self._start, observation.replace(images=images))
-        with np.errstate(over="ignore", invalid="ignore"):
-            for _ in run:
-                pass
-        scene = run.scene
-        sky, star_fluxes = run.engine.extended() * scene.unit, run.star_fluxes()
-        wanted = self._outcome.is_marginal, self._outcome.has_marginal_halos
-        sky, star_fluxes = marginalise(scene, sky, star_fluxes, *wanted)
-        return dataclasses.replace(self._outcome, scene=scene, sky=sky, star_fluxes=star_fluxes)
+        images = self._outcome.observation.images + self._counts(places, fluxes, rng)
+        return self._repeated.of(images)
 
     def _counts(self, places: Array, fluxes: Array, rng: np.random.Generator) -> Array:
         """Return counts of sources in each image, 0 in bad pixels."""

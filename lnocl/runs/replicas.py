@@ -8,17 +8,13 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from lnocl.process import ignored_warnings
-from lnocl.runs.halos import settle_halos
-from lnocl.runs.outcome import Outcome, marginalise
-from lnocl.runs.run import Run
-from lnocl.runs.start import make_start
+from lnocl.runs.outcome import Outcome
+from lnocl.runs.repeated import Repeated
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.texture import Texture, resolution
-from lnocl.solvers.light import Light
 
 
 class Sky(NamedTuple):
@@ -83,9 +79,7 @@ class Replicas:
             self._pixels = PsfPixels(
                 observation.psfs, observation.psf_scatter, observation.oversample
             )
-        with ignored_warnings():  # those of the reconstruction are the same
-            self._start = settle_halos(make_start(outcome.setup, outcome.scene.penalty))
-        self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
+        self._repeated = Repeated(outcome)
 
     def reconstruct(self, k: int) -> Replica:
         """Return replica k.
@@ -115,17 +109,10 @@ class Replicas:
 
     def _find(self, counts: Array) -> Sky:
         """Return the reconstruction of an observation with these counts."""
-        observation, run = self._outcome.scene.observation.replace(images=counts), self._run
-        run.repeat(self._start, observation)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for _ in run:
-                pass
-        scene, (ny, nx) = run.scene, observation.sky_shape
-        sky, star_fluxes = run.engine.extended() * scene.unit, run.star_fluxes()
-        wanted = self._outcome.is_marginal, self._outcome.has_marginal_halos
-        sky, star_fluxes = marginalise(scene, sky, star_fluxes, *wanted)
-        light = Light(scene, sky, star_fluxes).sky()
-        return Sky(sky[:ny, :nx], light, star_fluxes, run.star_positions())
+        found = self._repeated.of(counts)
+        ny, nx = found.observation.sky_shape
+        places = found.scene.stars.copy()  # the scene moves its stars for the next
+        return Sky(found.sky[:ny, :nx], found.light().sky(), found.star_fluxes, places)
 
     def _draw_psfs(self, seed: np.random.SeedSequence) -> Array:
         psfs = self._outcome.scene.observation.psfs

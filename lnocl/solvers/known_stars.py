@@ -198,7 +198,7 @@ def _distance(cutout: Cutout, place: Array) -> Array:
 
 
 def _wider(cutout: Cutout, width: float) -> Cutout:
-    """Return what a Gaussian source shares, given what a point does."""
+    """Return what a star shares with a Gaussian source, from what it shares with a point."""
     if not width:
         return cutout
     blurred = ndimage.gaussian_filter(cutout.values, width / FWHM, mode="constant")

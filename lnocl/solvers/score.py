@@ -45,7 +45,7 @@ from lnocl.solvers.score_noise import noise_of
 # Radius of the disc whose level is taken out, and full width of the Gaussian that smooths the
 # estimate for the model without sources, resolutions.
 DISC, SMOOTHED = 3.0, 12.0
-# What is brighter than so many times the smoothed estimate is no part of the level.
+# Pixels brighter than so many times the smoothed estimate are cut to that for the level.
 PEAKED = 3.0
 # Where less than this share of what lies round a place is level, it has none.
 FAR = 1e-3

@@ -245,6 +245,16 @@ def test_rare_sums_of_counts_are_as_rare_as_simulated():
         assert tail == pytest.approx((sums > value).mean(), rel=0.07)
 
 
+def test_bright_sources_keep_their_order():
+    """However rare they are, and however few the counts."""
+    values = np.geomspace(2.0, 5000.0, 40)
+    for skewness in (0.01, 1.0, 30.0):
+        found = Rarity(PSFS[0])(values, np.full(40, skewness))
+        assert (np.diff(found) > 0).all()
+        for degrees in (12.0, 1e5):
+            assert (np.diff(of_student(values, np.full(40, degrees))) > 0).all()
+
+
 def test_values_without_skewness_are_gaussian():
     values = np.array([-3.0, 0.5, 4.0])
     np.testing.assert_array_equal(Rarity(np.ones(4))(values, np.zeros(3)), values)

@@ -1,0 +1,52 @@
+"""A reconstruction that is made again of other counts."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from lnocl.process import ignored_warnings
+from lnocl.runs.halos import settle_halos
+from lnocl.runs.outcome import Outcome, marginalise
+from lnocl.runs.run import Run
+from lnocl.runs.start import make_start
+from lnocl.scene.arrays import Array
+
+
+class Repeated:
+    """Reconstructions like one, of images with the same background, PSFs and bad pixels.
+
+    They are made by as many iterations, with the same penalty, from the same start. All use the
+    buffers and programs of one run.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        The reconstruction.
+    """
+
+    def __init__(self, outcome: Outcome) -> None:
+        self._outcome = outcome
+        with ignored_warnings():  # those of the reconstruction are the same
+            self._start = settle_halos(make_start(outcome.setup, outcome.scene.penalty))
+        self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
+
+    def of(self, counts: Array) -> Outcome:
+        """Return the reconstruction of images with these counts, shape (p, ny, nx).
+
+        Raises
+        ------
+        NotFiniteError, DivergedError
+            Its objective is not finite, or rises.
+        """
+        run, outcome = self._run, self._outcome
+        run.repeat(self._start, outcome.scene.observation.replace(images=counts))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in run:
+                pass
+        scene = run.scene
+        sky, star_fluxes = run.engine.extended() * scene.unit, run.star_fluxes()
+        wanted = outcome.is_marginal, outcome.has_marginal_halos
+        sky, star_fluxes = marginalise(scene, sky, star_fluxes, *wanted)
+        return dataclasses.replace(outcome, scene=scene, sky=sky, star_fluxes=star_fluxes)
