@@ -36,7 +36,8 @@ from lnocl.runs.options import (
 from lnocl.runs.outcome import Mended, Outcome
 from lnocl.runs.progress import Progress
 from lnocl.runs.run import Run, most_bytes
-from lnocl.runs.start import Setup, make_start
+from lnocl.runs.start import Setup, Start, make_start
+from lnocl.runs.steady import run_steadily, told_prior
 from lnocl.runs.stopping import Rule, make_rule
 from lnocl.scene.noise_check import warn_of_noise
 from lnocl.scene.observation import Observation
@@ -375,6 +376,8 @@ def deconvolve(
         is_fit = not any(star.is_misfit for star in outcome.star_residuals())
     else:
         is_fit = is_auto and mended.fits
+    if stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):
+        is_fit = False  # what leaves them without an end leaves marginal fluxes without sense
     if is_fit or has_halos:
         what = "fitting stars and halos" if has_halos else "fitting star fluxes"
         with _quietly(), Progress(None, "", bool(progress), what, stays=False):
@@ -435,10 +438,24 @@ def reconstruct(
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes
         largest = partial(measure, start, int(n_iter))
         checkpointer = checkpoints(largest)
+        steady = None
+        if stop == "held-out" and len(penalties) > 1 and start.scene.n_stars:
+            steady = _run_steadily(start, penalties, int(n_iter), progress)
+            prior = told_prior(steady)
+            penalties = [replace(penalty, stars=prior) for penalty in penalties]
         with Progress(int(n_iter), "it", bool(progress), "iterations") as bar:
             if stop == "held-out":
                 held_out = HeldOutCounts(start, penalties, int(n_iter))
-                return _choose(held_out, callback, bar, checkpointer)
+                outcome = _choose(held_out, callback, bar, checkpointer)
+                if not (outcome.stop_reason == "held-out" and held_out.finds_no_end):
+                    return outcome
+                is_free = len(penalties) > 1
+                held_out.tell_of_no_end(is_free)
+                if not is_free:
+                    return outcome
+                del held_out
+                steady = steady or _run_steadily(start, penalties, int(n_iter), progress)
+                return replace(steady, curve=outcome.curve)
             run = Run(start, int(n_iter))
             del start, largest  # which hold arrays of the grid
             return run.outcome(_complete(run, make_rule(stop), callback, bar, checkpointer))
@@ -458,6 +475,13 @@ def _choose(
     outcome = held_out.choose(look, partial(checkpointer.save_held_out, held_out))
     checkpointer.save_held_out(held_out, outcome.stop_reason)
     return outcome
+
+
+def _run_steadily(
+    start: Start, penalties: Sequence[Penalty], n_iter: int, progress: bool
+) -> Outcome:
+    with Progress(n_iter, "it", bool(progress), "fitting the stars", stays=False) as bar:
+        return run_steadily(start, penalties, n_iter, bar.update)
 
 
 def _complete(

@@ -123,18 +123,34 @@ class HeldOutCounts:
             self._halves = None  # the device need not hold those of the next penalty too
             if is_better and len(self._curves) < len(self._penalties):
                 self._halves = self._begin()
-        best, first = cast(_Best, self._best), cast(_First, self._first)
-        if LEAST_RATIO * first.n_iter > self._n_iter:
-            warn(
-                f"held-out counts have chosen iteration {first.n_iter} of {self._n_iter}, too near "
-                f"the end to be sure: give `n_iter` {MORE * self._n_iter}, of which they do as "
-                "many as they need; if that is too near too, PSF or noise are wrong"
-            )
+        best = cast(_Best, self._best)
         penalty = self._penalties[best.trial]
         if len(self._penalties) > 1:
             note(f"`smoothing` chosen: {penalty.in_words()}, by held-out counts")
         outcome = self._outcome(best.chosen, penalty, best.objectives, "held-out")
         return replace(outcome, curve=np.concatenate(self._curves))
+
+    @property
+    def finds_no_end(self) -> bool:
+        """Whether the iteration chosen with the first penalty is too near the last to be sure."""
+        return LEAST_RATIO * cast(_First, self._first).n_iter > self._n_iter
+
+    def tell_of_no_end(self, is_remedied: bool) -> None:
+        """Warn of that, and say that a run with a weight is the result where it is."""
+        chosen = cast(_First, self._first).n_iter
+        words = (
+            f"held-out counts have chosen iteration {chosen} of {self._n_iter}, too near the end"
+        )
+        if is_remedied:
+            warn(
+                f"{words}: a weight is taken instead, until the objective settles; PSF or noise "
+                "may be wrong"
+            )
+            return
+        warn(
+            f"{words} to be sure: give `n_iter` {MORE * self._n_iter}, of which they do as many as "
+            "they need; if that is too near too, PSF or noise are wrong"
+        )
 
     def _is_ended(self, halves: Halves, look: Look, save: Callable[[], None]) -> bool:
         """Run halves as long as is needed; return whether `look` has ended them before."""

@@ -14,7 +14,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import PsfPixels
-from lnocl.scene.texture import Texture, resolution
+from lnocl.scene.texture import Texture, hidden_radii, resolution
 
 
 class Sky(NamedTuple):
@@ -69,7 +69,10 @@ class Replicas:
     def __init__(self, outcome: Outcome, seed: int) -> None:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
         self._texture = Texture(
-            outcome.sky / scene.unit, on_sky(scene.stars, scene.oversample), resolution(scene)
+            outcome.sky / scene.unit,
+            on_sky(scene.stars, scene.oversample),
+            resolution(scene),
+            hidden_radii(scene),
         )
         self._model = Model(scene)
         observation = scene.observation

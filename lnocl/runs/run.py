@@ -99,7 +99,8 @@ class Run:
         descent.check(self.engine.objectives().tolist())  # those from before a checkpoint
         while self.done < self.n_iter:
             begin, is_stage_new = self.done, not self._steps.has_iterated
-            for iteration in solve(self.engine, self._due - begin, self._steps):
+            prior = self.scene.star_prior
+            for iteration in solve(self.engine, self._due - begin, self._steps, prior):
                 self.done = begin + iteration
                 if fetched := self.engine.fetched_objectives():
                     descent.check(fetched)

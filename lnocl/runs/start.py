@@ -100,7 +100,13 @@ class Start:
 
     def penalised(self, penalty: Penalty) -> Start:
         """Return this start with another penalty."""
-        return replace(self, scene=self.scene.penalised(penalty))
+        scene = self.scene.penalised(penalty)
+        if self.scaling is None or scene.star_prior is self.scene.star_prior:
+            return replace(self, scene=scene)
+        from lnocl.solvers.scaling import heed
+
+        star_fluxes, scaling = heed(scene.star_prior, self.star_fluxes, self.scaling)
+        return replace(self, scene=scene, star_fluxes=star_fluxes, scaling=scaling)
 
     def of_half(self, observation: Observation) -> Start:
         """Return this start for half of the counts."""
@@ -184,6 +190,6 @@ def measure_steps(
     """Return star fluxes to continue from, and the scaling of steps for the solver that has one."""
     if setup.solver != "sgp":
         return star_fluxes, None
-    from lnocl.solvers.scaling import prepare
+    from lnocl.solvers.scaling import heed, prepare
 
-    return prepare(scene, model, extended, star_fluxes)
+    return heed(scene.star_prior, *prepare(scene, model, extended, star_fluxes))

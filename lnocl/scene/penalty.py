@@ -1,4 +1,4 @@
-"""The penalty on the extended source, beside the data term of the objective."""
+"""The penalty on the estimate, beside the data term of the objective."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from lnocl.errors import InputError
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import seen_psfs
 from lnocl.scene.observation import Observation
+from lnocl.scene.star_prior import StarPrior
 
 # A larger weight leaves nothing of the data term of images at unit mean.
 MAX_WEIGHT = 2.0**64
@@ -45,6 +46,8 @@ class Penalty:
     near_stars : ndarray of float64, of the shape of the extended source, or None
         Weight of the edge-preserving term beside `smoothing` in each pixel; a pair of pixels has
         the mean of both. None: 0 everywhere.
+    stars : StarPrior or None
+        Of star fluxes, electrons, which the objective leaves out.
 
     Raises
     ------
@@ -56,6 +59,7 @@ class Penalty:
     smoothing: float = 0.0
     edge: float | None = None
     near_stars: Array | None = field(default=None, compare=False)
+    stars: StarPrior | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         weights: dict[str, Any] = {"mu": self.mu, "smoothing": self.smoothing}

@@ -107,6 +107,8 @@ class Scene:
         with `smoothing` in it.
     edge : float
         delta of the edge-preserving term, scaled; 0 where there is no such term.
+    star_prior : StarPrior or None
+        That of the penalty, scaled.
     weights : ndarray of bool or float64, shape (p, ny, nx) of the images' grid, or None
         True where a pixel was observed, or its relative exposure where exposures are maps; None
         where all were observed alike.
@@ -216,6 +218,7 @@ class Scene:
         self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / self.mean_exposure)
         self.smoothing_map = self._smoothing_map(penalty)
         self.edge = self._edge(penalty) if self.is_smoothed else 0.0
+        self.star_prior = penalty.stars and penalty.stars.scaled(self.unit, self.scale)
 
     @property
     def is_smoothed(self) -> bool:

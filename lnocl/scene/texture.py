@@ -32,6 +32,8 @@ CORRELATED, SMOOTHED, SMOOTHED_NEAR = 0.4, 0.55, 0.28
 # What lies to the first distance of a star is its core, to the second it is near, to the third
 # round it; the core ends over a width.
 CORE, NEAR, ROUND, EDGE = 0.85, 1.1, 1.65, 0.4
+# The farthest that a star may be from the middle of its pixel.
+HALF_PIXEL = 0.5**0.5
 # What is expected under the core is at most so many times the mean round it.
 STEEPEST = 4.0
 
@@ -47,6 +49,8 @@ class Texture:
         Positions of stars there.
     resolution : float
         Full width at half maximum of what all images resolve together, pixels.
+    hidden : ndarray of float64, shape (n,), optional
+        Radii round the stars in which no image has observed a pixel: all of that is core.
 
     Attributes
     ----------
@@ -56,26 +60,32 @@ class Texture:
         Pixels over which the field is correlated (`lnocl.scene.smooth_field.SmoothField`).
     """
 
-    def __init__(self, extended: Array, stars: Array, resolution: float) -> None:
+    def __init__(
+        self, extended: Array, stars: Array, resolution: float, hidden: Array | None = None
+    ) -> None:
         self._resolution, self.width = resolution, CORRELATED * resolution
         self.mean = extended.copy()
         self.amplitude = SHARE * _smooth(extended, SMOOTHED * resolution)
         self._correlate = SmoothField(extended.shape, self.width).apply
         bright = _smooth(extended, SMOOTHED_NEAR * resolution)
-        for star in stars:
-            self._fill(star, extended, bright)
+        radii = np.zeros(len(stars)) if hidden is None else hidden
+        for star, radius in zip(stars, radii.tolist(), strict=True):
+            self._fill(star, radius, extended, bright)
 
-    def _fill(self, star: Array, extended: Array, bright: Array) -> None:
+    def _fill(self, star: Array, hidden: float, extended: Array, bright: Array) -> None:
         """Expect the light round a star's core to go on under it; near it vary by the brightest."""
         grid = extended.shape
-        half = min(int(np.ceil(ROUND * self._resolution)), (min(grid) - 1) // 2)
+        half = min(int(np.ceil(ROUND * self._resolution + hidden)), (min(grid) - 1) // 2)
         columns, rows = (round(at) + np.arange(-half, half + 1) for at in star)
-        distance = np.hypot((rows - star[1])[:, None], columns - star[0]) / self._resolution
+        distance = np.hypot((rows - star[1])[:, None], columns - star[0])
+        is_seen = distance >= hidden
+        distance = np.maximum(distance - hidden, 0.0) / self._resolution
         window = np.ix_(rows % grid[0], columns % grid[1])
         is_round = (distance > CORE) & (distance <= ROUND)
         if not is_round.any():  # the grid is smaller than this
             return
-        least = np.where(distance <= NEAR, SHARE_NEAR * bright[window][distance <= ROUND].max(), 0)
+        brightest = bright[window][is_seen & (distance <= ROUND)].max()
+        least = np.where(distance <= NEAR, SHARE_NEAR * brightest, 0)
         self.amplitude[window] = np.maximum(self.amplitude[window], least)
         share = core(distance)
         expected = _continued(extended[window], distance, is_round)
@@ -128,3 +138,27 @@ def _continued(values: Array, distance: Array, is_round: NDArray[np.bool_]) -> A
 
 def _smooth(sky: Array, width: float) -> Array:
     return np.asarray(gaussian_filter(sky, width, mode="wrap"), np.float64)
+
+
+def hidden_radii(scene: Scene) -> Array:
+    """Return the radius round each star in which no image has observed a pixel, pixels of the sky.
+
+    It is 0 for a star that an image has observed, or that lies outside the images.
+    """
+    return np.array([_hidden_radius(scene, star) for star in scene.stars])
+
+
+def _hidden_radius(scene: Scene, star: Array) -> float:
+    observation, radii = scene.observation, []
+    shape = np.array(observation.shape)
+    for j, mask in enumerate(observation.mask):
+        at = observation.places(j, star)[::-1]
+        nearest = np.round(at).astype(int)
+        if (nearest < 0).any() or (nearest >= shape).any():
+            continue
+        if not mask[tuple(nearest)]:
+            return 0.0
+        good = np.argwhere(~mask)
+        away = float(np.hypot(*(good - at).T).min()) if len(good) else 0.0
+        radii.append(max(away - HALF_PIXEL, 0.0) * scene.oversample * observation.scales[j])
+    return min(radii, default=0.0)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Literal
 
+from lnocl.scene.star_prior import StarPrior
 from lnocl.solvers import sgm, sgp
 from lnocl.solvers.engine import Engine
 
-Solver = Callable[[Engine, int, sgp.Steps], Iterator[int]]
+Solver = Callable[[Engine, int, sgp.Steps, StarPrior | None], Iterator[int]]
 SolverName = Literal["sgp", "sgm"]
 SOLVERS: dict[SolverName, Solver] = {"sgm": sgm.sgm, "sgp": sgp.sgp}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from lnocl.scene.arrays import Array
 
 if TYPE_CHECKING:
+    from lnocl.scene.scene import Scene
     from lnocl.solvers.scaling import Scaling
 
 # Arrays by name; `objectives` grows along its first axis.
@@ -25,6 +26,8 @@ class Engine(Protocol):
     ----------
     name : str
         The device, its platform and driver.
+    scene : Scene
+        What is modelled.
     rounding : float
         A rise of the objective, as a share of it, that may be rounding: in single precision, where
         a step promises less than that long before the estimate is at the minimum.
@@ -33,6 +36,7 @@ class Engine(Protocol):
     """
 
     name: str
+    scene: Scene
     rounding: float
     scaling: Scaling | None
 

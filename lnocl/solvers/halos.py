@@ -27,7 +27,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model, model_images
 from lnocl.scene.scene import MIN_MODEL, Scene
-from lnocl.scene.texture import Texture, resolution
+from lnocl.scene.texture import Texture, hidden_radii, resolution
 from lnocl.solvers.fluxes import variances
 from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
 
@@ -76,7 +76,7 @@ class _Joint:
         self.first, extended = len(fitted) - scene.n_halos, sky / scene.unit
         expected = extended if is_lit is None else np.where(is_lit, extended, 0.0)
         stars = on_sky(scene.stars, scene.oversample)
-        texture = Texture(expected, stars, resolution(scene))
+        texture = Texture(expected, stars, resolution(scene), hidden_radii(scene))
         if is_lit is not None:  # nor are stars taken to be on light that is not significant
             texture.amplitude[~is_lit] = 0.0
         source = SourceError(model.forward, model.adjoint, texture.amplitude, texture.width)

@@ -118,6 +118,37 @@ class SourceError:
         return self._smooth.apply(self._amplitude * self._adjoint(images))
 
 
+class LevelError:
+    """The error of a level of the extended source, the same in all pixels, as a field of one value.
+
+    Parameters
+    ----------
+    deviation : float
+        The standard deviation of the error, in the unit of the sky.
+    areas : ndarray of float64, shape (p,)
+        The light of a sky of 1 in a pixel of each image.
+    shape : tuple of int
+        Shape (Ny, Nx) of the images.
+
+    Attributes
+    ----------
+    at : ndarray of float64, shape (1,)
+        The current value, which is 0.
+    """
+
+    def __init__(self, deviation: float, areas: Array, shape: tuple[int, int]) -> None:
+        self._levels, self._shape, self.at = deviation * areas, shape, np.zeros(1)
+
+    def forward(self, x: Array) -> Array:
+        """Return the changes of the images, shape (p, Ny, Nx)."""
+        levels = x[0] * self._levels[:, None, None]
+        return np.broadcast_to(levels, (len(levels), *self._shape))
+
+    def adjoint(self, images: Sequence[Array]) -> Array:
+        """Return the transpose of `forward` applied to images, shape (1,)."""
+        return np.array([sum(a * y.sum() for a, y in zip(self._levels, images, strict=True))])
+
+
 class LeastSquares:
     """The joint least squares of a few parameters and of random fields.
 

@@ -56,7 +56,7 @@ def marginal(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array
         is_free = np.isfinite(variances(near.fit.information)[at]) & (star_fluxes[star] > 0)
         if not is_free.any():
             continue
-        change, (x,) = near.fit.solve(np.zeros(near.n_held))
+        change, (x, _) = near.fit.solve(np.zeros(near.n_held))
         moved = np.maximum(star_fluxes[star] + change[at] * scene.unit, 0.0)
         fluxes[star] = np.where(is_free, moved, star_fluxes[star])
         there = near.places(scene)
@@ -67,7 +67,7 @@ def marginal(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array
 
 
 def _core_of(near: NearStar, scene: Scene, star: int) -> Array:
-    """Return the core of a star in its window, 1 in its middle."""
+    """Return the core of a star in its window, 1 in its middle and where nothing is observed."""
     window, (x, y) = (
         near.window.finer(scene.oversample),
         on_sky(scene.stars, scene.oversample)[star],
@@ -76,7 +76,8 @@ def _core_of(near: NearStar, scene: Scene, star: int) -> Array:
         first + np.arange(k) - at
         for first, k, at in zip((window.y, window.x), window.shape, (y, x), strict=True)
     )
-    return core(np.hypot(rows[:, None], columns) / near.resolution)
+    beyond = np.maximum(np.hypot(rows[:, None], columns) - near.hidden, 0.0)
+    return core(beyond / near.resolution)
 
 
 def _at_most(light: Array, total: float) -> Array:

@@ -21,8 +21,8 @@ from lnocl.scene.forward_model import LocalRotation, add_to_window, sampled, spr
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import along_sky
-from lnocl.scene.texture import Texture, resolution
-from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
+from lnocl.scene.texture import Texture, hidden_radii, resolution
+from lnocl.solvers.least_squares import Field, LeastSquares, LevelError, LinearImage, SourceError
 
 # Side of the window round a star, and how far off other stars may be that are not taken as known,
 # resolutions.
@@ -75,11 +75,13 @@ class Surroundings:
     ----------
     width : float
         The resolution, pixels of the sky.
+    hidden : ndarray of float64, shape (n,)
+        Radii round the stars in which no image has observed a pixel, pixels of the sky.
     """
 
     def __init__(self, scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -> None:
         self.scene, self.sky, self.star_fluxes, self.moves = scene, sky, star_fluxes, moves
-        self.width = resolution(scene)
+        self.width, self.hidden = resolution(scene), hidden_radii(scene)
         self.psfs = movable_psfs(scene.scaled_psfs(), scene.observation, scene.image_grid)
 
 
@@ -105,6 +107,8 @@ class NearStar:
         Stars that are fitted: this, which is the first, and those near it.
     resolution : float
         What all images resolve together, pixels of the sky.
+    hidden : float
+        The radius round the star in which no image has observed a pixel, pixels of the sky.
     source : SourceError
         The extended source less its expected mean, in the window.
     expected : ndarray of float64
@@ -113,13 +117,16 @@ class NearStar:
 
     def __init__(self, around: Surroundings, star: int, finished: float) -> None:
         scene, sky, width = around.scene, around.sky, around.width
-        self.window = _window_round(scene, scene.stars[star], width)
+        self.hidden = float(around.hidden[star])
+        self.window = _window_round(scene, scene.stars[star], WINDOW * width + 2.0 * self.hidden)
         held = np.append(star, _neighbours(scene, star, width))
-        there, texture = _texture_in(self.window, scene, sky, width)
+        there, texture = _texture_in(self.window, around)
         self.source = self._source_error(around, texture.amplitude[there], texture.width)
         self.held, self.n_held, self.resolution = held, len(held), width
         self._finished, self._moves = finished, around.moves
         self.expected = texture.mean[there] - sky[self.places(scene)] / scene.unit
+        level = float(texture.mean[there].mean())
+        self._level = LevelError(level, scene.gains * scene.areas, self.window.shape)
         beyond = self.source.images_of(self.expected)
         self._images = [self._linearise(around, j, held, each) for j, each in enumerate(beyond)]
 
@@ -131,7 +138,8 @@ class NearStar:
     def fit(self) -> LeastSquares:
         """The least squares: the unknowns are all fluxes, perhaps all x, and all y."""
         k = (3 if self._moves else 1) * self.n_held
-        return LeastSquares(self._images, [self.source], np.zeros(k), N_STEPS, self._finished)
+        fields: list[Field] = [self.source, self._level]
+        return LeastSquares(self._images, fields, np.zeros(k), N_STEPS, self._finished)
 
     def _source_error(self, around: Surroundings, amplitude: Array, width: float) -> SourceError:
         """Return the error of the extended source in the window, and its change there."""
@@ -226,25 +234,24 @@ class NearStar:
         return LinearImage(laid.reshape(k, left.size), unknowns, left, precision)
 
 
-def _texture_in(
-    window: Window, scene: Scene, sky: Array, width: float
-) -> tuple[tuple[slice, slice], Texture]:
+def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slice], Texture]:
     """Return the texture round a window of the images, and where the window lies in it."""
+    scene, sky, width = around.scene, around.sky, around.width
     window = window.finer(scene.oversample)
     margin = int(np.ceil(MARGIN * width))
     (y, height), (x, breadth) = (
         (first - margin, k + 2 * margin) if k + 2 * margin < n else (first, n)
         for first, k, n in zip((window.y, window.x), window.shape, scene.grid, strict=True)
     )
-    around = Window(y, x, (height, breadth))
+    whole = Window(y, x, (height, breadth))
     stars = (on_sky(scene.stars, scene.oversample) - (x, y)) % scene.grid[::-1]
     inside = (stars < (breadth, height)).all(axis=1)
     there = tuple(
         slice(first - start, first - start + k)
         for first, start, k in zip((window.y, window.x), (y, x), window.shape, strict=True)
     )
-    extended = sky[around.of(scene.grid)] / scene.unit
-    return (there[0], there[1]), Texture(extended, stars[inside], width)
+    extended = sky[whole.of(scene.grid)] / scene.unit
+    return (there[0], there[1]), Texture(extended, stars[inside], width, around.hidden[inside])
 
 
 def _observed(scene: Scene, j: int, there: Window) -> tuple[Array, Array, Array]:
@@ -288,9 +295,12 @@ def _padded(image: Array, shape: tuple[int, int]) -> Array:
     return laid
 
 
-def _window_round(scene: Scene, star: Array, resolution: float) -> Window:
-    """Return a window round a star: the whole axis of the grid where it is not twice as long."""
-    length = int(np.ceil(WINDOW * resolution / scene.oversample))
+def _window_round(scene: Scene, star: Array, side: float) -> Window:
+    """Return a window of so many pixels of the sky round a star.
+
+    It is the whole axis of the grid where that is not twice as long.
+    """
+    length = int(np.ceil(side / scene.oversample))
     size = scipy.fft.next_fast_len(length, real=True)
     height, width = (size if 2 * size <= n else n for n in scene.image_grid)
     x, y = np.round(star).astype(int).tolist()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 
@@ -16,6 +16,7 @@ from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.forward_model import Box, Model, largest_window
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout
+from lnocl.scene.star_prior import StarPrior
 from lnocl.solvers.fluxes import bounded_step, fit_fluxes, movable_weights
 
 # Share of the light of stars and background that shifts the scaling. With all of it the
@@ -104,6 +105,13 @@ class Scaling:
             np.append(self.cross_windows, np.tile(NOTHING, (n, 1)), axis=0),
         )
 
+    def with_prior(self, prior: StarPrior) -> Scaling:
+        """Return this scaling with the information that a prior of the fluxes adds."""
+        information = self.star_information
+        added = np.zeros_like(information.band)
+        added[0, information.places] = prior.precision
+        return replace(self, star_information=information + BandMatrix(added, information.places))
+
     def is_usable(self) -> bool:
         """Return whether the star information can be inverted, as that of any scene can."""
         diagonal, places = self.star_information.diagonal, self.star_information.places
@@ -159,6 +167,17 @@ def prepare(
     np.maximum(shift, 0.0, out=shift)
     shift *= SHIFT
     return star_fluxes, Scaling(shift, information, values, windows)
+
+
+def heed(prior: StarPrior | None, star_fluxes: Array, scaling: Scaling) -> tuple[Array, Scaling]:
+    """Return star fluxes and the scaling of steps, of `prepare`, where a prior of them holds."""
+    if prior is None:
+        return star_fluxes, scaling
+    scaling = scaling.with_prior(prior)
+    nothing = np.zeros_like(star_fluxes)
+    return star_fluxes + scaling.star_step(
+        star_fluxes, prior.gradient(star_fluxes), nothing
+    ), scaling
 
 
 def _back_projections(model: Model) -> tuple[Array, Array]:

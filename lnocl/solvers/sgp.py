@@ -12,6 +12,7 @@ from lnocl.errors import refuse_not_finite
 from lnocl.solvers.engine import Engine
 
 if TYPE_CHECKING:
+    from lnocl.scene.star_prior import StarPrior
     from lnocl.solvers.scaling import Scaling
 
 # Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002: the line search shortens a step by
@@ -45,7 +46,9 @@ class Steps:
     has_iterated: bool = False
 
 
-def sgp(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int]:
+def sgp(
+    engine: Engine, n_iter: int, steps: Steps | None = None, prior: StarPrior | None = None
+) -> Iterator[int]:
     """Iterate the scaled gradient projection method, yielding the number of iterations done.
 
     ``f <- f + share d``, ``d = P(f - alpha D grad J) - f``, P the projection on ``f >= 0`` and D
@@ -54,7 +57,8 @@ def sgp(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int
     IMA J. Numer. Anal. 8, 141), their second, in the metric of D. The star fluxes follow the
     extended source, by `Scaling.star_step`. The share is 1, shortened until the objective falls
     enough, or rises by no more than rounding. The method ends early where no step lowers the
-    objective any more.
+    objective any more. With a prior of star fluxes its term is part of the objective here, not of
+    that which the engine records.
     """
     steps = steps or Steps()
     engine.ratio()
@@ -66,7 +70,7 @@ def sgp(engine: Engine, n_iter: int, steps: Steps | None = None) -> Iterator[int
             steps.lengths = [*steps.lengths[1:], length]
             steps.alpha = min(steps.lengths)
         steps.has_iterated = True
-        if not _descend(engine, steps.alpha):
+        if not _descend(engine, steps.alpha, prior):
             return
         yield iteration
 
@@ -77,9 +81,12 @@ def _barzilai_borwein(change_step: float, change_change: float, alpha: float) ->
     return float(np.clip(step, *ALPHA_BOUNDS))
 
 
-def _descend(engine: Engine, alpha: float) -> bool:
+def _descend(engine: Engine, alpha: float, prior: StarPrior | None) -> bool:
     """Step along the projected gradient as far as the objective falls; return whether it fell."""
     objective, fluxes, gradient = engine.objective(), engine.star_fluxes(), engine.star_gradient()
+    before = 0.0
+    if prior is not None:
+        before, gradient = prior.value(fluxes), gradient + prior.gradient(fluxes)
     slope, coupling = engine.step(alpha, 1.0)
     refuse_not_finite(objective, slope, *gradient, *coupling)
     scaling = cast("Scaling", engine.scaling)
@@ -93,6 +100,8 @@ def _descend(engine: Engine, alpha: float) -> bool:
         engine.ratio()
         engine.correct()  # perhaps in vain, but the device need not wait
         trial_objective = engine.objective()
+        if prior is not None:
+            trial_objective += prior.value(fluxes + share * change) - before
         if trial_objective <= objective + SUFFICIENT * share * slope + rounding:
             return True
         engine.forget_objective()

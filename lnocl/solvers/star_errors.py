@@ -28,7 +28,9 @@ from lnocl.solvers.near_star import NearStar, Surroundings
 FINISHED = 1e-8
 
 
-def standard_errors(scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -> Array:
+def standard_errors(
+    scene: Scene, sky: Array, star_fluxes: Array, moves: bool, finished: float = FINISHED
+) -> Array:
     """Return the standard errors of stars, with the extended source marginalised.
 
     Parameters
@@ -41,6 +43,8 @@ def standard_errors(scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -
         Electrons.
     moves : bool
         Whether positions were fitted too; else they are taken as known.
+    finished : float
+        The share of the gradient at which conjugate gradients end.
 
     Returns
     -------
@@ -52,7 +56,7 @@ def standard_errors(scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -
     errors = np.full((scene.n_stars, 3), np.nan)
     n_epochs, k = scene.observation.n_epochs, 3 if moves else 1
     for first in range(0, scene.n_stars, n_epochs):  # which lies there in all epochs
-        near = NearStar(around, first, FINISHED)
+        near = NearStar(around, first, finished)
         there = range(first, first + n_epochs)
         errors[first : first + n_epochs, :k] = _errors_of(near, np.isin(near.held, there))
     errors[:, 0] *= scene.unit

@@ -1,0 +1,68 @@
+"""A run with one weight to where it settles, from which star fluxes are told before others choose.
+
+Held-out counts share what a scene leaves open. Pixels under a star may take over its light at
+almost no price, and so bright an extended source has a small relative error. The edge-preserving
+term holds that light where it belongs, whatever the number of iterations
+(:doc:`/validation/sgp`). So a run with a weight is the first; the star fluxes that it ends with,
+with the errors that the least squares of `lnocl.solvers.near_star` give them, are the prior of the
+runs from which held-out counts choose. Where these find no end, it is the answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lnocl.process import ignored_notes, ignored_warnings
+from lnocl.runs.options import WRONG_PSFS
+from lnocl.runs.outcome import Outcome
+from lnocl.runs.run import Run
+from lnocl.runs.start import Start
+from lnocl.runs.stopping import Change
+from lnocl.scene.penalty import Penalty
+from lnocl.scene.star_prior import StarPrior
+
+# It ends where the objective falls by less than this share of itself in an iteration.
+SETTLED = 1e-5
+# The share of the gradient at which the conjugate gradients of errors end.
+FINISHED = 1e-2
+
+
+def run_steadily(
+    start: Start, penalties: Sequence[Penalty], n_iter: int, tick: Callable[[], object] = int
+) -> Outcome:
+    """Return the outcome with `WRONG_PSFS` times the least weight of these above none.
+
+    Parameters
+    ----------
+    start : Start
+        Where it starts.
+    penalties : sequence of Penalty
+        From which held-out counts choose: the first without `smoothing`.
+    n_iter : int
+        Iterations at most.
+    tick : callable, optional
+        Is called after each iteration.
+    """
+    penalty = replace(penalties[1], smoothing=WRONG_PSFS * penalties[1].smoothing)
+    rule = Change(SETTLED)
+    with ignored_notes(), ignored_warnings():  # the runs that follow say the same
+        run = Run(start.penalised(penalty), n_iter)
+        for _ in run:
+            tick()
+            if rule.met(run):
+                return run.outcome(rule.reason)
+        return run.outcome("n_iter" if run.done == n_iter else "converged")
+
+
+def told_prior(outcome: Outcome) -> StarPrior:
+    """Return the prior of star fluxes that an outcome tells; nothing of halos."""
+    from lnocl.solvers.star_errors import standard_errors  # which loads scipy
+
+    scene, fluxes = outcome.scene, outcome.star_fluxes
+    errors = np.full(len(fluxes), np.nan)
+    found = standard_errors(scene, outcome.sky, fluxes, outcome.moves, FINISHED)
+    errors[: scene.n_stars] = found[:, 0]
+    return StarPrior.of(fluxes, errors)
