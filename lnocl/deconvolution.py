@@ -221,7 +221,7 @@ def deconvolve(
         - The noise of an image is not that of Poisson counts.
         - The background is above the darker half of an image.
         - The extended source to start from was far brighter than the images.
-        - Held-out counts choose an iteration too near `n_iter`.
+        - Held-out counts choose an iteration too near `n_iter`; a run with a weight is the result.
         - The objective rises or is not finite.
         - A later checkpoint cannot be written.
         - Compiled kernels cannot be stored, or they or the tunings are damaged.
@@ -245,6 +245,13 @@ def deconvolve(
     continue with larger and larger weights, each from a third of the chosen iteration, until the
     error rises. That takes six times as long in the median, and up to eleven
     (:doc:`/validation/sgp`).
+
+    **Stars have a prior** in the halves where smoothing is "auto". What lies under a star the
+    extended source may take over at almost no price, and the more light it has, the smaller is its
+    relative error. So a run with a fixed weight comes first, until the objective settles. The star
+    fluxes that it tells, and their errors by `lnocl.solvers.star_errors`, are a Gaussian prior
+    (`lnocl.runs.steady`). Where held-out counts choose an iteration of more than four fifths of
+    `n_iter`, that run is the result, and a warning says so.
 
     **Refined PSFs** have parameters of these kinds (`lnocl.scene.psf_families`,
     `lnocl.solvers.psf_fit`):

@@ -12,6 +12,7 @@ from lnocl.runs.outcome import Outcome, marginalise
 from lnocl.runs.run import Run
 from lnocl.runs.start import make_start
 from lnocl.scene.arrays import Array
+from lnocl.scene.star_prior import StarPrior
 
 
 class Repeated:
@@ -32,8 +33,10 @@ class Repeated:
             self._start = settle_halos(make_start(outcome.setup, outcome.scene.penalty))
         self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
 
-    def of(self, counts: Array) -> Outcome:
+    def of(self, counts: Array, prior: StarPrior | None = None) -> Outcome:
         """Return the reconstruction of images with these counts, shape (p, ny, nx).
+
+        `prior` takes the place of that of the reconstruction, where there is one.
 
         Raises
         ------
@@ -41,6 +44,8 @@ class Repeated:
             Its objective is not finite, or rises.
         """
         run, outcome = self._run, self._outcome
+        if prior is not None:
+            run.scene.star_prior = prior.scaled(run.scene.unit, run.scene.scale)
         run.repeat(self._start, outcome.scene.observation.replace(images=counts))
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in run:

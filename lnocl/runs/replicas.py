@@ -14,6 +14,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import PsfPixels
+from lnocl.scene.star_prior import StarPrior
 from lnocl.scene.texture import Texture, hidden_radii, resolution
 
 
@@ -68,11 +69,12 @@ class Replicas:
 
     def __init__(self, outcome: Outcome, seed: int) -> None:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
+        width = resolution(scene)
         self._texture = Texture(
             outcome.sky / scene.unit,
             on_sky(scene.stars, scene.oversample),
-            resolution(scene),
-            hidden_radii(scene),
+            width,
+            hidden_radii(scene, width),
         )
         self._model = Model(scene)
         observation = scene.observation
@@ -93,8 +95,8 @@ class Replicas:
             Its objective is not finite, or rises.
         """
         scene = self._outcome.scene
-        of_sky, of_psfs, *of_images = np.random.SeedSequence([self._seed, k]).spawn(
-            scene.n_images + 2
+        of_sky, of_psfs, *of_images, of_prior = np.random.SeedSequence([self._seed, k]).spawn(
+            scene.n_images + 3
         )
         sky = self._texture.draw(np.random.default_rng(of_sky))
         ny, nx = scene.observation.sky_shape
@@ -102,17 +104,19 @@ class Replicas:
         drawn = Sky(extended, extended, self._outcome.star_fluxes, scene.stars)
         models = list(self._means(self._model, sky))
         counts = self._draw(models, of_images)
-        found = self._find(counts)
+        prior, star_fluxes = scene.penalty.stars, self._outcome.star_fluxes
+        prior = prior and prior.drawn(star_fluxes, np.random.default_rng(of_prior))
+        found = self._find(counts, prior)
         if self._pixels is None:
             return Replica(drawn, found, None)
         others = self._means(Model(scene.seen_through(self._draw_psfs(of_psfs))), sky)
         # The same noise: counts that are drawn of almost the same mean may be quite others.
         changed = [n + b - a for n, a, b in zip(counts, models, others, strict=True)]
-        return Replica(drawn, found, self._find(np.maximum(changed, 0.0)))
+        return Replica(drawn, found, self._find(np.maximum(changed, 0.0), prior))
 
-    def _find(self, counts: Array) -> Sky:
-        """Return the reconstruction of an observation with these counts."""
-        found = self._repeated.of(counts)
+    def _find(self, counts: Array, prior: StarPrior | None) -> Sky:
+        """Return the reconstruction of an observation with these counts and this prior."""
+        found = self._repeated.of(counts, prior)
         ny, nx = found.observation.sky_shape
         places = found.scene.stars.copy()  # the scene moves its stars for the next
         return Sky(found.sky[:ny, :nx], found.light().sky(), found.star_fluxes, places)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,6 +41,14 @@ class StarPrior:
         the same, scaled.
         """
         return StarPrior(self.fluxes / unit, self.precision * unit**2 / scale)
+
+    def drawn(self, fluxes: Array, rng: np.random.Generator) -> StarPrior:
+        """Return a prior like this one that was told of stars of these fluxes."""
+        is_known = self.precision > 0
+        errors = np.zeros_like(self.precision)
+        errors[is_known] = self.precision[is_known] ** -0.5
+        drawn = fluxes + errors * rng.standard_normal(len(fluxes))
+        return replace(self, fluxes=np.where(is_known, drawn, 0.0))
 
     def value(self, fluxes: Array) -> float:
         """Return the term."""

@@ -86,10 +86,15 @@ class Texture:
             return
         brightest = bright[window][is_seen & (distance <= ROUND)].max()
         least = np.where(distance <= NEAR, SHARE_NEAR * brightest, 0)
-        self.amplitude[window] = np.maximum(self.amplitude[window], least)
         share = core(distance)
-        expected = _continued(extended[window], distance, is_round)
+        amplitude = self.amplitude[window]
+        if hidden:  # too wide to follow a slope across, and what an estimate holds there is any
+            expected = np.full(distance.shape, extended[window][is_round].mean())
+            amplitude += share * (SHARE * expected - amplitude)
+        else:
+            expected = _continued(extended[window], distance, is_round)
         self.mean[window] += share * (expected - self.mean[window])
+        self.amplitude[window] = np.maximum(amplitude, least)
 
     def apply(self, x: Array) -> Array:
         """Return the field ``a C^(1/2) x`` of white noise x."""
@@ -140,12 +145,14 @@ def _smooth(sky: Array, width: float) -> Array:
     return np.asarray(gaussian_filter(sky, width, mode="wrap"), np.float64)
 
 
-def hidden_radii(scene: Scene) -> Array:
+def hidden_radii(scene: Scene, resolution: float) -> Array:
     """Return the radius round each star in which no image has observed a pixel, pixels of the sky.
 
-    It is 0 for a star that an image has observed, or that lies outside the images.
+    It is 0 for a star that an image has observed, for one that lies outside the images, and where
+    the core of the star, which a resolution has, is wider.
     """
-    return np.array([_hidden_radius(scene, star) for star in scene.stars])
+    radii = np.array([_hidden_radius(scene, star) for star in scene.stars])
+    return np.where(radii > CORE * resolution, radii, 0.0)
 
 
 def _hidden_radius(scene: Scene, star: Array) -> float:

@@ -76,7 +76,8 @@ class _Joint:
         self.first, extended = len(fitted) - scene.n_halos, sky / scene.unit
         expected = extended if is_lit is None else np.where(is_lit, extended, 0.0)
         stars = on_sky(scene.stars, scene.oversample)
-        texture = Texture(expected, stars, resolution(scene), hidden_radii(scene))
+        width = resolution(scene)
+        texture = Texture(expected, stars, width, hidden_radii(scene, width))
         if is_lit is not None:  # nor are stars taken to be on light that is not significant
             texture.amplitude[~is_lit] = 0.0
         source = SourceError(model.forward, model.adjoint, texture.amplitude, texture.width)

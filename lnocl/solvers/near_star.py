@@ -81,7 +81,8 @@ class Surroundings:
 
     def __init__(self, scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -> None:
         self.scene, self.sky, self.star_fluxes, self.moves = scene, sky, star_fluxes, moves
-        self.width, self.hidden = resolution(scene), hidden_radii(scene)
+        self.width = resolution(scene)
+        self.hidden = hidden_radii(scene, self.width)
         self.psfs = movable_psfs(scene.scaled_psfs(), scene.observation, scene.image_grid)
 
 

@@ -6,7 +6,7 @@ import pytest
 import lnocl
 from lnocl.scene import texture
 from lnocl.scene.scene import Scene
-from lnocl.scene.texture import Texture, resolution
+from lnocl.scene.texture import Texture, hidden_radii, resolution
 
 N = 64
 Y, X = np.indices((N, N), float)
@@ -88,3 +88,36 @@ def test_a_psf_wider_than_the_grid_leaves_the_estimate():
     found = Texture(np.ones((8, 8)), scene.stars, resolution(scene))
     np.testing.assert_array_equal(found.mean, 1.0)
     assert resolution(scene) > 8
+
+
+def hidden(mask, star, **known):
+    images = np.full(mask.shape, 9.0)
+    psf = 1.0 / (4.0 + (X[:41, :41] - 20) ** 2 + 2 * (Y[:41, :41] - 20) ** 2)
+    observation = lnocl.Observation(images, psf, mask=mask, **known)
+    return hidden_radii(Scene(observation, [star]), 3.0)[0]
+
+
+def test_a_hidden_radius_ends_at_the_nearest_pixel_that_an_image_has_observed():
+    star = 15.3, 17.8
+    away = np.hypot(X - star[0], Y - star[1])
+    disc = away < 6.0
+    found = hidden(disc, star)
+    assert found == pytest.approx(away[~disc].min() - 0.5**0.5)
+    assert hidden(np.zeros_like(disc), star) == 0.0
+    assert hidden(disc & (X != 15), star) == 0.0  # its own pixel is observed
+    column = (X == 15) & (Y > 2)
+    assert hidden(column, star) == 0.0  # it is narrower than the core
+    assert hidden(np.array([disc, np.zeros_like(disc)]), star) == 0.0
+    larger = away < 8.0
+    assert hidden(np.array([disc, larger]), star) == pytest.approx(found)
+
+
+def test_what_is_hidden_is_core():
+    """Light in it is expected to be that round it, however much the estimate has there."""
+    sky = np.where(np.hypot(X - 16, Y - 16) < 6, 50.0, 2.0) + 0.1 * X
+    stars, radii = np.array([(16.0, 16.0)]), np.array([7.0])
+    seen, unseen = Texture(sky, stars, 3.0), Texture(sky, stars, 3.0, radii)
+    assert seen.mean[16, 20] > 40
+    inside = np.hypot(X - 16, Y - 16) < 7
+    assert (unseen.mean[inside] < 6).all()
+    assert unseen.amplitude[16, 16] < 0.2 * seen.amplitude[16, 16]

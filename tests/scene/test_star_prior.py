@@ -1,0 +1,63 @@
+"""The prior of star fluxes: its slope, its units, and the minimum of both solvers with it."""
+
+import numpy as np
+import pytest
+from scenes import Recipe
+
+from lnocl.engines.numpy import ReferenceEngine
+from lnocl.runs.start import Setup, make_start
+from lnocl.scene.penalty import Penalty
+from lnocl.scene.star_prior import StarPrior
+from lnocl.solvers import SOLVERS
+
+RECIPE = Recipe((16, 32), 3, 2, masked=0.05, background="each")
+
+
+def a_start(solver, prior):
+    made = RECIPE.make()
+    setup = Setup(made.observation(), np.array(made.stars), 0, solver, "double", "numpy", None)
+    return make_start(setup, Penalty(mu=1e-2, stars=prior))
+
+
+def test_the_gradient_is_the_slope_of_the_value():
+    prior = StarPrior.of(np.array([30.0, 4.0, 9.0]), np.array([2.0, np.nan, 0.5]))
+    fluxes, step = np.array([34.0, 5.0, 8.0]), 1e-4 * np.eye(3)
+    slopes = [(prior.value(fluxes + d) - prior.value(fluxes - d)) / 2e-4 for d in step]
+    np.testing.assert_allclose(prior.gradient(fluxes), slopes, rtol=1e-7, atol=1e-7)
+    assert prior.value(fluxes) == pytest.approx(0.5 * (4 / 2) ** 2 + 0.5 * (1 / 0.5) ** 2)
+
+
+def test_of_half_of_the_counts_it_is_the_same_scaled():
+    """A half has half of the flux and of the information: its error is half of that of all, r2."""
+    prior = StarPrior.of(np.array([500.0, 80.0]), np.array([20.0, 9.0]))
+    scene = a_start("sgp", prior).scene
+    half = StarPrior.of(np.array([250.0, 40.0]), np.array([20.0, 9.0]) / 2 * np.sqrt(2))
+    found = half.scaled(scene.unit / 2, scene.scale / 2)
+    np.testing.assert_allclose(found.fluxes, scene.star_prior.fluxes, rtol=1e-15)
+    np.testing.assert_allclose(found.precision, scene.star_prior.precision, rtol=1e-14)
+
+
+@pytest.mark.parametrize("solver", ["sgp", "sgm"])
+def test_iterations_end_where_the_gradients_of_data_and_prior_cancel(solver):
+    told = np.array([900.0, np.nan])
+    prior = StarPrior.of(told, np.array([7.0, 1.0]))
+    start = a_start(solver, prior)
+    engine = ReferenceEngine(start.scene, start.scaling)
+    engine.start(start.extended, start.star_fluxes)
+    for _ in SOLVERS[solver](engine, 3000, None, start.scene.star_prior):
+        pass
+    engine.ratio()
+    of_data, fluxes = engine.star_gradient(), engine.star_fluxes()
+    of_prior = start.scene.star_prior.gradient(fluxes)
+    assert abs(of_data[1]) < 1e-4  # measured below 4e-5
+    assert abs(of_prior[0]) > 0.01
+    assert abs(of_data[0] + of_prior[0]) < 1e-3 * abs(of_prior[0])
+
+
+def test_priors_are_drawn_about_the_fluxes_with_their_errors():
+    errors = np.array([20.0, np.nan, 3.0])
+    prior = StarPrior.of(np.array([500.0, 80.0, 40.0]), errors)
+    rng = np.random.default_rng(4)
+    drawn = np.array([prior.drawn(np.array([600.0, 9.0, 50.0]), rng).fluxes for _ in range(4000)])
+    np.testing.assert_allclose(drawn.mean(axis=0), [600.0, 0.0, 50.0], atol=1.0)
+    np.testing.assert_allclose(drawn.std(axis=0), [20.0, 0.0, 3.0], rtol=0.03)
