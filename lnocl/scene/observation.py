@@ -776,6 +776,23 @@ class Observation:
             )
 
 
+def mean_exposure(observation: Observation) -> float:
+    """Return the mean of the exposures, of good pixels where they are maps.
+
+    Raises
+    ------
+    InputError
+        They are too large to be summed.
+    """
+    exposures = observation.exposure
+    with np.errstate(over="ignore"):
+        seen = exposures[~observation.mask] if exposures.ndim == 3 else exposures
+        mean = float(seen.mean())
+    if not np.isfinite(mean):
+        raise InputError("the exposures are too large to be summed: divide them by a constant")
+    return mean
+
+
 def _check_oversample(oversample: object) -> int:
     if isinstance(oversample, (int, np.integer)) and oversample in OVERSAMPLES:
         return int(oversample)
