@@ -616,7 +616,11 @@ class Result:
         >>> len(result.significance().detections)
         0
         """
+        from lnocl.scene.quantities import in_unit
         from lnocl.significance import significance  # which loads scipy
+
+        width = in_unit("width", width, "pix")
+        false_alarms = in_unit("false_alarms", false_alarms, "")
 
         return significance(self._outcome, width, false_alarms)
 

@@ -21,6 +21,7 @@ from lnocl.plotting.significance import SignificanceView, draw_significance
 from lnocl.runs.outcome import Outcome
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
+from lnocl.scene.quantities import in_unit
 from lnocl.scene.texture import SHARE_NEAR
 from lnocl.solvers.point_test import point_flux
 from lnocl.solvers.score import Null
@@ -159,6 +160,7 @@ class Significance:
         >>> bool(60 < half < 90), bool(half < most < 1.5 * half)
         (True, True)
         """
+        completeness = in_unit("completeness", completeness, "")
         check_completeness(completeness)
         found, outcome = self._map, self._outcome
         fluxes = np.maximum(found.needed(self._at_threshold, completeness), self._told_from_source)
@@ -301,6 +303,7 @@ class Significance:
         from astropy.table import QTable
         from astropy.units import electron, mag, pix
 
+        completeness = in_unit("completeness", completeness, "")
         limits = {f"{100 * each:g}": self.limit(each) for each in completeness}
         observation, scene = self._outcome.observation, self._outcome.scene
         n_epochs = observation.n_epochs
