@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scenes import blur, make_psfs
 
 import lnocl
 from lnocl.scene.forward_model import Model
@@ -9,6 +10,8 @@ from lnocl.scene.psf_misfit import measure_misfit, smoothing_near_stars
 from lnocl.scene.psf_wings import without_noise
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import Scene
+
+pytestmark = pytest.mark.filterwarnings("ignore:the images are shifted")
 
 N, STAR, FLUX, LEVEL = 48, (23.0, 20.0), 3e6, 40.0
 Y, X = np.indices((N, N)) - N // 2
@@ -112,6 +115,32 @@ def test_the_smoothing_is_the_deviation_of_the_gradient():
     assert ratio.mean() == pytest.approx(2.0, rel=0.03)
     assert ratio.std() < 0.2
     assert near[0, -1] < 0.01 * near.max()
+
+
+def test_the_smoothing_is_the_formula_where_images_differ():
+    """In depth, PSF, level, place and bad pixels; kappa in three rings, PSFs without symmetry."""
+    psfs, depth, levels = make_psfs(2, (9, 11)), np.array([0.6, 2.4]), np.array([30.0, 90.0])
+    psfs /= psfs.sum(axis=(1, 2), keepdims=True)
+    offsets, bad = np.array([(0, 0), (3, -2)]), RNG.random((2, N, N)) < 0.05
+    in_rings, (x, y) = np.array([0.3, 0.1, 0.02]), (23, 20)
+    expected, counts = np.zeros((N, N)), np.empty((2, N, N))
+    for j, psf in enumerate(psfs):
+        dx, dy = offsets[j]
+        point = np.zeros((N, N))
+        point[y, x] = 1e4 * depth[j]
+        light = np.roll(blur(point, psf), (dy, dx), (0, 1))
+        counts[j] = RNG.poisson(light + levels[j])
+        total = np.maximum(counts[j], light + levels[j])
+        rings = Rings((N, N), np.array([(x + dx, y + dy)], float)).number
+        share = ~bad[j] * in_rings[np.minimum(rings, 2)] * light / total
+        squares = (depth[j] / depth.mean() * psf) ** 2
+        for (v, u), value in np.ndenumerate(squares):
+            expected += value * np.roll(share**2, (4 - v - dy, 5 - u - dx), (0, 1))
+    known = {"background": levels, "exposure": depth, "offsets": offsets, "mask": bad}
+    observation = lnocl.Observation(counts, psfs, psf_centre="given", **known)
+    scene = Scene(observation, [(x, y)])
+    near = smoothing_near_stars(scene, Model(scene), np.array([1e4 / scene.unit]), in_rings, 2.0)
+    np.testing.assert_allclose(near, 2.0 * np.sqrt(expected), rtol=1e-9, atol=1e-9)
 
 
 def test_smoothing_does_not_hang_on_the_unit_of_time():
