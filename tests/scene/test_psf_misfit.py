@@ -117,30 +117,68 @@ def test_the_smoothing_is_the_deviation_of_the_gradient():
     assert near[0, -1] < 0.01 * near.max()
 
 
-def test_the_smoothing_is_the_formula_where_images_differ():
-    """In depth, PSF, level, place and bad pixels; kappa in three rings, PSFs without symmetry."""
-    psfs, depth, levels = make_psfs(2, (9, 11)), np.array([0.6, 2.4]), np.array([30.0, 90.0])
-    psfs /= psfs.sum(axis=(1, 2), keepdims=True)
-    offsets, bad = np.array([(0, 0), (3, -2)]), RNG.random((2, N, N)) < 0.05
-    in_rings, (x, y) = np.array([0.3, 0.1, 0.02]), (23, 20)
-    expected, counts = np.zeros((N, N)), np.empty((2, N, N))
-    for j, psf in enumerate(psfs):
-        dx, dy = offsets[j]
+class TestImagesThatDiffer:
+    """In depth, PSF, level, place and bad pixels; PSFs have no symmetry."""
+
+    DEPTH, LEVELS = np.array([0.6, 2.4]), np.array([30.0, 90.0])
+    OFFSETS, PLACE, LIGHT = np.array([(0, 0), (3, -2)]), np.array([23, 20]), 1e4
+    BAD = np.random.default_rng(8).random((2, N, N)) < 0.05
+    PSFS = make_psfs(2, (9, 11))
+    PSFS /= PSFS.sum(axis=(1, 2), keepdims=True)
+
+    def light(self, j):
+        """Return the star's light in image j, and the rings round it."""
         point = np.zeros((N, N))
-        point[y, x] = 1e4 * depth[j]
-        light = np.roll(blur(point, psf), (dy, dx), (0, 1))
-        counts[j] = RNG.poisson(light + levels[j])
-        total = np.maximum(counts[j], light + levels[j])
-        rings = Rings((N, N), np.array([(x + dx, y + dy)], float)).number
-        share = ~bad[j] * in_rings[np.minimum(rings, 2)] * light / total
-        squares = (depth[j] / depth.mean() * psf) ** 2
-        for (v, u), value in np.ndenumerate(squares):
-            expected += value * np.roll(share**2, (4 - v - dy, 5 - u - dx), (0, 1))
-    known = {"background": levels, "exposure": depth, "offsets": offsets, "mask": bad}
-    observation = lnocl.Observation(counts, psfs, psf_centre="given", **known)
-    scene = Scene(observation, [(x, y)])
-    near = smoothing_near_stars(scene, Model(scene), np.array([1e4 / scene.unit]), in_rings, 2.0)
-    np.testing.assert_allclose(near, 2.0 * np.sqrt(expected), rtol=1e-9, atol=1e-9)
+        point[tuple(self.PLACE[::-1])] = self.LIGHT * self.DEPTH[j]
+        seen = np.roll(blur(point, self.PSFS[j]), self.OFFSETS[j][::-1], (0, 1))
+        return seen, Rings((N, N), (self.PLACE + self.OFFSETS[j])[None].astype(float)).number
+
+    def counts(self):
+        means = [self.light(j)[0] + self.LEVELS[j] + 5.0 * self.DEPTH[j] for j in range(2)]
+        return np.random.default_rng(9).poisson(means).astype(float)
+
+    def scene(self):
+        known = {"background": self.LEVELS, "exposure": self.DEPTH, "offsets": self.OFFSETS}
+        observation = lnocl.Observation(
+            self.counts(), self.PSFS, psf_centre="given", mask=self.BAD, **known
+        )
+        return Scene(observation, [self.PLACE])
+
+    def test_the_misfit_is_the_formula(self):
+        scene, squares = self.scene(), np.zeros(2)
+        expected = excess = norm = 0.0
+        scaled, flux = SKY / scene.unit, np.array([self.LIGHT / scene.unit])
+        found = measure_misfit(scene, Model(scene), scaled, flux, (1.2 * scaled, 0.9 * flux))
+        for j, counts in enumerate(self.counts()):
+            light, rings = self.light(j)
+            model = light + self.LEVELS[j] + 5.0 * self.DEPTH[j]
+            left = counts - 0.9 * light - self.LEVELS[j] - 1.2 * 5.0 * self.DEPTH[j]
+            weight = np.where(light > 0.5 * model, light**2 / model / (model + 0.5), 0.0)
+            weight *= ~self.BAD[j]
+            squares[j] = (weight * left**2 / model).sum()
+            expected += weight.sum()
+            sums = weight * (left**2 / model - 1.0), weight * light**2 / model
+            excess, norm = (
+                a + each[rings == 1].sum() for a, each in zip((excess, norm), sums, strict=True)
+            )
+        np.testing.assert_allclose(found.squares, squares)
+        np.testing.assert_allclose(found.expected, expected)
+        assert excess > 0
+        np.testing.assert_allclose(found.in_rings[1], np.sqrt(excess / norm))
+
+    def test_the_smoothing_is_the_formula(self):
+        in_rings, expected = np.array([0.3, 0.1, 0.02]), np.zeros((N, N))
+        for j, (psf, counts) in enumerate(zip(self.PSFS, self.counts(), strict=True)):
+            light, rings = self.light(j)
+            total = np.maximum(counts, light + self.LEVELS[j])
+            share = ~self.BAD[j] * in_rings[np.minimum(rings, 2)] * light / total
+            dx, dy = self.OFFSETS[j]
+            for (v, u), value in np.ndenumerate((self.DEPTH[j] / self.DEPTH.mean() * psf) ** 2):
+                expected += value * np.roll(share**2, (4 - v - dy, 5 - u - dx), (0, 1))
+        scene = self.scene()
+        fluxes = np.array([self.LIGHT / scene.unit])
+        near = smoothing_near_stars(scene, Model(scene), fluxes, in_rings, 2.0)
+        np.testing.assert_allclose(near, 2.0 * np.sqrt(expected), rtol=1e-9, atol=1e-8)
 
 
 def test_smoothing_does_not_hang_on_the_unit_of_time():
