@@ -5,9 +5,10 @@ import pytest
 from scenes import make_psfs
 
 import lnocl
+from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.scene.texture import Texture, resolution
-from lnocl.solvers import near_star
+from lnocl.solvers import halos, near_star
 from lnocl.solvers.halos import halo_errors
 from lnocl.solvers.star_errors import standard_errors
 
@@ -98,6 +99,31 @@ def test_errors_are_those_of_the_dense_matrix(seed):
     np.testing.assert_allclose(found, np.hypot(deviations, change)[:2], rtol=1e-6)
     errors = halo_errors(scene, sky, fluxes).errors * scene.mean_exposure
     np.testing.assert_allclose(errors, deviations[2:], rtol=0.01)
+
+
+def test_amounts_take_the_step_of_the_dense_matrix(monkeypatch):
+    """With the sky expected to be dark but where it is significant, and that light missed."""
+    monkeypatch.setattr(halos, "STEPS", 1)
+    scene, sky, fluxes, mean = an_estimate(sky=0.3 * SKY, seed=1)
+    scaled = sky / scene.unit, fluxes / scene.unit
+    is_lit = halos._significant(scene, Model(scene), *scaled)
+    assert 0.02 < is_lit.mean() < 0.9
+    expected = np.where(is_lit, sky, 0.0)
+    texture = Texture(expected, scene.stars, resolution(scene))
+    texture.amplitude[~is_lit] = 0.0
+    units = np.eye(N * N).reshape(-1, N, N)
+    columns = columns_of(np.array([texture.apply(unit).ravel() for unit in units]).T)
+    k = len(columns) - N * N
+    information = columns / mean @ columns.T + np.diag(np.repeat([0.0, 1.0], [k, N * N]))
+    missed = columns_of((sky - expected).reshape(-1, 1))[-1]
+    left = scene.observation.images.ravel() - mean + missed
+    change = np.linalg.solve(information, columns @ (left / mean))[len(STARS) : k]
+    errors = np.sqrt(np.diag(np.linalg.inv(information)))[len(STARS) : k]
+    found = halos.marginal_halos(scene, sky, fluxes)[1] - fluxes
+    moved = found[len(STARS) :] * scene.mean_exposure
+    assert abs(change).max() > errors.min()
+    # Conjugate gradients end at a fiftieth of the gradient.
+    assert abs(moved - np.maximum(change, -AMOUNTS.ravel())).max() <= 0.05 * errors.max()
 
 
 def test_a_halo_that_is_known_leaves_a_star_the_error_of_counts():
