@@ -77,8 +77,8 @@ def deconvolve(
     .. math::
 
        J = \sum_j \sum_n \left[ g_j \, \ln \frac{g_j}{m_j} + m_j - g_j \right]
-           + \frac{\mu}{2} \sum f^2
-           + \lambda \sum \left[ \sqrt{(f - f')^2 + \delta^2} - \delta \right]
+           + \frac{\mu}{2} \sum F^2
+           + \lambda \sum \left[ \sqrt{(F - F')^2 + \delta^2} - \delta \right]
 
     for images :math:`g_j` of pixels n, with the models
 
@@ -86,10 +86,11 @@ def deconvolve(
 
     Here :math:`A_j` convolves with PSF j, and :math:`P_{js}` is the image of star s for flux 1. The
     background is :math:`b_j`, and the exposure :math:`e_j`, by default 1. Halos :math:`H_{kj}`, if
-    any, have amounts :math:`a_{kj}` that are fitted in each image. The weights μ and λ of
-    the penalties are `mu` and `smoothing`; the last sum is over pairs of neighbouring pixels. The
-    sky may be finer than the images (``oversample`` of the observation). :math:`A_j` then sums over
-    the pixels of the sky that a pixel of the image holds.
+    any, have amounts :math:`a_{kj}` that are fitted in each image. The weights μ and λ of the
+    penalties are `mu` and `smoothing`. These are on :math:`F = \bar e f`, the extended source in
+    electrons at the mean exposure, and no unit of time enters them. The last sum is over pairs of
+    neighbouring pixels. The sky may be finer than the images (``oversample`` of the observation).
+    :math:`A_j` then sums over the pixels of the sky that a pixel of the image holds.
 
     The defaults are for real frames. The paper's iteration is ``solver="sgm", stop=None,
     smoothing=0, pad=0`` with `mu` and `n_iter` given. Without stars and penalties that is
@@ -113,10 +114,11 @@ def deconvolve(
         Weight λ of the edge-preserving term (`lnocl.scene.penalty.Penalty`), zero or more, without
         unit. The length δ is three times the mean of the extended source. The term keeps the noise
         down that grows with the iterations, most of all beside bright stars. "auto" is a tenth of
-        the noise of the data term's gradient, ``0.1 sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, with < >
-        the mean over pixels. With held-out counts it is 0, or 1, 3 or 10 times that, whichever they
-        choose (:doc:`/validation/sgp`). Where PSFs do not fit the stars it is 3 times that. It is
-        more near the stars, as far as rings round these show an error of the PSFs. See Notes.
+        the noise of the data term's gradient, ``0.1 sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, with e_j
+        over their mean and < > the mean over pixels. With held-out counts it is 0, or 1, 3 or 10
+        times that, whichever they choose (:doc:`/validation/sgp`). Where PSFs do not fit the stars
+        it is 3 times that. It is more near the stars, as far as rings round these show an error of
+        the PSFs. See Notes.
     solver : {"sgp", "sgm"}, optional
         Iteration to use. "sgp" is the scaled gradient projection method. It solves for the star
         fluxes at the start, so that those given matter little. "sgm" is the split-gradient method,

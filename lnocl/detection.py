@@ -13,6 +13,7 @@ from lnocl.matched_filter import DARKER, PointSources, around, find_points, in_b
 from lnocl.process import ignored_warnings
 from lnocl.scene.arrays import Array, numbers
 from lnocl.scene.cores import fwhm, peak
+from lnocl.scene.quantities import bare, in_unit, split
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -79,7 +80,7 @@ def find_stars(
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is bad.
     saturation : float, optional
-        Pixels of this value and above are saturated.
+        Pixels of this value and above are saturated. A Quantity has the unit of the image's.
 
     Returns
     -------
@@ -126,6 +127,10 @@ def find_stars(
     1 30.2 20.0
     """
     _require_photutils()
+    image, unit = split("image", image)
+    threshold = in_unit("threshold", threshold, "")
+    if saturation is not None:
+        saturation = in_unit("saturation", saturation, unit or "")
     pixels, bad = _check(image, mask, threshold)
     shape = None if psf is None else _check_psf(psf)
     above, noise = _above_sky(pixels, bad, FIRST_WIDTH if shape is None else fwhm(shape))
@@ -186,7 +191,7 @@ def _are_counts(values: Array) -> bool:
 
 
 def _check_psf(psf: ArrayLike) -> Array:
-    light = numbers("psf", psf)
+    light = numbers("psf", bare("psf", psf))
     if light.ndim != 2 or not np.isfinite(light).all() or not light.sum() > 0:
         raise InputError(
             f"`psf` of shape {light.shape} must be one image of finite numbers with a positive sum"

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError
 from lnocl.scene.arrays import Array, unmasked
+from lnocl.scene.quantities import bare, in_unit, split
 
 N_STAR_ROWS = 24
 
@@ -84,7 +85,7 @@ def mask_star(image: ArrayLike, star: tuple[int, int]) -> Array:
     >>> mask_star(np.ones((4, 4)), (1, 2)).sum()
     np.float64(7.0)
     """
-    masked = _plane("image", image).copy()
+    masked = _plane("image", bare("image", image)).copy()
     masked[_box(star, masked.shape)] = 0.0
     return masked
 
@@ -137,7 +138,9 @@ def restoration_error(
     >>> restoration_error([[3.0, 0.0], [0.0, 5.0]], [[3.0, 0.0], [0.0, 4.0]])
     0.2
     """
-    found, true = _plane("reconstruction", reconstruction), _plane("truth", truth)
+    reconstruction, unit = split("reconstruction", reconstruction)
+    found = _plane("reconstruction", reconstruction)
+    true = _plane("truth", in_unit("truth", truth, unit or ""))
     if found.shape != true.shape:
         raise InputError(f"the reconstruction has shape {found.shape} and the truth {true.shape}")
     if star is not None:
@@ -179,6 +182,8 @@ def magnitude(flux: float, zero_magnitude_flux: float) -> float:
     >>> magnitude(1e4, 1e10)
     15.0
     """
+    flux, unit = split("flux", flux)
+    zero_magnitude_flux = in_unit("zero_magnitude_flux", zero_magnitude_flux, unit or "")
     if not (math.isfinite(zero_magnitude_flux) and zero_magnitude_flux > 0):
         raise InputError(
             f"zero_magnitude_flux must be positive and finite; {zero_magnitude_flux} was given"
@@ -218,7 +223,7 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
     >>> flux_profile([[1, 2, 3], [0, 4, 0]])
     array([6., 4.])
     """
-    plane = _plane("image", image)
+    plane = _plane("image", bare("image", image))
     profile = plane.sum(axis=1)
     if star is not None:
         profile[_box(star, plane.shape)[0]] = np.nan
@@ -237,7 +242,7 @@ def _plane(name: str, values: ArrayLike) -> Array:
 
 
 def _check_star(star: tuple[int, int], shape: tuple[int, ...]) -> tuple[int, int]:
-    x, y = star
+    x, y = in_unit("star", star, "pix")
     if x != round(x) or y != round(y):
         raise InputError(f"the star at ({x:g}, {y:g}) lies between pixels; give whole ones")
     if not (0 <= x < shape[1] and 0 <= y < shape[0]):

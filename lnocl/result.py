@@ -229,11 +229,12 @@ class Result:
     def star_flux_errors(self) -> Array:
         """Standard errors of the star fluxes, electrons, shape (n,).
 
-        They follow from the joint Fisher information of all stars and of the extended source, which
-        is not taken as known (`lnocl.solvers.star_errors`, :doc:`/validation/errors`). The relative
+        They follow from the joint Fisher information of all stars, of halos and of the extended
+        source, which are not taken as known (`lnocl.solvers.star_errors`,
+        :doc:`/validation/errors`). Where a halo is like a star they are large. The relative
         error that the PSFs still have (`psf_refinement`) is added in quadrature. They are
         computed when they are first read. They are NaN where the images do not determine the flux,
-        as for stars that have moved to one place.
+        as for stars that have moved to one place, or that a halo can stand in for.
 
         Warns
         -----
@@ -616,7 +617,11 @@ class Result:
         >>> len(result.significance().detections)
         0
         """
+        from lnocl.scene.quantities import in_unit
         from lnocl.significance import significance  # which loads scipy
+
+        width = in_unit("width", width, "pix")
+        false_alarms = in_unit("false_alarms", false_alarms, "")
 
         return significance(self._outcome, width, false_alarms)
 

@@ -21,7 +21,9 @@ from lnocl.plotting.significance import SignificanceView, draw_significance
 from lnocl.runs.outcome import Outcome
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
+from lnocl.scene.quantities import in_unit
 from lnocl.scene.texture import SHARE_NEAR
+from lnocl.solvers.halos import halo_errors
 from lnocl.solvers.point_test import point_flux
 from lnocl.solvers.score import Null
 from lnocl.solvers.score_map import ScoreMap
@@ -159,6 +161,7 @@ class Significance:
         >>> bool(60 < half < 90), bool(half < most < 1.5 * half)
         (True, True)
         """
+        completeness = in_unit("completeness", completeness, "")
         check_completeness(completeness)
         found, outcome = self._map, self._outcome
         fluxes = np.maximum(found.needed(self._at_threshold, completeness), self._told_from_source)
@@ -301,6 +304,7 @@ class Significance:
         from astropy.table import QTable
         from astropy.units import electron, mag, pix
 
+        completeness = in_unit("completeness", completeness, "")
         limits = {f"{100 * each:g}": self.limit(each) for each in completeness}
         observation, scene = self._outcome.observation, self._outcome.scene
         n_epochs = observation.n_epochs
@@ -475,12 +479,13 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
     errors, fluxes = found.errors[at], found.peak_fluxes(*at)
     kinds = np.full(len(places), POINT_SOURCE, dtype="U8")
     pixels = (places - (q - 1) / 2.0) / q
+    known = scene, outcome.sky, outcome.star_fluxes
+    raised = halo_errors(*known).raised
     for i, place in enumerate(places):
         if found.width:
             kinds[i] = EXTENDED
         elif found.light_round(place, values[i], null.resolution) > THERE:
-            known = scene, outcome.sky, outcome.star_fluxes
-            fluxes[i], errors[i] = point_flux(*known, pixels[i], fluxes[i], outcome.moves)
+            fluxes[i], errors[i] = point_flux(*known, pixels[i], fluxes[i], outcome.moves, raised)
             kinds[i] = POINT_SOURCE if fluxes[i] > POINT * errors[i] else EXTENDED
     # Of a maximum between pixels the place errs by its noise, and by how it is interpolated.
     spread = np.sqrt(np.diag(np.linalg.inv(found.score.curvature)))[::-1]

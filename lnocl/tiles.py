@@ -33,7 +33,7 @@ from lnocl.runs.progress import Progress
 from lnocl.runs.start import Setup
 from lnocl.scene.arrays import Array
 from lnocl.scene.grid import length_for
-from lnocl.scene.observation import Observation
+from lnocl.scene.observation import Observation, mean_exposure
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import EDGE, Scene
@@ -290,7 +290,8 @@ def deconvolve_tiles(
     ]
     _refuse_unowned(positions, observed)
     if len(tiles) > 1:
-        pad = tile_pad
+        pad, exposure = tile_pad, mean_exposure(observation)
+        penalties = [replace(each, exposure=exposure) for each in penalties]
         if any(each.smoothing for each in penalties):
             with ignored_warnings():  # of which the tiles know more
                 edge = EDGE * Scene(observation, positions).level

@@ -121,9 +121,9 @@ def problem_of(made, stars=None):
         made.background,
         made.mask,
         stars,
-        recipe.mu,
+        recipe.mu * made.mean_exposure**2,
         made.exposure,
-        recipe.smoothing,
+        recipe.smoothing * made.mean_exposure,
         scene.edge * scene.unit or 1.0,
     )
 

@@ -155,6 +155,14 @@ class Made:
         dead[0, :, nx // 2] = True
         return np.where(dead, 0.0, exposure)
 
+    @property
+    def mean_exposure(self):
+        """That of good pixels, at which penalties have the extended source in electrons."""
+        if self.exposure is None or self.exposure.ndim == 1:
+            return 1.0 if self.exposure is None else self.exposure.mean()
+        is_good = self.exposure > 0 if self.mask is None else (self.exposure > 0) & ~self.mask
+        return self.exposure[is_good].mean()
+
     def observation(self, **changes):
         given = {
             "images": self.images,

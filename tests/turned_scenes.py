@@ -1,6 +1,7 @@
 """A small scene whose images are turned against the sky, and its model as an explicit matrix.
 
-PSFs are Gaussians, so that what an image sees of a pixel of the sky is known between pixels too.
+PSFs are Gaussians with a ghost beside each, so that what an image sees of a pixel of the sky is
+known between pixels too, and no PSF has a symmetry.
 Its program is that of the case "turned" of tests/kernel_cases.py.
 """
 
@@ -27,10 +28,16 @@ def gaussian(dx, dy, covariance):
     return np.exp(-0.5 * exponent) / (2 * np.pi * np.sqrt(np.linalg.det(covariance)))
 
 
+def psf(dx, dy, covariance):
+    """Return a PSF at these distances from its middle."""
+    ghost = gaussian(dx - 1.4, dy + 0.9, covariance)
+    return 0.75 * gaussian(dx, dy, covariance) + 0.25 * ghost
+
+
 def psfs():
     """Return the PSFs of the three images."""
-    y, x = np.indices((15, 15)) - 7
-    return np.array([gaussian(x, y, each) for each in COVARIANCES])
+    y, x = np.indices((19, 19)) - 9
+    return np.array([psf(x, y, each) for each in COVARIANCES])
 
 
 def transforms(angles=ANGLES):
@@ -63,7 +70,7 @@ def matrix(maps):
         period = np.array(GRID[::-1])[:, None, None]
         apart = (apart + period / 2) % period - period / 2  # the sky is periodic
         dx, dy = np.einsum("ij,jnu->inu", turn, apart)
-        rows.append(gaussian(dx, dy, covariance))
+        rows.append(psf(dx, dy, covariance))
     return np.concatenate(rows)
 
 
@@ -74,7 +81,7 @@ def star_columns(maps, stars=STARS):
     for star in stars:
         there = [each[:, :2] @ star + each[:, 2] for each in maps]
         images = [
-            gaussian(x - at[0], y - at[1], covariance)
+            psf(x - at[0], y - at[1], covariance)
             for at, covariance in zip(there, COVARIANCES, strict=True)
         ]
         columns.append(np.concatenate(images))

@@ -18,7 +18,7 @@ python "$here/real.py" stars-psf "$sci" "$exptime" "$out/psf.fits"
 known="--exposure $exptime --background 0 --read-noise 5.187 --pad 4"
 known="$known --residuals --quiet --overwrite"
 stars="--star 77,73 --star 47,56 --star 55,77 --star 73,48"
-for how in "0 30" "0 300" "30 30" "30 300"; do
+for how in "0 30" "0 300" "0.0328 30" "0.0328 300"; do
     set -- $how
     for refine in "" --refine; do
         lnocl deconvolve $paper "$sci" --psf "$out/psf.fits" $known $stars $refine \
@@ -35,6 +35,6 @@ python "$here/real.py" figures "$out/file_psf.fits"
 python "$here/real.py" draw "$out/lensed_quasar.png" "image, e-/s=$sci:62,62,32:0:0.5" \
     "Richardson-Lucy, 100=$out/plain.fits:62,62,32:0:0.2" \
     "refined stars, 300=$out/smoothing_0_300--refine.fits:62,62,32:0:0.2" \
-    "refined, 300, smoothing=$out/smoothing_30_300--refine.fits:62,62,32:0:0.2" \
-    "residuals, whole pixels=$out/smoothing_30_300.fits,RESIDUALS:62,62,32:-10:10" \
-    "residuals, refined=$out/smoothing_30_300--refine.fits,RESIDUALS:62,62,32:-10:10"
+    "refined, 300, smoothing=$out/smoothing_0.0328_300--refine.fits:62,62,32:0:0.2" \
+    "residuals, whole pixels=$out/smoothing_0.0328_300.fits,RESIDUALS:62,62,32:-10:10" \
+    "residuals, refined=$out/smoothing_0.0328_300--refine.fits,RESIDUALS:62,62,32:-10:10"

@@ -9,10 +9,10 @@ from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.errors import InputError
 
-OF_IMAGES = [options.PSFS, options.BACKGROUND, options.READ_NOISE, options.STARS]
+OF_IMAGES = options.PSFS, options.BACKGROUND, options.READ_NOISE, options.STARS
 OPTIONS = [
     options.IMAGES.but(nargs="*"),
-    *OF_IMAGES,
+    *(each.but(needs=("images",)) for each in OF_IMAGES),
     option(
         "--n-iter",
         type=int,
@@ -49,11 +49,6 @@ def _run(arguments: argparse.Namespace) -> None:
     from lnocl.studies import bench
 
     images, psfs, size = arguments.images, arguments.psfs or [], arguments.size
-    strays = [each.flags[-1] for each in OF_IMAGES if getattr(arguments, each.name)]
-    if not images and strays:
-        raise InputError(
-            f"{strays[0]} goes with images, and none are given; the demo's scene has its own"
-        )
     if images and not psfs:
         raise InputError("images need their PSFs: give --psf")
     if images and size is not None:

@@ -54,6 +54,10 @@ def solve(
     parameters = _parameters({**given, "device": arguments.device})
     parameters["progress"] = not arguments.quiet
     if arguments.tile is None and not frames.observation.psf_fields:
+        if arguments.parallel:
+            raise InputError(
+                "`parallel` does nothing without tiles: give `tile` too, or leave it out"
+            )
         return deconvolve(frames.observation, **parameters, callback=callback)
     return _solve_tiles(arguments, frames.observation, parameters)
 

@@ -160,6 +160,7 @@ OPTIONS = {
             **SEVERAL,
             type=number_or_word,
             metavar="EPOCH",
+            needs=("stars", "star_table"),
             help="epochs of the images, in each of which a star has a flux of its own, as a quasar "
             "that varies: each, for one an image; a keyword of their headers such as DATE-OBS; or "
             "a label for each image (default: one epoch)",
@@ -168,6 +169,7 @@ OPTIONS = {
             "--centre",
             type=options.pixel,
             metavar="X,Y",
+            needs=("angle",),
             help="with --angle: where the field turns about, pixels (default: the middle, "
             "nx // 2, ny // 2)",
         ),
@@ -179,6 +181,7 @@ OPTIONS = {
             "--refine",
             action=options.EITHER,
             dest="refine_positions",
+            needs=("stars", "star_table"),
             card=("REFINED", "star positions"),
             help="fit the positions of the stars too, each within 3 pixels of the one given, or "
             "take them as given; by default they are fitted where that mends a misfit at the "
@@ -200,6 +203,7 @@ OPTIONS = {
             "--psf-errors",
             **SEVERAL,
             kinds=PSF_ERRORS,
+            needs=("stars", "star_table"),
             checksum="DSUM",
             help="FITS files of the shape of the PSFs that tell how these may be wrong: ideal="
             "FILE, a PSF without aberrations; pupil=FILE, the transmission of a pupil in the "

@@ -58,7 +58,9 @@ COMMAND = Command(
                 help="time iterations with vectors of several widths (CPU) or groups of several "
                 "sizes (GPU), and use the fastest on this device from now on",
             ),
-            options.DEVICE.but(help="with --tune: the device, as PLATFORM[:DEVICE]"),
+            options.DEVICE.but(
+                needs=("tune",), help="with --tune: the device, as PLATFORM[:DEVICE]"
+            ),
         ]
     },
     _run,

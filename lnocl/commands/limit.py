@@ -45,6 +45,7 @@ OPTIONS = [
         type=int,
         default=0,
         metavar="S",
+        needs=("injections",),
         help="of these sources, 0 or more (default: %(default)s)",
     ),
     option(

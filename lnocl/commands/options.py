@@ -44,6 +44,8 @@ class Option:
         The kinds of its values, ``KIND=FILE``, with the parameter that each stands for.
     is_repeated : bool
         Whether the command that repeats a run has it.
+    needs : tuple of str
+        Names of options without all of which it would be ignored.
     """
 
     flags: tuple[str, ...]
@@ -53,6 +55,7 @@ class Option:
     is_input: bool = False
     is_repeated: bool = True
     kinds: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    needs: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -75,6 +78,21 @@ class Option:
         """Whether the usage names it: one of several options is hard to find there."""
         return self.is_positional or bool(self.keywords.get("required"))
 
+    def refuse_ignored(self, values: Mapping[str, Any]) -> None:
+        """Refuse a value where all options that it needs are left out.
+
+        Raises
+        ------
+        InputError
+            It would be ignored.
+        """
+        value = values[self.name]
+        if self.needs and value and value != self.default and not any(map(values.get, self.needs)):
+            others = " or ".join(f"`{name}`" for name in self.needs)
+            raise InputError(
+                f"`{self.name}` does nothing without {others}: give that too, or leave it out"
+            )
+
     def usage(self) -> str:
         """Return the words of the usage for it."""
         metavar = self.keywords["metavar"]
@@ -82,9 +100,10 @@ class Option:
         value = values.get(self.keywords.get("nargs", ""), metavar)
         return value if self.is_positional else f"{self.flags[0]} {value}"
 
-    def but(self, **keywords: Any) -> Option:
-        """Return the same option with other keywords for the parser, such as its help."""
-        return dataclasses.replace(self, keywords={**self.keywords, **keywords})
+    def but(self, needs: tuple[str, ...] | None = None, **keywords: Any) -> Option:
+        """Return the same option with other keywords for the parser, such as its help, or needs."""
+        needs = self.needs if needs is None else needs
+        return dataclasses.replace(self, keywords={**self.keywords, **keywords}, needs=needs)
 
     def words(self, value: Any) -> list[str]:
         """Return the words of a command line that give it a value; None gives no words."""
@@ -118,13 +137,14 @@ def option(
     is_input: bool = False,
     is_repeated: bool = True,
     kinds: Mapping[str, str] | None = None,
+    needs: tuple[str, ...] = (),
     **keywords: Any,
 ) -> Option:
     """Return an `Option`; all further keywords are for the parser."""
     if kinds is not None:
         keywords |= {"type": partial(_of_kind, kinds), "metavar": "KIND=FILE"}
     is_input = is_input or bool(checksum)
-    return Option(flags, keywords, card, checksum, is_input, is_repeated, kinds or {})
+    return Option(flags, keywords, card, checksum, is_input, is_repeated, kinds or {}, needs)
 
 
 def _of_kind(kinds: Mapping[str, str], word: str) -> str:

@@ -43,6 +43,18 @@ class Command(NamedTuple):
             for each in options:
                 group.add_argument(*each.flags, **each.keywords)
 
+    def refuse_ignored(self, arguments: argparse.Namespace) -> None:
+        """Refuse options that would be ignored, as others that they need are left out.
+
+        Raises
+        ------
+        InputError
+            There is one.
+        """
+        for options in self.options.values():
+            for each in options:
+                each.refuse_ignored(vars(arguments))
+
     def flags(self) -> dict[str, str]:
         """Return the flag of each parameter that an option, or a kind of its values, stands for."""
         options = [each for group in self.options.values() for each in group]

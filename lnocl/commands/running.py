@@ -33,6 +33,7 @@ def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
             warnings.showwarning = partial(messages.show_warning, flags)
             parsed = make_parser(commands).parse_args(words)
             flags |= parsed.command.flags()
+            parsed.command.refuse_ignored(parsed)
             parsed.command.run(parsed)
     except LnoclError as error:
         return messages.fail(messages.in_shell(error.message, flags), error.exit_status)

@@ -29,6 +29,8 @@ from lnocl.io.fitsread import read_keyword
 from lnocl.io.headers import make_wcs, quiet_log
 from lnocl.process import ignored_warnings
 from lnocl.scene import star_tables
+from lnocl.scene.quantities import in_unit
+from lnocl.scene.units import parse
 
 # Largest variation of the offset between two images over them, in pixels, from rotation, scale and
 # distortion.
@@ -334,7 +336,8 @@ def read_angles(path: str) -> tuple[NDArray[np.float64], str]:
     Parameters
     ----------
     path : str
-        FITS, with an image of one dimension, or text with a number a line.
+        FITS, with an image of one dimension, in the angle of its BUNIT or else in degrees; or text
+        with a number a line.
 
     Raises
     ------
@@ -350,6 +353,8 @@ def read_angles(path: str) -> tuple[NDArray[np.float64], str]:
         with open_fits(path) as file:
             images = [hdu for hdu in file.hdus() if len(getattr(hdu, "shape", ()) or ()) == 1]
             values = np.array(images[0].data, np.float64) if images else np.zeros(0)
+            if unit := parse(str(images[0].header.get("BUNIT", ""))) if images else None:
+                values = in_unit("angle", values * unit, "deg")
     else:
         try:
             values = np.array(content.decode("ascii").split(), np.float64)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from lnocl.errors import InputError
 from lnocl.psf.centring import Mask
 from lnocl.scene.arrays import Array, booleans, numbers, values_and_mask
+from lnocl.scene.quantities import in_unit
 
 MIN_SIZE = 3
 # Values beyond this have no finite variance in float64.
@@ -69,7 +70,8 @@ def whole_size(size: int | None) -> int | None:
 
 def wrapped_angles(rotate: Sequence[float]) -> list[float]:
     """Return the angles in [-180, 180], degrees."""
-    angles = [math.remainder(one_number("rotate", angle), 360) for angle in rotate]
+    given = in_unit("rotate", rotate, "deg")
+    angles = [math.remainder(one_number("rotate", angle), 360) for angle in given]
     if not angles:
         raise InputError("`rotate` holds no angle; give one or more")
     return angles

@@ -16,6 +16,7 @@ from lnocl.errors import InputError
 from lnocl.psf import checks, effective, resampling, steps
 from lnocl.psf.centring import Mask, Pixel, Point
 from lnocl.scene.arrays import Array, flag
+from lnocl.scene.quantities import in_unit, split
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,8 @@ def make_psf(
     ----------
     frame : array_like, shape (ny, nx)
         Image of a star, in any linear unit. A pixel that is not finite, or that is masked in a
-        `numpy.ma` array or a CCDData, is bad. Other arguments must not be masked.
+        `numpy.ma` array or a CCDData, is bad. Other arguments must not be masked. Quantities are
+        taken in the unit of the frame, in pixels and in degrees.
     position : array_like, shape (2,) or (n, 2), optional
         Position of the star, or of several: (x, y), 0-based pixels, to 5 pixels. By default the
         brightest pixel of the frame after a median filter of 3 x 3 good pixels.
@@ -335,6 +337,11 @@ def make_psfs(
     >>> np.abs(stars[1].psf - stars[0].psf.T).max() < 1e-7
     np.True_
     """
+    frame, unit = split("frame", frame)
+    if saturation is not None:
+        saturation = in_unit("saturation", saturation, unit or "")
+    if not isinstance(background, str):
+        background = in_unit("background", background, unit or "")
     given, bad = checks.read_frame(frame, mask)
     saturated = ~bad & (given >= checks.saturation_level(saturation))
     unusable = bad | saturated

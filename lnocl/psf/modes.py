@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError, counted
 from lnocl.scene.arrays import Array, numbers
+from lnocl.scene.quantities import bare
 
 
 class PsfModes(NamedTuple):
@@ -89,13 +90,13 @@ def find_modes(psfs: ArrayLike, n_modes: int) -> PsfModes:
     >>> found.modes.shape, round(found.share, 2)
     ((1, 9, 9), 1.0)
     """
-    given = numbers("psfs", psfs)
+    given = numbers("psfs", bare("psfs", psfs))
     if given.ndim != 3 or not np.isfinite(given).all():
         raise InputError(f"psfs have shape {given.shape}; give a cube of finite numbers")
     sums = given.sum(axis=(1, 2), keepdims=True)
     if (sums <= 0).any():
         raise InputError(f"`psfs[{int(np.argmax(sums <= 0))}]` has no positive sum")
-    if not 1 <= n_modes < len(given):
+    if not (isinstance(n_modes, (int, np.integer)) and 1 <= n_modes < len(given)):
         raise InputError(
             f"{counted(n_modes, 'mode')} of {counted(len(given), 'PSF')}; give 1 mode or more, and "
             "more PSFs than modes"

@@ -48,7 +48,7 @@ def find_stars(
     if position is None:
         start = brightest(pixels, bad)
         return [start], [f"star: brightest pixel of the median-filtered frame, {_at(start)}"]
-    given = numbers("position", position)
+    given = numbers("position", position, unit="pix")
     if given.shape[-1:] != (2,) or given.ndim > 2 or not given.size or not np.isfinite(given).all():
         raise InputError(f"position is {position!r}; give two finite numbers, x and y")
     places, lines = [], []

@@ -164,6 +164,11 @@ def check_families(
             "`refine_psfs` shift of one image is told from nothing but the stars' places; leave it "
             "out, or `refine_positions`"
         )
+    if not set(NEEDS) & set(found):
+        # Those of pupils are ideal PSFs too.
+        names = "psf_modes", "pupils" if observation.pupils.size else "ideal_psfs"
+        for name in (name for name in names if getattr(observation, name).size):
+            note(f"`{name}` have no part in this run, which does not refine the PSFs by them")
     return found
 
 

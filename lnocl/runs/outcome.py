@@ -254,36 +254,32 @@ class Outcome:
         LnoclWarning
             The images do not determine flux and position of a star, or the amount of a halo.
         """
+        from lnocl.solvers.halos import halo_errors
         from lnocl.solvers.star_errors import standard_errors
 
         scene, moves = self.scene, self.moves
         star_fluxes = self.star_fluxes[: scene.n_stars]
-        errors = standard_errors(scene, self.sky, self.star_fluxes, moves)
+        halos = halo_errors(scene, self.sky, self.star_fluxes)
+        errors = standard_errors(scene, self.sky, self.star_fluxes, moves, halos.raised)
         is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (star_fluxes > 0)
-        if is_lost.any():
-            named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in scene.stars[is_lost])
-            warn(
-                f"the images do not determine flux and position of each star at {named}, so that "
-                "these errors are NaN; leave out stars that lie on others"
-            )
+        _warn_of_undetermined(scene.stars[is_lost], bool(np.isnan(halos.errors).any()))
         if self.psf_refinement is not None:
             refinement = self.psf_refinement
             of_psfs = np.hypot(refinement.psf_error, refinement.hidden_error)
             errors[:, 0] = np.hypot(errors[:, 0], of_psfs * star_fluxes)
         positions = errors[:, 1:]
         positions[positions > MAX_SHIFT] = np.nan  # no star is moved farther
-        return np.append(errors[:, 0], self._halo_errors()), positions
+        return np.append(errors[:, 0], halos.errors), positions
 
-    def _halo_errors(self) -> Array:
-        """Return the standard errors of halos."""
-        if not self.scene.n_halos:
-            return np.zeros(0)
-        from lnocl.solvers.halos import halo_errors
 
-        errors = halo_errors(self.scene, self.sky, self.star_fluxes)
-        if np.isnan(errors).any():
-            warn(
-                "the images do not determine the amounts of all halos, whose errors are NaN; leave "
-                "out halos that others can stand in for"
-            )
-        return errors
+def _warn_of_undetermined(stars: Array, are_halos: bool) -> None:
+    """Warn of stars, and perhaps halos, that the images do not tell from others."""
+    named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in stars)
+    lost = [f"flux and position of each star at {named}"] * bool(named)
+    lost += ["the amounts of all halos"] * are_halos
+    advice = "leave out stars that lie on others"
+    if are_halos:
+        advice = "leave out halos that others, or a star, can stand in for"
+    if lost:
+        words = " and ".join(lost)
+        warn(f"the images do not determine {words}, so that these errors are NaN; {advice}")

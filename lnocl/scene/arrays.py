@@ -1,4 +1,4 @@
-"""Arrays of numbers from whatever a caller gives, masked or not."""
+"""Arrays of numbers from whatever a caller gives, masked or not, with a unit or not."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, counted
+from lnocl.scene.quantities import in_unit
 
 Array = NDArray[np.float64]
 
@@ -19,7 +20,11 @@ UNMASK = {
 
 
 def values_and_mask(name: str, values: ArrayLike) -> tuple[NDArray, NDArray[np.bool_]]:
-    """Return values as an array, and where they are masked, by whatever class or in a list."""
+    """Return values as an array, and where they are masked, by whatever class or in a list.
+
+    A unit is refused: whoever knows what it may be has converted it (`lnocl.scene.quantities`).
+    """
+    values = in_unit(name, values, "")
     try:
         array: NDArray = np.ma.asanyarray(values)
     except (TypeError, ValueError) as error:
@@ -52,9 +57,12 @@ def refuse_masked(name: str, masked: NDArray[np.bool_]) -> None:
         )
 
 
-def numbers(name: str, values: ArrayLike, copy: bool = True) -> Array:
-    """Return real numbers as float64, none of them masked; a copy unless that is not asked for."""
-    array = unmasked(name, values)
+def numbers(name: str, values: ArrayLike, copy: bool = True, unit: str = "") -> Array:
+    """Return real numbers as float64, none of them masked; a copy unless that is not asked for.
+
+    Quantities are taken in a unit; by default they must have none.
+    """
+    array = unmasked(name, in_unit(name, values, unit))
     if array.dtype.kind not in "biuf":
         raise InputError(f"`{name}` holds {array.dtype}; give real numbers")
     return array.astype(np.float64, copy=copy)

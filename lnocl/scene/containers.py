@@ -1,89 +1,15 @@
-"""Quantities, NDData and sequences of them as plain numbers, in the units of an observation."""
+"""Counts and exposures, as quantities and NDData hold them, in the units of an observation."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from lnocl.errors import InputError
+from lnocl.scene.quantities import in_unit, is_nddata, split
 from lnocl.scene.uncertainties import is_uncertainty, variance_of
 from lnocl.scene.units import count_of
-
-
-class _Numbers:
-    """Numbers with their unit, which may be None."""
-
-    def __init__(self, value: Any, unit: Any) -> None:
-        self.value, self.unit = value, unit
-
-
-def _gather(name: str, values: Any, depth: int = 0) -> Any:
-    """Return NDData as numbers with a unit, masked where it is, and a sequence with units as one.
-
-    Uncertainties are read by `variances` alone. Anything else is returned as it is.
-    """
-    if "astropy.units" not in sys.modules:  # then it cannot have any
-        return values
-    if _is_nddata(values):
-        return _Numbers(_masked(name, values), values.unit)
-    if not _may_hold_units(values) or depth > 1:  # pairs of lengths are the deepest
-        return values
-    parts = [_gather(name, part, depth + 1) if _may_hold_units(part) else part for part in values]
-    if not any(hasattr(part, "unit") for part in parts):
-        return values
-    units = {str(getattr(part, "unit", None)): getattr(part, "unit", None) for part in parts}
-    if len(units) > 1:
-        raise InputError(f"`{name}` come in several units ({', '.join(units)}); give them in one")
-    stack = [np.ma.asanyarray(getattr(part, "value", part)) for part in parts]
-    if len({part.shape for part in stack}) > 1:
-        raise InputError(f"`{name}` cannot be read as an array: their shapes differ")
-    return _Numbers(np.ma.stack(stack), *units.values())
-
-
-def _may_hold_units(values: Any) -> bool:
-    return _is_nddata(values) or (isinstance(values, Sequence) and not isinstance(values, str))
-
-
-def _is_nddata(values: Any) -> bool:
-    if "astropy.nddata" not in sys.modules:
-        return False
-    from astropy.nddata import NDData
-
-    return isinstance(values, NDData)
-
-
-def _masked(name: str, values: Any) -> Any:
-    data = np.ma.asanyarray(values.data)
-    if values.mask is None:
-        return data
-    if np.shape(values.mask) not in ((), data.shape):
-        raise InputError(
-            f"`{name}` have a mask of shape {np.shape(values.mask)}; their data have {data.shape}"
-        )
-    return np.ma.array(data, mask=np.asarray(values.mask, bool))
-
-
-def _split(name: str, values: Any) -> tuple[Any, Any]:
-    """Return plain numbers and their unit; the unit is None for plain numbers."""
-    values = _gather(name, values)
-    unit = getattr(values, "unit", None)
-    if unit is None and not isinstance(values, _Numbers):
-        return values, None
-    _refuse_logarithms(name, unit)
-    return values.value, unit
-
-
-def _refuse_logarithms(name: str, unit: Any) -> None:
-    from astropy import units as u
-
-    if not (unit is None or isinstance(unit, u.UnitBase)):
-        raise InputError(
-            f"`{name}` in {unit} are not linear; give them in linear units, as physical does of a "
-            "Magnitude"
-        )
 
 
 def counts(
@@ -115,7 +41,7 @@ def counts(
     InputError
         A unit that is not a count; counts per time without exposures.
     """
-    numbers, unit = _split(name, values)
+    numbers, unit = split(name, values)
     if unit is None:
         return numbers, False
     known = count_of(unit)
@@ -156,7 +82,7 @@ def variances(name: str, values: Any, are_rates: bool) -> Any:
         `uncertainties.variance_of`.
     """
     parts = values if isinstance(values, (list, tuple)) else [values]
-    given = [part.uncertainty if _is_nddata(part) else None for part in parts]
+    given = [part.uncertainty if is_nddata(part) else None for part in parts]
     if not any(is_uncertainty(each) for each in given):
         return None
     if not all(is_uncertainty(each) for each in given):
@@ -204,31 +130,4 @@ def seconds(values: Any) -> Any:
     InputError
         A unit that is not a time.
     """
-    return _in_unit("exposure", values, "s", "in seconds or numbers without unit, not in {}")
-
-
-def pixels(name: str, values: Any) -> Any:
-    """Return lengths in pixels as plain numbers.
-
-    Raises
-    ------
-    InputError
-        A unit other than pixels.
-    """
-    wanted = "in pixels, not in {}; convert them with the WCS of the images"
-    return _in_unit(name, values, "pix", wanted)
-
-
-def _in_unit(name: str, values: Any, wanted: str, words: str) -> Any:
-    """Return values as plain numbers in a unit; those without unit stay as they are."""
-    numbers, unit = _split(name, values)
-    if unit is None or unit.physical_type == "dimensionless":
-        return numbers if unit is None else numbers * unit.to("")
-    if not unit.is_equivalent(wanted):
-        raise InputError(f"`{name}` must be {words.format(unit)}")
-    return numbers * unit.to(wanted)
-
-
-def bare(name: str, values: Any) -> Any:
-    """Return values without their unit: of PSFs only the shape counts."""
-    return _split(name, values)[0]
+    return in_unit("exposure", values, "s")

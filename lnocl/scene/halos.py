@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError
-from lnocl.scene import containers
 from lnocl.scene.arrays import Array, numbers, refuse_masked, values_and_mask
+from lnocl.scene.quantities import bare
 from lnocl.scene.shifting import Cutout
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def check_halos(halos: ArrayLike | None, mask: NDArray[np.bool_]) -> Array:
     """
     if halos is None:
         return np.zeros((0, *mask.shape))
-    array, masked = values_and_mask("halos", containers.bare("halos", halos))
+    array, masked = values_and_mask("halos", bare("halos", halos))
     given = _of_each(array, mask.shape)
     refuse_masked("halos", _of_each(masked, mask.shape) & ~mask)
     held = np.where(mask, 0.0, numbers("halos", given, copy=False))

@@ -18,6 +18,7 @@ from lnocl.scene.cores import centre, off_centre, peak
 from lnocl.scene.halos import check_halos, refuse_dark
 from lnocl.scene.psf_errors import check_modes, check_pixels
 from lnocl.scene.psf_field import PsfField, read_fields
+from lnocl.scene.quantities import bare
 from lnocl.scene.shifting import place
 from lnocl.scene.transforms import (
     Orientation,
@@ -59,6 +60,8 @@ MUCH_NEGATIVE = 0.1
 # PSFs that may be left out.
 MAPS = "background", "read_noise", "exposure"
 OF_PSFS = "ideal_psfs", "pupils", "psf_scatter"
+# Of attributes that have one and are not in counts.
+UNITS = {"exposure": "s", "offsets": "pix"}
 # Arrays that are of another type, or checked otherwise.
 UNCHECKED = "mask", "offsets", "turns", "epochs"
 # Those that may be below 0.
@@ -286,7 +289,7 @@ class Observation:
             y, x = (np.array(self.shape) - 1) / 2.0
             self.psfs = np.array([field.at(x, y) for field in self.psf_fields])
         else:
-            given_psfs = containers.bare("psfs", psfs)
+            given_psfs = bare("psfs", psfs)
             self.psfs = _check_psfs(given_psfs, self.n_images, psf_centre, own_psfs)
         self.pupils = check_pixels("pupils", pupils, self.psfs)
         self.ideal_psfs = self._check_ideals(ideal_psfs, psf_centre)
@@ -609,7 +612,7 @@ class Observation:
             return np.array([Pupil(pupil).ideal_psf() for pupil in self.pupils])
         if ideals is None:
             return np.zeros((0, *self.psfs.shape[1:]))
-        checked = _check_psfs(containers.bare("ideal_psfs", ideals), self.n_images, psf_centre)
+        checked = _check_psfs(bare("ideal_psfs", ideals), self.n_images, psf_centre)
         if checked.shape != self.psfs.shape:
             raise InputError(
                 f"`ideal_psfs` has PSFs of shape {checked.shape[1:]}, psfs of "
@@ -747,7 +750,7 @@ class Observation:
     def _check_offsets(self, offsets: ArrayLike | None) -> Array:
         if offsets is None:
             return np.zeros((self.n_images, 2))
-        values = numbers("offsets", containers.pixels("offsets", offsets))
+        values = numbers("offsets", offsets, unit="pix")
         if values.shape != (self.n_images, 2):
             raise InputError(
                 f"offsets has shape {values.shape}; give (dx, dy) for each of the "
@@ -776,6 +779,23 @@ class Observation:
             )
 
 
+def mean_exposure(observation: Observation) -> float:
+    """Return the mean of the exposures, of good pixels where they are maps.
+
+    Raises
+    ------
+    InputError
+        They are too large to be summed.
+    """
+    exposures = observation.exposure
+    with np.errstate(over="ignore"):
+        seen = exposures[~observation.mask] if exposures.ndim == 3 else exposures
+        mean = float(seen.mean())
+    if not np.isfinite(mean):
+        raise InputError("the exposures are too large to be summed: divide them by a constant")
+    return mean
+
+
 def _check_oversample(oversample: object) -> int:
     if isinstance(oversample, (int, np.integer)) and oversample in OVERSAMPLES:
         return int(oversample)
@@ -791,7 +811,12 @@ def _read(name: str, values: Any) -> Any:
     if values is None and name in (*OF_PSFS, "psf_modes", "halos"):
         return np.zeros(0)
     readers = {"mask": booleans, "epochs": lambda _, given: np.asarray(given, np.intp)}
-    array = readers.get(name, partial(numbers, copy=False))(name, values).view()
+    if name in ("images", "background", "read_noise"):
+        values = containers.counts(name, values)[0]
+    elif name in ("psfs", "psf_modes", "halos", *OF_PSFS):
+        values = bare(name, values)
+    reader = partial(numbers, copy=False, unit=UNITS.get(name, ""))
+    array = readers.get(name, reader)(name, values).view()
     array.flags.writeable = False
     return array
 

@@ -12,7 +12,7 @@ import numpy as np
 from lnocl.errors import InputError
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import seen_psfs
-from lnocl.scene.observation import Observation
+from lnocl.scene.observation import Observation, mean_exposure
 from lnocl.scene.star_prior import StarPrior
 
 # A larger weight leaves nothing of the data term of images at unit mean.
@@ -28,7 +28,9 @@ MAX_FLOAT = sys.float_info.max
 
 @dataclass(frozen=True)
 class Penalty:
-    """``mu / 2 sum f^2 + smoothing sum psi(f - f')``, over pixels, and over pairs of neighbours.
+    """``mu / 2 sum F^2 + smoothing sum psi(F - F')``, over pixels, and over pairs of neighbours.
+
+    F is the extended source in electrons, at one exposure: the unit of time has no part in it.
 
     ``psi(t) = sqrt(t^2 + delta^2) - delta`` is the hypersurface potential (Charbonnier et al. 1997,
     IEEE Trans. Image Process. 6, 298): steps far below delta are smoothed as by a quadratic term,
@@ -39,8 +41,7 @@ class Penalty:
     mu : float
         Weight of the Tikhonov term, per electron, zero or more.
     smoothing : float
-        Weight of the edge-preserving term, zero or more. It has no unit (with exposures that of an
-        exposure).
+        Weight of the edge-preserving term, zero or more. It has no unit.
     edge : float or None
         delta, in the unit of the extended source; None: three times its mean, roughly.
     near_stars : ndarray of float64, of the shape of the extended source, or None
@@ -48,6 +49,8 @@ class Penalty:
         the mean of both. None: 0 everywhere.
     stars : StarPrior or None
         Of star fluxes, electrons, which the objective leaves out.
+    exposure : float or None
+        That of F. None: the mean of the observation's, of which tiles have each their own.
 
     Raises
     ------
@@ -60,6 +63,7 @@ class Penalty:
     edge: float | None = None
     near_stars: Array | None = field(default=None, compare=False)
     stars: StarPrior | None = field(default=None, compare=False)
+    exposure: float | None = None
 
     def __post_init__(self) -> None:
         weights: dict[str, Any] = {"mu": self.mu, "smoothing": self.smoothing}
@@ -80,10 +84,10 @@ def recommend_smoothing(observation: Observation) -> float:
     """Return the weight of the edge-preserving term that suits the noise of an observation.
 
     It is `SMOOTHING` times the standard deviation of the gradient of the data term by the noise of
-    the counts, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, < > the mean over the observed pixels,
-    K_j as these see it.
+    the counts, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, e_j the exposures over their mean, < > the
+    mean over the observed pixels, K_j as these see it.
     """
-    relative = observation.exposure
+    relative = observation.exposure / mean_exposure(observation)
     if relative.ndim == 1:
         relative = relative[:, None, None]
     variance = np.ma.masked_array(

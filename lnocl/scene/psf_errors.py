@@ -6,15 +6,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError
-from lnocl.scene import containers
 from lnocl.scene.arrays import Array, numbers
+from lnocl.scene.quantities import bare
 
 
 def check_modes(modes: ArrayLike | None, psfs: Array) -> Array:
     """Return the modes of each PSF, shape (p, n, ky, kx); n is 0 where none are given."""
     if modes is None:
         return np.zeros((len(psfs), 0, *psfs.shape[1:]))
-    given = numbers("psf_modes", containers.bare("psf_modes", modes))
+    given = numbers("psf_modes", bare("psf_modes", modes))
     wanted = psfs.shape
     if given.ndim == 3:
         given = given[None]
@@ -42,7 +42,7 @@ def check_pixels(name: str, values: ArrayLike | None, psfs: Array) -> Array:
     """
     if values is None:
         return np.zeros((0, *psfs.shape[1:]))
-    given = numbers(name, containers.bare(name, values))
+    given = numbers(name, bare(name, values))
     given = given[None] if given.ndim == 2 else given
     if given.ndim != 3 or given.shape[0] not in (1, len(psfs)) or given.shape[1:] != psfs.shape[1:]:
         raise InputError(

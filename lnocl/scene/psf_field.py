@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError, counted
 from lnocl.scene.arrays import Array, numbers
+from lnocl.scene.quantities import bare, in_unit
 
 
 class PsfField:
@@ -25,12 +26,14 @@ class PsfField:
         PSF of each node, with its centre at ``(ky // 2, kx // 2)``. `lnocl.Observation` normalises
         the sums to 1.
     positions : array_like, shape (n, 2)
-        (x, y) of the nodes, pixels of the image, 0-based. They fill a rectangular grid.
+        (x, y) of the nodes, pixels of the image, 0-based. They fill a rectangular grid. They may be
+        a Quantity in pixels.
 
     Raises
     ------
     InputError
-        The shapes do not agree, positions are not finite, or they do not fill a grid.
+        The shapes do not agree, positions are not finite or not in pixels, or they do not fill a
+        grid.
 
     See Also
     --------
@@ -53,7 +56,8 @@ class PsfField:
     """
 
     def __init__(self, psfs: ArrayLike, positions: ArrayLike) -> None:
-        stack, places = numbers("psfs", psfs), numbers("positions", positions)
+        stack = numbers("psfs", bare("psfs", psfs))
+        places = numbers("positions", positions, unit="pix")
         if stack.ndim != 3 or places.shape != (len(stack), 2) or not len(stack):
             raise InputError(
                 f"psfs has shape {stack.shape} and positions {places.shape}; give n PSFs, "
@@ -106,6 +110,7 @@ class PsfField:
         >>> field.at(25, 7)[1, 1], field.at(500, 7)[1, 1]
         (np.float64(0.25), np.float64(1.0))
         """
+        x, y = in_unit("x", x, "pix"), in_unit("y", y, "pix")
         (i, u), (j, v) = _between(self._x, x), _between(self._y, y)
         weights = np.outer(v, u)
         cell = self._psfs[j : j + len(v), i : i + len(u)]

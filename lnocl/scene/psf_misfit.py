@@ -196,7 +196,7 @@ def smoothing_near_stars(
     variance = scipy.fft.irfft2(spectra, scene.grid)
     ny, nx = scene.observation.sky_shape
     deviation = np.sqrt(np.maximum(variance[:ny, :nx], 0.0))
-    return np.asarray(strength * scene.scale / scene.unit * deviation)
+    return np.asarray(strength * deviation)
 
 
 def _kappa(excess: float, norm: float) -> float:

@@ -17,7 +17,7 @@ from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
 from lnocl.scene.grid import grid_of, psf_shape
 from lnocl.scene.halos import halo_cutouts
-from lnocl.scene.observation import Observation, numbers
+from lnocl.scene.observation import Observation, mean_exposure, numbers
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
 from lnocl.scene.rotation import Rotation, turned_psf
 from lnocl.scene.shifting import Cutout, MovablePsf
@@ -160,8 +160,7 @@ class Scene:
         self.scale = 2.0 ** math.frexp(float(observation.images.sum() / n_good))[1]
         exposure = observation.exposure
         has_map = exposure.ndim == 3
-        seen = exposure[~observation.mask] if has_map else exposure
-        self.mean_exposure = _mean_exposure(seen)
+        self.mean_exposure = mean_exposure(observation)
         self.unit = self._sky_unit(self.mean_exposure)
         relative = exposure / self.mean_exposure
         self.gains = np.ones(self.n_images) if has_map else relative
@@ -214,8 +213,9 @@ class Scene:
 
     def _penalise(self, penalty: Penalty) -> None:
         self.penalty = penalty
-        self.mu = self._scaled("mu", penalty.mu, self.unit / self.mean_exposure)
-        self.smoothing = self._scaled("smoothing", penalty.smoothing, 1.0 / self.mean_exposure)
+        longer = 1.0 if penalty.exposure is None else penalty.exposure / self.mean_exposure
+        self.mu = self._scaled("mu", penalty.mu, self.scale * longer**2)
+        self.smoothing = self._scaled("smoothing", penalty.smoothing, longer)
         self.smoothing_map = self._smoothing_map(penalty)
         self.edge = self._edge(penalty) if self.is_smoothed else 0.0
         self.star_prior = penalty.stars and penalty.stars.scaled(self.unit, self.scale)
@@ -231,7 +231,7 @@ class Scene:
             return None
         ny, nx = self.observation.sky_shape
         total = np.full(self.grid, self.smoothing)
-        total[:ny, :nx] += penalty.near_stars / self.mean_exposure
+        total[:ny, :nx] += penalty.near_stars
         return total
 
     def _edge(self, penalty: Penalty) -> float:
@@ -727,14 +727,6 @@ def _lay(array: NDArray, grid: tuple[int, int], fill: float = 0.0) -> NDArray:
         laid.fill(fill)
     laid[..., :ny, :nx] = array
     return laid
-
-
-def _mean_exposure(exposures: Array) -> float:
-    with np.errstate(over="ignore"):
-        mean = float(exposures.mean())
-    if not math.isfinite(mean):
-        raise InputError("the exposures are too large to be summed: divide them by a constant")
-    return mean
 
 
 def _check_start(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError
-from lnocl.scene import containers, star_tables
+from lnocl.scene import star_tables
 from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf
@@ -399,7 +399,7 @@ def check_positions(stars: Any, observation: Observation) -> Array:
     if hasattr(stars, "colnames"):  # a table of astropy
         positions = star_tables.positions(stars)
     else:
-        positions = numbers("stars", containers.pixels("stars", stars))
+        positions = numbers("stars", stars, unit="pix")
     if positions.size == 0:
         return np.zeros((0, 2))
     if positions.ndim != 2 or positions.shape[1] != 2:

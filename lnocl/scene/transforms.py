@@ -35,11 +35,12 @@ def rotations(angles: ArrayLike, centre: ArrayLike) -> Array:
     Parameters
     ----------
     angles : array_like, shape (p,)
-        By how much each image shows the sky turned, degrees, from the x axis towards the y axis.
+        By how much each image shows the sky turned, degrees, from the x axis towards the y axis. A
+        Quantity or Angle of `astropy` may be in any unit of angle.
         Where north is to be up, and east left, that is minus the position angle of the images' y
         axis.
     centre : array_like, shape (2,)
-        (x, y) of the place, pixels, in the sky and in all images.
+        (x, y) of the place, pixels, in the sky and in all images. It may be a Quantity in pixels.
 
     Returns
     -------
@@ -49,7 +50,7 @@ def rotations(angles: ArrayLike, centre: ArrayLike) -> Array:
     Raises
     ------
     InputError
-        Angles or centre are no finite numbers, or of the wrong shape.
+        Angles or centre are no finite numbers, or of the wrong shape or unit.
 
     Examples
     --------
@@ -61,7 +62,8 @@ def rotations(angles: ArrayLike, centre: ArrayLike) -> Array:
            [[ 0., -1., 15.],
             [ 1.,  0., -5.]]])
     """
-    turned, middle = np.radians(numbers("angles", angles)), numbers("centre", centre)
+    turned = np.radians(numbers("angles", angles, unit="deg"))
+    middle = numbers("centre", centre, unit="pix")
     if turned.ndim != 1 or middle.shape != (2,):
         raise InputError("give `angles` of shape (p,), and a `centre` (x, y)")
     if not (np.isfinite(turned).all() and np.isfinite(middle).all()):

@@ -15,6 +15,7 @@ from scipy.special import expit
 from lnocl.errors import InputError
 from lnocl.io import fitsread
 from lnocl.scene.arrays import unmasked
+from lnocl.scene.quantities import bare
 from lnocl.simulation.checks import check_shape, number
 
 # Below this the 24 rows around the star of `hh34` do not fit.
@@ -83,7 +84,7 @@ class Target:
     """
 
     def __init__(self, extended: ArrayLike, stars: Sequence[Star] = ()) -> None:
-        array = unmasked("the extended source", extended)
+        array = unmasked("the extended source", bare("the extended source", extended))
         if array.ndim != 2 or array.dtype.kind not in "biuf":
             raise InputError(
                 f"the extended source has {array.ndim} dimensions of {array.dtype}; "

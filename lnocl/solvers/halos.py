@@ -13,10 +13,12 @@ grid: of all halos, of the stars, and of the extended source, of the covariance 
 
 For standard errors the variance of each halo takes conjugate gradients of its own. Of many images
 those of a few are computed, and tell by how much the extended source raises the variances of the
-others.
+others, and what images far from a star tell of a halo at it (`lnocl.solvers.near_star`).
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +40,9 @@ FINISHED, N_STEPS = 0.02, 100
 STEPS, SETTLED = 4, 0.1
 # Images of a halo whose variances are computed.
 MOST_IMAGES = 4
-# More stars are taken as known, the faintest of them.
-MOST_STARS = 4
+# Stars that are unknown beside halos: those most like one, so many at least, and further ones of
+# which a halo shares so much of the information, at most so many.
+LEAST_STARS, SHARED, MOST_STARS = 4, 1e-3, 16
 # The extended source is significant where its light in a resolution is so many times the noise, and
 # so many resolutions round it.
 SIGNIFICANT, ROUND = 7.0, 0.5
@@ -70,10 +73,15 @@ class _Joint:
         star_fluxes: Array,
         is_lit: NDArray[np.bool_] | None = None,
     ) -> None:
-        n = scene.n_stars
-        brightest = np.argsort(-star_fluxes[:n], kind="stable")[:MOST_STARS]
-        fitted = np.append(np.sort(brightest), np.arange(n, scene.n_fluxes))
-        self.first, extended = len(fitted) - scene.n_halos, sky / scene.unit
+        extended, fluxes = sky / scene.unit, star_fluxes / scene.unit
+        models = list(model_images(scene, extended, fluxes))
+        totals = [np.maximum(mean, MIN_MODEL) for mean in models]
+        precisions = [
+            np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
+            for total, weights in zip(totals, model.weights, strict=True)
+        ]
+        fitted = np.append(_like_halos(scene, precisions), np.arange(scene.n_stars, scene.n_fluxes))
+        self.first = len(fitted) - scene.n_halos
         expected = extended if is_lit is None else np.where(is_lit, extended, 0.0)
         stars = on_sky(scene.stars, scene.oversample)
         width = resolution(scene)
@@ -81,22 +89,39 @@ class _Joint:
         if is_lit is not None:  # nor are stars taken to be on light that is not significant
             texture.amplitude[~is_lit] = 0.0
         source = SourceError(model.forward, model.adjoint, texture.amplitude, texture.width)
-        fluxes = star_fluxes / scene.unit
         images = []
         unexpected = model.forward(extended - expected)
-        models = model_images(scene, extended, fluxes)
-        arrays = zip(scene.images(), models, model.weights, unexpected, strict=True)
-        for j, (counts, mean, weights, less) in enumerate(arrays):
+        arrays = zip(scene.images(), totals, precisions, unexpected, strict=True)
+        for j, (counts, total, precision, less) in enumerate(arrays):
             shown = np.flatnonzero(scene.shown[fitted, j])
             slopes = np.array([scene.star_image(j, s).ravel() for s in fitted[shown]])
-            total = np.maximum(mean, MIN_MODEL)
-            precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
             images.append(LinearImage(slopes, shown, counts - total + less, precision))
         self.fit = LeastSquares(images, [source], np.zeros(len(fitted)), N_STEPS, FINISHED)
 
     def change(self) -> Array:
         """Return the changes of the halos to where they are least, scaled."""
         return self.fit.solve(np.zeros(len(self.fit.information)))[0][self.first :]
+
+
+def _like_halos(scene: Scene, precisions: list[Array]) -> NDArray[np.int_]:
+    """Return the stars of which halos share most of the information that images have of each."""
+    n, shape = scene.n_stars, (scene.n_stars, scene.n_halos)
+    own, shared, of_halos = np.zeros(n), np.zeros(shape), np.zeros(scene.n_halos)
+    for j, precision in enumerate(precisions):
+        halos = {k: scene.star_image(j, n + k) for k in np.flatnonzero(scene.shown[n:, j]).tolist()}
+        for k, halo in halos.items():
+            of_halos[k] = np.vdot(halo * precision, halo)
+        for s in np.flatnonzero(scene.shown[:n, j]).tolist():
+            star = scene.star_cutout(j, s)
+            there = star.window(scene.image_grid)
+            weighted = precision[there] * star.values
+            own[s] += np.vdot(weighted, star.values)
+            for k, halo in halos.items():
+                shared[s, k] = np.vdot(weighted, halo[there])
+    whole = own[:, None] * of_halos
+    shares = np.divide(shared**2, whole, out=np.zeros(shape), where=whole > 0).max(axis=1)
+    order = np.argsort(-shares, kind="stable")[:MOST_STARS]
+    return np.sort(order[(shares[order] > SHARED) | (np.arange(len(order)) < LEAST_STARS)])
 
 
 def marginal_halos(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array]:
@@ -117,7 +142,9 @@ def marginal_halos(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array,
         is_lit = _significant(scene, model, sky / scene.unit, fluxes / scene.unit)
         joint = _Joint(scene, model, sky, fluxes, is_lit)
         information = np.diag(joint.fit.information)[joint.first :]
-        change = np.where(information > 0, joint.change(), 0.0) * scene.unit
+        # What a star or another halo can stand in for stays.
+        is_told = np.isfinite(variances(joint.fit.information))[joint.first :]
+        change = np.where(is_told, joint.change(), 0.0) * scene.unit
         change = np.maximum(change, -halos)
         halos += change
         sky = _without(scene, model, sky, np.append(np.zeros(scene.n_stars), change))
@@ -158,8 +185,24 @@ def _without(scene: Scene, model: Model, sky: Array, fluxes: Array) -> Array:
     return np.asarray(sky * (1.0 - np.clip(share, -1.0, 1.0)))
 
 
-def halo_errors(scene: Scene, sky: Array, star_fluxes: Array) -> Array:
-    """Return the standard errors of halos, in the unit of fluxes, shape (n_halos,).
+class HaloErrors(NamedTuple):
+    """Standard errors of halos.
+
+    Attributes
+    ----------
+    errors : ndarray of float64, shape (n_halos,)
+        In the unit of fluxes; NaN where the images do not determine a halo.
+    raised : ndarray of float64, shape (n_shapes,)
+        How many times the variance of each shape is that with the extended source known, 1 or more;
+        infinite where the images determine it nowhere.
+    """
+
+    errors: Array
+    raised: Array
+
+
+def halo_errors(scene: Scene, sky: Array, star_fluxes: Array) -> HaloErrors:
+    """Return the standard errors of halos, with stars and extended source marginalised.
 
     Parameters
     ----------
@@ -169,20 +212,20 @@ def halo_errors(scene: Scene, sky: Array, star_fluxes: Array) -> Array:
         Extended source on the grid, electrons per pixel.
     star_fluxes : ndarray of float64, shape (n_fluxes,)
         Those of stars and halos, electrons.
-
-    Returns
-    -------
-    ndarray of float64, shape (n_halos,)
-        NaN where the images do not determine a halo.
     """
+    if not scene.n_halos:
+        return HaloErrors(np.zeros(0), np.zeros(0))
     joint, p = _Joint(scene, Model(scene), sky, star_fluxes), scene.n_images
     found = variances(joint.fit.information)[joint.first :].reshape(-1, p)
     some = np.unique(np.linspace(0, p - 1, MOST_IMAGES).round().astype(int))
+    factors = np.full(len(found), np.inf)
     for k, halo in enumerate(found):
         known = [j for j in some.tolist() if np.isfinite(halo[j])]
         wholes = [joint.fit.variance(joint.first + k * p + j) for j in known]
         raised = [whole / halo[j] for whole, j in zip(wholes, known, strict=True)]
-        halo *= max(float(np.median(raised)), 1.0) if raised else np.nan
+        if raised:
+            factors[k] = max(float(np.median(raised)), 1.0)
+        halo *= factors[k]
         halo[known] = wholes
     errors = np.sqrt(np.where(np.isfinite(found), found, np.nan)).ravel()
-    return errors * scene.unit
+    return HaloErrors(errors * scene.unit, factors)

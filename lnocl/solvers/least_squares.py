@@ -158,8 +158,9 @@ class LeastSquares:
         The images, of one shape.
     fields : list of Field
         The fields; one at least.
-    prior : ndarray of float64, shape (k,)
-        One over the variance of the prior of each parameter, whose mean is 0; 0 for no prior.
+    prior : ndarray of float64, shape (k,) or (k, k)
+        One over the variance of the prior of each parameter, whose mean is 0; 0 for no prior. Or
+        the inverse of their covariance.
     n_steps : int
         Steps of conjugate gradients, at most.
     finished : float
@@ -179,10 +180,11 @@ class LeastSquares:
         n_steps: int,
         finished: float,
     ) -> None:
-        self._images, self._fields, self._prior = images, fields, prior
+        self._images, self._fields = images, fields
+        self._prior = prior = np.diag(prior) if prior.ndim == 1 else prior
         self._n_steps, self._finished = n_steps, finished
         self._ends = np.cumsum([field.at.size for field in fields])[:-1]
-        self.information = information = np.diag(prior)
+        self.information = information = prior.copy()
         for each in images:
             block = _sum("ik,jk->ij", each.slopes * each.precision.ravel(), each.slopes)
             information[np.ix_(each.unknowns, each.unknowns)] += block
@@ -206,7 +208,7 @@ class LeastSquares:
         fields : list of ndarray of float64
             To add to `at` of each field.
         """
-        change, x = self._solve(self._prior * at)
+        change, x = self._solve(self._prior @ at)
         return change, self._each(x)
 
     def variance(self, unknown: int) -> float:

@@ -1,7 +1,8 @@
 """The least squares of a star and of the extended source round it, in a window.
 
 The extended source is a field of the covariance that `lnocl.scene.texture` expects. So the fluxes
-and positions of stars, and their errors, depend on no iteration.
+and positions of stars, and their errors, depend on no iteration. For errors the amounts of halos
+are unknown too: what the images tell of them beyond the window is their prior in it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import movable_psfs, on_sky
-from lnocl.scene.forward_model import LocalRotation, add_to_window, sampled, spread
+from lnocl.scene.forward_model import LocalRotation, add_to_window, model_images, sampled, spread
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import along_sky
@@ -70,6 +71,9 @@ class Surroundings:
         Electrons.
     moves : bool
         Whether positions are unknown too; else they are taken as known.
+    raised : ndarray of float64, shape (n_shapes,), optional
+        How many times the variance of each halo is that with the extended source known
+        (`lnocl.solvers.halos.HaloErrors`). Halos are unknown then; by default they are known.
 
     Attributes
     ----------
@@ -77,13 +81,48 @@ class Surroundings:
         The resolution, pixels of the sky.
     hidden : ndarray of float64, shape (n,)
         Radii round the stars in which no image has observed a pixel, pixels of the sky.
+    n_shapes : int
+        Halos of each image that are unknown.
     """
 
-    def __init__(self, scene: Scene, sky: Array, star_fluxes: Array, moves: bool) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        sky: Array,
+        star_fluxes: Array,
+        moves: bool,
+        raised: Array | None = None,
+    ) -> None:
         self.scene, self.sky, self.star_fluxes, self.moves = scene, sky, star_fluxes, moves
         self.width = resolution(scene)
         self.hidden = hidden_radii(scene, self.width)
         self.psfs = movable_psfs(scene.scaled_psfs(), scene.observation, scene.image_grid)
+        self.n_shapes = 0 if raised is None else len(raised)
+        self._roots = np.zeros(0) if raised is None else raised**-0.5
+        self._precisions = self._find_precisions() if self.n_shapes else []
+
+    def _find_precisions(self) -> list[Array]:
+        scene = self.scene
+        weights = np.ones((1, 1, 1)) if scene.weights is None else scene.weights
+        weights = np.broadcast_to(weights, (scene.n_images, *scene.image_grid))
+        models = model_images(scene, self.sky / scene.unit, self.star_fluxes / scene.unit)
+        return [_precision(scene, model, w) for model, w in zip(models, weights, strict=True)]
+
+    def halos(self, j: int) -> list[Cutout]:
+        """Return the halos of image j that are unknown, for an amount of 1."""
+        scene, p = self.scene, self.scene.n_images
+        return [scene.star_cutout(j, scene.n_stars + h * p + j) for h in range(self.n_shapes)]
+
+    def beyond(self, j: int, window: Window) -> Array:
+        """Return what image j tells of its halos beyond a window, the extended source unknown.
+
+        That is their information, shape (n_shapes, n_shapes), less by the factors `raised`.
+        """
+        precision = self._precisions[j].copy()
+        precision[window.of(self.scene.image_grid)] = 0.0
+        halos = np.array([halo.on_grid(self.scene.image_grid) for halo in self.halos(j)])
+        halos *= self._roots[:, None, None]
+        return np.asarray(np.einsum("hyx,yx,iyx->hi", halos, precision, halos, optimize=True))
 
 
 class NearStar:
@@ -106,6 +145,8 @@ class NearStar:
         The pixels of the images, without offset.
     held : ndarray of int, shape (n_held,)
         Stars that are fitted: this, which is the first, and those near it.
+    n_of_stars : int
+        Unknowns of these, all fluxes, perhaps all x, and all y. Halos follow, shape by shape.
     resolution : float
         What all images resolve together, pixels of the sky.
     hidden : float
@@ -124,12 +165,13 @@ class NearStar:
         there, texture = _texture_in(self.window, around)
         self.source = self._source_error(around, texture.amplitude[there], texture.width)
         self.held, self.n_held, self.resolution = held, len(held), width
-        self._finished, self._moves = finished, around.moves
+        self._finished, self.n_of_stars = finished, len(held) * (3 if around.moves else 1)
         self.expected = texture.mean[there] - sky[self.places(scene)] / scene.unit
         level = float(texture.mean[there].mean())
         self._level = LevelError(level, scene.gains * scene.areas, self.window.shape)
         beyond = self.source.images_of(self.expected)
         self._images = [self._linearise(around, j, held, each) for j, each in enumerate(beyond)]
+        self._prior = self._prior_of_halos(around)
 
     def places(self, scene: Scene) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Return the rows and columns of the window in the sky, on the grid."""
@@ -137,10 +179,18 @@ class NearStar:
 
     @cached_property
     def fit(self) -> LeastSquares:
-        """The least squares: the unknowns are all fluxes, perhaps all x, and all y."""
-        k = (3 if self._moves else 1) * self.n_held
+        """The least squares of stars, halos, and extended source and its level."""
         fields: list[Field] = [self.source, self._level]
-        return LeastSquares(self._images, fields, np.zeros(k), N_STEPS, self._finished)
+        return LeastSquares(self._images, fields, self._prior, N_STEPS, self._finished)
+
+    def _prior_of_halos(self, around: Surroundings) -> Array:
+        p, k = around.scene.n_images, self.n_of_stars
+        prior = np.zeros((k + around.n_shapes * p,) * 2)
+        if around.n_shapes:
+            for j in range(p):
+                there = _in_image(around.scene, j, self.window)
+                prior[k + j :: p, k + j :: p] = around.beyond(j, there)
+        return prior
 
     def _source_error(self, around: Surroundings, amplitude: Array, width: float) -> SourceError:
         """Return the error of the extended source in the window, and its change there."""
@@ -215,7 +265,7 @@ class NearStar:
         model, first, shape = background.copy(), (there.y, there.x), self.window.shape
         add_to_window(model, scene, around.sky, around.star_fluxes, j, first)
         total = np.maximum(model, MIN_MODEL)
-        precision = np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
+        precision = _precision(scene, model, weights)
         lit = np.flatnonzero(scene.shown[held, j])
         slopes = [_cut(scene.star_cutout(j, s), there, grid) for s in held[lit]]
         if around.moves:
@@ -227,8 +277,11 @@ class NearStar:
                 for flux, each in zip(fluxes, moved, strict=True):
                     slope = each._replace(values=flux * each.values[axis])
                     slopes.append(_cut(slope, there, grid))
-        n, k = self.n_held, len(slopes)
+        n, p = self.n_held, scene.n_images
         unknowns = np.concatenate([lit, lit + n, lit + 2 * n]) if around.moves else lit
+        slopes += [_cut(halo, there, grid) for halo in around.halos(j)]
+        of_halos = self.n_of_stars + j + p * np.arange(around.n_shapes)
+        unknowns, k = np.append(unknowns, of_halos), len(slopes)
         left = _padded(counts - total, shape) - beyond
         laid = np.array([_padded(slope, shape) for slope in slopes])
         precision = _padded(precision, shape)
@@ -253,6 +306,12 @@ def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slic
     )
     extended = sky[whole.of(scene.grid)] / scene.unit
     return (there[0], there[1]), Texture(extended, stars[inside], width, around.hidden[inside])
+
+
+def _precision(scene: Scene, model: Array, weights: NDArray) -> Array:
+    """Return one over the variances of pixels of an image, scaled."""
+    lit = model > MIN_MODEL
+    return np.where(lit, scene.scale * weights / np.maximum(model, MIN_MODEL), 0.0)
 
 
 def _observed(scene: Scene, j: int, there: Window) -> tuple[Array, Array, Array]:

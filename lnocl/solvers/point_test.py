@@ -2,8 +2,8 @@ r"""Whether the extended source could be what a place holds, by the least square
 
 A point takes the place of the light of the estimate within a resolution, where the extended source
 is expected to go on inwards as it is round it (`lnocl.scene.texture`). Flux and error follow from
-the least squares of `lnocl.solvers.near_star`, with stars near it and the extended source
-marginalised.
+the least squares of `lnocl.solvers.near_star`, with stars near it, halos and the extended
+source marginalised.
 """
 
 from __future__ import annotations
@@ -22,7 +22,13 @@ FINISHED = 1e-4
 
 
 def point_flux(
-    scene: Scene, sky: Array, star_fluxes: Array, place: Array, flux: float, moves: bool
+    scene: Scene,
+    sky: Array,
+    star_fluxes: Array,
+    place: Array,
+    flux: float,
+    moves: bool,
+    raised: Array,
 ) -> tuple[float, float]:
     """Return the flux of a point at a place and its standard error, electrons.
 
@@ -40,6 +46,8 @@ def point_flux(
         About that of the point, electrons.
     moves : bool
         Whether positions of stars are unknown.
+    raised : ndarray of float64, shape (n_shapes,)
+        As of `lnocl.solvers.halos.halo_errors`: halos are unknown too.
     """
     n, n_epochs = scene.n_stars, scene.observation.n_epochs
     width = resolution(scene)
@@ -48,7 +56,7 @@ def point_flux(
     without = Texture(sky, there, width).mean
     other = scene.with_star(place)
     fluxes = np.insert(star_fluxes, n, [max(flux, 0.0)] * n_epochs)
-    near = NearStar(Surroundings(other, without, fluxes, moves), n, FINISHED)
+    near = NearStar(Surroundings(other, without, fluxes, moves, raised), n, FINISHED)
     at = [int(np.flatnonzero(near.held == s)[0]) for s in range(n, n + n_epochs)]
     known = variances(near.fit.information)[at]
     change, _ = near.fit.solve(np.zeros(len(near.fit.information)))

@@ -4,11 +4,12 @@ The joint Fisher information of the stars' fluxes and positions and of the exten
 
 .. math:: \begin{pmatrix} J^T P J & J^T P A L \\ L^T A^T P J & 1 + L^T A^T P A L \end{pmatrix},
 
-with J the derivatives of the models ``m_j``, P one over their variances, A the convolutions, and
-``L = a C^(1/2)`` the root of the covariance that the extended source is expected to have
-(`lnocl.scene.texture`): what lies under a star nothing but this tells from it. The variance of a
-star is a diagonal element of the inverse. The extended source is eliminated by its Schur
-complement, with conjugate gradients, in a window round each star (`lnocl.solvers.near_star`).
+with J the derivatives of the models ``m_j``, of halos too, whose amounts are unknown, P one over
+their variances, A the convolutions, and ``L = a C^(1/2)`` the root of the covariance that the
+extended source is expected to have (`lnocl.scene.texture`): what lies under a star nothing but this
+tells from it. The variance of a star is a diagonal element of the inverse. The extended source is
+eliminated by its Schur complement, with conjugate gradients, in a window round each star
+(`lnocl.solvers.near_star`).
 
 The same least squares tell how far a star is from where they are least, as the extended source is
 not where it is expected or iterations have ended early. The square of that is added.
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from lnocl.scene.arrays import Array
 from lnocl.scene.scene import Scene
 from lnocl.solvers.fluxes import variances
+from lnocl.solvers.halos import halo_errors
 from lnocl.solvers.near_star import NearStar, Surroundings
 
 # The share of the gradient at which conjugate gradients end.
@@ -29,9 +31,14 @@ FINISHED = 1e-8
 
 
 def standard_errors(
-    scene: Scene, sky: Array, star_fluxes: Array, moves: bool, finished: float = FINISHED
+    scene: Scene,
+    sky: Array,
+    star_fluxes: Array,
+    moves: bool,
+    raised: Array | None = None,
+    finished: float = FINISHED,
 ) -> Array:
-    """Return the standard errors of stars, with the extended source marginalised.
+    """Return the standard errors of stars, with halos and extended source marginalised.
 
     Parameters
     ----------
@@ -43,6 +50,8 @@ def standard_errors(
         Electrons.
     moves : bool
         Whether positions were fitted too; else they are taken as known.
+    raised : ndarray of float64, shape (n_shapes,), optional
+        As of `lnocl.solvers.halos.halo_errors`, where that is known already.
     finished : float
         The share of the gradient at which conjugate gradients end.
 
@@ -52,7 +61,9 @@ def standard_errors(
         Of flux, electrons, x and y, pixels; NaN for positions that were not fitted, and where the
         images do not determine a star.
     """
-    around = Surroundings(scene, sky, star_fluxes, moves)
+    if raised is None:
+        raised = halo_errors(scene, sky, star_fluxes).raised
+    around = Surroundings(scene, sky, star_fluxes, moves, raised)
     errors = np.full((scene.n_stars, 3), np.nan)
     n_epochs, k = scene.observation.n_epochs, 3 if moves else 1
     for first in range(0, scene.n_stars, n_epochs):  # which lies there in all epochs
@@ -66,7 +77,7 @@ def standard_errors(
 def _errors_of(near: NearStar, wanted: NDArray[np.bool_]) -> Array:
     """Return the errors of stars that are fitted, of their fluxes and perhaps x and y."""
     fit, k = near.fit, len(near.fit.information)
-    unknowns = np.arange(k).reshape(-1, near.n_held)[:, wanted].T
+    unknowns = np.arange(near.n_of_stars).reshape(-1, near.n_held)[:, wanted].T
     is_determined = np.isfinite(variances(fit.information))
     if not is_determined.any():
         return np.full(unknowns.shape, np.nan)

@@ -248,8 +248,7 @@ class TestFrames:
         for name in ("f1.fits", "f2.fits"):
             fits.delval(name, "CTYPE1")
             fits.delval(name, "CTYPE2")
-        assert self.run("--gain", "1", "--exposure", "1", "--refine", "--n-iter", "1",
-                        "--residuals") == 0  # fmt: skip
+        assert self.run("--gain", "1", "--exposure", "1", "--n-iter", "1", "--residuals") == 0
         found = outcome("out.fits")
         columns = ["x", "y", "flux", "flux_error"]
         assert list(found["STARS"]) == [*columns, "core_rms", "wings_rms", "halo"]

@@ -170,3 +170,53 @@ class TestNamesOfOutputs:
     def test_those_of_fits_files_are_taken(self, name):
         assert run(output=name) == 0
         assert fits.getdata(name).shape == (16, 12)
+
+
+# Words that are ignored without others, and these.
+NEEDED = {
+    "deconvolve i.fits --psf p.fits -o o.fits --centre 3,4": "--angle",
+    "deconvolve i.fits --psf p.fits -o o.fits --epoch each": "--star or --stars",
+    "deconvolve i.fits --psf p.fits -o o.fits --refine": "--star or --stars",
+    "deconvolve i.fits --psf p.fits -o o.fits --psf-errors ideal=d.fits": "--star or --stars",
+    "limit r.fits --injections 0 --seed 3": "--injections",
+    "devices --device 0": "--tune",
+    "bench --psf p.fits": "images",
+    "bench --background 3": "images",
+    "bench --read-noise 3": "images",
+    "bench --star 3,4": "images",
+}
+
+
+def test_every_option_that_needs_another_is_listed():
+    needing = {
+        (name, each.flags[0])
+        for name, command in cli.COMMANDS.items()
+        for group in command.options.values()
+        for each in group
+        if each.needs
+    }
+    words = [each.split() for each in NEEDED]
+    assert {(each[0], next(w for w in each[::-1] if w[:2] == "--")) for each in words} == needing
+
+
+@pytest.mark.parametrize("command", NEEDED)
+def test_an_option_that_would_be_ignored_is_refused_before_any_work(command, capsys):
+    flag = next(word for word in command.split()[::-1] if word.startswith("--"))
+    assert cli.main(command.split()) == 2
+    assert one_complaint(capsys.readouterr()) == (
+        f"{flag} does nothing without {NEEDED[command]}: give that too, or leave it out"
+    )
+
+
+def test_options_of_stars_are_taken_with_a_table_of_them_and_defaults_alone():
+    parser = cli.make_parser()
+    for words in ("--stars s.csv --refine --epoch each", "--no-refine"):
+        line = f"deconvolve i.fits --psf p.fits -o o.fits {words}"
+        parsed = parser.parse_args(line.split())
+        parsed.command.refuse_ignored(parsed)
+
+
+def test_processes_are_refused_where_there_are_no_tiles(capsys):
+    assert run("--parallel", "2") == 2
+    message = "--parallel does nothing without tiles: give --tile too, or leave it out"
+    assert one_complaint(capsys.readouterr()) == message

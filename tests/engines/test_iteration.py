@@ -95,6 +95,7 @@ def scipy_iteration(made):
     smoothing = made.recipe.smoothing
     scene = Scene(made.observation(), made.stars, Penalty(mu, smoothing))
     edge = scene.edge * scene.unit or 1.0  # its own value is tested in test_scene.py
+    mu, smoothing = mu * made.mean_exposure**2, smoothing * made.mean_exposure
     inside = np.s_[..., : shape[0], : shape[1]]
 
     variance = np.square(np.broadcast_to(made.recipe.read_noise, len(made.images)))[:, None, None]

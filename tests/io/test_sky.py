@@ -424,3 +424,13 @@ def test_texts_for_numbers_are_refused(keyword):
         make_wcs(damaged)
     with pytest.raises(InputError, match=r"a\.fits has no sky coordinates"):
         sky.celestial_wcs(damaged, "a.fits")
+
+
+def test_angles_of_a_file_are_in_its_unit(tmp_path):
+    path = str(tmp_path / "angles.fits")
+    for unit, expected in (("rad", np.degrees([0.5, -1.0])), ("deg", [0.5, -1.0])):
+        fits.writeto(path, np.array([0.5, -1.0]), fits.Header({"BUNIT": unit}), overwrite=True)
+        np.testing.assert_allclose(sky.read_angles(path)[0], expected, rtol=1e-14)
+    fits.writeto(path, np.array([0.5, -1.0]), fits.Header({"BUNIT": "pix"}), overwrite=True)
+    with pytest.raises(InputError, match="angle must be in degrees, not in pix"):
+        sky.read_angles(path)

@@ -513,3 +513,15 @@ def test_where_psfs_give_nothing_their_error_is_no_noise():
     result = lnocl.deconvolve(observation, TWO, refine_psfs=["pixels"], **PAPER | given)
     assert (result.psf_refinement.errors_in_rings[6:] == 0).all()
     assert (result.star_fluxes < 4e5).all()
+
+
+@pytest.mark.parametrize("given", ["ideal_psfs", "pupils", "psf_modes"])
+def test_what_could_refine_psfs_and_does_not_is_named(given, caplog):
+    caplog.set_level("INFO", "lnocl")
+    value = PSF[None] if given == "psf_modes" else PSF
+    observation = lnocl.Observation(np.ones((N, N)), PSF, **{given: value})
+    run = {"stop": None, "n_iter": 1, "smoothing": 0.1, "engine": "numpy"}
+    lnocl.deconvolve(observation, [STAR], **run)
+    assert [line for line in caplog.messages if "no part" in line] == [
+        f"{given} have no part in this run, which does not refine the PSFs by them"
+    ]

@@ -50,27 +50,52 @@ def assert_close(result, other, extended, star_fluxes, objective):
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
 @every_scene
 def test_a_longer_unit_of_time_is_bit_for_bit(solver, recipe, start, exponent):
-    """Of exposures times k, fluxes are k times less, and mu, a weight of squares, k^2 times more.
-
-    Of J nothing is left to see.
-    """
+    """Of exposures times k, fluxes are k times less; weights of penalties stay, and so does J."""
     made, factor = recipe.make(), 2.0**exponent
     starts = {
         name: getattr(made, name) if start == "given" else None
         for name in ("initial_extended", "initial_star_fluxes")
     }
-    result = made.deconvolve(n_iter=10, solver=solver, **starts, **numpy_alone)
+    given = {"n_iter": 10, "solver": solver, "smoothing": 0.02, **numpy_alone}
+    result = made.deconvolve(**starts, **given)
     scaled = made.deconvolve(
         made.observation(exposure=factor * made.exposure),
-        n_iter=10,
-        solver=solver,
-        mu=factor**2 * recipe.mu,
+        **given,
         **{k: None if v is None else v / factor for k, v in starts.items()},
-        **numpy_alone,
     )
     np.testing.assert_array_equal(scaled.extended, result.extended / factor)
     np.testing.assert_array_equal(scaled.star_fluxes, result.star_fluxes / factor)
     np.testing.assert_array_equal(scaled.history["objective"], result.history["objective"])
+
+
+@pytest.mark.parametrize("oversample", [1, 2])
+@pytest.mark.parametrize("smoothing", [0.02, "auto"])
+@every_scene
+def test_models_do_not_hang_on_the_unit_of_time(recipe, smoothing, oversample):
+    made = dataclasses.replace(recipe, n_stars=0, fractions=False).make()
+    psfs = np.repeat(np.repeat(made.psfs, oversample, 1), oversample, 2)
+    given = {"n_iter": 10, "stop": None, "smoothing": smoothing, "mu": 1e-3, **numpy_alone}
+    found = []
+    for factor in (1.0, 1024.0, 1000.0):
+        changes = {"psfs": psfs, "oversample": oversample, "exposure": factor * made.exposure}
+        found.append(lnocl.deconvolve(made.observation(**changes), **given))
+    expected, exact, close = (each.models() for each in found)
+    np.testing.assert_array_equal(exact, expected)
+    assert found[1].smoothing == found[0].smoothing
+    assert worst(close, expected) <= 1e-12
+
+
+def test_tiles_are_smoothed_by_one_weight_where_exposures_differ_between_them():
+    seconds = np.broadcast_to(np.where(np.arange(64) < 32, 1.0, 4.0), (32, 64))
+    images = np.random.default_rng(0).poisson(10.0 * seconds).astype(float)
+    psf = [[0.0, 1.0, 0.0], [1.0, 4.0, 2.0], [0.0, 1.5, 0.0]]
+    observation = lnocl.Observation(images, psf, exposure=seconds)
+    given = {"smoothing": 0.2, "stop": None, "n_iter": 300, "pad": 0, **numpy_alone}
+    whole = lnocl.deconvolve(observation, **given)
+    tiled = lnocl.deconvolve_tiles(observation, tile=32, **given)
+    assert len(tiled.tiles) > 1
+    inner = np.s_[4:28, 4:60]  # what wraps round the whole does not round a tile
+    assert worst(tiled.extended[inner], whole.extended[inner]) <= 3e-4
 
 
 @numpy_first
@@ -83,7 +108,6 @@ def test_equal_exposures_are_none(engine):
         other = made.deconvolve(
             made.observation(exposure=8.0),
             n_iter=10,
-            mu=64 * made.recipe.mu,
             initial_extended=made.initial_extended / 8,
             initial_star_fluxes=made.initial_star_fluxes / 8,
             **engine,

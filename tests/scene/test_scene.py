@@ -175,8 +175,8 @@ def test_edge_is_three_times_the_mean_of_the_extended_source(exposure):
     observation = lnocl.Observation(images, np.ones((1, 1)), background=2.0, exposure=exposure)
     scene = Scene(observation, [(4, 3)], Penalty(0.0, 0.5))
     np.testing.assert_allclose(scene.edge * scene.unit, 3.0 * 6.0 / (exposure or 1.0))
-    # J is in units of the scale, the estimate in its own.
-    np.testing.assert_allclose(scene.smoothing, 0.5 * scene.unit / scene.scale)
+    # J and electrons at the mean exposure are in one unit, that of the scale.
+    assert scene.smoothing == 0.5
     assert Scene(observation, [(4, 3)]).edge == 0.0
 
 

@@ -247,10 +247,10 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (["--psf", "psfs.fits"], "--psf goes with images, and none are given"),
-            (STAR, "--star goes with images"),
-            (["--background", "8"], "--background goes with images"),
-            (["--read-noise", "8"], "--read-noise goes with images"),
+            (["--psf", "psfs.fits"], "--psf does nothing without images: give that too, or"),
+            (STAR, "--star does nothing without images"),
+            (["--background", "8"], "--background does nothing without images"),
+            (["--read-noise", "8"], "--read-noise does nothing without images"),
             (["images.fits"], "images need their PSFs: give --psf"),
             ([*FILES, "--size", "64"], "--size is of the demo's scene"),
             ([*FILES, "--n-iter", "7"], "--n-iter must be a whole number, 8 or more; 7"),

@@ -282,7 +282,7 @@ class TestExamples:
                  "--read-noise", 5.187, "--pad", 4, *stars]  # fmt: skip
         for how, whole, refined in [
             (["--n-iter", 30], 3.31, 0.95),
-            (["--smoothing", 30, "--n-iter", 300], 3.04, 0.98),
+            (["--smoothing", 0.0328, "--n-iter", 300], 3.04, 0.98),
         ]:
             rms = []
             for refine in ([], ["--refine"]):

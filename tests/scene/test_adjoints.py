@@ -1,0 +1,146 @@
+"""Each linear map against its adjoint, and those of a window against those of the grid.
+
+PSFs have no symmetry, and images differ in depth, PSF, place and scale: so a conjugate that is
+dropped, an axis that is turned round, or one image taken for another changes a sum.
+"""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import turned_scenes
+from scenes import make_psfs, make_smooth_psfs
+
+import lnocl
+from lnocl.scene.forward_model import LocalRotation, Model
+from lnocl.scene.psf_pixels import PsfPixels
+from lnocl.scene.scene import Scene
+from lnocl.solvers import near_star
+from lnocl.solvers.near_star import NearStar, Surroundings
+from lnocl.solvers.psf_fit import _PixelErrors
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:the images are shifted"),
+    pytest.mark.filterwarnings("ignore:psf . is sharper"),
+    pytest.mark.filterwarnings("ignore:the star at .* lies on bad pixels"),
+]
+
+SHAPE, P = (40, 56), 3
+STARS = [(27, 18), (9.3, 30.6)]
+RNG = np.random.default_rng(11)
+IMAGES = RNG.poisson(np.array([20.0, 60.0, 9.0])[:, None, None] * np.ones(SHAPE)).astype(float)
+EXPOSURE = np.array([1.0, 3.0, 0.4])
+OFFSETS = np.array([(0.0, 0.0), (1.4, -2.7), (-3.0, 0.3)])
+SECONDS = EXPOSURE[:, None, None] * RNG.uniform(0.5, 2.0, SHAPE)
+MASK = RNG.random((P, *SHAPE)) < 0.03
+SMOOTH = make_smooth_psfs(P, (13, 15))
+
+
+def turned(maps):
+    return turned_scenes.observation(maps, psfs=SMOOTH, psf_centre="given")
+
+
+KINDS = {
+    "apart": lambda: observe(make_psfs(P, (7, 8))),
+    "shared": lambda: observe(make_psfs(1, (7, 8)), offsets=np.round(OFFSETS)),
+    "moved": lambda: observe(SMOOTH, offsets=OFFSETS, mask=MASK),
+    "mapped": lambda: observe(SMOOTH, offsets=OFFSETS, exposure=SECONDS),
+    "finer": lambda: observe(make_smooth_psfs(P, (18, 17)), offsets=OFFSETS, oversample=2),
+    "turned": lambda: turned(turned_scenes.transforms()),
+    "scaled": lambda: turned(turned_scenes.scaled()),
+}
+every_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+def observe(psfs, **changes):
+    given = {"background": [2.0, 5.0, 1.0], "exposure": EXPOSURE, "psf_centre": "given"}
+    return lnocl.Observation(IMAGES, psfs, **(given | changes))
+
+
+@cache
+def a_scene(kind):
+    stars = turned_scenes.STARS if kind in ("turned", "scaled") else STARS
+    return Scene(KINDS[kind](), stars)
+
+
+def dot(a, b):
+    return float(np.vdot(a, b))
+
+
+def noise(*shape, seed=3):
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+def assert_adjoint(forward, adjoint, x, y):
+    """Assert that ``<A x, y>`` is ``<x, A^T y>``, but for rounding."""
+    images = np.asarray(forward(x))
+    scale = np.linalg.norm(images) * np.linalg.norm(y)
+    assert dot(images, y) == pytest.approx(dot(x, adjoint(y)), rel=0, abs=1e-13 * scale)
+
+
+@every_kind
+def test_images_of_the_sky(kind):
+    model = Model(a_scene(kind))
+    x, y = noise(*model.grid), noise(*model.shape, seed=4)
+    assert_adjoint(model.forward, model.adjoint, x, y)
+    factors = abs(noise(2, P, seed=5))
+    for found, shares in zip(model.adjoints(y, factors), factors, strict=True):
+        expected = model.adjoint(shares[:, None, None] * y)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+@every_kind
+def test_cutouts_of_stars(kind):
+    scene = a_scene(kind)
+    model = Model(scene)
+    cutouts = [scene.star_cutout(j, 1) for j in range(P)]
+    whole = model.adjoint([each.on_grid(scene.image_grid) for each in cutouts])
+    found = model.adjoint_of_cutouts(cutouts).on_grid(model.grid)
+    # Where images are turned, what is cut off is a ten thousandth.
+    allowed = 1e-4 if scene.rotations else 1e-12
+    np.testing.assert_allclose(found, whole, atol=allowed * abs(whole).max())
+
+
+@pytest.mark.parametrize("kind", ["turned", "scaled"])
+def test_a_window_of_a_turned_image(kind):
+    for j in range(P):
+        local = LocalRotation(a_scene(kind), j, range(3, 14), range(6, 23))
+        x = noise(len(local.rows), len(local.columns))
+        assert_adjoint(local.image, local.adjoint, x, noise(*local.shape, seed=4))
+
+
+@every_kind
+def test_the_sky_round_a_star(kind, monkeypatch):
+    """Its adjoint, and its images against those of the whole sky."""
+    monkeypatch.setattr(near_star, "WINDOW", 2.0)
+    scene = a_scene(kind)
+    sky = np.full(scene.grid, 3.0)
+    near = NearStar(Surroundings(scene, sky, np.full(scene.n_fluxes, 900.0), False), 0, 1e-8)
+    source, shape = near.source, near.expected.shape
+    assert shape != scene.grid
+    x, y = abs(noise(*shape)), noise(P, *near.window.shape, seed=4)
+    weights = np.array([each.precision > 0 for each in near._images])
+    assert_adjoint(source.images_of, source._adjoint, x, y * weights)
+    laid = np.zeros(scene.grid)
+    laid[near.places(scene)] = x
+    images = Model(scene).forward(laid)
+    for j, found in enumerate(source.images_of(x)):
+        there = near_star._in_image(scene, j, near.window)
+        expected = images[j][there.of(scene.image_grid)]
+        ny, nx = expected.shape
+        is_seen = weights[j, :ny, :nx]
+        # The weights that turn an image have an error of their own.
+        allowed = 1e-3 if scene.rotations else 1e-9
+        difference = abs(found[:ny, :nx] - expected)[is_seen].max()
+        assert difference <= allowed * expected[is_seen].max()
+
+
+@pytest.mark.parametrize("kind", ["apart", "moved", "finer"])
+def test_errors_of_the_pixels_of_psfs(kind):
+    scene = a_scene(kind)
+    psfs = scene.observation.psfs
+    pixels = PsfPixels(psfs, 0.1 * abs(psfs) + 1e-4, scene.oversample)
+    sky = abs(noise(*scene.grid, seed=5))
+    errors = _PixelErrors(scene, pixels, sky, np.array([40.0, 7.0]), np.zeros(psfs.shape))
+    x, y = noise(*psfs.shape), noise(P, *scene.image_grid, seed=4)
+    assert_adjoint(lambda x: list(errors.forward(x)), errors.adjoint, x, y)
