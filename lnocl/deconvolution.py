@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from lnocl.errors import DivergedError, InputError, NotFiniteError, note, warn
 from lnocl.result import Callback, Estimate, Iterating, Result, make_result
+from lnocl.result.verdict import warn_of_faults
 from lnocl.runs.checkpoint import Checkpointer, describe
 from lnocl.runs.halves import Halves
 from lnocl.runs.held_out import HeldOutCounts
@@ -222,6 +223,7 @@ def deconvolve(
         - The extended source to start from was far brighter than the images.
         - Held-out counts choose an iteration too near `n_iter`.
         - The objective rises or is not finite.
+        - The model does not fit, at a star or in all, or a star has no light (`Result.verdict`).
         - A later checkpoint cannot be written.
         - Compiled kernels cannot be stored, or they or the tunings are damaged.
 
@@ -379,7 +381,11 @@ def deconvolve(
         what = "fitting stars and halos" if has_halos else "fitting star fluxes"
         with _quietly(), Progress(None, "", bool(progress), what, stays=False):
             outcome = outcome.marginal(is_fit, has_halos)
-    return make_result(replace(outcome, psf_refinement=mended.refinement))
+    may_free = "pixels" not in families and not (found or observation.psf_fields)
+    outcome = replace(outcome, psf_refinement=mended.refinement, may_free_pixels=may_free)
+    result = make_result(outcome)
+    warn_of_faults(result, progress)
+    return result
 
 
 def _quietly() -> np.errstate:

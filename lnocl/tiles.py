@@ -19,6 +19,7 @@ from lnocl.parallel import Parallel, check_parallel, work
 from lnocl.process import ignored_warnings, recorded_warnings
 from lnocl.residuals import StarResiduals
 from lnocl.result import Result, make_result
+from lnocl.result.verdict import warn_of_faults
 from lnocl.runs.options import (
     StopName,
     check_choices,
@@ -302,7 +303,7 @@ def deconvolve_tiles(
         curve, reason, n_iter, last = chosen.held_out, chosen.stop_reason, chosen.n_iter, None
         penalty = next(each for each in penalties if each.smoothing == chosen.smoothing)
     solver = _Solver(setup, [penalty], max(n_iter, 1), last)
-    mosaic = _Mosaic(observation, len(positions))
+    mosaic = _Mosaic(observation, positions)
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
         closing(work(solver.solving, observed, parallel)) as answers,
@@ -311,7 +312,9 @@ def deconvolve_tiles(
             mosaic.add(each, found)
             bar.update()
     _warn_of_tiles(mosaic.messages)
-    return mosaic.result(penalty, curve, reason, n_iter if reason else None)
+    result = mosaic.result(penalty, curve, reason, n_iter if reason else None)
+    warn_of_faults(result, progress)
+    return result
 
 
 ALLOWED = {"solver", "precision", "engine", "device", "pad", "refine_positions"}
@@ -523,8 +526,11 @@ def _light(tile: _Tile) -> float:
 class _Mosaic:
     """What all tiles have found, put together as they are done."""
 
-    def __init__(self, observation: Observation, n_stars: int) -> None:
-        self.observation = observation
+    may_free_pixels = False
+
+    def __init__(self, observation: Observation, positions: Array) -> None:
+        n_stars = len(positions)
+        self.observation, self.given_positions = observation, positions
         self._extended = np.zeros(observation.sky_shape)
         self._weight = np.zeros(observation.sky_shape)
         self._models = np.zeros(observation.images.shape)

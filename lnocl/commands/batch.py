@@ -22,10 +22,10 @@ from lnocl.commands import deconvolve, environment, messages, options, pictures,
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.commands.signals import Terminated
-from lnocl.commands.summary import FITS
 from lnocl.commands.targets import Target, read_targets
 from lnocl.errors import FileError, LnoclError, counted
 from lnocl.residuals import MUCH_HALO
+from lnocl.result.verdict import FITS
 
 if TYPE_CHECKING:
     from astropy.table import Table

@@ -344,7 +344,6 @@ STAR_TABLE = option(
 DEVICE = option(
     "--device",
     metavar="SPEC",
-    card=("DEVICE", "device"),
     help="OpenCL device as PLATFORM[:DEVICE], each an index or a part of the name, as lnocl "
     "devices lists them (default: that of PYOPENCL_CTX, else the first GPU, else the first CPU)",
 )

@@ -181,6 +181,8 @@ class Outcome:
         Whether the star fluxes are those of `marginal`, and so those of replicas.
     has_marginal_halos : bool
         Whether the amounts of halos are, likewise.
+    may_free_pixels : bool
+        Whether the pixels of PSFs were not to be refined, and could be.
     """
 
     setup: Setup
@@ -193,6 +195,12 @@ class Outcome:
     psf_refinement: PsfRefinement | None = None
     is_marginal: bool = False
     has_marginal_halos: bool = False
+    may_free_pixels: bool = False
+
+    @property
+    def given_positions(self) -> Array:
+        """The places of the stars that were given, in the order of the fluxes, shape (n, 2)."""
+        return np.repeat(self.setup.stars, self.observation.n_epochs, axis=0)
 
     @property
     def moves(self) -> bool:
