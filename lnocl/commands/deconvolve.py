@@ -70,10 +70,9 @@ def _run(arguments: argparse.Namespace) -> None:
     from lnocl.io import atomic
     from lnocl.parallel import check_parallel
 
-    inputs = options.input_paths(ALL_OPTIONS, vars(arguments))
-    atomic.check_fits_output(arguments.output, arguments.overwrite, inputs)
-    pictures.check(arguments, inputs)
-    checkpoints.check(arguments, inputs)
+    atomic.check_fits_output(arguments.output, arguments.overwrite)
+    pictures.check(arguments)
+    checkpoints.check(arguments)
     check_parallel(arguments.parallel)
     with (
         messages.shown_log(arguments.quiet, COMMAND.flags()),

@@ -80,9 +80,7 @@ def simulated_case(size: int) -> Case:
     return Case(observation, made.stars, [f"hh34, {size} x {size}"], made.extended)
 
 
-def check(
-    n_iter: int, accuracy: float, stem: str | None, overwrite: bool, inputs: Sequence[str]
-) -> None:
+def check(n_iter: int, accuracy: float, stem: str | None, overwrite: bool) -> None:
     """Check the parameters of `run` before any work is done.
 
     Raises
@@ -100,7 +98,7 @@ def check(
         if not os.path.basename(stem):
             raise InputError(f"the output {stem!r} names no file; give a path without its ending")
         for ending in (".ecsv", ".png"):
-            atomic.check_output(stem + ending, overwrite, inputs)
+            atomic.check_output(stem + ending, overwrite)
 
 
 def run(

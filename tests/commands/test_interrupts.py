@@ -112,7 +112,8 @@ def test_signals_do_again_what_they_did_once_the_run_is_over():
 def test_a_checkpoint_in_the_place_of_other_files_is_refused(name, small_command, capsys):
     words = ["-o", "found.fits", "--plot", "a.png", "--checkpoint", name]
     assert cli.main([*small_command, *words]) == 2
-    assert f"the checkpoint {name} is an output or an input" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f" {name} is an output too" in said or f" {name} is one of the inputs" in said
 
 
 def test_the_output_does_not_replace_the_checkpoint_gone_on_from(small_command, capsys):
