@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lnocl.errors import counted, warn
+from lnocl.errors import MisfitWarning, counted, warn
 from lnocl.runs.progress import Progress
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
@@ -31,7 +31,7 @@ def warn_of_faults(result: Result, progress: bool) -> None:
 
     Warns
     -----
-    LnoclWarning
+    MisfitWarning
         The model does not fit.
     """
     with (
@@ -40,7 +40,7 @@ def warn_of_faults(result: Result, progress: bool) -> None:
     ):
         found = faults(result)
     for line in found:
-        warn(line)
+        warn(line, MisfitWarning)
 
 
 def faults(result: Result) -> list[str]:
