@@ -352,15 +352,10 @@ def deconvolve(
     moves = refine_positions if is_auto else refine_positions is True
     shared = observation, positions, pad, solver, precision, engine, device
     setup = Setup(*shared, moves is True, *initial, settles_halos=has_halos)
-    mended = Mended(setup)
-    if is_auto or families or len(observation.psf_scatter):
-        is_asked = bool(families) and not isinstance(refine_psfs, str)
-        mended = judge_psfs(setup, families, moves, is_asked, progress)
-    are_psfs_wrong = is_auto and mended.near_stars is not None and not mended.fits
-    observation, near_stars = mended.setup.observation, mended.near_stars
-    penalties = read_penalties(mu, smoothing, stop, observation, near_stars, are_psfs_wrong)
-    if are_psfs_wrong and stop == "held-out":
-        stop = CONVERGED
+    is_asked = bool(families) and not isinstance(refine_psfs, str)
+    mended, penalties, stop = choose_penalties(
+        setup, mu, smoothing, stop, families, moves, is_asked, is_auto, progress
+    )
     inputs = partial(
         describe, mended.setup, mu=mu, smoothing=smoothing, n_iter=int(n_iter), stop=stop
     )
@@ -391,6 +386,39 @@ def deconvolve(
 def _quietly() -> np.errstate:
     """Have NumPy not warn of what is too large: the run looks for objectives that are infinite."""
     return np.errstate(over="ignore", invalid="ignore")
+
+
+def choose_penalties(
+    setup: Setup,
+    mu: float,
+    smoothing: float | Literal["auto"],
+    stop: StopName | float | None,
+    families: Sequence[str],
+    moves: bool | str,
+    is_asked: bool,
+    is_auto: bool,
+    progress: bool,
+) -> tuple[Mended, list[Penalty], StopName | float | None]:
+    """Return a setup whose PSFs and positions were judged, the penalties for it, and when to stop.
+
+    Parameters
+    ----------
+    setup, mu, smoothing, stop, progress
+        As for `deconvolve`.
+    families, moves, is_asked
+        As for `lnocl.runs.psf_refinement.mend`.
+    is_auto : bool
+        Whether PSFs are judged though nothing is asked of them.
+    """
+    mended = Mended(setup)
+    if is_auto or families or len(setup.observation.psf_scatter):
+        mended = judge_psfs(setup, families, moves, is_asked, progress)
+    are_psfs_wrong = is_auto and mended.near_stars is not None and not mended.fits
+    observation, near_stars = mended.setup.observation, mended.near_stars
+    penalties = read_penalties(mu, smoothing, stop, observation, near_stars, are_psfs_wrong)
+    if are_psfs_wrong and stop == "held-out":
+        stop = CONVERGED
+    return mended, penalties, stop
 
 
 def judge_psfs(
