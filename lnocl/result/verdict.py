@@ -54,6 +54,8 @@ def faults(result: Result) -> list[str]:
     for place, given, flux, found in zip(
         result.star_positions, findings.given_positions, result.star_fluxes, at_stars, strict=True
     ):
+        if np.isnan(flux):  # no image shows it, as the run has told
+            continue
         if not flux > NO_LIGHT:
             where = _elsewhere(result.extended, place, findings.observation.oversample)
             dark.append(f"{_at(given)}{where}")
