@@ -309,7 +309,7 @@ def test_stars_of_tiles_are_those_of_one_run_though_their_psf_is_wrong(narrow):
     for each in (whole, result):
         assert (abs(each.star_fluxes - fluxes) < 3 * each.star_flux_errors).all()
     assert (abs(result.star_fluxes - whole.star_fluxes) < 0.6 * whole.star_flux_errors).all()
-    np.testing.assert_allclose(result.star_flux_errors, whole.star_flux_errors, rtol=0.02)
+    np.testing.assert_allclose(result.star_flux_errors, whole.star_flux_errors, rtol=0.06)
 
 
 @pytest.mark.parametrize("is_wrong", [True, pytest.param(False, marks=pytest.mark.exhaustive)])

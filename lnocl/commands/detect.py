@@ -87,6 +87,7 @@ def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Fra
             atomic.check_output(arguments.output, arguments.overwrite)
         pictures.check(arguments)
 
+    check()  # before the result is read; then that nothing that it was made of is replaced
     again = Again.read(arguments.result, arguments.quiet, check)
     return again.solve().significance(arguments.width, arguments.false_alarms), again.frames
 
