@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from lnocl.errors import DivergedError, InputError, NotFiniteError, note, warn
 from lnocl.result import Callback, Estimate, Iterating, Result, make_result
+from lnocl.result.verdict import warn_of_faults
 from lnocl.runs.checkpoint import Checkpointer, describe
 from lnocl.runs.halves import Halves
 from lnocl.runs.held_out import HeldOutCounts
@@ -225,6 +226,7 @@ def deconvolve(
         - The extended source to start from was far brighter than the images.
         - Held-out counts choose an iteration too near `n_iter`; a run with a weight is the result.
         - The objective rises or is not finite.
+        - The model does not fit, at a star or in all, or a star has no light (`Result.verdict`).
         - A later checkpoint cannot be written.
         - Compiled kernels cannot be stored, or they or the tunings are damaged.
 
@@ -360,15 +362,10 @@ def deconvolve(
     moves = refine_positions if is_auto else refine_positions is True
     shared = observation, positions, pad, solver, precision, engine, device
     setup = Setup(*shared, moves is True, *initial, settles_halos=has_halos)
-    mended = Mended(setup)
-    if is_auto or families or len(observation.psf_scatter):
-        is_asked = bool(families) and not isinstance(refine_psfs, str)
-        mended = judge_psfs(setup, families, moves, is_asked, progress)
-    are_psfs_wrong = is_auto and mended.near_stars is not None and not mended.fits
-    observation, near_stars = mended.setup.observation, mended.near_stars
-    penalties = read_penalties(mu, smoothing, stop, observation, near_stars, are_psfs_wrong)
-    if are_psfs_wrong and stop == "held-out":
-        stop = CONVERGED
+    is_asked = bool(families) and not isinstance(refine_psfs, str)
+    mended, penalties, stop = choose_penalties(
+        setup, mu, smoothing, stop, families, moves, is_asked, is_auto, progress
+    )
     inputs = partial(
         describe, mended.setup, mu=mu, smoothing=smoothing, n_iter=int(n_iter), stop=stop
     )
@@ -391,12 +388,49 @@ def deconvolve(
         what = "fitting stars and halos" if has_halos else "fitting star fluxes"
         with _quietly(), Progress(None, "", bool(progress), what, stays=False):
             outcome = outcome.marginal(is_fit, has_halos)
-    return make_result(replace(outcome, psf_refinement=mended.refinement))
+    may_free = "pixels" not in families and not (found or observation.psf_fields)
+    outcome = replace(outcome, psf_refinement=mended.refinement, may_free_pixels=may_free)
+    result = make_result(outcome)
+    warn_of_faults(result, progress)
+    return result
 
 
 def _quietly() -> np.errstate:
     """Have NumPy not warn of what is too large: the run looks for objectives that are infinite."""
     return np.errstate(over="ignore", invalid="ignore")
+
+
+def choose_penalties(
+    setup: Setup,
+    mu: float,
+    smoothing: float | Literal["auto"],
+    stop: StopName | float | None,
+    families: Sequence[str],
+    moves: bool | str,
+    is_asked: bool,
+    is_auto: bool,
+    progress: bool,
+) -> tuple[Mended, list[Penalty], StopName | float | None]:
+    """Return a setup whose PSFs and positions were judged, the penalties for it, and when to stop.
+
+    Parameters
+    ----------
+    setup, mu, smoothing, stop, progress
+        As for `deconvolve`.
+    families, moves, is_asked
+        As for `lnocl.runs.psf_refinement.mend`.
+    is_auto : bool
+        Whether PSFs are judged though nothing is asked of them.
+    """
+    mended = Mended(setup)
+    if is_auto or families or len(setup.observation.psf_scatter):
+        mended = judge_psfs(setup, families, moves, is_asked, progress)
+    are_psfs_wrong = is_auto and mended.near_stars is not None and not mended.fits
+    observation, near_stars = mended.setup.observation, mended.near_stars
+    penalties = read_penalties(mu, smoothing, stop, observation, near_stars, are_psfs_wrong)
+    if are_psfs_wrong and stop == "held-out":
+        stop = CONVERGED
+    return mended, penalties, stop
 
 
 def judge_psfs(

@@ -208,12 +208,33 @@ class LnoclWarning(UserWarning):
         super().__init__(with_names(message))
 
 
-def warn(message: str) -> None:
+class MisfitWarning(LnoclWarning):
+    """The model that a run has ended with does not fit its images: a line of `Result.verdict`.
+
+    Examples
+    --------
+    One iteration is too few, as is known:
+
+    >>> import warnings
+    >>> import numpy as np
+    >>> import lnocl
+    >>> image = np.full((16, 16), 9.0)
+    >>> image[8, 8] = 900.0
+    >>> observation = lnocl.Observation(image, np.ones((3, 3)))
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", lnocl.errors.MisfitWarning)
+    ...     result = lnocl.deconvolve(observation, n_iter=1, stop=None, engine="numpy")
+    >>> result.verdict()
+    ['the model does not fit: see to background, noise and gain']
+    """
+
+
+def warn(message: str, category: type[LnoclWarning] = LnoclWarning) -> None:
     """Warn with an `LnoclWarning` that points to the caller's line, the nearest outside lnocl."""
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(PACKAGE):
         level, frame = level + 1, frame.f_back
-    warnings.warn(LnoclWarning(message), stacklevel=level)
+    warnings.warn(category(message), stacklevel=level)
 
 
 def note(message: str, *values: Any) -> None:

@@ -13,22 +13,22 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.deconvolution import judge_psfs, reconstruct
+from lnocl.deconvolution import choose_penalties, reconstruct
 from lnocl.errors import InputError, LnoclWarning, counted, warn
 from lnocl.parallel import Parallel, check_parallel, work
 from lnocl.process import ignored_warnings, recorded_warnings
 from lnocl.residuals import StarResiduals
 from lnocl.result import Result, make_result
+from lnocl.result.verdict import warn_of_faults
 from lnocl.runs.options import (
     StopName,
     check_choices,
     check_families,
     check_length,
     check_observation,
-    read_penalties,
     read_refine_positions,
 )
-from lnocl.runs.outcome import CURVE_DTYPE, Mended, Outcome
+from lnocl.runs.outcome import CURVE_DTYPE, Outcome, PsfRefinement
 from lnocl.runs.progress import Progress
 from lnocl.runs.start import Setup
 from lnocl.scene.arrays import Array
@@ -143,6 +143,8 @@ class _Tile(NamedTuple):
         Positions in the window.
     own, numbers : ndarray of int
         Which of them lie in its core, and which those are of all stars.
+    near_stars : ndarray of float64 or None
+        As of `lnocl.scene.penalty.Penalty`, in its window.
     """
 
     spans: tuple[_Span, _Span]
@@ -150,6 +152,7 @@ class _Tile(NamedTuple):
     stars: Array
     own: NDArray[np.intp]
     numbers: NDArray[np.intp]
+    near_stars: Array | None
 
     def without_unseen_neighbours(self) -> _Tile:
         """Return it without stars of its neighbours that it does not observe."""
@@ -195,6 +198,9 @@ def deconvolve_tiles(
     half a PSF and the largest offset. So no source that lights the part is left out. Its PSFs are
     those of the middle of its part, ``K = sum_i w_i K_i`` of a `lnocl.PsfField`; each star has that
     of its own place. The extended sources are blended across half of the margins.
+
+    PSFs that are the same all over the images are judged once, as by `lnocl.deconvolve`: all tiles
+    have those that were found, and star fluxes are marginal where they fit.
 
     All tiles have the same weights and the same δ of the edge-preserving term, and the same number
     of iterations unless `stop` is a number. Where held-out counts or the discrepancy choose, the
@@ -275,16 +281,24 @@ def deconvolve_tiles(
     check_length(n_iter, stop)
     _check_options(options)
     given = {"solver": "sgp", "precision": "single", "engine": "opencl", "device": None, **options}
-    moves = read_refine_positions(given.pop("refine_positions", "auto")) is True
+    moves = read_refine_positions(given.pop("refine_positions", "auto"))
     positions = check_positions(stars, observation)
-    check_families("auto", observation, positions, moves, False)
-    penalties = read_penalties(mu, smoothing, stop, observation)
+    Penalty(mu)  # a wrong weight is refused before any work
+    is_auto = isinstance(smoothing, str) and smoothing == "auto" and len(positions) > 0
+    is_auto = is_auto and not observation.psf_fields  # which are not judged
+    families = check_families("auto", observation, positions, moves, is_auto)
     pad = given.pop("pad", "auto")
     check_choices(**given)
     tile_pad = _pad(observation, pad)
     tiles = _lay(observation, tile, tile_pad)
+    moves = moves if is_auto else moves is True
+    whole = Setup(observation, positions, pad, refine_positions=moves is True, **given)
+    mended, penalties, stop = choose_penalties(
+        whole, mu, smoothing, stop, families, moves, False, is_auto, progress
+    )
+    observation = mended.setup.observation
     observed = [
-        _cut(observation, positions, (y, x))
+        _cut(observation, positions, mended.near_stars, (y, x))
         for y, x in tiles
         if not observation.mask[:, y.seen, x.seen].all()
     ]
@@ -292,18 +306,21 @@ def deconvolve_tiles(
     if len(tiles) > 1:
         pad, exposure = tile_pad, mean_exposure(observation)
         penalties = [replace(each, exposure=exposure) for each in penalties]
-        if any(each.smoothing for each in penalties):
+        if any(each.smoothing for each in penalties) or mended.near_stars is not None:
             with ignored_warnings():  # of which the tiles know more
                 edge = EDGE * Scene(observation, positions).level
             penalties = [replace(each, edge=edge) for each in penalties]
     curve, reason, penalty, last = np.zeros(0, CURVE_DTYPE), "", penalties[0], stop
-    setup = partial(Setup, pad=pad, refine_positions=moves, **given)
+    setup = partial(Setup, pad=pad, refine_positions=mended.setup.refine_positions, **given)
+    is_fit = is_auto and mended.fits
     if isinstance(stop, str):
-        chosen = _choose(observed, parallel, _Solver(setup, penalties, n_iter, stop))
+        solver = _Solver(setup, penalties, n_iter, stop, mended.refinement, False)
+        chosen = _choose(observed, parallel, solver)
         curve, reason, n_iter, last = chosen.held_out, chosen.stop_reason, chosen.n_iter, None
-        penalty = next(each for each in penalties if each.smoothing == chosen.smoothing)
-    solver = _Solver(setup, [penalty], max(n_iter, 1), last)
-    mosaic = _Mosaic(observation, len(positions))
+        penalty = replace(penalties[0], smoothing=chosen.smoothing)
+        is_fit = is_fit and reason == stop  # else held-out counts have found no end
+    solver = _Solver(setup, [penalty], max(n_iter, 1), last, mended.refinement, is_fit)
+    mosaic = _Mosaic(observation, positions)
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
         closing(work(solver.solving, observed, parallel)) as answers,
@@ -312,7 +329,9 @@ def deconvolve_tiles(
             mosaic.add(each, found)
             bar.update()
     _warn_of_tiles(mosaic.messages)
-    return mosaic.result(penalty, curve, reason, n_iter if reason else None)
+    result = mosaic.result(penalty, curve, reason, n_iter if reason else None, mended.refinement)
+    warn_of_faults(result, progress)
+    return result
 
 
 ALLOWED = {"solver", "precision", "engine", "device", "pad", "refine_positions"}
@@ -383,7 +402,12 @@ def _divide(size: int, window: int, margin: int) -> list[_Span]:
     ]
 
 
-def _cut(observation: Observation, positions: Array, spans: tuple[_Span, _Span]) -> _Tile:
+def _cut(
+    observation: Observation,
+    positions: Array,
+    near_stars: Array | None,
+    spans: tuple[_Span, _Span],
+) -> _Tile:
     rows, columns = (span.window for span in spans)
     moved = positions - (columns.start, rows.start)
     y, x = ((each.core.start + each.core.stop - 1) / 2.0 - each.window.start for each in spans)
@@ -391,7 +415,12 @@ def _cut(observation: Observation, positions: Array, spans: tuple[_Span, _Span])
     is_seen = part.shows(moved)
     is_own = _are_own(positions, spans) & is_seen
     own = np.flatnonzero(is_own[is_seen])
-    return _Tile(spans, part, moved[is_seen], own, np.flatnonzero(is_own))
+    if near_stars is not None:
+        q = observation.oversample
+        near_stars = near_stars[
+            q * rows.start : q * rows.stop, q * columns.start : q * columns.stop
+        ].copy()
+    return _Tile(spans, part, moved[is_seen], own, np.flatnonzero(is_own), near_stars)
 
 
 def _refuse_unowned(positions: Array, tiles: Sequence[_Tile]) -> None:
@@ -439,12 +468,18 @@ class _Choice(NamedTuple):
 
 
 class _Solver(NamedTuple):
-    """The parameters that tiles share; `setup` takes the observation and the stars of each."""
+    """The parameters that tiles share; `setup` takes the observation and the stars of each.
+
+    The PSFs were judged as those of one run are, whose `refinement` is their outcome; the fluxes of
+    stars are marginal where they fit.
+    """
 
     setup: Callable[[Observation, Array], Setup]
     penalties: Sequence[Penalty]
     n_iter: int
     stop: str | float | None
+    refinement: PsfRefinement | None
+    is_fit: bool
 
     def choosing(self) -> Callable[[_Tile], _Choice]:
         """Return the function that has a tile choose iterations and smoothing."""
@@ -460,11 +495,12 @@ class _Solver(NamedTuple):
         return _Choice(result.n_iter, result.smoothing, result.stop_reason, result.held_out)
 
     def _outcome(self, tile: _Tile) -> Outcome:
-        mended = Mended(self.setup(tile.observation, tile.stars))
-        if len(tile.observation.psf_scatter) and len(tile.stars):
-            mended = judge_psfs(mended.setup, (), mended.setup.refine_positions, False, False)
-        outcome = reconstruct(mended.setup, self.penalties, self.n_iter, self.stop)
-        return replace(outcome, psf_refinement=mended.refinement)
+        penalties = [replace(each, near_stars=tile.near_stars) for each in self.penalties]
+        setup = self.setup(tile.observation, tile.stars)
+        outcome = reconstruct(setup, penalties, self.n_iter, self.stop)
+        if self.is_fit and len(tile.stars):
+            outcome = outcome.marginal(stars=True, halos=False)
+        return replace(outcome, psf_refinement=self.refinement)
 
     def _solve(self, tile: _Tile) -> _Found:
         tile = tile.without_unseen_neighbours()
@@ -524,8 +560,11 @@ def _light(tile: _Tile) -> float:
 class _Mosaic:
     """What all tiles have found, put together as they are done."""
 
-    def __init__(self, observation: Observation, n_stars: int) -> None:
-        self.observation = observation
+    may_free_pixels = False
+
+    def __init__(self, observation: Observation, positions: Array) -> None:
+        n_stars = len(positions)
+        self.observation, self.given_positions = observation, positions
         self._extended = np.zeros(observation.sky_shape)
         self._weight = np.zeros(observation.sky_shape)
         self._models = np.zeros(observation.images.shape)
@@ -556,7 +595,12 @@ class _Mosaic:
         self._found.append(found._replace(extended=np.zeros(0), models=np.zeros(0)))
 
     def result(
-        self, penalty: Penalty, curve: NDArray[np.void], reason: str, n_iter: int | None
+        self,
+        penalty: Penalty,
+        curve: NDArray[np.void],
+        reason: str,
+        n_iter: int | None,
+        refinement: PsfRefinement | None,
     ) -> TiledResult:
         """Return it all."""
         longest = max(self._found, key=lambda each: len(each.history))
@@ -580,7 +624,7 @@ class _Mosaic:
             mu=penalty.mu,
             smoothing=penalty.smoothing,
             held_out=curve,
-            psf_refinement=None,
+            psf_refinement=refinement,
             halo_fluxes=self.of_halos(np.zeros(0)),
             _findings=self,
             tiles=np.array(self._tiles, TILE_DTYPE),

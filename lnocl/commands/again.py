@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -47,8 +48,8 @@ class Again:
     given: Any
 
     @classmethod
-    def read(cls, path: str, quiet: bool) -> Again:
-        """Read a result and its images.
+    def read(cls, path: str, quiet: bool, check: Callable[[], object] = int) -> Again:
+        """Read a result and its images; before these, check what is to be written.
 
         Raises
         ------
@@ -61,7 +62,7 @@ class Again:
         from lnocl.io.saved_results import read_result
 
         saved = read_result(path)
-        atomic.check_fits_output(path, overwrite=True)
+        atomic.check_fits_output(path, overwrite=True, is_updated=True)
         if saved.header.get("STOPPED") == "interrupt":
             raise InputError(
                 f"the run of {path} was interrupted, and its command gives another result: "
@@ -69,6 +70,9 @@ class Again:
             )
         folder, run = _run_of(saved)
         run.quiet = quiet
+        inputs = deconvolve.COMMAND.inputs(run)
+        with atomic.kept(os.path.join(folder, each) for each in inputs):
+            check()
         try:
             with contextlib.chdir(folder), ignored_warnings():  # which were shown once
                 frames, given = deconvolve.read(run)

@@ -22,10 +22,10 @@ from lnocl.commands import deconvolve, environment, messages, options, pictures,
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.commands.signals import Terminated
-from lnocl.commands.summary import FITS
 from lnocl.commands.targets import Target, read_targets
-from lnocl.errors import FileError, LnoclError, counted
+from lnocl.errors import FileError, InputError, LnoclError, counted
 from lnocl.residuals import MUCH_HALO
+from lnocl.result.verdict import FITS
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -268,9 +268,10 @@ def _run(arguments: argparse.Namespace) -> None:
     targets = read_targets(arguments.targets)
     atomic.check_folder(arguments.output, overwrite=True)
     folder, start = Folder(os.path.abspath(arguments.output)), os.getcwd()
-    atomic.check_output(os.path.join(folder.path, SUMMARY), True, [arguments.targets])
-    pictures.check(arguments, [arguments.targets])
-    targets = _apart(targets, folder)
+    with atomic.kept(path for each in targets for path in each.inputs):
+        atomic.check_output(os.path.join(folder.path, SUMMARY), True)
+        pictures.check(arguments)
+        targets = [_apart(each, folder) for each in targets]
     i, n = arguments.array or (1, 1)
     own = targets[i - 1 :: n]
     before = [folder.state(each, start) for each in own]
@@ -311,16 +312,16 @@ def _run(arguments: argparse.Namespace) -> None:
     _explain_failures(summary, own)
 
 
-def _apart(targets: Sequence[Target], folder: Folder) -> list[Target]:
-    """Return the targets; those whose result would replace an input of any fail."""
-    inputs = {os.path.realpath(path) for each in targets for path in each.inputs}
-    fault = "its result would replace an input of the targets; give another name"
-    return [
-        each._replace(fault=each.fault or fault)
-        if os.path.realpath(folder.file(each.name, ".fits")) in inputs
-        else each
-        for each in targets
-    ]
+def _apart(target: Target, folder: Folder) -> Target:
+    """Return a target; one whose files would replace an input of any fails."""
+    from lnocl.io.atomic import refuse_input
+
+    try:
+        for ending in (".fits", ".log", ".json"):
+            refuse_input(folder.file(target.name, ending))
+    except InputError as error:
+        return target._replace(fault=target.fault or error.message)
+    return target
 
 
 def _records(

@@ -54,7 +54,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if images and size is not None:
         raise InputError("--size is of the demo's scene, and images are given; leave one out")
     n_iter, accuracy, stem = arguments.n_iter, arguments.accuracy, arguments.output
-    bench.check(n_iter, accuracy, stem, arguments.overwrite, [*images, *psfs])
+    bench.check(n_iter, accuracy, stem, arguments.overwrite)
     spec = device.spec_of(device.choose(arguments.device).device)
     if images:
         levels = arguments.background or [0.0], arguments.read_noise or [0.0]

@@ -6,12 +6,12 @@ import argparse
 import contextlib
 import os
 import signal
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from lnocl.commands.options import option
 from lnocl.commands.signals import ENDING, first_handled
 from lnocl.errors import InputError, LnoclError, counted
+from lnocl.io import atomic
 
 if TYPE_CHECKING:
     from lnocl.result import Result
@@ -37,18 +37,16 @@ OPTIONS = [
 ]
 
 
-def check(arguments: argparse.Namespace, inputs: Iterable[str]) -> None:
+def check(arguments: argparse.Namespace) -> None:
     """Refuse a checkpoint that would take the place of an output or an input."""
-    if arguments.checkpoint is None:
+    path, resume = arguments.checkpoint, arguments.resume
+    if path is None:
         return
-    outputs = [path for path in (arguments.output, arguments.plot) if path is not None]
-    taken = {os.path.realpath(path) for path in (*outputs, *inputs)}
-    if arguments.resume is not None:  # which the checkpoint may replace
-        taken.discard(os.path.realpath(arguments.resume))
-    if os.path.realpath(arguments.checkpoint) in taken:
-        raise InputError(
-            f"the checkpoint {arguments.checkpoint} is an output or an input; give it another name"
-        )
+    outputs = {os.path.realpath(each) for each in (arguments.output, arguments.plot) if each}
+    if os.path.realpath(path) in outputs:
+        raise InputError(f"the checkpoint {path} is an output too; give it another name")
+    if resume is None or os.path.realpath(resume) != os.path.realpath(path):
+        atomic.refuse_input(path)
 
 
 class RunInterruptedError(LnoclError):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -12,19 +11,14 @@ from typing import TYPE_CHECKING, Any
 from lnocl.commands import checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
-from lnocl.commands.summary import extended_flux, summarise, verdict_on
+from lnocl.commands.summary import extended_flux, summarise
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
-from lnocl.residuals import Fit, StarResiduals
-from lnocl.result import Callback, Result, saved_parts, view_of
+from lnocl.result import Callback, Result, view_of
 from lnocl.runs.progress import Progress
 
 if TYPE_CHECKING:
-    from astropy.io import fits
-
-    from lnocl.io.fitswrite import Card, StarColumn
     from lnocl.io.frames import Frames
-    from lnocl.plotting.result import ResultView
     from lnocl.scene.observation import Observation
 
 
@@ -77,13 +71,12 @@ def _solve_tiles(
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.io import atomic, fitsread
+    from lnocl.io import atomic
     from lnocl.parallel import check_parallel
 
-    inputs = options.input_paths(ALL_OPTIONS, vars(arguments))
-    atomic.check_fits_output(arguments.output, arguments.overwrite, inputs)
-    pictures.check(arguments, inputs)
-    checkpoints.check(arguments, inputs)
+    atomic.check_fits_output(arguments.output, arguments.overwrite)
+    pictures.check(arguments)
+    checkpoints.check(arguments)
     check_parallel(arguments.parallel)
     with (
         messages.shown_log(arguments.quiet, COMMAND.flags()),
@@ -96,22 +89,13 @@ def _run(arguments: argparse.Namespace) -> None:
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
         with Progress(None, "", not arguments.quiet, "measuring errors", stays=False):
-            at_stars = result.star_residuals()
-            view = view_of(result) if arguments.residuals or arguments.plot else None
-            overall = Fit.of(view.residuals, view.models) if view else result.fit()
-            verdict = verdict_on(
-                arguments, result, frames, given["stars"], at_stars, overall, bool(warned)
-            )
-            lines = [*summarise(arguments, result, frames, at_stars, overall), *verdict]
-            measured = _measured(result, frames, overall, verdict)
-        # With field rotation the sky has north up, as no image has.
-        wcs = None if arguments.angle else fitsread.wcs_cards(frames.header)
-        _write(arguments, result, frames, given, at_stars, view, wcs, measured, [*warned, *lines])
+            lines = summarise(arguments, result, frames, bool(warned))
+        _write(arguments, result, frames, given, [*warned, *lines])
         lines.append(f"written to {arguments.output}")
-        if arguments.plot is not None and view is not None:
+        if arguments.plot is not None:
             from lnocl.plotting.result import draw_result
 
-            lines.append(pictures.draw(arguments, draw_result(view)))
+            lines.append(pictures.draw(arguments, draw_result(view_of(result))))
         if not arguments.quiet:
             messages.say(lines)
     interrupts.explain(arguments, result)
@@ -122,61 +106,32 @@ def _write(
     result: Result,
     frames: Frames,
     given: Mapping[str, Any],
-    at_stars: Sequence[StarResiduals],
-    view: ResultView | None,
-    wcs: fits.Header | None,
-    measured: Sequence[Card],
     lines: Sequence[str],
 ) -> None:
     """Write the result with the command that repeats it."""
-    from lnocl.io import fitsread, fitswrite
+    from lnocl.io.fitsread import read_contents
     from lnocl.io.headers import observed_cards
+    from lnocl.result.file import write_file
 
-    primary = fitsread.read_contents(arguments.images[0]).primary
-    parts, has_places = saved_parts(result), bool(arguments.align or arguments.angle)
+    primary = read_contents(arguments.images[0]).primary
     repeated = {**given, **_repeated(given, frames)}
-    fitswrite.write_result(
+    used = repeated | _used(repeated, frames)
+    write_file(
+        result,
         arguments.output,
-        result.extended / frames.electrons,
-        result.star_positions,
-        result.star_fluxes / frames.electrons,
-        wcs=wcs,
+        # With field rotation the sky has north up, as no image has.
+        None if arguments.angle else frames.header,
+        arguments.overwrite,
         cards=[
             *observed_cards(frames.header, primary),
-            *record.make_cards(
-                ALL_OPTIONS,
-                repeated | _used(repeated, frames, result),
-                frames.sha256,
-                [
-                    *measured,
-                    *parts.pop("cards"),
-                    *(fitswrite.place_cards(parts["transforms"]) if has_places else []),
-                ],
-            ),
+            *record.make_cards(ALL_OPTIONS, used, frames.sha256),
         ],
+        unit=(frames.unit, frames.electrons),
+        extended_flux=extended_flux(result, frames),
+        has_cubes=arguments.residuals,
         commands=record.make_commands("deconvolve", ALL_OPTIONS, repeated, os.getcwd()),
-        overwrite=arguments.overwrite,
-        unit=frames.unit,
-        star_columns=_star_columns(arguments, result, frames, at_stars),
-        cubes={"MODELS": (view.models, "electron"), "RESIDUALS": (view.residuals, "")}
-        if arguments.residuals and view
-        else {},
         messages=lines,
-        **parts,
     )
-
-
-def _measured(result: Result, frames: Frames, overall: Fit, verdict: Sequence[str]) -> list[Card]:
-    """Return the cards of what is in no table, but for values that a card cannot hold."""
-    flux, error = (each / frames.electrons for each in extended_flux(result, frames))
-    cards: list[Card] = [
-        ("EXTFLUX", flux, "flux of the extended source"),
-        ("EXTERROR", error, "its standard error"),
-        ("ONEUNIT", f"{float(frames.electrons)} {result._unit}", "what one BUNIT is"),
-        ("RESIDRMS", overall.rms, "rms residual, 1 by noise"),
-        ("VERDICT", "; ".join(verdict), ""),
-    ]
-    return [card for card in cards if isinstance(card[1], str) or math.isfinite(card[1])]
 
 
 def _given(values: Mapping[str, Any], names: Any) -> dict[str, Any]:
@@ -203,51 +158,16 @@ def _repeated(given: Mapping[str, Any], frames: Frames) -> dict[str, Any]:
     }
 
 
-def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[str, Any]:
+def _used(repeated: Mapping[str, Any], frames: Frames) -> dict[str, Any]:
     """Return the values that were computed with, where rules and keywords were given."""
     from lnocl.scene.padding import choose_pad
 
     exposure = frames.observation.exposure
     return {
-        "n_iter": result.n_iter,
-        "stop": result.stop_reason,
-        "mu": result.mu,
-        "smoothing": result.smoothing,
-        "device": result.device,
         "gain": frames.gain,
         "pad": choose_pad(frames.observation) if repeated["pad"] == "auto" else repeated["pad"],
         **({"exposure": exposure.tolist()} if repeated["exposure"] and exposure.ndim == 1 else {}),
     }
-
-
-def _star_columns(
-    arguments: argparse.Namespace,
-    result: Result,
-    frames: Frames,
-    at_stars: Sequence[StarResiduals],
-) -> list[StarColumn]:
-    """Return the columns of the table of stars after positions and fluxes."""
-    from lnocl.io import sky
-    from lnocl.io.fitswrite import StarColumn, error_columns
-
-    header, flux_errors = frames.header, result.star_flux_errors / frames.electrons
-    columns = error_columns(result.star_position_errors, flux_errors, frames.unit)
-    if (n_epochs := frames.observation.n_epochs) > 1:
-        epochs = [k % n_epochs for k in range(len(flux_errors))]
-        columns.append(StarColumn("epoch", epochs, "", "number of the epoch, from 0 on"))
-    if sky.has_celestial(header):
-        ra, dec = sky.to_sky(result.star_positions, header).T
-        columns += [
-            StarColumn("ra", ra, "deg", "right ascension, ICRS"),
-            StarColumn("dec", dec, "deg", "declination, ICRS"),
-        ]
-    core, wings, halo, _ = map(list, zip(*at_stars, strict=True) if at_stars else [()] * 4)
-    for name, found in (("core", core), ("wings", wings)):
-        values = [fit.rms for fit in found]
-        comment = f"rms residual in the {name}, 1 by noise"
-        columns.append(StarColumn(f"{name}_rms", values, "", comment))
-    columns.append(StarColumn("halo", halo, "", "light all round it over its flux"))
-    return columns
 
 
 def _device_spec(arguments: argparse.Namespace) -> str | None:

@@ -219,14 +219,12 @@ OPTIONS = {
             "--n-iter",
             type=int,
             metavar="N",
-            card=("NITER", "iterations done"),
             help="largest number of iterations (default: %(default)s)",
         ),
         _parameter(
             "--stop",
             type=number_or_word,
             metavar="RULE",
-            card=("STOPPED", "why it stopped"),
             help="when to stop before N iterations: held-out, at the iteration that held-out "
             "counts choose; discrepancy, when the data are fitted as well as noise allows; a "
             "number below 1, when the objective changes relatively by less in an iteration; or "
@@ -243,7 +241,6 @@ OPTIONS = {
             "--mu",
             type=float,
             metavar="MU",
-            card=("MU", "weight of the Tikhonov term, per electron"),
             help="weight of the Tikhonov term on the extended source, per electron (default: "
             "%(default)s)",
         ),
@@ -251,7 +248,6 @@ OPTIONS = {
             "--smoothing",
             type=number_or_word,
             metavar="WEIGHT",
-            card=("SMOOTHIN", "weight of the edge-preserving term"),
             help="weight of an edge-preserving term against noise, or auto: that which suits the "
             "noise of the counts (default: %(default)s)",
         ),

@@ -80,11 +80,15 @@ def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Fra
 
     check_width(arguments.width)
     check_alarms(arguments.false_alarms)
-    if arguments.output is not None:
-        tables.format_of(arguments.output, content)
-        atomic.check_output(arguments.output, arguments.overwrite, [arguments.result])
-    pictures.check(arguments, [arguments.result])
-    again = Again.read(arguments.result, arguments.quiet)
+
+    def check() -> None:
+        if arguments.output is not None:
+            tables.format_of(arguments.output, content)
+            atomic.check_output(arguments.output, arguments.overwrite)
+        pictures.check(arguments)
+
+    check()  # before the result is read; then that nothing that it was made of is replaced
+    again = Again.read(arguments.result, arguments.quiet, check)
     return again.solve().significance(arguments.width, arguments.false_alarms), again.frames
 
 

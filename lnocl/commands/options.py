@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from lnocl.errors import InputError
-from lnocl.io.names import ERR, file_of, parse_kind
+from lnocl.io.names import ERR, parse_kind
 from lnocl.parallel import CURRENT
 
 if TYPE_CHECKING:
@@ -152,11 +152,6 @@ def _of_kind(kinds: Mapping[str, str], word: str) -> str:
     if kind not in kinds or not (path or word == ERR):
         raise argparse.ArgumentTypeError(f"{word!r} is not KIND=FILE; kinds are {', '.join(kinds)}")
     return word
-
-
-def input_paths(options: Sequence[Option], values: Mapping[str, Any]) -> list[str]:
-    """Return the names in the values of arguments that may be those of files to read."""
-    return [file_of(path) for each in options for path in each.inputs(values[each.name])]
 
 
 def _listed(value: Any) -> list[Any]:
@@ -364,7 +359,6 @@ STAR_TABLE = option(
 DEVICE = option(
     "--device",
     metavar="SPEC",
-    card=("DEVICE", "device"),
     help="OpenCL device as PLATFORM[:DEVICE], each an index or a part of the name, as lnocl "
     "devices lists them (default: that of PYOPENCL_CTX, else the first GPU, else the first CPU)",
 )

@@ -55,6 +55,16 @@ class Command(NamedTuple):
             for each in options:
                 each.refuse_ignored(vars(arguments))
 
+    def inputs(self, arguments: argparse.Namespace) -> list[str]:
+        """Return the names in its arguments that may be those of files to read."""
+        values = vars(arguments)
+        return [
+            file_of(path)
+            for options in self.options.values()
+            for each in options
+            for path in each.inputs(values[each.name])
+        ]
+
     def flags(self) -> dict[str, str]:
         """Return the flag of each parameter that an option, or a kind of its values, stands for."""
         options = [each for group in self.options.values() for each in group]

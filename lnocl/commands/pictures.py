@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from lnocl.errors import InputError
@@ -13,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def check(arguments: argparse.Namespace, inputs: Iterable[str]) -> None:
+def check(arguments: argparse.Namespace) -> None:
     """Check that the picture can be drawn and written, where one is asked for.
 
     Raises
@@ -37,7 +36,7 @@ def check(arguments: argparse.Namespace, inputs: Iterable[str]) -> None:
     output = arguments.output
     if output is not None and os.path.realpath(arguments.plot) == os.path.realpath(output):
         raise InputError(f"the picture {arguments.plot} is the output too; give it another name")
-    atomic.check_output(arguments.plot, arguments.overwrite, inputs)
+    atomic.check_output(arguments.plot, arguments.overwrite)
     check_matplotlib()
 
 

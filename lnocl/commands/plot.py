@@ -13,6 +13,7 @@ OPTIONS = [
         "results",
         nargs="+",
         metavar="RESULT",
+        is_input=True,
         help="FITS file that lnocl deconvolve or lnocl demo has written, or the truth.fits of "
         "lnocl simulate",
     ),

@@ -280,13 +280,12 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
 
     if arguments.output is None:
         raise InputError("give -o PSF.fits for the PSF, or --check to look at one")
-    inputs = options.input_paths(OPTIONS, vars(arguments))
-    atomic.check_fits_output(arguments.output, arguments.overwrite, inputs)
+    atomic.check_fits_output(arguments.output, arguments.overwrite)
     if arguments.plot is not None and len(arguments.rotate) > MAX_DRAWN:
         raise InputError(
             f"--plot draws {MAX_DRAWN} PSFs at most, and {len(arguments.rotate)} angles were given"
         )
-    pictures.check(arguments, inputs)
+    pictures.check(arguments)
 
 
 def _report(arguments: argparse.Namespace) -> None:

@@ -29,7 +29,7 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError(
             f"the report is a page of HTML; give it a name ending in .html, not {arguments.output}"
         )
-    atomic.check_output(arguments.output, arguments.overwrite, [arguments.result])
+    atomic.check_output(arguments.output, arguments.overwrite)
     page = figures.report(arguments.result)
     atomic.write_text(arguments.output, page, arguments.overwrite)
     messages.say([f"written to {arguments.output}: open it in a browser"])

@@ -11,6 +11,7 @@ from lnocl.commands import messages
 from lnocl.commands.parser import Command, Parser
 from lnocl.commands.signals import ENDING, Terminated, first_handled, terminate
 from lnocl.errors import LnoclError, LnoclWarning
+from lnocl.io.atomic import kept
 
 FAILED = 1
 INTERRUPTED = 130
@@ -34,7 +35,8 @@ def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
             parsed = make_parser(commands).parse_args(words)
             flags |= parsed.command.flags()
             parsed.command.refuse_ignored(parsed)
-            parsed.command.run(parsed)
+            with kept(parsed.command.inputs(parsed)):
+                parsed.command.run(parsed)
     except LnoclError as error:
         return messages.fail(messages.in_shell(error.message, flags), error.exit_status)
     except MemoryError:

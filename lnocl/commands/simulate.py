@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 
 from lnocl.commands import messages, options
@@ -22,6 +23,7 @@ OPTIONS = [
     option(
         "scene",
         metavar="SCENE",
+        is_input=True,
         help="hh34, a jet like the paper's, or a FITS file whose first image is the extended "
         "source; its header keywords STARX and STARY, 0-based, give the position of a star",
     ),
@@ -67,7 +69,7 @@ def write(arguments: argparse.Namespace) -> list[str]:
 
     from lnocl.io import atomic
     from lnocl.simulation import Experiment, Star, load_target, simulate
-    from lnocl.studies.files import write_simulation
+    from lnocl.studies.files import names_of, write_simulation
 
     stars = arguments.stars and [Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
     with messages.shown_log(arguments.quiet):
@@ -78,6 +80,8 @@ def write(arguments: argparse.Namespace) -> list[str]:
         **{name: value * units[name] for name, value in given.items() if value is not None}
     )
     atomic.check_folder(arguments.output, arguments.overwrite, make=False)
+    for name in names_of(len(experiment.angles)):
+        atomic.refuse_input(os.path.join(arguments.output, name))
     simulation = simulate(target, experiment)
     atomic.check_folder(arguments.output, arguments.overwrite)
     return write_simulation(arguments.output, arguments.scene, simulation, arguments.overwrite)

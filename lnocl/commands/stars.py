@@ -62,9 +62,8 @@ def _run(arguments: argparse.Namespace) -> None:
     from lnocl.io import atomic, fitsread, sky, tables
 
     tables.format_of(arguments.output, "stars")
-    inputs = options.input_paths(OPTIONS, vars(arguments))
-    atomic.check_output(arguments.output, arguments.overwrite, inputs)
-    pictures.check(arguments, inputs)
+    atomic.check_output(arguments.output, arguments.overwrite)
+    pictures.check(arguments)
     with messages.shown_log(arguments.quiet):
         stack = fitsread.read_single(arguments.image)
         image = stack.data[0]

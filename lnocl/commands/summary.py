@@ -5,15 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lnocl.errors import counted
-from lnocl.residuals import Fit, StarResiduals, sharp_sources
+from lnocl.residuals import Fit, sharp_sources
 from lnocl.result import Result
-from lnocl.scene.detector import on_sky
+from lnocl.result.verdict import FITS
 from lnocl.scene.observation import Observation
 from lnocl.scene.stars import MAX_SHIFT
 
@@ -25,12 +24,8 @@ if TYPE_CHECKING:
 # The darkest share of the extended source, and how bright it may be, in standard deviations of a
 # pixel's noise.
 DARK_SHARE, FLOOR = 0.05, 0.5
-# How a verdict begins where nothing is wrong.
-FITS = "the model fits"
-# Where a star without light may be instead: so many pixels from its place.
-ELSEWHERE = 10
-# Of a star that was moved by this share of `MAX_SHIFT` more may be needed.
-AT_LIMIT = 0.99
+
+SEE_WARNINGS = ", but see the warnings of the run"
 
 REASONS = {
     "n_iter": "all iterations were done",
@@ -48,10 +43,13 @@ def summarise(
     arguments: argparse.Namespace,
     result: Result,
     frames: Frames,
-    at_stars: Sequence[StarResiduals],
-    overall: Fit,
+    is_warned: bool,
 ) -> list[str]:
-    """Return how a reconstruction ended, and what it found, a line each."""
+    """Return how a reconstruction ended, and what it found, a line each.
+
+    Of the faults of its model `lnocl.deconvolve` has warned.
+    """
+    verdict = result.verdict()
     objective = result.history["objective"][-1]
     device, _, _ = result.device.partition(" (")  # the header has its platform and driver
     unit = _unit(frames)
@@ -62,7 +60,7 @@ def summarise(
             result.star_positions,
             result.star_fluxes,
             result.star_flux_errors,
-            at_stars,
+            result.star_residuals(),
             strict=True,
         )
     ]
@@ -74,8 +72,9 @@ def summarise(
         f"extended source: {_flux(*extended_flux(result, frames), frames)} in the whole frame",
         *_floor(result, frames, unit),
         *_unnamed(result, frames),
-        f"residuals {_rms(overall)} in all, where noise gives 1",
+        f"residuals {_rms(result.fit())} in all, where noise gives 1",
         *_shortness(arguments, result),
+        *([FITS + SEE_WARNINGS * is_warned] if verdict == [FITS] else []),
     ]
 
 
@@ -177,88 +176,3 @@ def _number(value: float, error: float) -> str:
 
 def _rms(fit: Fit) -> str:
     return f"{fit.rms:.2f} +- {fit.error:.2f}" if fit.n_pixels else "unknown (no good pixel)"
-
-
-def verdict_on(
-    arguments: argparse.Namespace,
-    result: Result,
-    frames: Frames,
-    given_stars: Sequence[tuple[float, float]],
-    at_stars: Sequence[StarResiduals],
-    overall: Fit,
-    is_warned: bool,
-) -> list[str]:
-    """Return that the model fits, or else where it does not and what to do, a line each."""
-    unfitted, lit, dark, lost = [], [], [], []
-    observation = frames.observation
-    given_stars = [star for star in given_stars for _ in range(observation.n_epochs)]
-    for place, given, flux, found in zip(
-        result.star_positions, given_stars, result.star_fluxes, at_stars, strict=True
-    ):
-        if not flux > 0:
-            where = _elsewhere(result.extended, place, observation.oversample)
-            dark.append(f"{_at(given)}{where}")
-            continue
-        if np.hypot(*(place - np.array(given))) > AT_LIMIT * MAX_SHIFT:
-            lost.append(f"{_at(given)} to {_at(place)}")
-        if found.is_misfit:
-            unfitted.append(_at(place))
-        if found.has_halo:
-            lit.append(f"{_at(place)}, {100 * found.halo:.0f} %")
-    verdict = []
-    if dark:
-        verdict.append(f"no light is left for {counted(len(dark), 'star')}: {'; '.join(dark[:3])}")
-    if lost:
-        verdict.append(
-            f"{counted(len(lost), 'star')} moved as far as stars may, {MAX_SHIFT:g} pixels, from "
-            f"{'; '.join(lost[:3])}: give the place where it is brightest"
-        )
-    if unfitted:
-        by_default = [] if isinstance(arguments.smoothing, float) else ["pixels"]
-        remedy = "leave --refine-psfs out" if by_default else "try --refine-psfs jitter pixels"
-        may_free = "pixels" not in (arguments.refine_psfs or by_default)
-        may_free = may_free and not observation.is_turned and observation.n_epochs == 1
-        verdict.append(
-            f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
-            f"{' '.join(unfitted[:3])}: give a better PSF" + (f", or {remedy}" if may_free else "")
-        )
-    elif overall.is_misfit and not (dark or lost):
-        verdict.append("the model does not fit: see to background, noise and gain")
-    refinement = result.psf_refinement
-    is_fitted = refinement is not None and refinement.has_free_pixels  # which follow the noise
-    if overall.is_overfit and not is_fitted:
-        is_smoothed = bool((result.smoothing or 0.0) > 0.0)
-        verdict.append(
-            "the residuals are far less than noise: the noise that is taken is too large (see to "
-            "unit, gain, exposure, background and read noise), or the model follows the noise"
-            + ("" if is_smoothed else " (take fewer iterations, or --smoothing)")
-        )
-    if lit:
-        verdict.append(
-            f"light lies all round {counted(len(lit), 'star')}, as a share of its flux: "
-            f"{'; '.join(lit[:3])}: the PSF is too narrow or lacks its wings, the background is "
-            "too low, or a source lies there"
-        )
-    return verdict or [f"{FITS}, but see the warnings of the run" if is_warned else FITS]
-
-
-def _at(place: Iterable[float]) -> str:
-    x, y = place
-    return f"({x:.7g}, {y:.7g})"
-
-
-def _elsewhere(extended: NDArray[np.float64], place: NDArray[np.float64], finer: int) -> str:
-    """Return where the brightest light near a star without light is, and what to do."""
-    x, y = np.round(on_sky(place, finer)).astype(int)
-    reach = ELSEWHERE * finer
-    rows, columns = (slice(max(at - reach, 0), max(at + reach + 1, 0)) for at in (y, x))
-    around = extended[rows, columns]
-    if not around.any():
-        return ", nor near it: leave it out"
-    row, column = np.unravel_index(int(around.argmax()), around.shape)
-    at = np.array([columns.start + column, rows.start + row], float)
-    brightest = (at - (finer - 1) / 2.0) / finer
-    return (
-        f", and the brightest light within {ELSEWHERE} pixels lies at {_at(brightest)}: give the "
-        "star's place, or leave it out"
-    )

@@ -12,6 +12,7 @@ import secrets
 import stat
 import time
 from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
 from typing import IO, Any
 
 from lnocl.errors import FileError, InputError
@@ -21,6 +22,40 @@ FITS_ENDINGS = (".fits", ".fit", ".fts")
 _TEMPORARY = re.compile(r"\.lnocl-[0-9a-f]{16}\.tmp")
 # Seconds after the last write to a temporary file from which on nobody writes to it.
 ABANDONED = 24 * 3600.0
+# What tells the files that a command reads (`_marks`), which no output may replace.
+_INPUTS: ContextVar[frozenset[Any]] = ContextVar("inputs", default=frozenset())
+
+
+@contextlib.contextmanager
+def kept(inputs: Iterable[str]) -> Iterator[None]:
+    """Have outputs refused that would replace one of these files, or others kept already."""
+    token = _INPUTS.set(_INPUTS.get().union(*map(_marks, inputs)))
+    try:
+        yield
+    finally:
+        _INPUTS.reset(token)
+
+
+def refuse_input(path: str) -> None:
+    """Refuse an output that is one of the files that are `kept`, links included.
+
+    Raises
+    ------
+    InputError
+        It is one of them.
+    """
+    if not _marks(path).isdisjoint(_INPUTS.get()):
+        raise InputError(f"the output {path} is one of the inputs; give it another name")
+
+
+def _marks(path: str) -> set[Any]:
+    """Return what a file has in common with its links: where it is, and what it is."""
+    marks: set[Any] = set()
+    with contextlib.suppress(OSError, ValueError):  # of a name that no file has
+        marks.add(os.path.realpath(path))
+        found = os.stat(path)
+        marks.add((found.st_dev, found.st_ino))
+    return marks
 
 
 def check_folder(
@@ -71,7 +106,7 @@ def check_folder(
         check_output(os.path.join(path, name), overwrite)
 
 
-def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None:
+def check_output(path: str, overwrite: bool, is_updated: bool = False) -> None:
     """Check that a result can be written, before any work is done for it.
 
     Parameters
@@ -80,8 +115,8 @@ def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None
         File to write.
     overwrite : bool
         Whether it may exist already.
-    inputs : iterable of str, optional
-        Files that it must not replace.
+    is_updated : bool, optional
+        Whether it may be an input, to which something is added.
 
     Raises
     ------
@@ -93,9 +128,8 @@ def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None
     """
     if path.lower().endswith(COMPRESSED):
         raise InputError(f"the output {path} is not compressed; give it a name ending in .fits")
-    for source in inputs:
-        if os.path.exists(path) and os.path.exists(source) and os.path.samefile(source, path):
-            raise InputError(f"the output {path} is one of the inputs; give it another name")
+    if not is_updated:
+        refuse_input(path)
     _check_replaceable(path, overwrite)
     target = os.path.realpath(path)
     if not os.path.isdir(os.path.dirname(target)):
@@ -112,7 +146,7 @@ def check_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None
         ) from error
 
 
-def check_fits_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) -> None:
+def check_fits_output(path: str, overwrite: bool, is_updated: bool = False) -> None:
     """Check that a FITS file can be written, before any work is done for it.
 
     Raises
@@ -122,7 +156,7 @@ def check_fits_output(path: str, overwrite: bool, inputs: Iterable[str] = ()) ->
     """
     if os.path.basename(path) and not path.lower().endswith((*FITS_ENDINGS, *COMPRESSED)):
         raise InputError(f"the output is a FITS file; give it a name ending in .fits, not {path}")
-    check_output(path, overwrite, inputs)
+    check_output(path, overwrite, is_updated)
 
 
 @contextlib.contextmanager

@@ -96,7 +96,8 @@ def write_result(
         Further images (p, ny, nx), by the name of their extension, with their unit.
     transforms : array_like, shape (p, 2, 3), optional
         Maps from the sky to these images, pixels. Where they are not all the same, no coordinate
-        system holds for all of a cube: it has the cards of `place_cards` instead.
+        system holds for all of a cube: it has the cards of `place_cards` instead, as the primary
+        header has beside its own.
     oversample : int, optional
         Pixels of the extended source to one of the images, along each axis.
     psf_fit : ndarray with fields ``image`` and those of the parameters, optional
@@ -119,14 +120,15 @@ def write_result(
     """
     coordinates = fits.Header() if wcs is None else wcs
     is_shared = not np.any(np.asarray(transforms).reshape(-1, 2, 3) - np.eye(2, 3))
-    shared = coordinates if is_shared else fits.Header(place_cards(transforms))
+    places = [] if is_shared else place_cards(transforms)
+    shared = coordinates if is_shared else fits.Header(places)
     of_sky = coordinates if oversample == 1 else finer_cards(coordinates, oversample)
     header = of_sky.copy()
     header["BUNIT"] = (unit, "per pixel")
     if oversample > 1:
         header["OVERSAMP"] = (oversample, "pixels of this image to one of the frames")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
-    _add_provenance(header, cards, (), commands)
+    _add_provenance(header, [*cards, *places], (), commands)
     hdus = fits.HDUList(
         [
             fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
@@ -188,20 +190,6 @@ def write_image(
         each.add_checksum(when="")  # astropy would note the time
     with whole_file(path, overwrite) as stream:
         fits.HDUList(hdus).writeto(stream)
-
-
-def error_columns(
-    position_errors: ArrayLike, flux_errors: ArrayLike, unit: str
-) -> list[StarColumn]:
-    """Return the columns of the standard errors of stars, of positions only where there are any."""
-    columns = []
-    if np.isfinite(position_errors).any():
-        x_error, y_error = np.asarray(position_errors).T
-        columns = [
-            StarColumn("x_error", x_error, "pix", "standard error"),
-            StarColumn("y_error", y_error, "pix", "standard error"),
-        ]
-    return [*columns, StarColumn("flux_error", flux_errors, column_unit(unit), "standard error")]
 
 
 def column_unit(unit: str) -> str:

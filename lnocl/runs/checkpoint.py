@@ -226,9 +226,9 @@ class Checkpointer:
         resumed = None if source is None else read(source, most_bytes())
         self._may_replace = False
         if self._path is not None:
-            check_output(self._path, overwrite=True)
-            self._path = os.path.abspath(self._path)  # wherever the process goes
             self._may_replace = _are_same(self._path, source)
+            check_output(self._path, overwrite=True, is_updated=self._may_replace)
+            self._path = os.path.abspath(self._path)  # wherever the process goes
             self._refuse_to_replace(self._path)
         self._described = describe() if self._path is not None or resumed is not None else {}
         self._ended, self._saved = "", None

@@ -32,11 +32,11 @@ class PsfRefinement:
     parameters : tuple of str
         Names of the n parameters of each PSF (`lnocl.scene.psf_families.PsfFamilies`).
     values : ndarray of float64, shape (p, n)
-        The values found for them, whether they were accepted or not; lengths in pixels of the
-        images.
+        Their values in the PSFs used; lengths in pixels of the images. Where the refined PSFs were
+        not accepted, those that were found for them.
     misfit : tuple of float
         The reduced chi squared at the stars (`lnocl.scene.psf_misfit`), of the given PSFs and of
-        those last tried: 1 for noise alone.
+        those used: 1 for noise alone.
     is_accepted : bool
         Whether the refined PSFs are used (`lnocl.runs.psf_refinement.mend`).
     psf_error : float
@@ -110,7 +110,7 @@ class PsfRefinement:
         return [
             ("PSFUSED", self.is_accepted, "whether refined PSFs are used"),
             ("PSFMIS1", before, "chi squared at stars, PSFs as given"),
-            ("PSFMIS2", after, "chi squared at stars, PSFs refined"),
+            ("PSFMIS2", after, "chi squared at stars, PSFs used"),
             ("PSFERR", self.psf_error, "relative error that the PSFs used have"),
         ]
 
@@ -181,6 +181,8 @@ class Outcome:
         Whether the star fluxes are those of `marginal`, and so those of replicas.
     has_marginal_halos : bool
         Whether the amounts of halos are, likewise.
+    may_free_pixels : bool
+        Whether the pixels of PSFs were not to be refined, and could be.
     """
 
     setup: Setup
@@ -193,6 +195,12 @@ class Outcome:
     psf_refinement: PsfRefinement | None = None
     is_marginal: bool = False
     has_marginal_halos: bool = False
+    may_free_pixels: bool = False
+
+    @property
+    def given_positions(self) -> Array:
+        """The places of the stars that were given, in the order of the fluxes, shape (n, 2)."""
+        return np.repeat(self.setup.stars, self.observation.n_epochs, axis=0)
 
     @property
     def moves(self) -> bool:

@@ -120,17 +120,19 @@ def mend(
     of_parameters = [name for name in names if name != "pixels"]
     families = PsfFamilies(of_parameters, observation.replace(psfs=state.psfs))
     values, tried, left = np.zeros((observation.n_images, len(families.prior))), state, None
+    is_fitted = False  # whether the PSFs used have these values
     done = ["the noise of wings taken"] if state.psfs is not observation.psfs else []
     if state.misfit.is_doubtful and families.parameters:
         tried, values = _fit(runs, families, state, moves is not False)
-        if state.is_mended_by(tried):
+        if is_fitted := state.is_mended_by(tried):
             state = tried
             done.append(f"{' and '.join(of_parameters)} fitted")
     if state.misfit.is_doubtful and _shows_pixels(state.misfit) and "pixels" in names:
-        loose = _loosen(runs, min(state, tried, key=lambda each: each.misfit.kappa))
+        fitted, first = tried, min(state, tried, key=lambda each: each.misfit.kappa)
+        loose = _loosen(runs, first)
         tried = _free_pixels(runs, observation.psf_scatter, loose, moves is not False)
         if _is_trusted(tried, loose, state.misfit.kappa):
-            left, state = state.misfit, tried
+            left, state, is_fitted = state.misfit, tried, first is fitted
             done.append("pixels fitted")
     is_accepted = state.psfs is not observation.psfs
     if is_accepted:
@@ -146,8 +148,8 @@ def mend(
     _tell(given, state, tried, done)
     refinement = PsfRefinement(
         tuple(families.parameters),
-        values / families.units,
-        (given.misfit.reduced, tried.misfit.reduced),
+        values / families.units if is_fitted or not is_accepted else 0.0 * values,
+        (given.misfit.reduced, state.misfit.reduced),
         is_accepted,
         allowance.error,
         allowance.edges,

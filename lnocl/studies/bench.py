@@ -15,7 +15,7 @@ from astropy.table import Table
 
 from lnocl import __version__, metrics
 from lnocl.deconvolution import deconvolve
-from lnocl.errors import InputError, LnoclError, LnoclWarning
+from lnocl.errors import InputError, LnoclError, LnoclWarning, MisfitWarning
 from lnocl.io import atomic
 from lnocl.opencl.device import choose, describe
 from lnocl.plotting.curves import draw_costs
@@ -80,9 +80,7 @@ def simulated_case(size: int) -> Case:
     return Case(observation, made.stars, [f"hh34, {size} x {size}"], made.extended)
 
 
-def check(
-    n_iter: int, accuracy: float, stem: str | None, overwrite: bool, inputs: Sequence[str]
-) -> None:
+def check(n_iter: int, accuracy: float, stem: str | None, overwrite: bool) -> None:
     """Check the parameters of `run` before any work is done.
 
     Raises
@@ -100,7 +98,7 @@ def check(
         if not os.path.basename(stem):
             raise InputError(f"the output {stem!r} names no file; give a path without its ending")
         for ending in (".ecsv", ".png"):
-            atomic.check_output(stem + ending, overwrite, inputs)
+            atomic.check_output(stem + ending, overwrite)
 
 
 def run(
@@ -201,7 +199,9 @@ def compare(
         given = PAPER | setting | {"n_iter": n_iter, "device": device} | more
         return deconvolve(case.observation, case.stars, **given)
 
-    reconstruct(settings[0], 1)  # whose warnings are shown
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MisfitWarning)  # as after an iteration is no wonder
+        reconstruct(settings[0], 1)  # whose other warnings are shown
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LnoclWarning)
         for setting in settings:  # compiled, and with their errors raised, before the work

@@ -151,15 +151,14 @@ def view_of(saved: SavedResult) -> ResultView:
     )
     # Electrons, as images and models are, whatever the unit of the file.
     alone = f"1 {saved.header.get('BUNIT', '')}"
-    # Of a star in several epochs the first.
     table = saved.tables["STARS"]
     epochs = table.get("epoch", np.zeros(len(saved.stars), int))
-    first = epochs == 0
+    n_epochs = int(np.max(epochs, initial=0)) + 1
     factor, _, unit = str(saved.header.get("ONEUNIT", alone)).partition(" ")
     return ResultView(
         extended=float(factor) * saved.extended,
-        stars=[star for star, is_first in zip(saved.stars, first, strict=True) if is_first],
-        star_fluxes=saved.star_fluxes[first],
+        stars=saved.stars[::n_epochs],  # once each, whatever epochs there are
+        star_fluxes=saved.star_fluxes.reshape(-1, n_epochs).mean(axis=1),
         n_iter=int(saved.number("NITER") or 0),
         history=saved.tables.get("HISTORY", {}),
         held_out=saved.tables.get("HELDOUT", {}),

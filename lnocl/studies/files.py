@@ -84,6 +84,12 @@ def write_simulation(
     ]
 
 
+def names_of(n_images: int) -> list[str]:
+    """Return the names of the files of a simulation."""
+    each = [f"{kind}_{j}.fits" for kind in ("image", "psf") for j in range(1, n_images + 1)]
+    return [*each, "truth.fits", "record.json"]
+
+
 def path_in(folder: str, name: str) -> str:
     """Return the path of a FITS file in a folder, from its name without the ending."""
     return os.path.join(folder, f"{name}.fits")

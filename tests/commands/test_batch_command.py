@@ -77,14 +77,15 @@ def test_the_summary_says_what_was_found_and_whether_it_fits(capsys):
     alone = ["a.fits", "--psf", "k1.fits", "--star", "7,5", "--star", "3.5,2", "--n-iter", "3"]
     command = ["deconvolve", *alone, "--engine", "numpy", *PAPER, *GIVEN, "-o", "alone.fits"]
     assert cli.main(command) == 0
-    one, said = found["one"], capsys.readouterr().out
+    one, (said, warned) = found["one"], capsys.readouterr()
     star = "star at (7, 5): {star_flux:.6g} +- {star_flux_error:.2g} {unit}s; ".format(**one)
     light = "extended source: {extended_flux:.6g} +- {extended_flux_error:.2g} {unit}s in "
     assert star in said
     assert light.format(**one) in said
     assert f"residuals {one['residual_rms']:.2f} +- " in said
     assert one["verdict"].startswith("the model does not fit at ")
-    assert f"\n{one['verdict'].partition('; ')[0]}" in said
+    fault = one["verdict"].partition("; ")[0].replace("refine_psfs", "--refine-psfs")
+    assert f"lnocl: warning: {fault}\n" in warned
     assert found["flat"]["verdict"] == "the model fits"
     assert np.isnan(found["flat"]["star_flux"])
     assert np.isnan(found["lost"]["residual_rms"])

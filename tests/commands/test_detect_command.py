@@ -1,12 +1,13 @@
 """``lnocl detect`` and ``lnocl limit``: what they write, say and refuse."""
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from commandline import gaussian
+from commandline import gaussian, one_complaint
 
 from lnocl.commands import cli
 from lnocl.io.fitsfindings import read_findings
@@ -157,3 +158,31 @@ def test_fluxes_are_in_the_unit_of_the_images(unit, capsys):
 def test_wrong_words_are_refused_before_the_run(words, message, capsys):
     assert cli.main(words) != 0
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "output"),
+    [
+        (["detect"], ["-o", "image.fits"]),
+        (["detect"], ["-o", "hard.fits"]),
+        (["limit", "--injections", "0"], ["-o", "link.fits"]),
+        (["limit", "--injections", "0"], ["-o", "out.fits"]),
+        (["detect"], ["--plot", "link.png"]),
+    ],
+)
+def test_the_images_of_the_run_are_not_replaced(command, output, capsys, tmp_path, monkeypatch):
+    """From another folder too, whose names are not those of the run's."""
+    os.link("image.fits", "hard.fits")
+    os.symlink("image.fits", "link.fits")
+    os.symlink("psf.fits", "link.png")
+    os.mkdir("other")
+    monkeypatch.chdir("other")
+    before = {path: path.read_bytes() for path in sorted(tmp_path.glob("*.*"))}
+    flag, name = output
+    words = [*command, "../out.fits", flag, f"../{name}", "--overwrite"]
+    monkeypatch.setattr("lnocl.commands.deconvolve.read", None)
+    assert cli.main(words) == 2
+    assert one_complaint(capsys.readouterr()) == (
+        f"the output ../{name} is one of the inputs; give it another name"
+    )
+    assert {path: path.read_bytes() for path in sorted(tmp_path.glob("*.*"))} == before

@@ -3,7 +3,9 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
+from astropy.io import fits
 from commandline import NUMPY, one_complaint, outside, run
 
 import lnocl
@@ -161,3 +163,26 @@ class TestRefusals:
         )
         with pytest.raises(ZeroDivisionError):
             run()
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["simulate", "truth.fits", "-o", "."], "./truth.fits"),
+        (["simulate", "image_2.fits", "-o", ".", "--angle", "0", "90"], "./image_2.fits"),
+        (["plot", "result.png", "-o", "."], "./result.png"),
+        (["batch", "targets.csv", "-o", "."], "{here}/summary.ecsv"),
+    ],
+)
+def test_files_in_a_folder_of_outputs_that_are_inputs_stay(words, name, capsys):
+    """Whatever they are called, and however they are linked."""
+    for each in ("truth.fits", "image_2.fits", "result.png"):
+        fits.writeto("sky.fits", np.ones((32, 32)), overwrite=True)
+        os.rename("sky.fits", each)
+    os.link("a.fits", "summary.ecsv")
+    Path("targets.csv").write_text("images,psf\na.fits,k1.fits\n")
+    before = {path: path.read_bytes() for path in Path().glob("*.*")}
+    assert cli.main([*words, "--overwrite"]) == 2
+    complaint = one_complaint(capsys.readouterr())
+    assert f"the output {name.format(here=os.getcwd())} is one of the inputs" in complaint
+    assert {path: path.read_bytes() for path in Path().glob("*.*")} == before

@@ -1,4 +1,4 @@
-"""The lines of a run on its result: unnamed stars, stars elsewhere, errors of backgrounds."""
+"""The lines of a run on its result: unnamed stars, errors of backgrounds, halos of a batch."""
 
 from types import SimpleNamespace
 
@@ -8,8 +8,6 @@ from astropy.io import fits
 
 from lnocl.commands import cli
 from lnocl.commands.batch import _summarise
-from lnocl.commands.summary import verdict_on
-from lnocl.residuals import Fit, StarResiduals
 
 Y, X = np.indices((48, 48))
 NAMED, UNNAMED = (16, 20), (34, 30)
@@ -52,23 +50,6 @@ def test_the_error_of_a_measured_background_is_in_that_of_the_extended_source(ca
     expected = np.hypot(given["EXTERROR"], X.size * error)
     assert measured["EXTERROR"] == pytest.approx(expected, rel=0.05)
     assert measured["EXTERROR"] > 1.1 * given["EXTERROR"]
-
-
-def test_a_star_that_moved_as_far_as_stars_may_is_named_first():
-    result = SimpleNamespace(
-        star_positions=np.array([(10.0, 13.0)]),
-        star_fluxes=np.array([5.0]),
-        extended=np.ones((32, 32)),
-        psf_refinement=None,
-    )
-    bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.0, 0.0)
-    arguments = SimpleNamespace(smoothing="auto", refine_psfs=None)
-    frames = SimpleNamespace(observation=SimpleNamespace(n_epochs=1, is_turned=False))
-    lines = verdict_on(arguments, result, frames, [(10, 10)], [bad], Fit(), False)
-    assert lines[0].startswith("1 star moved as far as stars may, 3 pixels, from (10, 10) to (10,")
-    assert "does not fit" in lines[1]
-    near = verdict_on(arguments, result, frames, [(10, 10.5)], [bad], Fit(), False)
-    assert len(near) == 1
 
 
 def test_halos_of_a_batch_are_counted():

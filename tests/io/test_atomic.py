@@ -199,10 +199,14 @@ class TestCheckOutput:
         path = str(tmp_path / "a.fits")
         fits.PrimaryHDU(IMAGE).writeto(path)
         (tmp_path / "link.fits").symlink_to(path)
-        with pytest.raises(InputError, match="is one of the inputs"):
-            atomic.check_output(
-                str(tmp_path / "link.fits"), overwrite=True, inputs=["missing.fits", path]
-            )
+        os.link(path, tmp_path / "hard.fits")
+        for name in ("a.fits", "link.fits", "hard.fits"):
+            output = str(tmp_path / name)
+            with atomic.kept(["missing.fits", path]):
+                with pytest.raises(InputError, match="is one of the inputs"):
+                    atomic.check_output(output, overwrite=True)
+                atomic.check_output(output, overwrite=True, is_updated=True)
+            atomic.check_output(output, overwrite=True)
 
 
 class TestCommandLine:

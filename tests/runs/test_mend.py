@@ -158,6 +158,9 @@ class TestSpeckles:
         found = solve(self.TRUE, refine_psfs=["jitter"])
         assert not found.psf_refinement.is_accepted
         assert 0.04 < found.psf_refinement.psf_error < 0.25
+        there = {"beside": found.star_positions[0] - STAR, "refine_positions": False}
+        as_used = solve(self.TRUE, refine_psfs=(), n_iter=1, **there).psf_refinement.misfit[0]
+        assert found.psf_refinement.misfit[1] == pytest.approx(as_used, rel=0.01)
         assert found.stop_reason == "change"
         assert found.star_fluxes == pytest.approx(FLUX, rel=0.03)
         assert found.star_flux_errors > found.psf_refinement.psf_error * found.star_fluxes

@@ -6,13 +6,12 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, with_names
 from lnocl.notebook import html_card
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import ResultView, draw_result
@@ -58,6 +57,14 @@ class Findings(Protocol):
     @property
     def observation(self) -> Observation:
         """The observation, with the PSFs that were used."""
+
+    @property
+    def given_positions(self) -> Array:
+        """The places of the stars that were given, in the order of the fluxes, shape (n, 2)."""
+
+    @property
+    def may_free_pixels(self) -> bool:
+        """Whether the pixels of PSFs were not to be refined, and could be."""
 
     def models(self) -> Iterator[Array]:
         """Yield the m_j, electrons per pixel, shape (ny, nx)."""
@@ -662,19 +669,21 @@ class Result:
     ) -> None:
         """Write a FITS file, which ``lnocl plot`` and ``lnocl report`` read.
 
-        It is the file of ``lnocl deconvolve --residuals``, without the command and the
-        messages of the run. The primary HDU holds the extended source. The tables STARS, HISTORY
-        and HELDOUT hold the stars, the objectives, and the errors that held-out counts estimate.
-        The cubes MODELS and RESIDUALS hold those of each image. PSFS and others are added where
-        PSFs were refined. Units are electrons, per second where exposures were given.
+        It is the file of ``lnocl deconvolve --residuals``, without the options, the command and
+        the messages of the run. The primary HDU holds the extended source. The tables STARS,
+        HALOS, HISTORY and HELDOUT hold the stars, the amounts of halos, the objectives, and the
+        errors that held-out counts estimate. The cubes MODELS and RESIDUALS hold those of each
+        image. PSFS and others are added where PSFs were refined. Units are electrons, per second
+        where exposures were given.
 
         Parameters
         ----------
         path : str
             File to write, named .fits, .fit or .fts.
         header : astropy.io.fits.Header, optional
-            Header of the first image. Its coordinates, and the keywords of the target and the
-            observation, are copied.
+            Header of the first image, or of another whose pixels are those of the sky. The
+            keywords of the target and the observation are copied. So are its coordinates, by
+            which stars get ``ra`` and ``dec``, unless all images are turned against the sky.
         overwrite : bool, optional
             Whether an existing file may be replaced.
 
@@ -699,37 +708,15 @@ class Result:
         ...     fits.getdata(path).shape, fits.getheader(path)["NITER"]
         ((8, 8), 2)
         """
-        from lnocl.io import atomic, fitswrite
-        from lnocl.io.fitsread import wcs_cards
+        from lnocl.io import atomic
         from lnocl.io.headers import observed_cards
+        from lnocl.result.file import write_file
 
         path = os.fspath(path)
         atomic.check_fits_output(path, overwrite)
-        models, parts = self.models(), saved_parts(self)
-        fitswrite.write_result(
-            path,
-            self.extended,
-            self.star_positions,
-            self.star_fluxes,
-            wcs=None if header is None else wcs_cards(header),
-            cards=[
-                *([] if header is None else observed_cards(header, header)),
-                ("CREATOR", f"lnocl {version('lnocl')}", "program that wrote this file"),
-                ("NITER", self.n_iter, "iterations done"),
-                ("STOPPED", self.stop_reason, "why it stopped"),
-                ("MU", self.mu, "weight of the Tikhonov term, per electron"),
-                ("SMOOTHIN", self.smoothing, "weight of the edge-preserving term"),
-                ("DEVICE", self.device, "device"),
-                *parts.pop("cards"),
-            ],
-            overwrite=overwrite,
-            unit=self._unit,
-            star_columns=fitswrite.error_columns(
-                self.star_position_errors, self.star_flux_errors, self._unit
-            ),
-            cubes={"MODELS": (models, "electron"), "RESIDUALS": (self._residuals(models), "")},
-            **parts,
-        )
+        cards = [] if header is None else observed_cards(header, header)
+        is_upright = (self._observation.transforms[:, :, :2] == np.eye(2)).all(axis=(1, 2))
+        write_file(self, path, header if is_upright.any() else None, overwrite, cards=cards)
 
     def _repr_html_(self) -> str:
         """Return a table for a notebook, with a thumbnail where matplotlib is there."""
@@ -794,6 +781,10 @@ class Result:
         >>> fit.n_pixels, bool(0.9 < fit.rms < 1.1), fit.is_misfit
         (1024, True, False)
         """
+        return self._fit
+
+    @cached_property
+    def _fit(self) -> Fit:
         return judge(self._observation, self._findings.models())
 
     def star_residuals(self) -> list[StarResiduals]:
@@ -816,7 +807,42 @@ class Result:
         >>> star.core.n_pixels, star.is_misfit, star.has_halo
         (9, False, False)
         """
+        return list(self._star_residuals)
+
+    @cached_property
+    def _star_residuals(self) -> list[StarResiduals]:
         return self._findings.star_residuals()
+
+    def verdict(self) -> list[str]:
+        """Return that the model fits, or else where it does not and what to do, a line each.
+
+        It rests on `star_residuals` and `fit`. `lnocl.deconvolve` has warned of each fault.
+
+        Returns
+        -------
+        list of str
+            ``["the model fits"]``, or a line for each fault.
+
+        Examples
+        --------
+        A star that is wider than its PSF:
+
+        >>> import warnings
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((33, 33)) - 16
+        >>> star, psf = (np.exp(-(x**2 + y**2) / width) for width in (8, 6))
+        >>> observation = lnocl.Observation(5 + 1e4 * star / star.sum(), psf)
+        >>> with warnings.catch_warnings():
+        ...     warnings.simplefilter("ignore", lnocl.LnoclWarning)
+        ...     options = {"smoothing": 10.0, "stop": None, "n_iter": 20, "engine": "numpy"}
+        ...     result = lnocl.deconvolve(observation, [(16, 16)], **options)
+        >>> result.verdict()[0].partition(" or try")[0]
+        'the model does not fit at 1 of 1 star, (16, 16): give a better PSF,'
+        """
+        from lnocl.result.verdict import FITS, faults
+
+        return [with_names(line) for line in faults(self)] or [FITS]
 
 
 def make_result(outcome: Outcome) -> Result:
@@ -841,28 +867,6 @@ def make_result(outcome: Outcome) -> Result:
         halo_fluxes=outcome.of_halos(outcome.star_fluxes),
         _findings=outcome,
     )
-
-
-def saved_parts(result: Result) -> dict[str, Any]:
-    """Return the arguments of `lnocl.io.fitswrite.write_result` that follow from a result alone."""
-    refinement = result.psf_refinement
-    parts: dict[str, Any] = {
-        "history": result.history,
-        "held_out": result.held_out if result.held_out.size else None,
-        "transforms": result._observation.transforms,
-        "oversample": result._observation.oversample,
-        "halos": result._halo_table() if result.halo_fluxes.size else None,
-        "cards": [],
-    }
-    if refinement is not None:
-        parts |= {
-            "psf_fit": refinement.table(),
-            "psf_errors": refinement.errors_table(),
-            "doubtful": result.doubtful,
-            "psfs": result.psfs,
-            "cards": refinement.cards(),
-        }
-    return parts
 
 
 def view_of(result: Result) -> ResultView:

@@ -1,0 +1,121 @@
+"""The verdict on a result: that the model fits, or where it does not and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lnocl.errors import MisfitWarning, counted, warn
+from lnocl.runs.progress import Progress
+from lnocl.scene.arrays import Array
+from lnocl.scene.detector import on_sky
+from lnocl.scene.stars import MAX_SHIFT
+
+if TYPE_CHECKING:
+    from lnocl.result import Result
+
+# What it is where nothing is wrong.
+FITS = "the model fits"
+# Where a star without light may be instead: so many pixels from its place.
+ELSEWHERE = 10
+# Electrons, or per second, that iterations which multiply leave of a star without light.
+NO_LIGHT = 1e-6
+# Of a star that was moved by this share of `MAX_SHIFT` more may be needed.
+AT_LIMIT = 0.99
+
+
+def warn_of_faults(result: Result, progress: bool) -> None:
+    """Warn of each of the faults of a result.
+
+    Warns
+    -----
+    MisfitWarning
+        The model does not fit.
+    """
+    with (
+        np.errstate(over="ignore", invalid="ignore"),
+        Progress(None, "", bool(progress), "measuring residuals", stays=False),
+    ):
+        found = faults(result)
+    for line in found:
+        warn(line, MisfitWarning)
+
+
+def faults(result: Result) -> list[str]:
+    """Return where the model does not fit and what to do, a line each; parameters by their names.
+
+    They are those of stars without light, of stars that moved too far, and of residuals far from
+    what noise leaves; and light all round a star, as a PSF that is too narrow leaves it.
+    """
+    unfitted, lit, dark, lost = [], [], [], []
+    findings, at_stars, overall = result._findings, result.star_residuals(), result.fit()
+    for place, given, flux, found in zip(
+        result.star_positions, findings.given_positions, result.star_fluxes, at_stars, strict=True
+    ):
+        if np.isnan(flux):  # no image shows it, as the run has told
+            continue
+        if not flux > NO_LIGHT:
+            where = _elsewhere(result.extended, place, findings.observation.oversample)
+            dark.append(f"{_at(given)}{where}")
+            continue
+        if np.hypot(*(place - given)) > AT_LIMIT * MAX_SHIFT:
+            lost.append(f"{_at(given)} to {_at(place)}")
+        if found.is_misfit:
+            unfitted.append(_at(place))
+        if found.has_halo:
+            lit.append(f"{_at(place)}, {100 * found.halo:.0f} %")
+    lines = []
+    if dark:
+        lines.append(f"no light is left for {counted(len(dark), 'star')}: {'; '.join(dark[:3])}")
+    if lost:
+        lines.append(
+            f"{counted(len(lost), 'star')} moved as far as stars may, {MAX_SHIFT:g} pixels, from "
+            f"{'; '.join(lost[:3])}: give the place where it is brightest"
+        )
+    if unfitted:
+        remedy = ", or try `refine_psfs` jitter pixels" if findings.may_free_pixels else ""
+        lines.append(
+            f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
+            f"{' '.join(unfitted[:3])}: give a better PSF{remedy}"
+        )
+    elif overall.is_misfit and not (dark or lost):
+        lines.append("the model does not fit: see to background, noise and gain")
+    refinement = result.psf_refinement
+    is_fitted = refinement is not None and refinement.has_free_pixels  # which follow the noise
+    if overall.is_overfit and not is_fitted:
+        lines.append(
+            "the residuals are far less than noise: the noise that is taken is too large (see to "
+            "unit, gain, exposure, background and read noise), or the model follows the noise"
+            + ("" if result.smoothing > 0.0 else " (take fewer iterations, or `smoothing`)")
+        )
+    if lit:
+        lines.append(
+            f"light lies all round {counted(len(lit), 'star')}, as a share of its flux: "
+            f"{'; '.join(lit[:3])}: the PSF is too narrow or lacks its wings, the background is "
+            "too low, or a source lies there"
+        )
+    return lines
+
+
+def _at(place: Iterable[float]) -> str:
+    x, y = place
+    return f"({x:.7g}, {y:.7g})"
+
+
+def _elsewhere(extended: Array, place: Array, finer: int) -> str:
+    """Return where the brightest light near a star without light is, and what to do."""
+    x, y = np.round(on_sky(place, finer)).astype(int)
+    reach = ELSEWHERE * finer
+    rows, columns = (slice(max(at - reach, 0), max(at + reach + 1, 0)) for at in (y, x))
+    around = extended[rows, columns]
+    if not around.any():
+        return ", nor near it: leave it out"
+    row, column = np.unravel_index(int(around.argmax()), around.shape)
+    at = np.array([columns.start + column, rows.start + row], float)
+    brightest = (at - (finer - 1) / 2.0) / finer
+    return (
+        f", and the brightest light within {ELSEWHERE} pixels lies at {_at(brightest)}: give the "
+        "star's place, or leave it out"
+    )

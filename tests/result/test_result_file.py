@@ -1,0 +1,134 @@
+"""The file of a result is the same from Python and from the shell."""
+
+import contextlib
+import dataclasses
+import inspect
+import re
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from scenes import make_smooth_psfs
+
+import lnocl
+from lnocl.commands import cli
+from lnocl.commands.deconvolve_options import ALL_OPTIONS
+from lnocl.io.saved_results import read_result
+from lnocl.result import view_of
+from lnocl.studies.figures import view_of as view_of_file
+
+NY, NX, LEVEL = 40, 36, 12.0
+STARS = [(9.0, 12.0), (25.0, 29.0)]
+FLUXES = np.array([[6e3, 2e3, 4e3], [3e3, 9e3, 1e3]])
+EXPOSURES = [1.0, 3.0, 0.5]
+WORDS = ["--psf-centre", "given", "--background", str(LEVEL), "--smoothing", "0.1", "--stop"]
+WORDS += ["none", "--n-iter", "3", "--engine", "numpy", "--pad", "0", "--residuals"]
+DECONVOLVE = inspect.signature(lnocl.deconvolve).parameters
+OPTIONS = {"smoothing": 0.1, "stop": None, "n_iter": 3, "engine": "numpy", "pad": 0}
+WCS = {
+    "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 65.0, "CRVAL2": 19.5,
+    "CRPIX1": 10.0, "CRPIX2": 20.0, "CDELT1": -1e-4, "CDELT2": 1e-4,
+}  # fmt: skip
+HEADER = fits.Header({"BUNIT": "electron", "OBJECT": "RW Aur", "EXPTIME": 30.0, **WCS})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def files(tmp_path_factory):
+    """Work in a folder with three images of two stars that vary, their PSFs, and a halo."""
+    y, x = np.indices((NY, NX))
+    halo = 1.0 / (4.0 + np.hypot(x - 9, 1.3 * (y - 12)))
+    psfs, rng = make_smooth_psfs(3, (17, 17)), np.random.default_rng(0)
+    psfs /= psfs.sum(axis=(1, 2), keepdims=True)
+    with contextlib.chdir(tmp_path_factory.mktemp("result_file")):
+        for j, (psf, exposure) in enumerate(zip(psfs, EXPOSURES, strict=True)):
+            means = LEVEL + exposure * 4e3 * halo / halo.sum()
+            for (sx, sy), fluxes in zip(STARS, FLUXES, strict=True):
+                there = np.s_[int(sy) - 8 : int(sy) + 9, int(sx) - 8 : int(sx) + 9]
+                means[there] += exposure * fluxes[j] * psf
+            fits.writeto(f"image{j}.fits", rng.poisson(means).astype(float), HEADER)
+            fits.writeto(f"psf{j}.fits", psf)
+            fits.writeto(f"scatter{j}.fits", 0.02 * psf)
+        fits.writeto("halo.fits", halo)
+        yield
+
+
+def both(*more, n_images=3, **options):
+    """Return the result of Python, having written those of Python and of the shell."""
+    given = {name: options.pop(name) for name in list(options) if name not in DECONVOLVE}
+    names = [[f"{name}{j}.fits" for j in range(n_images)] for name in ("image", "psf")]
+    images, psfs = (np.array([fits.getdata(name) for name in each]) for each in names)
+    observation = lnocl.Observation(images, psfs, background=LEVEL, psf_centre="given", **given)
+    result = lnocl.deconvolve(observation, STARS, **OPTIONS, **options)
+    result.write("python.fits", header=HEADER, overwrite=True)
+    stars = [word for x, y in STARS for word in ("--star", f"{x},{y}")]
+    words = [*names[0], "--psf", *names[1], *stars, *WORDS, *more, "-o", "shell.fits"]
+    assert cli.main(["deconvolve", *words, "--overwrite", "--quiet"]) == 0
+    return result
+
+
+def epochs_and_halos():
+    options = ("--epoch", "each", "--exposure", *map(str, EXPOSURES), "--halo", "halo.fits")
+    halo = fits.getdata("halo.fits")
+    return both(*options, epochs=[0, 1, 2], exposure=EXPOSURES, halos=halo)
+
+
+def psf_errors():
+    options = ("--psf-errors", "scatter=scatter0.fits", "--refine-psfs", "none", "--refine")
+    scatter = fits.getdata("scatter0.fits")
+    more = {"refine_psfs": (), "refine_positions": True}
+    return both(*options, n_images=1, psf_scatter=scatter, **more)
+
+
+def turned():
+    middle = NX // 2, NY // 2
+    return both("--angle", "10", "25", transforms=lnocl.rotations([-10, -25], middle), n_images=2)
+
+
+@pytest.fixture(scope="module", params=[epochs_and_halos, psf_errors, turned])
+def case(request, files):
+    return request.param, request.param()
+
+
+def cards(header):
+    """Return values and comments, but for those of the time."""
+    left_out = "DATE", "CHECKSUM", "DATASUM", "HISTORY"
+    return {c.keyword: (c.value, c.comment) for c in header.cards if c.keyword not in left_out}
+
+
+def test_python_and_the_shell_write_the_same(case):
+    run, _ = case
+    words = {each.card[0] for each in ALL_OPTIONS if each.card}
+    words |= {each.checksum for each in ALL_OPTIONS if each.checksum}
+    with fits.open("python.fits", checksum=True) as one, fits.open("shell.fits") as other:
+        names = [hdu.name for hdu in one]
+        assert [hdu.name for hdu in other if hdu.name != "MESSAGES"] == names
+        for name in names:
+            np.testing.assert_equal(one[name].data, other[name].data, name)
+            found, expected = cards(other[name].header), cards(one[name].header)
+            of_command = {k for k in found if re.sub(r"\d+$", "", k) in words}
+            assert {k: found[k] for k in found if k not in of_command - {*expected}} == expected
+        assert set(one["STARS"].columns.names) >= {"core_rms", "wings_rms", "halo"}
+        assert {"EXTFLUX", "EXTERROR", "VERDICT", "RESIDRMS"} <= set(one[0].header)
+        assert ("CRVAL1" in one[0].header) == (run is not turned)
+        assert one[0].header["OBJECT"] == "RW Aur"
+        assert ("epoch" in one["STARS"].columns.names) == (run is epochs_and_halos)
+        assert ("ra" in one["STARS"].columns.names) == (run is not turned)
+
+
+def test_read_back_both_plot_as_the_result_does(case):
+    _, result = case
+    expected, *found = (
+        view_of(result),
+        *(view_of_file(read_result(f"{name}.fits")) for name in ("python", "shell")),
+    )
+    for field in dataclasses.fields(expected):
+        one, python, shell = (getattr(each, field.name) for each in (expected, *found))
+        np.testing.assert_equal(python, shell, field.name)
+        if isinstance(one, dict):
+            one, python = (np.ravel([*each.values()]) for each in (one, python))
+        if field.name == "light_curves" and one is not None:
+            one, python = one[:2], python[:2]
+        if one is None or isinstance(one, str):
+            assert python == one
+        else:
+            np.testing.assert_allclose(python, one, rtol=1e-5, atol=1e-5, err_msg=field.name)

@@ -1,0 +1,128 @@
+"""The verdict on a result: what it says of stars and residuals, and that runs warn of it."""
+
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scenes import make_psfs
+
+import lnocl
+from lnocl.commands import cli
+from lnocl.residuals import Fit, StarResiduals
+from lnocl.result.verdict import faults
+
+N, STAR, LEVEL = 48, (21, 26), 20.0
+Y, X = np.indices((N, N))
+RUN = {"engine": "numpy", "pad": 0, "n_iter": 60}
+
+
+def star(flux=4e4, widen=1.0):
+    """Return an image of a star through a lopsided PSF, of which another is known, and that PSF."""
+    u, v = X - N // 2, Y - N // 2
+    wide, known = (
+        np.exp(-0.5 * ((u / (1.8 * w)) ** 2 + (v / (1.2 * w)) ** 2))
+        + 0.3 * np.exp(-0.5 * ((u - 3) ** 2 + (v + 2) ** 2) / w**2)
+        for w in (widen, 1.0)
+    )
+    shift = STAR[1] - N // 2, STAR[0] - N // 2
+    means = LEVEL + flux * np.roll(wide / wide.sum(), shift, (0, 1))
+    return np.random.default_rng(0).poisson(means).astype(float), known
+
+
+def solve(image, psf, background=LEVEL, **options):
+    """Return a result and what was warned of."""
+    observation = lnocl.Observation(image, psf, background=background, psf_centre="given")
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        result = lnocl.deconvolve(observation, [STAR], **RUN, **options)
+    return result, [str(each.message) for each in warned]
+
+
+def test_a_model_that_fits_is_said_to_and_nobody_is_warned():
+    result, warned = solve(*star(), smoothing=0.1)
+    assert result.verdict() == ["the model fits"]
+    assert warned == []
+
+
+def test_a_run_warns_of_each_fault_of_its_verdict():
+    image, psf = star(widen=1.25)
+    result, warned = solve(image, psf, smoothing=3.0, stop=None)
+    assert max(found.core.rms for found in result.star_residuals()) > 3
+    (line,) = (each for each in result.verdict() if each.startswith("the model does not fit at 1"))
+    assert line.endswith("of 1 star, (21, 26): give a better PSF, or try refine_psfs jitter pixels")
+    assert warned[-len(result.verdict()) :] == result.verdict()
+    _, warned = solve(image, psf, smoothing=3.0, stop=None, refine_psfs=["pixels"])
+    assert not any("refine_psfs" in each for each in warned)
+
+
+def test_a_star_without_light_is_said_to_have_none():
+    """Iterations that multiply leave 1e-63 of it."""
+    image, psf = star(flux=0.0)
+    image[STAR[1] - 3 : STAR[1] + 4, STAR[0] - 3 : STAR[0] + 4] = 0.0
+    beside = np.roll(psf / psf.sum(), (30 - N // 2, 18 - N // 2), (0, 1))
+    image += np.random.default_rng(5).poisson(4e3 * beside)
+    _, warned = solve(image, psf, smoothing=0.0, stop=None)
+    assert any(
+        each.startswith("no light is left for 1 star: (21, 26), and the brightest light within 10")
+        and "lies at (18, 30)" in each
+        for each in warned
+    )
+
+
+def test_a_star_that_moved_as_far_as_stars_may_is_named_first():
+    def at(*given):
+        bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.0, 0.0)
+        result = SimpleNamespace(
+            star_positions=np.array([(10.0, 13.0)]),
+            star_fluxes=np.array([5.0]),
+            extended=np.ones((32, 32)),
+            psf_refinement=None,
+            smoothing=0.0,
+            star_residuals=lambda: [bad],
+            fit=Fit,
+            _findings=SimpleNamespace(given_positions=np.array([given]), may_free_pixels=True),
+        )
+        return faults(result)
+
+    lines = at(10.0, 10.0)
+    assert lines[0].startswith("1 star moved as far as stars may, 3 pixels, from (10, 10) to (10,")
+    assert "does not fit" in lines[1]
+    assert len(at(10.0, 10.5)) == 1
+
+
+@pytest.mark.parametrize("more", [[], ["--quiet"]])
+def test_the_shell_says_each_fault_once(more, tmp_path, monkeypatch, capsys):
+    from astropy.io import fits
+
+    monkeypatch.chdir(tmp_path)
+    image, psf = star(widen=1.25)
+    fits.writeto("image.fits", image)
+    fits.writeto("psf.fits", psf)
+    words = ["image.fits", "--psf", "psf.fits", "--psf-centre", "given", "--background", "20"]
+    words += ["--star", "21,26", "--smoothing", "3", "--stop", "none", "--n-iter", "60"]
+    words += ["--engine", "numpy", "--pad", "0", "-o", "out.fits"]
+    assert cli.main(["deconvolve", *words, *more]) == 0
+    said = capsys.readouterr()
+    result, _ = solve(image, psf, smoothing=3.0, stop=None)
+    with fits.open("out.fits") as hdus:
+        assert hdus[0].header["VERDICT"] == "; ".join(result.verdict())
+        kept = [str(line) for line in hdus["MESSAGES"].data["message"]]
+    for line in result.verdict():
+        shown = line.replace("refine_psfs", "--refine-psfs")
+        assert (said.out + said.err).count(shown) == 1
+        assert f"lnocl: warning: {shown}" in said.err.splitlines()
+        assert kept.count(f"warning: {shown}") == 1
+    assert "the model fits" not in said.out
+
+
+def test_tiles_have_a_verdict_too():
+    psf = make_psfs(1, (7, 7))[0]
+    image = np.random.default_rng(2).poisson(LEVEL + 0.0 * X).astype(float)
+    image[STAR[1], STAR[0]] += 3e3
+    observation = lnocl.Observation(image, psf, background=LEVEL, psf_centre="given")
+    options = {**RUN, "n_iter": 5, "smoothing": 0.0, "stop": None}
+    with pytest.warns(lnocl.LnoclWarning) as warned:
+        result = lnocl.deconvolve_tiles(observation, [STAR], **options)
+    assert result.verdict()[0].startswith("the model does not fit at 1 of 1 star, (21, 26): give")
+    assert result.verdict()[0] in [str(each.message) for each in warned]
