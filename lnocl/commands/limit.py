@@ -64,14 +64,15 @@ def _run(arguments: argparse.Namespace) -> None:
     from lnocl.significance import check_injections
 
     check_injections(arguments.injections or 1, arguments.seed)
-    found, frames = detect.find(arguments, "limits")
+    found, again = detect.find(arguments, "limits")
+    frames = again.frames
     curves = found.contrast_curves(COMPLETENESS)
     table = detect.in_unit(curves, frames)
     maps = {
         f"{LIMIT}{100 * share:g}": (found.limit(share) / frames.electrons, frames.unit)
         for share in COMPLETENESS
     }
-    write_findings(arguments.result, LIMITS, table, maps, detect.cards(found))
+    write_findings(again.saved, LIMITS, table, maps, detect.cards(found))
     lines = _told(found, table, maps[f"{LIMIT}50"][0], frames.unit)
     with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
         lines += _checked(found, arguments)
