@@ -95,6 +95,9 @@ def _told(found: Significance, table: QTable, limit: np.ndarray, unit: str) -> l
     stars = np.unique(table["star"])
     for star in stars[stars > 0][: detect.MAX_LISTED]:
         rows = table[table["star"] == star]
+        if not np.isfinite(rows["magnitudes50"].value).any():
+            lines.append(f"star {star} has no light, and nothing is faint beside it")
+            continue
         shown = rows[np.unique(np.round(np.geomspace(1, len(rows), 4)).astype(int)) - 1]
         limits = ", ".join(
             f"{row['magnitudes50'].value:.2f} at {row['distance'].value:.1f}" for row in shown
