@@ -112,7 +112,7 @@ def _run_of(saved: SavedResult) -> tuple[str, argparse.Namespace]:
     parser = Parser(prog="lnocl")
     deconvolve.COMMAND.add_arguments(parser)
     lines = saved.command_words()
-    folder = next((words[1] for words in lines if words[:1] == ["cd"]), os.curdir)
+    folder = next((words[1] for words in lines if words[:1] == ["cd"] and words[1:]), os.curdir)
     words = next((words for words in lines if words[:2] == ["lnocl", "deconvolve"]), None)
     if words is None:
         raise InputError(

@@ -168,6 +168,14 @@ def test_a_file_that_is_not_standard_gets_its_detections(capsys):
     assert "Traceback" not in captured.err
 
 
+def test_a_command_without_its_folder_is_made_where_one_is(capsys):
+    content = Path("out.fits").read_bytes()
+    at = content.index(b"HISTORY cd")
+    Path("out.fits").write_bytes(content[:at] + b"HISTORY cd".ljust(80) + content[at + 80 :])
+    assert cli.main(["detect", "out.fits"]) == 0
+    assert "1 detection above" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
