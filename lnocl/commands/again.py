@@ -97,6 +97,7 @@ class Again:
         fluxes = self.saved.star_fluxes * self.frames.electrons
         if (
             found.extended.shape != expected.shape
+            or found.star_fluxes.size != fluxes.size
             or not np.allclose(found.extended, expected, SAME, ROUNDING * abs(expected).max())
             or not np.allclose(found.star_fluxes, fluxes, SAME)
         ):

@@ -168,6 +168,13 @@ def test_a_file_that_is_not_standard_gets_its_detections(capsys):
     assert "Traceback" not in captured.err
 
 
+def test_a_result_whose_stars_are_gone_is_another(capsys):
+    with fits.open("out.fits", mode="update") as hdus:
+        hdus["STARS"].data = hdus["STARS"].data[:0]
+    assert cli.main(["detect", "out.fits"]) == 2
+    assert "the run of out.fits gives another result now" in capsys.readouterr().err
+
+
 def test_a_command_without_its_folder_is_made_where_one_is(capsys):
     content = Path("out.fits").read_bytes()
     at = content.index(b"HISTORY cd")
