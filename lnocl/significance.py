@@ -42,6 +42,8 @@ NEAR = 0.7
 INTERPOLATED = 0.02
 # Of more false alarms in a field the number is not what the threshold says.
 MOST_ALARMS = 10.0
+# The threshold of fewer is beyond what numbers hold.
+FEWEST_ALARMS = 1e-200
 POINT_SOURCE, EXTENDED = "point", "extended"
 
 
@@ -266,12 +268,12 @@ class Significance:
             return np.zeros(self._map.values.shape)
         return np.asarray(POINT * SHARE_NEAR * self._null.brightest_structure() * self._map.unit)
 
-    def contrast_curves(self, completeness: Sequence[float] = (0.5, 0.9, 0.95)) -> QTable:
+    def contrast_curves(self, completeness: Sequence[float] | float = (0.5, 0.9, 0.95)) -> QTable:
         """Return the faintest sources that would be found, against the distance from each star.
 
         Parameters
         ----------
-        completeness : sequence of float, optional
+        completeness : sequence of float or float, optional
             Probabilities of being found, between 0 and 1.
 
         Returns
@@ -304,8 +306,10 @@ class Significance:
         from astropy.table import QTable
         from astropy.units import electron, mag, pix
 
-        completeness = in_unit("completeness", completeness, "")
-        limits = {f"{100 * each:g}": self.limit(each) for each in completeness}
+        shares = np.atleast_1d(in_unit("completeness", completeness, "")).tolist()
+        for each in shares:
+            check_completeness(each)
+        limits = {f"{100 * each:g}": self.limit(each) for each in shares}
         observation, scene = self._outcome.observation, self._outcome.scene
         n_epochs = observation.n_epochs
         fluxes = self._outcome.star_fluxes[: scene.n_stars].reshape(-1, n_epochs).mean(axis=1)
@@ -432,11 +436,14 @@ def check_alarms(false_alarms: object) -> None:
     Raises
     ------
     InputError
-        It is not a number above 0 and at most 10.
+        It is not a number from 1e-200 to 10.
     """
-    if not (isinstance(false_alarms, (int, float, np.number)) and 0 < false_alarms <= MOST_ALARMS):
+    if not (
+        isinstance(false_alarms, (int, float, np.number))
+        and FEWEST_ALARMS <= false_alarms <= MOST_ALARMS
+    ):
         raise InputError(
-            "`false_alarms` is the number expected in the whole field, above 0 and at most "
+            f"`false_alarms` is the number expected in the whole field, {FEWEST_ALARMS:g} to "
             f"{MOST_ALARMS:g}, such as 0.01; {false_alarms} was given"
         )
 

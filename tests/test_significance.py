@@ -6,6 +6,7 @@ from scipy import ndimage
 
 import lnocl
 from lnocl.errors import InputError
+from lnocl.process import ignored_warnings
 from lnocl.runs.injections import Injections, spread_places
 from lnocl.significance import significance
 from lnocl.solvers.point_test import point_flux
@@ -217,13 +218,32 @@ def test_the_picture_has_the_map_the_limits_and_the_curves(found):
     ]
 
 
+def test_one_probability_has_its_curves(found):
+    one, listed = found.contrast_curves(0.7), found.contrast_curves([0.7])
+    assert one.colnames == listed.colnames
+    assert one.colnames[3:] == ["flux70", "contrast70", "magnitudes70"]
+    assert (one["flux70"] == listed["flux70"]).all()
+
+
+def test_a_star_without_light_has_no_curve_in_the_picture():
+    observation = lnocl.Observation(np.full((24, 24), 50.0), PSF, background=50.0)
+    with ignored_warnings():
+        result = lnocl.deconvolve(observation, [(9, 11)], stop=None, n_iter=5, engine="numpy")
+    titles = [axes.get_title() for axes in result.significance().plot().axes if axes.get_title()]
+    assert titles[1:] == ["found with a probability of 50 %"]
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda r: r.significance(width=-1), "width must be a finite number of pixels, 0 or more"),
         (lambda r: r.significance(width=np.inf), "width must be"),
-        (lambda r: r.significance(false_alarms=0), "above 0 and at most 10, such as 0.01; 0 was"),
-        (lambda r: r.significance(false_alarms=11), "above 0 and at most 10"),
+        (lambda r: r.significance(false_alarms=0), "1e-200 to 10, such as 0.01; 0 was"),
+        (lambda r: r.significance(false_alarms=11), "1e-200 to 10"),
+        (lambda r: r.significance(false_alarms=5e-324), "1e-200 to 10"),
+        (lambda r: r.significance().contrast_curves(None), "completeness lies between 0 and 1; N"),
+        (lambda r: r.significance().contrast_curves("ab"), "completeness lies between 0 and 1; a"),
+        (lambda r: r.significance().contrast_curves([[0.5]]), "completeness lies between 0 and"),
         (lambda r: r.significance().limit(1.0), "completeness lies between 0 and 1; 1.0"),
         (lambda r: r.significance().inject(0), "injections must be a whole number, 1 or more"),
         (lambda r: r.significance().inject(3, 0.5, -1), "seed must be a whole number"),

@@ -101,6 +101,7 @@ class Again:
         fluxes = self.saved.star_fluxes * self.frames.electrons
         if (
             found.extended.shape != expected.shape
+            or found.star_fluxes.size != fluxes.size
             or not np.allclose(found.extended, expected, SAME, ROUNDING * abs(expected).max())
             or not np.allclose(found.star_fluxes, fluxes, SAME)
         ):
@@ -116,7 +117,7 @@ def _run_of(saved: SavedResult) -> tuple[str, argparse.Namespace]:
     parser = Parser(prog="lnocl")
     deconvolve.COMMAND.add_arguments(parser)
     lines = saved.command_words()
-    folder = next((words[1] for words in lines if words[:1] == ["cd"]), os.curdir)
+    folder = next((words[1] for words in lines if words[:1] == ["cd"] and words[1:]), os.curdir)
     words = next((words for words in lines if words[:2] == ["lnocl", "deconvolve"]), None)
     if words is None:
         raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import re
 import time
@@ -11,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lnocl.errors import InputError
+from lnocl.errors import FileError, InputError
 from lnocl.scene.apertures import Aperture
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from lnocl.commands.again import Again
+    from lnocl.io.fitserrors import Held
     from lnocl.io.frames import Frames
     from lnocl.result import Result
     from lnocl.runs.bootstrap import Bootstrap, Part
@@ -33,7 +36,7 @@ _OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)")
 def add_errors(
     arguments: argparse.Namespace,
     result: Result,
-    frames: Frames,
+    again: Again,
     parts: Sequence[Part],
 ) -> list[str]:
     """Add the errors of a result to its file, as replicas are done; return what to say of them.
@@ -44,14 +47,15 @@ def add_errors(
         Those of ``lnocl errors``.
     result : Result
         What the file holds.
-    frames : Frames
-        What it was made of.
+    again : Again
+        The file, and what its result was made of.
     parts : list of Aperture or Profile
         Regions and profiles that are measured.
     """
+    from lnocl.io.fitserrors import read_replicas
     from lnocl.runs.bootstrap import bootstrap, without_replicas
 
-    outcome, seed, path = result._outcome, arguments.seed, arguments.result
+    outcome, seed, frames = result._outcome, arguments.seed, again.frames
     latest: list[Bootstrap] = []
     written = time.monotonic()
 
@@ -59,11 +63,16 @@ def add_errors(
         nonlocal written
         latest[:] = [found]
         if time.monotonic() - written > WRITE_EVERY:
-            _write(path, found, parts, frames)
+            _write(again, found, parts, before)
             written = time.monotonic()
 
     expected = without_replicas(outcome, parts, seed)
-    earlier = None if arguments.overwrite else _earlier(path, expected, frames)
+    before = earlier = None
+    if arguments.overwrite:
+        with contextlib.suppress(FileError):  # damaged ones
+            before = read_replicas(again.saved.path)
+    else:
+        earlier = _earlier(again.saved.path, expected, frames)
     try:
         found = bootstrap(
             outcome,
@@ -77,7 +86,7 @@ def add_errors(
         )
     finally:
         if latest:
-            _write(path, latest[0], parts, frames)
+            _write(again, latest[0], parts, before)
     return _summarise(found, parts, frames)
 
 
@@ -129,12 +138,13 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
     return dataclasses.replace(expected, errors=held.errors, of_psfs=held.of_psfs, sums=held.sums)
 
 
-def _write(path: str, found: Bootstrap, parts: Sequence[Part], frames: Frames) -> None:
+def _write(again: Again, found: Bootstrap, parts: Sequence[Part], before: Held | None) -> None:
     from lnocl.io.fitserrors import write_errors
 
+    frames = again.frames
     quantities = found.to_table(frames.electrons, frames.unit)
     write_errors(
-        path,
+        again.saved,
         quantities,
         _table_of(_regions(parts), quantities[[each.at is None for each in found.quantities]]),
         (
@@ -148,6 +158,7 @@ def _write(path: str, found: Bootstrap, parts: Sequence[Part], frames: Frames) -
         found.seed,
         found.resolution,
         frames.unit,
+        before,
     )
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from lnocl.io.frames import Frames
+    from lnocl.io.saved_results import SavedResult
     from lnocl.significance import Significance
 
 # Detections that are printed.
@@ -61,9 +62,9 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    found, frames = find(arguments, "detections")
-    table = in_unit(found.detections, frames)
-    _write(arguments.result, found, table)
+    found, again = find(arguments, "detections")
+    table = in_unit(found.detections, again.frames)
+    _write(again.saved, found, table)
     lines = [*_told(found, table), *output(arguments, table, "detections")]
     if arguments.plot is not None:
         from lnocl.plotting.significance import draw_significance
@@ -73,8 +74,8 @@ def _run(arguments: argparse.Namespace) -> None:
         messages.say(lines)
 
 
-def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Frames]:
-    """Return the significance of sources in a result, whose run is made again, and its images."""
+def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Again]:
+    """Return the significance of sources in a result, whose run is made again, and that run."""
     from lnocl.io import atomic, tables
     from lnocl.significance import check_alarms, check_width
 
@@ -89,7 +90,7 @@ def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Fra
 
     check()  # before the result is read; then that nothing that it was made of is replaced
     again = Again.read(arguments.result, arguments.quiet, check)
-    return again.solve().significance(arguments.width, arguments.false_alarms), again.frames
+    return again.solve().significance(arguments.width, arguments.false_alarms), again
 
 
 def in_unit(table: QTable, frames: Frames) -> QTable:
@@ -108,12 +109,12 @@ def in_unit(table: QTable, frames: Frames) -> QTable:
     return table
 
 
-def _write(path: str, found: Significance, table: QTable) -> None:
+def _write(saved: SavedResult, found: Significance, table: QTable) -> None:
     """Add the detections to the file of the result."""
     from lnocl.io.fitsfindings import DETECTIONS, SIGNAL, write_findings
 
     maps = {SIGNAL: (found.signal_to_noise, "")}
-    write_findings(path, DETECTIONS, table, maps, cards(found))
+    write_findings(saved, DETECTIONS, table, maps, cards(found))
 
 
 def cards(found: Significance) -> list[tuple[str, Any, str]]:

@@ -75,7 +75,7 @@ def _run(arguments: argparse.Namespace) -> None:
             bootstrap.check_earlier(arguments.result, arguments.seed, parts)
     found = again.solve()
     with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
-        lines = bootstrap.add_errors(arguments, found, again.frames, parts)
+        lines = bootstrap.add_errors(arguments, found, again, parts)
     if not arguments.quiet:
         messages.say([*lines, f"added to {arguments.result}"])
 

@@ -65,14 +65,15 @@ def _run(arguments: argparse.Namespace) -> None:
     from lnocl.significance import check_injections
 
     check_injections(arguments.injections or 1, arguments.seed)
-    found, frames = detect.find(arguments, "limits")
+    found, again = detect.find(arguments, "limits")
+    frames = again.frames
     curves = found.contrast_curves(COMPLETENESS)
     table = detect.in_unit(curves, frames)
     maps = {
         f"{LIMIT}{100 * share:g}": (found.limit(share) / frames.electrons, frames.unit)
         for share in COMPLETENESS
     }
-    write_findings(arguments.result, LIMITS, table, maps, detect.cards(found))
+    write_findings(again.saved, LIMITS, table, maps, detect.cards(found))
     lines = _told(found, table, maps[f"{LIMIT}50"][0], frames.unit)
     with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
         lines += _checked(found, arguments)
@@ -95,6 +96,9 @@ def _told(found: Significance, table: QTable, limit: np.ndarray, unit: str) -> l
     stars = np.unique(table["star"])
     for star in stars[stars > 0][: detect.MAX_LISTED]:
         rows = table[table["star"] == star]
+        if not np.isfinite(rows["magnitudes50"].value).any():
+            lines.append(f"star {star} has no light, and nothing is faint beside it")
+            continue
         shown = rows[np.unique(np.round(np.geomspace(1, len(rows), 4)).astype(int)) - 1]
         limits = ", ".join(
             f"{row['magnitudes50'].value:.2f} at {row['distance'].value:.1f}" for row in shown

@@ -39,7 +39,9 @@ def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
                 parsed.command.run(parsed)
     except LnoclError as error:
         return messages.fail(messages.in_shell(error.message, flags), error.exit_status)
-    except MemoryError:
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and "start new thread" not in str(error):
+            raise
         return messages.fail("not enough memory; cut the images, or give fewer at a time", FAILED)
     except Terminated as error:
         return messages.fail("terminated", 128 + error.args[0])

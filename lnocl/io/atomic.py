@@ -5,17 +5,18 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import hashlib
 import io
 import os
 import re
 import secrets
 import stat
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextvars import ContextVar
 from typing import IO, Any
 
-from lnocl.errors import FileError, InputError
+from lnocl.errors import FileError, InputError, warn
 
 COMPRESSED = (".gz", ".bz2", ".xz", ".zip", ".z", ".fz")
 FITS_ENDINGS = (".fits", ".fit", ".fts")
@@ -56,6 +57,10 @@ def _marks(path: str) -> set[Any]:
         found = os.stat(path)
         marks.add((found.st_dev, found.st_ino))
     return marks
+
+
+# Seconds between two looks at a lock of others, and seconds after which the wait is told.
+LOOK, LONG = 0.02, 10.0
 
 
 def check_folder(
@@ -160,7 +165,9 @@ def check_fits_output(path: str, overwrite: bool, is_updated: bool = False) -> N
 
 
 @contextlib.contextmanager
-def whole_file(path: str, overwrite: bool = False) -> Iterator[IO[bytes]]:
+def whole_file(
+    path: str, overwrite: bool = False, before: os.stat_result | None = None
+) -> Iterator[IO[bytes]]:
     """Yield a stream whose content becomes the file once it is complete and on the disk.
 
     Until then it is a temporary file in the same folder. After a failure that one is gone, and a
@@ -172,6 +179,8 @@ def whole_file(path: str, overwrite: bool = False) -> Iterator[IO[bytes]]:
         File to write.
     overwrite : bool, optional
         Whether an existing file may be replaced.
+    before : os.stat_result, optional
+        The file that the content was made of.
 
     Yields
     ------
@@ -182,6 +191,8 @@ def whole_file(path: str, overwrite: bool = False) -> Iterator[IO[bytes]]:
     ------
     FileError
         The file cannot be written, or exists and must not be overwritten.
+    ChangedError
+        The file is not the one it was before.
     """
     _refuse_planted_link(path)
     target = os.path.realpath(path)
@@ -195,10 +206,48 @@ def whole_file(path: str, overwrite: bool = False) -> Iterator[IO[bytes]]:
                 stream.flush()
                 os.fsync(stream.fileno())
             _check_replaceable(path, overwrite)
+            if before is not None:
+                os.chmod(temporary, stat.S_IMODE(before.st_mode))
+                if not _is_same(before, os.stat(target)):
+                    raise ChangedError(f"{path} has changed while it was written")
             os.replace(temporary, target)
     except BaseException:
         _remove(temporary)
         raise
+
+
+class ChangedError(FileError):
+    """A file that others have changed since its content was read."""
+
+
+def update_file(path: str, write: Callable[[IO[bytes]], None]) -> None:
+    """Replace a file by one that is made of it; what others add to it meanwhile is not lost.
+
+    They wait for a lock, as far as the file system has locks. Where it has none, or others do not
+    heed them, the file is made once more.
+
+    Parameters
+    ----------
+    path : str
+        The file.
+    write : callable
+        Reads the file, and writes the new content to the binary stream that it is given.
+
+    Raises
+    ------
+    FileError
+        The file is not there, or cannot be written.
+    """
+    target = os.path.realpath(path)
+    with _explained(path), _locked(target):
+        while True:
+            before = os.stat(target)
+            try:
+                with whole_file(path, overwrite=True, before=before) as stream:
+                    write(stream)
+            except ChangedError:
+                continue
+            return
 
 
 def write_text(path: str, text: str, overwrite: bool = False) -> None:
@@ -248,6 +297,64 @@ def _remove_abandoned(folder: str) -> None:
                 with open(entry.path, "rb") as file:
                     if _lock(file.fileno(), shared=True):
                         os.unlink(entry.path)
+
+
+@contextlib.contextmanager
+def _locked(target: str) -> Iterator[None]:
+    """Let nobody else update a file, by the lock of a neighbour that is there as long.
+
+    The file itself cannot be locked: it is replaced, and on some file systems a locked file cannot
+    be read.
+    """
+    if os.name == "nt":  # no flock, and no file can be removed that is open
+        yield
+        return
+    folder, name = os.path.split(target)
+    digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+    neighbour = os.path.join(folder, f".lnocl-{digest}.tmp")
+    file = _wait_for(neighbour, target)
+    try:
+        yield
+    finally:
+        _remove(neighbour)
+        os.close(file)
+
+
+def _wait_for(neighbour: str, target: str) -> int:
+    """Return a file of this name that is open and locked, once nobody else has it locked."""
+    patience = time.monotonic() + LONG
+    while True:
+        os.stat(target)  # it is still there
+        with contextlib.suppress(FileNotFoundError):  # who had it locked has removed it
+            file = _open_or_make(neighbour)
+            try:
+                if _lock(file) and os.path.samestat(os.fstat(file), os.stat(neighbour)):
+                    return file
+            except BaseException:
+                os.close(file)
+                raise
+            os.close(file)
+        if time.monotonic() > patience:
+            warn(f"waiting for another process, which is writing {target}")
+            patience = float("inf")
+        time.sleep(LOOK)
+
+
+def _open_or_make(path: str) -> int:
+    """Open a file, which may be another user's, or make it."""
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    except PermissionError:
+        if not os.access(os.path.dirname(path), os.W_OK):
+            raise
+        return os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+
+
+def _is_same(one: os.stat_result, other: os.stat_result) -> bool:
+    return os.path.samestat(one, other) and (one.st_size, one.st_mtime_ns) == (
+        other.st_size,
+        other.st_mtime_ns,
+    )
 
 
 def _lock(file: int, shared: bool = False) -> bool:

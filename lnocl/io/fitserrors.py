@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from lnocl.errors import FileError
 from lnocl.io.fitsadd import add_hdus
-from lnocl.io.fitsfile import open_fits
+from lnocl.io.fitsfile import FitsFile, open_fits
 from lnocl.io.fitswrite import ascii_of
+from lnocl.io.saved_results import SavedResult
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -25,7 +26,7 @@ NAMES = ERRORS, REGIONS, ERROR, BIAS, SHARE, REPLICAS, SUMS
 
 
 def write_errors(
-    path: str,
+    saved: SavedResult,
     quantities: QTable,
     regions: QTable,
     maps: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
@@ -35,13 +36,16 @@ def write_errors(
     seed: int,
     resolution: float,
     unit: str,
+    before: Held | None,
 ) -> None:
     """Add the errors of a result to its file, or replace those that it has.
 
+    Of the same replicas the file keeps the more.
+
     Parameters
     ----------
-    path : str
-        The file; it is replaced once the new one is complete.
+    saved : SavedResult
+        The result; its file is replaced once the new one is complete.
     quantities, regions : QTable
         What was measured, and the regions.
     maps : three ndarray of float64, shape (ny, nx)
@@ -58,11 +62,14 @@ def write_errors(
         Full width at half maximum of the smoothing of the maps, pixels.
     unit : str
         Of the maps.
+    before : Held or None
+        Replicas of something else that the file had at first, which are replaced.
 
     Raises
     ------
     FileError
-        The file cannot be read or written.
+        The file cannot be read or written, or holds another result now, or replicas of something
+        else than at first.
     """
     cards = [
         ("NREPL", len(replicas), "replicas"),
@@ -87,7 +94,25 @@ def write_errors(
     for hdu, name in zip(added, NAMES, strict=True):
         hdu.name = name
         hdu.header.extend(cards)
-    add_hdus(path, added, {ERROR: unit, BIAS: unit, SHARE: ""})
+    names = [str(name).strip() for name in _in_ascii(quantities)["name"]]
+    values = np.array(quantities["value"], np.float64)
+    new = Held(names, values, replicas, of_psfs, sums, seed)
+
+    def are_wanted(file: FitsFile) -> bool:
+        try:
+            there = _replicas(file)
+        except FileError:  # damaged ones, which are replaced
+            return True
+        if there is None or there.is_start_of(new) or (before and there.is_start_of(before)):
+            return True
+        if new.is_start_of(there):
+            return False
+        raise FileError(
+            f"{saved.path} has got replicas of another `seed` or of other regions from another "
+            "command meanwhile, and these are not added: give one command after the other"
+        )
+
+    add_hdus(saved, added, {ERROR: unit, BIAS: unit, SHARE: ""}, are_wanted)
 
 
 def _in_ascii(table: QTable) -> QTable:
@@ -137,6 +162,14 @@ class Held(NamedTuple):
     sums: NDArray[np.float64]
     seed: int
 
+    def is_start_of(self, other: Held) -> bool:
+        """Return whether others are these, or these and more."""
+        return (
+            (self.names, self.seed) == (other.names, other.seed)
+            and np.array_equal(self.values, other.values, equal_nan=True)
+            and np.array_equal(self.errors, other.errors[: len(self.errors)], equal_nan=True)
+        )
+
 
 def read_replicas(path: str) -> Held | None:
     """Return the replicas that a file has; None without them.
@@ -147,22 +180,26 @@ def read_replicas(path: str) -> Held | None:
         The file is missing or damaged.
     """
     with open_fits(path) as file:
-        held = {hdu.name: hdu for hdu in file.hdus() if hdu.name in (ERRORS, REPLICAS, SUMS)}
-        if len(held) < 3:
-            return None
-        try:
-            quantities, replicas = held[ERRORS].data, held[REPLICAS].data
-            shape = len(replicas), len(quantities)
-            columns = held[REPLICAS].columns.names
-            errors = np.zeros(shape)
-            if "errors" in columns:
-                errors = np.array(replicas["errors"], np.float64).reshape(shape)
-            of_psfs = errors[:0]
-            if "of_psfs" in columns:
-                of_psfs = np.array(replicas["of_psfs"], np.float64).reshape(shape)
-            values = np.array(quantities["value"], np.float64)
-            names = [str(name).strip() for name in quantities["name"]]
-            seed = int(held[REPLICAS].header["SEED"])
-        except (KeyError, ValueError) as error:
-            raise FileError(f"{path} has damaged replicas: {error}; begin anew") from error
-        return Held(names, values, errors, of_psfs, file.pixels(held[SUMS]), seed)
+        return _replicas(file)
+
+
+def _replicas(file: FitsFile) -> Held | None:
+    held = {hdu.name: hdu for hdu in file.hdus() if hdu.name in (ERRORS, REPLICAS, SUMS)}
+    if len(held) < 3:
+        return None
+    try:
+        quantities, replicas = held[ERRORS].data, held[REPLICAS].data
+        shape = len(replicas), len(quantities)
+        columns = held[REPLICAS].columns.names
+        errors = np.zeros(shape)
+        if "errors" in columns:
+            errors = np.array(replicas["errors"], np.float64).reshape(shape)
+        of_psfs = errors[:0]
+        if "of_psfs" in columns:
+            of_psfs = np.array(replicas["of_psfs"], np.float64).reshape(shape)
+        values = np.array(quantities["value"], np.float64)
+        names = [str(name).strip() for name in quantities["name"]]
+        seed = int(held[REPLICAS].header["SEED"])
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise FileError(f"{file.path} has damaged replicas: {error}; begin anew") from error
+    return Held(names, values, errors, of_psfs, file.pixels(held[SUMS]), seed)

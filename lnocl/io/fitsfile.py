@@ -7,27 +7,17 @@ import errno
 import hashlib
 import io
 import os
-import re
 import stat
 from collections.abc import Iterator
 from typing import IO, Any
 
 import numpy as np
 from astropy.io import fits
-from astropy.utils.data import get_readable_fileobj
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError, LnoclError, warn
+from lnocl.io.packed import BLOCK, Blocks, check_sizes, copy_bytes, fits_content
 from lnocl.process import recorded_warnings
-
-# Keywords that say how many bytes of data follow. Of two with different values astropy takes one to
-# read them and the other to go on.
-SIZES = re.compile("BITPIX|NAXIS[0-9]*|[PG]COUNT|GROUPS|TFIELDS")
-# Those whose value astropy counts to when it reads a header, and the largest that FITS allows.
-COUNTS = ("NAXIS", "TFIELDS")
-MAX_COUNT = 999
-# Bytes of a block of a FITS file.
-BLOCK = 2880
 
 
 class FitsFile:
@@ -116,7 +106,7 @@ class FitsFile:
                 f"{self.path} has an image of shape {hdu.shape}, {needed / 2**30:.3g} GiB; "
                 f"this machine has {memory / 2**30:.3g} GiB of memory"
             )
-        _verify(hdu)
+        self._verify(hdu)
         return np.array(hdu.data, dtype=np.float64)
 
     def columns(self, hdu: Any) -> dict[str, NDArray[np.float64]]:
@@ -132,7 +122,7 @@ class FitsFile:
         UserWarning
             Data that do not match their DATASUM.
         """
-        _verify(hdu)
+        self._verify(hdu)
         columns = {name: np.array(hdu.data[name], np.float64) for name in hdu.columns.names}
         for name, values in columns.items():
             if values.ndim != 1:
@@ -140,6 +130,20 @@ class FitsFile:
                     f"{self.path} has several numbers in a row of column {name} of {hdu.name}"
                 )
         return columns
+
+    def _verify(self, hdu: Any) -> None:
+        where = hdu.fileinfo()
+        if where["datLoc"] + where["datSpan"] > self._length:
+            return  # astropy warns of missing padding, and cannot sum without it
+        if "DATASUM" in hdu.header and hdu.verify_datasum() == 0:
+            warn("the data do not match their DATASUM; the file may be damaged")
+
+    def copy(self, hdu: Any, stream: IO[bytes]) -> None:
+        """Copy an HDU as it is, but for the padding that it may lack."""
+        where = hdu.fileinfo()
+        self._content.seek(where["hdrLoc"])
+        size = where["datLoc"] + where["datSpan"] - where["hdrLoc"]
+        stream.write(bytes(copy_bytes(self._content, stream, size)))
 
     def sha256(self) -> str:
         """Return the checksum of the file, in hexadecimal; call it last."""
@@ -159,26 +163,12 @@ def check_header(path: str, content: IO[bytes], length: int, start: int) -> None
         Any error of astropy on bytes that are not a header.
     """
     content.seek(start)
-    header = fits.Header.fromfile(content)
-    sizes: dict[str, Any] = {}
-    for card in header.cards:
-        keyword = card.keyword.upper()
-        if not SIZES.fullmatch(keyword):
-            continue
-        if keyword in COUNTS and not 0 <= card.value <= MAX_COUNT:
-            raise FileError(f"{path} is damaged: {keyword} is {card.value}")
-        if sizes.setdefault(keyword, card.value) != card.value:
-            raise FileError(
-                f"{path} is damaged: {keyword} is both {sizes[keyword]} and {card.value}; delete "
-                "the wrong one"
-            )
-    if header.data_size < 0:
-        # This would send astropy round in circles.
-        raise FileError(f"{path} is damaged: the size of an extension is negative")
+    header = Blocks(content).header()
+    check_sizes(path, header)
     if length < (end := content.tell() + header.data_size):
         raise FileError(f"{path} is truncated: it should have {end} bytes and has {length}")
     # Rows of no bytes are always there, and take as long to read as others.
-    if isinstance(rows := sizes.get("NAXIS2"), (int, float)) and rows > length:
+    if isinstance(rows := header.get("NAXIS2"), (int, float)) and rows > length:
         raise FileError(f"{path} is damaged: it has {rows} rows in {length} bytes")
 
 
@@ -231,8 +221,7 @@ def open_fits(
         raise FileError(f"{path} cannot be opened: {reason}") from error
     with stream, recorded_warnings() as caught:
         try:
-            with get_readable_fileobj(stream, encoding="binary") as content:
-                # Of a compressed file this unpacks all of it, and so verifies its checksum.
+            with fits_content(path, stream) as content:
                 length = content.seek(0, os.SEEK_END)
                 check_header(path, content, length, 0)
                 content.seek(0)
@@ -253,8 +242,3 @@ def _memory() -> float:
     if not hasattr(os, "sysconf"):
         return float("inf")
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def _verify(hdu: Any) -> None:
-    if "DATASUM" in hdu.header and hdu.verify_datasum() == 0:
-        warn("the data do not match their DATASUM; the file may be damaged")

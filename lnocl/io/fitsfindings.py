@@ -11,6 +11,7 @@ from astropy.table import QTable, Table
 
 from lnocl.io.fitsadd import add_hdus
 from lnocl.io.fitsfile import open_fits
+from lnocl.io.saved_results import SavedResult
 from lnocl.scene.arrays import Array
 
 # The extensions: sources and the map of signal-to-noise; curves of limits and their maps.
@@ -20,7 +21,7 @@ COMPLETENESS = 50, 90, 95
 
 
 def write_findings(
-    path: str,
+    saved: SavedResult,
     name: str,
     table: QTable,
     maps: Mapping[str, tuple[Array, str]],
@@ -30,8 +31,8 @@ def write_findings(
 
     Parameters
     ----------
-    path : str
-        The file.
+    saved : SavedResult
+        The result.
     name : str
         Of the table.
     table : QTable
@@ -44,7 +45,7 @@ def write_findings(
     Raises
     ------
     FileError
-        The file cannot be read or written.
+        The file cannot be read or written, or holds another result now.
     """
     columns = [_column(table, each) for each in table.colnames]
     added: list[fits.BinTableHDU | fits.ImageHDU] = [
@@ -55,7 +56,7 @@ def write_findings(
     unit = next((str(table[each].unit) for each in table.colnames if each.startswith("flux")), "")
     for hdu in added:
         hdu.header.extend([*cards, ("FLUXUNIT", unit, "unit of fluxes")])
-    add_hdus(path, added, {key: unit for key, (_, unit) in maps.items()})
+    add_hdus(saved, added, {key: unit for key, (_, unit) in maps.items()})
 
 
 def _column(table: QTable, name: str) -> fits.Column:

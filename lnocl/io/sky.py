@@ -17,7 +17,6 @@ from astropy.io import fits
 from astropy.io.registry import identify_format
 from astropy.table import Table
 from astropy.time import Time
-from astropy.utils.data import get_readable_fileobj
 from astropy.utils.xml.iterparser import get_xml_iterator
 from astropy.wcs import WCS
 from astropy.wcs.utils import pixel_to_pixel
@@ -27,6 +26,7 @@ from lnocl.errors import FileError, InputError, LnoclError, counted, note, warn
 from lnocl.io.fitsfile import open_fits, open_regular
 from lnocl.io.fitsread import read_keyword
 from lnocl.io.headers import make_wcs, quiet_log
+from lnocl.io.packed import unpacked
 from lnocl.process import ignored_warnings
 from lnocl.scene import star_tables
 from lnocl.scene.quantities import in_unit
@@ -305,11 +305,7 @@ def _compare(
 
 def _read_table(path: str) -> Table:
     try:
-        with (
-            open_regular(path) as stream,
-            get_readable_fileobj(stream, encoding="binary") as content,
-            ignored_warnings(),
-        ):
+        with open_regular(path) as stream, unpacked(stream) as content, ignored_warnings():
             formats = identify_format("read", Table, path, content, [content], {})
             # A file whose name and content show no other format is plain text.
             kind = formats[0] if formats else "ascii"

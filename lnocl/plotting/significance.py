@@ -69,7 +69,11 @@ def draw_significance(view: SignificanceView) -> Figure:
         panels.append(_draw_signal)
     if view.limit is not None:
         panels.append(_draw_limit)
-    if view.curves is not None and len(view.curves["distance"]):
+    if view.curves is not None and any(
+        np.isfinite(values).any()
+        for name, values in view.curves.items()
+        if name.startswith("magnitudes")
+    ):
         panels.append(_draw_curves)
     figure = new_figure(6.2 * len(panels), 4.8)
     for axis, draw in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):

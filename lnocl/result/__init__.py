@@ -601,7 +601,7 @@ class Result:
         width : float, optional
             Full width at half maximum of the source, pixels of the images; 0 for a point.
         false_alarms : float, optional
-            Number of false alarms expected in the whole field, above 0 and at most 10.
+            Number of false alarms expected in the whole field, from 1e-200 to 10.
 
         Returns
         -------

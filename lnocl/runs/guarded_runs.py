@@ -8,7 +8,8 @@ This error is first assumed to be large. It is then measured after each run, unt
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,8 +35,9 @@ from lnocl.scene.rings import Rings
 from lnocl.scene.scene import Scene
 from lnocl.solvers.psf_fit import settle
 
-# PSFs are judged in a window of this side, pixels of the images.
-WINDOW = 256
+# PSFs are judged in a window of this side, pixels of the images; in a half or a quarter of it where
+# the PSFs of its stars have more pixels than this together, since each step computes all of them.
+WINDOW, LEAST_WINDOW, MOST_PIXELS = 256, 64, 2**22
 # The error that PSFs are first taken to have; later ones are measured until they change by less
 # than this share, or so often.
 FIRST_ERROR, SETTLED, MAX_ROUNDS = 0.3, 0.1, 4
@@ -78,7 +80,8 @@ class Estimate:
 class GuardedRuns:
     """Short runs in the window that holds most stars, smoothed more strongly near them.
 
-    The window has `WINDOW` pixels a side, or the side of smaller images. Positions are (x, y).
+    The window has `WINDOW` pixels a side or less, or the side of smaller images. Positions are
+    (x, y).
 
     Parameters
     ----------
@@ -104,7 +107,8 @@ class GuardedRuns:
         self.all_stars = setup.stars
         # PSFs that are cut to the window go without what has the shape of whole ones.
         shown = with_noise_shown(observation).replace(**dict.fromkeys((*OF_PSFS, "psf_modes")))
-        self.observation, self.stars, self.held = find_window(setup.stars, shown)
+        self._side = choose_window(setup.stars, shown, observation.psfs.shape[1:])
+        self.observation, self.stars, self.held = find_window(setup.stars, shown, self._side)
         # One grid for all PSFs that are tried.
         pad = choose_pad(observation) if setup.pad == "auto" else setup.pad
         self._setup = replace(
@@ -214,7 +218,7 @@ class GuardedRuns:
 
     def _shown(self, psfs: Array) -> tuple[slice, slice]:
         """Return the slices of the middle of PSFs that `cut` keeps."""
-        most = WINDOW * self.observation.oversample
+        most = self._side * self.observation.oversample
         y, x = (
             slice(n // 2 - min(n, most) // 2, n // 2 - min(n, most) // 2 + min(n, most))
             for n in psfs.shape[1:]
@@ -222,7 +226,20 @@ class GuardedRuns:
         return y, x
 
 
-def find_window(stars: Array, observation: Observation) -> tuple[Observation, Array, Array]:
+def choose_window(stars: Array, observation: Observation, psf_shape: Sequence[int]) -> int:
+    """Return the side of the window in which PSFs of a shape are judged, pixels of the images."""
+    side = WINDOW
+    while side > LEAST_WINDOW:
+        of_psf = math.prod(min(n, side * observation.oversample) for n in psf_shape)
+        if len(find_window(stars, observation, side)[1]) * of_psf <= MOST_PIXELS:
+            break
+        side //= 2
+    return side
+
+
+def find_window(
+    stars: Array, observation: Observation, side: int
+) -> tuple[Observation, Array, Array]:
     """Return the observation cut to the window that holds most stars.
 
     Candidates lie round the middle of all stars and round each star, inside the images.
@@ -236,11 +253,11 @@ def find_window(stars: Array, observation: Observation) -> tuple[Observation, Ar
     held : ndarray of bool, shape (m,)
         Which of all m stars it holds.
     """
-    size = np.minimum(observation.shape[::-1], WINDOW)
+    size = np.minimum(observation.shape[::-1], side)
     last = np.array(observation.shape[::-1]) - size
     middle = (stars.min(axis=0) + stars.max(axis=0)) / 2.0
     firsts = np.clip(np.round(np.vstack([middle, stars])) - size // 2, 0, last).astype(int)
-    best = int(np.argmax(_count_in_windows(stars, firsts, observation.shape)))
+    best = int(np.argmax(_count_in_windows(stars, firsts, observation.shape, side)))
     low = firsts[best] - 0.5
     held = np.all((stars >= low) & (stars < low + size), axis=1)
     x, y = (range(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
@@ -248,14 +265,14 @@ def find_window(stars: Array, observation: Observation) -> tuple[Observation, Ar
 
 
 def _count_in_windows(
-    stars: Array, firsts: NDArray[np.int_], shape: tuple[int, int]
+    stars: Array, firsts: NDArray[np.int_], shape: tuple[int, int], side: int
 ) -> NDArray[np.int_]:
     """Return the number of stars in each window; stars outside the images do not count."""
     pixels = np.floor(stars + 0.5)
     inside = pixels[np.all((pixels >= 0) & (pixels < shape[::-1]), axis=1)]
     if not len(inside):
         return np.zeros(len(firsts), int)
-    half = (WINDOW - 1) / 2.0
+    half = (side - 1) / 2.0
     return np.asarray(
         KDTree(inside).query_ball_point(firsts + half, half, p=np.inf, return_length=True)
     )

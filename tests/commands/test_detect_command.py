@@ -143,6 +143,47 @@ def test_fluxes_are_in_the_unit_of_the_images(unit, capsys):
     assert read_findings("adu.fits").unit == unit
 
 
+def test_a_star_without_light_has_no_limit_beside_it(capsys):
+    pytest.importorskip("matplotlib")
+    fits.writeto("flat.fits", np.full((N, N), 50.0))
+    words = ["deconvolve", "flat.fits", "--psf", "psf.fits", "--background", "50", "--star", "9,11"]
+    words += ["--stop", "none", "--n-iter", "5", "--engine", "numpy", "-o", "dark.fits", "--quiet"]
+    assert cli.main(words) == 0
+    assert cli.main(["limit", "dark.fits", "--injections", "0", "--plot", "limits.png"]) == 0
+    assert "\nstar 1 has no light, and nothing is faint beside it\n" in capsys.readouterr().out
+    assert cli.main(["report", "dark.fits", "-o", "page.html"]) == 0
+
+
+def test_a_file_that_is_not_standard_gets_its_detections(capsys):
+    """One that lacks its last padding, and has a card that astropy does not write."""
+    with fits.open("out.fits") as hdus:
+        where, size = hdus[-1].fileinfo(), hdus[-1].size
+    content = bytearray(Path("out.fits").read_bytes()[: where["datLoc"] + size])
+    at = content.index(b"DATE    =")
+    content[at : at + 80] = b"date    = 'one day".ljust(80)
+    Path("out.fits").write_bytes(content)
+    for command in (["detect", "out.fits"], ["limit", "out.fits", "--injections", "0"]):
+        assert cli.main(command) == 0
+    captured = capsys.readouterr()
+    assert "1 detection above" in captured.out
+    assert "Traceback" not in captured.err
+
+
+def test_a_result_whose_stars_are_gone_is_another(capsys):
+    with fits.open("out.fits", mode="update") as hdus:
+        hdus["STARS"].data = hdus["STARS"].data[:0]
+    assert cli.main(["detect", "out.fits"]) == 2
+    assert "the run of out.fits gives another result now" in capsys.readouterr().err
+
+
+def test_a_command_without_its_folder_is_made_where_one_is(capsys):
+    content = Path("out.fits").read_bytes()
+    at = content.index(b"HISTORY cd")
+    Path("out.fits").write_bytes(content[:at] + b"HISTORY cd".ljust(80) + content[at + 80 :])
+    assert cli.main(["detect", "out.fits"]) == 0
+    assert "1 detection above" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -12,7 +12,7 @@ import pytest
 from astropy.io import fits
 
 import lnocl
-from lnocl.commands import cli
+from lnocl.commands import bootstrap, cli
 from lnocl.plotting.profiles import draw_bands
 
 pytest.importorskip("regions", reason="regions is not installed")
@@ -220,6 +220,29 @@ def test_overwrite_begins_anew():
     np.testing.assert_array_equal(
         held()["REPLICAS"].data["errors"], expected["REPLICAS"].data["errors"]
     )
+
+
+@pytest.mark.usefixtures("result")
+def test_replicas_of_another_command_meanwhile_are_kept(monkeypatch, capsys):
+    """Of the same replicas the more are kept, and those of something else are not replaced."""
+    for words, name in ((["12"], "more"), (["10", "--seed", "5"], "other")):
+        assert cli.main([*ERRORS, *words, "--overwrite", "--quiet"]) == 0
+        Path("out.fits").rename(f"{name}.fits")
+        Path("out.fits").write_bytes(Path(f"{name}.fits").read_bytes())
+    assert cli.main([*ERRORS, "10", "--overwrite", "--quiet"]) == 0
+    before, write = Path("out.fits").read_bytes(), bootstrap._write
+    for name, status in (("more", 0), ("other", 1)):
+        Path("out.fits").write_bytes(before)
+        there = Path(f"{name}.fits").read_bytes()
+
+        def others_first(*given, there=there):
+            Path("out.fits").write_bytes(there)
+            write(*given)
+
+        monkeypatch.setattr(bootstrap, "_write", others_first)
+        assert cli.main([*ERRORS, "11", "--quiet"]) == status
+        assert Path("out.fits").read_bytes() == there
+    assert "out.fits has got replicas of another --seed or of other" in capsys.readouterr().err
 
 
 WRONG_USES = [

@@ -1,6 +1,7 @@
 """The command line as a process: streams, signals, imports, devices."""
 
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -157,6 +158,25 @@ def test_an_interrupt_while_modules_are_loaded_is_one_line(way, tmp_path):
         assert done.stderr.endswith("KeyboardInterrupt\n")
     else:
         assert (done.returncode, done.stderr) == (130, "lnocl: error: interrupted\n")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others do not limit the address space")
+@pytest.mark.parametrize("threads", ["1", ""])
+def test_a_limit_of_memory_that_is_too_low_is_one_line_at_once(threads):
+    """OpenBLAS would ask for its memory for ever, and hear no signal."""
+    words = f"ulimit -v 200000; exec {shlex.quote(sys.executable)} -m lnocl detect a.fits"
+    done = subprocess.run(
+        ["bash", "-c", words],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": threads},
+        timeout=100,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    said = r"lnocl: error: not enough memory: \d+ MiB are needed; raise ulimit -v"
+    if threads != "1" and os.cpu_count() > 1:
+        said += ", or give OPENBLAS_NUM_THREADS=1"
+    assert re.fullmatch(said, done.stderr.strip())
 
 
 class TestDevices:

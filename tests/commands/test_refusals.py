@@ -145,6 +145,7 @@ class TestRefusals:
         [
             (KeyboardInterrupt(), 130, "interrupted"),
             (MemoryError(), 1, "not enough memory"),
+            (RuntimeError("can't start new thread"), 1, "not enough memory"),
             (OSError(28, "No space left on device"), 1, "No space left on device"),
         ],
     )

@@ -7,6 +7,7 @@ import stat
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from astropy.io import fits
 from matplotlib.figure import Figure
 
 from lnocl.commands import cli
-from lnocl.errors import FileError, InputError
+from lnocl.errors import FileError, InputError, LnoclWarning
 from lnocl.io import atomic, fitswrite, saved_results
 from lnocl.plotting.figure import save_figure
 
@@ -123,6 +124,97 @@ class TestEveryWriter:
         write(str(link), overwrite=True)
         assert link.is_symlink()
         assert target.stat().st_size > 100_000
+
+
+class TestUpdateFile:
+    def test_threads_wait_for_each_other(self, tmp_path):
+        path = tmp_path / "a"
+        path.write_bytes(b"")
+
+        def add(k):
+            def write(stream):
+                content = path.read_bytes()
+                time.sleep(0.002)
+                stream.write(content + bytes([k]))
+
+            atomic.update_file(str(path), write)
+
+        with ThreadPoolExecutor(12) as pool:
+            list(pool.map(add, range(12)))
+        assert sorted(path.read_bytes()) == list(range(12))
+        assert names(tmp_path) == ["a"]
+
+    def test_what_others_write_without_the_lock_is_kept(self, tmp_path):
+        path, other = tmp_path / "a", tmp_path / "b"
+        path.write_bytes(b"1")
+        calls = []
+
+        def write(stream):
+            content = path.read_bytes()
+            calls.append(content)
+            if len(calls) == 1:
+                other.write_bytes(b"12")
+                other.replace(path)
+            stream.write(content + b"3")
+
+        atomic.update_file(str(path), write)
+        assert calls == [b"1", b"12"]
+        assert path.read_bytes() == b"123"
+        assert names(tmp_path) == ["a"]
+
+    @pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
+    def test_a_file_system_without_locks_is_no_hindrance(self, tmp_path, monkeypatch, number):
+        fcntl = pytest.importorskip("fcntl")
+
+        def flock(file, how):
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(fcntl, "flock", flock)
+        path = tmp_path / "a"
+        path.write_bytes(b"1")
+        atomic.update_file(str(path), lambda stream: stream.write(b"2"))
+        assert path.read_bytes() == b"2"
+        assert names(tmp_path) == ["a"]
+
+    def test_it_keeps_the_permissions(self, tmp_path):
+        path = tmp_path / "a"
+        path.write_bytes(b"1")
+        path.chmod(0o600)
+        atomic.update_file(str(path), lambda stream: stream.write(b"2"))
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+    def test_a_lock_that_a_killed_process_left_holds_nobody(self, tmp_path):
+        path = tmp_path / "a"
+        path.write_bytes(b"1")
+        with atomic._locked(str(path)):
+            [left] = set(names(tmp_path)) - {"a"}
+        (tmp_path / left).touch()
+        atomic.update_file(str(path), lambda stream: stream.write(b"2"))
+        assert names(tmp_path) == ["a"]
+
+    def test_a_long_wait_is_told(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(atomic, "LONG", 0.0)
+        path = tmp_path / "a"
+        path.write_bytes(b"1")
+
+        def hold():
+            with ThreadPoolExecutor(1) as pool:
+                with atomic._locked(str(path)):
+                    update = pool.submit(
+                        atomic.update_file, str(path), lambda stream: stream.write(b"2")
+                    )
+                    time.sleep(0.1)
+                    assert path.read_bytes() == b"1"
+                update.result()
+
+        with pytest.warns(LnoclWarning, match="waiting for another process, which is writing"):
+            hold()
+        assert path.read_bytes() == b"2"
+
+    def test_a_file_that_is_gone_is_one_line(self, tmp_path):
+        with pytest.raises(FileError, match="cannot be written: No such file"):
+            atomic.update_file(str(tmp_path / "a"), lambda stream: None)
+        assert names(tmp_path) == []
 
 
 class TestWholeFile:

@@ -8,6 +8,7 @@ import os
 import re
 import time
 import tracemalloc
+from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from sound_files import (
 from wcs_headers import SIP
 
 from lnocl.errors import FileError, InputError, LnoclWarning
-from lnocl.io import fitsread, fitswrite, saved_results, sky
+from lnocl.io import fitsread, fitswrite, packed, saved_results, sky
 from lnocl.process import ignored_warnings
 
 BLOCK = 2880
@@ -225,6 +226,78 @@ def test_damage_to_a_compressed_file_beyond_the_image_is_seen(sound, tmp_path):
     path = tmp_path / "a.fits.gz"
     path.write_bytes(content)
     with pytest.raises(FileError, match="CRC check failed"):
+        fitsread.read_stack([str(path)])
+
+
+COMPRESS = [gzip.compress, bz2.compress, lzma.compress]
+
+
+@pytest.mark.usefixtures("limits")
+@pytest.mark.parametrize("compress", COMPRESS)
+def test_a_compressed_file_is_unpacked_as_far_as_its_headers_say(
+    sound, tmp_path, monkeypatch, compress
+):
+    """Gigabytes may follow its zeros; that these are not read, their damaged end shows."""
+    monkeypatch.setattr(packed, "TAIL", 2**14)
+    rest = bytes(BLOCK) + np.random.default_rng(0).bytes(3 * 2**19)
+    path = tmp_path / "a.fits.packed"
+    whole = sound["image.dat"].read_bytes()
+    path.write_bytes(compress(whole + rest)[:-24] + bytes(24))
+    with pytest.raises((EOFError, OSError, lzma.LZMAError)):
+        {gzip.compress: gzip, bz2.compress: bz2, lzma.compress: lzma}[compress].open(path).read()
+    found, expected = (fitsread.read_stack([str(p)]) for p in (path, sound["image.dat"]))
+    np.testing.assert_array_equal(found.data, expected.data)
+
+
+@pytest.mark.usefixtures("limits")
+@pytest.mark.parametrize("compress", [bytes, gzip.compress])
+@pytest.mark.parametrize("filling", [b" ", b"COMMENT a".ljust(80)], ids=["blanks", "comments"])
+def test_a_header_without_an_end_is_not_read_for_ever(
+    sound, tmp_path, monkeypatch, compress, filling
+):
+    monkeypatch.setattr(packed, "MAX_HEADER", 2**20)
+    path = tmp_path / "damaged"
+    start = hostile({})[:BLOCK].replace(b"END ", b"    ")
+    path.write_bytes(compress(start + filling * (2**22 // len(filling))))
+    tracemalloc.start()
+    try:
+        with pytest.raises(FileError, match="a header does not end within 1 MiB"):
+            read_observation(sound, str(path), "image.dat")
+        assert tracemalloc.get_traced_memory()[1] < 2**23
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("compress", COMPRESS)
+def test_a_compressed_file_of_many_extensions_is_read_and_leaves_none(
+    tmp_path, monkeypatch, compress
+):
+    monkeypatch.setattr(packed, "IN_MEMORY", 2**16)  # and so is on the disk
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    images = np.random.default_rng(5).normal(50.0, 5.0, (6, 90, 110))
+    made = fits.HDUList([fits.PrimaryHDU()])
+    for k, each in enumerate(images):
+        made.append(fits.ImageHDU(each, name="SCI", ver=k + 1))
+        made.append(fits.BinTableHDU.from_columns([fits.Column("a", "D", array=np.ones(k))]))
+    content = io.BytesIO()
+    made.writeto(content, checksum=True)
+    path = tmp_path / "a.fits.packed"
+    path.write_bytes(compress(content.getvalue()))
+    for k, each in enumerate(images):
+        np.testing.assert_array_equal(
+            fitsread.read_single(f"{path}[SCI,{k + 1}]").data[0], each.astype(float)
+        )
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def test_what_would_not_fit_unpacked_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(packed, "IN_MEMORY", 2**10)
+    usage = namedtuple("usage", "free")(2**11)
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: usage)
+    path = tmp_path / "a.fits.gz"
+    image(str(path))
+    with pytest.raises(FileError, match="has no room: name another folder by TMPDIR, or unpack it"):
         fitsread.read_stack([str(path)])
 
 

@@ -210,7 +210,7 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
     observation = lnocl.Observation(np.ones((1, 100, 120)), np.ones((40, 5)))
     stars = np.array([(5.0, 90.0), (100.0, 20.0), (108.4, 24.0)])
     setup = Setup(observation, stars, 0, "sgp", "single", "numpy", None)
-    cut, found, held = guarded_runs.find_window(stars, observation)
+    cut, found, held = guarded_runs.find_window(stars, observation, 32)
     assert cut.shape == (32, 32)
     np.testing.assert_array_equal(held, (False, True, True))
     np.testing.assert_array_equal(found, stars[1:] - (84, 4))
@@ -221,9 +221,29 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
     np.testing.assert_allclose(whole[0, 4:36], 2.0 / (72 * 5))
     np.testing.assert_allclose(whole[0, :4], 1.0 / (72 * 5))
     whole = lnocl.Observation(np.ones((1, 20, 30)), np.ones((3, 3)))
-    cut, found, _ = guarded_runs.find_window(np.array([(3.0, 4.0)]), whole)
+    cut, found, _ = guarded_runs.find_window(np.array([(3.0, 4.0)]), whole, 32)
     assert cut.shape == (20, 30)
     np.testing.assert_array_equal(found, [(3.0, 4.0)])
+
+
+@pytest.mark.parametrize(
+    ("n", "oversample", "psf_shape", "side"),
+    [
+        (64, 1, (300, 400), 256),
+        (15, 4, (528, 528), 256),
+        (52, 4, (528, 528), 64),
+        (52, 4, (41, 41), 256),
+        (400, 4, (2000, 2000), 64),
+    ],
+)
+def test_many_stars_with_large_psfs_are_judged_in_a_smaller_window(n, oversample, psf_shape, side):
+    observation = lnocl.Observation(np.ones((300, 280)), np.ones((3, 3)), oversample=oversample)
+    chance = np.random.default_rng(n)
+    stars = chance.uniform((30.0, 40.0), (200.0, 210.0), (n, 2))
+    found = guarded_runs.choose_window(stars, observation, psf_shape)
+    assert found == side
+    held = guarded_runs.find_window(stars, observation, side)[1]
+    assert len(held) > 3
 
 
 def test_a_star_may_leave_the_images_while_psfs_are_judged():
