@@ -18,6 +18,7 @@ from astropy.utils.data import get_readable_fileobj
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError, LnoclError, warn
+from lnocl.io.packed import is_tiled, unpacked, verify
 from lnocl.process import recorded_warnings
 
 # Keywords that say how many bytes of data follow. Of two with different values astropy takes one to
@@ -65,7 +66,7 @@ class FitsFile:
         Raises
         ------
         FileError
-            An HDU of negative size, beyond the end of the file or compressed in tiles.
+            An HDU of negative size, or beyond the end of the file.
 
         Warns
         -----
@@ -74,11 +75,6 @@ class FitsFile:
         """
         for hdu in self._hdus:
             where = hdu.fileinfo()
-            if hdu.header.get("ZIMAGE") is True:
-                # Decompressing damaged tiles corrupts the memory (so in astropy 8.0).
-                raise FileError(
-                    f"{self.path} is tile-compressed; unpack it first, such as with funpack"
-                )
             yield hdu
             end = where["datLoc"] + where["datSpan"]
             if end >= self._length or self._is_empty(end):
@@ -102,7 +98,7 @@ class FitsFile:
         Raises
         ------
         FileError
-            An image larger than the memory.
+            An image larger than the memory; damaged tiles.
 
         Warns
         -----
@@ -116,7 +112,9 @@ class FitsFile:
                 f"{self.path} has an image of shape {hdu.shape}, {needed / 2**30:.3g} GiB; "
                 f"this machine has {memory / 2**30:.3g} GiB of memory"
             )
-        _verify(hdu)
+        if is_tiled(hdu):
+            return unpacked(self.path, hdu, self._content)
+        verify(hdu)
         return np.array(hdu.data, dtype=np.float64)
 
     def columns(self, hdu: Any) -> dict[str, NDArray[np.float64]]:
@@ -132,7 +130,7 @@ class FitsFile:
         UserWarning
             Data that do not match their DATASUM.
         """
-        _verify(hdu)
+        verify(hdu)
         columns = {name: np.array(hdu.data[name], np.float64) for name in hdu.columns.names}
         for name, values in columns.items():
             if values.ndim != 1:
@@ -236,7 +234,7 @@ def open_fits(
                 length = content.seek(0, os.SEEK_END)
                 check_header(path, content, length, 0)
                 content.seek(0)
-                with fits.open(content, memmap=False, disable_image_compression=True) as hdus:
+                with fits.open(content, memmap=False) as hdus:
                     yield FitsFile(path, stream, content, hdus, length)
         except (LnoclError, MemoryError, ImportError, NameError):
             raise  # no file can make the last two
@@ -253,8 +251,3 @@ def _memory() -> float:
     if not hasattr(os, "sysconf"):
         return float("inf")
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def _verify(hdu: Any) -> None:
-    if "DATASUM" in hdu.header and hdu.verify_datasum() == 0:
-        warn("the data do not match their DATASUM; the file may be damaged")
