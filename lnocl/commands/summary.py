@@ -14,6 +14,7 @@ from lnocl.errors import counted
 from lnocl.residuals import Fit, StarResiduals, sharp_sources
 from lnocl.result import Result
 from lnocl.scene.detector import on_sky
+from lnocl.scene.freedoms import refusal
 from lnocl.scene.observation import Observation
 from lnocl.scene.stars import MAX_SHIFT
 
@@ -217,7 +218,7 @@ def verdict_on(
         by_default = [] if isinstance(arguments.smoothing, float) else ["pixels"]
         remedy = "leave --refine-psfs out" if by_default else "try --refine-psfs jitter pixels"
         may_free = "pixels" not in (arguments.refine_psfs or by_default)
-        may_free = may_free and not observation.is_turned and observation.n_epochs == 1
+        may_free = may_free and arguments.tile is None and not refusal("refine_psfs", observation)
         verdict.append(
             f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
             f"{' '.join(unfitted[:3])}: give a better PSF" + (f", or {remedy}" if may_free else "")
