@@ -26,7 +26,7 @@ MAX_CHANNELS = 4
 # polarisations.
 NOT_EXPOSURES = (
     *("WAVE", "AWAV", "WAVN", "LAMBDA", "FREQ", "ENER", "VRAD", "VOPT", "VELO", "FELO", "ZOPT"),
-    *("BETA", "STOKES", "COLOR", "COLOUR", "BAND", "FILTER"),
+    *("BETA", "STOKES", "RGB", "COLOR", "COLOUR", "BAND", "FILTER"),
 )
 
 _WCS_KEYWORD = re.compile(r"(?:CTYPE|CRPIX|CRVAL|CDELT)1([A-Z]?)")

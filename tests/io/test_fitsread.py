@@ -184,7 +184,7 @@ class TestRefusedFiles:
     @pytest.mark.parametrize(
         ("kind", "n", "is_read"),
         [
-            *((kind, 2, False) for kind in ("WAVE", "FREQ-LSR", "stokes", "VELO", "ENERGY")),
+            *((kind, 2, False) for kind in ("WAVE", "FREQ-LSR", "stokes", "RGB", "VELO", "ENERGY")),
             *((kind, 2, True) for kind in ("TIME", "", "EXPOSURE")),
             *((kind, 1, True) for kind in ("FREQ", "STOKES")),
         ],
