@@ -40,6 +40,7 @@ from lnocl.runs.run import Run, most_bytes
 from lnocl.runs.start import Setup, Start, make_start
 from lnocl.runs.steady import run_steadily, told_prior
 from lnocl.runs.stopping import Rule, make_rule
+from lnocl.scene.freedoms import refusal
 from lnocl.scene.noise_check import warn_of_noise
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
@@ -355,10 +356,8 @@ def deconvolve(
         note("PSFs are not judged before the run, as the images %s", found[0])
         is_auto = False
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
-    if observation.n_epochs > 1 and refine_positions is True:
-        raise InputError(
-            "`refine_positions` moves stars of one epoch alone; leave it out, or `epochs`"
-        )
+    if refine_positions is True and (why := refusal("refine_positions", observation)):
+        raise InputError(why)
     moves = refine_positions if is_auto else refine_positions is True
     shared = observation, positions, pad, solver, precision, engine, device
     setup = Setup(*shared, moves is True, *initial, settles_halos=has_halos)
@@ -388,7 +387,7 @@ def deconvolve(
         what = "fitting stars and halos" if has_halos else "fitting star fluxes"
         with _quietly(), Progress(None, "", bool(progress), what, stays=False):
             outcome = outcome.marginal(is_fit, has_halos)
-    may_free = "pixels" not in families and not (found or observation.psf_fields)
+    may_free = "pixels" not in families and not refusal("refine_psfs", observation)
     outcome = replace(outcome, psf_refinement=mended.refinement, may_free_pixels=may_free)
     result = make_result(outcome)
     warn_of_faults(result, progress)

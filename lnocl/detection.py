@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
+from scipy.special import erf
 
-from lnocl.errors import InputError, LnoclError, counted, warn
+from lnocl.blemishes import flat_tops, sharp_pixels
+from lnocl.errors import InputError, LnoclError, counted, note, warn
 from lnocl.matched_filter import DARKER, PointSources, around, find_points, in_boxes, pixels_at
 from lnocl.process import ignored_warnings
 from lnocl.scene.arrays import Array, numbers
@@ -18,15 +20,22 @@ from lnocl.scene.quantities import bare, in_unit, split
 if TYPE_CHECKING:
     from astropy.table import Table
 
+Mask = NDArray[np.bool_]
 
+# Stars are sought from this significance on, whatever the threshold: the noise in which they are
+# seen is that without them.
+SOUGHT = 5.0
+# No stars are narrower than this, full width at half maximum, pixels, where no PSF is known.
+SHARPEST = 1.5
 # The sky's level is a median over boxes of so many PSF widths, and of this many pixels or more.
 BOX_WIDTHS, MIN_BOX = 12, 24
 # Noise is measured in the image less the same, smoothed by a Gaussian of so many PSF widths.
 SMOOTHER = 0.5
 # A PSF width to begin with where none is known, pixels, and the stars that it is then measured on.
 FIRST_WIDTH, MEASURED = 3.0, 20
-# Of their widths it is this quantile, as galaxies and clumps are wider than stars.
-NARROW = 0.25
+# The stars among them are the narrowest that are this share of all, and as wide as each other to
+# the other share: galaxies and clumps are wider, and cosmic rays, if they are narrower, differ.
+NARROW, ALIKE = 0.25, 0.15
 # Half the side of the square in which a star's width is fitted, pixels, and the least width.
 FIT_HALF, LEAST_WIDTH = 10, 0.8
 # Limits of Moffat functions, and half the side of a PSF that is one, in its widths.
@@ -35,6 +44,8 @@ BOUNDS, PSF_WIDTHS = {"gamma": (0.3, 30.0), "alpha": (1.2, 20.0)}, 8
 LONGEST = 1.5
 # A PSF is not this image's where stars are narrower than this share of its width.
 NARROWER = 0.7
+# What is narrower than this share of a PSF's width is no star.
+TOO_NARROW = 0.6
 # A saturated star is a region of bad pixels inside a ring whose median is so many times as
 # significant as a star must be.
 OF_RING = 4.0
@@ -65,7 +76,13 @@ def find_stars(
     with one over the variance as weights w. Significant maxima are taken out of the image, the
     brightest first, so that their side lobes are no stars. Maxima in the wings of brighter stars
     are left out unless they are half as bright as those wings. So are extended sources: maxima that
-    the PSF, smoothed by a Gaussian of 0.4 of its width, fits better than the PSF.
+    the PSF, smoothed by a Gaussian of 0.4 of its width, fits better than the PSF. Pixels sharper
+    than the PSF, as cosmic rays leave them, are bad (`lnocl.blemishes.sharp_pixels`), and what is
+    less than 0.6 times as wide is no star. Flat tops are saturated, which is logged
+    (`lnocl.blemishes.flat_tops`).
+
+    Stars are sought from 5 standard deviations on, also where the threshold is higher: the noise of
+    the filtered image is that without them.
 
     Parameters
     ----------
@@ -80,7 +97,8 @@ def find_stars(
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is bad.
     saturation : float, optional
-        Pixels of this value and above are saturated. A Quantity has the unit of the image's.
+        Pixels of this value and above are saturated, besides flat tops. A Quantity has the unit of
+        the image's.
 
     Returns
     -------
@@ -93,7 +111,8 @@ def find_stars(
         - ``width``: of its image, full at half maximum, pixels;
         - ``saturated``: whether a pixel in the core is saturated or bad.
 
-        ``meta["n_extended"]`` is the number of extended sources left out.
+        ``meta["n_extended"]`` is the number of extended sources left out, ``meta["n_sharp"]``
+        that of cosmic rays and other sources sharper than the PSF.
 
     Warns
     -----
@@ -132,28 +151,55 @@ def find_stars(
     if saturation is not None:
         saturation = in_unit("saturation", saturation, unit or "")
     pixels, bad = _check(image, mask, threshold)
+    sought = min(threshold, SOUGHT)
     shape = None if psf is None else _check_psf(psf)
-    above, noise = _above_sky(pixels, bad, FIRST_WIDTH if shape is None else fwhm(shape))
-    if shape is None:
-        shape = _measured_psf(above / noise, threshold)
-        above, noise = _above_sky(pixels, bad, fwhm(shape))
-    saturated = bad | _holes(above)
-    if saturation is not None:
-        saturated |= pixels >= saturation
-    cores, covered = _saturated_stars(above / noise, saturated, fwhm(shape), threshold)
+    width = FIRST_WIDTH if shape is None else fwhm(shape)
+    above, noise = _above_sky(pixels, bad, width)
+    saturated = bad | _saturated(pixels, above / noise, bad, saturation) | _holes(above)
+    are_counts = _are_counts(pixels[~bad])
+    sharp = sharp_pixels(above, noise, saturated, [_sharpest_psf()], are_counts)
+    above, noise = _above_sky(pixels, bad | sharp, width)
+    own = _measured_psf(above / noise, sought, is_all=shape is None)
+    shape = own if shape is None else shape
+    above, noise = _above_sky(pixels, bad | sharp, fwhm(shape))
+    sharp |= sharp_pixels(above, noise, saturated | sharp, [own, shape], are_counts)
+    above, noise = _above_sky(pixels, bad | sharp, fwhm(shape))
+    cores, covered = _saturated_stars(above / noise, saturated, fwhm(shape), sought)
     unit = float(noise.min()) if np.isfinite(noise).any() else 1.0
     weights = np.where(saturated, 0.0, (noise / unit) ** -2.0)
-    found = find_points(
-        above / unit, weights, shape, threshold, cores, covered, is_rough=psf is None
-    )
+    found = find_points(above / unit, weights, shape, sought, cores, covered, is_rough=psf is None)
     if psf is not None:
         _compare_widths(found, fwhm(shape))
-    return _table(found, saturated, unit * float(shape.max()))
+    stars = _table(found, saturated, unit * float(shape.max()))
+    stars = stars[stars["significance"] >= threshold]
+    narrow = _narrow_rows(stars, fwhm(shape))
+    stars.meta["n_extended"] = int((found.extended >= threshold).sum())
+    stars.meta["n_sharp"] = ndimage.label(sharp, np.ones((3, 3)))[1] + int(narrow.sum())
+    return stars[~narrow]
 
 
-def _check(
-    image: ArrayLike, mask: ArrayLike | None, threshold: float
-) -> tuple[Array, NDArray[np.bool_]]:
+def _saturated(pixels: Array, significance: Array, bad: Mask, saturation: float | None) -> Mask:
+    """Return which pixels are saturated, by the level that is given and by flat tops."""
+    given = np.zeros(bad.shape, bool) if saturation is None else pixels >= saturation
+    flat = flat_tops(pixels, significance, bad | given)
+    if flat.any():
+        lowest, highest = pixels[flat].min(), pixels[flat].max()
+        note(
+            f"{counted(int(flat.sum()), 'pixel')} of flat tops at {lowest:.10g}"
+            + (f" to {highest:.10g}" if highest > lowest else "")
+            + f" are taken as saturated, as by `saturation` {lowest:.10g}"
+        )
+    return given | flat
+
+
+def _sharpest_psf() -> Array:
+    """Return a PSF as sharp as optics leave it, a Gaussian of `SHARPEST`, summed in pixels."""
+    edges = np.arange(-3.5, 4.0) * np.sqrt(4.0 * np.log(2.0)) / SHARPEST
+    profile = np.diff(erf(edges))
+    return np.outer(profile, profile) / profile.sum() ** 2
+
+
+def _check(image: ArrayLike, mask: ArrayLike | None, threshold: float) -> tuple[Array, Mask]:
     """Return the pixels, and which of them are bad."""
     pixels = numbers("image", image)
     if pixels.ndim != 2:
@@ -174,7 +220,7 @@ def _check(
     return pixels, bad
 
 
-def _outside(pixels: Array) -> NDArray[np.bool_]:
+def _outside(pixels: Array) -> Mask:
     """Return blocks of pixels of exactly 0 in an image that is not of whole counts.
 
     They are outside the field: a mosaic has 0 there.
@@ -209,7 +255,7 @@ def _require_photutils() -> None:
         ) from None
 
 
-def _above_sky(pixels: Array, bad: NDArray[np.bool_], width: float) -> tuple[Array, Array]:
+def _above_sky(pixels: Array, bad: Mask, width: float) -> tuple[Array, Array]:
     """Return the light above the sky and its noise; 0 and infinite where the sky is not known.
 
     The noise is that of what a Gaussian leaves of white noise. Of whole counts it is that of
@@ -231,7 +277,7 @@ def _above_sky(pixels: Array, bad: NDArray[np.bool_], width: float) -> tuple[Arr
     return np.where(is_known, filled - level, 0.0), np.where(is_known, noise, np.inf)
 
 
-def _filled(pixels: Array, bad: NDArray[np.bool_], width: float) -> Array:
+def _filled(pixels: Array, bad: Mask, width: float) -> Array:
     """Return an image whose bad pixels have the mean of those near them, or of all."""
     if not bad.any():
         return pixels
@@ -242,8 +288,11 @@ def _filled(pixels: Array, bad: NDArray[np.bool_], width: float) -> Array:
     return np.where(bad, near, pixels)
 
 
-def _measured_psf(image: Array, threshold: float) -> Array:
-    """Return a round Moffat function as narrow as the narrow ones among the brightest sources."""
+def _measured_psf(image: Array, threshold: float, is_all: bool) -> Array:
+    """Return a round Moffat function as narrow as the narrow ones among the brightest sources.
+
+    Where it is all there is to know of the PSF it is warned of sources that are not round.
+    """
     from astropy.modeling.fitting import TRFLSQFitter
     from astropy.modeling.models import Const2D, Moffat2D
 
@@ -251,7 +300,7 @@ def _measured_psf(image: Array, threshold: float) -> Array:
     lowest = threshold * float(np.median(smooth) - np.quantile(smooth, DARKER))
     apart = 2 * round(FIRST_WIDTH) + 1
     y, x = np.nonzero((smooth == ndimage.maximum_filter(smooth, apart)) & (smooth > lowest))
-    widths, powers, lengths = [], [], []
+    fits = []
     for i in np.argsort(-smooth[y, x])[:MEASURED]:
         there = around(x[i], y[i], (FIT_HALF, FIT_HALF), image.shape)
         rows, columns = np.mgrid[there]
@@ -259,20 +308,27 @@ def _measured_psf(image: Array, threshold: float) -> Array:
         with ignored_warnings():  # of fits that do not converge
             fit = TRFLSQFitter()(star + Const2D(), columns, rows, image[there])[0]
         if LEAST_WIDTH < fit.fwhm < FIT_HALF and np.hypot(fit.x_0 - x[i], fit.y_0 - y[i]) < 2:
-            widths.append(fit.fwhm)
-            powers.append(fit.alpha.value)
-            lengths.append(_elongation(image[there]))
-    if lengths and np.median(lengths) > LONGEST:
+            fits.append((fit.fwhm, fit.alpha.value, _elongation(image[there])))
+    width, power, length = np.median(_narrow(fits), axis=0)
+    if is_all and length > LONGEST:
         warn(
-            f"the brightest sources are {np.median(lengths):.1f} times as long as wide: give the "
-            "PSF, unless it is round, as stars are sought with a round one"
+            f"the brightest sources are {length:.1f} times as long as wide: give the PSF, unless "
+            "it is round, as stars are sought with a round one"
         )
-    width = float(np.quantile(widths, NARROW)) if widths else FIRST_WIDTH
-    power = float(np.median(powers)) if widths else BOUNDS["alpha"][1]
     half = round(PSF_WIDTHS * width)
     light = Moffat2D(1.0, 0.0, 0.0, width / (2.0 * np.sqrt(2.0 ** (1.0 / power) - 1.0)), power)
     profile = light(*np.mgrid[-half : half + 1, -half : half + 1])
     return profile / profile.sum()
+
+
+def _narrow(fits: list[tuple[float, float, float]]) -> Array:
+    """Return the fits, each with its width first, that are those of stars."""
+    found = np.array(sorted(fits) or [(FIRST_WIDTH, BOUNDS["alpha"][1], 1.0)])
+    widths = found[:, 0]
+    ends = np.searchsorted(widths, (1.0 + ALIKE) * widths, side="right")
+    enough = np.flatnonzero(ends - np.arange(len(widths)) >= NARROW * len(widths))
+    first = enough[0] if len(enough) else int(NARROW * len(widths))
+    return found[first : ends[first]]
 
 
 def _elongation(window: Array) -> float:
@@ -285,7 +341,7 @@ def _elongation(window: Array) -> float:
     return float(np.sqrt(variances[1] / variances[0]))
 
 
-def _holes(light: Array) -> NDArray[np.bool_]:
+def _holes(light: Array) -> Mask:
     """Return dark pixels inside bright ones: cores in which counts were lost."""
     peak = ndimage.median_filter(light, 3).max()  # single bright pixels are no stars
     bright = light > HOLLOW * max(peak, 0.0)
@@ -293,8 +349,8 @@ def _holes(light: Array) -> NDArray[np.bool_]:
 
 
 def _saturated_stars(
-    significance: Array, saturated: NDArray[np.bool_], width: float, threshold: float
-) -> tuple[Array, NDArray[np.bool_]]:
+    significance: Array, saturated: Mask, width: float, threshold: float
+) -> tuple[Array, Mask]:
     """Return x and y of bad regions of some size inside bright rings.
 
     Of a region with trails of bleeding it is the part that is wider than those. The second array
@@ -325,6 +381,19 @@ def _saturated_stars(
     return np.reshape(stars, (-1, 2)), covered
 
 
+def _narrow_rows(stars: Table, width: float) -> Mask:
+    """Return which stars are narrower than the PSF, or than most of them if this is too wide.
+
+    The width of stars of 5 to 30 standard deviations is that of the PSF to 0.6 in all but 1 of 800,
+    and is known of all.
+    """
+    own = np.asarray(stars["width"], float)
+    whole = ~np.asarray(stars["saturated"], bool)
+    known = own[whole & np.isfinite(own)]
+    usual = min(width, float(np.median(known))) if known.size else width
+    return whole & ~(own >= TOO_NARROW * usual)
+
+
 def _compare_widths(stars: PointSources, width: float) -> None:
     """Warn where the brightest stars are not as wide as the PSF."""
     brightest = stars.width[~stars.is_known][np.argsort(-stars.flux[~stars.is_known])[:MEASURED]]
@@ -335,7 +404,7 @@ def _compare_widths(stars: PointSources, width: float) -> None:
         )
 
 
-def _table(stars: PointSources, saturated: NDArray[np.bool_], psf_peak: float) -> Table:
+def _table(stars: PointSources, saturated: Mask, psf_peak: float) -> Table:
     """Return the stars, the saturated ones and then the brightest first."""
     from astropy.table import Table
 
@@ -354,7 +423,4 @@ def _table(stars: PointSources, saturated: NDArray[np.bool_], psf_peak: float) -
         "saturated": touched,
     }
     order = np.lexsort((-stars.flux, ~touched))
-    return Table(
-        {name: values[order] for name, values in columns.items()},
-        meta={"n_extended": stars.n_extended},
-    )
+    return Table({name: values[order] for name, values in columns.items()})

@@ -53,8 +53,8 @@ class PointSources(NamedTuple):
         deviation of such fluxes in the image, and its full width at half maximum, pixels.
     is_known : ndarray of bool, shape (n,)
         Whether it was known before, so that its place was not fitted.
-    n_extended : int
-        Maxima as significant that are wider than the PSF.
+    extended : ndarray of float64, shape (m,)
+        Significance of each maximum that is wider than the PSF.
     """
 
     x: Array
@@ -63,7 +63,7 @@ class PointSources(NamedTuple):
     significance: Array
     width: Array
     is_known: NDArray[np.bool_]
-    n_extended: int
+    extended: Array
 
 
 class _Profile:
@@ -426,7 +426,7 @@ def find_points(
     """
     if not weights.any():
         none = np.zeros(0)
-        return PointSources(none, none, none, none, none, none.astype(bool), 0)
+        return PointSources(none, none, none, none, none, none.astype(bool), none)
     search = _Search(image, weights, psf, threshold, is_rough)
     fixed = [search.take_out_known(x, y) for x, y in known]
     extended: list[Array] = []
@@ -455,6 +455,8 @@ def find_points(
     is_known = np.arange(len(found)) < len(fixed)
     x, y, flux, signal = np.reshape(found, (-1, 4)).T
     width = np.array([search.width(star) for star in found])
+    places = np.reshape(extended, (-1, 2))
+    wide = pixels_at(places[:, 0], places[:, 1], image.shape)
     return PointSources(
         x,
         y,
@@ -462,7 +464,7 @@ def find_points(
         signal / search.noise[pixels_at(x, y, image.shape)],
         width,
         is_known,
-        len(extended),
+        (search.filter(weights * search.left)[1] / search.noise)[wide],
     )
 
 

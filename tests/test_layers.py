@@ -10,7 +10,7 @@ FLOORS = [
     {"errors", "process", "notebook", "loading"},
     {"parallel"},
     {"scene"},
-    {"matched_filter"},
+    {"matched_filter", "blemishes"},
     {"metrics", "residuals", "detection", "psf", "io", "reference", "solvers", "opencl"},
     {"simulation", "plotting"},
     {"engines"},

@@ -13,7 +13,7 @@ from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
 from lnocl.commands.summary import extended_flux, summarise
 from lnocl.deconvolution import deconvolve
-from lnocl.errors import InputError
+from lnocl.errors import InputError, warn
 from lnocl.result import Callback, Result, view_of
 from lnocl.runs.progress import Progress
 
@@ -26,11 +26,19 @@ def read(arguments: argparse.Namespace) -> tuple[Frames, dict[str, Any]]:
     """Read what the arguments of ``lnocl deconvolve`` name; return it, and the values given."""
     from lnocl.io import missions
     from lnocl.io.frames import Calibration, read_frames
+    from lnocl.scene.uncertainties import OtherNoiseError
 
     given = {**vars(arguments), "device": _device_spec(arguments)}
     given |= missions.calibrate(arguments.images[0], given)
-    calibration = Calibration(**_given(given, Calibration._fields))
-    frames = read_frames(arguments.images, arguments.psfs, calibration)
+    paths = arguments.images, arguments.psfs
+    try:
+        frames = read_frames(*paths, Calibration(**_given(given, Calibration._fields)))
+    except OtherNoiseError as error:
+        if arguments.noise:
+            raise
+        warn(f"{error.message}: `noise` err is not taken, and the sky measured: `read_noise` auto")
+        given |= {"noise": arguments.noise, "read_noise": ["auto"]}
+        frames = read_frames(*paths, Calibration(**_given(given, Calibration._fields)))
     given["stars"] = options.star_places(
         arguments.stars, arguments.star_table, frames.header, arguments.images[0]
     )

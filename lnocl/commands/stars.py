@@ -64,7 +64,7 @@ def _run(arguments: argparse.Namespace) -> None:
     tables.format_of(arguments.output, "stars")
     atomic.check_output(arguments.output, arguments.overwrite)
     pictures.check(arguments)
-    with messages.shown_log(arguments.quiet):
+    with messages.shown_log(arguments.quiet, COMMAND.flags()):
         stack = fitsread.read_single(arguments.image)
         image = stack.data[0]
         psf = None if arguments.psf is None else fitsread.read_single(arguments.psf).data[0]
@@ -81,14 +81,14 @@ def _run(arguments: argparse.Namespace) -> None:
         positions = np.array([stars["x"], stars["y"]]).T
         stars["ra"], stars["dec"] = sky.to_sky(positions, stack.header).T
         stars["ra"].unit = stars["dec"].unit = "deg"
-    n_extended = stars.meta["n_extended"]
+    n_extended, n_sharp = stars.meta["n_extended"], stars.meta["n_sharp"]
     stars.meta = {"ORIGIN": "x and y begin at 0"}
     for name in ("x", "y"):
         stars[name].format, stars[name].unit = ".3f", "pix"
     for name in ("peak", "significance", "width"):
         stars[name].format = ".5g"
     tables.write_table(stars, arguments.output, "stars", arguments.overwrite)
-    lines = [*_told(stars, n_extended), f"written to {arguments.output}"]
+    lines = [*_told(stars, n_extended, n_sharp), f"written to {arguments.output}"]
     if arguments.plot is not None:
         from lnocl.plotting.stars import draw_stars
 
@@ -121,11 +121,14 @@ def _mask(arguments: argparse.Namespace) -> NDArray[np.bool_] | None:
     return flags.bad_pixels(values, good_bits, arguments.image)
 
 
-def _told(stars: Table, n_extended: int) -> list[str]:
+def _told(stars: Table, n_extended: int, n_sharp: int) -> list[str]:
     """Return how many stars there are, how many sources were left out, and which are saturated."""
     n = len(stars)
     wider = f"{counted(n_extended, 'source')} wider than the PSF left out"
-    left_out = [wider] if n_extended else []
+    sharper = (
+        f"{counted(n_sharp, 'source')} sharper than the PSF left out, as cosmic rays and bad pixels"
+    )
+    left_out = [wider] * (n_extended > 0) + [sharper] * (n_sharp > 0)
     if not n:
         return [
             "no star is found: give --psf with the PSF of the image, or a lower --threshold, and "

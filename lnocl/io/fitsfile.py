@@ -16,6 +16,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError, LnoclError, warn
+from lnocl.io.encoded import is_tiled, unpacked
 from lnocl.io.packed import BLOCK, Blocks, check_sizes, copy_bytes, fits_content
 from lnocl.process import recorded_warnings
 
@@ -55,7 +56,7 @@ class FitsFile:
         Raises
         ------
         FileError
-            An HDU of negative size, beyond the end of the file or compressed in tiles.
+            An HDU of negative size, or beyond the end of the file.
 
         Warns
         -----
@@ -64,11 +65,6 @@ class FitsFile:
         """
         for hdu in self._hdus:
             where = hdu.fileinfo()
-            if hdu.header.get("ZIMAGE") is True:
-                # Decompressing damaged tiles corrupts the memory (so in astropy 8.0).
-                raise FileError(
-                    f"{self.path} is tile-compressed; unpack it first, such as with funpack"
-                )
             yield hdu
             end = where["datLoc"] + where["datSpan"]
             if end >= self._length or self._is_empty(end):
@@ -92,7 +88,7 @@ class FitsFile:
         Raises
         ------
         FileError
-            An image larger than the memory.
+            An image larger than the memory; damaged tiles.
 
         Warns
         -----
@@ -106,6 +102,8 @@ class FitsFile:
                 f"{self.path} has an image of shape {hdu.shape}, {needed / 2**30:.3g} GiB; "
                 f"this machine has {memory / 2**30:.3g} GiB of memory"
             )
+        if is_tiled(hdu):
+            return unpacked(self.path, hdu, self._content)
         self._verify(hdu)
         return np.array(hdu.data, dtype=np.float64)
 
@@ -225,7 +223,7 @@ def open_fits(
                 length = content.seek(0, os.SEEK_END)
                 check_header(path, content, length, 0)
                 content.seek(0)
-                with fits.open(content, memmap=False, disable_image_compression=True) as hdus:
+                with fits.open(content, memmap=False) as hdus:
                     yield FitsFile(path, stream, content, hdus, length)
         except (LnoclError, MemoryError, ImportError, NameError):
             raise  # no file can make the last two

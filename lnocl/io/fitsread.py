@@ -11,6 +11,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError, counted, note, warn
+from lnocl.io.encoded import linear
 from lnocl.io.fitsfile import open_fits
 from lnocl.io.headers import finer_cards, make_wcs, quiet_log, readable
 from lnocl.io.names import parse_name
@@ -25,7 +26,7 @@ MAX_CHANNELS = 4
 # polarisations.
 NOT_EXPOSURES = (
     *("WAVE", "AWAV", "WAVN", "LAMBDA", "FREQ", "ENER", "VRAD", "VOPT", "VELO", "FELO", "ZOPT"),
-    *("BETA", "STOKES", "COLOR", "COLOUR", "BAND", "FILTER"),
+    *("BETA", "STOKES", "RGB", "COLOR", "COLOUR", "BAND", "FILTER"),
 )
 
 _WCS_KEYWORD = re.compile(r"(?:CTYPE|CRPIX|CRVAL|CDELT)1([A-Z]?)")
@@ -63,8 +64,8 @@ def read_stack(paths: Sequence[str], may_differ: bool = False) -> Stack:
     The image of a file is the one named, as in ``FILE[SCI,1]`` (`lnocl.io.names`); else the
     extension SCI, or DET_DIST of a PSF, else the primary HDU, else an image extension that is not
     auxiliary (`lnocl.io.selection.choose`); an extension is named in the log. BSCALE, BZERO
-    and BLANK are applied (a blank pixel is NaN). A file may be compressed as a whole (gzip, bzip2,
-    xz), but not in tiles.
+    and BLANK are applied (a blank pixel is NaN), and an asinh of Pan-STARRS is undone
+    (`lnocl.io.encoded`). A file may be compressed as a whole (gzip, bzip2, xz), and in tiles (.fz).
 
     Parameters
     ----------
@@ -82,8 +83,8 @@ def read_stack(paths: Sequence[str], may_differ: bool = False) -> Stack:
     Raises
     ------
     FileError
-        A file that is missing, damaged, truncated, tile-compressed or not FITS, that has no image,
-        or whose image is larger than the memory.
+        A file that is missing, damaged, truncated or not FITS, that has no image, or whose image is
+        larger than the memory.
     InputError
         An image of another dimension or shape than the others; a cube of colours or energies by its
         CTYPE3; several images in a file that have an equal claim; none that is named.
@@ -295,7 +296,8 @@ def _read_file(
         pixels = file.pixels(hdu)
         while pixels.ndim > 2 and len(pixels) == 1:
             pixels = pixels[0]
-        return pixels, readable(hdu.header), checksum
+        header = readable(hdu.header)
+        return linear(path, pixels, header), header, checksum
 
 
 def _check_shape(

@@ -12,7 +12,6 @@ from astropy.units import dimensionless_unscaled
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError, counted, note, warn
-from lnocl.io import sky
 from lnocl.io.fitsread import (
     keyword_number,
     read_contents,
@@ -21,21 +20,23 @@ from lnocl.io.fitsread import (
     read_stack,
 )
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
+from lnocl.io.headers import CONVERTERS
 from lnocl.io.levels import is_rate, sky_level, sky_noise
 from lnocl.io.maps import Maps, Word
 from lnocl.io.names import ERR, PSF_ERRORS, parse_kind
 from lnocl.io.noise import NoiseMap, electrons_by_variance, read_noise_map
+from lnocl.io.pixel_scales import warn_of_pixel_scales
 from lnocl.io.places import read_epochs, read_places
 from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.arrays import Array
-from lnocl.scene.observation import OVERSAMPLES, Observation, PsfCentre
+from lnocl.scene.observation import Observation, PsfCentre
 from lnocl.scene.transforms import enlarged
 
 Mask = NDArray[np.bool_]
 
-# The logarithm of the pixels' size in image and PSF may differ by this much.
-MAX_SCALE_ERROR = 0.02
+# The keywords that headers have for a gain and an exposure.
+KEYWORDS = {"gain": ("GAIN", "EGAIN", *CONVERTERS), "exposure": ("EXPTIME", "EXPOSURE")}
 # Of more masked pixels than this share of an image it is warned.
 MUCH_MASKED = 0.1
 # The word for a halo that is the same in all pixels.
@@ -193,16 +194,17 @@ class _Reader:
 
     def frames(self) -> Frames:
         """Return the observation in the files."""
+        if why := units.refusal(self._bunit(0)):
+            raise InputError(f"{self._paths[0]} is in {self._bunit(0)}, {why}")
         exposure = self._exposure()
         factor, are_rates = self._electrons(exposure)
         if are_rates and exposure is None:
             raise InputError(
                 f"{self._paths[0]} holds counts per time; give `exposure`, in seconds: a number, a "
-                "map, or a keyword of the header such as EXPTIME"
+                "map, or a keyword of the header such as EXPTIME" + self._typed(("exposure",))
             )
         # Electrons in each unit of the images.
-        if not self._grids:  # which are sampled on the images' pixels as they need
-            self._warn_of_pixel_scales()
+        warn_of_pixel_scales(self._images, self._psfs, self._grids, self._calibration.oversample)
         each = factor * (_maps(exposure) if are_rates and exposure is not None else 1.0)
         noise = self._noise_map
         mask = self._mask(exposure, noise)
@@ -278,37 +280,6 @@ class _Reader:
             found[PSF_ERRORS[kind]] = np.concatenate(held) if held else stack.data
         return found
 
-    def _warn_of_pixel_scales(self) -> None:
-        """Warn of the first PSF whose pixels are of another size than those of its image."""
-        scales = [sky.pixel_scale(header) for header in self._psfs.headers]
-        oversample = self._calibration.oversample
-        for j, header in enumerate(self._psfs.headers):
-            finer = sky.oversampling(header) if scales[j] is None else None
-            if finer is not None and finer != oversample:
-                warn(
-                    f"`psfs[{j}]` is sampled {finer:g} times finer than the detector, by OVERSAMP "
-                    f"in its header: give `oversample` {finer:g}, or bin it to "
-                    + ("the image's pixels" if oversample == 1 else f"{oversample} times finer")
-                )
-                return
-        if not any(scales):
-            return  # nor need the images' coordinates be read
-        for j, of_psf in enumerate(scales):
-            of_image = sky.pixel_scale(self._images.headers[min(j, len(self._paths) - 1)])
-            if not (of_psf and of_image):
-                continue
-            wanted = of_image / oversample
-            if abs(np.log(wanted / of_psf)) > MAX_SCALE_ERROR:
-                finer_by = round(of_image / of_psf)
-                exact = finer_by in OVERSAMPLES and abs(of_image / of_psf / finer_by - 1) < 0.01
-                words = f"give oversample {finer_by}, or " if exact else ""
-                pixels = "the image's pixels" if oversample == 1 else f"{wanted:.4g} arcsec"
-                warn(
-                    f"the pixels of `psfs[{j}]` are of {of_psf:.4g} arcsec, those of its image of "
-                    f"{of_image:.4g}: {words}rebin it to {pixels}, by {wanted / of_psf:.3g}"
-                )
-                return
-
     def _electrons(self, exposure: Array | None) -> tuple[float, bool]:
         """Return the electrons in a unit of the images, and whether they are per second."""
         if self._electrons_in_units is not None:
@@ -322,6 +293,7 @@ class _Reader:
                 "electrons in one of these units: a number, "
                 + (
                     "or a keyword of its header such as GAIN"
+                    + self._typed(("gain", "exposure")[: 1 + bool(counts and counts[1])])
                     if counts or not units.is_known(self._unit())
                     else "the exposure in seconds over the value of one electron per second"
                 )
@@ -342,7 +314,7 @@ class _Reader:
                 f"BUNIT {self._bunit(0)}" if self._bunit(0) else "no BUNIT",
                 f"by its noise it is in {name} per second"
                 if are_rates
-                else f"its unit is taken to be {name}",
+                else f"its unit is taken to be {name}" + self._typed(("gain",)),
             )
         elif units.count_of(self._unit(), ("electron",)) and gain not in (None, 1.0):
             warn(
@@ -350,6 +322,20 @@ class _Reader:
                 f"{gain:g}: leave `gain` out, unless BUNIT is wrong"
             )
         return factor, are_rates
+
+    def _typed(self, names: Sequence[str]) -> str:
+        """Return which keywords of the header have what was not given, and what to type."""
+        given, found = self._calibration, {}
+        for name in names:
+            for keyword in () if getattr(given, name) else KEYWORDS[name]:
+                value = read_keyword(self._paths[0], self._images.headers[0], keyword)
+                if isinstance(value, (int, float)) and 0 < value < np.inf:
+                    found[name] = f"{keyword} {value:g}", f"`{name}`={keyword}"
+                    break
+        if not found:
+            return ""
+        held, words = zip(*found.values(), strict=True)
+        return f"; its header has {' and '.join(held)}: give {' '.join(words)}"
 
     def _counts(self, others: Sequence[str] = ()) -> tuple[float, bool] | None:
         """Return the counts in the unit of the images, of these kinds too, as `units.count_of`."""

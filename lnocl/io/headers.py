@@ -31,6 +31,8 @@ OBSERVED = (
     *("OBJECT", "TARGNAME", "TELESCOP", "INSTRUME", "FILTER", "FILTER1", "FILTER2", "DATE-OBS"),
     *("EXPTIME", "EFFEXPTM"),
 )
+# The electrons in a count of a converter, in headers of HST: of NICMOS, and of STIS and WFPC2.
+CONVERTERS = ("ADCGAIN", "ATODGAIN")
 # Distortions of HST that need tables beside the header; they are at most 0.1 pixel.
 _TABLED = re.compile("(CPDIS|CPERR|DP|D2IM(DIS|ERR|EXT|ARR)?)[0-9]*([.].*)?")
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from lnocl.errors import InputError, note
 from lnocl.io.fitsread import Contents, read_contents
+from lnocl.io.headers import CONVERTERS
 from lnocl.io.names import ERR
 from lnocl.scene import units
 
@@ -52,8 +53,8 @@ def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
         found["mask"] = [word]
     if not given.get("background"):
         found["background"] = ["auto"]
-    if not (given.get("gain") or given.get("exposure")):
-        found |= _electrons(path, contents)
+    electrons = _electrons(path, contents, bool(given.get("gain")))
+    found |= {name: value for name, value in electrons.items() if not given.get(name)}
     for name, value in found.items():
         words = value if isinstance(value, str) else " ".join(value)
         note("%s: with %s %s, as for images of %s", path, name, words, telescope)
@@ -67,15 +68,21 @@ def mask_word(contents: Contents) -> str:
     return words[0] if words else ""
 
 
-def _electrons(path: str, contents: Contents) -> dict[str, Any]:
+def _electrons(path: str, contents: Contents, has_gain: bool) -> dict[str, Any]:
     """Return the options that convert the unit of the image to electrons."""
     unit = contents.value("BUNIT")
-    if unit.upper().startswith("COUNT") and contents.value("DETECTOR") not in PHOTON_COUNTING:
-        raise InputError(
-            f"{path} is in counts of its converter; give `gain`, a number or a keyword of its "
-            "header, such as ATODGAIN"
-        )
     counts = units.count_of(units.parse(unit))
-    if counts is not None:
-        return {"exposure": ["EXPTIME"]} if counts[1] and contents.value("EXPTIME") else {}
-    return {"gain": "VAR_POISSON"} if "VAR_POISSON" in contents.extensions else {}
+    if counts is None:
+        return {"gain": "VAR_POISSON"} if "VAR_POISSON" in contents.extensions else {}
+    found: dict[str, Any] = {}
+    if unit.upper().startswith("COUNT") and contents.value("DETECTOR") not in PHOTON_COUNTING:
+        keywords = [keyword for keyword in CONVERTERS if contents.value(keyword)]
+        if not (keywords or has_gain):
+            raise InputError(
+                f"{path} is in counts of its converter; give `gain`, a number or a keyword of its "
+                "header"
+            )
+        found["gain"] = keywords[0] if keywords else None
+    if counts[1] and contents.value("EXPTIME"):
+        found["exposure"] = ["EXPTIME"]
+    return {name: value for name, value in found.items() if value}

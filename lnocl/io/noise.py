@@ -13,7 +13,7 @@ from lnocl.io.levels import clipped_sky
 from lnocl.io.maps import Maps
 from lnocl.io.names import ERR, NOISE, parse_kind
 from lnocl.scene.arrays import Array
-from lnocl.scene.uncertainties import variance_of, without_source
+from lnocl.scene.uncertainties import OtherNoiseError, variance_of, without_source
 
 # No image has so many times the noise that its sky shows.
 TOO_NOISY = 5.0
@@ -75,7 +75,7 @@ class NoiseMap(NamedTuple):
             _, scatter = clipped_sky(j, counts[j], bad)
             if noise > TOO_NOISY * scatter > 0:
                 others = ", ".join(kind for kind in NOISE if kind != self.kind)
-                raise InputError(
+                raise OtherNoiseError(
                     f"`noise` {self.kind} says that the noise of `images[{j}]` is {noise:.3g} "
                     f"electrons, and its sky scatters by {scatter:.3g}: see to its unit, or give "
                     f"it as what it is ({others})"

@@ -78,10 +78,15 @@ def _find_wcs(header: fits.Header) -> WCS | None:
 
 
 def pixel_scale(header: fits.Header) -> float | None:
-    """Return the side of a pixel in arcsec, by PIXELSCL or the coordinates; None where unknown."""
+    """Return the side of a pixel in arcsec, None where it is unknown.
+
+    It is that of PIXELSCL, of the coordinates, or of PIXSCALE, as in PSFs of Tiny Tim.
+    """
     scale = header.get("PIXELSCL")
     if scale is None and "CTYPE1" in header and (wcs := _find_wcs(header)) is not None:
         scale = float(np.sqrt(wcs.proj_plane_pixel_area().to_value("arcsec2")))
+    if scale is None and isinstance(scale := header.get("PIXSCALE"), (int, float)):
+        scale *= 1e-3 if header.comments["PIXSCALE"].startswith("mas") else 1.0
     if isinstance(scale, (int, float)) and 0 < scale < np.inf:
         return float(scale)
     return None

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from lnocl.errors import InputError, note, warn
 from lnocl.scene.arrays import Array, flag
 from lnocl.scene.containers import counts
+from lnocl.scene.freedoms import refusal
 from lnocl.scene.observation import Observation, numbers
 from lnocl.scene.penalty import Penalty, recommend_smoothing
 from lnocl.scene.psf_families import FAMILIES
@@ -132,21 +133,8 @@ def check_families(
     for name in found:
         if not (isinstance(name, str) and name in FAMILIES):
             raise InputError(f"`refine_psfs` {name!r} is not known; give {', '.join(FAMILIES)}")
-    if observation.psf_fields and (found or len(observation.psf_scatter)):
-        raise InputError(
-            "`refine_psfs` and `psf_scatter` are for PSFs that are the same all over the images; "
-            "leave them out where PSFs vary over the field"
-        )
-    several = observation.is_turned or observation.n_epochs > 1
-    if several and (found or len(observation.psf_scatter)):
-        raise InputError(
-            "`refine_psfs` and `psf_scatter` are for images of one epoch that are not turned "
-            "against the sky; leave them out"
-        )
-    if len(observation.halos) and (found or len(observation.psf_scatter)):
-        raise InputError(
-            "`refine_psfs` and `psf_scatter` are for images without `halos`; leave one of them out"
-        )
+    if (found or len(observation.psf_scatter)) and (why := refusal("refine_psfs", observation)):
+        raise InputError(why)
     if found and not len(positions):
         raise InputError("`refine_psfs` needs a star, whose image shows the PSF; give stars")
     for name, needed in NEEDS.items():

@@ -15,6 +15,10 @@ from lnocl.scene.arrays import Array, numbers
 ROUNDING = 0.05
 
 
+class OtherNoiseError(InputError):
+    """A map of noise that the images contradict."""
+
+
 def is_uncertainty(values: Any) -> bool:
     """Return whether values are an uncertainty of astropy.nddata."""
     if "astropy.nddata" not in sys.modules:  # then they cannot be
@@ -81,7 +85,7 @@ def without_source(
     for j, (left, bad) in enumerate(zip(rest, mask, strict=True)):
         n_below = int((left < -ROUNDING * counts[j].clip(0.0)).sum())
         if n_below > 0.5 * (~bad).sum():
-            raise InputError(
+            raise OtherNoiseError(
                 f"{words[0]} of `images[{j}]` is less than the noise of its counts in most pixels; "
                 f"see to gain and exposure, or give it as {words[1]} if it leaves the source out"
             )

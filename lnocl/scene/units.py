@@ -31,6 +31,25 @@ ALIASES = {
 # grammar.
 WORDS = {r"\bS\b": "s", r"(?i)\bper\b": "/", r"(?i)\be-": "electron", r"(?i)\bdn\b": "adu"}
 
+# Units of which no number is one of counts, and why, by patterns of their names.
+NOT_LIGHT = {
+    r"(?i)(\b|[a-z])mags?\b|\bmag\(|\b(dex|dB)\b": "a logarithm; give the image in linear units",
+    r"(?i)\bbeam\b": "that of maps of interferometers and dishes in the radio, whose noise is not "
+    "that of counts; give an image of counted photons",
+}
+
+
+def refusal(text: str) -> str:
+    """Return why an image in the unit that a header names has no counts; nothing where it may.
+
+    Examples
+    --------
+    >>> from lnocl.scene.units import refusal
+    >>> refusal("mag"), refusal("MJy/sr")
+    ('a logarithm; give the image in linear units', '')
+    """
+    return next((why for pattern, why in NOT_LIGHT.items() if re.search(pattern, text)), "")
+
 
 def parse(text: str) -> Any:
     """Return the unit that a header or a table names, in upper or lower case.

@@ -222,7 +222,7 @@ class TestWhatIsGiven:
             ("read_noise", [3.0], {"noise"}),
             ("mask", ["a.fits"], {"mask"}),
             ("background", [5.0], {"background"}),
-            ("gain", 2.0, {"exposure"}),
+            ("gain", 2.0, set()),
             ("exposure", [9.0], {"exposure"}),
         ]:
             assert calibrate("ir.fits", {name: value}).keys() == every - without
@@ -242,6 +242,35 @@ class TestWhatIsGiven:
         assert "gain" not in calibrate("wfpc2.fits", {"gain": "ATODGAIN"})
         write_plainly("sbc.fits", {"TELESCOP": "HST", "DETECTOR": "SBC"}, cards)
         assert calibrate("sbc.fits", {}).keys() == {"read_noise", "background"}
+
+    def test_nicmos_needs_no_option(self, capsys):
+        """Its converter's gain is ADCGAIN; ERR may lack the noise of the source."""
+        seconds, gain = 703.9, 5.4
+        image = (electrons(7) + noise(7, 20.0)) / (seconds * gain)
+        errors = np.full((N, N), 15.0 / (seconds * gain))
+        headers = {
+            "PRIMARY": fits.Header({"TELESCOP": "HST", "INSTRUME": "NICMOS", "EXPTIME": seconds,
+                                    "ADCGAIN": gain, "CAMERA": 2}),
+            "SCI": fits.Header({"BUNIT": "COUNTS/S"}),
+        }  # fmt: skip
+        write("nicmos.fits", headers, image, ERR=errors, DQ=np.zeros((N, N), "i2"))
+        write_stpsf()
+        command = ["deconvolve", "nicmos.fits", "--psf", "stpsf.fits", "--star", f"{AT[0]},{AT[1]}"]
+        assert cli.main([*command, "-o", "o.fits", *NUMPY]) == 0
+        said = capsys.readouterr().err
+        assert "nicmos.fits: with gain ADCGAIN, as for images of HST" in said
+        assert "nicmos.fits: with exposure EXPTIME, as for images of HST" in said
+        assert "--noise err is not taken, and the sky measured: --read-noise auto" in said
+        with fits.open("o.fits") as file:
+            near = np.hypot(X - AT[0], Y - AT[1]) < 9
+            found = file["STARS"].data["flux"][0] + (file[0].data * near).sum()
+            assert found * seconds * gain == pytest.approx(STAR, rel=0.01)
+            repeated = "".join(file[0].header["HISTORY"]).replace("\\", "")
+            assert "--noise" not in repeated
+            assert "--gain ADCGAIN" in repeated
+            assert float(file[0].header["RON1"]) == pytest.approx(20.0, rel=0.05)
+        assert cli.main([*command, "-o", "p.fits", "--noise", "err"]) == 2
+        assert "is less than the noise of its counts" in capsys.readouterr().err
 
     def test_other_telescopes_say_nothing(self):
         write_plainly("other.fits", {"TELESCOP": "Keck"}, {}, ERR=np.ones((N, N)))

@@ -73,6 +73,18 @@ def test_saturated_stars_are_named(capsys):
     assert "ra" not in stars.colnames
 
 
+def test_cosmic_rays_and_flat_tops_are_told(capsys):
+    counts = fits.getdata("image.fits").clip(max=1500.0)
+    counts[8, 50:54] = counts[50:54, 50] = 900.0, 930.0, 870.0, 910.0
+    fits.writeto("image.fits", counts, overwrite=True)
+    assert cli.main(["stars", "image.fits", "--psf", "psf.fits", "-o", "stars.ecsv"]) == 0
+    told = capsys.readouterr()
+    assert "2 sources sharper than the PSF left out, as cosmic rays and bad pixels" in told.out
+    assert "1 star saturated: 1; mask their cores" in told.out
+    assert "of flat tops at 1500 are taken as saturated, as by --saturation 1500\n" in told.err
+    assert len(Table.read("stars.ecsv")) == 2
+
+
 @pytest.mark.parametrize("word", ["given", "default"])
 def test_flags_and_weights_of_the_file_are_heeded(word, capsys):
     counts = fits.getdata("image.fits")

@@ -20,7 +20,7 @@ RATES = ["ELECTRONS/S", "electron/s/pix", "electron/s", "counts/s", "Counts/sec"
 DIGITAL = ["DN", "adu", "ADU", "dn", "DN/pixel"]
 DIGITAL_RATES = ["ADU/s", "adu s-1", "DN/s", "DN/sec", "DN/s/pix"]
 LIGHT = ["MJy/sr", "mJy", "10**-20 erg/s/cm2"]
-OTHERS = [*LIGHT, "mag", "UNKNOWN", "total nonsense", "(", "[e-]",
+OTHERS = [*LIGHT, "UNKNOWN", "total nonsense", "(", "[e-]",
           "5", "1000", "%"]  # fmt: skip
 
 
@@ -166,6 +166,44 @@ class TestUnits:
         save("err.fits", np.sqrt(image / 100.0).astype("f4") * 0.999)
         found = observe("1.fits", noise=["err=err.fits"])
         assert np.median(found.background) < 1.0
+
+    @pytest.mark.parametrize(
+        ("unit", "why"),
+        [
+            *((unit, "a logarithm; give the image in lin") for unit in ("mag", "MAG/arcsec**2",
+                                                                       "mag(AB)", "ABmag", "dex")),
+            *((unit, "that of maps of interferometers and d") for unit in ("JY/BEAM", "mJy/beam",
+                                                                        "Jy beam-1")),
+        ],
+    )  # fmt: skip
+    @pytest.mark.parametrize("known", [{}, {"gain": 2.0}, {"gain": 2.0, "exposure": [9.0]}])
+    def test_units_that_no_gain_makes_counts_are_refused(self, unit, why, known):
+        save_images(BUNIT=unit)
+        with pytest.raises(InputError) as caught:
+            observe(**known)
+        assert str(caught.value).startswith(f"1.fits is in {unit}, {why}")
+
+    @pytest.mark.parametrize(
+        ("unit", "known", "said"),
+        [
+            ("adu", {}, "; its header has EGAIN 2.5: give gain=EGAIN"),
+            ("adu/s", {}, "; its header has EGAIN 2.5 and EXPTIME 30: give gain=EGAIN exposure=EX"),
+            ("electron/s", {}, "; its header has EXPTIME 30: give exposure=EXPTIME"),
+            ("adu/s", {"gain": 2.0}, "; its header has EXPTIME 30: give exposure=EXPTIME"),
+            ("", {}, "its unit is taken to be electrons; its header has EGAIN 2.5: give gain=EG"),
+            ("", {"gain": "EGAIN"}, "its unit is taken to be counts"),
+        ],
+    )
+    def test_what_the_header_has_is_named_with_what_to_type(self, log, unit, known, said):
+        save_images(BUNIT=unit, GAIN=0.0, EGAIN=2.5, EXPTIME=30.0)
+        if unit:
+            with pytest.raises(InputError) as caught:
+                observe(**known)
+            assert said in str(caught.value)
+        else:
+            observe(**known)
+            assert said in log.text
+            assert ("give gain" in log.text) == (not known)
 
     def test_images_in_several_units_are_refused(self):
         save("1.fits", IMAGES[0], BUNIT="electron")

@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,10 @@ from wcs_headers import NORTH_UP
 
 import lnocl
 from lnocl.errors import FileError, InputError, LnoclWarning, counted
+from lnocl.io import sky
+from lnocl.io.fitsread import Stack
 from lnocl.io.levels import sky_noise
+from lnocl.io.pixel_scales import warn_of_pixel_scales
 from lnocl.scene.noise_check import warn_of_noise
 
 pytestmark = pytest.mark.usefixtures("frame_folder")
@@ -603,8 +607,12 @@ class TestPixelScales:
 
     @pytest.mark.parametrize(
         "cards",
-        [{"PIXELSCL": 0.0125}, SCALE | {"CDELT1": -0.0125 / 3600, "CDELT2": 0.0125 / 3600}],
-        ids=["PIXELSCL", "WCS"],
+        [
+            {"PIXELSCL": 0.0125},
+            {"PIXSCALE": 0.0125},  # of Tiny Tim
+            SCALE | {"CDELT1": -0.0125 / 3600, "CDELT2": 0.0125 / 3600},
+        ],
+        ids=["PIXELSCL", "PIXSCALE", "WCS"],
     )
     def test_a_psf_of_other_pixels_is_said(self, cards):
         (message,) = self.said(cards)
@@ -633,6 +641,26 @@ class TestPixelScales:
         assert message.endswith("give oversample 4, or bin it to 2 times finer")
         (message,) = self.said({"OVERSAMP": 4, "PIXELSCL": 0.0125})
         assert "rebin it to the image's pixels, by 4" in message
+
+    def test_lnocl_simulates_milliarcseconds(self):
+        header = fits.Header([("PIXSCALE", 12.5, "mas per pixel")])
+        assert sky.pixel_scale(header) == 0.0125
+
+    @pytest.mark.parametrize(("scale", "is_other"), [(0.05, False), (0.0125, False), (0.03, True)])
+    def test_grids_are_for_the_pixels_of_one_camera(self, scale, is_other):
+        """They are on its pixels, or as many times finer as the grid is."""
+        header = fits.Header({"PIXELSCL": scale})
+        stacks = (
+            Stack(IMAGES, [fits.Header(SCALE)], [], []),
+            Stack(np.ones((1, 3, 3)), [header], [], []),
+        )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            warn_of_pixel_scales(*stacks, [SimpleNamespace(oversampling=np.array([4, 4]))], 1)
+        assert [str(each.message) for each in caught] == [
+            "the pixels of psf 0 are of 0.03 arcsec, those of its image of 0.05: give the grid of "
+            "this camera"
+        ] * is_other
 
     def test_images_without_coordinates_tell_nothing(self):
         assert self.said({"PIXELSCL": 0.0125}, {}) == []
