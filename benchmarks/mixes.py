@@ -5,7 +5,7 @@
 
 The sky has 80 x 80 pixels; PSFs are two Gaussians without symmetry. Means are formulae, and exact.
 
-faint   a PSF of 2 pixels FWHM with 3e-5 of the information, and one of 5
+faint   a PSF of 4 pixels FWHM, and two of 2 and 9 with 1e-5 of its information
 depths  PSFs of 2.2, 3 and 4.5 pixels, exposures of 1, 3 and 20, other read noise and sky in each
 bars    four PSFs of 2 x 5 pixels, turned by 45 degrees each, exposures of 1 to 8
 scales  a PSF of 2.5 pixels, and an image turned by 20 degrees, 30 times as deep, whose pixels are
@@ -80,7 +80,8 @@ def _gaussian(x, y, covariance):
 def cameras(mix):
     """Return the images of a mix."""
     if mix == "faint":
-        return [Camera(2.0, 5e-6, 10.0, 0.01), Camera(5.0, 1.0, 10.0)]
+        faint = Camera(2.0, 6e-6, 10.0, 0.01), Camera(9.0, 6e-5, 10.0, 0.01)
+        return [faint[0], Camera(4.0, 1.0, 10.0), faint[1]]
     if mix == "depths":
         return [Camera(2.2, 1.0, 20.0, 3.0), Camera(3.0, 3.0, 40.0), Camera(4.5, 20.0, 20.0, 5.0)]
     if mix == "bars":

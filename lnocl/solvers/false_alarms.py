@@ -8,8 +8,8 @@ length L, in about
            + \frac{1}{4 \pi} \int_L \sqrt{\lambda} \Bigr) e^{-u^2 / 2}
 
 places, lambda the curvature along the edge (the Euler characteristic of its excursion set: Adler,
-R. J., Taylor, J. E., "Random Fields and Geometry", 2007, theorem 12.4.1, of which the last term is
-left out: it is less than that of noise at one place). Sums of few counts are skewed: a saddlepoint
+R. J., Taylor, J. E., "Random Fields and Geometry", 2007, chapter 12; the last term is left out, as
+it is less than that of noise at one place). Sums of few counts are skewed: a saddlepoint
 approximation (Lugannani, R., Rice, S., 1980, Adv. Appl. Probab. 12, 475) says which Gaussian value
 is as rare.
 """

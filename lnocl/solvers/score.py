@@ -16,7 +16,7 @@ complements take out what the source has in common with them,
     F'' = F' - \frac{W'^2}{n_D \overline{W'}},
 
 where G is the information of the stars, B what they share with the source, W with a flat sky, and
-the bars are means over a disc of n_D pixels, three resolutions in radius. What is found to be
+the bars are means over a disc of n_D pixels, three PSF widths in radius. What is found to be
 structure has no part in them: a source there keeps all of F', and ``W'^2 / (n_D mean W')`` is added
 to the variance of its score.
 """
@@ -82,6 +82,8 @@ class Score(NamedTuple):
         Between the scores at the origin and at each place, of a level sky that is known.
     curvature : ndarray of float64, shape (2, 2, Ny, Nx)
         The mean of ``grad u grad u^T`` for noise u of unit variance, along y and x.
+    foremost : int
+        The image that tells most.
     """
 
     values: Array
@@ -94,6 +96,7 @@ class Score(NamedTuple):
     is_tested: NDArray[np.bool_]
     correlation: Array
     curvature: Array
+    foremost: int
 
 
 class _Linear(NamedTuple):
@@ -125,12 +128,15 @@ class _Spectral(NamedTuple):
         Of the score before the level is taken out.
     curvature : ndarray of float64, shape (2, 2, Ny, Nx)
         Of the score after that.
+    foremost : int
+        The image that tells most.
     """
 
     gain: Array
     spread: Array
     correlation: Array
     curvature: Array
+    foremost: int
 
 
 class Null:
@@ -314,10 +320,9 @@ class Null:
         if not self.is_structured.any():
             return found
         bare, structured = self._score(self._bare, width), self.is_structured
-        pairs = zip(bare, found, strict=True)
-        parts = dict(zip(Score._fields, pairs, strict=True))
         of_bare = ("values", "skewness", "of_psfs", "starlit")
-        return found._replace(**{name: np.where(structured, *parts[name]) for name in of_bare})
+        pairs = {name: (getattr(bare, name), getattr(found, name)) for name in of_bare}
+        return found._replace(**{k: np.where(structured, *pair) for k, pair in pairs.items()})
 
     def _score(self, linear: _Linear, width: float) -> Score:
         scale = self.scene.scale
@@ -355,6 +360,7 @@ class Null:
             is_tested,
             spectral.correlation,
             spectral.curvature,
+            spectral.foremost,
         )
 
     def _of_images(self, linear: _Linear, width: float) -> tuple[Array, _Spectral]:
@@ -365,6 +371,7 @@ class Null:
         grid, high = self.scene.grid, 1.0 - scipy.fft.fft2(self._disc()).real
         in_disc, frequencies = np.count_nonzero(self._disc()), _wave_numbers(grid)
         total, correlation, sums = np.zeros(grid), np.zeros(grid), np.zeros((6, *grid))
+        told = []
         for j, part in enumerate(self._powers(linear.precisions, 2, width)):
             part = np.maximum(self.scene.scale * part, 0.0)  # but for rounding
             power = abs(scipy.fft.fft2(self.kernel(j, width), workers=-1)) ** 2
@@ -374,7 +381,8 @@ class Null:
             area = power[0, 0] * power.size / in_disc
             each = 1.0 - (power * high).sum(), 1.0 - noise.sum(), area, *moments
             total += part
-            correlation += part.sum() * power
+            told.append(float(part.sum()))
+            correlation += told[-1] * power
             for of_sum, factor in zip(sums, each, strict=True):
                 of_sum += factor * part
         shares = np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
@@ -386,6 +394,7 @@ class Null:
             shares[1] / area,
             correlation / correlation[0, 0],
             np.array([[yy, yx], [yx, xx]]),
+            int(np.argmax(told)),
         )
 
     def _is_seen(self, linear: _Linear, width: float) -> NDArray[np.bool_]:

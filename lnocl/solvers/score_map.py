@@ -40,7 +40,7 @@ class ScoreMap:
         self.score, self.width = null.score(width), width
         scene = null.scene
         self.noise = noise_of(self.score, null.rings, ~null.is_structured)
-        self._rarity = Rarity(null.kernel(0, width))
+        self._rarity = Rarity(null.kernel(self.score.foremost, width))
         self.unit = scene.unit
         self.values = self.score.values / self.noise.scatter
         self.values[~self.score.is_tested] = 0.0
