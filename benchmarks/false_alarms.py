@@ -124,13 +124,14 @@ def measure(job):
 def try_formula(alarms, fields=1000, n=64):
     """Print the alarms of noise of known levels."""
     from lnocl.solvers.false_alarms import Rarity, threshold
-    from lnocl.solvers.score import _curvature
     from lnocl.solvers.score_map import _near, _peaks
 
     psf = np.fft.ifftshift(psf_at(n // 2, n // 2, n))
     otf, squares = scipy.fft.rfft2(psf).conj(), (psf**2).sum()
-    power = abs(scipy.fft.fft2(psf)) ** 2
-    least = threshold(alarms, n * n, _curvature(power / power.sum()))
+    power, waves = abs(scipy.fft.fft2(psf)) ** 2, 2.0 * np.pi * np.fft.fftfreq(n)
+    axes = waves[:, None], waves
+    curvature = np.array([[(power * a * b).sum() for a in axes] for b in axes]) / power.sum()
+    least = threshold(alarms, n * n * np.sqrt(np.linalg.det(curvature)))
     rarity, skewness = Rarity(psf), (psf**3).sum() / squares**1.5
     for level in (1e4, 10.0, 1.0, 0.1, 0.01, 0.001):
         found = np.zeros(2)

@@ -397,6 +397,11 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
     null = null_of(outcome)
     found = ScoreMap(null, width * observation.oversample)
     ny, nx = observation.sky_shape
+    if not found.score.is_tested[:ny, :nx].any():
+        raise InputError(
+            f"nowhere do the images tell a source of `width` {width:g} pixels from stars, the "
+            "level of the sky and edges: give a narrower one, or a larger field"
+        )
     least = found.threshold(false_alarms)
     return Significance(
         found.significance[:ny, :nx],
@@ -495,7 +500,8 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
             fluxes[i], errors[i] = point_flux(*known, pixels[i], fluxes[i], outcome.moves, raised)
             kinds[i] = POINT_SOURCE if fluxes[i] > POINT * errors[i] else EXTENDED
     # Of a maximum between pixels the place errs by its noise, and by how it is interpolated.
-    spread = np.sqrt(np.diag(np.linalg.inv(found.score.curvature)))[::-1]
+    curvature = np.moveaxis(found.score.curvature[:, :, *at], -1, 0)
+    spread = np.sqrt(np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2))[:, ::-1]
     ratio = np.maximum(found.fluxes[at] / found.errors[at], 1.0)
     moved = np.hypot(spread / ratio[:, None], INTERPOLATED) / q
     stars = scene.stars[:: outcome.observation.n_epochs]

@@ -1,5 +1,8 @@
 """Sources beside the stars of a result: found, called a point or extended, and limited."""
 
+import runpy
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -206,6 +209,56 @@ def test_turned_images_find_what_is_in_all(result):
     [source] = near(outcome.significance().detections, 24.0, 36.0)
     assert source["flux"].value == pytest.approx(900, abs=3 * source["flux_error"].value)
     assert source["significance"] > 10
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_point_in_images_of_two_scales_is_found_once(seed):
+    """Where the deep image's PSF is three times as wide as the other: at 9 standard deviations."""
+    rng, sides, place = np.random.default_rng(seed), (N, 22), np.array([30.3, 34.6])
+    linear = lnocl.rotations([20.0], (0, 0))[0, :, :2] / 2.8
+    maps = np.array([np.eye(2, 3), np.column_stack([linear, (10.5, 10.5) - linear @ (31.5, 31.5)])])
+    exposures, means = np.array([1.0, 30.0]), SKY * np.array([1.0, 30.0 * 2.8**2])
+    lights = []
+    for to_image, side, exposure in zip(maps, sides, exposures, strict=True):
+        x, y = to_image[:, :2] @ place + to_image[:, 2]
+        rows, columns = np.indices((side, side))
+        light = np.exp(-((columns - x) ** 2 + (rows - y) ** 2 / 0.8) / 3.0)
+        light += 0.2 * np.exp(-((columns - x - 1.5) ** 2 + (rows - y + 1.0) ** 2) / 3.0)
+        lights.append(exposure * light / (3.0 * np.pi * (0.8**0.5 + 0.2)))
+    information = sum((p**2).sum() / m for p, m in zip(lights, means, strict=True))
+    flux = 9.0 / np.sqrt(information)
+    images = [rng.poisson(m + flux * p) * 1.0 for m, p in zip(means, lights, strict=True)]
+    y, x = np.mgrid[-8:9, -8:9]
+    psf = np.exp(-(x**2 + y**2 / 0.8) / 3.0)
+    psf += 0.2 * np.exp(-((x - 1.5) ** 2 + (y + 1.0) ** 2) / 3.0)
+    known = {"background": means, "exposure": exposures, "transforms": maps}
+    observation = lnocl.Observation(images, [psf, psf], psf_centre="given", **known)
+    result = lnocl.deconvolve(observation, stop=None, n_iter=10, engine="numpy")
+    [source] = result.significance().detections
+    assert source["kind"] == "point"
+    assert np.hypot(source["x"].value - place[0], source["y"].value - place[1]) < 1.5
+    assert source["flux"].value == pytest.approx(flux, abs=3 * source["flux_error"].value)
+    # The level of the sky takes a twelfth of the information.
+    assert flux / source["flux_error"].value == pytest.approx(9.0 * np.sqrt(11 / 12), rel=0.06)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("mix", ["faint", "depths", "bars", "scales", "coarse"])
+def test_images_that_differ_raise_as_many_alarms_as_stated(mix):
+    """Of 20 fields, 2 in each; a point is found once in each of the same."""
+    scenes = Path(__file__).parents[1] / "benchmarks" / "mixes.py"
+    measure = runpy.run_path(str(scenes))["measure"]
+    rows = np.array([measure((mix, 2.0, 600 + seed)) for seed in range(20)], float)
+    assert rows[:, 0].mean() == pytest.approx(2.0, abs=3 * np.sqrt(2.0 / 20))
+    assert (rows[:, 1] == 1).sum() >= 19
+    assert (rows[:, 2] == 1).sum() >= 18
+    assert np.median(rows[:, 3]) < 1.3 * np.median(rows[:, 4])
+    assert 0.85 * 9.0 < rows[:, 5].mean() < 9.3
+
+
+def test_a_field_in_which_nothing_is_tested_is_refused(result):
+    with pytest.raises(InputError, match="nowhere do the images tell a source of width 63 pixels"):
+        result.significance(width=63.0)
 
 
 def test_the_picture_has_the_map_the_limits_and_the_curves(found):

@@ -143,8 +143,8 @@ def _told(found: Significance, table: QTable) -> list[str]:
     what = f"source {found.width:g} pixels wide" if found.width else "point"
     lines = [
         f"{counted(len(table), 'detection')} above {found.threshold:.2f} standard deviations, "
-        f"which noise exceeds {found.false_alarms:g} times in such a field (each place was tested "
-        f"for a {what})"
+        f"which noise exceeds {found.false_alarms:g} times in such a field "
+        f"({100 * np.isfinite(found.signal_to_noise).mean():.3g} % of it was tested for a {what})"
     ]
     for k, row in enumerate(table[:MAX_LISTED], 1):
         flux, error = row["flux"], row["flux_error"]

@@ -613,6 +613,7 @@ class Result:
         InputError
             - A width or number of false alarms is out of range.
             - The result is of tiles, or of PSFs that vary over the field.
+            - Nowhere do the images tell such a source from stars, level and edges.
 
         Examples
         --------

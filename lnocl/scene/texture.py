@@ -13,6 +13,8 @@ docs/validation/errors.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
@@ -114,16 +116,54 @@ def resolution(scene: Scene) -> float:
     """Return the full width at half maximum of what all images resolve together, pixels.
 
     It is that of the PSF whose OTF is the root of the mean of ``|OTF_j|^2``, each with the
-    response of the images' pixels, in pixels of the sky.
+    response of the images' pixels, in pixels of the sky. Images count by what they tell of a flat
+    sky.
     """
+    return _width(sum(d * each for d, each in zip(_depths(scene), _powers(scene), strict=True)))
+
+
+def coarseness(scene: Scene) -> float:
+    """Return the width of the images' PSFs, pixels of the sky.
+
+    It is the root of the mean of squares of their full widths at half maximum. Images count by what
+    they tell of a point.
+    """
+    depths, powers = _depths(scene), list(_powers(scene))
+    told = np.array([d * each.sum() for d, each in zip(depths, powers, strict=True)])
+    squares = np.array([_width(each) for each in powers]) ** 2
+    return float(np.sqrt((told * squares).sum() / told.sum()))
+
+
+def _powers(scene: Scene) -> Iterator[Array]:
+    """Yield ``|OTF_j|^2`` with the response of the images' pixels, on the sky's."""
     psfs, observation = scene.psfs_of_sky(), scene.observation
     if scene.rotations:  # squares, whose sides are even
         n = max(map(len, psfs))
         psfs = [np.pad(psf, (n - len(psf)) // 2) for psf in psfs]
     v, u = (np.fft.fftfreq(n) for n in psfs[0].shape)
     pixel = abs(pixel_spectrum(v[:, None], u, observation)) / observation.oversample**2
-    power = np.mean([abs(scipy.fft.fft2(psf) * pixel) ** 2 for psf in psfs], axis=0)
+    for psf in psfs:
+        yield abs(scipy.fft.fft2(psf) * pixel) ** 2
+
+
+def _width(power: Array) -> float:
     return fwhm(scipy.fft.fftshift(scipy.fft.ifft2(np.sqrt(power)).real))
+
+
+def _depths(scene: Scene) -> Array:
+    """Return the information on a flat sky that each image has, as shares of all, shape (p,).
+
+    Its counts' variance is the median of its pixels, or their mean where most have none.
+    """
+    observation, depths = scene.observation, np.zeros(scene.n_images)
+    exposures = np.broadcast_to(observation.exposure.T, observation.images.T.shape).T
+    for j, (image, mask) in enumerate(zip(observation.images, observation.mask, strict=True)):
+        counts = image[~mask]
+        if counts.size:
+            variance = float(np.median(counts)) or max(float(counts.mean()), 1.0 / counts.size)
+            each = float(exposures[j][~mask].mean()) * scene.areas[j]
+            depths[j] = counts.size * each**2 / variance
+    return depths / depths.sum()
 
 
 def _continued(values: Array, distance: Array, is_round: NDArray[np.bool_]) -> Array:

@@ -1,12 +1,17 @@
 r"""How often noise alone exceeds a value somewhere in a field, and what a value of counts is worth.
 
-A field of unit variance and curvature Lambda exceeds a high value u, over an area A, in about
+A field of unit variance and curvature Lambda exceeds a high value u, over an area A with an edge of
+length L, in about
 
-.. math:: E(u) = A \sqrt{\det \Lambda} \, (2 \pi)^{-3/2} \, u \, e^{-u^2 / 2}
+.. math::
+    E(u) = \Bigl( \frac{u}{(2 \pi)^{3/2}} \int_A \sqrt{\det \Lambda}
+           + \frac{1}{4 \pi} \int_L \sqrt{\lambda} \Bigr) e^{-u^2 / 2}
 
-places (the Euler characteristic of its excursion set: Adler, R. J., "The Geometry of Random
-Fields", 1981, theorem 5.4.1). Sums of few counts are skewed: a saddlepoint approximation
-(Lugannani, R., Rice, S., 1980, Adv. Appl. Probab. 12, 475) says which Gaussian value is as rare.
+places, lambda the curvature along the edge (the Euler characteristic of its excursion set: Adler,
+R. J., Taylor, J. E., "Random Fields and Geometry", 2007, chapter 12; the last term is left out, as
+it is less than that of noise at one place). Sums of few counts are skewed: a saddlepoint
+approximation (Lugannani, R., Rice, S., 1980, Adv. Appl. Probab. 12, 475) says which Gaussian value
+is as rare.
 """
 
 from __future__ import annotations
@@ -28,34 +33,37 @@ GAUSSIAN, MOST = 1e-3, 100.0
 N_TILTS, LARGEST = 400, 300.0
 # A Gaussian value in the table is this or more.
 LEAST = 1e-3
+# A field without noise exceeds a value in so many places.
+FEWEST = 1e-300
 # Rarer probabilities are lost in rounding.
 RAREST = 1e-300
 # Of the profile what is above this share of its peak matters.
 FAINT = 1e-4
 
 
-def threshold(alarms: float, area: float, curvature: Array) -> float:
+def threshold(alarms: float, cells: float, edge: float = 0.0) -> float:
     """Return the value that noise exceeds in so many places of a field, on average.
 
     Parameters
     ----------
     alarms : float
         Expected number of places.
-    area : float
-        Pixels.
-    curvature : ndarray of float64, shape (2, 2)
-        Lambda, 1 / pixel^2.
+    cells : float
+        The integral of ``sqrt(det Lambda)`` over the field.
+    edge : float, optional
+        The integral of ``sqrt(lambda)`` along its edge.
     """
-    density = area * math.sqrt(max(float(np.linalg.det(curvature)), 0.0)) * (2 * math.pi) ** -1.5
-    if density * math.exp(-0.5) <= alarms:  # where the number falls, from 1 on
+
+    def excess(u: float) -> float:
+        of_area, of_edge = cells * u * (2.0 * math.pi) ** -1.5, edge / (4.0 * math.pi)
+        return math.log(max((of_area + of_edge) / alarms, FEWEST)) - u * u / 2.0
+
+    if excess(1.0) <= 0:  # where the number falls, from 1 on
         return 1.0
-    return float(
-        optimize.brentq(
-            lambda u: math.log(density * u / alarms) - u * u / 2.0,
-            1.0,
-            2.0 + math.sqrt(2.0 * math.log(density / alarms) + 20.0),
-        )
-    )
+    high = 2.0
+    while excess(high) > 0:
+        high *= 2.0
+    return float(optimize.brentq(excess, 1.0, high))
 
 
 class Rarity:

@@ -14,13 +14,15 @@ from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
-from lnocl.scene.shifting import Cutout
+from lnocl.scene.shifting import Cutout, window
 from lnocl.scene.stars import along_sky
 
 # Stars and sources share nothing farther apart than so many resolutions.
 APART = 4.0
 # Combinations of stars with less than this share of their information tell nothing.
 SAME = 1e-6
+# Outer rows and columns of a star below this share of its largest value are left out.
+DARK = 1e-6
 # Side of the squares of the sky whose stars are taken out together, resolutions.
 TILE = 8.0
 
@@ -72,7 +74,8 @@ class KnownStars:
             for axis in (1, 2):
                 images.append([each._replace(values=each.values[axis]) for each in slopes])
         each = 3 if moves else 1
-        return images, [k // each for k in range(len(images))]
+        trimmed = [[c.trimmed(DARK * float(abs(c.values).max())) for c in k] for k in images]
+        return trimmed, [k // each for k in range(len(images))]
 
     def shared(
         self,
@@ -94,20 +97,22 @@ class KnownStars:
         """
         grid, n = self._scene.grid, len(self._images)
         found = Shared(*np.zeros((3, *grid)))
-        common, moments = [], np.zeros((2, n))
+        common, moments = list[Cutout](), np.zeros((2, n))
         half = int(np.ceil(APART * resolution))
         for k in range(n):
             each, moments[:, k] = self._with_source(k, residuals, precisions, half)
             common.append(_wider(each, width))
-        gram = self._gram(precisions, (2.0 * APART + TILE) * resolution)
+        firsts = np.array([each[1:] for each in common]).reshape(-1, 2)
+        sizes = np.array([each.values.shape for each in common]).reshape(-1, 2)
         for here in _tiles(grid, int(np.ceil(TILE * resolution))):
             first, shape = (here[0].start, here[1].start), _shape(here)
-            near = [k for k in range(n) if _overlaps(common[k], first, shape, grid)]
+            reach = (firsts - first) % grid < shape, (first - firsts) % grid < sizes
+            near = np.flatnonzero(np.logical_or(*reach).all(axis=1)).tolist()
             if not near:
                 continue
             laid = np.array([common[k].add_to(np.zeros(shape), first, grid) for k in near])
             of_source = laid.reshape(len(near), -1)
-            solved = _inverse(gram[np.ix_(near, near)]) @ of_source
+            solved = _inverse(self._gram(near, precisions)) @ of_source
             found.score[here], found.flat[here] = (moments[:, near] @ solved).reshape(2, *shape)
             found.information[here] = (of_source * solved).sum(axis=0).reshape(shape)
         return found
@@ -127,23 +132,21 @@ class KnownStars:
         place = on_sky(scene.stars, scene.oversample)[self._owners[k]]
         return _cut_round(common, place, half, scene.grid), (score, flat)
 
-    def _gram(self, precisions: Sequence[Array], reach: float) -> Array:
-        """Return the information of unknowns of stars no farther apart than this."""
-        scene = self._scene
-        grid, n = scene.image_grid, len(self._images)
-        gram = np.zeros((n, n))
-        places = on_sky(scene.stars, scene.oversample)[self._owners]
-        size = np.array(scene.grid[::-1])
-        away = (places[:, None] - places + size / 2) % size - size / 2
-        is_near = np.hypot(away[..., 0], away[..., 1]) <= reach
-        for j in range(scene.n_images):
-            for k in range(n):
-                cutout = self._images[k][j]
-                values = cutout.values * precisions[j][cutout.window(grid)]
-                for other in np.flatnonzero(is_near[k, : k + 1]).tolist():
-                    there = self._images[other][j].add_to(np.zeros(values.shape), cutout[1:], grid)
-                    gram[k, other] += float((values * there).sum())
-        return np.asarray(gram + np.tril(gram, -1).T)
+    def _gram(self, near: Sequence[int], precisions: Sequence[Array]) -> Array:
+        """Return the information of some unknowns, of stars near each other."""
+        grid, gram = self._scene.image_grid, np.zeros((len(near), len(near)))
+        for j, precision in enumerate(precisions):
+            # Stars are not in the images of other epochs.
+            lit = [i for i, k in enumerate(near) if self._scene.shown[self._owners[k], j]]
+            if not lit:
+                continue
+            cutouts = [self._images[near[i]][j] for i in lit]
+            first, shape = _window_of(cutouts, grid)
+            laid = np.array([each.add_to(np.zeros(shape), first, grid) for each in cutouts])
+            laid *= np.sqrt(precision[window(*first, shape, grid)])
+            rows = laid.reshape(len(lit), -1)
+            gram[np.ix_(lit, lit)] += rows @ rows.T  # of which BLAS computes one half
+        return gram
 
     def squares(
         self, precisions: Sequence[Array], edges: Array, errors: Array
@@ -224,13 +227,15 @@ def _cut_round(cutout: Cutout, place: Array, half: int, grid: tuple[int, int]) -
     return Cutout(cutout.add_to(np.zeros((height, width)), first, grid), *first)
 
 
-def _overlaps(
-    cutout: Cutout, first: tuple[int, int], shape: tuple[int, int], grid: tuple[int, int]
-) -> bool:
-    """Return whether a cutout reaches into a window of the periodic grid."""
-    return all(
-        (at - start) % n < size or (start - at) % n < length
-        for at, start, n, size, length in zip(
-            first, cutout[1:], grid, cutout.values.shape, shape, strict=True
-        )
-    )
+def _window_of(
+    cutouts: Sequence[Cutout], grid: tuple[int, int]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return first pixel and shape of a window of the periodic grid that cutouts lie in."""
+    n, half = np.array(grid), np.array(grid) // 2
+    middle = np.array(cutouts[0][1:])
+    starts = (np.array([each[1:] for each in cutouts]) - middle + half) % n - half
+    ends = starts + [each.values.shape for each in cutouts]
+    size = ends.max(axis=0) - starts.min(axis=0)
+    first = np.where(size < n, middle + starts.min(axis=0), 0).tolist()
+    shape = np.minimum(size, n).tolist()
+    return (first[0], first[1]), (shape[0], shape[1])

@@ -16,7 +16,7 @@ complements take out what the source has in common with them,
     F'' = F' - \frac{W'^2}{n_D \overline{W'}},
 
 where G is the information of the stars, B what they share with the source, W with a flat sky, and
-the bars are means over a disc of n_D pixels, three resolutions in radius. What is found to be
+the bars are means over a disc of n_D pixels, three PSF widths in radius. What is found to be
 structure has no part in them: a source there keeps all of F', and ``W'^2 / (n_D mean W')`` is added
 to the variance of its score.
 """
@@ -24,7 +24,7 @@ to the variance of its score.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -38,13 +38,13 @@ from lnocl.scene.forward_model import Model, spread
 from lnocl.scene.psf_pixels import CORRELATED
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.smooth_field import SmoothField
-from lnocl.scene.texture import ROUND, resolution
+from lnocl.scene.texture import ROUND, coarseness, resolution
 from lnocl.solvers.known_stars import KnownStars
 from lnocl.solvers.score_noise import noise_of
 
-# Radius of the disc whose level is taken out, and full width of the Gaussian that smooths the
-# estimate for the model without sources, resolutions.
-DISC, SMOOTHED = 3.0, 12.0
+# Radius of the disc whose level is taken out, in widths of the PSFs, and of a disc for the counts'
+# level over that. Full width of the Gaussian that smooths the estimate, resolutions.
+DISC, LARGER, SMOOTHED = 3.0, 2.0, 12.0
 # Pixels brighter than so many times the smoothed estimate are cut to that for the level.
 PEAKED = 3.0
 # Where less than this share of what lies round a place is level, it has none.
@@ -80,8 +80,10 @@ class Score(NamedTuple):
         Where the images tell a source from stars and level.
     correlation : ndarray of float64, shape (Ny, Nx)
         Between the scores at the origin and at each place, of a level sky that is known.
-    curvature : ndarray of float64, shape (2, 2)
+    curvature : ndarray of float64, shape (2, 2, Ny, Nx)
         The mean of ``grad u grad u^T`` for noise u of unit variance, along y and x.
+    foremost : int
+        The image that tells most.
     """
 
     values: Array
@@ -94,6 +96,7 @@ class Score(NamedTuple):
     is_tested: NDArray[np.bool_]
     correlation: Array
     curvature: Array
+    foremost: int
 
 
 class _Linear(NamedTuple):
@@ -111,6 +114,29 @@ class _Linear(NamedTuple):
     precisions: list[Array]
     variances: list[Array]
     apart: list[Array]
+
+
+class _Spectral(NamedTuple):
+    """What follows from the spectrum of a score's noise, as all images have it at each place.
+
+    Attributes
+    ----------
+    gain, spread : ndarray of float64, shape (Ny, Nx)
+        The shares of ``W^2 / (n_D mean W)`` that the level has of information and variance; exact
+        where the noise is the same everywhere.
+    correlation : ndarray of float64, shape (Ny, Nx)
+        Of the score before the level is taken out.
+    curvature : ndarray of float64, shape (2, 2, Ny, Nx)
+        Of the score after that.
+    foremost : int
+        The image that tells most.
+    """
+
+    gain: Array
+    spread: Array
+    correlation: Array
+    curvature: Array
+    foremost: int
 
 
 class Null:
@@ -134,6 +160,8 @@ class Null:
     ----------
     resolution : float
         That of all images together, pixels of the sky.
+    disc : float
+        Radius of the disc whose level is taken out, pixels of the sky.
     stars : KnownStars
         Of the model.
     rings : ndarray of int, shape (Ny, Nx)
@@ -151,7 +179,7 @@ class Null:
         psf_errors: tuple[Array, Array],
     ) -> None:
         self.scene, self._model = scene, Model(scene)
-        self.resolution = resolution(scene)
+        self.resolution, self.disc = resolution(scene), DISC * coarseness(scene)
         self._psf_errors = psf_errors
         fluxes = np.asarray(star_fluxes) / scene.unit
         self.stars = KnownStars(self._model, fluxes[: scene.n_stars], moves)
@@ -170,15 +198,15 @@ class Null:
         smooth = _level(self._sky, ~structured, SMOOTHED * self.resolution)
         structure = np.where(structured, np.maximum(self._sky - smooth, 0.0), 0.0)
         means, light = self._means(smooth), self._model.forward(structure)
-        first = self._linearise(means, self._means(smooth + structure), light)
+        first = self._linearise(means, self._variances(smooth + structure), light)
         # The level as the counts have it: the estimate may hold less or more.
         excess = self._adjoint(first.residuals) - self._adjoint(first.apart)
         excess, response = map(self._mean_in_disc, (excess, self._flat_response(first)))
         excess = np.divide(excess, response, out=np.zeros_like(excess), where=response > 0)
-        level = np.maximum(smooth + self._mean_in_disc(excess, 2.0), 0.0)
-        self._linear = self._linearise(means, self._means(level + structure), light)
+        level = np.maximum(smooth + self._mean_in_disc(excess, LARGER), self._one_count())
+        self._linear = self._linearise(means, self._variances(level + structure), light)
         # Whether there is anything is asked of counts of the level alone.
-        self._bare = self._linearise(means, self._means(level), light)
+        self._bare = self._linearise(means, self._variances(level), light)
 
     def _find_structure(self) -> NDArray[np.bool_]:
         """Return where the sky has more than noise, and a resolution round it."""
@@ -190,10 +218,24 @@ class Null:
         found = ndimage.binary_dilation(values > STRUCTURED, disc)
         return np.asarray(found)
 
+    def _one_count(self) -> float:
+        """Return the level of one count in the disc, about the most where there are no counts."""
+        seen = float((self._model.sums / self.scene.areas).sum())
+        return 1.0 / (self.scene.scale * seen * np.count_nonzero(self._disc(LARGER)))
+
     def _means(self, level: Array) -> list[Array]:
         images = self._model.forward(level)
         parts = zip(images, self._model.background, self._starlight, strict=True)
         return [np.maximum(image + known + light, MIN_MODEL) for image, known, light in parts]
+
+    def _variances(self, level: Array) -> list[Array]:
+        """Return the variances of the counts.
+
+        A PSF that is too sharp for its pixels rings below 0, and errs by as much light there.
+        """
+        images = self._model.forward(level)
+        parts = zip(images, self._model.background, self._starlight, strict=True)
+        return [np.maximum(image + known, MIN_MODEL) + abs(light) for image, known, light in parts]
 
     def _linearise(self, means: Sequence[Array], variances: list[Array], light: Array) -> _Linear:
         weights = self._model.weights
@@ -203,15 +245,47 @@ class Null:
         apart = [p * each for p, each in zip(precisions, light, strict=True)]
         return _Linear(residuals, precisions, variances, apart)
 
-    def _adjoint(self, images: Sequence[Array], power: int = 1, width: float = 0.0) -> Array:
-        """Return ``sum_j <P_jx^power, x_j>`` at each place x of the grid."""
+    def _adjoint(self, images: Sequence[Array], width: float = 0.0) -> Array:
+        """Return ``sum_j <P_jx, x_j>`` at each place x of the grid."""
         scene, total = self.scene, 0.0
         for j, image in enumerate(images):
-            kernel = self.kernel(j, width) ** power if power > 1 else self._psf(j, width)
             seen = scene.rotations[j].adjoint(image) if scene.rotations else image
             spectrum = scipy.fft.rfft2(spread(seen, scene.oversample), workers=-1)
-            total = total + np.conj(scipy.fft.rfft2(kernel, workers=-1)) * spectrum
+            otf = scipy.fft.rfft2(self._psf(j, width), workers=-1)
+            total = total + np.conj(otf) * spectrum
         return np.asarray(scipy.fft.irfft2(total, scene.grid, workers=-1))
+
+    def _powers(self, images: Sequence[Array], power: int, width: float = 0.0) -> Iterator[Array]:
+        """Yield ``<P_jx^power, x_j>`` at each place x of the grid for each image x_j, 0 or more.
+
+        Shears and their weights are made for what pixels hold, and would ring: pixels of an image
+        that is turned are shared out among the four of the sky round each.
+        """
+        for j, image in enumerate(images):
+            spectrum = scipy.fft.rfft2(self._on_sky(j, image), workers=-1)
+            spectrum *= np.conj(scipy.fft.rfft2(self.kernel(j, width) ** power, workers=-1))
+            yield np.asarray(scipy.fft.irfft2(spectrum, self.scene.grid, workers=-1))
+
+    def _sum_of_powers(self, images: Sequence[Array], power: int, width: float = 0.0) -> Array:
+        """Return ``sum_j <P_jx^power, x_j>`` at each place x, not below 0 by rounding."""
+        return np.maximum(sum(self._powers(images, power, width)), 0.0)
+
+    def _on_sky(self, j: int, image: Array) -> Array:
+        """Return the pixels of an image where they lie on the sky's grid."""
+        scene = self.scene
+        if not scene.rotations:
+            return spread(image, scene.oversample)
+        y, x = np.nonzero(image)
+        at = np.stack([x, y], axis=1) - scene.observation.offsets[j]
+        places = np.linalg.solve(scene.observation.turns[j], at.T)[::-1]
+        first = np.floor(places).astype(int)
+        sky = np.zeros(math.prod(scene.grid))
+        for step in np.ndindex(2, 2):
+            corner = first + np.array(step)[:, None]
+            share = (1.0 - abs(places - corner)).prod(axis=0)
+            index = np.ravel_multi_index(tuple(corner), scene.grid, mode="wrap")
+            sky += np.bincount(index, share * image[y, x], sky.size)
+        return sky.reshape(scene.grid)
 
     def kernel(self, j: int, width: float) -> Array:
         """Return what image j shows of a source at the origin, as wide as given."""
@@ -234,7 +308,7 @@ class Null:
 
     def _disc(self, larger: float = 1.0) -> Array:
         y, x = (np.fft.fftfreq(n, 1.0 / n) for n in self.scene.grid)
-        disc = (np.hypot(y[:, None], x) <= larger * DISC * self.resolution).astype(np.float64)
+        disc = (np.hypot(y[:, None], x) <= larger * self.disc).astype(np.float64)
         return np.asarray(disc / disc.sum())
 
     def score(self, width: float = 0.0) -> Score:
@@ -246,22 +320,20 @@ class Null:
         if not self.is_structured.any():
             return found
         bare, structured = self._score(self._bare, width), self.is_structured
-        pairs = zip(bare, found, strict=True)
-        parts = dict(zip(Score._fields, pairs, strict=True))
         of_bare = ("values", "skewness", "of_psfs", "starlit")
-        return found._replace(**{name: np.where(structured, *parts[name]) for name in of_bare})
+        pairs = {name: (getattr(bare, name), getattr(found, name)) for name in of_bare}
+        return found._replace(**{k: np.where(structured, *pair) for k, pair in pairs.items()})
 
     def _score(self, linear: _Linear, width: float) -> Score:
         scale = self.scene.scale
-        score = scale * self._adjoint(linear.residuals, width=width)
-        raw = np.maximum(scale * self._adjoint(linear.precisions, 2, width), 0.0)
+        score = scale * self._adjoint(linear.residuals, width)
+        raw, spectral = self._of_images(linear, width)
         flat = scale * self._flat_response(linear, width)
         taken = self.stars.shared(linear.residuals, linear.precisions, width, self.resolution)
         score, flat = score - scale * taken.score, flat - scale * taken.flat
         information = np.maximum(raw - scale * taken.information, 0.0)
-        gain, spread_, power, noise = self._spectral_shares(width)
         # Sources are tested without those elsewhere, and have no part in the level round others.
-        beside = score - scale * self._adjoint(linear.apart, width=width)
+        beside = score - scale * self._adjoint(linear.apart, width)
         is_level = ~self.is_structured
         least = SOME_LEVEL * self._mean_in_disc(flat)
         in_disc = np.maximum(self._mean_in_disc(flat * is_level), least)
@@ -269,27 +341,70 @@ class Null:
         shared = flat**2 / in_disc / np.count_nonzero(self._disc())
         score = np.where(is_level, beside, score)
         score -= flat * self._mean_in_disc(beside * is_level) / in_disc
-        left = np.where(is_level, information - gain * shared, information)
-        variance = np.where(is_level, information - spread_ * shared, information + shared)
-        seen = self._adjoint(list(self._model.weights), 2, width)
+        left = np.where(is_level, information - spectral.gain * shared, information)
+        variance = np.where(is_level, information - spectral.spread * shared, information + shared)
         is_tested = (information > LEFT * raw) & (variance > 0)
         is_tested &= left * abs(left) > LEFT_BY_LEVEL * information * variance
-        is_tested &= self._is_inside() & (seen > SEEN * seen.max())
+        is_tested &= self._is_inside() & self._is_seen(linear, width)
         variance = np.where(is_tested, variance, np.inf)
-        third = scale * self._adjoint(self._third_moments(linear), 3, width)
+        third = scale * self._sum_of_powers(self._third_moments(linear), 3, width)
         of_psfs, starlit = self._of_psfs(linear, width)
         return Score(
             score / np.sqrt(variance),
             score,
             np.where(is_tested, left, np.inf),
             variance,
-            np.maximum(third, 0.0) / np.maximum(variance, np.finfo(float).tiny) ** 1.5,
+            third / np.maximum(variance, np.finfo(float).tiny) ** 1.5,
             of_psfs / variance,
             starlit / variance,
             is_tested,
-            np.asarray(scipy.fft.ifft2(power).real * power.size),
-            _curvature(noise),
+            spectral.correlation,
+            spectral.curvature,
+            spectral.foremost,
         )
+
+    def _of_images(self, linear: _Linear, width: float) -> tuple[Array, _Spectral]:
+        """Return the information of a source alone, and what follows from the noise of each image.
+
+        Spectra of images count by their share of the information, at each place.
+        """
+        grid, high = self.scene.grid, 1.0 - scipy.fft.fft2(self._disc()).real
+        in_disc, frequencies = np.count_nonzero(self._disc()), _wave_numbers(grid)
+        total, correlation, sums = np.zeros(grid), np.zeros(grid), np.zeros((6, *grid))
+        told = []
+        for j, part in enumerate(self._powers(linear.precisions, 2, width)):
+            part = np.maximum(self.scene.scale * part, 0.0)  # but for rounding
+            power = abs(scipy.fft.fft2(self.kernel(j, width), workers=-1)) ** 2
+            power /= power.sum()
+            noise = power * high**2
+            moments = [(noise * k).sum() for k in frequencies]
+            area = power[0, 0] * power.size / in_disc
+            each = 1.0 - (power * high).sum(), 1.0 - noise.sum(), area, *moments
+            total += part
+            told.append(float(part.sum()))
+            correlation += told[-1] * power
+            for of_sum, factor in zip(sums, each, strict=True):
+                of_sum += factor * part
+        shares = np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
+        area = np.where(total > 0, shares[2], 1.0)
+        yy, yx, xx = shares[3:] / (1.0 - shares[1])
+        correlation = scipy.fft.ifft2(correlation, workers=-1).real
+        return total, _Spectral(
+            shares[0] / area,
+            shares[1] / area,
+            correlation / correlation[0, 0],
+            np.array([[yy, yx], [yx, xx]]),
+            int(np.argmax(told)),
+        )
+
+    def _is_seen(self, linear: _Linear, width: float) -> NDArray[np.bool_]:
+        """Return where the images tell as much of a source, beside all light, as elsewhere."""
+        depths = [
+            float(p.sum()) / max(float(w.sum()), 1.0) * w
+            for p, w in zip(linear.precisions, self._model.weights, strict=True)
+        ]
+        seen = self._sum_of_powers(depths, 2, width)
+        return np.asarray(seen > SEEN * seen.max())
 
     def _is_inside(self) -> NDArray[np.bool_]:
         """Return the places of the frame, less its edges along which the grid is periodic."""
@@ -313,24 +428,6 @@ class Null:
             moments.append(w * np.maximum(v - of_reading, 0.0) / v**3)
         return moments
 
-    def _spectral_shares(self, width: float) -> tuple[float, float, Array, Array]:
-        """Return the shares of the level in information and variance, and two spectra.
-
-        Shares are of ``W^2 / (n_D mean W)``, and exact where the noise is the same everywhere. The
-        spectra, of unit sum, are of the score before and after the level is taken out.
-        """
-        grid = self.scene.grid
-        power = sum(
-            abs(scipy.fft.fft2(self.kernel(j, width))) ** 2 for j in range(self.scene.n_images)
-        )
-        high = 1.0 - scipy.fft.fft2(self._disc()).real
-        total = power.sum()
-        taken = power[0, 0] * np.prod(grid) / np.count_nonzero(self._disc())
-        gain = (total - (power * high).sum()) / taken
-        spread_ = (total - (power * high**2).sum()) / taken
-        noise = power * high**2
-        return float(gain), float(spread_), power / total, noise / noise.sum()
-
     def _of_psfs(self, linear: _Linear, width: float) -> tuple[Array, Array]:
         """Return the variance of the score by PSF errors: those found, and relative ones of 1."""
         # Errors of pixels are correlated over less than a PSF.
@@ -338,7 +435,7 @@ class Null:
         together = float(SmoothField((size, size), CORRELATED).apply(np.ones((size, size)))[0, 0])
         factor = (self.scene.scale * together) ** 2
         found, whole = (
-            factor * self._adjoint(each, 2, width)
+            factor * self._sum_of_powers(each, 2, width)
             for each in self.stars.squares(linear.precisions, *self._psf_errors)
         )
         return found, whole
@@ -355,11 +452,10 @@ class Null:
         )
 
 
-def _curvature(noise: Array) -> Array:
-    """Return the mean of ``grad u grad u^T`` for noise of this power spectrum, of unit sum."""
-    ky, kx = (2.0 * np.pi * np.fft.fftfreq(n) for n in noise.shape)
-    axes = ky[:, None], kx
-    return np.array([[float((noise * a * b).sum()) for a in axes] for b in axes])
+def _wave_numbers(grid: tuple[int, int]) -> tuple[Array, Array, Array]:
+    """Return the products ``k_y k_y``, ``k_y k_x`` and ``k_x k_x`` of the grid's frequencies."""
+    ky, kx = (2.0 * np.pi * np.fft.fftfreq(n) for n in grid)
+    return (ky**2)[:, None] + 0.0 * kx, ky[:, None] * kx, kx**2 + 0.0 * ky[:, None]
 
 
 def _level(sky: Array, is_level: NDArray[np.bool_], width: float) -> Array:

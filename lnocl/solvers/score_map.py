@@ -6,6 +6,7 @@ import math
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -17,6 +18,9 @@ from lnocl.solvers.score_noise import MANY, noise_of
 
 # The extended source is looked for in a ring round a place, resolutions.
 AROUND = 0.85, 1.65
+# Sources whose scores are correlated by less than this are apart, and what is left of a variance is
+# no less than its rounding.
+APART, ROUNDING = 0.02, 1e-6
 # A maximum lies at most so far from the middle of its pixel, pixels.
 FARTHEST = 0.7
 
@@ -36,7 +40,7 @@ class ScoreMap:
         self.score, self.width = null.score(width), width
         scene = null.scene
         self.noise = noise_of(self.score, null.rings, ~null.is_structured)
-        self._rarity = Rarity(null.kernel(0, width))
+        self._rarity = Rarity(null.kernel(self.score.foremost, width))
         self.unit = scene.unit
         self.values = self.score.values / self.noise.scatter
         self.values[~self.score.is_tested] = 0.0
@@ -74,8 +78,14 @@ class ScoreMap:
 
     def threshold(self, alarms: float) -> float:
         """Return the value that noise exceeds in so many places of the field, on average."""
-        area = float(np.count_nonzero(self.score.is_tested))
-        return threshold(alarms, area, self.score.curvature)
+        is_tested, ((yy, yx), (_, xx)) = self.score.is_tested, self.score.curvature
+        cells = np.sqrt(np.maximum(yy * xx - yx**2, 0.0))[is_tested].sum()
+        edge = 0.0
+        for axis, along in enumerate((xx, yy)):
+            for step in (-1, 1):
+                is_edge = is_tested & ~np.roll(is_tested, step, axis)
+                edge += float(np.sqrt(along[is_edge]).sum())
+        return threshold(alarms, float(cells), edge)
 
     def values_at(self, least: float) -> Array:
         """Return the values of tested places whose Gaussian values are a threshold, shape (n,)."""
@@ -108,11 +118,21 @@ class ScoreMap:
         side = np.arange(-half, half + 1)
         there = np.ix_((y + side) % rows, (x + side) % columns)
         dx, dy = (place - (x, y)).tolist()
-        away = np.meshgrid(side - dy, side - dx, indexing="ij")
-        point = ndimage.map_coordinates(self.score.correlation, away, order=3, mode="grid-wrap")
+        away = np.array(np.meshgrid(side - dx, side - dy))
+        point = self._correlated(away.transpose(1, 2, 0))
         distance = np.hypot(*away) / resolution
         is_round = (distance >= AROUND[0]) & (distance <= AROUND[1])
         return float((self.values[there] - value * point)[is_round].max(initial=0.0))
+
+    @cached_property
+    def _spline(self) -> Array:
+        return np.asarray(ndimage.spline_filter(self.score.correlation, mode="grid-wrap"))
+
+    def _correlated(self, away: Array) -> Array:
+        """Return the correlation of scores so far apart, (x, y) of the last axis, pixels."""
+        at = np.moveaxis(away[..., ::-1], -1, 0)
+        found = ndimage.map_coordinates(self._spline, at, mode="grid-wrap", prefilter=False)
+        return np.asarray(found)
 
     def peak_fluxes(self, y: NDArray[np.int_], x: NDArray[np.int_]) -> Array:
         """Return the fluxes, electrons, of maxima between pixels, at these rows and columns."""
@@ -120,6 +140,9 @@ class ScoreMap:
 
     def maxima(self, least: float) -> tuple[Array, Array, Array]:
         """Return maxima whose Gaussian values are above one, highest first.
+
+        They are above it beside points at the higher ones too: the score of one source may have
+        several, where some images are sharper than others.
 
         Returns
         -------
@@ -134,7 +157,25 @@ class ScoreMap:
         gaussian = self.rarity(higher, (y, x))
         order = np.flatnonzero(gaussian > least)
         order = order[np.argsort(-gaussian[order])]
-        return np.stack([x, y], axis=1)[order] + moves[order], higher[order], gaussian[order]
+        places = np.stack([x, y], axis=1) + moves
+        told: list[int] = []
+        for i in order.tolist():
+            value = self._beside(places[[i, *told]], higher[[i, *told]])
+            if self.rarity(np.array([value]), (y[[i]], x[[i]]))[0] > least:
+                told.append(i)
+        return places[told], higher[told], gaussian[told]
+
+    def _beside(self, places: Array, values: Array) -> float:
+        """Return the value of the first of some places, with points at the others."""
+        common = self._correlated(places[1:] - places[0])
+        near = np.flatnonzero(abs(common) > APART)
+        if not near.size:
+            return float(values[0])
+        others = places[1:][near]
+        gram = self._correlated(others[:, None] - others)
+        shares = scipy.linalg.solve(gram, common[near], assume_a="sym")
+        left = max(1.0 - float(shares @ common[near]), ROUNDING)
+        return float(values[0] - shares @ values[1:][near]) / math.sqrt(left)
 
 
 def _near(values: Array, y: NDArray[np.int_], x: NDArray[np.int_]) -> Array:

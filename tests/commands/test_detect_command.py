@@ -39,7 +39,7 @@ def test_detections_are_said_written_and_added(output, capsys):
     said = captured.out.splitlines()
     assert said[0].startswith("1 detection above 4.")
     assert (
-        "which noise exceeds 0.01 times in such a field (each place was tested for a point)"
+        "which noise exceeds 0.01 times in such a field (87.7 % of it was tested for a point)"
         in (said[0])
     )
     assert said[1].startswith(("1: (44.9", "1: (45.0"))

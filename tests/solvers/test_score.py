@@ -5,19 +5,24 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import scipy.stats
+import turned_scenes
 from scipy import ndimage
 
 import lnocl
 from lnocl.scene.scene import Scene
 from lnocl.solvers.completeness import needed
 from lnocl.solvers.false_alarms import Rarity, of_student, threshold
-from lnocl.solvers.score import DISC, Null
+from lnocl.solvers.score import Null
 from lnocl.solvers.score_map import ScoreMap, _peaks
 from lnocl.solvers.score_noise import noise_of
 
 NO_ERRORS = np.zeros(1), np.zeros(0)
 ROWS, COLUMNS = np.indices((9, 9)) - 4
-PSFS = np.array([np.exp(-(ROWS**2 + COLUMNS**2 + 0.3 * k * ROWS * COLUMNS) / 3) for k in (0, 1)])
+CORES = [np.exp(-(ROWS**2 + COLUMNS**2 + 0.3 * k * ROWS * COLUMNS) / 3) for k in (0, 1)]
+# Without symmetry, each with a ghost on another side.
+PSFS = np.array(
+    [core + 0.3 * np.roll(core, (1, 2 - 4 * k), (0, 1)) for k, core in enumerate(CORES)]
+)
 STARS = [(10.2, 9.7), (14.0, 12.5)]
 FLUXES = np.array([3000.0, 800.0])
 N = 32
@@ -63,7 +68,7 @@ def test_score_and_information_are_those_of_matrices(sky):
     information = (points**2).T @ precision - (shared * solved).sum(axis=0)
     flat = points.T @ precision - solved.T @ (stars.T @ precision)
     distance = np.hypot(*(np.minimum(each, N - each) for each in np.indices((N, N))))
-    disc = distance <= DISC * null.resolution
+    disc = distance <= null.disc
     mean = (
         np.array([np.roll(disc, divmod(k, N), (0, 1)).ravel() for k in range(N * N)]) / disc.sum()
     )
@@ -76,6 +81,147 @@ def test_score_and_information_are_those_of_matrices(sky):
     ratio = (information - found.information.ravel())[tested] / level[tested]
     assert ratio.min() > 0.9
     assert ratio.max() < 1.1
+
+
+def lopsided(dx, dy):
+    """Return a PSF of a Gaussian and a ghost beside it."""
+    core = turned_scenes.gaussian(dx, dy, np.array([[2.6, 0.5], [0.5, 1.7]]))
+    return 0.8 * core + 0.2 * turned_scenes.gaussian(dx - 2.1, dy + 1.4, np.diag([2.0, 3.0]))
+
+
+def test_scores_of_turned_images_and_their_information_are_explicit_sums():
+    """One image as it is, and one turned, of larger pixels and thrice as deep, by formulae.
+
+    Pixels that are shared out widen squares of PSFs by a sixth of a pixel^2, where weights vary.
+    """
+    n, side, rng = 40, 24, np.random.default_rng(5)
+    linear = lnocl.rotations([20.0], (0, 0))[0, :, :2] / 1.7
+    maps = np.array([np.eye(2, 3), np.column_stack([linear, (side / 2, 11.0) - linear @ (20, 20)])])
+    y, x = np.mgrid[-9:10, -9:10]
+    means, exposures = [40.0, 90.0], np.array([1.0, 3.0])
+    images = [rng.poisson(m, (k, k)) * 1.0 for m, k in zip(means, (n, side), strict=True)]
+    known = {"background": means, "exposure": exposures, "transforms": maps}
+    psfs = [lopsided(x, y), lopsided(-y, x)]
+    scene = Scene(lnocl.Observation(images, psfs, psf_centre="given", **known), [])
+    null = Null(scene, np.zeros(scene.grid), np.zeros(0), False, NO_ERRORS)
+    linear = null._linear
+    score, information = np.zeros((2, 30))
+    places = rng.integers(8, 32, (30, 2))
+    for j, psf in enumerate((lopsided, lambda dx, dy: lopsided(-dy, dx))):
+        rows, columns = np.indices(scene.image_grid)
+        for i, place in enumerate(places):
+            at = maps[j, :, :2] @ place + maps[j, :, 2]
+            light = exposures[j] / scene.mean_exposure * psf(columns - at[0], rows - at[1])
+            score[i] += (light * linear.residuals[j]).sum()
+            information[i] += (light**2 * linear.precisions[j]).sum()
+    at = places[:, 1], places[:, 0]
+    found = null._adjoint(linear.residuals)[at]
+    np.testing.assert_allclose(found, score, atol=3e-3 * abs(score).max())
+    found = null._sum_of_powers(linear.precisions, 2)[at]
+    np.testing.assert_allclose(found, information, rtol=0.02)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 3.5])
+def test_an_image_without_information_changes_nothing(sigma):
+    """Sharper or wider than the other, of 1e-7 of its depth."""
+    rows, columns = np.indices((25, 25)) - 12
+    psfs = [np.exp(-(rows**2 + columns**2) / (2.0 * s**2)) for s in (2.0, sigma)]
+    images = np.random.default_rng(0).poisson(100.0, (2, 64, 64)).astype(float)
+    images[1] = 100.0
+    both = lnocl.Observation(images, psfs, background=[100.0, 100.0], exposure=[1.0, 3e-4])
+    alone = lnocl.Observation(images[:1], psfs[0], background=100.0)
+    maps = [
+        ScoreMap(Null(Scene(each, []), np.zeros((64, 64)), np.zeros(0), False, NO_ERRORS), 0.0)
+        for each in (alone, both)
+    ]
+    one, other = maps
+    assert other.threshold(0.01) == pytest.approx(one.threshold(0.01), abs=2e-3)
+    np.testing.assert_allclose(other.values, one.values, atol=0.02)
+    np.testing.assert_allclose(other.score.correlation, one.score.correlation, atol=1e-3)
+
+
+@pytest.mark.parametrize(("deep", "sigma"), [(1.0, 3.0), (30.0, 6.0)])
+def test_the_curvature_is_that_of_the_noise(deep, sigma):
+    """Of images of other depths and widths: squares of differences of neighbours, of ten fields."""
+    rows, columns = np.indices((49, 49)) - 24
+    psfs = [np.exp(-(rows**2 + 0.6 * columns**2) / (2.0 * s**2)) for s in (1.3, sigma)]
+    means = np.array([40.0, 40.0 * deep])
+    steps = []
+    for seed in range(10):
+        images = np.random.default_rng(seed).poisson(means[:, None, None], (2, 80, 80)) * 1.0
+        observation = lnocl.Observation(images, psfs, background=means, exposure=[1.0, deep])
+        scene = Scene(observation, [])
+        score = Null(scene, np.zeros((80, 80)), np.zeros(0), False, NO_ERRORS).score()
+        values = np.where(score.is_tested, score.values, np.nan)
+        steps.append([np.nanmean(np.diff(values, axis=axis) ** 2) for axis in (0, 1)])
+    # A difference is less than a slope, by the mean of (2 sin(k / 2) / k)^2.
+    expected = np.diag(score.curvature[:, :, 40, 40])
+    found = np.mean(steps, axis=0)
+    assert (found < 1.03 * expected).all()
+    assert (found > 0.84 * expected).all()
+
+
+def test_an_edge_has_alarms_of_its_own():
+    """White noise, smoothed by seven pixels: 800 fields of 40 pixels, of which none is periodic."""
+    rng, n, sigma, margin = np.random.default_rng(2), 40, 3.0, 12
+    least = threshold(0.5, n * n / (2.0 * sigma**2), 4 * n / (np.sqrt(2.0) * sigma))
+    found = 0
+    for _ in range(800):
+        field = rng.standard_normal((n + 2 * margin, n + 2 * margin))
+        field = ndimage.gaussian_filter(field, sigma)[margin:-margin, margin:-margin]
+        field *= 2.0 * sigma * np.sqrt(np.pi)
+        is_peak = field == ndimage.maximum_filter(field, 3, mode="constant", cval=-np.inf)
+        found += np.count_nonzero(is_peak & (field > least))
+    assert found / 800 == pytest.approx(0.5, abs=3 * np.sqrt(0.5 / 800))
+
+
+def test_a_maximum_beside_others_has_what_points_there_leave():
+    """Values of independent noise with a Gaussian's correlation, fitted by all points at once."""
+    null = Null(scene_of(), np.zeros((N, N)), FLUXES, False, NO_ERRORS)
+    found, places = ScoreMap(null, 0.0), np.array([[10.0, 10.0], [12.3, 10.6], [9.1, 13.0]])
+    gram = found._correlated(places[:, None] - places)
+    values = gram @ (5.0, 40.0, 20.0)  # of three points, the first the faintest
+    error = np.sqrt(np.linalg.inv(gram)[0, 0])
+    assert found._beside(places, values) == pytest.approx(5.0 / error, rel=1e-6)
+    assert found._beside(places, gram @ (0.0, 40.0, 20.0)) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_stars_have_the_information_of_explicit_products():
+    """Of two images, one across the edge of the grid, with their places."""
+    scene = scene_of([(1.2, 30.4), (6.7, 30.9)])
+    null = Null(scene, np.zeros((N, N)), FLUXES, True, NO_ERRORS)
+    stars, precisions = null.stars, null._linear.precisions
+    laid = np.array([[each.on_grid((N, N)).ravel() for each in images] for images in stars._images])
+    expected = np.einsum("kjn,jn,ljn->kl", laid, np.reshape(precisions, (2, -1)), laid)
+    np.testing.assert_allclose(stars._gram(range(6), precisions), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [None, 30.0])
+def test_a_psf_that_rings_below_the_sky_leaves_no_place_untold(turn):
+    """A star of 1e7 through a PSF of 1.5 pixels: the model is negative beside it."""
+    rows, columns = np.indices((25, 25)) - 12
+    psf = np.exp(-(rows**2 + columns**2) / (2.0 * 0.637**2))
+    images = np.random.default_rng(0).poisson(20.0, (1, 64, 64)).astype(float)
+    known = {} if turn is None else {"transforms": lnocl.rotations([turn], (31.5, 31.5))}
+    scene = Scene(lnocl.Observation(images, psf, background=20.0, **known), [(31.3, 30.6)])
+    errors = np.array([0.0, 4.0, 90.0]), np.array([0.03, 0.02])
+    null = Null(scene, np.zeros(scene.grid), np.array([1e7]), False, errors)
+    found = ScoreMap(null, 0.0)
+    assert (found.score.of_psfs >= 0).all()
+    assert np.isfinite(found.significance[found.score.is_tested]).all()
+    rows, columns = np.indices(scene.grid)
+    far = (np.hypot(rows - 30.6, columns - 31.3) > 22) & (rows < 58) & (columns < 58)
+    assert found.score.is_tested[far & (rows > 6) & (columns > 6)].mean() > 0.95
+
+
+def test_sky_without_counts_is_tested():
+    """And leaves what lies beside it as it is: there a variance of 0 would be all information."""
+    images = np.random.default_rng(0).poisson(0.5, (1, 64, 64)).astype(float)
+    images[:, :, 20:] = 0.0
+    scene = Scene(lnocl.Observation(images, PSFS[:1]), [])
+    found = ScoreMap(Null(scene, np.zeros((64, 64)), np.zeros(0), False, NO_ERRORS), 0.0)
+    assert np.isfinite(found.significance[2:-2, 2:-2]).all()
+    assert found.significance[2:-2, 26:-8].max() < 1.5
 
 
 def test_the_score_is_that_of_units_and_exposures():
@@ -200,8 +346,7 @@ def test_an_estimate_below_the_level_takes_nothing_from_the_variance():
 def test_noise_exceeds_the_threshold_as_often_as_stated(alarms):
     """White Gaussian noise, smoothed: 400 fields, of which nothing is known but its spectrum."""
     rng, n, sigma = np.random.default_rng(1), 64, 2.0
-    curvature = np.eye(2) / (2.0 * sigma**2)
-    least = threshold(alarms, n * n, curvature)
+    least = threshold(alarms, n * n / (2.0 * sigma**2))
     found = 0
     for _ in range(400):
         field = ndimage.gaussian_filter(rng.standard_normal((n, n)), sigma, mode="wrap")
@@ -212,7 +357,7 @@ def test_noise_exceeds_the_threshold_as_often_as_stated(alarms):
 
 
 def test_a_threshold_falls_with_the_alarms_and_ends_at_1():
-    found = [threshold(alarms, 4096, np.eye(2)) for alarms in (1e-3, 0.01, 1.0, 1e6)]
+    found = [threshold(alarms, 4096.0) for alarms in (1e-3, 0.01, 1.0, 1e6)]
     assert found == sorted(found, reverse=True)
     assert found[-1] == 1.0
     density = 4096 * (2 * np.pi) ** -1.5
