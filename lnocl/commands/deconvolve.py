@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from lnocl.commands import checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
-from lnocl.commands.summary import extended_flux, summarise
+from lnocl.commands.summary import summarise
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, warn
 from lnocl.result import Callback, Result, view_of
@@ -123,7 +123,7 @@ def _write(
 
     primary = read_contents(arguments.images[0]).primary
     repeated = {**given, **_repeated(given, frames)}
-    used = repeated | _used(repeated, frames)
+    used = repeated | _used(repeated, frames, result)
     write_file(
         result,
         arguments.output,
@@ -135,7 +135,6 @@ def _write(
             *record.make_cards(ALL_OPTIONS, used, frames.sha256),
         ],
         unit=(frames.unit, frames.electrons),
-        extended_flux=extended_flux(result, frames),
         has_cubes=arguments.residuals,
         commands=record.make_commands("deconvolve", ALL_OPTIONS, repeated, os.getcwd()),
         messages=lines,
@@ -158,24 +157,37 @@ def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def _repeated(given: Mapping[str, Any], frames: Frames) -> dict[str, Any]:
     """Return the values of the command that repeats the run, where others were given."""
+    words = given["background"] or []
     return {
-        "background": frames.background,
+        # A level that was measured is measured again: a number would be taken as known.
+        "background": words if "auto" in words else frames.background,
         "read_noise": frames.read_noise,
         "star_table": None,
         "precision": given["precision"] if given["engine"] == "opencl" else "double",
     }
 
 
-def _used(repeated: Mapping[str, Any], frames: Frames) -> dict[str, Any]:
+def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[str, Any]:
     """Return the values that were computed with, where rules and keywords were given."""
     from lnocl.scene.padding import choose_pad
 
     exposure = frames.observation.exposure
     return {
         "gain": frames.gain,
+        "background": _levels(frames, result),
         "pad": choose_pad(frames.observation) if repeated["pad"] == "auto" else repeated["pad"],
         **({"exposure": exposure.tolist()} if repeated["exposure"] and exposure.ndim == 1 else {}),
     }
+
+
+def _levels(frames: Frames, result: Result) -> list[Any]:
+    """Return the background as given, with the levels that were fitted."""
+    before, after = frames.observation.background, result._observation.background
+    errors = frames.observation.background_error
+    return [
+        float(word + after[j].mean() - before[j].mean()) if errors[j] > 0 else word
+        for j, word in enumerate(frames.background)
+    ]
 
 
 def _device_spec(arguments: argparse.Namespace) -> str | None:

@@ -27,7 +27,6 @@ def write_file(
     *,
     cards: Iterable[Card] = (),
     unit: tuple[str, float] | None = None,
-    extended_flux: tuple[float, float] | None = None,
     has_cubes: bool = True,
     commands: Iterable[Sequence[str]] = (),
     messages: Sequence[str] = (),
@@ -48,9 +47,6 @@ def write_file(
         What was observed, and how the file was made.
     unit : (str, float), optional
         Unit of the file, and the electrons in it; by default that of the result.
-    extended_flux : (float, float), optional
-        The light of the extended source and its standard error, electrons, where more is known of
-        it than the result has.
     has_cubes : bool, optional
         Whether the models and the residuals of the images are added.
     commands, messages
@@ -62,7 +58,7 @@ def write_file(
         The file cannot be written, or exists and must not be overwritten.
     """
     name, electrons = unit or (result._unit, 1.0)
-    flux, error = (each / electrons for each in extended_flux or result.extended_flux)
+    flux, error = (each / electrons for each in result.extended_flux)
     refinement, observation = result.psf_refinement, result._observation
     own: list[Card] = [
         ("CREATOR", f"lnocl {version('lnocl')}", "program that wrote this file"),
