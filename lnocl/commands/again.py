@@ -98,7 +98,7 @@ class Again:
         if (
             found.extended.shape != expected.shape
             or not np.allclose(found.extended, expected, SAME, ROUNDING * abs(expected).max())
-            or not np.allclose(found.star_fluxes, fluxes, SAME)
+            or not np.allclose(found.star_fluxes, fluxes, SAME, equal_nan=True)
         ):
             raise InputError(
                 f"the run of {self.saved.path} gives another result now: its images, PSFs or "

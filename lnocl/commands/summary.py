@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 DARK_SHARE, FLOOR = 0.05, 0.5
 # How a verdict begins where nothing is wrong.
 FITS = "the model fits"
+# Of a star that is masked in all images, or in all of its epoch.
+NOT_SHOWN = "no good pixel shows it, and its flux is not known"
 # Where a star without light may be instead: so many pixels from its place.
 ELSEWHERE = 10
 # Of a star that was moved by this share of `MAX_SHIFT` more may be needed.
@@ -56,9 +58,11 @@ def summarise(
     device, _, _ = result.device.partition(" (")  # the header has its platform and driver
     unit = _unit(frames)
     stars = _light_curves(result, frames) or [
-        f"star at ({x:.7g}, {y:.7g}): {_flux(flux, error, frames)}; residuals "
-        f"{_rms(found.core)} in its core, {_rms(found.wings)} in its wings, where noise gives 1"
-        for (x, y), flux, error, found in zip(
+        f"star at {_at(place)}: {_flux(flux, error, frames)}; residuals {_rms(found.core)} in its "
+        f"core, {_rms(found.wings)} in its wings, where noise gives 1"
+        if np.isfinite(flux)
+        else f"star at {_at(place)}: {NOT_SHOWN}"
+        for place, flux, error, found in zip(
             result.star_positions,
             result.star_fluxes,
             result.star_flux_errors,
@@ -88,11 +92,18 @@ def _light_curves(result: Result, frames: Frames) -> list[str]:
         np.reshape(each, (-1, n)) / frames.electrons
         for each in (result.star_fluxes, result.star_flux_errors)
     )
-    return [
-        f"star at ({x:.7g}, {y:.7g}): {n} epochs, {flux.min():.5g} to {flux.max():.5g} "
-        f"{_unit(frames)}, with errors of {np.median(error):.2g} (median)"
-        for (x, y), flux, error in zip(result.star_positions[::n], fluxes, errors, strict=True)
-    ]
+    lines = []
+    for place, flux, error in zip(result.star_positions[::n], fluxes, errors, strict=True):
+        seen = np.isfinite(flux)
+        number = f"{n} epochs" if seen.all() else f"{seen.sum()} of {n} epochs"
+        found = f"{number}, {NOT_SHOWN}"
+        if seen.any():
+            found = (
+                f"{number}, {flux[seen].min():.5g} to {flux[seen].max():.5g} {_unit(frames)}, with "
+                f"errors of {np.median(error[seen]):.2g} (median)"
+            )
+        lines.append(f"star at {_at(place)}: {found}")
+    return lines
 
 
 def _shortness(arguments: argparse.Namespace, result: Result) -> list[str]:
@@ -195,6 +206,8 @@ def verdict_on(
     for place, given, flux, found in zip(
         result.star_positions, given_stars, result.star_fluxes, at_stars, strict=True
     ):
+        if np.isnan(flux):  # which the run has told of
+            continue
         if not flux > 0:
             where = _elsewhere(result.extended, place, observation.oversample)
             dark.append(f"{_at(given)}{where}")

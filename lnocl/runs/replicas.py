@@ -11,7 +11,6 @@ import numpy as np
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.repeated import Repeated
 from lnocl.scene.arrays import Array
-from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.texture import Texture, resolution
@@ -68,9 +67,7 @@ class Replicas:
 
     def __init__(self, outcome: Outcome, seed: int) -> None:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
-        self._texture = Texture(
-            outcome.sky / scene.unit, on_sky(scene.stars, scene.oversample), resolution(scene)
-        )
+        self._texture = Texture(outcome.sky / scene.unit, scene.shown_stars, resolution(scene))
         self._model = Model(scene)
         observation = scene.observation
         self._added = observation.read_noise**2

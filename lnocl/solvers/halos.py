@@ -24,7 +24,6 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
-from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model, model_images
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.texture import Texture, resolution
@@ -75,8 +74,7 @@ class _Joint:
         fitted = np.append(np.sort(brightest), np.arange(n, scene.n_fluxes))
         self.first, extended = len(fitted) - scene.n_halos, sky / scene.unit
         expected = extended if is_lit is None else np.where(is_lit, extended, 0.0)
-        stars = on_sky(scene.stars, scene.oversample)
-        texture = Texture(expected, stars, resolution(scene))
+        texture = Texture(expected, scene.shown_stars, resolution(scene))
         if is_lit is not None:  # nor are stars taken to be on light that is not significant
             texture.amplitude[~is_lit] = 0.0
         source = SourceError(model.forward, model.adjoint, texture.amplitude, texture.width)

@@ -16,7 +16,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
-from lnocl.scene.detector import movable_psfs, on_sky
+from lnocl.scene.detector import movable_psfs
 from lnocl.scene.forward_model import LocalRotation, add_to_window, sampled, spread
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout
@@ -237,7 +237,7 @@ def _texture_in(
         for first, k, n in zip((window.y, window.x), window.shape, scene.grid, strict=True)
     )
     around = Window(y, x, (height, breadth))
-    stars = (on_sky(scene.stars, scene.oversample) - (x, y)) % scene.grid[::-1]
+    stars = (scene.shown_stars - (x, y)) % scene.grid[::-1]
     inside = (stars < (breadth, height)).all(axis=1)
     there = tuple(
         slice(first - start, first - start + k)
