@@ -356,8 +356,10 @@ class Scene:
 
     @property
     def shown_stars(self) -> Array:
-        """Positions of the stars that are shown, on the sky's grid, shape (n_shown, 2)."""
-        return on_sky(self.stars[self.is_shown[: self.n_stars]], self.oversample)
+        """Positions on the sky's grid of stars that are shown, once each, shape (n_shown, 2)."""
+        n_epochs = self.observation.n_epochs
+        is_shown = self.is_shown[: self.n_stars].reshape(-1, n_epochs).any(axis=1)
+        return on_sky(self.stars[::n_epochs][is_shown], self.oversample)
 
     @property
     def n_fluxes(self) -> int:

@@ -12,6 +12,7 @@ from turned_scenes import FLUXES, GRID, NX, NY, STARS, gaussian, observation
 import lnocl
 from lnocl.io.saved_results import read_result
 from lnocl.scene.scene import Scene
+from lnocl.solvers.near_star import NearStar, Surroundings
 
 EPOCHS = ["b", "a", "b"]  # of images 0 and 2, and of image 1, which comes first
 START = {
@@ -210,6 +211,16 @@ def test_a_star_is_in_the_images_of_its_epoch_alone():
             np.testing.assert_array_equal(scene.star_image(j, s), expected)
     total = scene.star_weights[::2] + scene.star_weights[1::2]
     np.testing.assert_allclose(total, plain.star_weights, rtol=1e-14)
+
+
+def test_what_is_expected_under_a_star_does_not_hang_on_the_number_of_epochs():
+    """Else the edge of its core would be filled once for each."""
+    found = []
+    for scene in (Scene(observation(epochs=EPOCHS), STARS), Scene(observation(), STARS)):
+        fluxes = np.repeat(FLUXES, scene.n_stars // 2)
+        around = Surroundings(scene, scenes_turned.sky(), fluxes, moves=False)
+        found.append(NearStar(around, 0, 1e-4).expected)
+    np.testing.assert_allclose(*found, rtol=1e-12)
 
 
 def test_exposures_of_epochs_weigh_their_stars():
