@@ -177,7 +177,7 @@ def halo_errors(scene: Scene, sky: Array, star_fluxes: Array) -> Array:
     some = np.unique(np.linspace(0, p - 1, MOST_IMAGES).round().astype(int))
     for k, halo in enumerate(found):
         known = [j for j in some.tolist() if np.isfinite(halo[j])]
-        wholes = [joint.fit.variance(joint.first + k * p + j) for j in known]
+        wholes = joint.fit.variances([joint.first + k * p + j for j in known])
         raised = [whole / halo[j] for whole, j in zip(wholes, known, strict=True)]
         halo *= max(float(np.median(raised)), 1.0) if raised else np.nan
         halo[known] = wholes

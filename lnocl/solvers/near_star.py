@@ -154,8 +154,11 @@ class NearStar:
             return np.asarray(sampled(images[inside], q))
 
         def adjoint(images: Iterable[Array]) -> Array:
-            spectra = np.conj(otfs) * scipy.fft.rfft2(spread(np.array(images), q), shape)
-            return np.asarray(scipy.fft.irfft2(spectra.sum(axis=0), shape)[inside])
+            total = np.zeros_like(otfs[0])
+            for otf, image in zip(otfs, images, strict=True):
+                if image.any():  # what a flux of one epoch changes is dark in all others
+                    total += np.conj(otf) * scipy.fft.rfft2(spread(image, q), shape)
+            return np.asarray(scipy.fft.irfft2(total, shape)[inside])
 
         return SourceError(forward, adjoint, amplitude, width)
 

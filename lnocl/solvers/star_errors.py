@@ -67,8 +67,8 @@ def _errors_of(near: NearStar, wanted: NDArray[np.bool_]) -> Array:
     if not is_determined.any():
         return np.full(unknowns.shape, np.nan)
     change, _ = fit.solve(np.zeros(k))
-    errors = [
-        np.hypot(fit.variance(i) ** 0.5, change[i]) if is_determined[i] else np.nan
-        for i in unknowns.ravel().tolist()
-    ]
-    return np.reshape(errors, unknowns.shape)
+    errors = np.full(unknowns.shape, np.nan)
+    known = is_determined[unknowns]
+    at = unknowns[known]
+    errors[known] = np.sqrt(fit.variances(at) + change[at] ** 2)
+    return errors
