@@ -55,16 +55,15 @@ LITTLE_OFF_CENTRE, FAR_OFF_CENTRE = 0.25, 0.8
 # give the same light as PSFs without that noise.
 MUCH_NEGATIVE = 0.1
 
-# Attributes that hold a number for each image or for each pixel, and a number for each pixel of
-# PSFs that may be left out.
+# Attributes that hold a number for each image or for each pixel, and those that go with PSFs.
 MAPS = "background", "read_noise", "exposure"
-OF_PSFS = "ideal_psfs", "pupils", "psf_scatter"
-# What goes with PSFs; and all that `replace` takes, in the order in which one is checked by others.
 BESIDE_PSFS = "pupils", "ideal_psfs", "psf_modes", "psf_scatter"
+# What `replace` takes, in the order in which one is checked beside those before it.
 PARAMETERS = (
     *("oversample", "effective_psfs", "images", "mask", "exposure", "psfs", *BESIDE_PSFS),
-    *("offsets", "transforms", "epochs", "background", "read_noise", "halos"),
+    *("epochs", "background", "read_noise", "halos"),
 )
+MOVES = "offsets", "transforms"
 
 
 class Observation:
@@ -126,8 +125,8 @@ class Observation:
         each image is fitted with the stars and the extended source, and is zero or more. A flat
         halo, ``np.ones((ny, nx))``, is a level of the background that is fitted in each image.
     epochs : array_like, shape (p,), optional
-        The epoch of each image, such as its night: any labels. Stars have a flux in each epoch, the
-        rest of the sky is common. By default all images are of one epoch.
+        The epoch of each image, such as its night: numbers or text. Stars have a flux in each
+        epoch, the rest of the sky is common. By default all images are of one epoch.
     oversample : {1, 2, 4}, optional
         Pixels of the sky, and of the PSFs, to one of the images along each axis. The model of a
         pixel is the sum over its pixels of the sky. It is meant for detectors with fewer than two
@@ -201,6 +200,7 @@ class Observation:
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
         - A halo is 0 on all good pixels of an image.
+        - A label of `epochs` is missing or not a number, or the labels have no order.
         - `transforms` are given beside `offsets`, `oversample` or PSFs that vary over the field,
           shear the images by more than 0.05 pixels, or are for pixels smaller than the sky's.
 
@@ -428,7 +428,7 @@ class Observation:
                 continue
             if name == "halos":  # whose first axis is not that of the images
                 values = np.moveaxis(values, 1, 0)
-            if name in ("psfs", "psf_modes", *OF_PSFS):
+            if name in ("psfs", *BESIDE_PSFS):
                 values = _about_centre(values, swaps)
             else:
                 values = enlarged(values, shape, float(name == "mask"))
@@ -495,25 +495,21 @@ class Observation:
         >>> other.psfs.shape, obs.psfs.shape, np.shares_memory(other.images, obs.images)
         ((2, 1, 1), (2, 3, 3), True)
         """
-        if unknown := sorted(changes.keys() - set(PARAMETERS)):
+        if unknown := sorted(changes.keys() - {*PARAMETERS, *MOVES}):
             raise InputError(
                 f"`{unknown[0]}` cannot be replaced in an observation; what can is "
-                f"{', '.join(PARAMETERS)}"
+                f"{', '.join((*PARAMETERS, *MOVES))}"
             )
         if containers.variances("images", changes.get("images"), False) is not None:
             raise InputError("`images` with an uncertainty replace none; give `read_noise` too")
-        self._refuse_freed_pixels(changes)
         other = copy(self)
-        held = vars(other)
-        del held["_is_checked"]
-        if {"images", "mask"} <= changes.keys():
-            del held["mask"]
+        del vars(other)["_is_checked"]
+        if "mask" in changes:
+            other.mask = np.zeros(self.mask.shape, bool)
         if changes.get("pupils") is not None:
             changes = {"ideal_psfs": None, **changes}
         for name in PARAMETERS:
-            if name in ("offsets", "transforms"):
-                other._replace_maps(self, changes)
-            elif name in changes:
+            if name in changes:
                 getattr(other, f"_hold_{name}")(changes[name])
             elif other._is_of_other_shape(name, self):
                 values: Any = getattr(self, name)
@@ -521,6 +517,8 @@ class Observation:
                     values = self.psf_fields
                 getattr(other, f"_hold_{name}")(values if np.size(values) else None)
         other._mask_not_finite()
+        other._replace_maps(self, changes)
+        other._refuse_freed_pixels(self, changes)
         other._leave_out_bad_pixels()
         if len(other.halos) and other.mask is not self.mask:
             other._hold_halos(other.halos)
@@ -543,20 +541,19 @@ class Observation:
         maps = np.concatenate([before.turns, before.offsets[:, :, None]], axis=2)
         transforms = changes.get("transforms", maps if before.is_mapped else None)
         is_kept = transforms is None and "transforms" not in changes
-        if changes.keys() & {"offsets", "transforms"} or self._is_of_other_shape("offsets", before):
+        if changes.keys() & set(MOVES) or self._is_of_other_shape("transforms", before):
             offsets = changes.get("offsets", before.offsets if is_kept else None)
             self._hold_maps(offsets, transforms)
         elif transforms is not None:
             self._refuse_beside_transforms()
             self._refuse_one_psf_for_scales()
 
-    def _refuse_freed_pixels(self, changes: dict[str, Any]) -> None:
+    def _refuse_freed_pixels(self, before: Observation, changes: dict[str, Any]) -> None:
         """Refuse to take pixels for good again of which nothing is held."""
-        given = booleans("mask", changes["mask"]) if changes.get("mask") is not None else False
-        if "mask" not in changes or np.shape(given) not in ((), self.shape, self.mask.shape):
+        if self.mask.shape != before.mask.shape:
             return
-        n_freed = int(np.count_nonzero(self.mask & ~np.asarray(given)))
-        maps = [name for name in ("images", *MAPS) if getattr(self, name).ndim == 3]
+        n_freed = int(np.count_nonzero(before.mask & ~self.mask))
+        maps = [name for name in ("images", *MAPS) if getattr(before, name).ndim == 3]
         if n_freed and (missing := [f"`{name}`" for name in maps if name not in changes]):
             raise InputError(
                 f"`mask` frees {counted(n_freed, 'pixel')} of which nothing is held; give "
@@ -782,7 +779,7 @@ class Observation:
             bad = self.mask if array.ndim == 3 else self.mask.all(axis=0)
             masked_there = masked_there & ~bad  # a new array: it may be the caller's
         refuse_masked(name, masked_there)
-        values = numbers(name, array)
+        values = numbers(name, array, copy=False)
         if values.ndim < 2:
             return _one_each(name, values, self.n_images)
         if values.shape not in (self.images.shape, self.shape):
