@@ -190,6 +190,8 @@ class LeastSquares:
         from all: with ``<x, S x> = 1``, ``w_i -= <x, w_i> S x`` leaves ``<x, w_i>^2`` less of
         ``<w_i, S^-1 w_i>``. No direction has less than 1 in S, so that ``|w_i|^2`` bounds the rest.
         """
+        if not len(unknowns):
+            return np.zeros(0)
         columns = [self._invert(unit) for unit in np.eye(len(self._prior))[unknowns]]
         found = np.array([column[i] for column, i in zip(columns, unknowns, strict=True)])
         rests = np.array([self._adjoint(self._changes(column)) for column in columns])

@@ -109,6 +109,7 @@ def test_variances_are_those_of_the_inverse_and_lack_no_more_than_is_said():
     assert lack.min() > -1e-9
     assert 0.0 < lack.max() < least_squares.MISSING
     alone = LeastSquares(images, [field], np.zeros(k), 2000, 1e-12).variances([k - 1])
+    assert not len(LeastSquares(images, [field], np.zeros(k), 2000, 1e-12).variances([]))
     assert alone[0] == pytest.approx(expected[-1], rel=least_squares.MISSING)
 
 
