@@ -219,6 +219,7 @@ def deconvolve(
         - PSFs vary by more than a fifth over an image that has one for its extended source.
         - A PSF is a tenth wider or narrower than a star.
         - A star is not at the position given, or lies on bad pixels of all images.
+        - No good pixel shows a star, at all or in an epoch: it is left out, and its flux is NaN.
         - PSFs have an error of more than 3 % at the stars that refining has not mended.
         - Images are offset by more than `pad` and the grid leave room for.
         - Single precision is expected to stray from double by a thousandth of the extended source.

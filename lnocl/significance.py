@@ -312,7 +312,7 @@ class Significance:
         limits = {f"{100 * each:g}": self.limit(each) for each in shares}
         observation, scene = self._outcome.observation, self._outcome.scene
         n_epochs = observation.n_epochs
-        fluxes = self._outcome.star_fluxes[: scene.n_stars].reshape(-1, n_epochs).mean(axis=1)
+        fluxes = self._outcome.mean_fluxes
         rows: list[tuple[float, ...]] = []
         for s, place in enumerate(on_sky(scene.stars[::n_epochs], observation.oversample)):
             rows += [(float(s + 1), *ring, float(fluxes[s])) for ring in self._rings(place, limits)]

@@ -103,7 +103,7 @@ class Again:
             found.extended.shape != expected.shape
             or found.star_fluxes.size != fluxes.size
             or not np.allclose(found.extended, expected, SAME, ROUNDING * abs(expected).max())
-            or not np.allclose(found.star_fluxes, fluxes, SAME)
+            or not np.allclose(found.star_fluxes, fluxes, SAME, equal_nan=True)
         ):
             raise InputError(
                 f"the run of {self.saved.path} gives another result now: its images, PSFs or "

@@ -12,7 +12,7 @@ import numpy as np
 from lnocl.errors import counted
 from lnocl.residuals import Fit, sharp_sources
 from lnocl.result import Result
-from lnocl.result.verdict import FITS
+from lnocl.result.verdict import FITS, in_words
 from lnocl.scene.observation import Observation
 from lnocl.scene.stars import MAX_SHIFT
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 # The darkest share of the extended source, and how bright it may be, in standard deviations of a
 # pixel's noise.
 DARK_SHARE, FLOOR = 0.05, 0.5
+# Of a star that is masked in all images, or in all of its epoch.
+NOT_SHOWN = "no good pixel shows it, and its flux is not known"
 
 SEE_WARNINGS = ", but see the warnings of the run"
 
@@ -54,9 +56,11 @@ def summarise(
     device, _, _ = result.device.partition(" (")  # the header has its platform and driver
     unit = _unit(frames)
     stars = _light_curves(result, frames) or [
-        f"star at ({x:.7g}, {y:.7g}): {_flux(flux, error, frames)}; residuals "
-        f"{_rms(found.core)} in its core, {_rms(found.wings)} in its wings, where noise gives 1"
-        for (x, y), flux, error, found in zip(
+        f"star at {in_words(place)}: {_flux(flux, error, frames)}; residuals {_rms(found.core)} in "
+        f"its core, {_rms(found.wings)} in its wings, where noise gives 1"
+        if np.isfinite(flux)
+        else f"star at {in_words(place)}: {NOT_SHOWN}"
+        for place, flux, error, found in zip(
             result.star_positions,
             result.star_fluxes,
             result.star_flux_errors,
@@ -87,11 +91,18 @@ def _light_curves(result: Result, frames: Frames) -> list[str]:
         np.reshape(each, (-1, n)) / frames.electrons
         for each in (result.star_fluxes, result.star_flux_errors)
     )
-    return [
-        f"star at ({x:.7g}, {y:.7g}): {n} epochs, {flux.min():.5g} to {flux.max():.5g} "
-        f"{_unit(frames)}, with errors of {np.median(error):.2g} (median)"
-        for (x, y), flux, error in zip(result.star_positions[::n], fluxes, errors, strict=True)
-    ]
+    lines = []
+    for place, flux, error in zip(result.star_positions[::n], fluxes, errors, strict=True):
+        seen = np.isfinite(flux)
+        number = f"{n} epochs" if seen.all() else f"{seen.sum()} of {n} epochs"
+        found = f"{number}, {NOT_SHOWN}"
+        if seen.any():
+            found = (
+                f"{number}, {flux[seen].min():.5g} to {flux[seen].max():.5g} {_unit(frames)}, with "
+                f"errors of {np.median(error[seen]):.2g} (median)"
+            )
+        lines.append(f"star at {in_words(place)}: {found}")
+    return lines
 
 
 def _shortness(arguments: argparse.Namespace, result: Result) -> list[str]:

@@ -36,7 +36,7 @@ def draw_beside(views: Mapping[str, ResultView]) -> Figure:
     """
     regions = [Region("whole frame")]
     if first := next((view for view in views.values() if len(view.stars)), None):
-        s = int(np.argmax(first.star_fluxes))
+        s = int(np.argmax(np.nan_to_num(first.star_fluxes)))
         regions.append(Region(f"star {s + 1}", first.stars[s], first.half()))
     figure = new_figure(max(3.0 * len(views), 6.0), 2.9 * len(regions))
     axes = figure.subplots(len(regions), len(views), squeeze=False)

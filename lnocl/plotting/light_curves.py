@@ -22,7 +22,7 @@ class LightCurves(NamedTuple):
     Attributes
     ----------
     fluxes, errors : ndarray of float64, shape (n_stars, n_epochs)
-        And their standard errors, which may be NaN.
+        And their standard errors. Both are NaN where no image of the epoch shows the star.
     unit : str
         Of both.
     """
@@ -44,7 +44,8 @@ def draw(axis: Axes, curves: LightCurves) -> None:
     """Draw the fluxes of the brightest stars over their mean, with their standard errors."""
     from matplotlib.ticker import MaxNLocator
 
-    means = curves.fluxes.mean(axis=1)
+    is_seen = np.isfinite(curves.fluxes)
+    means = np.where(is_seen, curves.fluxes, 0.0).sum(axis=1) / np.maximum(is_seen.sum(axis=1), 1)
     shown = np.sort(np.argsort(-means, kind="stable")[:MOST])
     epochs = np.arange(curves.fluxes.shape[1])
     for i, s in enumerate(shown[means[shown] > 0]):

@@ -16,7 +16,7 @@ from lnocl.notebook import html_card
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import ResultView, draw_result
 from lnocl.residuals import Fit, StarResiduals, judge, residuals
-from lnocl.runs.outcome import Outcome, PsfRefinement
+from lnocl.runs.outcome import Outcome, PsfRefinement, mean_over_epochs
 from lnocl.scene.arrays import Array
 from lnocl.scene.observation import Observation
 
@@ -46,6 +46,9 @@ class Iterating(Protocol):
 
     def star_fluxes(self) -> Array:
         """Return the fluxes of stars, and then of halos, electrons."""
+
+    def is_shown(self) -> NDArray[np.bool_]:
+        """Return which of these any image shows."""
 
     def star_positions(self) -> Array:
         """Return the star positions, pixels, shape (n, 2)."""
@@ -123,9 +126,9 @@ class Estimate:
 
     @cached_property
     def star_fluxes(self) -> Array:
-        """Star fluxes, electrons, shape (n,)."""
+        """Star fluxes, electrons, shape (n,); NaN where no good pixel shows a star."""
         run = self._live()
-        return run.star_fluxes()[: len(run.star_positions())]
+        return np.where(run.is_shown(), run.star_fluxes(), np.nan)[: len(run.star_positions())]
 
     @cached_property
     def star_positions(self) -> Array:
@@ -156,7 +159,8 @@ class Result:
         Extended source, electrons per pixel of it. Its shape is the observation's ``sky_shape``:
         that of the images, times ``oversample``.
     star_fluxes : ndarray of float64, shape (n,)
-        Electrons, in the order of the stars given.
+        Electrons, in the order of the stars given. NaN where no good pixel shows a star, at all or
+        in an epoch.
     star_positions : ndarray of float64, shape (n, 2)
         (x, y) in pixels, as given or refined.
     n_iter : int
@@ -241,7 +245,8 @@ class Result:
         :doc:`/validation/errors`). Where a halo is like a star they are large. The relative
         error that the PSFs still have (`psf_refinement`) is added in quadrature. They are
         computed when they are first read. They are NaN where the images do not determine the flux,
-        as for stars that have moved to one place, or that a halo can stand in for.
+        as for stars that have moved to one place, that a halo can stand in for, or that no good
+        pixel shows.
 
         Warns
         -----
@@ -856,7 +861,7 @@ def make_result(outcome: Outcome) -> Result:
     ny, nx = scene.observation.sky_shape
     return Result(
         extended=outcome.sky[:ny, :nx],
-        star_fluxes=outcome.star_fluxes[: scene.n_stars].copy(),
+        star_fluxes=outcome.fluxes_of_stars,
         star_positions=scene.stars,
         n_iter=len(history) - 1,
         stop_reason=outcome.stop_reason,
@@ -879,7 +884,7 @@ def view_of(result: Result) -> ResultView:
         extended=result.extended,
         # Once each, whatever epochs there are.
         stars=[(x, y) for x, y in result.star_positions[:: observation.n_epochs].tolist()],
-        star_fluxes=result.star_fluxes.reshape(-1, observation.n_epochs).mean(axis=1),
+        star_fluxes=mean_over_epochs(result.star_fluxes, observation.n_epochs),
         n_iter=result.n_iter,
         history={name: result.history[name] for name in HISTORY_DTYPE.names or ()},
         held_out={name: result.held_out[name] for name in result.held_out.dtype.names or ()},

@@ -58,14 +58,14 @@ def faults(result: Result) -> list[str]:
             continue
         if not flux > NO_LIGHT:
             where = _elsewhere(result.extended, place, findings.observation.oversample)
-            dark.append(f"{_at(given)}{where}")
+            dark.append(f"{in_words(given)}{where}")
             continue
         if np.hypot(*(place - given)) > AT_LIMIT * MAX_SHIFT:
-            lost.append(f"{_at(given)} to {_at(place)}")
+            lost.append(f"{in_words(given)} to {in_words(place)}")
         if found.is_misfit:
-            unfitted.append(_at(place))
+            unfitted.append(in_words(place))
         if found.has_halo:
-            lit.append(f"{_at(place)}, {100 * found.halo:.0f} %")
+            lit.append(f"{in_words(place)}, {100 * found.halo:.0f} %")
     lines = []
     if dark:
         lines.append(f"no light is left for {counted(len(dark), 'star')}: {'; '.join(dark[:3])}")
@@ -99,7 +99,8 @@ def faults(result: Result) -> list[str]:
     return lines
 
 
-def _at(place: Iterable[float]) -> str:
+def in_words(place: Iterable[float]) -> str:
+    """Return a place as messages have it."""
     x, y = place
     return f"({x:.7g}, {y:.7g})"
 
@@ -116,6 +117,6 @@ def _elsewhere(extended: Array, place: Array, finer: int) -> str:
     at = np.array([columns.start + column, rows.start + row], float)
     brightest = (at - (finer - 1) / 2.0) / finer
     return (
-        f", and the brightest light within {ELSEWHERE} pixels lies at {_at(brightest)}: give the "
-        "star's place, or leave it out"
+        f", and the brightest light within {ELSEWHERE} pixels lies at {in_words(brightest)}: give "
+        "the star's place, or leave it out"
     )

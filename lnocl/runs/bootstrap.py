@@ -415,36 +415,37 @@ def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
 
 def _measure(outcome: Outcome, sky: Sky, parts: Sequence[Part]) -> Array:
     fluxes = _in_electrons(outcome, sky.star_fluxes)
-    positions = sky.star_positions.ravel() if outcome.moves else np.zeros(0)
+    shown = outcome.scene.is_shown[: outcome.scene.n_stars]
+    positions = sky.star_positions[shown].ravel() if outcome.moves else np.zeros(0)
     return np.concatenate(
         [fluxes, positions, *(part.measure(sky.extended, sky.light) for part in parts)]
     )
 
 
 def _in_electrons(outcome: Outcome, fluxes: Array) -> Array:
-    """Return the fluxes of stars, and those of halos in electrons of their images."""
-    return np.append(fluxes[: outcome.scene.n_stars], outcome.of_halos(fluxes).ravel())
+    """Return the fluxes of stars that are shown, and of halos in electrons of their images."""
+    n, is_shown = outcome.scene.n_stars, outcome.scene.is_shown
+    return np.append(fluxes[:n], outcome.of_halos(fluxes).ravel())[is_shown]
 
 
 def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[Quantity, ...]:
     """Return the quantities in the order of `_measure`."""
     scene = outcome.scene
-    n, (ny, nx) = scene.n_stars, scene.observation.sky_shape
+    ny, nx = scene.observation.sky_shape
     moves = outcome.moves
     n_epochs = scene.observation.n_epochs
     epochs = [f" epoch {e}" for e in range(n_epochs)] if n_epochs > 1 else [""]
-    labels = [
-        Label(f"star {s + 1}{epoch} flux", FLUX) for s in range(n // n_epochs) for epoch in epochs
-    ]
+    shown = np.flatnonzero(scene.is_shown[: scene.n_stars]).tolist()
+    labels = [Label(f"star {s // n_epochs + 1}{epochs[s % n_epochs]} flux", FLUX) for s in shown]
     labels += [
         Label(f"halo {k + 1} image {j + 1}", AMOUNT)
         for k in range(len(scene.observation.halos))
         for j in range(scene.n_images)
     ]
     if moves:
-        labels += [Label(f"star {s} {axis}", LENGTH) for s in range(1, n + 1) for axis in "xy"]
+        labels += [Label(f"star {s + 1} {axis}", LENGTH) for s in shown for axis in "xy"]
+    notes = [""] * len(labels)
     labels += [label for part in parts for label in part.labels()]
-    notes = [""] * (scene.n_fluxes + 2 * n * moves)
     observed = _observed(scene)[:ny, :nx] if parts else np.ones((0, 0), bool)
     stars = on_sky(scene.stars, scene.oversample)
     notes += [note for part in parts for note in _notes(part, stars, width, observed)]
@@ -460,13 +461,15 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
 def _shares(outcome: Outcome, parts: Sequence[Part], n_quantities: int) -> Array:
     """Return the share of each star's light in each quantity, in the order of `_measure`."""
     scene = outcome.scene
-    shares = np.eye(n_quantities, scene.n_fluxes)
-    for s in range(scene.n_stars):
+    shown = np.flatnonzero(scene.is_shown[: scene.n_stars]).tolist()
+    n_fluxes = len(shown) + scene.n_halos
+    shares = np.eye(n_quantities, n_fluxes)
+    for i, s in enumerate(shown):
         cutouts = [scene.psf_on_sky(j, s) for j in range(scene.n_images)]
-        k = scene.n_fluxes + 2 * scene.n_stars * outcome.moves
+        k = n_fluxes + 2 * len(shown) * outcome.moves
         for part in parts:
             slices = part.slices if isinstance(part, Profile) else [part]
-            shares[k : k + len(slices), s] = [
+            shares[k : k + len(slices), i] = [
                 _light_within(each, cutouts, scene.grid) for each in slices
             ]
             k += len(part.labels())  # widths hold no light

@@ -27,7 +27,7 @@ from lnocl.runs.start import Setup, make_model, make_start
 from lnocl.scene.arrays import Array
 from lnocl.scene.forward_model import Model
 from lnocl.scene.noise_check import with_noise_shown
-from lnocl.scene.observation import OF_PSFS, Observation
+from lnocl.scene.observation import BESIDE_PSFS, Observation
 from lnocl.scene.padding import choose_pad
 from lnocl.scene.penalty import Penalty, recommend_smoothing
 from lnocl.scene.psf_misfit import PsfMisfit, measure_misfit, smoothing_near_stars
@@ -106,7 +106,7 @@ class GuardedRuns:
         self._tick, observation = tick, setup.observation
         self.all_stars = setup.stars
         # PSFs that are cut to the window go without what has the shape of whole ones.
-        shown = with_noise_shown(observation).replace(**dict.fromkeys((*OF_PSFS, "psf_modes")))
+        shown = with_noise_shown(observation).replace(**dict.fromkeys(BESIDE_PSFS))
         self._side = choose_window(setup.stars, shown, observation.psfs.shape[1:])
         self.observation, self.stars, self.held = find_window(setup.stars, shown, self._side)
         # One grid for all PSFs that are tried.

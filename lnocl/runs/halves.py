@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.errors import DivergedError, NotFiniteError, warn
 from lnocl.runs.run import Run
@@ -128,6 +129,10 @@ class Halves:
         """Return the sums of the star fluxes, electrons."""
         first, second = self._runs
         return first.star_fluxes() + second.star_fluxes()
+
+    def is_shown(self) -> NDArray[np.bool_]:
+        """Return which stars, and halos, any image shows."""
+        return self._runs[0].scene.is_shown
 
     def star_positions(self) -> Array:
         """Return the means of the star positions, pixels, shape (n, 2)."""

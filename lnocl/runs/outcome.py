@@ -139,6 +139,15 @@ class Mended(NamedTuple):
     fits: bool = False
 
 
+def mean_over_epochs(fluxes: Array, n_epochs: int) -> Array:
+    """Return the mean flux of each star, star by star in each epoch, over those that are known."""
+    of_epochs = fluxes.reshape(-1, n_epochs)
+    is_known = np.isfinite(of_epochs)
+    n_known = is_known.sum(axis=1)
+    totals = np.where(is_known, of_epochs, 0.0).sum(axis=1)
+    return np.divide(totals, n_known, out=np.full(len(totals), np.nan), where=n_known > 0)
+
+
 def marginalise(
     scene: Scene, sky: Array, star_fluxes: Array, stars: bool, halos: bool, levels: bool
 ) -> tuple[Scene, Array, Array]:
@@ -210,6 +219,17 @@ class Outcome:
     def given_positions(self) -> Array:
         """The places of the stars that were given, in the order of the fluxes, shape (n, 2)."""
         return np.repeat(self.setup.stars, self.observation.n_epochs, axis=0)
+
+    @property
+    def fluxes_of_stars(self) -> Array:
+        """Electrons, shape (n,); NaN where no image shows a star in its epoch."""
+        n = self.scene.n_stars
+        return np.where(self.scene.is_shown[:n], self.star_fluxes[:n], np.nan)
+
+    @property
+    def mean_fluxes(self) -> Array:
+        """The mean of each star over the epochs that show it, electrons; NaN where none does."""
+        return mean_over_epochs(self.fluxes_of_stars, self.observation.n_epochs)
 
     @property
     def moves(self) -> bool:

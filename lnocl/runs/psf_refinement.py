@@ -160,8 +160,8 @@ def mend(
     )
     _warn(refinement)
     # Replicas draw PSFs from it, so that the errors of regions contain that of the PSFs.
-    if not len(known):
-        observation = observation.replace(psf_scatter=allowance.scatter())
+    if not len(known) and len(scatter := allowance.scatter()):
+        observation = observation.replace(psf_scatter=scatter)
     changed = replace(setup, observation=observation, refine_positions=state.moves)
     return Mended(changed, refinement, near_stars, not allowance.error)
 

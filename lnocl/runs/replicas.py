@@ -11,7 +11,6 @@ import numpy as np
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.repeated import Repeated
 from lnocl.scene.arrays import Array
-from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.star_prior import StarPrior
@@ -71,10 +70,7 @@ class Replicas:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
         width = resolution(scene)
         self._texture = Texture(
-            outcome.sky / scene.unit,
-            on_sky(scene.stars, scene.oversample),
-            width,
-            hidden_radii(scene, width),
+            outcome.sky / scene.unit, scene.shown_stars, width, hidden_radii(scene, width)
         )
         self._model = Model(scene)
         observation = scene.observation

@@ -277,6 +277,10 @@ class Run:
         """Return the star fluxes, electrons."""
         return self.engine.star_fluxes() * self.scene.unit
 
+    def is_shown(self) -> NDArray[np.bool_]:
+        """Return which stars, and halos, any image shows."""
+        return self.scene.is_shown
+
     def objective(self) -> float:
         """Return the last objective."""
         return self.engine.objective() * self.scene.scale

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from functools import partial
 from typing import Any, Literal
@@ -56,16 +56,15 @@ LITTLE_OFF_CENTRE, FAR_OFF_CENTRE = 0.25, 0.8
 # give the same light as PSFs without that noise.
 MUCH_NEGATIVE = 0.1
 
-# Attributes that hold a number for each image or for each pixel, and a number for each pixel of
-# PSFs that may be left out.
+# Attributes that hold a number for each image or for each pixel, and those that go with PSFs.
 MAPS = "background", "read_noise", "exposure"
-OF_PSFS = "ideal_psfs", "pupils", "psf_scatter"
-# Of attributes that have one and are not in counts.
-UNITS = {"exposure": "s", "offsets": "pix"}
-# Arrays that are of another type, or checked otherwise.
-UNCHECKED = "mask", "offsets", "turns", "epochs"
-# Those that may be below 0.
-SIGNED = "psfs", "ideal_psfs", "psf_modes"
+BESIDE_PSFS = "pupils", "ideal_psfs", "psf_modes", "psf_scatter"
+# What `replace` takes, in the order in which one is checked beside those before it.
+PARAMETERS = (
+    *("oversample", "effective_psfs", "images", "mask", "exposure", "psfs", *BESIDE_PSFS),
+    *("epochs", "background", "background_error", "read_noise", "halos"),
+)
+MOVES = "offsets", "transforms"
 
 
 class Observation:
@@ -131,8 +130,8 @@ class Observation:
         each image is fitted with the stars and the extended source, and is zero or more. A flat
         halo, ``np.ones((ny, nx))``, is a level of the background that is fitted in each image.
     epochs : array_like, shape (p,), optional
-        The epoch of each image, such as its night: any labels. Stars have a flux in each epoch, the
-        rest of the sky is common. By default all images are of one epoch.
+        The epoch of each image, such as its night: numbers or text. Stars have a flux in each
+        epoch, the rest of the sky is common. By default all images are of one epoch.
     oversample : {1, 2, 4}, optional
         Pixels of the sky, and of the PSFs, to one of the images along each axis. The model of a
         pixel is the sum over its pixels of the sky. It is meant for detectors with fewer than two
@@ -208,6 +207,7 @@ class Observation:
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
         - A halo is 0 on all good pixels of an image.
+        - A label of `epochs` is missing or not a number, or the labels have no order.
         - `transforms` are given beside `offsets`, `oversample` or PSFs that vary over the field,
           shear the images by more than 0.05 pixels, or are for pixels smaller than the sky's.
 
@@ -242,6 +242,9 @@ class Observation:
     (np.float64(14.0), array([9.]))
     """
 
+    images: Array
+    mask: NDArray[np.bool_]
+
     def __init__(
         self,
         images: ArrayLike,
@@ -272,61 +275,44 @@ class Observation:
             images, mask = of_one_shape(images, np.nan), of_one_shape(mask, True)
             background, read_noise, exposure = map(of_one_shape, maps.values())
         own_psfs, psfs = shapes_of(psfs), of_one_shape(psfs, 0.0, about_centre=True)
-        self.oversample = _check_oversample(oversample)
-        self.effective_psfs = flag("effective_psfs", effective_psfs)
+        self._hold_oversample(oversample)
+        self._hold_effective_psfs(effective_psfs)
         has_exposure = exposure is not None
-        counts, are_rates = containers.counts("images", images, has_exposure)
-        given, masked = values_and_mask("images", counts)
-        self.images = _stack("images", given)
-        self.mask = masked.copy().reshape(self.images.shape)
+        are_rates = self._hold_images(images, has_exposure, copy=True)
         variances = containers.variances("images", images, are_rates)
         if variances is not None:
             variances = variances.reshape(self.images.shape)
-            self.mask |= variances == 0
-        if is_uncertainty(read_noise):
-            read_noise = containers.deviations("read_noise", read_noise)
-            if np.shape(read_noise) in (self.images.shape, self.shape):
-                self.mask |= np.equal(read_noise, 0)
-        fields = read_fields(psfs, self.n_images, self.oversample, self.effective_psfs)
-        self.psf_fields = tuple(
-            field.mapped(lambda stack: np.array(_check_psfs(stack, len(stack), psf_centre)))
-            for field in fields
-        )
-        if fields:
-            y, x = (np.array(self.shape) - 1) / 2.0
-            self.psfs = np.array([field.at(x, y) for field in self.psf_fields])
-        else:
-            given_psfs = bare("psfs", psfs)
-            self.psfs = _check_psfs(given_psfs, self.n_images, psf_centre, own_psfs)
-        self.pupils = check_pixels("pupils", pupils, self.psfs)
-        self.ideal_psfs = self._check_ideals(ideal_psfs, psf_centre)
-        self.psf_modes = check_modes(psf_modes, self.psfs)
-        self.psf_scatter = check_pixels("psf_scatter", psf_scatter, self.psfs)
-        self.turns, self.offsets = self._check_maps(offsets, transforms)
-        self.epochs = self._check_epochs(epochs)
+            self._add_to_mask(variances == 0)
+        read_noise = self._deviations(read_noise)
+        self._hold_mask(mask)
+        self._mask_not_finite()
+        self._hold_exposure(exposure)
+        self._leave_out_bad_pixels()
+        read_psfs = partial(_normalised_psfs, psf_centre=psf_centre)
+        self._hold_psfs(psfs, partial(read_psfs, shapes=own_psfs))
+        self._hold_pupils(pupils)
+        self._hold_ideal_psfs(ideal_psfs, read_psfs)
+        self._hold_psf_modes(psf_modes)
+        self._hold_psf_scatter(psf_scatter)
+        # With all bad pixels known: a map is fitted to the good ones of its image.
+        self._hold_maps(offsets, transforms)
+        self._hold_epochs(epochs)
         self._orientations: tuple[Orientation, ...] = ()
         self._given_shape = self.shape
         self._frame = self._shape_of_sky(shapes)
-        self._apply_mask(mask)
-        self.exposure = self._check_exposure(1.0 if exposure is None else exposure)
-        self._refuse_all_masked()
         with np.errstate(over="ignore"):
             if are_rates:
                 self.images *= _each_pixel(self.exposure)
-            self.background = self._check_background(background, has_exposure)
-            self.background_error = self._check_error(background_error)
-            self.read_noise = self._check_read_noise(read_noise)
+            self._hold_background(background, has_exposure)
+            self._hold_background_error(background_error)
+            self._hold_read_noise(read_noise)
             if variances is not None:
                 self.read_noise = self._read_noise_of(
                     variances * _each_pixel(self.exposure) ** 2 if are_rates else variances
                 )
             self._add_read_noise()
-        self._refuse_overflow()
-        self._clip_negative()
-        self.halos = check_halos(halos, self.mask)
-        for values in self._arrays().values():
-            values.flags.writeable = False
-        self._is_checked = True
+        self._hold_halos(halos)
+        self._close()
 
     def __setattr__(self, name: str, value: object) -> None:
         if "_is_checked" in vars(self):
@@ -451,7 +437,7 @@ class Observation:
                 continue
             if name == "halos":  # whose first axis is not that of the images
                 values = np.moveaxis(values, 1, 0)
-            if name in ("psfs", "psf_modes", *OF_PSFS):
+            if name in ("psfs", *BESIDE_PSFS):
                 values = _about_centre(values, swaps)
             else:
                 values = enlarged(values, shape, float(name == "mask"))
@@ -478,17 +464,17 @@ class Observation:
         return np.array([orientation.back(image)[:ny, :nx] for orientation, image in pairs])
 
     def replace(self, **changes: Any) -> Observation:
-        """Return an observation with other values of some attributes; the rest is shared.
+        """Return an observation with some parameters replaced, checked as before; the rest is kept.
 
-        The values are those of the attributes: the square of the read noise is in images and
+        Values are as the attributes hold them: the square of the read noise is in images and
         background, and PSFs are neither normalised nor moved. Images become 0 where a pixel is bad.
 
         Parameters
         ----------
         **changes : array_like, int, bool or None
-            Values by the name of their attribute. Arrays of the attribute's type are not copied, so
-            leave them as they are. New `psfs` are the same all over the images. None stands for no
-            `ideal_psfs`, `pupils`, `psf_modes`, `psf_scatter` or `halos`.
+            Values by the name of a parameter of `Observation`; any but `psf_centre`. Images and
+            PSFs in arrays of float64 are not copied, so leave them as they are. None stands for the
+            default. New `pupils` bring their own `ideal_psfs`.
 
         Returns
         -------
@@ -498,9 +484,16 @@ class Observation:
         Raises
         ------
         InputError
-            - A name is not that of an attribute.
-            - An array has the wrong shape or type, or holds masked values or ones out of range.
-            - The sum of a PSF is not positive, or no good pixel is left.
+            - A name is not that of a parameter.
+            - A value is refused as by `Observation`, alone or beside what is kept. What has another
+              shape than before is to be replaced with all that belongs to it.
+            - `images` have an uncertainty, or are per time.
+            - `mask` has less bad pixels than before, and what these hold is not replaced.
+
+        Warns
+        -----
+        LnoclWarning
+            As `Observation`.
 
         Examples
         --------
@@ -511,58 +504,70 @@ class Observation:
         >>> other.psfs.shape, obs.psfs.shape, np.shares_memory(other.images, obs.images)
         ((2, 1, 1), (2, 3, 3), True)
         """
+        if unknown := sorted(changes.keys() - {*PARAMETERS, *MOVES}):
+            raise InputError(
+                f"`{unknown[0]}` cannot be replaced in an observation; what can is "
+                f"{', '.join((*PARAMETERS, *MOVES))}"
+            )
+        if containers.variances("images", changes.get("images"), False) is not None:
+            raise InputError("`images` with an uncertainty replace none; give `read_noise` too")
         other = copy(self)
-        held = vars(other)
-        if unknown := sorted(changes.keys() - {name for name in held if name[0] != "_"}):
-            raise InputError(f"{unknown[0]} is no attribute of an observation; leave it out")
-        if "psfs" in changes:
-            changes = {"psf_fields": (), **changes}
-        held |= {name: _read(name, values) for name, values in changes.items()}
-        other._refuse_other_shapes()
+        del vars(other)["_is_checked"]
+        if "mask" in changes:
+            other.mask = np.zeros(self.mask.shape, bool)
+        if changes.get("pupils") is not None:
+            changes = {"ideal_psfs": None, **changes}
+        for name in PARAMETERS:
+            if name in changes:
+                getattr(other, f"_hold_{name}")(changes[name])
+            elif other._is_of_other_shape(name, self):
+                values: Any = getattr(self, name)
+                if name == "psfs" and self.psf_fields:
+                    values = self.psf_fields
+                getattr(other, f"_hold_{name}")(values if np.size(values) else None)
+        other._mask_not_finite()
+        other._replace_maps(self, changes)
+        other._refuse_freed_pixels(self, changes)
+        other._leave_out_bad_pixels()
+        if len(other.halos) and other.mask is not self.mask:
+            other._hold_halos(other.halos)
         if other.shape != self.shape and not other._orientations:
-            held["_given_shape"] = held["_frame"] = other.shape
-        for name in changes:
-            if isinstance(held[name], np.ndarray) and name not in UNCHECKED:
-                _refuse_out_of_range(name, held[name])
-        refuse_dark(other.halos, other.mask)
-        if not (other.psfs.sum(axis=(1, 2)) > 0).all():
-            raise InputError("psfs must have positive sums; give others")
-        if "offsets" in changes and not other.is_turned:
-            other._check_offsets(other.offsets)
-        other._refuse_overflow()
-        if other.mask.all() or other.images[other.mask].any():
-            held["images"] = other.images.copy()
-            other._refuse_all_masked()
-            held["images"].flags.writeable = False
+            other._given_shape = other._frame = other.shape
+        other._close()
         return other
 
-    def _refuse_other_shapes(self) -> None:
-        """Refuse attributes whose shape is not that of the images or the PSFs."""
-        images, n, psf = self.images.shape, self.n_images, self.psfs.shape[1:]
-        for name in OF_PSFS:  # those left out take the shape of the PSFs
-            if not len(getattr(self, name)):
-                vars(self)[name] = np.zeros((0, *psf))
-        if not self.psf_modes.size:
-            vars(self)["psf_modes"] = np.zeros((n, 0, *psf))
-        if not self.halos.size:
-            vars(self)["halos"] = np.zeros((0, *images))
-        shapes = {
-            "images": [(n, *images[-2:])],
-            "mask": [images],
-            **{name: [images, (n,)] for name in MAPS},
-            "background_error": [(n,)],
-            "psfs": [(n, *self.psfs.shape[-2:])],
-            **{name: [(n, *psf), (0, *psf)] for name in OF_PSFS},
-            "psf_modes": [(n, *self.psf_modes.shape[1:2], *psf)],
-            "halos": [(len(self.halos), *images)],
-        }
-        for name, known in shapes.items():
-            shape = getattr(self, name).shape
-            if shape not in known:
-                raise InputError(
-                    f"`{name}` has shape {shape}, beside images of {images} and PSFs of {psf}; "
-                    "replace those that belong together at once"
-                )
+    def _is_of_other_shape(self, name: str, before: Observation) -> bool:
+        """Return whether what a parameter belongs to has another shape than before."""
+        if name in ("oversample", "effective_psfs", "images"):
+            return False
+        is_other = self.images.shape != before.images.shape
+        return is_other or (name in BESIDE_PSFS and self.psfs.shape != before.psfs.shape)
+
+    def _replace_maps(self, before: Observation, changes: dict[str, Any]) -> None:
+        """Hold the offsets or transforms of changes, or those before beside what is changed."""
+        if before._orientations and "transforms" in changes:
+            raise InputError("the images were turned upright; give `transforms` to an Observation")
+        maps = np.concatenate([before.turns, before.offsets[:, :, None]], axis=2)
+        transforms = changes.get("transforms", maps if before.is_mapped else None)
+        is_kept = transforms is None and "transforms" not in changes
+        if changes.keys() & set(MOVES) or self._is_of_other_shape("transforms", before):
+            offsets = changes.get("offsets", before.offsets if is_kept else None)
+            self._hold_maps(offsets, transforms)
+        elif transforms is not None:
+            self._refuse_beside_transforms()
+            self._refuse_one_psf_for_scales()
+
+    def _refuse_freed_pixels(self, before: Observation, changes: dict[str, Any]) -> None:
+        """Refuse to take pixels for good again of which nothing is held."""
+        if self.mask.shape != before.mask.shape:
+            return
+        n_freed = int(np.count_nonzero(before.mask & ~self.mask))
+        maps = [name for name in ("images", *MAPS) if getattr(before, name).ndim == 3]
+        if n_freed and (missing := [f"`{name}`" for name in maps if name not in changes]):
+            raise InputError(
+                f"`mask` frees {counted(n_freed, 'pixel')} of which nothing is held; give "
+                f"{', '.join(missing)} with it"
+            )
 
     def shows(self, positions: Array) -> NDArray[np.bool_]:
         """Return which positions, shape (n, 2), lie within any image, its offset added."""
@@ -577,14 +582,22 @@ class Observation:
 
         PSFs that vary are those of a place (x, y) there, by default of its middle.
         """
-        inside = np.s_[..., rows.start : rows.stop, columns.start : columns.stop]
-        held = {name: getattr(self, name) for name in ("images", "mask", "halos", *MAPS)}
-        changes: dict[str, Any] = {k: each[inside] for k, each in held.items() if each.ndim > 2}
+        other, inside = copy(self), np.s_[..., rows.start : rows.stop, columns.start : columns.stop]
+        held = vars(other)
+        del held["_is_checked"]
+        for name in ("images", "mask", "halos", *MAPS):
+            if getattr(self, name).ndim > 2:
+                held[name] = getattr(self, name)[inside]
         if self.psf_fields:
-            fields = [field.moved(-columns.start, -rows.start) for field in self.psf_fields]
+            fields = tuple(field.moved(-columns.start, -rows.start) for field in self.psf_fields)
             x, y = middle or ((len(columns) - 1) / 2.0, (len(rows) - 1) / 2.0)
-            changes |= {"psfs": [field.at(x, y) for field in fields], "psf_fields": fields}
-        return self.replace(**changes)
+            other.psf_fields, other.psfs = fields, np.array([field.at(x, y) for field in fields])
+        if not other._orientations:
+            other._given_shape = other._frame = other.shape
+        other._leave_out_bad_pixels()
+        refuse_dark(other.halos, other.mask)
+        other._close()
+        return other
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {name: each for name, each in vars(self).items() if isinstance(each, np.ndarray)}
@@ -614,72 +627,142 @@ class Observation:
         image = np.where(self.mask[0], np.nan, self.images[0])
         return html_card("lnocl.Observation", rows, image)
 
-    def _check_ideals(self, ideals: ArrayLike | None, psf_centre: PsfCentre) -> Array:
-        if ideals is None and len(self.pupils):
-            from lnocl.scene.pupils import Pupil  # which loads scipy
+    def _hold_oversample(self, oversample: object) -> None:
+        if not (isinstance(oversample, (int, np.integer)) and oversample in OVERSAMPLES):
+            raise InputError(f"`oversample` must be 1, 2 or 4; {oversample} was given")
+        self.oversample = int(oversample)
 
-            return np.array([Pupil(pupil).ideal_psf() for pupil in self.pupils])
-        if ideals is None:
-            return np.zeros((0, *self.psfs.shape[1:]))
-        checked = _check_psfs(bare("ideal_psfs", ideals), self.n_images, psf_centre)
-        if checked.shape != self.psfs.shape:
-            raise InputError(
-                f"`ideal_psfs` has PSFs of shape {checked.shape[1:]}, psfs of "
-                f"{self.psfs.shape[1:]}; give them in one shape"
-            )
-        return checked
+    def _hold_effective_psfs(self, effective_psfs: object) -> None:
+        self.effective_psfs = flag("effective_psfs", effective_psfs)
 
-    def _apply_mask(self, mask: ArrayLike | None) -> None:
-        if mask is not None:
-            given = booleans("mask", mask)
-            if given.shape not in (self.images.shape, self.shape):
-                raise InputError(
-                    f"`mask` has shape {given.shape}; the images have {self.images.shape}"
-                )
-            self.mask |= given
-        non_finite = ~np.isfinite(self.images) & ~self.mask
-        if n_non_finite := int(non_finite.sum()):
-            self.mask |= non_finite
-            warn(_pixels(n_non_finite, "image", "not finite", "masked"))
+    def _hold_images(
+        self, images: ArrayLike, has_exposure: bool | None = None, copy: bool = False
+    ) -> bool:
+        """Hold images and where they are masked; return whether they are counts per time."""
+        counts, are_rates = containers.counts("images", images, has_exposure)
+        given, masked = values_and_mask("images", counts)
+        n_before = len(self.images) if "images" in vars(self) else 0
+        self.images = _stack("images", given, n_before, copy)
+        if "mask" not in vars(self) or self.mask.shape != self.images.shape:
+            self.mask = np.zeros(self.images.shape, bool)
+        self._add_to_mask(masked.reshape(self.images.shape))
+        return are_rates
 
-    def _refuse_all_masked(self) -> None:
+    def _add_to_mask(self, bad: NDArray[np.bool_]) -> None:
+        if (bad & ~self.mask).any():
+            self.mask = self.mask | bad
+
+    def _hold_mask(self, mask: ArrayLike | None) -> None:
+        if mask is None:
+            return
+        given = booleans("mask", mask)
+        if given.shape not in (self.images.shape, self.shape):
+            raise InputError(f"`mask` has shape {given.shape}; the images have {self.images.shape}")
+        self._add_to_mask(given)
+
+    def _mask_not_finite(self) -> None:
+        not_finite = ~np.isfinite(self.images) & ~self.mask
+        if n_not_finite := int(not_finite.sum()):
+            self._add_to_mask(not_finite)
+            warn(_pixels(n_not_finite, "image", "not finite", "masked"))
+
+    def _leave_out_bad_pixels(self) -> None:
+        """Refuse images without a good pixel, and hold 0 in bad ones."""
         if self.mask.all():
             raise InputError(
                 "all pixels are masked; a mask is True, or not 0, where a pixel is bad: turn it "
                 "round if it marks the good ones"
             )
-        self.images[self.mask] = 0.0
+        if self.images[self.mask].any():
+            self.images = np.where(self.mask, 0.0, self.images)
 
-    def _check_exposure(self, exposure: ArrayLike) -> Array:
-        """Return the exposures, and mask pixels of no exposure."""
-        values = self._one_or_map("exposure", containers.seconds(exposure), 1.0)
+    def _hold_psfs(self, psfs: Any, read: Callable[[ArrayLike, int], Array] | None = None) -> None:
+        """Hold PSFs, or fields of them, as `read` returns them."""
+        read = read or _read_psfs
+        fields = read_fields(psfs, self.n_images, self.oversample, self.effective_psfs)
+        self.psf_fields = tuple(
+            field.mapped(lambda stack: np.array(read(stack, len(stack)))) for field in fields
+        )
+        if fields:
+            y, x = (np.array(self.shape) - 1) / 2.0
+            self.psfs = np.array([field.at(x, y) for field in self.psf_fields])
+        else:
+            self.psfs = read(bare("psfs", psfs), self.n_images)
+
+    def _hold_pupils(self, pupils: ArrayLike | None) -> None:
+        self.pupils = check_pixels("pupils", pupils, self.psfs)
+
+    def _hold_ideal_psfs(
+        self, ideals: ArrayLike | None, read: Callable[[ArrayLike, int], Array] | None = None
+    ) -> None:
+        if ideals is None and len(self.pupils):
+            from lnocl.scene.pupils import Pupil  # which loads scipy
+
+            self.ideal_psfs = np.array([Pupil(pupil).ideal_psf() for pupil in self.pupils])
+            return
+        if ideals is None:
+            self.ideal_psfs = np.zeros((0, *self.psfs.shape[1:]))
+            return
+        checked = (read or _read_psfs)(bare("ideal_psfs", ideals), self.n_images)
+        if checked.shape != self.psfs.shape:
+            raise InputError(
+                f"`ideal_psfs` has PSFs of shape {checked.shape[1:]}, psfs of "
+                f"{self.psfs.shape[1:]}; give them in one shape"
+            )
+        self.ideal_psfs = checked
+
+    def _hold_psf_modes(self, modes: ArrayLike | None) -> None:
+        self.psf_modes = check_modes(modes, self.psfs)
+
+    def _hold_psf_scatter(self, scatter: ArrayLike | None) -> None:
+        self.psf_scatter = check_pixels("psf_scatter", scatter, self.psfs)
+
+    def _hold_halos(self, halos: ArrayLike | None) -> None:
+        self.halos = check_halos(halos, self.mask)
+
+    def _hold_exposure(self, exposure: ArrayLike | None) -> None:
+        """Hold the exposures, and mask pixels of no exposure."""
+        given = containers.seconds(1.0 if exposure is None else exposure)
+        values = self._one_or_map("exposure", given, 1.0)
         _refuse_out_of_range("exposure", values)
         if values.ndim == 3:
-            self.mask |= values == 0
-        return values
+            self._add_to_mask(values == 0)
+        self.exposure = values
 
-    def _check_background(self, background: ArrayLike, has_exposure: bool) -> Array:
+    def _hold_background(self, background: ArrayLike, has_exposure: bool | None = None) -> None:
         given, are_rates = containers.counts("background", background, has_exposure)
         values = self._one_or_map("background", given, 0.0)
         _refuse_out_of_range("background", values)
-        if not are_rates:
-            return values
-        if values.ndim < self.exposure.ndim:
-            values = _each_pixel(values)
-        return values * (_each_pixel(self.exposure) if values.ndim == 3 else self.exposure)
+        if are_rates:
+            if values.ndim < self.exposure.ndim:
+                values = _each_pixel(values)
+            values = values * (_each_pixel(self.exposure) if values.ndim == 3 else self.exposure)
+        self.background = values
 
-    def _check_error(self, background_error: ArrayLike) -> Array:
+    def _hold_background_error(self, background_error: ArrayLike) -> None:
         given = containers.counts("background_error", background_error)[0]
         values = self._one_or_map("background_error", given, 0.0)
         _refuse_out_of_range("background_error", values)
         if values.ndim == 3:
             raise InputError("`background_error` is that of a level; give a number for each image")
-        return values
+        self.background_error = values
 
-    def _check_read_noise(self, read_noise: ArrayLike) -> Array:
-        sigma = self._one_or_map("read_noise", containers.counts("read_noise", read_noise)[0], 0.0)
-        _refuse_out_of_range("read_noise", sigma)
+    def _deviations(self, read_noise: Any) -> Any:
+        """Return the standard deviations of an uncertainty, and mask pixels where it has none."""
+        if not is_uncertainty(read_noise):
+            return read_noise
+        sigma = containers.deviations("read_noise", read_noise)
+        if np.shape(sigma) in (self.images.shape, self.shape):
+            self._add_to_mask(np.equal(sigma, 0))
         return sigma
+
+    def _hold_read_noise(self, read_noise: ArrayLike) -> None:
+        given = containers.counts("read_noise", self._deviations(read_noise))[0]
+        sigma = self._one_or_map("read_noise", given, 0.0)
+        _refuse_out_of_range("read_noise", sigma)
+        with np.errstate(over="ignore"):
+            _refuse_unless("the square of `read_noise`", sigma**2, "finite", sigma >= 0)
+        self.read_noise = sigma
 
     def _read_noise_of(self, variances: Array) -> Array:
         """Return the noise of images beyond that of their counts, by their uncertainty."""
@@ -691,7 +774,6 @@ class Observation:
 
     def _add_read_noise(self) -> None:
         variance = self.read_noise**2
-        _refuse_unless("the square of `read_noise`", variance, "finite", variance >= 0)
         if variance.any():
             np.add(self.images, _each_pixel(variance), out=self.images, where=~self.mask)
         if variance.ndim != self.background.ndim:
@@ -714,7 +796,7 @@ class Observation:
             bad = self.mask if array.ndim == 3 else self.mask.all(axis=0)
             masked_there = masked_there & ~bad  # a new array: it may be the caller's
         refuse_masked(name, masked_there)
-        values = numbers(name, array)
+        values = numbers(name, array, copy=False)
         if values.ndim < 2:
             return _one_each(name, values, self.n_images)
         if values.shape not in (self.images.shape, self.shape):
@@ -723,39 +805,55 @@ class Observation:
             )
         return np.where(self.mask, masked, values)
 
-    def _check_epochs(self, epochs: ArrayLike | None) -> NDArray[np.intp]:
+    def _hold_epochs(self, epochs: ArrayLike | None) -> None:
         if epochs is None:
-            return np.zeros(self.n_images, np.intp)
-        labels = np.asarray(epochs)
+            epochs = np.zeros(self.n_images)
+        labels, masked = values_and_mask("epochs", epochs)
+        refuse_masked("epochs", masked)
         if labels.shape != (self.n_images,):
             raise InputError(
                 f"`epochs` has shape {labels.shape}; give a label for each of the "
                 f"{self.n_images} images"
             )
-        return np.unique(labels, return_inverse=True)[1].astype(np.intp)
+        if (labels != labels).any():
+            raise InputError("`epochs` holds a label that is not a number; give one, or a name")
+        try:
+            numbered = np.unique(labels, return_inverse=True)[1]
+        except TypeError:
+            kinds = sorted({type(label).__name__ for label in labels.tolist()})
+            raise InputError(
+                f"`epochs` holds labels without an order, of {' and '.join(kinds)}; give numbers "
+                "alone, or text alone"
+            ) from None
+        self.epochs = numbered.astype(np.intp)
 
-    def _check_maps(
-        self, offsets: ArrayLike | None, transforms: ArrayLike | None
-    ) -> tuple[Array, Array]:
-        """Return the rotations and the shifts of the images."""
+    def _hold_maps(self, offsets: ArrayLike | None, transforms: ArrayLike | None) -> None:
+        """Hold the rotations and the shifts of the images."""
         if transforms is None:
-            still = np.broadcast_to(np.eye(2), (self.n_images, 2, 2))
-            return still, self._check_offsets(offsets)
+            self.turns = np.broadcast_to(np.eye(2), (self.n_images, 2, 2))
+            self.offsets = self._check_offsets(offsets)
+            return
+        self._refuse_beside_transforms(offsets is not None)
+        exact = check_transforms(transforms, [self.good_box(j) for j in range(self.n_images)])
+        self.turns, self.offsets = exact[:, :, :2].copy(), exact[:, :, 2].copy()
+        self._refuse_one_psf_for_scales()
+
+    def _refuse_beside_transforms(self, has_offsets: bool = False) -> None:
         for name, is_given in (
-            ("offsets", offsets is not None),
+            ("offsets", has_offsets),
             ("oversample", self.oversample > 1),
             ("PSFs that vary over the field", bool(self.psf_fields)),
         ):
             if is_given:
                 raise InputError(f"`transforms` are not taken beside {name}; give one of them")
-        exact = check_transforms(transforms, [self.good_box(j) for j in range(self.n_images)])
-        scales = [scale_of(each) for each in exact]
-        if self.n_images > 1 and self.psfs.strides[0] == 0 and min(scales) < max(scales):
+
+    def _refuse_one_psf_for_scales(self) -> None:
+        low, high = min(self.scales), max(self.scales)
+        if self.n_images > 1 and self.psfs.strides[0] == 0 and low < high:
             raise InputError(
-                f"one PSF is given for images whose pixels are {min(scales):.4g} and "
-                f"{max(scales):.4g} times the sky's; give one for each image, on its own pixels"
+                f"one PSF is given for images whose pixels are {low:.4g} and {high:.4g} times the "
+                "sky's; give one for each image, on its own pixels"
             )
-        return exact[:, :, :2].copy(), exact[:, :, 2].copy()
 
     def _shape_of_sky(self, shapes: Sequence[tuple[int, int]]) -> tuple[int, int]:
         """Return the shape of the image whose pixels the sky has, of images of several shapes."""
@@ -782,10 +880,19 @@ class Observation:
         )
         return values
 
+    def _close(self) -> None:
+        """Refuse counts out of range, and hold all arrays as they are from now on."""
+        self._refuse_overflow()
+        self._clip_negative()
+        for name, values in self._arrays().items():
+            if values.flags.writeable:  # the array itself may be the caller's
+                vars(self)[name] = values.view()
+                vars(self)[name].flags.writeable = False
+        self._is_checked = True
+
     def _clip_negative(self) -> None:
-        negative = self.images < 0
-        if n_negative := int(negative.sum()):
-            self.images[negative] = 0.0
+        if n_negative := int((self.images < 0).sum()):
+            self.images = np.maximum(self.images, 0.0)
             words = _pixels(n_negative, "image", "negative", "set to 0")
             if self.read_noise.any():
                 warn(f"{words}, with the square of `read_noise` added")
@@ -813,39 +920,17 @@ def mean_exposure(observation: Observation) -> float:
     return mean
 
 
-def _check_oversample(oversample: object) -> int:
-    if isinstance(oversample, (int, np.integer)) and oversample in OVERSAMPLES:
-        return int(oversample)
-    raise InputError(f"`oversample` must be 1, 2 or 4; {oversample} was given")
-
-
-def _read(name: str, values: Any) -> Any:
-    """Return the value of an attribute as it is held, in a read-only array that is no copy."""
-    if name in ("oversample", "effective_psfs"):
-        return _check_oversample(values) if name == "oversample" else flag(name, values)
-    if name == "psf_fields":
-        return tuple(values)
-    if values is None and name in (*OF_PSFS, "psf_modes", "halos"):
-        return np.zeros(0)
-    readers = {"mask": booleans, "epochs": lambda _, given: np.asarray(given, np.intp)}
-    if name in ("images", "background", "read_noise"):
-        values = containers.counts(name, values)[0]
-    elif name in ("psfs", "psf_modes", "halos", *OF_PSFS):
-        values = bare(name, values)
-    reader = partial(numbers, copy=False, unit=UNITS.get(name, ""))
-    array = readers.get(name, reader)(name, values).view()
-    array.flags.writeable = False
-    return array
-
-
 def _range(values: Array) -> str:
     low, high = float(values.min()), float(values.max())
     return f"{low:.5g}" if low == high else f"{low:.5g} to {high:.5g}"
 
 
-def _stack(name: str, values: ArrayLike) -> Array:
-    """Return a float64 copy of one or several two-dimensional arrays, as a stack."""
-    array = numbers(name, values)
+def _stack(name: str, values: ArrayLike, n_images: int = 0, copy: bool = True) -> Array:
+    """Return one or several two-dimensional arrays as a stack; several may be one for each image.
+
+    They are in float64, and copied unless that is not asked for.
+    """
+    array = numbers(name, values, copy)
     if array.ndim not in (2, 3):
         raise InputError(
             f"`{name}` has {counted(array.ndim, 'dimension')}; give two, or three for several "
@@ -853,7 +938,8 @@ def _stack(name: str, values: ArrayLike) -> Array:
         )
     if array.size == 0:
         raise InputError(f"`{name}` is empty: its shape is {array.shape}")
-    if array.ndim == 3 and array.shape[2] <= MAX_CHANNELS and min(array.shape[:2]) >= MIN_SIDE:
+    may_be_colours = array.ndim == 3 and len(array) != n_images
+    if may_be_colours and array.shape[2] <= MAX_CHANNELS and min(array.shape[:2]) >= MIN_SIDE:
         raise InputError(
             f"`{name}` has shape {array.shape}, but its axes are (p, ny, nx): of colours give one, "
             f"{name}[:, :, 0]; if they are of one sky, np.moveaxis({name}, -1, 0)"
@@ -888,9 +974,7 @@ def _refuse_unless(name: str, values: Array, requirement: str, holds: NDArray[np
 
 
 def _refuse_out_of_range(name: str, values: Array) -> None:
-    if name in SIGNED:
-        _refuse_unless(f"`{name}`", values, "finite", np.isfinite(values))
-    elif name == "exposure" and values.ndim == 1:
+    if name == "exposure" and values.ndim == 1:
         _refuse_unless(f"`{name}`", values, "finite and more than zero", values > 0)
     else:
         _refuse_unless(f"`{name}`", values, "finite and not negative", values >= 0)
@@ -906,17 +990,9 @@ def _about_centre(psfs: Array, is_square: bool) -> Array:
     return laid
 
 
-def _check_psfs(
-    psfs: ArrayLike,
-    n_images: int,
-    psf_centre: str,
-    shapes: Sequence[tuple[int, int]] = (),
-) -> Array:
-    """Return PSFs of unit sum, their cores at their centres where asked for.
-
-    Those that were enlarged from their own shapes are moved within these.
-    """
-    stack = _stack("psfs", psfs)
+def _read_psfs(psfs: ArrayLike, n_images: int, copy: bool = False) -> Array:
+    """Return PSFs with light, finite, one for each image; copied where that is asked for."""
+    stack = _stack("psfs", psfs, n_images, copy)
     if stack.shape[0] not in (1, n_images):
         raise InputError(
             f"{counted(len(stack), 'psf')} for {counted(n_images, 'image')}; give one, or one for "
@@ -939,7 +1015,21 @@ def _check_psfs(
             f"`psfs[{j}]` has the sum {sums.flat[j]:g}; it must be positive, finite and more than "
             "the rounding of its values: give another, or subtract less of a background from it"
         )
-    stack /= sums
+    return stack if copy else np.broadcast_to(stack, (n_images, *stack.shape[1:]))
+
+
+def _normalised_psfs(
+    psfs: ArrayLike,
+    n_images: int,
+    psf_centre: str,
+    shapes: Sequence[tuple[int, int]] = (),
+) -> Array:
+    """Return PSFs of unit sum, their cores at their centres where asked for.
+
+    Those that were enlarged from their own shapes are moved within these.
+    """
+    stack = _read_psfs(psfs, n_images, copy=True)
+    stack /= stack.sum(axis=(1, 2), keepdims=True)
     if n_negative := int((stack < 0).sum()):
         share = float(-stack.clip(max=0.0).sum(axis=(1, 2)).min())
         tell = warn if share > MUCH_NEGATIVE else note

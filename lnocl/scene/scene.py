@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.errors import InputError, warn
+from lnocl.errors import InputError, counted, warn
 from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
@@ -87,7 +87,8 @@ class Scene:
     stars : ndarray of float64, shape (n, 2)
         Positions. With several epochs n counts each star in each epoch, star by star.
     shown : ndarray of bool, shape (n_fluxes, p)
-        Which images show a star, those of its epoch; then which a halo, that which it is of.
+        Which images show a star, those of its epoch; none where no good pixel of these has its
+        light, and its flux is 0. Then which show a halo, that which it is of.
     rotations : list of Rotation
         How each image is turned against the sky; empty where none is.
     areas : ndarray of float64, shape (p,)
@@ -116,22 +117,23 @@ class Scene:
         Relative exposures where they are numbers, else 1; the PSFs are multiplied by them.
     star_weights : ndarray of float64, shape (n_fluxes,)
         ``sum_j <P_js, w_j>``, of each image not less than 0: the shares of the star's light that
-        were observed, summed; likewise of halos, or `HELD`.
+        were observed, summed; likewise of halos. `HELD` where a flux is to stay.
     holds_halos : bool
         Whether halos keep their fluxes.
 
     Raises
     ------
     InputError
-        A star outside the images, or masked in all of them; penalty or pad out of range; images too
-        large for the transform; exposures too large to be summed; a sky, images over exposures,
-        that is no finite number, or 0.
+        A star outside the images; penalty or pad out of range; images too large for the transform;
+        exposures too large to be summed; a sky, images over exposures, that is no finite number, or
+        0.
 
     Warns
     -----
     LnoclWarning
-        A PSF that is larger than the grid, whose wings wrap round; offsets larger than what is
-        unobserved beside the images; a PSF that rings where it is moved between pixels.
+        A star that no good pixel shows, in an epoch or at all; a PSF that is larger than the grid,
+        whose wings wrap round; offsets larger than what is unobserved beside the images; a PSF that
+        rings where it is moved between pixels.
     """
 
     def __init__(
@@ -175,7 +177,7 @@ class Scene:
         )
         self._field = self._place_stars(positions)
         self.star_weights, is_observed = self._weigh_stars(self._field)
-        self._refuse_unobserved_stars(is_observed)
+        self._leave_out_stars(~is_observed[: len(positions)])
         self.holds_halos = False
         self._warn_of_ringing()
         self._penalise(penalty)
@@ -351,6 +353,23 @@ class Scene:
         return self.n_fluxes - self.n_stars
 
     @property
+    def is_shown(self) -> NDArray[np.bool_]:
+        """Whether any image shows each star, in its epoch, and each halo; shape (n_fluxes,)."""
+        return np.asarray(self.shown.any(axis=1))
+
+    @property
+    def shown_places(self) -> Array:
+        """Positions of stars that any image shows, once each, shape (n_shown, 2)."""
+        n_epochs = self.observation.n_epochs
+        is_shown = self.is_shown[: self.n_stars].reshape(-1, n_epochs).any(axis=1)
+        return np.asarray(self.stars[::n_epochs][is_shown])
+
+    @property
+    def shown_stars(self) -> Array:
+        """Those on the sky's grid."""
+        return on_sky(self.shown_places, self.oversample)
+
+    @property
     def n_fluxes(self) -> int:
         """Number of fluxes: of the stars, and then of the halos, shape by shape."""
         return len(self.shown)
@@ -499,8 +518,9 @@ class Scene:
             grid is filled with its mean. By default flat, with the flux that the stars leave. One
             that is far brighter than the images is made as bright as that.
         star_fluxes : array_like, shape (n,), optional
-            Electrons, finite and not negative. By default a least-squares fit of the star
-            images and one constant to the images; of halos, where there are any, instead of that.
+            Electrons, finite and not negative, but for stars that no image shows, which have none.
+            By default a least-squares fit of the star images and one constant to the images; of
+            halos, where there are any, instead of that.
 
         Raises
         ------
@@ -512,7 +532,10 @@ class Scene:
             fluxes = self._rough_fit[0].copy()
         else:
             shape = (self.n_stars,)
-            fluxes = _check_start("initial_star_fluxes", star_fluxes, shape) / self.unit
+            given = numbers("initial_star_fluxes", star_fluxes)
+            if given.shape == shape:
+                given[~self.is_shown[: self.n_stars]] = 0.0
+            fluxes = _check_start("initial_star_fluxes", given, shape) / self.unit
             fluxes = np.append(fluxes, self._rough_fit[0][self.n_stars :])
         if extended is None:
             level = self._rough_fit[1]
@@ -600,6 +623,7 @@ class Scene:
         else:
             best = _solve_beside(normal, np.array(levels).T, moment)
         fluxes = np.maximum(best, least * math.prod(self.image_grid) / 100)
+        fluxes[~self.is_shown] = 0.0
         level = (total - float(fluxes @ self.star_weights)) / n_seen
         return fluxes, max(level, least * n_observed / n_seen)
 
@@ -641,11 +665,31 @@ class Scene:
             is_observed |= (on_good >= OBSERVED_SHARE * self.gains[j]) & (light > 0)
         return total, is_observed
 
-    def _refuse_unobserved_stars(self, is_observed: NDArray[np.bool_]) -> None:
-        for x, y in self.stars[~is_observed[: self.n_stars]]:
-            raise InputError(
-                f"the star at ({x:g}, {y:g}) lies where all images are masked; "
-                "leave it out or mend the mask"
+    def _leave_out_stars(self, is_lost: NDArray[np.bool_]) -> None:
+        """Hold stars at no flux, and show them in no image, where no good pixel has their light."""
+        if not is_lost.any():
+            return
+        self.shown[: len(is_lost)][is_lost] = False
+        self.star_weights[: len(is_lost)][is_lost] = HELD
+        self._field = self._place_stars(self.stars)
+        of_epochs = is_lost.reshape(-1, self.observation.n_epochs)
+        is_dark = np.asarray(of_epochs.all(axis=1))
+        stars = self.stars[:: self.observation.n_epochs]
+        if n_dark := int(is_dark.sum()):
+            x, y = stars[is_dark][0]
+            others = f", and so do {counted(n_dark - 1, 'other')}" if n_dark > 1 else ""
+            warn(
+                f"the star at ({x:g}, {y:g}) lies where all images are masked{others}: it is left "
+                "out, and its flux is NaN"
+            )
+        of_epochs = of_epochs & ~is_dark[:, None]
+        if n_lost := int(of_epochs.sum()):
+            s, epoch = np.argwhere(of_epochs)[0].tolist()
+            x, y = stars[s]
+            others = f", as {counted(n_lost - 1, 'other')} in their epochs" if n_lost > 1 else ""
+            warn(
+                f"the star at ({x:g}, {y:g}) is on no good pixel of epoch {epoch}: its flux there "
+                f"is NaN{others}"
             )
 
     def _weigh(self, relative: Array | None) -> NDArray[Any] | None:

@@ -105,6 +105,8 @@ def _masked_stars(scene: Scene) -> Iterator[int]:
     observation = scene.observation
     size = observation.shape[::-1]
     for s, star in enumerate(scene.stars):
+        if not scene.shown[s].any():  # of which is told otherwise
+            continue
         places = [observation.places(j, star) for j in range(observation.n_images)]
         nearest = np.round(places).astype(int)
         inside = ((nearest >= 0) & (nearest < size)).all(axis=1) & scene.shown[s]

@@ -304,7 +304,8 @@ class StarField:
         """Return the stars whose light in image j reaches into a window of the periodic grid."""
         firsts, sizes = self._windows[j]
         ahead, into = (firsts - first) % self._grid, (first - firsts) % self._grid
-        return np.flatnonzero(((ahead < shape) | (into < sizes)).all(axis=1)).tolist()
+        is_there = ((ahead < shape) | (into < sizes)).all(axis=1)
+        return np.flatnonzero(is_there & self.shown[:, j]).tolist()
 
     @cached_property
     def _windows(self) -> list[tuple[NDArray[np.int_], NDArray[np.int_]]]:

@@ -186,13 +186,18 @@ def _smooth(sky: Array, width: float) -> Array:
 
 
 def hidden_radii(scene: Scene, resolution: float) -> Array:
-    """Return the radius round each star in which no image has observed a pixel, pixels of the sky.
+    """Return that of `hidden_radius` for each star that is shown, once each, shape (n_shown,)."""
+    return np.array([hidden_radius(scene, star, resolution) for star in scene.shown_places])
+
+
+def hidden_radius(scene: Scene, star: Array, resolution: float) -> float:
+    """Return the radius round a star in which no image has observed a pixel, pixels of the sky.
 
     It is 0 for a star that an image has observed, for one that lies outside the images, and where
     the core of the star, which a resolution has, is wider.
     """
-    radii = np.array([_hidden_radius(scene, star) for star in scene.stars])
-    return np.where(radii > CORE * resolution, radii, 0.0)
+    radius = _hidden_radius(scene, star)
+    return radius if radius > CORE * resolution else 0.0
 
 
 def _hidden_radius(scene: Scene, star: Array) -> float:

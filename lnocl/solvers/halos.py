@@ -27,7 +27,6 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
-from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model, model_images
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.texture import Texture, hidden_radii, resolution
@@ -84,9 +83,8 @@ class _Joint:
         fitted = np.append(_like_halos(scene, precisions), np.arange(scene.n_stars, scene.n_fluxes))
         self.first = len(fitted) - scene.n_halos
         expected = extended if is_lit is None else np.where(is_lit, extended, 0.0)
-        stars = on_sky(scene.stars, scene.oversample)
         width = resolution(scene)
-        texture = Texture(expected, stars, width, hidden_radii(scene, width))
+        texture = Texture(expected, scene.shown_stars, width, hidden_radii(scene, width))
         if is_lit is not None:  # nor are stars taken to be on light that is not significant
             texture.amplitude[~is_lit] = 0.0
         source = SourceError(model.forward, model.adjoint, texture.amplitude, texture.width)
@@ -235,7 +233,7 @@ def halo_errors(scene: Scene, sky: Array, star_fluxes: Array) -> HaloErrors:
     factors = np.full(len(found), np.inf)
     for k, halo in enumerate(found):
         known = [j for j in some.tolist() if np.isfinite(halo[j])]
-        wholes = [joint.fit.variance(joint.first + k * p + j) for j in known]
+        wholes = joint.fit.variances([joint.first + k * p + j for j in known])
         raised = [whole / halo[j] for whole, j in zip(wholes, known, strict=True)]
         if raised:
             factors[k] = max(float(np.median(raised)), 1.0)

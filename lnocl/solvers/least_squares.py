@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from lnocl.scene.arrays import Array
 from lnocl.scene.smooth_field import SmoothField
 
+# A variance may be too small by this share of it, and a change off by so many standard errors.
+MISSING, NEGLIGIBLE = 1e-4, 1e-4
 # Added to the diagonal of the information, which is scaled to 1 before.
 ROUNDING = 1e-12
 
@@ -211,12 +213,33 @@ class LeastSquares:
         change, x = self._solve(self._prior @ at)
         return change, self._each(x)
 
-    def variance(self, unknown: int) -> float:
-        """Return the variance of one parameter, with the others and the fields marginalised.
+    def variances(self, unknowns: Sequence[int] | NDArray[np.int_]) -> Array:
+        """Return the variances of some parameters, with the others and the fields marginalised.
 
-        It is too small where conjugate gradients end early.
+        They are too small by less than `MISSING` of them, or where `finished` or `n_steps` ends
+        conjugate gradients. One parameter has ``F^-1_ii + <w_i, S^-1 w_i>``, F the information,
+        w_i what the parameter does to the fields and S `_curvature`. The w_i of one star in many
+        epochs are much alike. So x with ``S x = w_i`` is found for one of them, and its part taken
+        from all: with ``<x, S x> = 1``, ``w_i -= <x, w_i> S x`` leaves ``<x, w_i>^2`` less of
+        ``<w_i, S^-1 w_i>``. No direction has less than 1 in S, so that ``|w_i|^2`` bounds the rest.
         """
-        return self.row(unknown)[0]
+        if not len(unknowns):
+            return np.zeros(0)
+        columns = [self._invert(unit) for unit in np.eye(len(self._prior))[unknowns]]
+        found = np.array([column[i] for column, i in zip(columns, unknowns, strict=True)])
+        rests = np.array([self._adjoint(self._changes(column)) for column in columns])
+        least = self._finished**2 * _squares(rests)
+        for _ in columns:
+            squares, enough = _squares(rests), np.maximum(least, MISSING * found)
+            worst = int(np.argmax(squares / enough))
+            if squares[worst] <= enough[worst]:
+                break
+            x, left = self._descend(rests[worst], float(enough[worst]))
+            image = rests[worst] - left
+            shares, square = _sum("ik,k->i", rests, x), float(_sum("i,i", x, image))
+            rests -= shares[:, None] * (image / square)
+            found += shares**2 / square
+        return found
 
     def row(self, unknown: int) -> tuple[float, Array]:
         """Return the variance of one parameter, and its change by each residual, (p, Ny, Nx)."""
@@ -246,18 +269,29 @@ class LeastSquares:
         return self._invert(self._moments(left - self._forward(x)) - pull), x
 
     def _find_fields(self, wanted: Array) -> Array:
-        """Return x with ``S x = wanted`` by conjugate gradients from 0; `_curvature` applies S."""
+        """Return x with ``S x = wanted``.
+
+        What is left in that bounds by how many standard errors parameters and fields are off.
+        """
+        least = self._finished**2 * float(_sum("i,i", wanted, wanted))
+        return self._descend(wanted, max(least, NEGLIGIBLE**2))[0]
+
+    def _descend(self, wanted: Array, least: float) -> tuple[Array, Array]:
+        """Return x with ``S x = wanted`` by conjugate gradients from 0, and what is left of it.
+
+        `_curvature` applies S. They end where the square of what is left is at most `least`.
+        """
         x, rest, along = np.zeros_like(wanted), wanted, wanted
-        square = first = float(_sum("i,i", rest, rest))
+        square = float(_sum("i,i", rest, rest))
         for _ in range(self._n_steps):
-            if square <= self._finished**2 * first:
+            if square <= least:
                 break
             image = self._curvature(along)
             share = square / float(_sum("i,i", along, image))
             x, rest = x + share * along, rest - share * image
             before, square = square, float(_sum("i,i", rest, rest))
             along = rest + square / before * along
-        return x
+        return x, rest
 
     def _curvature(self, x: Array) -> Array:
         """Return ``S x``, S half the second derivative in the fields, the parameters eliminated.
@@ -296,16 +330,20 @@ class LeastSquares:
 
     def _changes(self, change: Array) -> Array:
         """Return the changes of the models, shape (p, Ny, Nx), where the unknowns change."""
-        return np.array(
-            [
-                _sum("i,ik->k", change[each.unknowns], each.slopes).reshape(each.left.shape)
-                for each in self._images
-            ]
-        )
+        images = np.zeros((len(self._images), *self._images[0].left.shape))
+        for image, each in zip(images, self._images, strict=True):
+            if (own := change[each.unknowns]).any():
+                image[:] = _sum("i,ik->k", own, each.slopes).reshape(image.shape)
+        return images
 
     def _invert(self, moments: Array) -> Array:
         """Return the inverse of `information` applied to a vector, shape (k,)."""
         return np.asarray(self._units * scipy.linalg.cho_solve(self._factor, self._units * moments))
+
+
+def _squares(vectors: Array) -> Array:
+    """Return the square of each row."""
+    return _sum("ik,ik->i", vectors, vectors)
 
 
 def _sum(products: str, a: Array, b: Array) -> Array:

@@ -88,7 +88,7 @@ class Light:
         """
         scene, (ny, nx) = self._scene, shares.shape
         inside, star_fluxes = self._inside(shares), self._star_fluxes / scene.unit
-        errors = star_flux_errors.copy()
+        errors = np.where(scene.is_shown, star_flux_errors, 0.0)
         of_counts, variances = 0.0, np.zeros(3)  # of the background, of all but stars, of stars
         factors = list(self._factors(shares))
         for j, (factor, image) in enumerate(zip(factors, scene.images(), strict=True)):

@@ -47,8 +47,8 @@ def marginal(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array
     after, fluxes = sky.copy(), star_fluxes.copy()
     n_epochs = scene.observation.n_epochs
     for first in range(0, scene.n_stars, n_epochs):
-        # The star in all epochs; one without light in any, or not determined, stays.
-        star = np.arange(first, first + n_epochs)
+        # The star in all epochs that show it; one without light in any, or not determined, stays.
+        star = first + np.flatnonzero(scene.is_shown[first : first + n_epochs])
         if not (star_fluxes[star] > 0).any():
             continue
         near = NearStar(around, first, FINISHED)

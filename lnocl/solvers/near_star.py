@@ -17,12 +17,12 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
-from lnocl.scene.detector import movable_psfs, on_sky
+from lnocl.scene.detector import movable_psfs
 from lnocl.scene.forward_model import LocalRotation, add_to_window, model_images, sampled, spread
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import along_sky
-from lnocl.scene.texture import Texture, hidden_radii, resolution
+from lnocl.scene.texture import Texture, hidden_radii, hidden_radius, resolution
 from lnocl.solvers.least_squares import Field, LeastSquares, LevelError, LinearImage, SourceError
 from lnocl.solvers.levels import planes
 
@@ -80,8 +80,8 @@ class Surroundings:
     ----------
     width : float
         The resolution, pixels of the sky.
-    hidden : ndarray of float64, shape (n,)
-        Radii round the stars in which no image has observed a pixel, pixels of the sky.
+    hidden : ndarray of float64, shape (n_shown,)
+        Radii round stars that are shown in which no image has observed a pixel, pixels of the sky.
     n_shapes : int
         Halos of each image that are unknown.
     """
@@ -160,7 +160,7 @@ class NearStar:
 
     def __init__(self, around: Surroundings, star: int, finished: float) -> None:
         scene, sky, width = around.scene, around.sky, around.width
-        self.hidden = float(around.hidden[star])
+        self.hidden = hidden_radius(scene, scene.stars[star], width)
         self.window = _window_round(scene, scene.stars[star], WINDOW * width + 2.0 * self.hidden)
         held = np.append(star, _neighbours(scene, star, width))
         there, texture = _texture_in(self.window, around)
@@ -226,8 +226,11 @@ class NearStar:
             return np.asarray(sampled(images[inside], q))
 
         def adjoint(images: Iterable[Array]) -> Array:
-            spectra = np.conj(otfs) * scipy.fft.rfft2(spread(np.array(images), q), shape)
-            return np.asarray(scipy.fft.irfft2(spectra.sum(axis=0), shape)[inside])
+            total = np.zeros_like(otfs[0])
+            for otf, image in zip(otfs, images, strict=True):
+                if image.any():  # what a flux of one epoch changes is dark in all others
+                    total += np.conj(otf) * scipy.fft.rfft2(spread(image, q), shape)
+            return np.asarray(scipy.fft.irfft2(total, shape)[inside])
 
         return SourceError(forward, adjoint, amplitude, width)
 
@@ -311,7 +314,7 @@ def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slic
         for first, k, n in zip((window.y, window.x), window.shape, scene.grid, strict=True)
     )
     whole = Window(y, x, (height, breadth))
-    stars = (on_sky(scene.stars, scene.oversample) - (x, y)) % scene.grid[::-1]
+    stars = (scene.shown_stars - (x, y)) % scene.grid[::-1]
     inside = (stars < (breadth, height)).all(axis=1)
     there = tuple(
         slice(first - start, first - start + k)

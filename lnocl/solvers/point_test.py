@@ -57,14 +57,11 @@ def point_flux(
     other = scene.with_star(place)
     fluxes = np.insert(star_fluxes, n, [max(flux, 0.0)] * n_epochs)
     near = NearStar(Surroundings(other, without, fluxes, moves, raised), n, FINISHED)
-    at = [int(np.flatnonzero(near.held == s)[0]) for s in range(n, n + n_epochs)]
-    known = variances(near.fit.information)[at]
-    change, _ = near.fit.solve(np.zeros(len(near.fit.information)))
-    found = [(fluxes[n] + change[i] * scene.unit, near.fit.variance(i)) for i, v
-             in zip(at, known, strict=True) if np.isfinite(v)]  # fmt: skip
-    if not found:
+    at = np.array([np.flatnonzero(near.held == s)[0] for s in range(n, n + n_epochs)])
+    at = at[np.isfinite(variances(near.fit.information)[at])]
+    if not len(at):
         return 0.0, np.inf
-    values, squares = np.array(found).T
-    weights = 1.0 / squares
+    change, _ = near.fit.solve(np.zeros(len(near.fit.information)))
+    values, weights = fluxes[n] + change[at] * scene.unit, 1.0 / near.fit.variances(at)
     mean = float((weights * values).sum() / weights.sum())
     return mean, float(weights.sum() ** -0.5) * scene.unit

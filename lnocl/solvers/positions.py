@@ -108,6 +108,7 @@ class StarFit:
             )
             for cutouts in both
         ]
+        is_shown = scene.is_shown[: scene.n_stars]
         is_turned = self._observation.is_turned
         scales = np.repeat(self._observation.scales, 2) if is_turned else None
         order = order_of(scene.stars, reached, scene.image_grid, scales)
@@ -117,7 +118,7 @@ class StarFit:
             diffuse += np.array(list(model.starlight(held)))
         self._likelihood = StarLikelihood.of_scene(scene, model, diffuse, covered)
         self._stars = [
-            _MovableStars(psfs, turn, where, places_there, whole, around, order)
+            _MovableStars(psfs, turn, where, places_there, whole, around, order, is_shown)
             for psfs, turn, places_there, where, whole, around in zip(
                 scene.star_psfs(scene.stars, part),
                 turns,
@@ -234,6 +235,8 @@ class _MovableStars:
         The part of the grid that each star may light, wherever it goes.
     order : Order
         Of the stars.
+    is_shown : ndarray of bool, shape (n,)
+        Whether any image shows a star; others have no light, and stay.
 
     Attributes
     ----------
@@ -250,6 +253,7 @@ class _MovableStars:
         whole: Sequence[Cutout],
         squares: Sequence[Cutout],
         order: Order,
+        is_shown: NDArray[np.bool_],
     ) -> None:
         self._grid, self._covered, self._order = (
             (covered.shape[0], covered.shape[1]),
@@ -257,6 +261,7 @@ class _MovableStars:
             order,
         )
         self._psfs, self._turn, self._places = psfs, turn, places(covered)
+        self._is_shown = is_shown
         # One number more, which the dark pixels share: their place is -1.
         self._image = np.zeros(int(covered.sum()) + 1)
         self.around: list[NDArray[np.intp]] = []
@@ -283,7 +288,8 @@ class _MovableStars:
 
     def _moving(self, s: int, position: Array) -> Cutout:
         """Return the part of star s's PSF that moves, and its derivatives along the sky's x, y."""
-        return along_sky(self._psfs[s].with_slopes(*position), self._turn)
+        star = along_sky(self._psfs[s].with_slopes(*position), self._turn)
+        return star._replace(values=self._is_shown[s] * star.values)
 
     def at(self, positions: Array) -> StarImages:
         """Return the images of the stars and their derivatives along x and y."""

@@ -92,11 +92,14 @@ def _errors_of(
     if not is_determined.any():
         return np.full(unknowns.shape, np.nan)
     change, _ = fit.solve(np.zeros(k))
-    errors = np.full(unknowns.size, np.nan)
-    for k, i in enumerate(unknowns.ravel().tolist()):
-        if is_determined[i]:
-            variance, by_residuals = fit.row(i)
-            if levels is not None:
-                variance += levels.variance_of(near.level_shares(scene, by_residuals))
-            errors[k] = np.hypot(variance**0.5, change[i])
-    return np.reshape(errors, unknowns.shape)
+    errors = np.full(unknowns.shape, np.nan)
+    known = is_determined[unknowns]
+    at = unknowns[known]
+    if levels is None:
+        found = fit.variances(at)
+    else:
+        rows = (fit.row(i) for i in at.tolist())
+        shares = [(each, near.level_shares(scene, by_residuals)) for each, by_residuals in rows]
+        found = np.array([each + levels.variance_of(share) for each, share in shares])
+    errors[known] = np.sqrt(found + change[at] ** 2)
+    return errors

@@ -10,7 +10,9 @@ from scenes import FEWER_ENGINES, paper, same, worst
 from turned_scenes import FLUXES, GRID, NX, NY, STARS, gaussian, observation
 
 import lnocl
+from lnocl.io.saved_results import read_result
 from lnocl.scene.scene import Scene
+from lnocl.solvers.near_star import NearStar, Surroundings
 
 EPOCHS = ["b", "a", "b"]  # of images 0 and 2, and of image 1, which comes first
 START = {
@@ -22,20 +24,21 @@ pytestmark = pytest.mark.filterwarnings(
 )
 
 
-def split_gradient(n_iter):
+def split_gradient(n_iter, given, is_shown):
     """Return extended source and star fluxes of the paper's iteration on the matrix."""
-    maps, given = scenes_turned.transforms(), observation()
+    maps = scenes_turned.transforms()
     stars = scenes_turned.star_columns(maps).reshape(3, NY * NX, 2)
     columns = np.zeros((3, NY * NX, 4))
     for j, epoch in enumerate((1, 0, 1)):
         columns[j, :, [epoch, 2 + epoch]] = stars[j].T
+    columns[..., ~is_shown] = 0.0
     matrix = np.hstack([scenes_turned.matrix(maps), columns.reshape(-1, 4)])
     weights, images = (~given.mask).ravel().astype(float), given.images.ravel()
     background = np.tile(scenes_turned.background().ravel(), 3)
     total = matrix.T @ weights
     is_observed = total[:-4] >= 0.01 * total[:-4].max()
     x = np.append(np.where(is_observed, 8.0, 0.0), START["initial_star_fluxes"])
-    total[:-4][~is_observed] = np.inf
+    total[:-4][~is_observed] = total[-4:][~is_shown] = np.inf
     for _ in range(n_iter):
         x *= matrix.T @ (weights * images / (matrix @ x + background)) / total
     return x[:-4].reshape(GRID)[:NY, :NX], x[-4:]
@@ -44,10 +47,135 @@ def split_gradient(n_iter):
 @pytest.mark.parametrize("engine", FEWER_ENGINES)
 def test_iterations_are_those_of_the_matrix(engine):
     result = paper(observation(epochs=EPOCHS), STARS, n_iter=30, **START, **engine)
-    extended, fluxes = split_gradient(30)
+    extended, fluxes = split_gradient(30, observation(), np.ones(4, bool))
     assert worst(result.extended, extended) <= 3e-3
     assert worst(result.star_fluxes, fluxes) <= 4e-4
     np.testing.assert_array_equal(result.star_positions, np.repeat(STARS, 2, axis=0))
+
+
+NOT_SHOWN = r"the star at \(11\.3, 8\.2\) is on no good pixel of epoch 0: its flux there is NaN$"
+
+
+def without_first_star(**changes):
+    """Return the observation with the first star masked in the one image of epoch "a"."""
+    bad = scenes_turned.mask()
+    x, y = scenes_turned.transforms()[1] @ np.append(STARS[0], 1.0)
+    v, u = np.indices(scenes_turned.SHAPE)
+    bad[1] |= np.hypot(u - x, v - y) < 7.5
+    return observation(epochs=EPOCHS, mask=bad, **changes)
+
+
+@pytest.mark.parametrize("engine", FEWER_ENGINES)
+def test_a_star_that_one_epoch_does_not_show_has_no_flux_there_and_the_others_as_before(engine):
+    given, shown = without_first_star(), np.array([False, True, True, True])
+    start = START | {"initial_star_fluxes": np.where(shown, START["initial_star_fluxes"], np.nan)}
+    with pytest.warns(lnocl.LnoclWarning, match=NOT_SHOWN):
+        result = paper(given, STARS, n_iter=30, **start, **engine)
+    extended, fluxes = split_gradient(30, given, shown)
+    assert worst(result.extended, extended) <= 3e-3
+    assert worst(result.star_fluxes[shown], fluxes[shown]) <= 4e-4
+    np.testing.assert_array_equal(np.isnan(result.star_fluxes), ~shown)
+    np.testing.assert_array_equal(np.isnan(result.star_flux_errors), ~shown)
+    np.testing.assert_array_equal(result.star_positions, np.repeat(STARS, 2, axis=0))
+
+
+def nights(bad=None, **known):
+    """Return three nights of two stars on a common host, each night with a PSF of its own."""
+    rng, (y, x) = np.random.default_rng(4), np.indices((30, 33))
+    spreads = [np.diag([1.5 + 0.3 * j, 2.2]) for j in range(3)]
+    psfs = [gaussian(*(np.indices((11, 11)) - 5), spread[::-1, ::-1]) for spread in spreads]
+    images = np.full((3, 30, 33), 20.0) + 2e3 * gaussian(x - 15, y - 14, np.diag([30.0, 20.0]))
+    for image, spread, fluxes in zip(images, spreads, NIGHTS.T, strict=True):
+        for (at_x, at_y), flux in zip(PLACES, fluxes, strict=True):
+            image += flux * gaussian(x - at_x, y - at_y, spread)
+    given = {"background": 20.0, "epochs": [5, 2, 9], "mask": bad, **known}
+    return lnocl.Observation(rng.poisson(images).astype(float), psfs, **given)
+
+
+PLACES = [(9.3, 11.7), (22.1, 18.4)]
+NIGHTS = np.array([(9e3, 7e3, 8e3), (4e3, 5e3, 6e3)])
+
+
+def bad_first_star():
+    """Return bad pixels round the first star in the last image, of epoch 2."""
+    bad, (y, x) = np.zeros((3, 30, 33), bool), np.indices((30, 33))
+    bad[2] = np.hypot(x - 9.3, y - 11.7) < 8.5
+    return bad
+
+
+@pytest.mark.filterwarnings("ignore:the star at .* is on no good pixel of epoch 2")
+def test_a_flux_that_no_image_shows_is_nan_wherever_fluxes_are_told(tmp_path):
+    given, seen, lost = nights(bad_first_star()), [], [False, False, True, False, False, False]
+    path = str(tmp_path / "run.fits")
+    options = {"n_iter": 12, "engine": "numpy", "checkpoint": path}
+
+    def stop(iteration, estimate):
+        seen.append(estimate.star_fluxes)
+        return iteration == 4
+
+    lnocl.deconvolve(given, PLACES, callback=stop, **options)
+    assert all(np.isnan(fluxes).tolist() == lost for fluxes in seen)
+    result = lnocl.deconvolve(given, PLACES, resume=path, **options)
+    same(result, lnocl.deconvolve(given, PLACES, **{**options, "checkpoint": None}))
+    pulls = (result.star_fluxes - NIGHTS[:, [1, 0, 2]].ravel()) / result.star_flux_errors
+    assert abs(pulls[~np.array(lost)]).max() < 3
+    for told in (result.star_fluxes, result.star_flux_errors, result.to_table()["flux"].value):
+        assert np.isnan(told).tolist() == lost
+    assert np.isfinite(result.extended_flux).all()
+    again = lnocl.deconvolve(
+        given, PLACES, initial_star_fluxes=result.star_fluxes, n_iter=1, stop=None, engine="numpy"
+    )
+    assert np.isnan(again.star_fluxes).tolist() == lost
+    result.write(tmp_path / "found.fits")
+    saved = read_result(str(tmp_path / "found.fits"))
+    np.testing.assert_array_equal(saved.star_fluxes, result.star_fluxes)
+
+
+@pytest.mark.filterwarnings("ignore:the star at .* is on no good pixel of epoch 2")
+def test_what_is_made_of_light_curves_leaves_out_fluxes_that_no_image_shows():
+    result = paper(nights(bad_first_star()), PLACES, n_iter=8, engine="numpy")
+    table = result.bootstrap(10).to_table()
+    of_first = [f"star 1 epoch {e} flux" for e in (0, 1)]
+    assert table["name"].tolist() == [*of_first, *(f"star 2 epoch {e} flux" for e in range(3))]
+    assert np.isfinite(table["error"]).all()
+    curves = result.significance().contrast_curves()
+    mean = result.star_fluxes[:2].mean()
+    np.testing.assert_allclose((curves["flux50"] / curves["contrast50"])[0].value, mean)
+    drawn = [axes for axes in result.plot().axes if axes.get_title() == "light curves"]
+    words = [text.get_text() for text in drawn[0].get_legend().get_texts()]
+    assert words[0] == f"star 1, mean {mean:.4g} electron"
+
+
+def test_a_star_that_images_of_an_epoch_do_not_reach_has_no_flux_there():
+    rng, (y, x) = np.random.default_rng(6), np.indices((40, 40))
+    psf = gaussian(*(np.indices((11, 11)) - 5), np.diag([2.0, 1.4]))
+    offsets, star = np.array([(0.0, 0.0), (-14.0, 0.0)]), (6.2, 21.7)
+    light = [gaussian(x - star[0] - dx, y - star[1], np.diag([1.4, 2.0])) for dx, _ in offsets]
+    images = rng.poisson(20.0 + 5e3 * np.array(light)).astype(float)
+    given = lnocl.Observation(images, psf, background=20.0, offsets=offsets, epochs=["one", "two"])
+    with pytest.warns(lnocl.LnoclWarning, match="is on no good pixel of epoch 1"):
+        result = lnocl.deconvolve(given, [star], engine="numpy")
+    assert abs(result.star_fluxes[0] - 5e3) < 3 * result.star_flux_errors[0]
+    assert np.isnan(result.star_fluxes[1])
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_star_that_is_masked_everywhere_is_left_out_and_rows_stay(moves):
+    bad = scenes_turned.mask()
+    maps, (v, u) = scenes_turned.transforms(), np.indices(scenes_turned.SHAPE)
+    masked = (33.1, 5.2)
+    for each, there in zip(bad, maps @ np.append(masked, 1.0), strict=True):
+        each |= np.hypot(u - there[0], v - there[1]) < 8.0
+    given = observation(mask=bad)
+    options = {"n_iter": 20, "refine_positions": moves, "engine": "numpy"}
+    expected = paper(given, STARS, **options)
+    with pytest.warns(lnocl.LnoclWarning, match=r"\(33\.1, 5\.2\) lies where all images are mask"):
+        found = paper(given, [STARS[0], masked, STARS[1]], **options)
+    assert np.isnan([found.star_fluxes[1], found.star_flux_errors[1]]).all()
+    assert found.star_positions[1].tolist() == [33.1, 5.2]
+    assert worst(found.star_fluxes[::2], expected.star_fluxes) <= 1e-12
+    assert worst(found.extended, expected.extended) <= 1e-12
+    assert worst(found.star_flux_errors[::2], expected.star_flux_errors) <= 1e-6
 
 
 @pytest.mark.parametrize(
@@ -83,6 +211,16 @@ def test_a_star_is_in_the_images_of_its_epoch_alone():
             np.testing.assert_array_equal(scene.star_image(j, s), expected)
     total = scene.star_weights[::2] + scene.star_weights[1::2]
     np.testing.assert_allclose(total, plain.star_weights, rtol=1e-14)
+
+
+def test_what_is_expected_under_a_star_does_not_hang_on_the_number_of_epochs():
+    """Else the edge of its core would be filled once for each."""
+    found = []
+    for scene in (Scene(observation(epochs=EPOCHS), STARS), Scene(observation(), STARS)):
+        fluxes = np.repeat(FLUXES, scene.n_stars // 2)
+        around = Surroundings(scene, scenes_turned.sky(), fluxes, moves=False)
+        found.append(NearStar(around, 0, 1e-4).expected)
+    np.testing.assert_allclose(*found, rtol=1e-12)
 
 
 def test_exposures_of_epochs_weigh_their_stars():

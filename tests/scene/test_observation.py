@@ -1,10 +1,13 @@
 """The door: what an observation makes of its input, what it refuses and what it announces."""
 
+import inspect
 import pickle
 import warnings
 
+import astropy.units as u
 import numpy as np
 import pytest
+from astropy.nddata import CCDData, StdDevUncertainty
 from scenes import paper
 
 import lnocl
@@ -450,8 +453,8 @@ def test_without_more_there_is_no_background_and_an_exposure_of_one():
 def test_one_pixel_is_said_to_be_one():
     images = np.where(IMAGES == 7, np.nan, np.where(IMAGES == 9, -1.0, IMAGES))
     _, messages, _ = announced(images=images, psfs=np.where(PSF == 2, -0.8, PSF))
-    assert messages[0].startswith("1 psf pixel is negative and was kept: 15 % of the light")
-    assert messages[1] == "1 image pixel is not finite and was masked"
+    assert messages[0] == "1 image pixel is not finite and was masked"
+    assert messages[1].startswith("1 psf pixel is negative and was kept: 15 % of the light")
     assert messages[2].startswith("1 image pixel is negative and was set to 0; if the sky was ")
 
 
@@ -560,7 +563,7 @@ def test_replace_keeps_one_psf_for_all_images_in_one():
 
 def test_replace_of_psfs_of_another_shape_takes_what_goes_with_them():
     given = two_images(psf_scatter=np.ones((3, 3)), pupils=np.ones((3, 3)))
-    with pytest.raises(InputError, match=r"^ideal_psfs has shape \(2, 3, 3\), beside images of"):
+    with pytest.raises(InputError, match=r"^pupils has shape \(2, 3, 3\); give \(5, 5\), the"):
         given.replace(psfs=np.ones((2, 5, 5)))
     other = given.replace(psfs=np.ones((2, 5, 5)), ideal_psfs=None, pupils=None, psf_scatter=None)
     assert other.pupils.shape == other.psf_scatter.shape == (0, 5, 5)
@@ -574,39 +577,190 @@ def test_replaced_psfs_are_the_same_all_over():
     assert not given.replace(psfs=given.psfs).psf_fields
 
 
+MASK_89 = np.indices((8, 9)).sum(axis=0) < 3
+MASK_89[7, 7:] = True
+HALO_89 = np.exp(-np.hypot(*(np.indices((8, 9)) - 3.4)))
+PUPIL = np.pad(np.ones((2, 2)), 1)[:3, :3]
+TURNED = lnocl.rotations([0.0, 30.0], (4, 3))
+# Wrong values of each parameter that replace takes; images are of 8 rows, and 9 columns.
+WRONG = {
+    "images": [
+        np.ones((8, 9), complex),
+        [[1.0], [2.0, 3.0]],
+        np.ones(9),
+        np.ones((0, 8, 9)),
+        np.full((2, 8, 9), 1e31),
+        np.ma.masked_all((2, 8, 9)),
+        np.full((2, 8, 9), 5.0) * u.adu,
+    ],
+    "mask": [np.ones((2, 8, 9)), np.ones((2, 8, 9), bool), np.ones((8, 8), bool), "all"],
+    "psfs": [
+        np.full((2, 3, 3), np.nan),
+        np.zeros((2, 3, 3)),
+        -np.ones((3, 3)),
+        np.ones((3, 3, 3)),
+        np.ones(3),
+        np.ma.masked_all((3, 3)),
+        [lnocl.PsfField(np.ones((1, 3, 3)), [(0, 0)])] * 3,
+    ],
+    "background": [-1.0, [1.0, np.nan], np.ones(3), np.ones((3, 8, 9)), 1e31, 3 * u.adu, None],
+    "read_noise": [-1.0, np.full(2, np.inf), np.ones((8, 8)), 1e200, 3 * u.s],
+    "exposure": [0.0, [1.0, -1.0], np.ones(3), np.zeros((8, 9)), 3 * u.m, "long"],
+    "offsets": [np.zeros((3, 2)), [(0, 0), (9, 0)], [(0, 0), (0, np.nan)], np.eye(2) * u.arcsec],
+    "transforms": [
+        np.ones((1, 2, 3)),
+        np.full((2, 2, 3), np.nan),
+        [np.eye(2, 3), [(1.0, 0.2, 0.0), (0.0, 1.0, 0.0)]],
+        [np.eye(2, 3), 2.0 * np.eye(2, 3)],
+        [np.eye(2, 3), 0.5 * np.eye(2, 3)],
+    ],
+    "epochs": [[0], [0, 1, 2], [None, "a"], [0.0, np.nan], "ab", [[1], [2, 3]]],
+    "halos": [np.ones((8, 8)), -np.ones((8, 9)), np.zeros((8, 9)), np.full((8, 9), np.nan)],
+    "oversample": [3, 0, 2.0, None],
+    "effective_psfs": [1, None],
+    "ideal_psfs": [np.ones((5, 5)), np.zeros((3, 3)), np.full((3, 3), np.inf), np.ones((3, 3, 3))],
+    "pupils": [-PUPIL, np.zeros((3, 3)), np.ones((2, 5, 5)), np.ones((3, 3, 3))],
+    "psf_modes": [np.ones((2, 4, 5, 5)), np.ones(3), np.full((1, 3, 3), np.nan)],
+    "psf_scatter": [-np.ones((2, 3, 3)), np.ones((3, 3, 3)), np.zeros((3, 3))],
+}
+
+
+def error_of(make, **changes):
+    with pytest.raises(InputError) as caught:
+        make(**changes)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_replace_refuses_what_an_observation_does_with_the_same_words(name):
+    given = {"images": np.full((2, 8, 9), 5.0), "psfs": np.ones((3, 3)), "background": [1.0, 2.0]}
+    observation = lnocl.Observation(**given)
+    for values in WRONG[name]:
+        wrong = error_of(lnocl.Observation, **{**given, name: values})
+        assert error_of(observation.replace, **{name: values}) == wrong
+
+
+def test_replace_takes_every_parameter_but_the_treatment_of_centres():
+    names = set(inspect.signature(lnocl.Observation).parameters)
+    assert set(WRONG) == names - {"psf_centre"}
+
+
+RIGHT = {
+    "mask": MASK_89,
+    "background": np.where(MASK_89, 0.0, 3.0),
+    "exposure": [1.0, 1.5] * u.min,
+    "offsets": [(0.0, 0.0), (1.5, -2.0)],
+    "transforms": TURNED,
+    "epochs": ["second", "first"],
+    "halos": HALO_89,
+    "oversample": 2,
+    "effective_psfs": True,
+    "pupils": PUPIL,
+    "psf_modes": np.arange(9.0).reshape(1, 3, 3),
+    "psf_scatter": np.arange(9.0).reshape(3, 3),
+}
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_replace_makes_what_an_observation_of_these_is(name):
+    given = {"images": np.full((2, 8, 9), 5.0), "psfs": np.ones((2, 3, 3))}
+    new = lnocl.Observation(**given, **{name: RIGHT[name]})
+    other = lnocl.Observation(**given).replace(**{name: RIGHT[name]})
+    for attribute, values in vars(new).items():
+        np.testing.assert_array_equal(getattr(other, attribute), values, err_msg=attribute)
+
+
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("known", "changes", "message"),
     [
-        ({"image": 1.0}, "image is no attribute"),
-        ({"_is_checked": True}, "_is_checked is no attribute"),
-        ({"images": np.ones((2, 8, 8))}, "mask has shape"),
-        ({"images": np.ones((8, 9))}, "images has shape"),
-        ({"images": np.full((2, 8, 9), -1.0)}, "images must be finite and not negative; -1 was"),
-        ({"images": np.full((2, 8, 9), np.nan)}, "images must be finite and not negative; nan"),
-        ({"images": np.full((2, 8, 9), 1e31)}, "the images, with exposure"),
-        ({"images": np.ma.masked_all((2, 8, 9))}, "images has 144 masked values"),
-        ({"images": np.ones((2, 8, 9), complex)}, "images holds complex128"),
-        ({"background": np.array([1.0, -2.0])}, "background must be finite and not negative; -2"),
-        ({"background": np.array([1e31, 1.0])}, "the background, with exposure"),
-        ({"background": 1.0}, r"background has shape \(\)"),
-        ({"read_noise": np.full(2, np.inf)}, "read_noise must be finite"),
-        ({"exposure": np.array([1.0, 0.0])}, "exposure must be finite and more than zero; 0 was"),
-        ({"mask": np.ones((2, 8, 9))}, "mask is of type float64"),
-        ({"mask": np.ones((2, 8, 9), bool)}, "all pixels are masked"),
-        ({"offsets": np.array([(0, 0), (9, 0)])}, "offsets must be finite, and less than"),
-        ({"psfs": np.ones((3, 3))}, "psfs has shape"),
-        ({"psfs": np.full((2, 3, 3), np.nan)}, "psfs must be finite; nan was given"),
-        ({"psfs": np.zeros((2, 3, 3))}, "psfs must have positive sums"),
-        ({"psf_scatter": -np.ones((2, 3, 3))}, "psf_scatter must be finite and not negative; -1"),
-        ({"psf_modes": np.ones((2, 4, 5, 5))}, "psf_modes has shape"),
-        ({"psf_modes": np.ones(3)}, "psf_modes has shape"),
-        ({"oversample": 3}, "oversample must be 1, 2 or 4"),
-        ({"effective_psfs": 1}, "effective_psfs must be True or False"),
+        ({}, {"image": 1.0}, "image cannot be replaced in an observation; what can is oversample"),
+        ({}, {"turns": np.zeros((2, 2, 2))}, "turns cannot be replaced"),
+        ({}, {"_is_checked": True}, "_is_checked cannot be replaced"),
+        ({}, {"images": np.ones((2, 8, 8))}, "mask has shape (2, 8, 9); the images have (2, 8, 8)"),
+        ({"transforms": TURNED}, {"oversample": 2}, "transforms are not taken beside oversample"),
+        ({"transforms": TURNED}, {"offsets": np.eye(2)}, "transforms are not taken beside offsets"),
+        (
+            {"mask": MASK_89, "exposure": np.ones((8, 9))},
+            {"mask": MASK_89 & False, "images": np.ones((2, 8, 9))},
+            "mask frees 16 pixels of which nothing is held; give exposure with it",
+        ),
+        (
+            {"mask": MASK_89},
+            {"mask": None},
+            "mask frees 16 pixels of which nothing is held",
+        ),
     ],
 )
-def test_replace_refuses(changes, message):
-    with pytest.raises(InputError, match=f"^{message}"):
-        two_images().replace(**changes)
+def test_replace_refuses_what_does_not_go_with_the_rest(known, changes, message):
+    observation = lnocl.Observation(np.full((2, 8, 9), 5.0), np.ones((3, 3)), **known)
+    assert message in error_of(observation.replace, **changes)
+
+
+def test_replaced_offsets_stay_where_images_are_turned_no_more():
+    observation = lnocl.Observation(np.full((2, 8, 9), 5.0), np.ones((3, 3)), transforms=TURNED)
+    other = observation.replace(transforms=None, offsets=[(0, 1), (2, 3)])
+    np.testing.assert_array_equal(other.offsets, [(0, 1), (2, 3)])
+    assert not other.is_mapped
+
+
+def test_a_replaced_mask_takes_the_light_of_halos_from_bad_pixels():
+    observation = lnocl.Observation(np.full((2, 8, 9), 5.0), np.ones((3, 3)), halos=HALO_89)
+    other = observation.replace(mask=MASK_89)
+    assert not other.halos[..., MASK_89].any()
+    np.testing.assert_allclose(other.halos.sum(axis=(2, 3)), 1.0, rtol=1e-15)
+
+
+# --- Epochs
+
+
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        ([None, "a"], "epochs holds labels without an order, of NoneType and str; give numbers "),
+        ([None, None], "epochs holds labels without an order, of NoneType; give numbers alone"),
+        ([60000.5, np.nan], "epochs holds a label that is not a number; give one, or a name"),
+        (np.array(["2020-01-01", "NaT"], "M8[D]"), "epochs holds a label that is not a number"),
+        (np.ma.array([1, 2], mask=[0, 1]), "epochs has 1 masked value"),
+    ],
+)
+def test_epochs_without_a_label_are_refused(labels, message):
+    wrong = error_of(lnocl.Observation, images=IMAGES[:2], psfs=PSF, epochs=labels)
+    assert wrong.startswith(message)
+
+
+# --- Bad pixels and where images lie
+
+
+def test_bad_pixels_are_the_same_however_they_are_marked():
+    """The map of an image is fitted to its good pixels, so that these are known before."""
+    images, bad = np.full((2, 40, 50), 5.0), np.zeros((2, 40, 50), bool)
+    bad[1, :, :9], bad[1, 31:] = True, True
+    sheared = np.array([np.eye(2, 3), [(1.0, 1e-3, 0.3), (2e-4, 1.0, -0.7)]])
+    known = {"psfs": np.ones((3, 3)), "transforms": sheared}
+    wanted = lnocl.Observation(images, mask=bad, **known)
+    whole = lnocl.Observation(images, **known)
+    assert abs(wanted.offsets - whole.offsets).max() > 1e-3  # so that it shows
+    errors = np.where(bad, 0.0, 3.0)
+    flagged = [CCDData(each, unit="electron", mask=m) for each, m in zip(images, bad, strict=True)]
+    unknown = [
+        CCDData(each, unit="electron", uncertainty=StdDevUncertainty(error))
+        for each, error in zip(images, errors, strict=True)
+    ]
+    for given in (
+        {"images": np.ma.array(images, mask=bad)},
+        {"images": [np.ma.array(each, mask=m) for each, m in zip(images, bad, strict=True)]},
+        {"images": flagged},
+        {"images": unknown},
+        {"images": images, "exposure": np.where(bad, 0.0, 1.0)},
+        {"images": images, "read_noise": StdDevUncertainty(errors)},
+    ):
+        found = lnocl.Observation(**given, **known)
+        np.testing.assert_array_equal(found.transforms, wanted.transforms)
+        np.testing.assert_array_equal(found.mask, wanted.mask)
+    with pytest.warns(lnocl.LnoclWarning, match="not finite and were masked"):
+        found = lnocl.Observation(np.where(bad, np.nan, images), **known)
+    np.testing.assert_array_equal(found.transforms, wanted.transforms)
 
 
 def test_attributes_cannot_be_set():

@@ -1,4 +1,4 @@
-"""Least squares of stars and fields: what their rounding depends on."""
+"""Least squares of stars and fields: what their rounding depends on, and variances."""
 
 import os
 import subprocess
@@ -7,7 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from lnocl.solvers.least_squares import LevelError
+from lnocl.solvers import least_squares
+from lnocl.solvers.least_squares import LeastSquares, LevelError, LinearImage
 
 SCRIPT = """
 import hashlib
@@ -52,3 +53,88 @@ def test_a_level_is_the_transpose_of_its_effect():
     images = rng.standard_normal((3, 6, 9))
     forward = (level.forward(np.array([1.3])) * images).sum()
     assert forward == pytest.approx(1.3 * level.adjoint(images)[0], rel=1e-13)
+
+
+SIDE = 12
+
+
+class Blurred:
+    """A field that each image sees blurred by a PSF of its own, without symmetry."""
+
+    def __init__(self, n_images):
+        self.at = np.zeros((SIDE, SIDE))
+        y, x = np.indices((SIDE, SIDE))
+        psfs = [np.exp(-(x**2) / (2 + j % 3) - (y - 0.4 * x) ** 2 / 3) for j in range(n_images)]
+        self._otfs = 9.0 * np.fft.rfft2(psfs)
+
+    def forward(self, x):
+        return np.fft.irfft2(self._otfs * np.fft.rfft2(x), (SIDE, SIDE))
+
+    def adjoint(self, images):
+        spectra = np.conj(self._otfs) * np.fft.rfft2(np.array(images))
+        return np.fft.irfft2(spectra.sum(axis=0), (SIDE, SIDE))
+
+
+def nights(n_epochs, noise=0.5):
+    """Return the least squares of two stars in each of some epochs, of an image each.
+
+    PSFs come again after 15 epochs; the noise of pixels does not, where it differs.
+    """
+    rng, (y, x) = np.random.default_rng(8), np.indices((SIDE, SIDE))
+    images = []
+    for j in range(n_epochs):
+        widths = 2.0 + 0.1 * (j % 5), 1.5
+        stars = np.array(
+            [
+                np.exp(-((x - at_x) ** 2) / widths[0] - (y - at_y) ** 2 / widths[1]).ravel()
+                for at_x, at_y in ((4.2, 5.1), (7.3, 5.9))
+            ]
+        )
+        precision = rng.uniform(1.0 - noise, 1.0 + noise, (SIDE, SIDE))
+        unknowns = np.array([j, n_epochs + j])
+        images.append(LinearImage(stars, unknowns, rng.standard_normal((SIDE, SIDE)), precision))
+    return images, Blurred(n_epochs), 2 * n_epochs
+
+
+def dense_variances(images, field, k):
+    """Return the variances of all parameters by the inverse of the whole information."""
+    slopes = np.zeros((k, len(images), SIDE**2))
+    for j, each in enumerate(images):
+        slopes[each.unknowns, j] = each.slopes
+    of_field = np.array([field.forward(unit.reshape(SIDE, SIDE)) for unit in np.eye(SIDE**2)])
+    columns = np.concatenate([slopes, of_field.reshape(SIDE**2, len(images), -1)])
+    weights = np.array([each.precision.ravel() for each in images])
+    information = np.einsum("ajn,jn,bjn->ab", columns, weights, columns)
+    information[k:, k:] += np.eye(SIDE**2)
+    return np.diag(np.linalg.inv(information))[:k]
+
+
+def test_variances_are_those_of_the_inverse_and_lack_no_more_than_is_said():
+    images, field, k = nights(6)
+    expected = dense_variances(images, field, k)
+    found = LeastSquares(images, [field], np.zeros(k), 2000, 1e-12).variances(range(k))
+    lack = 1.0 - found / expected
+    assert lack.min() > -1e-9
+    assert 0.0 < lack.max() < least_squares.MISSING
+    alone = LeastSquares(images, [field], np.zeros(k), 2000, 1e-12).variances([k - 1])
+    assert not len(LeastSquares(images, [field], np.zeros(k), 2000, 1e-12).variances([]))
+    assert alone[0] == pytest.approx(expected[-1], rel=least_squares.MISSING)
+
+
+def test_epochs_share_the_solutions_of_their_variances(monkeypatch):
+    """With a solution for each, products of the matrix would grow as the number of epochs."""
+    products, curvature = [], LeastSquares._curvature
+    monkeypatch.setattr(
+        LeastSquares, "_curvature", lambda fit, x: products.append(1) or curvature(fit, x)
+    )
+
+    def count(n_epochs, unknowns):
+        images, field, k = nights(n_epochs, noise=0.0)
+        fit = LeastSquares(images, [field], np.zeros(k), 2000, 1e-12)
+        products.clear()
+        fit.variances(unknowns)
+        return len(products)
+
+    few, many = (count(n, range(n)) for n in (15, 60))
+    assert many < 1.5 * few
+    assert many < 0.1 * 60 * count(60, [0])
