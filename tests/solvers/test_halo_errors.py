@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scenes import make_psfs
+from scipy.ndimage import gaussian_filter
 
 import lnocl
 from lnocl.scene.forward_model import Model
@@ -119,11 +120,38 @@ def test_amounts_take_the_step_of_the_dense_matrix(monkeypatch):
     left = scene.observation.images.ravel() - mean + missed
     change = np.linalg.solve(information, columns @ (left / mean))[len(STARS) : k]
     errors = np.sqrt(np.diag(np.linalg.inv(information)))[len(STARS) : k]
-    found = halos.marginal_halos(scene, sky, fluxes)[1] - fluxes
-    moved = found[len(STARS) :] * scene.mean_exposure
+    after, found = halos.marginal_halos(scene, sky, fluxes)
+    moved = (found - fluxes)[len(STARS) :] * scene.mean_exposure
     assert abs(change).max() > errors.min()
     # Conjugate gradients end at a fiftieth of the gradient.
     assert abs(moved - np.maximum(change, -AMOUNTS.ravel())).max() <= 0.05 * errors.max()
+
+    # The sky loses what halos win, as the images show it, over three resolutions.
+    depth = EXPOSURE / EXPOSURE.mean()
+    won = np.einsum("kj,kjyx->jyx", moved.reshape(AMOUNTS.shape), HALOS) / EXPOSURE.mean()
+    back = np.einsum("j,jnm,jn->m", depth, MATRICES, won.reshape(P, -1))
+    total = np.einsum("j,jnm->m", depth, MATRICES)
+    width = 3.0 * resolution(scene)
+    smooth = [
+        gaussian_filter(each, width, mode="wrap") for each in ((back / total).reshape(N, N), sky)
+    ]
+    np.testing.assert_allclose(
+        after, sky * (1.0 - np.clip(smooth[0] / smooth[1], -1, 1)), rtol=1e-9
+    )
+
+
+def test_what_lies_beyond_a_window_is_the_information_of_each_image():
+    scene, sky, fluxes, mean = an_estimate()
+    raised = np.array([4.0, 1.5])
+    around = near_star.Surroundings(scene, sky, fluxes, False, raised)
+    outside = np.ones((N, N), bool)
+    outside[9:20, 11:17] = False
+    for j, model in enumerate(mean.reshape(P, N, N)):
+        shapes = HALOS[:, j, outside] / np.sqrt(raised)[:, None]
+        expected = shapes / model[outside] @ shapes.T
+        found = around.beyond(j, near_star.Window(9, 11, (11, 6)))
+        amount = scene.unit * scene.mean_exposure  # of one, scaled, in electrons
+        np.testing.assert_allclose(found, expected * amount**2, rtol=1e-9)
 
 
 def test_a_halo_that_is_known_leaves_a_star_the_error_of_counts():
