@@ -336,7 +336,7 @@ def test_progress_ends_at_the_last_iteration(stop, words, interval, monkeypatch)
     monkeypatch.setattr("sys.stderr", screen)
     monkeypatch.setattr("lnocl.runs.progress.PROGRESS_INTERVAL", interval)
     result = run(scene()[0], n_iter=60, stop=stop, progress=True)
-    last = screen.getvalue().rstrip().rsplit("\r", 1)[-1]
+    last = [each for each in screen.getvalue().split("\r") if "iterations" in each][-1]
     assert f"{result.n_iter}/60" in last
     assert words in last
     assert "nan" not in screen.getvalue()
@@ -347,7 +347,7 @@ def test_progress_of_held_out_counts_has_no_end(monkeypatch):
     monkeypatch.setattr("sys.stderr", screen)
     monkeypatch.setattr("lnocl.runs.progress.PROGRESS_INTERVAL", 0.0)
     run(scene()[0], n_iter=60, stop="held-out", progress=True)
-    last = screen.getvalue().rstrip().rsplit("\r", 1)[-1]
+    last = [each for each in screen.getvalue().split("\r") if "iterations" in each][-1]
     assert "it [" in last
     assert "/60" not in last
     assert "objective" in last
