@@ -43,7 +43,7 @@ from lnocl.solvers.halos import without
 
 # Smoothed over so many resolutions, the extended source is lit where it is so many times the noise
 # above the darkest pixels, and so many resolutions round it.
-SMOOTHED, SIGNIFICANT, DARKEST, ROUND = 0.85, 3.0, 0.2, 2.0
+SMOOTHED, SIGNIFICANT, DARKEST, ROUND = 0.85, 4.0, 0.2, 1.0
 # Wings reach over so many resolutions, and hold about this share of the light.
 WINGS, SHARE = 4.0, 0.3
 # Relative error of the light of stars that is taken for noise.
