@@ -25,7 +25,7 @@ from photutils.background import MMMBackground, ModeEstimatorBackground, SExtrac
 from photutils.centroids import centroid_1dg, centroid_2dg, centroid_com, centroid_quadratic
 from scipy import ndimage
 
-from lnocl.io.levels import clipped_sky
+from lnocl.io.levels import sky_level
 from lnocl.psf.centring import fit_gaussian
 from lnocl.psf.repair import repair
 from lnocl.psf.resampling import rotate, shift
@@ -151,7 +151,7 @@ def levels(seed):
         image = rng.poisson(sky + light + np.zeros((n, n))) + rng.normal(0, read_noise, (n, n))
         no_pixel = np.zeros(image.shape, bool)
         ways = {
-            "lnocl": clipped_sky(0, image, no_pixel)[0],
+            "lnocl": sky_level(0, image, no_pixel)[0],
             "sigma-clipped median": sigma_clipped_stats(image)[1],
             **{
                 type(each).__name__: each(image)

@@ -285,6 +285,10 @@ def deconvolve(
     source marginalised (`lnocl.solvers.marginal`). The extended source takes up what stars lose.
     A callback and the history have the iterations as they were.
 
+    **Levels** of backgrounds with a `background_error` are fitted after a short run, and again at
+    the end, with a gradient (`lnocl.solvers.levels`). Their errors are in those of star fluxes and
+    of the extended source. Where `smoothing` is a number levels stay, with the errors as given.
+
     **The split-gradient method** lowers the objective at every iteration where PSFs are not
     negative. With many negative pixels, as in a raw frame of a star, the objective may rise again.
     All the light may then end in one pixel. Where the objective stays a tenth above its least for
@@ -332,6 +336,7 @@ def deconvolve(
     Penalty(mu)  # a wrong weight is refused before any work
     is_auto = isinstance(smoothing, str) and smoothing == "auto"
     has_halos = is_auto and len(observation.halos) > 0
+    has_levels = is_auto and bool(observation.background_error.any())
     is_auto = is_auto and len(positions) > 0
     is_auto = is_auto and not observation.psf_fields  # which are not judged
     reasons = {
@@ -352,6 +357,11 @@ def deconvolve(
     moves = refine_positions if is_auto else refine_positions is True
     shared = observation, positions, pad, solver, precision, engine, device
     setup = Setup(*shared, moves is True, *initial, settles_halos=has_halos)
+    if has_levels:
+        from lnocl.runs.halos import settle_levels  # which loads scipy
+
+        with _quietly(), Progress(None, "", bool(progress), "fitting levels", stays=False):
+            setup = settle_levels(setup)
     mended = Mended(setup)
     if is_auto or families or len(observation.psf_scatter):
         is_asked = bool(families) and not isinstance(refine_psfs, str)
@@ -377,10 +387,12 @@ def deconvolve(
         is_fit = not any(star.is_misfit for star in outcome.star_residuals())
     else:
         is_fit = is_auto and mended.fits
-    if is_fit or has_halos:
-        what = "fitting stars and halos" if has_halos else "fitting star fluxes"
+    if is_fit or has_halos or has_levels:
+        what = "fitting stars, halos and levels"
         with _quietly(), Progress(None, "", bool(progress), what, stays=False):
-            outcome = outcome.marginal(is_fit, has_halos)
+            outcome = outcome.marginal(is_fit, has_halos, has_levels)
+    for words in outcome.levels_in_words():
+        note("%s", words)
     return make_result(replace(outcome, psf_refinement=mended.refinement))
 
 

@@ -326,7 +326,8 @@ class Result:
         It is the sum of the extended source and of what the residuals have beside it
         (`lnocl.solvers.light`), so that it has no bias, and may be negative where there is little
         but noise. ``extended.sum()`` is too large there, as no pixel is negative. The error is that
-        of counts and of `star_flux_errors`. It is computed when it is first read.
+        of counts, of `star_flux_errors`, and of levels of the background that are not known. It is
+        computed when it is first read.
 
         Examples
         --------

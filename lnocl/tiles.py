@@ -477,6 +477,8 @@ class _Solver(NamedTuple):
             except InputError as error:
                 raise InputError(f"{begins}: {error.message}") from error
             errors = outcome.star_errors()
+        from lnocl.solvers.light import Light  # which loads scipy
+
         result, q = make_result(outcome), tile.observation.oversample
         rows, columns = (
             slice(span.core.start - span.window.start, span.core.stop - span.window.start)
@@ -488,7 +490,7 @@ class _Solver(NamedTuple):
         return _Found(
             result.extended,
             result.models()[:, rows, columns],
-            outcome.light().flux(within, errors[0]),
+            Light(outcome.scene, outcome.sky, outcome.star_fluxes).flux(within, errors[0]),
             np.column_stack([result.star_positions, result.star_fluxes, *errors])[tile.own],
             [at_stars[s] for s in tile.own],
             result.history,
@@ -601,7 +603,11 @@ class _Mosaic:
     def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
         """Return the light of the extended source and its standard error, electrons."""
         fluxes, errors = zip(*(found.flux for found in self._found), strict=True)
-        return sum(fluxes), math.hypot(*errors)
+        # The level of an image is wrong in all its tiles alike.
+        exposure = self.observation.exposure.reshape(self.observation.n_images, -1).mean(axis=1)
+        error = float(np.linalg.norm(self.observation.background_error)) / float(exposure.sum())
+        n_pixels = self.observation.images[0].size
+        return sum(fluxes), math.hypot(*errors, n_pixels * error)
 
     def star_residuals(self) -> list[StarResiduals]:
         """Return how well the model fits at each star."""

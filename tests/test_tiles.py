@@ -514,3 +514,13 @@ def test_the_shell_refuses_what_is_not_for_tiles(more, message, tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     assert cli.main([*write_frame(*stpsf_file()), *more]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_an_error_of_the_level_is_alike_in_all_tiles():
+    known, _ = make_frame()
+    free = known.replace(background_error=np.full(known.n_images, 0.3))
+    run = {"n_iter": 2, "smoothing": 0.01, "stop": None, "tile": 96, "pad": 8, **RUN}
+    errors = [lnocl.deconvolve_tiles(each, **run).extended_flux[1] for each in (known, free)]
+    exposure = known.exposure.reshape(known.n_images, -1).mean(axis=1).sum()
+    added = 0.3 * np.sqrt(known.n_images) * known.images[0].size / exposure
+    assert np.sqrt(errors[1] ** 2 - errors[0] ** 2) == pytest.approx(added, rel=1e-6)

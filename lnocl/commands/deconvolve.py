@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lnocl.commands import checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
-from lnocl.commands.summary import extended_flux, summarise, verdict_on
+from lnocl.commands.summary import summarise, verdict_on
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError
 from lnocl.residuals import Fit, StarResiduals
@@ -168,7 +168,7 @@ def _write(
 
 def _measured(result: Result, frames: Frames, overall: Fit, verdict: Sequence[str]) -> list[Card]:
     """Return the cards of what is in no table, but for values that a card cannot hold."""
-    flux, error = (each / frames.electrons for each in extended_flux(result, frames))
+    flux, error = (each / frames.electrons for each in result.extended_flux)
     cards: list[Card] = [
         ("EXTFLUX", flux, "flux of the extended source"),
         ("EXTERROR", error, "its standard error"),
@@ -195,8 +195,10 @@ def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def _repeated(given: Mapping[str, Any], frames: Frames) -> dict[str, Any]:
     """Return the values of the command that repeats the run, where others were given."""
+    words = given["background"] or []
     return {
-        "background": frames.background,
+        # A level that was measured is measured again: a number would be taken as known.
+        "background": words if "auto" in words else frames.background,
         "read_noise": frames.read_noise,
         "star_table": None,
         "precision": given["precision"] if given["engine"] == "opencl" else "double",
@@ -215,9 +217,20 @@ def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[s
         "smoothing": result.smoothing,
         "device": result.device,
         "gain": frames.gain,
+        "background": _levels(frames, result),
         "pad": choose_pad(frames.observation) if repeated["pad"] == "auto" else repeated["pad"],
         **({"exposure": exposure.tolist()} if repeated["exposure"] and exposure.ndim == 1 else {}),
     }
+
+
+def _levels(frames: Frames, result: Result) -> list[Any]:
+    """Return the background as given, with the levels that were fitted."""
+    before, after = frames.observation.background, result._observation.background
+    errors = frames.observation.background_error
+    return [
+        float(word + after[j].mean() - before[j].mean()) if errors[j] > 0 else word
+        for j, word in enumerate(frames.background)
+    ]
 
 
 def _star_columns(

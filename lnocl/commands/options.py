@@ -320,9 +320,9 @@ BACKGROUND = option(
     metavar="B",
     card=("BKG", "background, electrons"),
     checksum="BSUM",
-    help="electrons per pixel, a FITS file with a map of them, or auto, the sigma-clipped median "
-    "of the image, or of its darker half where light fills it; below 0 where too much sky was "
-    "subtracted; one for all images or one for each (default: 0)",
+    help="electrons per pixel, a FITS file with a map of them, or auto, measured and then fitted "
+    "with the rest; below 0 where too much sky was subtracted; one for all images or one for each "
+    "(default: 0)",
 )
 READ_NOISE = option(
     "--read-noise",

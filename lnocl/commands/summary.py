@@ -71,7 +71,7 @@ def summarise(
         REASONS[result.stop_reason],
         *stars,
         *(["; ".join(lines)] if (lines := result._halo_lines()) else []),
-        f"extended source: {_flux(*extended_flux(result, frames), frames)} in the whole frame",
+        f"extended source: {_flux(*result.extended_flux, frames)} in the whole frame",
         *_floor(result, frames, unit),
         *_unnamed(result, frames),
         f"residuals {_rms(overall)} in all, where noise gives 1",
@@ -144,18 +144,6 @@ def _areas(observation: Observation) -> NDArray[np.float64]:
 def _means(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the mean of each image, of numbers or maps."""
     return np.asarray(values.reshape(len(values), -1).mean(axis=1))
-
-
-def extended_flux(result: Result, frames: Frames) -> tuple[float, float]:
-    """Return the flux of the extended source, electrons, and its error.
-
-    The error is that of the result, and of the background where this was measured.
-    """
-    flux, error = result.extended_flux
-    observation = frames.observation
-    n_pixels = observation.images[0].size
-    of_level = n_pixels * float(np.linalg.norm(frames.background_errors))
-    return flux, math.hypot(error, of_level / float(_means(observation.exposure).sum()))
 
 
 def _flux(flux: float, error: float, frames: Frames) -> str:

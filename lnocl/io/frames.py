@@ -51,7 +51,7 @@ class Calibration(NamedTuple):
     ----------
     background : sequence of Word
         Electrons per pixel, one or one for each image: a number, a map, or ``"auto"``, the
-        sigma-clipped median of the image.
+        mode of the image (`lnocl.io.levels`), which is then fitted with the rest.
     read_noise : sequence of Word
         Standard deviation, electrons: numbers, maps, a keyword of the headers, of the images or
         their files, or ``"auto"``, what the sigma-clipped scatter of the image has beyond the noise
@@ -136,8 +136,6 @@ class Frames(NamedTuple):
         Electrons, or electrons per second, in this unit.
     gain : float, optional
         As given, or as the headers have it.
-    background_errors : ndarray of float64, shape (p,)
-        Standard errors of the backgrounds that ``"auto"`` found, electrons per pixel; 0 of others.
     """
 
     observation: Observation
@@ -148,7 +146,6 @@ class Frames(NamedTuple):
     unit: str
     electrons: float
     gain: float | None
-    background_errors: Array
 
 
 def read_frames(images: Sequence[str], psfs: Sequence[str], calibration: Calibration) -> Frames:
@@ -218,6 +215,8 @@ class _Reader:
             _in_own_shapes(counts, self._images.shapes),
             self._grids or _in_own_shapes(self._psfs.data, self._psfs.shapes),
             background=self._maps.combine("background", levels),
+            # A flat halo is fitted in the place of the level.
+            background_error=self._background_errors * (FLAT not in self._calibration.halos),
             read_noise=self._maps.combine("read_noise", read_noise)
             if noise is None
             else noise.read_noise(counts, each, mask),
@@ -250,7 +249,6 @@ class _Reader:
             name,
             of_unit,
             self._gain,
-            self._background_errors,
         )
 
     def _halos(self) -> Array | None:

@@ -25,7 +25,7 @@ from lnocl.scene.arrays import numbers
 from lnocl.solvers.engine import State
 
 OBSERVED = (
-    *("images", "psfs", "background", "mask", "exposure", "offsets", "turns"),
+    *("images", "psfs", "background", "background_error", "mask", "exposure", "offsets", "turns"),
     *("epochs", "halos"),
     *("oversample", "effective_psfs"),
 )

@@ -1,9 +1,9 @@
-"""Amounts of halos that runs are to hold, from a short run.
+"""Amounts of halos, and levels of the background, that runs are to hold, from a short run.
 
 Fitted with a sky that is positive and free, halos lose more of their light with every iteration
 (`lnocl.solvers.halos`). So they are first estimated in a run that is too short for that, with the
 extended source marginalised. Then the reconstruction holds them, and they are estimated again when
-it has ended.
+it has ended. So are levels that are not known, which are held as background.
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ import numpy as np
 
 from lnocl.process import ignored_notes, ignored_warnings
 from lnocl.runs.run import Run
-from lnocl.runs.start import Start, make_model, make_start, measure_steps
+from lnocl.runs.start import Setup, Start, make_model, make_start, measure_steps
+from lnocl.scene.arrays import Array
 from lnocl.scene.penalty import Penalty
+from lnocl.scene.scene import Scene
 from lnocl.solvers.halos import marginal_halos
+from lnocl.solvers.levels import fit_levels
 
 # Iterations of the short run: the most likely amounts are right to 0.5 % then, and fall.
 N_ITER = 10
@@ -28,13 +31,7 @@ def settle_halos(start: Start) -> Start:
     if not (setup.settles_halos and start.scene.n_halos):
         return start
     with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
-        free = replace(setup, solver="sgp", refine_positions=False, initial_extended=None)
-        run = Run(make_start(free, Penalty()), N_ITER)
-        for _ in run:
-            pass
-        scene, fluxes = run.scene, run.star_fluxes()
-        sky = run.engine.extended().astype(np.float64) * scene.unit
-        del run  # the device need not hold both
+        scene, sky, fluxes = _short_run(setup)
         fluxes = marginal_halos(scene, sky, fluxes)[1]
     n = scene.n_stars
     fluxes = np.append(start.star_fluxes[:n], fluxes[n:] / scene.unit)
@@ -42,3 +39,19 @@ def settle_halos(start: Start) -> Start:
     extended = start.extended if setup.initial_extended is not None else held.start(None, None)[0]
     fluxes, scaling = measure_steps(setup, held, make_model(held), extended, fluxes)
     return replace(start, scene=held, extended=extended, star_fluxes=fluxes, scaling=scaling)
+
+
+def settle_levels(setup: Setup) -> Setup:
+    """Return a setup with the levels of the background that are fitted after a short run."""
+    with ignored_warnings(), ignored_notes():
+        scene = fit_levels(*_short_run(setup))[0]
+    return replace(setup, observation=scene.observation)
+
+
+def _short_run(setup: Setup) -> tuple[Scene, Array, Array]:
+    """Return scene, extended source and fluxes after a short run, electrons."""
+    free = replace(setup, solver="sgp", refine_positions=False, initial_extended=None)
+    run = Run(make_start(free, Penalty()), N_ITER)
+    for _ in run:
+        pass
+    return run.scene, run.engine.extended().astype(np.float64) * run.scene.unit, run.star_fluxes()

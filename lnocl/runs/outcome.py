@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from lnocl.scene.scene import Scene
 from lnocl.scene.stars import MAX_SHIFT
 
 if TYPE_CHECKING:
+    from lnocl.solvers.levels import Levels
     from lnocl.solvers.light import Light
 
 CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("error", np.float64)])
@@ -138,12 +140,16 @@ class Mended(NamedTuple):
 
 
 def marginalise(
-    scene: Scene, sky: Array, star_fluxes: Array, stars: bool, halos: bool
-) -> tuple[Array, Array]:
-    """Return extended source and fluxes, those of halos and of stars marginal where wanted.
+    scene: Scene, sky: Array, star_fluxes: Array, stars: bool, halos: bool, levels: bool
+) -> tuple[Scene, Array, Array]:
+    """Return scene, extended source and fluxes, with levels, halos and stars marginal where wanted.
 
-    `lnocl.solvers.halos` and `lnocl.solvers.marginal` have the equations.
+    `lnocl.solvers.levels`, `lnocl.solvers.halos` and `lnocl.solvers.marginal` have the equations.
     """
+    if levels:
+        from lnocl.solvers.levels import fit_levels
+
+        scene, sky = fit_levels(scene, sky, star_fluxes)
     if halos:
         from lnocl.solvers.halos import marginal_halos
 
@@ -152,7 +158,7 @@ def marginalise(
         from lnocl.solvers.marginal import marginal
 
         sky, star_fluxes = marginal(scene, sky, star_fluxes)
-    return sky, star_fluxes
+    return scene, sky, star_fluxes
 
 
 @dataclass(frozen=True)
@@ -181,6 +187,8 @@ class Outcome:
         Whether the star fluxes are those of `marginal`, and so those of replicas.
     has_marginal_halos : bool
         Whether the amounts of halos are, likewise.
+    has_levels : bool
+        Whether levels of the background were fitted.
     """
 
     setup: Setup
@@ -193,17 +201,27 @@ class Outcome:
     psf_refinement: PsfRefinement | None = None
     is_marginal: bool = False
     has_marginal_halos: bool = False
+    has_levels: bool = False
 
     @property
     def moves(self) -> bool:
         """Whether stars were moved."""
         return self.setup.refine_positions and self.scene.n_stars > 0
 
-    def marginal(self, stars: bool, halos: bool) -> Outcome:
-        """Return the outcome with marginal star fluxes, or amounts of halos, or both."""
-        sky, fluxes = marginalise(self.scene, self.sky, self.star_fluxes, stars, halos)
+    def marginal(self, stars: bool, halos: bool, levels: bool) -> Outcome:
+        """Return the outcome with marginal star fluxes, amounts of halos, or levels fitted."""
+        scene, sky, fluxes = marginalise(
+            self.scene, self.sky, self.star_fluxes, stars, halos, levels
+        )
         return replace(
-            self, sky=sky, star_fluxes=fluxes, is_marginal=stars, has_marginal_halos=halos
+            self,
+            setup=replace(self.setup, observation=scene.observation),
+            scene=scene,
+            sky=sky,
+            star_fluxes=fluxes,
+            is_marginal=stars,
+            has_marginal_halos=halos,
+            has_levels=levels,
         )
 
     def of_halos(self, fluxes: Array) -> Array:
@@ -239,7 +257,30 @@ class Outcome:
         """Return the light of the extended source without bias."""
         from lnocl.solvers.light import Light  # which loads scipy
 
-        return Light(self.scene, self.sky, self.star_fluxes)
+        return Light(self.scene, self.sky, self.star_fluxes, self.levels)
+
+    @cached_property
+    def levels(self) -> Levels | None:
+        """The levels of the background, where they are not known."""
+        if not self.scene.observation.background_error.any():
+            return None
+        from lnocl.solvers.levels import Levels  # which loads scipy
+
+        return Levels(self.scene, self.sky, self.star_fluxes, self.has_levels)
+
+    def levels_in_words(self) -> list[str]:
+        """Return the level of each image whose background was fitted, electrons per pixel."""
+        if self.levels is None or not self.has_levels:
+            return []
+        observation = self.scene.observation
+        pairs = zip(observation.background, observation.read_noise, strict=True)
+        levels = [float(np.mean(level) - np.mean(noise**2)) for level, noise in pairs]
+        return [
+            f"`images[{j}]`: background {levels[j]:.6g} +- {error:.2g} electrons per pixel, fitted "
+            "with the rest"
+            for j, error in enumerate(self.levels.errors[:, 0])
+            if error > 0
+        ]
 
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of fluxes and positions, the extended source not known.
@@ -260,7 +301,9 @@ class Outcome:
         scene, moves = self.scene, self.moves
         star_fluxes = self.star_fluxes[: scene.n_stars]
         halos = halo_errors(scene, self.sky, self.star_fluxes)
-        errors = standard_errors(scene, self.sky, self.star_fluxes, moves, halos.raised)
+        errors = standard_errors(
+            scene, self.sky, self.star_fluxes, moves, halos.raised, self.levels
+        )
         is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (star_fluxes > 0)
         _warn_of_undetermined(scene.stars[is_lost], bool(np.isnan(halos.errors).any()))
         if self.psf_refinement is not None:

@@ -47,6 +47,6 @@ class Repeated:
                 pass
         scene = run.scene
         sky, star_fluxes = run.engine.extended() * scene.unit, run.star_fluxes()
-        wanted = outcome.is_marginal, outcome.has_marginal_halos
-        sky, star_fluxes = marginalise(scene, sky, star_fluxes, *wanted)
+        wanted = outcome.is_marginal, outcome.has_marginal_halos, outcome.has_levels
+        scene, sky, star_fluxes = marginalise(scene, sky, star_fluxes, *wanted)
         return dataclasses.replace(outcome, scene=scene, sky=sky, star_fluxes=star_fluxes)

@@ -96,7 +96,11 @@ class Observation:
         that vary over the image. Each star then has the PSF of its own place. The extended source
         has that of the middle; `lnocl.deconvolve_tiles` has one for each tile.
     background : float or array_like, shape (p,) or (p, ny, nx), optional
-        Known background, electrons per pixel, zero or more. A Quantity may be per time.
+        Background, electrons per pixel, zero or more. A Quantity may be per time.
+    background_error : float or array_like, shape (p,), optional
+        Standard error of the level of `background`, electrons per pixel; 0 where it is known. Where
+        it is more, `lnocl.deconvolve` fits the level with the rest, and a gradient of it
+        (`lnocl.solvers.levels`).
     read_noise : float or array_like, shape (p,) or (p, ny, nx), optional
         Standard deviation of the read noise, electrons per pixel, zero or more. Its square is added
         to images and background (Snyder's approximation of Gaussian noise by Poisson noise). A
@@ -163,6 +167,8 @@ class Observation:
         Electrons per pixel, the square of `read_noise` included; 0 where a pixel is bad.
     background : ndarray of float64, shape (p,) or (p, ny, nx)
         Electrons per pixel, the square of `read_noise` included.
+    background_error : ndarray of float64, shape (p,)
+        As given.
     read_noise : ndarray of float64, shape (p,) or (p, ny, nx)
         As given.
     exposure : ndarray of float64, shape (p,) or (p, ny, nx)
@@ -242,6 +248,7 @@ class Observation:
         psfs: ArrayLike | PsfField | Sequence[PsfField],
         *,
         background: ArrayLike = 0.0,
+        background_error: ArrayLike = 0.0,
         read_noise: ArrayLike = 0.0,
         mask: ArrayLike | None = None,
         exposure: ArrayLike | None = None,
@@ -307,6 +314,7 @@ class Observation:
             if are_rates:
                 self.images *= _each_pixel(self.exposure)
             self.background = self._check_background(background, has_exposure)
+            self.background_error = self._check_error(background_error)
             self.read_noise = self._check_read_noise(read_noise)
             if variances is not None:
                 self.read_noise = self._read_noise_of(
@@ -542,6 +550,7 @@ class Observation:
             "images": [(n, *images[-2:])],
             "mask": [images],
             **{name: [images, (n,)] for name in MAPS},
+            "background_error": [(n,)],
             "psfs": [(n, *self.psfs.shape[-2:])],
             **{name: [(n, *psf), (0, *psf)] for name in OF_PSFS},
             "psf_modes": [(n, *self.psf_modes.shape[1:2], *psf)],
@@ -658,6 +667,14 @@ class Observation:
         if values.ndim < self.exposure.ndim:
             values = _each_pixel(values)
         return values * (_each_pixel(self.exposure) if values.ndim == 3 else self.exposure)
+
+    def _check_error(self, background_error: ArrayLike) -> Array:
+        given = containers.counts("background_error", background_error)[0]
+        values = self._one_or_map("background_error", given, 0.0)
+        _refuse_out_of_range("background_error", values)
+        if values.ndim == 3:
+            raise InputError("`background_error` is that of a level; give a number for each image")
+        return values
 
     def _check_read_noise(self, read_noise: ArrayLike) -> Array:
         sigma = self._one_or_map("read_noise", containers.counts("read_noise", read_noise)[0], 0.0)

@@ -385,7 +385,7 @@ class Scene:
         for j, image in enumerate(self.observation.images):
             laid = np.zeros(self.image_grid)
             np.divide(image, self.scale, out=laid[:ny, :nx])
-            yield self._per_exposure(laid, 0.0, j)
+            yield self.per_exposure(laid, 0.0, j)
 
     def background(self) -> Array:
         """Return the background, scaled, shape (p,) or (p, ny, nx); 1 where not observed."""
@@ -394,12 +394,15 @@ class Scene:
             background = np.broadcast_to(background[:, None, None], self.observation.images.shape)
         if background.ndim == 1:
             return background
-        return self._per_exposure(self._on_grid(background, fill=1.0), 1.0, slice(None))
+        return self.per_exposure(self._on_grid(background, fill=1.0), 1.0, slice(None))
 
-    def _per_exposure(self, values: Array, fill: float, j: int | slice) -> Array:
+    def per_exposure(
+        self, values: Array, fill: float, j: int | slice, there: Any = np.s_[:]
+    ) -> Array:
+        """Return counts of images over relative exposures, where these are maps and weights."""
         if self.weights is None or not self.has_exposure_map:
             return values
-        weights = self.weights[j]
+        weights = self.weights[j][there]
         return np.divide(values, weights, out=np.full_like(values, fill), where=weights > 0)
 
     def in_electrons(self, model: Array, j: int, there: Any = np.s_[:]) -> Array:

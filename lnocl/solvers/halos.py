@@ -18,6 +18,7 @@ others, and what images far from a star tell of a halo at it (`lnocl.solvers.nea
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -95,11 +96,21 @@ class _Joint:
             shown = np.flatnonzero(scene.shown[fitted, j])
             slopes = np.array([scene.star_image(j, s).ravel() for s in fitted[shown]])
             images.append(LinearImage(slopes, shown, counts - total + less, precision))
-        self.fit = LeastSquares(images, [source], np.zeros(len(fitted)), N_STEPS, FINISHED)
+        # A level that is not known is a halo that is flat, which the prior holds.
+        errors = scene.observation.background_error / scene.scale
+        for k, j in enumerate(np.flatnonzero(errors).tolist()):
+            image, flat = images[j], scene.per_exposure(np.ones(scene.image_grid), 0.0, j)
+            images[j] = image._replace(
+                slopes=np.append(image.slopes, flat.reshape(1, -1), axis=0),
+                unknowns=np.append(image.unknowns, len(fitted) + k),
+            )
+        prior = np.append(np.zeros(len(fitted)), errors[errors > 0] ** -2.0)
+        self.halos = slice(self.first, len(fitted))
+        self.fit = LeastSquares(images, [source], prior, N_STEPS, FINISHED)
 
     def change(self) -> Array:
         """Return the changes of the halos to where they are least, scaled."""
-        return self.fit.solve(np.zeros(len(self.fit.information)))[0][self.first :]
+        return self.fit.solve(np.zeros(len(self.fit.information)))[0][self.halos]
 
 
 def _like_halos(scene: Scene, precisions: list[Array]) -> NDArray[np.int_]:
@@ -140,13 +151,14 @@ def marginal_halos(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array,
     for _ in range(STEPS):
         is_lit = _significant(scene, model, sky / scene.unit, fluxes / scene.unit)
         joint = _Joint(scene, model, sky, fluxes, is_lit)
-        information = np.diag(joint.fit.information)[joint.first :]
+        information = np.diag(joint.fit.information)[joint.halos]
         # What a star or another halo can stand in for stays.
-        is_told = np.isfinite(variances(joint.fit.information))[joint.first :]
+        is_told = np.isfinite(variances(joint.fit.information))[joint.halos]
         change = np.where(is_told, joint.change(), 0.0) * scene.unit
         change = np.maximum(change, -halos)
         halos += change
-        sky = _without(scene, model, sky, np.append(np.zeros(scene.n_stars), change))
+        won = model.starlight(np.append(np.zeros(scene.n_stars), change) / scene.unit)
+        sky = without(scene, model, sky, won)
         if (abs(change) * np.sqrt(information) < SETTLED * scene.unit).all():
             break
     return sky, fluxes
@@ -169,15 +181,17 @@ def _significant(scene: Scene, model: Model, extended: Array, fluxes: Array) -> 
     return np.asarray(maximum_filter(is_lit, 2 * int(np.ceil(ROUND * width)) + 1, mode="wrap"))
 
 
-def _without(scene: Scene, model: Model, sky: Array, fluxes: Array) -> Array:
-    """Return the extended source less light that halos won, or with what they lost.
+def without(scene: Scene, model: Model, sky: Array, lights: Iterable[Array]) -> Array:
+    """Return the extended source less light that halos or levels won, or with what they lost.
 
-    It changes by a share of itself, smoothed, so that it is dark where it was.
+    It changes by a share of itself, smoothed, so that it is dark where it was. `lights` are those
+    that they won in each image, scaled.
     """
-    weighted = (w * light for w, light in zip(model.weights, model.starlight(fluxes), strict=True))
+    weighted = (w * light for w, light in zip(model.weights, lights, strict=True))
     total = model.adjoint(model.weights)
     seen = scene.observed(total)
-    won = np.divide(model.adjoint(weighted), total, out=np.zeros(sky.shape), where=seen)
+    back = model.adjoint(weighted) * scene.unit
+    won = np.divide(back, total, out=np.zeros(sky.shape), where=seen)
     width = SPREAD * resolution(scene)
     won, light = (gaussian_filter(each, width, mode="wrap") for each in (won, sky))
     share = np.divide(won, light, out=np.zeros(sky.shape), where=light > 0)
@@ -215,7 +229,7 @@ def halo_errors(scene: Scene, sky: Array, star_fluxes: Array) -> HaloErrors:
     if not scene.n_halos:
         return HaloErrors(np.zeros(0), np.zeros(0))
     joint, p = _Joint(scene, Model(scene), sky, star_fluxes), scene.n_images
-    found = variances(joint.fit.information)[joint.first :].reshape(-1, p)
+    found = variances(joint.fit.information)[joint.halos].reshape(-1, p)
     some = np.unique(np.linspace(0, p - 1, MOST_IMAGES).round().astype(int))
     factors = np.full(len(found), np.inf)
     for k, halo in enumerate(found):

@@ -185,9 +185,19 @@ class LeastSquares:
 
         It is too small where conjugate gradients end early.
         """
+        return self.row(unknown)[0]
+
+    def row(self, unknown: int) -> tuple[float, Array]:
+        """Return the variance of one parameter, and its change by each residual, (p, Ny, Nx)."""
         direct = self._invert(np.eye(len(self._prior))[unknown])
-        wanted = self._adjoint(self._changes(direct))
-        return float(direct[unknown] + _sum("i,i", wanted, self._find_fields(wanted)))
+        seen = self._changes(direct)
+        wanted = self._adjoint(seen)
+        x = self._find_fields(wanted)
+        of_fields = self._forward(x)
+        seen += self._changes(self._invert(self._moments(of_fields))) - of_fields
+        for image, each in zip(seen, self._images, strict=True):
+            image *= each.precision
+        return float(direct[unknown] + _sum("i,i", wanted, x)), seen
 
     def _left(self) -> Array:
         """Return the residuals of all images, shape (p, Ny, Nx)."""

@@ -25,6 +25,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model, images_of_sky, is_flat, model_images
 from lnocl.scene.scene import Scene
+from lnocl.solvers.levels import Levels
 
 
 class Light:
@@ -38,10 +39,15 @@ class Light:
         Extended source on the grid, electrons per pixel.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons.
+    levels : Levels, optional
+        Those of the background, where they are not known.
     """
 
-    def __init__(self, scene: Scene, sky: Array, star_fluxes: Array) -> None:
+    def __init__(
+        self, scene: Scene, sky: Array, star_fluxes: Array, levels: Levels | None = None
+    ) -> None:
         self._scene, self._sky, self._star_fluxes = scene, sky, star_fluxes
+        self._levels = levels
         self._map = Model(scene)
         total = self._map.adjoint(self._map.weights)
         self._per_weight = np.broadcast_to(1.0 / total[:1, :1], total.shape)
@@ -70,7 +76,8 @@ class Light:
 
         What stars are in error there the extended source is too, with the other sign. The photons
         of a star, which scatter its flux and the sum alike, have no part in it. A halo is in error
-        by the share of it that the sum takes for light of the sky.
+        by the share of it that the sum takes for light of the sky, and so is a level of the
+        background (`lnocl.solvers.levels`).
 
         Parameters
         ----------
@@ -103,7 +110,8 @@ class Light:
         of_sky -= np.einsum("yx,yx", self._map.adjoint(factors), self._sky)
         least, rest, photons = variances * scene.unit**2 / scene.scale
         of_stars = (errors[inside] ** 2).sum() - photons
-        error = np.sqrt(max(rest, least) + max(of_stars, 0.0))
+        of_levels = 0.0 if self._levels is None else self._levels.variance(factors) * scene.unit**2
+        error = np.sqrt(max(max(rest, least) + of_levels, 0.0) + max(of_stars, 0.0))
         return float(of_sky + of_counts * scene.unit), float(error)
 
     def _factors(self, shares: Array) -> Iterator[Array]:

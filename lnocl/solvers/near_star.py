@@ -24,6 +24,7 @@ from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import along_sky
 from lnocl.scene.texture import Texture, resolution
 from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
+from lnocl.solvers.levels import planes
 
 # Side of the window round a star, and how far off other stars may be that are not taken as known,
 # resolutions.
@@ -168,6 +169,18 @@ class NearStar:
     def places(self, scene: Scene) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Return the rows and columns of the window in the sky, on the grid."""
         return self.window.finer(scene.oversample).of(scene.grid)
+
+    def level_shares(self, scene: Scene, change: Array) -> Array:
+        """Return how much an unknown falls where levels of the background rise, shape (p, 3).
+
+        `change` is its change by each residual in the window, shape (p, height, width).
+        """
+        shares = np.zeros((scene.n_images, 3))
+        for j, each in enumerate(change):
+            there = _in_image(scene, j, self.window)
+            shapes = _planes_in(scene, j, there)
+            shares[j] = [np.vdot(each, _padded(shape, each.shape)) for shape in shapes]
+        return shares
 
     @cached_property
     def fit(self) -> LeastSquares:
@@ -326,6 +339,12 @@ def _observed(scene: Scene, j: int, there: Window) -> tuple[Array, Array, Array]
         counts = np.divide(counts, weights, out=np.zeros(there.shape), where=seen)
         background = np.divide(background, weights, out=np.ones(there.shape), where=seen)
     return counts, background, weights
+
+
+def _planes_in(scene: Scene, j: int, there: Window) -> Array:
+    """Return the shapes of a level of image j in a window, shape (3, height, width)."""
+    rows, columns = there.of(scene.image_grid)
+    return scene.per_exposure(planes(scene.observation, rows, columns), 0.0, j, (rows, columns))
 
 
 def _in_image(scene: Scene, j: int, window: Window) -> Window:

@@ -11,6 +11,8 @@ tells from it. The variance of a star is a diagonal element of the inverse. The 
 eliminated by its Schur complement, with conjugate gradients, in a window round each star
 (`lnocl.solvers.near_star`).
 
+A level of the background that is not known adds the square of what it changes in a star.
+
 The same least squares tell how far a star is from where they are least, as the extended source is
 not where it is expected or iterations have ended early. The square of that is added.
 """
@@ -24,6 +26,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.scene import Scene
 from lnocl.solvers.fluxes import variances
 from lnocl.solvers.halos import halo_errors
+from lnocl.solvers.levels import Levels
 from lnocl.solvers.near_star import NearStar, Surroundings
 
 # The share of the gradient at which conjugate gradients end.
@@ -31,7 +34,12 @@ FINISHED = 1e-8
 
 
 def standard_errors(
-    scene: Scene, sky: Array, star_fluxes: Array, moves: bool, raised: Array | None = None
+    scene: Scene,
+    sky: Array,
+    star_fluxes: Array,
+    moves: bool,
+    raised: Array | None = None,
+    levels: Levels | None = None,
 ) -> Array:
     """Return the standard errors of stars, with halos and extended source marginalised.
 
@@ -47,6 +55,8 @@ def standard_errors(
         Whether positions were fitted too; else they are taken as known.
     raised : ndarray of float64, shape (n_shapes,), optional
         As of `lnocl.solvers.halos.halo_errors`, where that is known already.
+    levels : Levels, optional
+        Those of the background, where they are not known.
 
     Returns
     -------
@@ -62,12 +72,16 @@ def standard_errors(
     for first in range(0, scene.n_stars, n_epochs):  # which lies there in all epochs
         near = NearStar(around, first, FINISHED)
         there = range(first, first + n_epochs)
-        errors[first : first + n_epochs, :k] = _errors_of(near, np.isin(near.held, there))
+        errors[first : first + n_epochs, :k] = _errors_of(
+            near, np.isin(near.held, there), scene, levels
+        )
     errors[:, 0] *= scene.unit
     return errors
 
 
-def _errors_of(near: NearStar, wanted: NDArray[np.bool_]) -> Array:
+def _errors_of(
+    near: NearStar, wanted: NDArray[np.bool_], scene: Scene, levels: Levels | None
+) -> Array:
     """Return the errors of stars that are fitted, of their fluxes and perhaps x and y."""
     fit, k = near.fit, len(near.fit.information)
     unknowns = np.arange(near.n_of_stars).reshape(-1, near.n_held)[:, wanted].T
@@ -75,8 +89,11 @@ def _errors_of(near: NearStar, wanted: NDArray[np.bool_]) -> Array:
     if not is_determined.any():
         return np.full(unknowns.shape, np.nan)
     change, _ = fit.solve(np.zeros(k))
-    errors = [
-        np.hypot(fit.variance(i) ** 0.5, change[i]) if is_determined[i] else np.nan
-        for i in unknowns.ravel().tolist()
-    ]
+    errors = np.full(unknowns.size, np.nan)
+    for k, i in enumerate(unknowns.ravel().tolist()):
+        if is_determined[i]:
+            variance, by_residuals = fit.row(i)
+            if levels is not None:
+                variance += levels.variance_of(near.level_shares(scene, by_residuals))
+            errors[k] = np.hypot(variance**0.5, change[i])
     return np.reshape(errors, unknowns.shape)

@@ -14,7 +14,7 @@ from wcs_headers import NORTH_UP
 
 import lnocl
 from lnocl.errors import FileError, InputError, LnoclWarning, counted
-from lnocl.io.levels import sky_noise
+from lnocl.io.levels import sky_level, sky_noise
 from lnocl.scene.noise_check import warn_of_noise
 
 pytestmark = pytest.mark.usefixtures("frame_folder")
@@ -124,21 +124,22 @@ class TestBackground:
         assert read_.background == [7.0, "map.fits"]
         assert len(read_.sha256["background"]) == 1
 
-    def test_auto_is_the_sigma_clipped_median_in_electrons(self, log):
+    def test_auto_is_the_level_in_electrons_with_its_error(self, log):
         images = IMAGES.copy()
         images[:, 4, 4:7] = 1e4
         save_images(images, BUNIT="adu/s")
         found = read(background=["auto"], gain=1.5, exposure=[10.0])
-        stats = [sigma_clipped_stats(15.0 * image) for image in images]
-        assert found.background == [median for _, median, _ in stats]
+        no_pixel = np.zeros(SHAPE, bool)
+        known = [sky_level(j, 15.0 * image, no_pixel) for j, image in enumerate(images)]
+        assert found.background == [level for level, _ in known]
         np.testing.assert_array_equal(found.observation.background, found.background)
-        errors = [scatter * (np.pi / 2 / images[0].size) ** 0.5 for _, _, scatter in stats]
-        np.testing.assert_allclose(found.background_errors, errors, rtol=1e-14)
-        for j, ((_, median, scatter), error) in enumerate(zip(stats, errors, strict=True)):
-            assert (
-                f"image {j}: background {median:.6g} +- {error:.2g} electrons per pixel, scatter "
-                f"{scatter:.3g} (sigma-clipped median)"
-            ) in notes(log)
+        np.testing.assert_array_equal(
+            found.observation.background_error, [error for _, error in known]
+        )
+        for j, (level, error) in enumerate(known):
+            assert f"image {j}: background {level:.6g} +- {error:.2g} electrons per pixel (" in str(
+                notes(log)
+            )
 
     @pytest.mark.filterwarnings("ignore:.* % of image . are masked")
     def test_auto_leaves_bad_pixels_out(self):
@@ -162,13 +163,15 @@ class TestBackground:
     def test_what_was_subtracted_too_much_is_added_and_the_noise_measured(self, log):
         save_images(IMAGES - 60.0)
         found = read("1.fits", background=["auto"])
-        assert found.background == [-9.5]
-        scatter = sigma_clipped_stats(IMAGES[0])[2]
-        assert found.read_noise == [pytest.approx(scatter)]
-        observation = found.observation
-        np.testing.assert_allclose(observation.images[0], (IMAGES[0] - 50.5 + scatter**2).clip(0.0))
-        np.testing.assert_allclose(observation.background, scatter**2)
-        assert "image 0: its sky was subtracted; 9.5 electrons are added again" in notes(log)
+        (level,) = found.background
+        assert level == pytest.approx(-9.5, abs=0.5)
+        noise = np.sqrt(sigma_clipped_stats(IMAGES[0])[2] ** 2 - max(-9.5 - level, 0.0))
+        assert found.read_noise == [pytest.approx(noise)]
+        observation, counts = found.observation, IMAGES[0] - 60.0 - level
+        np.testing.assert_allclose(observation.images[0], (counts + noise**2).clip(0.0))
+        np.testing.assert_allclose(observation.background, noise**2)
+        added = f"image 0: its sky was subtracted; {-level:.6g} electrons are added again"
+        assert added in notes(log)
         again = read("1.fits", background=found.background, read_noise=found.read_noise)
         np.testing.assert_array_equal(again.observation.images, observation.images)
 

@@ -485,6 +485,7 @@ def test_the_arrays_of_an_observation_are_read_only(maps):
         "images",
         "psfs",
         "background",
+        "background_error",
         "read_noise",
         "mask",
         "exposure",
