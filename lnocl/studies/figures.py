@@ -156,8 +156,15 @@ def view_of(saved: SavedResult) -> ResultView:
     epochs = table.get("epoch", np.zeros(len(saved.stars), int))
     first = epochs == 0
     factor, _, unit = str(saved.header.get("ONEUNIT", alone)).partition(" ")
+    try:
+        electrons = float(factor)
+    except ValueError:
+        raise InputError(
+            f"ONEUNIT of {saved.path} is {factor!r}, not a number and its unit: delete the card, "
+            "or deconvolve again"
+        ) from None
     return ResultView(
-        extended=float(factor) * saved.extended,
+        extended=electrons * saved.extended,
         stars=[star for star, is_first in zip(saved.stars, first, strict=True) if is_first],
         star_fluxes=saved.star_fluxes[first],
         n_iter=int(saved.number("NITER") or 0),
