@@ -20,6 +20,7 @@ from lnocl.plotting.profiles import draw_bands
 from lnocl.plotting.report import make_report
 from lnocl.plotting.result import ResultView, draw_result
 from lnocl.plotting.significance import SignificanceView
+from lnocl.runs.outcome import mean_over_epochs
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -155,10 +156,17 @@ def view_of(saved: SavedResult) -> ResultView:
     epochs = table.get("epoch", np.zeros(len(saved.stars), int))
     n_epochs = int(np.max(epochs, initial=0)) + 1
     factor, _, unit = str(saved.header.get("ONEUNIT", alone)).partition(" ")
+    try:
+        electrons = float(factor)
+    except ValueError:
+        raise InputError(
+            f"ONEUNIT of {saved.path} is {factor!r}, not a number and its unit: delete the card, "
+            "or deconvolve again"
+        ) from None
     return ResultView(
-        extended=float(factor) * saved.extended,
+        extended=electrons * saved.extended,
         stars=saved.stars[::n_epochs],  # once each, whatever epochs there are
-        star_fluxes=saved.star_fluxes.reshape(-1, n_epochs).mean(axis=1),
+        star_fluxes=mean_over_epochs(saved.star_fluxes, n_epochs),
         n_iter=int(saved.number("NITER") or 0),
         history=saved.tables.get("HISTORY", {}),
         held_out=saved.tables.get("HELDOUT", {}),
