@@ -456,7 +456,8 @@ def test_each_phase_is_shown(monkeypatch):
     monkeypatch.setattr("sys.stderr", screen)
     options = {"stop": "held-out", "smoothing": "auto", "progress": True}
     lnocl.deconvolve(scene()[0], [STAR], engine="numpy", n_iter=60, **options)
-    for phase in ("judging the PSFs", "measuring steps", "iterations", "fitting star fluxes"):
+    phases = "judging the PSFs", "measuring steps", "fitting the stars", "iterations"
+    for phase in (*phases, "fitting stars, halos and levels"):
         assert f"\r{phase}: " in screen.getvalue()
 
 

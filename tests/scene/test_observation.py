@@ -604,6 +604,7 @@ WRONG = {
         [lnocl.PsfField(np.ones((1, 3, 3)), [(0, 0)])] * 3,
     ],
     "background": [-1.0, [1.0, np.nan], np.ones(3), np.ones((3, 8, 9)), 1e31, 3 * u.adu, None],
+    "background_error": [-1.0, [1.0, np.nan], np.ones(3), np.ones((2, 8, 9)), 3 * u.adu],
     "read_noise": [-1.0, np.full(2, np.inf), np.ones((8, 8)), 1e200, 3 * u.s],
     "exposure": [0.0, [1.0, -1.0], np.ones(3), np.zeros((8, 9)), 3 * u.m, "long"],
     "offsets": [np.zeros((3, 2)), [(0, 0), (9, 0)], [(0, 0), (0, np.nan)], np.eye(2) * u.arcsec],

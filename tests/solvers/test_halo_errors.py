@@ -9,7 +9,7 @@ import lnocl
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.scene.texture import Texture, resolution
-from lnocl.solvers import halos, near_star
+from lnocl.solvers import halos, least_squares, near_star
 from lnocl.solvers.halos import halo_errors
 from lnocl.solvers.star_errors import standard_errors
 
@@ -79,13 +79,17 @@ def an_estimate(sky=SKY, seed=0, **changes):
     return scene, sky, np.append(FLUXES, AMOUNTS.ravel() / scene.mean_exposure), mean
 
 
-def dense(scene, sky, mean):
+def dense(scene, sky, mean, has_level):
     """Return the standard deviations of stars and halos, and what the least squares add."""
     texture = Texture(sky, scene.stars, resolution(scene))
     units = np.eye(N * N).reshape(-1, N, N)
     columns = columns_of(np.array([texture.apply(unit).ravel() for unit in units]).T)
     k = len(columns) - N * N
-    information = columns / mean @ columns.T + np.diag(np.repeat([0.0, 1.0], [k, N * N]))
+    if has_level:  # as the windows of stars have
+        level = np.repeat(EXPOSURE / EXPOSURE.mean(), N * N) * texture.mean.mean()
+        columns = np.append(columns, level[None], axis=0)
+    prior = np.repeat([0.0, 1.0], [k, len(columns) - k])
+    information = columns / mean @ columns.T + np.diag(prior)
     expected = columns_of((texture.mean - sky).reshape(-1, 1))[-1]
     left = scene.observation.images.ravel() - mean - expected
     change = np.linalg.solve(information, columns @ (left / mean))[:k]
@@ -93,12 +97,15 @@ def dense(scene, sky, mean):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_errors_are_those_of_the_dense_matrix(seed):
+def test_errors_are_those_of_the_dense_matrix(seed, monkeypatch):
+    monkeypatch.setattr(least_squares, "MISSING", 1e-12)
+    monkeypatch.setattr(least_squares, "NEGLIGIBLE", 1e-7)
     scene, sky, fluxes, mean = an_estimate(seed=seed)
-    deviations, change = dense(scene, sky, mean)
+    deviations, change = dense(scene, sky, mean, True)
     found = standard_errors(scene, sky, fluxes, False)[:, 0]
     np.testing.assert_allclose(found, np.hypot(deviations, change)[:2], rtol=1e-6)
     errors = halo_errors(scene, sky, fluxes).errors * scene.mean_exposure
+    deviations, _ = dense(scene, sky, mean, False)
     np.testing.assert_allclose(errors, deviations[2:], rtol=0.01)
 
 
@@ -159,7 +166,7 @@ def test_a_halo_that_is_known_leaves_a_star_the_error_of_counts():
     scene, sky, fluxes, _ = an_estimate()
     found = standard_errors(scene, sky, fluxes, False)[:, 0]
     around = near_star.Surroundings(scene, sky, fluxes, False)
-    known = [near_star.NearStar(around, s, 1e-8).fit.variance(0) ** 0.5 for s in (0, 1)]
+    known = [near_star.NearStar(around, s, 1e-8).fit.variances([0])[0] ** 0.5 for s in (0, 1)]
     raised = found / (np.array(known) * scene.unit)
     assert raised[0] > 2.5
     assert 1.0 < raised[1] < 1.1
