@@ -493,27 +493,42 @@ def reconstruct(
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes
         largest = partial(measure, start, int(n_iter))
         checkpointer = checkpoints(largest)
-        steady = None
-        if stop == "held-out" and len(penalties) > 1 and start.scene.n_stars:
-            steady = _run_steadily(start, penalties, int(n_iter), progress)
-            prior = told_prior(steady)
-            penalties = [replace(penalty, stars=prior) for penalty in penalties]
+        if stop == "held-out":
+            return _cross_validate(start, penalties, int(n_iter), callback, progress, checkpointer)
         with Progress(int(n_iter), "it", bool(progress), "iterations") as bar:
-            if stop == "held-out":
-                held_out = HeldOutCounts(start, penalties, int(n_iter))
-                outcome = _choose(held_out, callback, bar, checkpointer)
-                if not (outcome.stop_reason == "held-out" and held_out.finds_no_end):
-                    return outcome
-                is_free = len(penalties) > 1
-                held_out.tell_of_no_end(is_free)
-                if not is_free:
-                    return outcome
-                del held_out
-                steady = steady or _run_steadily(start, penalties, int(n_iter), progress)
-                return replace(steady, curve=outcome.curve)
             run = Run(start, int(n_iter))
             del start, largest  # which hold arrays of the grid
             return run.outcome(_complete(run, make_rule(stop), callback, bar, checkpointer))
+
+
+def _cross_validate(
+    start: Start,
+    penalties: Sequence[Penalty],
+    n_iter: int,
+    callback: Callback | None,
+    progress: bool,
+    checkpointer: Checkpointer,
+) -> Outcome:
+    """Return the choice of held-out counts, or a run with one weight where these find no end.
+
+    The star fluxes of that run are the prior of the halves. Where no weight is to be chosen there
+    is neither.
+    """
+    steady, is_auto = None, len(penalties) > 1
+    if is_auto and start.scene.n_stars:
+        steady = _run_steadily(start, penalties, n_iter, progress)
+    if steady is not None:
+        prior = told_prior(steady)
+        penalties = [replace(penalty, stars=prior) for penalty in penalties]
+    held_out = HeldOutCounts(start, penalties, n_iter)
+    with Progress(n_iter, "it", bool(progress), "iterations") as bar:
+        outcome = _choose(held_out, callback, bar, checkpointer)
+    if outcome.stop_reason != "held-out" or not held_out.finds_no_end:
+        return outcome
+    if is_auto and steady is None:
+        steady = _run_steadily(start, penalties, n_iter, progress)
+    held_out.tell_of_no_end(is_remedied=steady is not None)
+    return outcome if steady is None else replace(steady, curve=outcome.curve)
 
 
 def _choose(
@@ -534,9 +549,12 @@ def _choose(
 
 def _run_steadily(
     start: Start, penalties: Sequence[Penalty], n_iter: int, progress: bool
-) -> Outcome:
-    with Progress(n_iter, "it", bool(progress), "fitting the stars", stays=False) as bar:
-        return run_steadily(start, penalties, n_iter, bar.update)
+) -> Outcome | None:
+    """Return that of `lnocl.runs.steady.run_steadily`; None where its objective rises."""
+    fitting = Progress(n_iter, "it", bool(progress), "fitting the stars", stays=False)
+    with fitting, suppress(DivergedError, NotFiniteError):  # of which the halves tell
+        return run_steadily(start, penalties, n_iter, fitting.update)
+    return None
 
 
 def _complete(

@@ -103,7 +103,7 @@ def test_errors_are_those_of_the_dense_matrix(seed, monkeypatch):
     scene, sky, fluxes, mean = an_estimate(seed=seed)
     deviations, change = dense(scene, sky, mean, True)
     found = standard_errors(scene, sky, fluxes, False)[:, 0]
-    np.testing.assert_allclose(found, np.hypot(deviations, change)[:2], rtol=1e-6)
+    np.testing.assert_allclose(found, np.hypot(deviations, change)[:2], rtol=1e-5)
     errors = halo_errors(scene, sky, fluxes).errors * scene.mean_exposure
     deviations, _ = dense(scene, sky, mean, False)
     np.testing.assert_allclose(errors, deviations[2:], rtol=0.01)
