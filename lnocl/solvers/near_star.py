@@ -1,6 +1,7 @@
 """The least squares of a star and of the extended source round it, in a window.
 
-The extended source is a field of the covariance that `lnocl.scene.texture` expects. So the fluxes
+The extended source is a field of the covariance that `lnocl.scene.texture` expects, and a level of
+about its mean there: an estimate that is positive holds light where there is none. So the fluxes
 and positions of stars, and their errors, depend on no iteration. For errors the amounts of halos
 are unknown too: what the images tell of them beyond the window is their prior in it.
 """
