@@ -84,6 +84,7 @@ def try_it(image, psf, stars, device=None, **known):
     words = {
         "pixels off its centre": "centre", "does not fit": "width", "pixels from there": "place",
         "negative and were kept": "negative", "too near the end": "length",
+        "light lies all round": "halo", "no light is left": "dark", "far less than noise": "noise",
         "not that of its counts": "noise",
         "the PSFs do not fit the stars": "error left",
         "the PSFs given do not fit the stars": "error fitted",

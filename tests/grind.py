@@ -7,12 +7,14 @@ kernels' source, and run that one kernel. Names what was launched, as JSON.
 import functools
 import json
 import sys
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
 from scenes import Recipe, worst
 
+from lnocl.errors import MisfitWarning
 from lnocl.opencl import launch, layout, program
 from lnocl.opencl.device import choose
 from lnocl.opencl.tuning import Tuning
@@ -237,6 +239,7 @@ def main(case, dtype, old=None, new=None, kernel=None):
     if old is not None:
         plant(old, new)
     dtype = DTYPES[dtype]
+    warnings.simplefilter("ignore", MisfitWarning)  # of runs that end early
     if CASES[case][2] == DECONVOLUTION:
         run_deconvolution(case, dtype)
     else:

@@ -21,11 +21,12 @@ def run_python(code, *arguments, cwd=None, **environment):
 
 
 PRELUDE = """
-import os, sys
+import os, sys, warnings
 import numpy as np
 import lnocl
 from functools import partial
 paper = partial(lnocl.deconvolve, solver="sgm", stop=None, smoothing=0.0, pad=0)
+warnings.simplefilter("ignore", lnocl.errors.MisfitWarning)
 observation = lnocl.Observation(np.arange(256.0).reshape(16, 16), np.ones((3, 3)))
 def deconvolve(n_iter=3):
     return paper(observation, n_iter=n_iter).extended.sum()

@@ -412,12 +412,16 @@ def finest(
     Raises
     ------
     InputError
-        An image without sky coordinates.
+        An image without sky coordinates, or whose pixels have no area by them.
     """
     scales = []
     for header, path in zip(headers, paths, strict=True):
-        area = celestial_wcs(header, path, "leave align out").proj_plane_pixel_area()
-        scales.append(float(np.sqrt(area.to_value("arcsec2"))))
+        wcs = celestial_wcs(header, path, "leave align out")
+        with np.errstate(invalid="ignore"):
+            area = float(wcs.proj_plane_pixel_area().to_value("arcsec2"))
+        if not 0.0 < area < math.inf:
+            raise InputError(f"the pixels of {path} have no area by its WCS; leave align out")
+        scales.append(math.sqrt(area))
     smallest = int(np.argmin(scales))
     change = (scales[0] / scales[smallest] - 1.0) * math.hypot(*shapes[smallest]) / 2.0
     return smallest if change > MAX_OFFSET_VARIATION else 0

@@ -7,9 +7,9 @@ The joint Fisher information of the stars' fluxes and positions and of the exten
 with J the derivatives of the models ``m_j``, of halos too, whose amounts are unknown, P one over
 their variances, A the convolutions, and ``L = a C^(1/2)`` the root of the covariance that the
 extended source is expected to have (`lnocl.scene.texture`), with a column for its level: what lies
-under a star nothing but this tells from it. The variance of a star is a diagonal element of the inverse. The extended source is
-eliminated by its Schur complement, with conjugate gradients, in a window round each star
-(`lnocl.solvers.near_star`).
+under a star nothing but this tells from it. The variance of a star is a diagonal element of the
+inverse. The extended source is eliminated by its Schur complement, with conjugate gradients, in a
+window round each star (`lnocl.solvers.near_star`).
 
 A level of the background that is not known adds the square of what it changes in a star.
 

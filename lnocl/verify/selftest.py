@@ -14,8 +14,9 @@ import pyopencl as cl
 from astropy import units as u
 
 from lnocl.deconvolution import deconvolve
-from lnocl.errors import DeviceError, LnoclError
+from lnocl.errors import DeviceError, LnoclError, MisfitWarning
 from lnocl.opencl.device import context_of, describe, has_double, spec_of
+from lnocl.process import ignored_warnings
 from lnocl.result import Result
 from lnocl.runs.options import PAPER
 from lnocl.scene.observation import Observation
@@ -186,7 +187,8 @@ def _try_deconvolutions(device: str, precisions: Sequence[str]) -> Iterator[Row]
         reconstruct = functools.partial(
             deconvolve, observation, stars=stars, **(PAPER | {"solver": solver, "n_iter": n_iter})
         )
-        expected = reconstruct(engine="numpy")
+        with ignored_warnings(MisfitWarning):
+            expected = reconstruct(engine="numpy")
         for precision in precisions:
             measure = functools.partial(
                 _strays, reconstruct, expected, precision=precision, device=device
@@ -202,7 +204,8 @@ def _row(
     allowed: float,
 ) -> Row:
     try:
-        with np.errstate(all="ignore"):
+        # Runs that end early fit no image.
+        with np.errstate(all="ignore"), ignored_warnings(MisfitWarning):
             return Row(what, precision, grid, measure(), allowed)
     except FAULTS as error:
         return Row(what, precision, grid, math.nan, allowed, _fault(error))

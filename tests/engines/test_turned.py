@@ -131,7 +131,7 @@ def reference(solver, name):
         ("sgm", "single", 3e-6),
         ("sgp", "single", 2e-4),
         pytest.param("sgm", "double", 3e-14, marks=pytest.mark.exhaustive),
-        pytest.param("sgp", "double", 4e-13, marks=pytest.mark.exhaustive),
+        pytest.param("sgp", "double", 1e-12, marks=pytest.mark.exhaustive),
     ],
 )
 @pytest.mark.parametrize("name", MAPS)

@@ -75,7 +75,9 @@ def deconvolve(observation, **keywords):
 
 def check(result):
     assert result.extended.dtype == np.float64
-    for values in (result.extended, result.star_fluxes):
+    shown = result._outcome.scene.is_shown[: len(result.star_fluxes)]
+    assert np.isnan(result.star_fluxes[~shown]).all()
+    for values in (result.extended, result.star_fluxes[shown]):
         assert np.isfinite(values).all()
         assert (values >= 0).all()
     assert np.isfinite(result.history["objective"]).all()

@@ -120,9 +120,10 @@ def test_a_process_forked_while_a_thread_is_at_work_does_not_wait_for_it():
 
 
 PROGRAM = """
-import hashlib, sys
+import hashlib, sys, warnings
 import numpy as np
 import lnocl
+warnings.simplefilter("ignore", lnocl.errors.MisfitWarning)
 observation = lnocl.Observation(np.arange(64.0).reshape(8, 8), np.ones((3, 3)), background=1.0)
 print("ready", flush=True)
 sys.stdin.readline()
