@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError, note, warn
 from lnocl.io.headers import number
+from lnocl.io.packed import place_of
 
 # Unpacks the image of standard input, and writes its pixels, or why that cannot be done.
 PROGRAM = """
@@ -60,7 +61,7 @@ def unpacked(path: str, hdu: fits.CompImageHDU, content: IO[bytes]) -> NDArray[n
     UserWarning
         Tiles that do not match their DATASUM.
     """
-    where = hdu.fileinfo()
+    where = place_of(hdu)
     content.seek(where["hdrLoc"])
     tiles = content.read(where["datLoc"] + where["datSpan"] - where["hdrLoc"])
     alone = fits.PrimaryHDU().header.tostring().encode() + tiles

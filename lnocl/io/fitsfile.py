@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lnocl.errors import FileError, LnoclError, warn
 from lnocl.io.encoded import is_tiled, unpacked
-from lnocl.io.packed import BLOCK, Blocks, check_sizes, copy_bytes, fits_content
+from lnocl.io.packed import BLOCK, Blocks, check_sizes, copy_bytes, fits_content, place_of
 from lnocl.process import recorded_warnings
 
 
@@ -64,7 +64,7 @@ class FitsFile:
             The end of the file is not an HDU, and is left out.
         """
         for hdu in self._hdus:
-            where = hdu.fileinfo()
+            where = place_of(hdu)
             yield hdu
             end = where["datLoc"] + where["datSpan"]
             if end >= self._length or self._is_empty(end):
@@ -130,7 +130,7 @@ class FitsFile:
         return columns
 
     def _verify(self, hdu: Any) -> None:
-        where = hdu.fileinfo()
+        where = place_of(hdu)
         if where["datLoc"] + where["datSpan"] > self._length:
             return  # astropy warns of missing padding, and cannot sum without it
         if "DATASUM" in hdu.header and hdu.verify_datasum() == 0:
@@ -138,7 +138,7 @@ class FitsFile:
 
     def copy(self, hdu: Any, stream: IO[bytes]) -> None:
         """Copy an HDU as it is, but for the padding that it may lack."""
-        where = hdu.fileinfo()
+        where = place_of(hdu)
         self._content.seek(where["hdrLoc"])
         size = where["datLoc"] + where["datSpan"] - where["hdrLoc"]
         stream.write(bytes(copy_bytes(self._content, stream, size)))

@@ -136,6 +136,12 @@ class Blocks:
         return part
 
 
+def place_of(hdu: Any) -> dict[str, Any]:
+    """Return where the header and the data of an HDU begin, and how long the data are, bytes."""
+    # astropy 7 knows it of the table that holds compressed tiles alone.
+    return cast(dict[str, Any], hdu.fileinfo() or hdu._bintable.fileinfo())
+
+
 def check_sizes(path: str, header: fits.Header) -> None:
     """Refuse a header of sizes that no file has, before astropy counts to them.
 
