@@ -243,7 +243,13 @@ def make_frame(seed=0, n_images=1, psf=None, n_stars=9, size=N):
     [
         # With stars the fluxes that "sgm" starts from, and depends on, differ.
         ({"solver": "sgm", "n_iter": 60, "smoothing": 0.0}, 0, 1e-3, 1e-2),
-        ({"solver": "sgp", "n_iter": 400, "smoothing": 0.02}, 9, 6e-4, 1e-3),
+        pytest.param(
+            {"solver": "sgp", "n_iter": 400, "smoothing": 0.02},
+            9,
+            6e-4,
+            1e-3,
+            marks=pytest.mark.exhaustive,
+        ),
     ],
 )
 def test_tiles_are_the_whole(run, n_stars, middle, blends):

@@ -126,7 +126,8 @@ def test_a_callback_that_ends_a_run_where_it_ends_anyway_is_not_heeded(tmp_path)
 
 
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
-@pytest.mark.parametrize("engine", ["numpy", pytest.param("opencl", marks=pytest.mark.exhaustive)])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
 def test_held_out_counts_go_on_from_their_last_checkpoint(engine, tmp_path, monkeypatch):
     """And those that had ended do not iterate again."""
     made, path = STARS.make(), str(tmp_path / "run.fits")

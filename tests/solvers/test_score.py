@@ -266,6 +266,7 @@ def test_stars_at_one_place_are_one():
     assert (found.is_tested == alone.is_tested).mean() > 0.95
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("degrees", "scale"), [(0.0, 1.0), (20.0, 1.0), (44.0, 1.0), (20.0, 2.0)])
 def test_values_of_turned_images_scatter_as_noise_does(degrees, scale):
     """With a PSF that has wings and is cut off, which shears make ring; and fluxes are right."""
