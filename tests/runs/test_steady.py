@@ -69,7 +69,7 @@ def test_where_held_out_counts_find_no_end_a_weight_is_taken():
 
 
 def test_a_weight_that_is_given_stays():
+    given = {"n_iter": 20, "smoothing": 0.0, "engine": "numpy"}
     with pytest.warns(lnocl.LnoclWarning, match="give n_iter 200, of which"):
-        given = {"n_iter": 20, "smoothing": 0.0, "engine": "numpy"}
         result = lnocl.deconvolve(knot(), [(22, 20)], **given)
     assert result.stop_reason == "held-out"
