@@ -38,7 +38,7 @@ from lnocl.runs.outcome import Mended, Outcome
 from lnocl.runs.progress import Progress
 from lnocl.runs.run import Run, most_bytes
 from lnocl.runs.start import Setup, Start, make_start
-from lnocl.runs.steady import run_steadily, told_prior
+from lnocl.runs.steady import run_steadily, steady_penalty, told_prior
 from lnocl.runs.stopping import Rule, make_rule
 from lnocl.scene.freedoms import refusal
 from lnocl.scene.noise_check import warn_of_noise
@@ -387,7 +387,16 @@ def deconvolve(
     )
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
-    outcome = reconstruct(mended.setup, penalties, n_iter, stop, callback, progress, checkpoints)
+    outcome = reconstruct(
+        mended.setup,
+        penalties,
+        n_iter,
+        stop,
+        callback,
+        progress,
+        checkpoints,
+        steady_penalty(penalties),
+    )
     if are_told_last:
         is_fit = not any(star.is_misfit for star in outcome.star_residuals())
     else:
@@ -465,6 +474,7 @@ def reconstruct(
     callback: Callback | None = None,
     progress: bool = False,
     checkpoints: Callable[[Callable[[], int]], Checkpointer] = Checkpointer,
+    steady: Penalty | None = None,
 ) -> Outcome:
     """Return the outcome with the first penalty, or with those that held-out counts choose.
 
@@ -478,6 +488,9 @@ def reconstruct(
         As for `deconvolve`.
     checkpoints : callable
         Returns what writes checkpoints, given what returns the bytes that they may take.
+    steady : Penalty, optional
+        That of a run before, whose star fluxes are the prior of the others (`lnocl.runs.steady`),
+        and which is the outcome where held-out counts find no end.
     """
     if setup.engine == "opencl" and setup.precision == "single":
         warn_of_rounding(int(n_iter))
@@ -493,67 +506,48 @@ def reconstruct(
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes
         largest = partial(measure, start, int(n_iter))
         checkpointer = checkpoints(largest)
+        told = None
+        if steady is not None and start.scene.n_stars:
+            told = _run_steadily(start, steady, int(n_iter), progress)
+        if told is not None:
+            prior = told_prior(told)
+            penalties = [replace(penalty, stars=prior) for penalty in penalties]
         if stop == "held-out":
-            return _cross_validate(start, penalties, int(n_iter), callback, progress, checkpointer)
+            held_out = HeldOutCounts(start, penalties, int(n_iter))
+            outcome = _choose(held_out, callback, progress, checkpointer)
+            if outcome.stop_reason != "held-out" or not held_out.finds_no_end:
+                return outcome
+            if steady is not None and told is None:
+                told = _run_steadily(start, steady, int(n_iter), progress)
+            held_out.tell_of_no_end(is_remedied=told is not None)
+            return outcome if told is None else replace(told, curve=outcome.curve)
         with Progress(int(n_iter), "it", bool(progress), "iterations") as bar:
-            run = Run(start, int(n_iter))
+            run = Run(start.penalised(penalties[0]), int(n_iter))
             del start, largest  # which hold arrays of the grid
             return run.outcome(_complete(run, make_rule(stop), callback, bar, checkpointer))
 
 
-def _cross_validate(
-    start: Start,
-    penalties: Sequence[Penalty],
-    n_iter: int,
-    callback: Callback | None,
-    progress: bool,
-    checkpointer: Checkpointer,
-) -> Outcome:
-    """Return the choice of held-out counts, or a run with one weight where these find no end.
-
-    The star fluxes of that run are the prior of the halves. Where no weight is to be chosen there
-    is neither.
-    """
-    steady, is_auto = None, len(penalties) > 1
-    if is_auto and start.scene.n_stars:
-        steady = _run_steadily(start, penalties, n_iter, progress)
-    if steady is not None:
-        prior = told_prior(steady)
-        penalties = [replace(penalty, stars=prior) for penalty in penalties]
-    held_out = HeldOutCounts(start, penalties, n_iter)
-    with Progress(n_iter, "it", bool(progress), "iterations") as bar:
-        outcome = _choose(held_out, callback, bar, checkpointer)
-    if outcome.stop_reason != "held-out" or not held_out.finds_no_end:
-        return outcome
-    if is_auto and steady is None:
-        steady = _run_steadily(start, penalties, n_iter, progress)
-    held_out.tell_of_no_end(is_remedied=steady is not None)
-    return outcome if steady is None else replace(steady, curve=outcome.curve)
-
-
 def _choose(
-    held_out: HeldOutCounts, callback: Callback | None, bar: Progress, checkpointer: Checkpointer
+    held_out: HeldOutCounts, callback: Callback | None, progress: bool, checkpointer: Checkpointer
 ) -> Outcome:
     """Have held-out counts choose, from their checkpoint where there is one."""
-    checkpointer.restore_held_out(held_out)
-    bar.total = None
+    with Progress(None, "it", bool(progress), "iterations") as bar:
+        checkpointer.restore_held_out(held_out)
 
-    def look(iteration: int, halves: Halves) -> bool:
-        bar.show(iteration, lambda: f"objective {halves.objective():.6g}")
-        return _is_ended(callback, iteration, halves)
+        def look(iteration: int, halves: Halves) -> bool:
+            bar.show(iteration, lambda: f"objective {halves.objective():.6g}")
+            return _is_ended(callback, iteration, halves)
 
-    outcome = held_out.choose(look, partial(checkpointer.save_held_out, held_out))
+        outcome = held_out.choose(look, partial(checkpointer.save_held_out, held_out))
     checkpointer.save_held_out(held_out, outcome.stop_reason)
     return outcome
 
 
-def _run_steadily(
-    start: Start, penalties: Sequence[Penalty], n_iter: int, progress: bool
-) -> Outcome | None:
+def _run_steadily(start: Start, penalty: Penalty, n_iter: int, progress: bool) -> Outcome | None:
     """Return that of `lnocl.runs.steady.run_steadily`; None where its objective rises."""
     fitting = Progress(n_iter, "it", bool(progress), "fitting the stars", stays=False)
     with fitting, suppress(DivergedError, NotFiniteError):  # of which the halves tell
-        return run_steadily(start, penalties, n_iter, fitting.update)
+        return run_steadily(start, penalty, n_iter, fitting.update)
     return None
 
 

@@ -31,6 +31,7 @@ from lnocl.runs.options import (
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome, PsfRefinement
 from lnocl.runs.progress import Progress
 from lnocl.runs.start import Setup
+from lnocl.runs.steady import steady_penalty
 from lnocl.scene.arrays import Array
 from lnocl.scene.grid import length_for
 from lnocl.scene.observation import Observation, mean_exposure
@@ -312,14 +313,15 @@ def deconvolve_tiles(
             penalties = [replace(each, edge=edge) for each in penalties]
     curve, reason, penalty, last = np.zeros(0, CURVE_DTYPE), "", penalties[0], stop
     setup = partial(Setup, pad=pad, refine_positions=mended.setup.refine_positions, **given)
-    is_fit = is_auto and mended.fits
+    is_fit, steady = is_auto and mended.fits, steady_penalty(penalties)
     if isinstance(stop, str):
-        solver = _Solver(setup, penalties, n_iter, stop, mended.refinement, False)
+        solver = _Solver(setup, penalties, n_iter, stop, steady, mended.refinement, False)
         chosen = _choose(observed, parallel, solver)
         curve, reason, n_iter, last = chosen.held_out, chosen.stop_reason, chosen.n_iter, None
         penalty = replace(penalties[0], smoothing=chosen.smoothing)
-        is_fit = is_fit and reason == stop  # else held-out counts have found no end
-    solver = _Solver(setup, [penalty], max(n_iter, 1), last, mended.refinement, is_fit)
+        if reason != stop:  # held-out counts have found no end, and this is the steady run
+            is_fit, steady = False, None
+    solver = _Solver(setup, [penalty], max(n_iter, 1), last, steady, mended.refinement, is_fit)
     mosaic = _Mosaic(observation, positions)
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
@@ -478,6 +480,7 @@ class _Solver(NamedTuple):
     penalties: Sequence[Penalty]
     n_iter: int
     stop: str | float | None
+    steady: Penalty | None
     refinement: PsfRefinement | None
     is_fit: bool
 
@@ -496,8 +499,9 @@ class _Solver(NamedTuple):
 
     def _outcome(self, tile: _Tile) -> Outcome:
         penalties = [replace(each, near_stars=tile.near_stars) for each in self.penalties]
+        steady = self.steady and replace(self.steady, near_stars=tile.near_stars)
         setup = self.setup(tile.observation, tile.stars)
-        outcome = reconstruct(setup, penalties, self.n_iter, self.stop)
+        outcome = reconstruct(setup, penalties, self.n_iter, self.stop, steady=steady)
         if self.is_fit and len(tile.stars):
             outcome = outcome.marginal(stars=True, halos=False, levels=False)
         return replace(outcome, psf_refinement=self.refinement)

@@ -30,23 +30,33 @@ SETTLED = 1e-5
 FINISHED = 1e-2
 
 
+def steady_penalty(penalties: Sequence[Penalty]) -> Penalty | None:
+    """Return that of such a run, with `WRONG_PSFS` times the recommended weight.
+
+    `penalties` are those to choose from: none, the recommended weight, and multiples of it. Where
+    there is nothing to choose there is no such run, and it is None.
+    """
+    if len(penalties) == 1:
+        return None
+    return replace(penalties[1], smoothing=WRONG_PSFS * penalties[1].smoothing)
+
+
 def run_steadily(
-    start: Start, penalties: Sequence[Penalty], n_iter: int, tick: Callable[[], object] = int
+    start: Start, penalty: Penalty, n_iter: int, tick: Callable[[], object] = int
 ) -> Outcome:
-    """Return the outcome with `WRONG_PSFS` times the least weight of these above none.
+    """Return the outcome of a run to where it settles.
 
     Parameters
     ----------
     start : Start
         Where it starts.
-    penalties : sequence of Penalty
-        From which held-out counts choose: the first without `smoothing`.
+    penalty : Penalty
+        That of `steady_penalty`.
     n_iter : int
         Iterations at most.
     tick : callable, optional
         Is called after each iteration.
     """
-    penalty = replace(penalties[1], smoothing=WRONG_PSFS * penalties[1].smoothing)
     rule = Change(SETTLED)
     with ignored_notes(), ignored_warnings():  # the runs that follow say the same
         run = Run(start.penalised(penalty), n_iter)

@@ -210,7 +210,19 @@ def _hidden_radius(scene: Scene, star: Array) -> float:
             continue
         if not mask[tuple(nearest)]:
             return 0.0
-        good = np.argwhere(~mask)
-        away = float(np.hypot(*(good - at).T).min()) if len(good) else 0.0
-        radii.append(max(away - HALF_PIXEL, 0.0) * scene.oversample * observation.scales[j])
+        away = _to_good_pixel(mask, at)
+        if away < np.inf:
+            radii.append(max(away - HALF_PIXEL, 0.0) * scene.oversample * observation.scales[j])
     return min(radii, default=0.0)
+
+
+def _to_good_pixel(mask: NDArray[np.bool_], at: Array) -> float:
+    """Return the distance from a place (y, x) to the nearest good pixel; infinite without one."""
+    reach, away = 4, np.inf
+    while away > reach and reach < 2 * max(mask.shape):
+        reach *= 2
+        low = np.maximum(np.floor(at).astype(int) - reach, 0)
+        high = np.ceil(at).astype(int) + reach + 1
+        good = np.argwhere(~mask[low[0] : high[0], low[1] : high[1]]) + low
+        away = float(np.hypot(*(good - at).T).min(initial=np.inf))
+    return away
