@@ -15,8 +15,8 @@ Mask = NDArray[np.bool_]
 
 # The pairs of pixels on both sides of one: beside it, above and below, and across.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
-# Beside a cosmic ray there is less than this share of what a star has there, by so many standard
-# deviations.
+# The pixels beside a cosmic ray have less than this share of a star's light there, by so many
+# standard deviations.
 SHARE, CLEAR = 0.3, 4.0
 # The charge of a cosmic ray spreads to those beside it that are above the sky by so many.
 SPREAD = 2.0
@@ -80,7 +80,7 @@ def _beside(values: Array, direction: tuple[int, int]) -> Array:
 
 
 def _least_shares(psf: Array) -> list[float]:
-    """Return what a star has at least on both sides of its brightest pixel, in each direction."""
+    """Return the least share of its brightest pixel that a star has beside it, by direction."""
     wide = np.pad(psf, 3)
     row, column = (n // 2 + 3 for n in psf.shape)
     spline = ndimage.spline_filter(wide, 3)

@@ -519,7 +519,7 @@ def reconstruct(
                 return outcome
             if steady is not None and told is None:
                 told = _run_steadily(start, steady, int(n_iter), progress)
-            held_out.tell_of_no_end(is_remedied=told is not None)
+            held_out.warn_of_no_end(None if told is None else steady)
             return outcome if told is None else replace(told, curve=outcome.curve)
         with Progress(int(n_iter), "it", bool(progress), "iterations") as bar:
             run = Run(start.penalised(penalties[0]), int(n_iter))

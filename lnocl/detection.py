@@ -44,7 +44,7 @@ BOUNDS, PSF_WIDTHS = {"gamma": (0.3, 30.0), "alpha": (1.2, 20.0)}, 8
 LONGEST = 1.5
 # A PSF is not this image's where stars are narrower than this share of its width.
 NARROWER = 0.7
-# What is narrower than this share of a PSF's width is no star.
+# Stars are as wide as this share of the PSF, or wider.
 TOO_NARROW = 0.6
 # A saturated star is a region of bad pixels inside a ring whose median is so many times as
 # significant as a star must be.
@@ -77,9 +77,9 @@ def find_stars(
     brightest first, so that their side lobes are no stars. Maxima in the wings of brighter stars
     are left out unless they are half as bright as those wings. So are extended sources: maxima that
     the PSF, smoothed by a Gaussian of 0.4 of its width, fits better than the PSF. Pixels sharper
-    than the PSF, as cosmic rays leave them, are bad (`lnocl.blemishes.sharp_pixels`), and what is
-    less than 0.6 times as wide is no star. Flat tops are saturated, which is logged
-    (`lnocl.blemishes.flat_tops`).
+    than the PSF, as cosmic rays leave them, are bad (`lnocl.blemishes.sharp_pixels`), and sources
+    less than 0.6 times as wide are left out. Pixels of flat tops count as saturated, and a line of
+    the log says how many (`lnocl.blemishes.flat_tops`).
 
     Stars are sought from 5 standard deviations on, also where the threshold is higher: the noise of
     the filtered image is that without them.

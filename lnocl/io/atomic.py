@@ -23,7 +23,7 @@ FITS_ENDINGS = (".fits", ".fit", ".fts")
 _TEMPORARY = re.compile(r"\.lnocl-[0-9a-f]{16}\.tmp")
 # Seconds after the last write to a temporary file from which on nobody writes to it.
 ABANDONED = 24 * 3600.0
-# What tells the files that a command reads (`_marks`), which no output may replace.
+# The marks (`_marks`) of the files that a command reads, which no output may replace.
 _INPUTS: ContextVar[frozenset[Any]] = ContextVar("inputs", default=frozenset())
 
 
@@ -50,7 +50,7 @@ def refuse_input(path: str) -> None:
 
 
 def _marks(path: str) -> set[Any]:
-    """Return what a file has in common with its links: where it is, and what it is."""
+    """Return the place and the inode of a file, which its links share."""
     marks: set[Any] = set()
     with contextlib.suppress(OSError, ValueError):  # of a name that no file has
         marks.add(os.path.realpath(path))

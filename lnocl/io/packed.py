@@ -103,7 +103,7 @@ def copy_bytes(source: IO[bytes], target: IO[bytes], size: int) -> int:
 
 
 class Blocks:
-    """The blocks of a header, which is no longer than any.
+    """The blocks of a header, of which no more than `MAX_HEADER` bytes are read.
 
     Parameters
     ----------

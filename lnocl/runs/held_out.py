@@ -135,16 +135,16 @@ class HeldOutCounts:
         """Whether the iteration chosen with the first penalty is too near the last to be sure."""
         return LEAST_RATIO * cast(_First, self._first).n_iter > self._n_iter
 
-    def tell_of_no_end(self, is_remedied: bool) -> None:
-        """Warn of that, and say that a run with a weight is the result where it is."""
+    def warn_of_no_end(self, instead: Penalty | None) -> None:
+        """Warn of that, and name the penalty of the run that is the result instead, if any."""
         chosen = cast(_First, self._first).n_iter
         words = (
             f"held-out counts have chosen iteration {chosen} of {self._n_iter}, too near the end"
         )
-        if is_remedied:
+        if instead is not None:
             warn(
-                f"{words}: a weight is taken instead, until the objective settles; PSF or noise "
-                "may be wrong"
+                f"{words}: the result has `smoothing` {instead.in_words()} instead, run until the "
+                "objective settled; PSF or noise may be wrong"
             )
             return
         warn(

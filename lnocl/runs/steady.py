@@ -1,11 +1,12 @@
-"""A run with one weight to where it settles, from which star fluxes are told before others choose.
+"""A run with one weight of smoothing, whose star fluxes are the prior of those that follow.
 
-Held-out counts share what a scene leaves open. Pixels under a star may take over its light at
-almost no price, and so bright an extended source has a small relative error. The edge-preserving
-term holds that light where it belongs, whatever the number of iterations
-(:doc:`/validation/sgp`). So a run with a weight is the first; the star fluxes that it ends with,
-with the errors that the least squares of `lnocl.solvers.near_star` give them, are the prior of the
-runs from which held-out counts choose. Where these find no end, it is the answer.
+The extended source may take over the light of a star at almost no price, most of all where the core
+of the star is masked. Held-out counts do not notice it: both halves do so alike, and a brighter
+source has a smaller relative error. The edge-preserving term keeps the light in the star, whatever
+the number of iterations (:doc:`/validation/sgp`). So a run with a fixed weight goes first, until
+its objective settles. Its star fluxes, and their errors by the least squares of
+`lnocl.solvers.near_star`, are a Gaussian prior (`lnocl.scene.star_prior`) in the runs from which
+held-out counts choose. Where these choose an iteration too near the last, it is the result.
 """
 
 from __future__ import annotations

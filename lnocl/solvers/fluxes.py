@@ -128,6 +128,11 @@ def movable_weights(weights: Array, model: Array) -> Array:
     return np.where(model > MIN_MODEL, weights, 0.0)
 
 
+def precision(scene: Scene, model: Array, weights: Array) -> Array:
+    """Return one over the variances of the pixels of an image, scaled; 0 at the guard."""
+    return scene.scale * movable_weights(weights, model) / np.maximum(model, MIN_MODEL)
+
+
 def fit_fluxes(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Array:
     """Return the star fluxes that minimise J_0, by Fisher scoring from these."""
     if not len(fluxes):

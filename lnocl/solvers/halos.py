@@ -30,7 +30,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.forward_model import Model, model_images
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.texture import Texture, hidden_radii, resolution
-from lnocl.solvers.fluxes import variances
+from lnocl.solvers.fluxes import precision, variances
 from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
 
 # Conjugate gradients end at this share of the gradient, or after so many steps. The error of a
@@ -77,7 +77,7 @@ class _Joint:
         models = list(model_images(scene, extended, fluxes))
         totals = [np.maximum(mean, MIN_MODEL) for mean in models]
         precisions = [
-            np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0)
+            precision(scene, total, weights)
             for total, weights in zip(totals, model.weights, strict=True)
         ]
         fitted = np.append(_like_halos(scene, precisions), np.arange(scene.n_stars, scene.n_fluxes))
@@ -91,10 +91,10 @@ class _Joint:
         images = []
         unexpected = model.forward(extended - expected)
         arrays = zip(scene.images(), totals, precisions, unexpected, strict=True)
-        for j, (counts, total, precision, less) in enumerate(arrays):
+        for j, (counts, total, of_counts, less) in enumerate(arrays):
             shown = np.flatnonzero(scene.shown[fitted, j])
             slopes = np.array([scene.star_image(j, s).ravel() for s in fitted[shown]])
-            images.append(LinearImage(slopes, shown, counts - total + less, precision))
+            images.append(LinearImage(slopes, shown, counts - total + less, of_counts))
         # A level that is not known is a halo that is flat, which the prior holds.
         errors = scene.observation.background_error / scene.scale
         for k, j in enumerate(np.flatnonzero(errors).tolist()):
@@ -116,14 +116,14 @@ def _like_halos(scene: Scene, precisions: list[Array]) -> NDArray[np.int_]:
     """Return the stars of which halos share most of the information that images have of each."""
     n, shape = scene.n_stars, (scene.n_stars, scene.n_halos)
     own, shared, of_halos = np.zeros(n), np.zeros(shape), np.zeros(scene.n_halos)
-    for j, precision in enumerate(precisions):
+    for j, of_counts in enumerate(precisions):
         halos = {k: scene.star_image(j, n + k) for k in np.flatnonzero(scene.shown[n:, j]).tolist()}
         for k, halo in halos.items():
-            of_halos[k] = np.vdot(halo * precision, halo)
+            of_halos[k] = np.vdot(halo * of_counts, halo)
         for s in np.flatnonzero(scene.shown[:n, j]).tolist():
             star = scene.star_cutout(j, s)
             there = star.window(scene.image_grid)
-            weighted = precision[there] * star.values
+            weighted = of_counts[there] * star.values
             own[s] += np.vdot(weighted, star.values)
             for k, halo in halos.items():
                 shared[s, k] = np.vdot(weighted, halo[there])
@@ -168,15 +168,15 @@ def _significant(scene: Scene, model: Model, extended: Array, fluxes: Array) -> 
     models = model_images(scene, extended, fluxes)
     # A pixel of an image has the noise of all pixels of the sky in it.
     precisions = [
-        np.where(mean > MIN_MODEL, area * scene.scale * w / np.maximum(mean, MIN_MODEL), 0.0)
+        area * precision(scene, mean, w)
         for mean, w, area in zip(models, model.weights, scene.areas, strict=True)
     ]
     width = resolution(scene)
     # The light in a resolution over its noise: both are nearly flat over one.
     smooth = gaussian_filter(extended, width / FWHM, mode="wrap")
-    precision = np.maximum(model.adjoint(precisions), 0.0)
+    told = np.maximum(model.adjoint(precisions), 0.0)
     area = 4.0 * np.pi * (width / FWHM) ** 2
-    is_lit = smooth * np.sqrt(area * precision) > SIGNIFICANT
+    is_lit = smooth * np.sqrt(area * told) > SIGNIFICANT
     return np.asarray(maximum_filter(is_lit, 2 * int(np.ceil(ROUND * width)) + 1, mode="wrap"))
 
 

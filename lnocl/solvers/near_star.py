@@ -24,6 +24,7 @@ from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import along_sky
 from lnocl.scene.texture import Texture, hidden_radii, hidden_radius, resolution
+from lnocl.solvers.fluxes import precision
 from lnocl.solvers.least_squares import Field, LeastSquares, LevelError, LinearImage, SourceError
 from lnocl.solvers.levels import planes
 
@@ -108,7 +109,7 @@ class Surroundings:
         weights = np.ones((1, 1, 1)) if scene.weights is None else scene.weights
         weights = np.broadcast_to(weights, (scene.n_images, *scene.image_grid))
         models = model_images(scene, self.sky / scene.unit, self.star_fluxes / scene.unit)
-        return [_precision(scene, model, w) for model, w in zip(models, weights, strict=True)]
+        return [precision(scene, model, w) for model, w in zip(models, weights, strict=True)]
 
     def halos(self, j: int) -> list[Cutout]:
         """Return the halos of image j that are unknown, for an amount of 1."""
@@ -120,11 +121,11 @@ class Surroundings:
 
         That is their information, shape (n_shapes, n_shapes), less by the factors `raised`.
         """
-        precision = self._precisions[j].copy()
-        precision[window.of(self.scene.image_grid)] = 0.0
+        precisions = self._precisions[j].copy()
+        precisions[window.of(self.scene.image_grid)] = 0.0
         halos = np.array([halo.on_grid(self.scene.image_grid) for halo in self.halos(j)])
         halos *= self._roots[:, None, None]
-        return np.asarray(np.einsum("hyx,yx,iyx->hi", halos, precision, halos, optimize=True))
+        return np.asarray(np.einsum("hyx,yx,iyx->hi", halos, precisions, halos, optimize=True))
 
 
 class NearStar:
@@ -282,7 +283,6 @@ class NearStar:
         model, first, shape = background.copy(), (there.y, there.x), self.window.shape
         add_to_window(model, scene, around.sky, around.star_fluxes, j, first)
         total = np.maximum(model, MIN_MODEL)
-        precision = _precision(scene, model, weights)
         lit = np.flatnonzero(scene.shown[held, j])
         slopes = [_cut(scene.star_cutout(j, s), there, grid) for s in held[lit]]
         if around.moves:
@@ -301,8 +301,8 @@ class NearStar:
         unknowns, k = np.append(unknowns, of_halos), len(slopes)
         left = _padded(counts - total, shape) - beyond
         laid = np.array([_padded(slope, shape) for slope in slopes])
-        precision = _padded(precision, shape)
-        return LinearImage(laid.reshape(k, left.size), unknowns, left, precision)
+        precisions = _padded(precision(scene, model, weights), shape)
+        return LinearImage(laid.reshape(k, left.size), unknowns, left, precisions)
 
 
 def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slice], Texture]:
@@ -323,12 +323,6 @@ def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slic
     )
     extended = sky[whole.of(scene.grid)] / scene.unit
     return (there[0], there[1]), Texture(extended, stars[inside], width, around.hidden[inside])
-
-
-def _precision(scene: Scene, model: Array, weights: NDArray) -> Array:
-    """Return one over the variances of pixels of an image, scaled."""
-    lit = model > MIN_MODEL
-    return np.where(lit, scene.scale * weights / np.maximum(model, MIN_MODEL), 0.0)
 
 
 def _observed(scene: Scene, j: int, there: Window) -> tuple[Array, Array, Array]:

@@ -27,7 +27,7 @@ from lnocl.scene.forward_model import Model, sampled, spread
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.scene import MIN_MODEL, Scene
-from lnocl.solvers.fluxes import MAX_FADING
+from lnocl.solvers.fluxes import MAX_FADING, precision
 from lnocl.solvers.least_squares import Field, LeastSquares, LinearImage, SourceError
 
 # The error of the extended source is correlated over this, pixels of the images, and as large as it
@@ -156,7 +156,7 @@ def _linearise(
                 np.array(slopes).reshape(len(slopes), -1),
                 np.concatenate([np.arange(j * k, (j + 1) * k), shared]),
                 counts - total,
-                np.where(total > MIN_MODEL, scene.scale * weights / total, 0.0),
+                precision(scene, total, weights),
             )
         )
     return images

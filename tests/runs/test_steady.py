@@ -58,7 +58,7 @@ def test_where_held_out_counts_find_no_end_a_weight_is_taken():
     """The run with that weight, asked for by name, is the same bit for bit."""
     observation, engine = knot(), {"engine": "numpy"}
     fixed = {"refine_positions": False, "refine_psfs": (), **engine}
-    with pytest.warns(lnocl.LnoclWarning, match="too near the end: a weight is taken instead"):
+    with pytest.warns(lnocl.LnoclWarning, match="too near the end: the result has smoothing"):
         result = lnocl.deconvolve(observation, [(22, 20)], n_iter=20, **fixed)
     assert result.stop_reason != "held-out"
     weight = 3.0 * recommend_smoothing(observation)
