@@ -209,7 +209,7 @@ class LnoclWarning(UserWarning):
 
 
 class MisfitWarning(LnoclWarning):
-    """The model that a run has ended with does not fit its images: a line of `Result.verdict`.
+    """The model that a run has ended with does not fit its images; see `~lnocl.Result.verdict`.
 
     Examples
     --------

@@ -12,12 +12,14 @@ from scipy.stats import t
 import lnocl
 from lnocl.runs import bootstrap
 from lnocl.runs.bootstrap import Bootstrap, Quantity
+from lnocl.runs.repeated import Repeated
 from lnocl.runs.replicas import Replicas
 from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_start
 from lnocl.scene.apertures import Aperture
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.shifting import place
+from lnocl.scene.star_prior import StarPrior
 
 BASE = Recipe((32, 32), 2, 1, smooth=True)
 RECIPES = {
@@ -115,6 +117,40 @@ def test_replicas_hang_on_seed_and_number_alone():
     different = Replicas(outcome, 6).reconstruct(0)[0].extended
     assert (different != second.reconstruct(0)[0].extended).any()
     assert (different != second.reconstruct(1)[0].extended).any()
+
+
+# --- The prior of star fluxes
+
+
+def told(errors):
+    """Return the outcome of a run with a prior of these errors, at the fluxes of the stars."""
+    made = BASE.make()
+    setup = Setup(made.observation(), made.stars, 0, "sgp", "double", "numpy", None)
+    fluxes = Run(make_start(setup, Penalty(smoothing=1e-3)), 8).star_fluxes()
+    run = Run(make_start(setup, Penalty(smoothing=1e-3, stars=StarPrior.of(fluxes, errors))), 8)
+    assert list(run) == list(range(1, 9))
+    return run.outcome("n_iter")
+
+
+def test_a_repeated_run_heeds_the_prior_that_it_is_given():
+    outcome = told(np.array([1e-3]))
+    counts = outcome.scene.observation.images
+    fluxes = 1.1 * outcome.star_fluxes
+    found = Repeated(outcome).of(counts, StarPrior.of(fluxes, np.array([1e-3])))
+    np.testing.assert_allclose(found.star_fluxes, fluxes, rtol=1e-3)
+
+
+def test_each_replica_has_a_prior_that_is_drawn_about_its_truth(monkeypatch):
+    outcome, seen = told(np.array([20.0])), []
+    of = Repeated.of
+    monkeypatch.setattr(Repeated, "of", lambda *given: (seen.append(given[-1]), of(*given))[1])
+    replicas = Replicas(outcome, 0)
+    for k in range(12):
+        replicas.reconstruct(k)
+    pulls = np.array([prior.fluxes - outcome.star_fluxes for prior in seen]) / 20.0
+    assert len(np.unique(pulls)) == 12
+    assert 0.5 < pulls.std() < 1.7
+    assert abs(pulls.mean()) < 3 / np.sqrt(12)
 
 
 # --- What is made of it

@@ -39,11 +39,12 @@ def test_of_half_of_the_counts_it_is_the_same_scaled():
 
 @pytest.mark.parametrize("solver", ["sgp", "sgm"])
 def test_iterations_end_where_the_gradients_of_data_and_prior_cancel(solver):
+    """From where the data have the fluxes: the data term has to rise on the way."""
     told = np.array([900.0, np.nan])
     prior = StarPrior.of(told, np.array([7.0, 1.0]))
-    start = a_start(solver, prior)
+    start, without = a_start(solver, prior), a_start(solver, None)
     engine = ReferenceEngine(start.scene, start.scaling)
-    engine.start(start.extended, start.star_fluxes)
+    engine.start(without.extended, without.star_fluxes)
     for _ in SOLVERS[solver](engine, 3000, None, start.scene.star_prior):
         pass
     engine.ratio()
@@ -52,6 +53,20 @@ def test_iterations_end_where_the_gradients_of_data_and_prior_cancel(solver):
     assert abs(of_data[1]) < 1e-4  # measured below 4e-5
     assert abs(of_prior[0]) > 0.01
     assert abs(of_data[0] + of_prior[0]) < 1e-3 * abs(of_prior[0])
+
+
+def test_a_prior_that_is_added_to_a_start_is_that_of_a_start_with_it():
+    prior = StarPrior.of(np.array([900.0, np.nan]), np.array([7.0, 1.0]))
+    made, without = a_start("sgp", prior), a_start("sgp", None)
+    added = without.penalised(Penalty(mu=1e-2, stars=prior))
+    np.testing.assert_array_equal(added.star_fluxes, made.star_fluxes)
+    informations = [each.scaling.star_information.dense() for each in (added, made, without)]
+    np.testing.assert_array_equal(*informations[:2])
+    more = informations[0] - informations[2]
+    np.testing.assert_allclose(more, np.diag(made.scene.star_prior.precision), rtol=1e-9, atol=1e-9)
+    assert more[0, 0] > 0
+    far, near = (abs(each.star_fluxes - prior.fluxes / each.scene.unit) for each in (without, made))
+    assert near[0] < 0.5 * far[0]
 
 
 def test_priors_are_drawn_about_the_fluxes_with_their_errors():

@@ -17,14 +17,14 @@ HOST *= 1e5 / HOST.sum()
 STARS, FLUXES = [(24, 24), (33, 21)], np.array([1e5, 3e4])
 
 
-def a_scene(scale=1.0, stars=STARS, fluxes=FLUXES, **known):
-    """Return a scene of the mean counts of the host and stars."""
-    observation = lnocl.Observation(np.full((N, N), 5.0), PSF, background=scale * 30.0, **known)
+def a_scene(scale=1.0, stars=STARS, fluxes=FLUXES, psf=PSF, host=HOST, **known):
+    """Return a scene of the mean counts of a host and stars."""
+    observation = lnocl.Observation(np.full((N, N), 5.0), psf, background=scale * 30.0, **known)
     flat = Scene(observation, stars)
-    light = np.array(list(Model(flat).images(scale * HOST / flat.unit, scale * fluxes / flat.unit)))
+    light = np.array(list(Model(flat).images(scale * host / flat.unit, scale * fluxes / flat.unit)))
     if flat.has_exposure_map:
         light *= flat.weights
-    observation = lnocl.Observation(light * flat.scale, PSF, background=scale * 30.0, **known)
+    observation = lnocl.Observation(light * flat.scale, psf, background=scale * 30.0, **known)
     return Scene(observation, stars)
 
 
@@ -55,6 +55,20 @@ def test_the_extended_source_gains_no_more_than_the_stars_lose():
     assert (found_sky >= 0).all()
     far = np.min([np.hypot(X + 24 - x, Y + 24 - y) for x, y in STARS], axis=0) > 5
     np.testing.assert_array_equal(found_sky[far], sky[far])
+
+
+def test_light_where_no_image_has_observed_a_pixel_goes_to_the_star():
+    """An estimate has given a ring under the mask a tenth of the star."""
+    radius, sky, flux = np.hypot(X, Y), np.full((N, N), 2.0), FLUXES[:1]
+    psf = (1 + (X**2 + Y**2) / 15.0) ** -3.0  # with wings, which are seen beyond the mask
+    scene = a_scene(stars=STARS[:1], fluxes=flux, psf=psf, host=sky, mask=radius < 6)
+    ring = np.exp(-0.5 * (radius - 4.5) ** 2)
+    ring *= 1e4 / ring.sum()
+    found_sky, found = marginal(scene, sky + ring, flux - 1e4)
+    won, taken = found - (flux - 1e4), sky + ring - found_sky
+    assert won[0] == pytest.approx(1e4, rel=0.1)
+    assert taken.sum() == pytest.approx(won[0], rel=0.01)
+    assert taken[radius > 3.5].sum() > 0.5 * won[0]
 
 
 def test_the_truth_stays():
