@@ -21,6 +21,7 @@ from lnocl.errors import FileError as FileError
 from lnocl.errors import InputError as InputError
 from lnocl.errors import LnoclError, LnoclWarning
 from lnocl.result import Result
+from lnocl.runs.plan import Plan, plan
 from lnocl.scene.observation import Observation
 from lnocl.scene.psf_field import PsfField
 from lnocl.scene.transforms import rotations
@@ -30,10 +31,12 @@ __all__ = [
     "LnoclError",
     "LnoclWarning",
     "Observation",
+    "Plan",
     "PsfField",
     "Result",
     "deconvolve",
     "deconvolve_tiles",
+    "plan",
     "rotations",
 ]
 __version__ = version("lnocl")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lnocl.errors import DivergedError, InputError, NotFiniteError, note, warn
+from lnocl.errors import DivergedError, NotFiniteError, note, warn
 from lnocl.result import Callback, Estimate, Iterating, Result, make_result
 from lnocl.result.verdict import warn_of_faults
 from lnocl.runs.checkpoint import Checkpointer, describe
@@ -20,25 +20,20 @@ from lnocl.runs.halves import Halves
 from lnocl.runs.held_out import HeldOutCounts
 from lnocl.runs.held_out import most_bytes as most_bytes_of_halves
 from lnocl.runs.options import (
-    CONVERGED,
     EngineName,
     Precision,
     StopName,
-    check_choices,
-    check_families,
-    check_length,
-    check_observation,
     check_types,
-    read_penalties,
-    read_refine_positions,
-    read_start,
     warn_of_rounding,
 )
-from lnocl.runs.outcome import Mended, Outcome
+from lnocl.runs.outcome import Outcome
+from lnocl.runs.plan import FIT, HALOS, LEVELS, Plan
+from lnocl.runs.plan import plan as make_plan
+from lnocl.runs.preparation import Prepared, prepare, quietly
 from lnocl.runs.progress import Progress
 from lnocl.runs.run import Run, most_bytes
-from lnocl.runs.start import Setup, Start, make_start
-from lnocl.runs.steady import run_steadily, steady_penalty, told_prior
+from lnocl.runs.start import Start, make_start
+from lnocl.runs.steady import run_steadily, told_prior
 from lnocl.runs.stopping import Rule, make_rule
 from lnocl.scene.freedoms import refusal
 from lnocl.scene.noise_check import warn_of_noise
@@ -46,7 +41,6 @@ from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.psf_families import Family
 from lnocl.scene.star_check import warn_of_stars
-from lnocl.scene.stars import check_positions
 from lnocl.solvers import SolverName
 
 
@@ -336,165 +330,84 @@ def deconvolve(
     >>> result.n_iter, result.stop_reason
     (3, 'callback')
     """
-    check_observation(observation)
-    check_choices(solver, precision, engine, device)
-    check_length(n_iter, stop)
     check_types(callback, progress=progress)
-    refine_positions = read_refine_positions(refine_positions)
-    fits_stars = solver == "sgp" or refine_positions is True
-    positions = check_positions(stars, observation)
-    observation = observation.upright()
-    initial = read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
-    Penalty(mu)  # a wrong weight is refused before any work
-    is_auto = isinstance(smoothing, str) and smoothing == "auto"
-    has_halos = is_auto and len(observation.halos) > 0
-    has_levels = is_auto and bool(observation.background_error.any())
-    is_auto = is_auto and len(positions) > 0
-    is_auto = is_auto and not observation.psf_fields  # which are not judged
-    reasons = {
-        "are turned against the sky": observation.is_turned,
-        "are of several epochs": observation.n_epochs > 1,
-        "have halos": len(observation.halos) > 0,
-    }
-    found = [reason for reason, holds in reasons.items() if holds]
-    are_told_last = is_auto and bool(found)
-    if are_told_last:
-        note("PSFs are not judged before the run, as the images %s", found[0])
-        is_auto = False
-    families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
-    if refine_positions is True and (why := refusal("refine_positions", observation)):
-        raise InputError(why)
-    moves = refine_positions if is_auto else refine_positions is True
-    shared = observation, positions, pad, solver, precision, engine, device
-    setup = Setup(*shared, moves is True, *initial, settles_halos=has_halos)
-    if has_levels:
-        from lnocl.runs.halos import settle_levels  # which loads scipy
-
-        with _quietly(), Progress(None, "", bool(progress), "fitting levels", stays=False):
-            setup = settle_levels(setup)
-    is_asked = bool(families) and not isinstance(refine_psfs, str)
-    mended, penalties, stop = choose_penalties(
-        setup, mu, smoothing, stop, families, moves, is_asked, is_auto, progress
+    plan = make_plan(
+        observation,
+        stars,
+        mu=mu,
+        smoothing=smoothing,
+        solver=solver,
+        n_iter=n_iter,
+        stop=stop,
+        precision=precision,
+        engine=engine,
+        device=device,
+        pad=pad,
+        initial_extended=initial_extended,
+        initial_star_fluxes=initial_star_fluxes,
+        refine_positions=refine_positions,
+        refine_psfs=refine_psfs,
     )
+    prepared = prepare(plan, progress)
     inputs = partial(
-        describe, mended.setup, mu=mu, smoothing=smoothing, n_iter=int(n_iter), stop=stop
+        describe,
+        prepared.setup,
+        mu=mu,
+        smoothing=smoothing,
+        n_iter=plan.n_iter,
+        stop=prepared.stop,
     )
-    checkpoints = partial(
-        Checkpointer,
-        describe=inputs,
-        path=checkpoint,
-        resume=resume,
-    )
+    checkpoints = partial(Checkpointer, describe=inputs, path=checkpoint, resume=resume)
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
-    outcome = reconstruct(
-        mended.setup,
-        penalties,
-        n_iter,
-        stop,
-        callback,
-        progress,
-        checkpoints,
-        steady_penalty(penalties),
-    )
-    if are_told_last:
-        is_fit = not any(star.is_misfit for star in outcome.star_residuals())
-    else:
-        is_fit = is_auto and mended.fits
-    if stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):
-        is_fit = False  # what leaves them without an end leaves marginal fluxes without sense
-    if is_fit or has_halos or has_levels:
-        what = "fitting stars, halos and levels"
-        with _quietly(), Progress(None, "", bool(progress), what, stays=False):
-            outcome = outcome.marginal(is_fit, has_halos, has_levels)
-    for words in outcome.levels_in_words():
-        note("%s", words)
-    may_free = "pixels" not in families and not refusal("refine_psfs", observation)
-    outcome = replace(outcome, psf_refinement=mended.refinement, may_free_pixels=may_free)
+    outcome = reconstruct(prepared, callback, progress, checkpoints)
+    outcome = _finish(outcome, plan, prepared, progress)
     result = make_result(outcome)
     warn_of_faults(result, progress)
     return result
 
 
-def _quietly() -> np.errstate:
-    """Have NumPy not warn of what is too large: the run looks for objectives that are infinite."""
-    return np.errstate(over="ignore", invalid="ignore")
-
-
-def choose_penalties(
-    setup: Setup,
-    mu: float,
-    smoothing: float | Literal["auto"],
-    stop: StopName | float | None,
-    families: Sequence[str],
-    moves: bool | str,
-    is_asked: bool,
-    is_auto: bool,
-    progress: bool,
-) -> tuple[Mended, list[Penalty], StopName | float | None]:
-    """Return a setup whose PSFs and positions were judged, the penalties for it, and when to stop.
-
-    Parameters
-    ----------
-    setup, mu, smoothing, stop, progress
-        As for `deconvolve`.
-    families, moves, is_asked
-        As for `lnocl.runs.psf_refinement.mend`.
-    is_auto : bool
-        Whether PSFs are judged though nothing is asked of them.
-    """
-    mended = Mended(setup)
-    if is_auto or families or len(setup.observation.psf_scatter):
-        mended = judge_psfs(setup, families, moves, is_asked, progress)
-    are_psfs_wrong = is_auto and mended.near_stars is not None and not mended.fits
-    observation, near_stars = mended.setup.observation, mended.near_stars
-    penalties = read_penalties(mu, smoothing, stop, observation, near_stars, are_psfs_wrong)
-    if are_psfs_wrong and stop == "held-out":
-        stop = CONVERGED
-    return mended, penalties, stop
-
-
-def judge_psfs(
-    setup: Setup, families: Sequence[str], moves: bool | str, is_asked: bool, progress: bool
-) -> Mended:
-    """Return the result of `lnocl.runs.psf_refinement.mend`, or `setup` where it is not finite."""
-    from lnocl.runs.psf_refinement import mend  # which loads scipy
-
-    judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
-    with judging, suppress(NotFiniteError):  # of which the run itself tells
-        return mend(setup, families, moves, is_asked, judging.update)
-    return Mended(setup)
+def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) -> Outcome:
+    """Return an outcome with what the plan has marginal, and how well PSFs fit."""
+    is_fit = prepared.fits
+    if plan.does(FIT):
+        is_fit = not any(star.is_misfit for star in outcome.star_residuals())
+    if prepared.stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):
+        is_fit = False  # what leaves them without an end leaves marginal fluxes without sense
+    has_halos, has_levels = plan.does(HALOS), plan.does(LEVELS)
+    if is_fit or has_halos or has_levels:
+        what = "fitting stars, halos and levels"
+        with quietly(), Progress(None, "", bool(progress), what, stays=False):
+            outcome = outcome.marginal(is_fit, has_halos, has_levels)
+    for words in outcome.levels_in_words():
+        note("%s", words)
+    may_free = "pixels" not in plan.families and not refusal("refine_psfs", outcome.observation)
+    return replace(outcome, psf_refinement=prepared.refinement, may_free_pixels=may_free)
 
 
 def reconstruct(
-    setup: Setup,
-    penalties: Sequence[Penalty],
-    n_iter: int,
-    stop: str | float | None,
+    prepared: Prepared,
     callback: Callback | None = None,
     progress: bool = False,
     checkpoints: Callable[[Callable[[], int]], Checkpointer] = Checkpointer,
-    steady: Penalty | None = None,
 ) -> Outcome:
     """Return the outcome with the first penalty, or with those that held-out counts choose.
 
     Parameters
     ----------
-    setup : Setup
-        The observation and the parameters.
-    penalties : sequence of Penalty
-        One, or more to choose from.
-    n_iter, stop, callback, progress
+    prepared : Prepared
+        The parameters. With its steady penalty a run goes before, whose star fluxes are the prior
+        of the others (`lnocl.runs.steady`); it is the outcome where held-out counts find no end.
+    callback, progress
         As for `deconvolve`.
     checkpoints : callable
         Returns what writes checkpoints, given what returns the bytes that they may take.
-    steady : Penalty, optional
-        That of a run before, whose star fluxes are the prior of the others (`lnocl.runs.steady`),
-        and which is the outcome where held-out counts find no end.
     """
+    setup, penalties, steady = prepared.setup, prepared.penalties, prepared.steady
+    n_iter, stop = prepared.n_iter, prepared.stop
     if setup.engine == "opencl" and setup.precision == "single":
-        warn_of_rounding(int(n_iter))
-    with _quietly():
+        warn_of_rounding(n_iter)
+    with quietly():
         with Progress(None, "", bool(progress), "measuring steps", stays=False):
             start = make_start(setup, penalties[0])
             if setup.settles_halos:
@@ -504,25 +417,25 @@ def reconstruct(
         warn_of_noise(setup.observation)
         warn_of_stars(start.scene, setup.refine_positions)
         measure = most_bytes_of_halves if stop == "held-out" else most_bytes
-        largest = partial(measure, start, int(n_iter))
+        largest = partial(measure, start, n_iter)
         checkpointer = checkpoints(largest)
         told = None
         if steady is not None and start.scene.n_stars:
-            told = _run_steadily(start, steady, int(n_iter), progress)
+            told = _run_steadily(start, steady, n_iter, progress)
         if told is not None:
             prior = told_prior(told)
             penalties = [replace(penalty, stars=prior) for penalty in penalties]
         if stop == "held-out":
-            held_out = HeldOutCounts(start, penalties, int(n_iter))
+            held_out = HeldOutCounts(start, penalties, n_iter)
             outcome = _choose(held_out, callback, progress, checkpointer)
             if outcome.stop_reason != "held-out" or not held_out.finds_no_end:
                 return outcome
             if steady is not None and told is None:
-                told = _run_steadily(start, steady, int(n_iter), progress)
+                told = _run_steadily(start, steady, n_iter, progress)
             held_out.warn_of_no_end(None if told is None else steady)
             return outcome if told is None else replace(told, curve=outcome.curve)
-        with Progress(int(n_iter), "it", bool(progress), "iterations") as bar:
-            run = Run(start.penalised(penalties[0]), int(n_iter))
+        with Progress(n_iter, "it", bool(progress), "iterations") as bar:
+            run = Run(start.penalised(penalties[0]), n_iter)
             del start, largest  # which hold arrays of the grid
             return run.outcome(_complete(run, make_rule(stop), callback, bar, checkpointer))
 

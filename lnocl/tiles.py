@@ -7,38 +7,29 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.deconvolution import choose_penalties, reconstruct
+from lnocl.deconvolution import reconstruct
 from lnocl.errors import InputError, LnoclWarning, counted, warn
 from lnocl.parallel import Parallel, check_parallel, work
 from lnocl.process import ignored_warnings, recorded_warnings
 from lnocl.residuals import StarResiduals
 from lnocl.result import Result, make_result
 from lnocl.result.verdict import warn_of_faults
-from lnocl.runs.options import (
-    StopName,
-    check_choices,
-    check_families,
-    check_length,
-    check_observation,
-    read_refine_positions,
-)
+from lnocl.runs.options import StopName, check_observation
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome, PsfRefinement
+from lnocl.runs.plan import plan as make_plan
+from lnocl.runs.preparation import Prepared, prepare
 from lnocl.runs.progress import Progress
-from lnocl.runs.start import Setup
-from lnocl.runs.steady import steady_penalty
 from lnocl.scene.arrays import Array
 from lnocl.scene.grid import length_for
 from lnocl.scene.observation import Observation, mean_exposure
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import EDGE, Scene
-from lnocl.scene.stars import check_positions
 
 # The side of a tile in those of the PSFs, where these vary: docs/validation/tiles.md.
 SIDES = 5
@@ -279,61 +270,58 @@ def deconvolve_tiles(
     check_parallel(parallel)
     check_observation(observation)
     _refuse_turned(observation)
-    check_length(n_iter, stop)
     _check_options(options)
-    given = {"solver": "sgp", "precision": "single", "engine": "opencl", "device": None, **options}
-    moves = read_refine_positions(given.pop("refine_positions", "auto"))
-    positions = check_positions(stars, observation)
-    Penalty(mu)  # a wrong weight is refused before any work
-    is_auto = isinstance(smoothing, str) and smoothing == "auto" and len(positions) > 0
-    is_auto = is_auto and not observation.psf_fields  # which are not judged
-    families = check_families("auto", observation, positions, moves, is_auto)
-    pad = given.pop("pad", "auto")
-    check_choices(**given)
+    pad = options.pop("pad", "auto")
+    given = {"mu": mu, "smoothing": smoothing, "n_iter": n_iter, "stop": stop, **options}
+    plan = make_plan(observation, stars, **given)
+    positions = plan.setup.stars
     tile_pad = _pad(observation, pad)
     tiles = _lay(observation, tile, tile_pad)
-    moves = moves if is_auto else moves is True
-    whole = Setup(observation, positions, pad, refine_positions=moves is True, **given)
-    mended, penalties, stop = choose_penalties(
-        whole, mu, smoothing, stop, families, moves, False, is_auto, progress
-    )
-    observation = mended.setup.observation
+    plan = replace(plan, setup=replace(plan.setup, pad=pad), in_tiles=True)
+    prepared = prepare(plan, progress)
+    observation, near_stars = prepared.setup.observation, prepared.penalties[0].near_stars
     observed = [
-        _cut(observation, positions, mended.near_stars, (y, x))
+        _cut(observation, positions, near_stars, (y, x))
         for y, x in tiles
         if not observation.mask[:, y.seen, x.seen].all()
     ]
     _refuse_unowned(positions, observed)
     if len(tiles) > 1:
-        pad, exposure = tile_pad, mean_exposure(observation)
-        penalties = [replace(each, exposure=exposure) for each in penalties]
-        if any(each.smoothing for each in penalties) or mended.near_stars is not None:
+        common = {"exposure": mean_exposure(observation)}
+        if near_stars is not None or any(each.smoothing for each in prepared.penalties):
             with ignored_warnings():  # of which the tiles know more
-                edge = EDGE * Scene(observation, positions).level
-            penalties = [replace(each, edge=edge) for each in penalties]
-    curve, reason, penalty, last = np.zeros(0, CURVE_DTYPE), "", penalties[0], stop
-    setup = partial(Setup, pad=pad, refine_positions=mended.setup.refine_positions, **given)
-    is_fit, steady = is_auto and mended.fits, steady_penalty(penalties)
-    if isinstance(stop, str):
-        solver = _Solver(setup, penalties, n_iter, stop, steady, mended.refinement, False)
-        chosen = _choose(observed, parallel, solver)
-        curve, reason, n_iter, last = chosen.held_out, chosen.stop_reason, chosen.n_iter, None
-        penalty = replace(penalties[0], smoothing=chosen.smoothing)
-        if reason != stop:  # held-out counts have found no end, and this is the steady run
-            is_fit, steady = False, None
-    solver = _Solver(setup, [penalty], max(n_iter, 1), last, steady, mended.refinement, is_fit)
+                common["edge"] = EDGE * Scene(observation, positions).level
+        prepared = prepared.penalised(**common)
+    pad = tile_pad if len(tiles) > 1 else pad
+    # It goes to other processes, without the whole images.
+    prepared = prepared.of(observed[0].observation, observed[0].stars, pad=pad)
+    curve, reason, chosen = np.zeros(0, CURVE_DTYPE), "", None
+    if isinstance(prepared.stop, str):
+        chosen = _choose(observed, parallel, _Solver(replace(prepared, fits=False)))
+        curve, reason = chosen.held_out, chosen.stop_reason
+        prepared = _ending(prepared, chosen)
     mosaic = _Mosaic(observation, positions)
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
-        closing(work(solver.solving, observed, parallel)) as answers,
+        closing(work(_Solver(prepared).solving, observed, parallel)) as answers,
     ):
         for each, found in zip(observed, answers, strict=True):
             mosaic.add(each, found)
             bar.update()
     _warn_of_tiles(mosaic.messages)
-    result = mosaic.result(penalty, curve, reason, n_iter if reason else None, mended.refinement)
+    n_done = chosen and chosen.n_iter
+    result = mosaic.result(prepared.penalties[0], curve, reason, n_done, prepared.refinement)
     warn_of_faults(result, progress)
     return result
+
+
+def _ending(prepared: Prepared, choice: _Choice) -> Prepared:
+    """Return the runs of all tiles after some have chosen."""
+    penalty = replace(prepared.penalties[0], smoothing=choice.smoothing)
+    prepared = replace(prepared, penalties=[penalty], n_iter=max(choice.n_iter, 1))
+    if choice.stop_reason != prepared.stop:  # there was no end, and this is the steady run
+        prepared = replace(prepared, steady=None, fits=False)
+    return replace(prepared, stop=None)
 
 
 ALLOWED = {"solver", "precision", "engine", "device", "pad", "refine_positions"}
@@ -470,19 +458,9 @@ class _Choice(NamedTuple):
 
 
 class _Solver(NamedTuple):
-    """The parameters that tiles share; `setup` takes the observation and the stars of each.
+    """The run that tiles share; its setup takes the observation and the stars of each."""
 
-    The PSFs were judged as those of one run are, whose `refinement` is their outcome; the fluxes of
-    stars are marginal where they fit.
-    """
-
-    setup: Callable[[Observation, Array], Setup]
-    penalties: Sequence[Penalty]
-    n_iter: int
-    stop: str | float | None
-    steady: Penalty | None
-    refinement: PsfRefinement | None
-    is_fit: bool
+    prepared: Prepared
 
     def choosing(self) -> Callable[[_Tile], _Choice]:
         """Return the function that has a tile choose iterations and smoothing."""
@@ -498,13 +476,12 @@ class _Solver(NamedTuple):
         return _Choice(result.n_iter, result.smoothing, result.stop_reason, result.held_out)
 
     def _outcome(self, tile: _Tile) -> Outcome:
-        penalties = [replace(each, near_stars=tile.near_stars) for each in self.penalties]
-        steady = self.steady and replace(self.steady, near_stars=tile.near_stars)
-        setup = self.setup(tile.observation, tile.stars)
-        outcome = reconstruct(setup, penalties, self.n_iter, self.stop, steady=steady)
-        if self.is_fit and len(tile.stars):
+        prepared = self.prepared.of(tile.observation, tile.stars)
+        prepared = prepared.penalised(near_stars=tile.near_stars)
+        outcome = reconstruct(prepared)
+        if prepared.fits and len(tile.stars):
             outcome = outcome.marginal(stars=True, halos=False, levels=False)
-        return replace(outcome, psf_refinement=self.refinement)
+        return replace(outcome, psf_refinement=prepared.refinement)
 
     def _solve(self, tile: _Tile) -> _Found:
         tile = tile.without_unseen_neighbours()

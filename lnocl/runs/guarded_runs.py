@@ -21,9 +21,9 @@ from scipy.spatial import KDTree
 
 from lnocl.errors import DivergedError
 from lnocl.process import ignored_notes, ignored_warnings
-from lnocl.runs.options import WRONG_PSFS
 from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_model, make_start
+from lnocl.runs.steady import STEADY
 from lnocl.scene.arrays import Array
 from lnocl.scene.forward_model import Model
 from lnocl.scene.noise_check import with_noise_shown
@@ -114,7 +114,7 @@ class GuardedRuns:
         self._setup = replace(
             setup, solver="sgp", pad=pad, initial_extended=None, initial_star_fluxes=None
         )
-        self._smoothing = WRONG_PSFS * recommend_smoothing(self.observation)
+        self._smoothing = STEADY * recommend_smoothing(self.observation)
 
     def fit(
         self,

@@ -14,20 +14,11 @@ from lnocl.scene.arrays import Array, flag
 from lnocl.scene.containers import counts
 from lnocl.scene.freedoms import refusal
 from lnocl.scene.observation import Observation, numbers
-from lnocl.scene.penalty import Penalty, recommend_smoothing
 from lnocl.scene.psf_families import FAMILIES
 from lnocl.solvers import SOLVERS
 
 # The iteration of La Camera et al. (2012), whatever the defaults; mu and n_iter are given too.
 PAPER: dict[str, Any] = {"solver": "sgm", "stop": None, "smoothing": 0.0, "pad": 0}
-
-# Of the smoothing that is recommended, from which held-out counts choose besides none.
-MULTIPLES = (1.0, 3.0, 10.0)
-
-# And that of which is taken where PSFs are wrong.
-WRONG_PSFS = 3.0
-# Such runs end where the objective falls by less than this share of itself in an iteration.
-CONVERGED = 1e-6
 
 # Families of PSFs, and what an observation must have for them.
 NEEDS = {"strehl": "ideal_psfs", "pupil": "pupils", "modes": "psf_modes"}
@@ -133,8 +124,10 @@ def check_families(
     for name in found:
         if not (isinstance(name, str) and name in FAMILIES):
             raise InputError(f"`refine_psfs` {name!r} is not known; give {', '.join(FAMILIES)}")
-    if (found or len(observation.psf_scatter)) and (why := refusal("refine_psfs", observation)):
-        raise InputError(why)
+    asked = {"refine_psfs": bool(found), "psf_scatter": len(observation.psf_scatter) > 0}
+    for name in (name for name, is_asked in asked.items() if is_asked):
+        if why := refusal(name, observation):
+            raise InputError(why)
     if found and not len(positions):
         raise InputError("`refine_psfs` needs a star, whose image shows the PSF; give stars")
     for name, needed in NEEDS.items():
@@ -238,39 +231,19 @@ def read_start(
     return extended, fluxes
 
 
-def read_penalties(
-    mu: Any,
-    smoothing: Any,
-    stop: object,
-    observation: Observation,
-    near_stars: Array | None = None,
-    are_psfs_wrong: bool = False,
-) -> list[Penalty]:
-    """Return the penalty; for smoothing "auto" with held-out counts those to choose from.
-
-    There is one alone where the PSFs are wrong: held-out counts share that error, and choose too
-    little. `near_stars` is the weight that an error of the PSFs asks for near stars.
+def read_smoothing(value: object) -> float | Literal["auto"]:
+    """Return a number or "auto".
 
     Raises
     ------
     InputError
-        A weight is not a number, finite and not negative; smoothing is another word than "auto".
+        It is another word.
     """
-    if not isinstance(smoothing, str):
-        return [Penalty(mu, smoothing)]
-    if smoothing != "auto":
-        raise InputError(f"`smoothing` {smoothing!r} is not known; give a number or auto")
-    recommended = recommend_smoothing(observation)
-    if are_psfs_wrong and near_stars is not None:
-        penalty = Penalty(mu, WRONG_PSFS * recommended, near_stars=near_stars)
-        note(f"`smoothing` chosen: {penalty.in_words()}, by the error of the PSFs")
-        return [penalty]
-    if stop == "held-out":
-        weights = [multiple * recommended for multiple in (0.0, *MULTIPLES)]
-        return [Penalty(mu, weight, near_stars=near_stars) for weight in weights]
-    penalty = Penalty(mu, recommended, near_stars=near_stars)
-    note(f"`smoothing` chosen: {penalty.in_words()}, by the noise of the counts")
-    return [penalty]
+    if isinstance(value, str):
+        if value != "auto":
+            raise InputError(f"`smoothing` {value!r} is not known; give a number or auto")
+        return "auto"
+    return cast(float, value)
 
 
 def warn_of_rounding(n_iter: int) -> None:

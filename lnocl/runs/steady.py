@@ -17,7 +17,6 @@ from dataclasses import replace
 import numpy as np
 
 from lnocl.process import ignored_notes, ignored_warnings
-from lnocl.runs.options import WRONG_PSFS
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.run import Run
 from lnocl.runs.start import Start
@@ -25,6 +24,8 @@ from lnocl.runs.stopping import Change
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.star_prior import StarPrior
 
+# Its weight in those that are recommended; that of runs with wrong PSFs too.
+STEADY = 3.0
 # It ends where the objective falls by less than this share of itself in an iteration.
 SETTLED = 1e-5
 # The share of the gradient at which the conjugate gradients of errors end.
@@ -32,14 +33,14 @@ FINISHED = 1e-2
 
 
 def steady_penalty(penalties: Sequence[Penalty]) -> Penalty | None:
-    """Return that of such a run, with `WRONG_PSFS` times the recommended weight.
+    """Return that of such a run, with `STEADY` times the recommended weight.
 
     `penalties` are those to choose from: none, the recommended weight, and multiples of it. Where
     there is nothing to choose there is no such run, and it is None.
     """
     if len(penalties) == 1:
         return None
-    return replace(penalties[1], smoothing=WRONG_PSFS * penalties[1].smoothing)
+    return replace(penalties[1], smoothing=STEADY * penalties[1].smoothing)
 
 
 def run_steadily(

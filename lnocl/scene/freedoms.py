@@ -1,36 +1,47 @@
-"""What may be free in a fit: the rule of the refusals, and of the advice that leads to them."""
+"""What may be free in a fit: conditions on images, of plans, of refusals and of advice."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 from lnocl.scene.observation import Observation
 
 
-def refusal(name: str, observation: Observation) -> str:
-    """Return why a parameter of `lnocl.deconvolve` is refused for images; nothing where it is not.
+class Condition(NamedTuple):
+    """What must hold of images for a fit.
 
-    Parameters
+    Attributes
     ----------
-    name : {"refine_positions", "refine_psfs"}
-        The parameter.
-    observation : Observation
-        The images.
+    holds : callable
+        Tells of an observation whether it does.
+    otherwise : str
+        What is said where it does not.
     """
-    if name == "refine_positions":
-        if observation.n_epochs > 1:
-            return "`refine_positions` moves stars of one epoch alone; leave it out, or `epochs`"
-        return ""
-    if observation.psf_fields:
-        return (
-            "`refine_psfs` and `psf_scatter` are for PSFs that are the same all over the images; "
-            "leave them out where PSFs vary over the field"
-        )
-    if observation.is_turned or observation.n_epochs > 1:
-        return (
-            "`refine_psfs` and `psf_scatter` are for images of one epoch that are not turned "
-            "against the sky; leave them out"
-        )
-    if len(observation.halos):
-        return (
-            "`refine_psfs` and `psf_scatter` are for images without `halos`; leave one of them out"
-        )
-    return ""
+
+    holds: Callable[[Observation], bool]
+    otherwise: str
+
+
+ONE_PSF = Condition(lambda images: not images.psf_fields, "PSFs vary over the field")
+UPRIGHT = Condition(lambda images: not images.is_turned, "the images are turned against the sky")
+ONE_EPOCH = Condition(lambda images: images.n_epochs == 1, "the images are of several epochs")
+NO_HALOS = Condition(lambda images: not len(images.halos), "the images have halos")
+
+# What each parameter of `lnocl.deconvolve` needs, in the order in which reasons are given.
+NEEDS = {
+    "refine_positions": (ONE_EPOCH,),
+    "refine_psfs": (ONE_PSF, UPRIGHT, ONE_EPOCH, NO_HALOS),
+    "psf_scatter": (ONE_PSF, UPRIGHT, ONE_EPOCH, NO_HALOS),
+}
+
+
+def why_not(name: str, observation: Observation) -> str:
+    """Return why a parameter of `NEEDS` cannot be used for images; nothing where it can."""
+    return next((each.otherwise for each in NEEDS[name] if not each.holds(observation)), "")
+
+
+def refusal(name: str, observation: Observation) -> str:
+    """Return the message that refuses a parameter for images; nothing where it can be used."""
+    why = why_not(name, observation)
+    return why and f"`{name}` cannot be used where {why}; leave it out"

@@ -82,7 +82,7 @@ WRONG = {
     "--halo small.fits": "small.fits has the shape (1, 4, 5) and the images (3, 48, 48)",
     "--halo nothing.fits": "nothing.fits",
     "--halo halos.fits --tile 40": "whole images, which tiles do not see",
-    "--halo halos.fits --refine-psfs jitter": "are for images without --halo",
+    "--halo halos.fits --refine-psfs jitter": "cannot be used where the images have halos",
 }
 
 

@@ -461,7 +461,11 @@ def test_all_goes_wrong_in_one_line():
         ({"transforms": maps * np.nan}, {}, "`transforms` must be finite"),
         ({"transforms": maps * 1.01}, {}, "`transforms[0]` is for pixels of 0.9901 of the sky's"),
         ({"transforms": sheared}, {}, "`transforms[0]` shears an image of 40 x 22 pixels by 0.1"),
-        ({}, {"refine_psfs": ["jitter"]}, "`refine_psfs` and `psf_scatter` are for images of"),
+        (
+            {},
+            {"refine_psfs": ["jitter"]},
+            "`refine_psfs` cannot be used where the images are turned",
+        ),
     ]
     for changes, options, message in cases:
         with pytest.raises(lnocl.LnoclError) as caught:

@@ -1,0 +1,98 @@
+"""Plans: which steps they have, and that runs take these and no others."""
+
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+import lnocl
+from lnocl import deconvolution
+from lnocl.errors import InputError
+from lnocl.runs import halos, psf_refinement
+from lnocl.runs.plan import CHOICE, FIT, HALOS, LEVELS, PRIOR, PSFS, STARS, STEPS
+
+Y, X = np.indices((24, 24))
+PSF = np.exp(-((X[:17, :17] - 8.0) ** 2 + 1.3 * (Y[:17, :17] - 8.0) ** 2) / 3.0)
+STAR = [(11.5, 11.5)]  # where turned images have it too
+HALO = np.exp(-np.hypot(X - 10, Y - 13) / 9.0)
+TURNED = lnocl.rotations([0.0, 20.0], (11.5, 11.5))
+FIELD = lnocl.PsfField([PSF, PSF], [(0, 0), (23, 0)])
+
+
+def observe(n=1, psfs=PSF, **known):
+    mean = 20 + 4e4 * np.exp(-((X - 11.5) ** 2 + 1.3 * (Y - 11.5) ** 2) / 3.0)
+    images = np.random.default_rng(5).poisson([mean] * n).astype(float)
+    return lnocl.Observation(images, psfs, background=20.0, **known)
+
+
+# The steps of a star in one image; then what is other in others, and what is said of it.
+PLAIN = {PSFS, PRIOR, CHOICE, STARS}
+SCENES = {
+    "plain": (observe, STAR, {}, PLAIN, "before it"),
+    "no star": (observe, (), {}, {CHOICE}, "there are no stars"),
+    "a weight": (observe, STAR, {"smoothing": 0.1}, {CHOICE}, "`smoothing` is a number"),
+    "a number of iterations": (observe, STAR, {"stop": None}, {PSFS, STARS}, "another rule"),
+    "turned": (lambda: observe(2, transforms=TURNED), STAR, {}, PLAIN - {PSFS} | {FIT}, "turned"),
+    "epochs": (lambda: observe(2, epochs=[0, 1]), STAR, {}, PLAIN - {PSFS} | {FIT}, "several epoc"),
+    "a halo": (
+        lambda: observe(halos=[HALO]),
+        STAR,
+        {},
+        PLAIN - {PSFS} | {HALOS, FIT},
+        "have halos",
+    ),
+    "a field": (lambda: observe(psfs=FIELD), STAR, {}, {PRIOR, CHOICE}, "vary over the field"),
+    "levels": (lambda: observe(background_error=1.0), STAR, {}, PLAIN | {LEVELS}, "no halos"),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_steps_of_a_scene_and_the_reasons_against_others(name):
+    make, stars, options, expected, reason = SCENES[name]
+    plan = lnocl.plan(make(), stars, **options)
+    assert {step for step in STEPS if plan.does(step)} == expected
+    others = [plan.why_not(step) for step in STEPS if step not in expected]
+    assert any(reason in why for why in others)
+    assert all(str(plan).count(f"{step}: no, ") == (step not in expected) for step in STEPS)
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+def test_a_run_takes_the_steps_of_its_plan(name, monkeypatch):
+    """Each step has a function of its own, which is called or not."""
+    make, stars, options, expected, _ = SCENES[name]
+    called = set()
+
+    def watch(step, module, function):
+        real = getattr(module, function)
+
+        def watched(*given, **more):
+            called.add(step)
+            return real(*given, **more)
+
+        monkeypatch.setattr(module, function, watched)
+
+    watch(PSFS, psf_refinement, "mend")
+    watch(LEVELS, halos, "settle_levels")
+    watch(HALOS, halos, "settle_halos")
+    watch(PRIOR, deconvolution, "told_prior")
+    watch(CHOICE, deconvolution, "HeldOutCounts")
+    result = lnocl.deconvolve(make(), stars, n_iter=99, engine="numpy", **options)
+    called |= {STARS} if result._outcome.is_marginal else set()
+    assert called == expected - {FIT}
+
+
+def test_families_that_are_named_are_judged_whatever_the_smoothing():
+    plan = lnocl.plan(observe(), STAR, smoothing=0.1, refine_psfs=["jitter"])
+    assert plan.judges_psfs
+    assert plan.families == ("jitter",)
+    assert f"{PSFS}: yes, and fit jitter" in str(plan)
+    assert plan.why_not(STARS) == "`smoothing` is a number"
+
+
+def test_a_wrong_word_is_refused_before_any_work():
+    with (
+        patch.object(psf_refinement, "mend", side_effect=AssertionError),
+        pytest.raises(InputError, match="smoothing 'none' is not known; give a number or auto"),
+    ):
+        lnocl.deconvolve(observe(), STAR, smoothing="none", engine="numpy")
