@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from lnocl.scene.arrays import Array
 from lnocl.scene.cores import fwhm
 from lnocl.scene.detector import on_sky, seen_psfs
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.observation import Observation
-from lnocl.scene.scene import Scene
 
 # The core of a star is where its PSF is above this share of its peak; its wings go on to the other.
 CORE, WINGS = 0.5, 1e-3
@@ -207,53 +207,42 @@ def judge(observation: Observation, models: Iterable[Array]) -> Fit:
     return overall
 
 
-def judge_stars(scene: Scene, sky: Array, star_fluxes: Array) -> list[StarResiduals]:
+def judge_stars(estimate: Estimate) -> list[StarResiduals]:
     """Return how well a model fits at each star, in all images together.
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled; the models are made in windows round its stars alone.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n,)
-        Electrons.
+    estimate : Estimate
+        The models are made in windows round its stars alone.
     """
-    found = []
-    ny, nx = scene.observation.sky_shape
+    found, scene = [], estimate.scene
     background = [np.broadcast_to(each, scene.image_grid) for each in scene.background()]
     width = min(fwhm(psf) for psf in scene.observation.psfs) if scene.n_stars else 0.0
     psfs = seen_psfs(scene.observation) if scene.n_stars else np.zeros((0, 0, 0))
     on_pixels = on_sky(scene.stars, scene.oversample)
     n = scene.n_stars
-    stars = zip(scene.stars, on_pixels, star_fluxes[:n], scene.shown[:n], strict=True)
+    stars = zip(scene.stars, on_pixels, estimate.star_fluxes[:n], scene.shown[:n], strict=True)
     for position, on_pixel, flux, shown in stars:
         core, wings = Fit(), Fit()
         for j in np.flatnonzero(shown).tolist():
             psf = psfs[j]
-            fits = _fits_at(scene, background[j], sky, star_fluxes, j, psf, position)
+            fits = _fits_at(estimate, background[j], j, psf, position)
             core, wings = core.plus(fits[0]), wings.plus(fits[1])
-        halo, light = _halo(sky[:ny, :nx], on_pixel, width)
+        halo, light = _halo(estimate.observed_sky, on_pixel, width)
         shares = (halo / each if each > 0 else 0.0 for each in (float(flux), light))
         found.append(StarResiduals(core, wings, *shares))
     return found
 
 
 def _fits_at(
-    scene: Scene,
-    background: Array,
-    sky: Array,
-    star_fluxes: Array,
-    j: int,
-    psf: Array,
-    position: Array,
+    estimate: Estimate, background: Array, j: int, psf: Array, position: Array
 ) -> tuple[Fit, Fit]:
     """Return the fit in the core and in the wings of a star in one image, whose PSF is given."""
     from astropy.nddata import NoOverlapError, overlap_slices
 
     from lnocl.scene.forward_model import add_to_window  # which loads scipy
 
-    observation = scene.observation
+    scene, observation = estimate.scene, estimate.scene.observation
     y, x = np.nonzero(psf > WINGS * psf.max())
     bright = psf[y.min() : y.max() + 1, x.min() : x.max() + 1]
     # The middle of these pixels, where the PSF's is at the star.
@@ -272,7 +261,7 @@ def _fits_at(
     except NoOverlapError:  # the star is in other images alone
         return Fit(), Fit()
     model = np.array(background[there])
-    add_to_window(model, scene, sky, star_fluxes, j, (there[0].start, there[1].start))
+    add_to_window(model, estimate, j, (there[0].start, there[1].start))
     np.maximum(model, 0.0, out=model)
     model = scene.in_electrons(model, j, there)
     values = residuals(observation.images[j][there], observation.mask[j][there], model)

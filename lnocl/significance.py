@@ -53,7 +53,7 @@ def null_of(outcome: Outcome) -> Null:
     errors = np.zeros(1), np.zeros(0)
     if refinement is not None and refinement.psf_error:
         errors = refinement.edges, refinement.errors_in_rings
-    return Null(outcome.scene, outcome.sky, outcome.star_fluxes, outcome.moves, errors)
+    return Null(outcome.estimate, outcome.moves, errors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -491,13 +491,14 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
     errors, fluxes = found.errors[at], found.peak_fluxes(*at)
     kinds = np.full(len(places), POINT_SOURCE, dtype="U8")
     pixels = (places - (q - 1) / 2.0) / q
-    known = scene, outcome.sky, outcome.star_fluxes
-    raised = halo_errors(*known).raised
+    raised = halo_errors(outcome.estimate).raised
     for i, place in enumerate(places):
         if found.width:
             kinds[i] = EXTENDED
         elif found.light_round(place, values[i], null.resolution) > THERE:
-            fluxes[i], errors[i] = point_flux(*known, pixels[i], fluxes[i], outcome.moves, raised)
+            fluxes[i], errors[i] = point_flux(
+                outcome.estimate, pixels[i], fluxes[i], outcome.moves, raised
+            )
             kinds[i] = POINT_SOURCE if fluxes[i] > POINT * errors[i] else EXTENDED
     # Of a maximum between pixels the place errs by its noise, and by how it is interpolated.
     curvature = np.moveaxis(found.score.curvature[:, :, *at], -1, 0)

@@ -507,7 +507,7 @@ class _Solver(NamedTuple):
         return _Found(
             result.extended,
             result.models()[:, rows, columns],
-            Light(outcome.scene, outcome.sky, outcome.star_fluxes).flux(within, errors[0]),
+            Light(outcome.estimate).flux(within, errors[0]),
             np.column_stack([result.star_positions, result.star_fluxes, *errors])[tile.own],
             [at_stars[s] for s in tile.own],
             result.history,

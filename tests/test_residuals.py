@@ -8,6 +8,7 @@ from scenes import Recipe, make_smooth_psfs, paper
 
 import lnocl
 from lnocl.residuals import CORE, WINGS, Fit, judge, judge_stars, residuals, sharp_sources
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import place
 
@@ -59,7 +60,10 @@ def test_noise_gives_one(known):
 
 def test_pixels_are_those_of_the_images(known):
     observation, scene, models = known
-    overall, at_stars = judge(observation, models), judge_stars(scene, no_sky(scene), FLUXES)
+    overall, at_stars = (
+        judge(observation, models),
+        judge_stars(Estimate(scene, no_sky(scene), FLUXES)),
+    )
     good = ~observation.mask
     squares = (observation.images - models) ** 2 / models
     assert overall.n_pixels == good.sum()
@@ -92,7 +96,7 @@ def test_a_misfit_is_found_where_it_is(known, wrong):
         images, observation.psfs, mask=observation.mask, offsets=OFFSETS, background=LEVEL
     )
     scene = Scene(changed, STARS, pad=4)
-    at_stars = judge_stars(scene, no_sky(scene), FLUXES)
+    at_stars = judge_stars(Estimate(scene, no_sky(scene), FLUXES))
     assert (at_stars[0].core.is_misfit, at_stars[0].wings.is_misfit) == (
         wrong == "core",
         wrong == "wings",
@@ -109,7 +113,7 @@ def test_a_star_without_good_pixels_has_no_rms():
     for images in (1, 2):
         observation = lnocl.Observation(np.ones((2, 16, 16)), psf, mask=mask)
         scene = Scene(observation, [(6, 6)])
-        ((core, wings, *_),) = judge_stars(scene, no_sky(scene), np.ones(1))
+        ((core, wings, *_),) = judge_stars(Estimate(scene, no_sky(scene), np.ones(1)))
         assert core.n_pixels > 0
         if images == 1:
             alone = Fit()
@@ -123,7 +127,9 @@ def test_a_star_may_be_beyond_one_of_the_images():
     images, psf = np.ones((2, 16, 16)), make_smooth_psfs(1, (5, 5))
     both = Scene(lnocl.Observation(images, psf, offsets=[(0, 0), (15, 15)]), [(8, 8)], pad=16)
     first = Scene(lnocl.Observation(images[:1], psf), [(8, 8)])
-    found, expected = (judge_stars(each, no_sky(each), np.ones(1)) for each in (both, first))
+    found, expected = (
+        judge_stars(Estimate(each, no_sky(each), np.ones(1))) for each in (both, first)
+    )
     assert found[0].core.n_pixels == expected[0].core.n_pixels > 0
     assert found[0].wings.n_pixels == expected[0].wings.n_pixels
 
@@ -169,7 +175,7 @@ class TestHalo:
         scene = Scene(lnocl.Observation(np.ones(sky.shape), self.PSF), [at])
         laid = np.zeros(scene.grid)
         laid[: sky.shape[0], : sky.shape[1]] = sky
-        return judge_stars(scene, laid, np.array([flux]))[0].halo
+        return judge_stars(Estimate(scene, laid, np.array([flux])))[0].halo
 
     def test_light_all_round_is_found_whole(self):
         halo = np.exp(-(self.X**2 + self.Y**2) / 50.0)

@@ -87,8 +87,7 @@ def test_a_jet_is_called_extended(found):
 def test_the_extended_source_may_be_a_jet_but_no_point(result, place, is_point):
     """Nothing of a point is expected of the light round it; on the jet there is as much."""
     outcome = result._outcome
-    known = outcome.scene, outcome.sky, outcome.star_fluxes
-    flux, error = point_flux(*known, np.array(place), 1000.0, False, np.zeros(0))
+    flux, error = point_flux(outcome.estimate, np.array(place), 1000.0, False, np.zeros(0))
     assert (flux > 5 * error) == is_point
     assert (flux > 3 * error) == is_point
     if is_point:

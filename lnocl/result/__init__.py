@@ -858,9 +858,8 @@ def make_result(outcome: Outcome) -> Result:
     history = np.zeros(len(outcome.objectives), HISTORY_DTYPE)
     history["iteration"] = np.arange(len(history))
     history["objective"] = outcome.objectives
-    ny, nx = scene.observation.sky_shape
     return Result(
-        extended=outcome.sky[:ny, :nx],
+        extended=outcome.estimate.observed_sky,
         star_fluxes=outcome.fluxes_of_stars,
         star_positions=scene.stars,
         n_iter=len(history) - 1,

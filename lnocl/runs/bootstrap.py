@@ -382,8 +382,7 @@ class _Measuring:
     def __init__(self, outcome: Outcome, parts: Sequence[Part], seed: int, width: float) -> None:
         self._outcome, self._parts, self._width = outcome, parts, width
         self._replicas = Replicas(outcome, seed)
-        ny, nx = outcome.observation.sky_shape
-        self._smooth_answer = self._smooth(outcome.sky[:ny, :nx])
+        self._smooth_answer = self._smooth(outcome.estimate.observed_sky)
 
     def _smooth(self, sky: Array) -> Array:
         """Return a sky at the resolution."""
@@ -450,7 +449,7 @@ def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[
     stars = on_sky(scene.stars, scene.oversample)
     notes += [note for part in parts for note in _notes(part, stars, width, observed)]
     light = outcome.light().sky() if parts else outcome.sky
-    sky = Sky(outcome.sky[:ny, :nx], light, outcome.star_fluxes, scene.stars)
+    sky = Sky(outcome.estimate.observed_sky, light, outcome.star_fluxes, scene.stars)
     values = _measure(outcome, sky, parts).tolist()
     return tuple(
         Quantity(label.name, label.kind, value, note, label.at)

@@ -25,6 +25,7 @@ from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_model, make_start
 from lnocl.runs.steady import STEADY
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.noise_check import with_noise_shown
 from lnocl.scene.observation import BESIDE_PSFS, Observation
@@ -52,23 +53,16 @@ UNRESOLVED = 0.25
 SPREAD = 2.0
 
 
-@dataclass(frozen=True)
-class Estimate:
+@dataclass(frozen=True, eq=False)
+class Judged(Estimate):
     """An estimate with extra smoothing near the stars, and its misfit at the stars.
 
     Attributes
     ----------
-    scene : Scene
-        The model, with the stars where they are.
-    extended, fluxes : ndarray of float64
-        Extended source, shape (Ny, Nx), and star fluxes, shape (n,), scaled.
     misfit : PsfMisfit
         How far the images are from their models at the stars.
     """
 
-    scene: Scene
-    extended: Array
-    fluxes: Array
     misfit: PsfMisfit
 
     @cached_property
@@ -123,7 +117,7 @@ class GuardedRuns:
         moves: bool,
         error: float = FIRST_ERROR,
         guard: float = GUARD,
-    ) -> Estimate:
+    ) -> Judged:
         """Return the estimate with these PSFs.
 
         At most `MAX_ROUNDS` runs follow each other, each from the estimate of the one before. Each
@@ -148,7 +142,7 @@ class GuardedRuns:
         setup = replace(self._setup, observation=observation, stars=inside, refine_positions=moves)
         with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
             start = make_start(setup, Penalty())
-            found = Estimate(start.scene, start.extended, start.star_fluxes, _unknown(error))
+            found = _judged(start.estimate(), _unknown(error))
             moved = replace(setup, refine_positions=False)
             rounds = (moved, FIRST_ITERATIONS), *[(setup, ITERATIONS)] * (MAX_ROUNDS - 1)
             for each, n_iter in rounds:
@@ -157,22 +151,20 @@ class GuardedRuns:
                     break
         return found
 
-    def _run(self, setup: Setup, found: Estimate, n_iter: int, guard: float) -> Estimate:
+    def _run(self, setup: Setup, found: Judged, n_iter: int, guard: float) -> Judged:
         """Return the estimate after a run that begins at `found`, with its misfit measured anew.
 
         The misfit of `found` sets the smoothing near the stars. A run that diverges keeps its last
         state.
         """
         rings = found.misfit.in_rings
-        near = smoothing_near_stars(found.scene, found.model, found.fluxes, rings, guard)
+        near = smoothing_near_stars(found, found.model, rings, guard)
         penalty = Penalty(smoothing=self._smoothing, near_stars=near)
-        ny, nx = found.scene.observation.sky_shape
-        unit = found.scene.unit
         setup = replace(
             setup,
             stars=self._inside(found.scene.stars),
-            initial_extended=np.maximum(found.extended[:ny, :nx], 0.0) * unit,
-            initial_star_fluxes=found.fluxes * unit,
+            initial_extended=np.maximum(found.observed_sky, 0.0),
+            initial_star_fluxes=found.star_fluxes,
         )
         start = make_start(setup, penalty)
         # Stars are moved at the start of a round alone.
@@ -180,16 +172,13 @@ class GuardedRuns:
         with suppress(DivergedError):  # by negative PSFs: the misfit tells how good the end is
             for _ in run:
                 self._tick()
-        extended, fluxes = run.engine.extended().astype(np.float64), run.engine.star_fluxes()
-        model = make_model(run.scene)
-        estimate = extended, fluxes
-        misfit = measure_misfit(run.scene, model, *estimate, estimate)
+        estimate, model = run.estimate(), make_model(run.scene)
+        misfit = measure_misfit(estimate, model, estimate)
         if misfit.is_significant:  # which may be of structure that was smoothed
-            settled = settle(run.scene, model, *estimate, UNRESOLVED)
-            misfit = measure_misfit(run.scene, model, *estimate, settled)
-        return Estimate(run.scene, extended, fluxes, misfit)
+            misfit = measure_misfit(estimate, model, settle(estimate, model, UNRESOLVED))
+        return _judged(estimate, misfit)
 
-    def moved(self, estimate: Estimate, psfs: Array, fluxes: Array, stars: Array) -> Estimate:
+    def moved(self, estimate: Judged, psfs: Array, star_fluxes: Array, stars: Array) -> Judged:
         """Return an estimate with other PSFs, star fluxes and positions.
 
         Its extended source and misfit are unchanged; stars are clipped to the window.
@@ -198,7 +187,7 @@ class GuardedRuns:
         observation = self.observation.replace(psfs=self.cut(psfs))
         with ignored_warnings():
             scene = Scene(observation, stars.clip(0, (nx - 1, ny - 1)), pad=self._setup.pad)
-        return Estimate(scene, estimate.extended, fluxes, estimate.misfit)
+        return replace(estimate, scene=scene, star_fluxes=star_fluxes)
 
     def _inside(self, stars: Array) -> Array:
         """Return star positions; those that no image shows are clipped to the window."""
@@ -303,6 +292,10 @@ def rings_of(psfs: Array, oversample: int) -> Rings:
     """Return the rings round the central pixel of PSFs, ``(kx // 2, ky // 2)``."""
     ky, kx = psfs.shape[1:]
     return Rings((ky, kx), np.array([(kx // 2, ky // 2)]), oversample)
+
+
+def _judged(estimate: Estimate, misfit: PsfMisfit) -> Judged:
+    return Judged(estimate.scene, estimate.sky, estimate.star_fluxes, misfit)
 
 
 def _unknown(error: float) -> PsfMisfit:

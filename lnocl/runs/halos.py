@@ -15,9 +15,8 @@ import numpy as np
 from lnocl.process import ignored_notes, ignored_warnings
 from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, Start, make_model, make_start, measure_steps
-from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
 from lnocl.solvers.halos import marginal_halos
 from lnocl.solvers.levels import fit_levels
 
@@ -31,10 +30,9 @@ def settle_halos(start: Start) -> Start:
     if not (setup.settles_halos and start.scene.n_halos):
         return start
     with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
-        scene, sky, fluxes = _short_run(setup)
-        fluxes = marginal_halos(scene, sky, fluxes)[1]
-    n = scene.n_stars
-    fluxes = np.append(start.star_fluxes[:n], fluxes[n:] / scene.unit)
+        found = marginal_halos(_short_run(setup))
+    n = start.scene.n_stars
+    fluxes = np.append(start.star_fluxes[:n], found.fluxes[n:])
     held = start.scene.holding(fluxes, penalty)
     extended = start.extended if setup.initial_extended is not None else held.start(None, None)[0]
     fluxes, scaling = measure_steps(setup, held, make_model(held), extended, fluxes)
@@ -44,14 +42,14 @@ def settle_halos(start: Start) -> Start:
 def settle_levels(setup: Setup) -> Setup:
     """Return a setup with the levels of the background that are fitted after a short run."""
     with ignored_warnings(), ignored_notes():
-        scene = fit_levels(*_short_run(setup))[0]
-    return replace(setup, observation=scene.observation)
+        found = fit_levels(_short_run(setup))
+    return replace(setup, observation=found.scene.observation)
 
 
-def _short_run(setup: Setup) -> tuple[Scene, Array, Array]:
-    """Return scene, extended source and fluxes after a short run, electrons."""
+def _short_run(setup: Setup) -> Estimate:
+    """Return the estimate after a short run."""
     free = replace(setup, solver="sgp", refine_positions=False, initial_extended=None)
     run = Run(make_start(free, Penalty()), N_ITER)
     for _ in run:
         pass
-    return run.scene, run.engine.extended().astype(np.float64) * run.scene.unit, run.star_fluxes()
+    return run.estimate()

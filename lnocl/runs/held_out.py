@@ -26,6 +26,7 @@ from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved, is_whole
 from lnocl.runs.start import Start
 from lnocl.runs.thinning import split_counts
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.penalty import Penalty
 from lnocl.solvers.engine import State
 
@@ -226,13 +227,10 @@ class HeldOutCounts:
         scene = start.scene.penalised(penalty)
         if start.refines:
             scene.move_stars(snapshot.positions.mean(axis=0))
-        sky = snapshot.extended.mean(axis=0, dtype=np.float64)
-        sky *= scene.unit
+        extended = snapshot.extended.mean(axis=0, dtype=np.float64)
         return Outcome(
             setup=start.setup,
-            scene=scene,
-            sky=sky,
-            star_fluxes=snapshot.star_fluxes.mean(axis=0) * scene.unit,
+            estimate=Estimate.of_scaled(scene, extended, snapshot.star_fluxes.mean(axis=0)),
             objectives=objectives,
             stop_reason=stop_reason,
         )

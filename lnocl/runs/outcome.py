@@ -14,6 +14,7 @@ from lnocl.errors import warn
 from lnocl.residuals import StarResiduals, judge_stars
 from lnocl.runs.start import Setup
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.observation import Observation
 from lnocl.scene.scene import Scene
 from lnocl.scene.stars import MAX_SHIFT
@@ -148,26 +149,24 @@ def mean_over_epochs(fluxes: Array, n_epochs: int) -> Array:
     return np.divide(totals, n_known, out=np.full(len(totals), np.nan), where=n_known > 0)
 
 
-def marginalise(
-    scene: Scene, sky: Array, star_fluxes: Array, stars: bool, halos: bool, levels: bool
-) -> tuple[Scene, Array, Array]:
-    """Return scene, extended source and fluxes, with levels, halos and stars marginal where wanted.
+def marginalise(estimate: Estimate, stars: bool, halos: bool, levels: bool) -> Estimate:
+    """Return the estimate with levels, halos and stars marginal where wanted.
 
     `lnocl.solvers.levels`, `lnocl.solvers.halos` and `lnocl.solvers.marginal` have the equations.
     """
     if levels:
         from lnocl.solvers.levels import fit_levels
 
-        scene, sky = fit_levels(scene, sky, star_fluxes)
+        estimate = fit_levels(estimate)
     if halos:
         from lnocl.solvers.halos import marginal_halos
 
-        sky, star_fluxes = marginal_halos(scene, sky, star_fluxes)
+        estimate = marginal_halos(estimate)
     if stars:
         from lnocl.solvers.marginal import marginal
 
-        sky, star_fluxes = marginal(scene, sky, star_fluxes)
-    return scene, sky, star_fluxes
+        estimate = marginal(estimate)
+    return estimate
 
 
 @dataclass(frozen=True)
@@ -178,12 +177,8 @@ class Outcome:
     ----------
     setup : Setup
         Observation and parameters, from which it starts anew.
-    scene : Scene
-        The model of the observation, with the stars where they are now.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n_fluxes,)
-        Electrons, of the stars and then of the halos, as `Scene` has them.
+    estimate : Estimate
+        What it has found, with the stars where they are now.
     objectives : ndarray of float64, shape (n_iter + 1,)
         Objectives of the start and after each iteration; not scaled.
     stop_reason : str
@@ -203,9 +198,7 @@ class Outcome:
     """
 
     setup: Setup
-    scene: Scene
-    sky: Array
-    star_fluxes: Array
+    estimate: Estimate
     objectives: Array
     stop_reason: str
     curve: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
@@ -214,6 +207,21 @@ class Outcome:
     has_marginal_halos: bool = False
     has_levels: bool = False
     may_free_pixels: bool = False
+
+    @property
+    def scene(self) -> Scene:
+        """The model of the observation."""
+        return self.estimate.scene
+
+    @property
+    def sky(self) -> Array:
+        """Extended source on the grid, electrons per pixel, shape (Ny, Nx)."""
+        return self.estimate.sky
+
+    @property
+    def star_fluxes(self) -> Array:
+        """Fluxes of the stars and then of the halos, electrons, shape (n_fluxes,)."""
+        return self.estimate.star_fluxes
 
     @property
     def given_positions(self) -> Array:
@@ -238,15 +246,11 @@ class Outcome:
 
     def marginal(self, stars: bool, halos: bool, levels: bool) -> Outcome:
         """Return the outcome with marginal star fluxes, amounts of halos, or levels fitted."""
-        scene, sky, fluxes = marginalise(
-            self.scene, self.sky, self.star_fluxes, stars, halos, levels
-        )
+        estimate = marginalise(self.estimate, stars, halos, levels)
         return replace(
             self,
-            setup=replace(self.setup, observation=scene.observation),
-            scene=scene,
-            sky=sky,
-            star_fluxes=fluxes,
+            setup=replace(self.setup, observation=estimate.scene.observation),
+            estimate=estimate,
             is_marginal=stars,
             has_marginal_halos=halos,
             has_levels=levels,
@@ -264,17 +268,13 @@ class Outcome:
 
     def models(self) -> Iterator[Array]:
         """Yield the m_j, electrons per pixel."""
-        from lnocl.scene.forward_model import model_images  # which loads scipy
-
-        scene = self.scene
-        ny, nx = scene.observation.shape
-        extended, star_fluxes = self.sky / scene.unit, self.star_fluxes / scene.unit
-        for j, image in enumerate(model_images(scene, extended, star_fluxes)):
-            yield scene.in_electrons(image, j)[:ny, :nx]
+        ny, nx = self.observation.shape
+        for j, image in enumerate(self.estimate.models()):
+            yield self.scene.in_electrons(image, j)[:ny, :nx]
 
     def star_residuals(self) -> list[StarResiduals]:
         """Return how well the model fits at each star."""
-        return judge_stars(self.scene, self.sky, self.star_fluxes)
+        return judge_stars(self.estimate)
 
     def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
         """Return the light of the extended source and its standard error, electrons."""
@@ -285,7 +285,7 @@ class Outcome:
         """Return the light of the extended source without bias."""
         from lnocl.solvers.light import Light  # which loads scipy
 
-        return Light(self.scene, self.sky, self.star_fluxes, self.levels)
+        return Light(self.estimate, self.levels)
 
     @cached_property
     def levels(self) -> Levels | None:
@@ -294,7 +294,7 @@ class Outcome:
             return None
         from lnocl.solvers.levels import Levels  # which loads scipy
 
-        return Levels(self.scene, self.sky, self.star_fluxes, self.has_levels)
+        return Levels(self.estimate, self.has_levels)
 
     def levels_in_words(self) -> list[str]:
         """Return the level of each image whose background was fitted, electrons per pixel."""
@@ -328,10 +328,8 @@ class Outcome:
 
         scene, moves = self.scene, self.moves
         star_fluxes = self.star_fluxes[: scene.n_stars]
-        halos = halo_errors(scene, self.sky, self.star_fluxes)
-        errors = standard_errors(
-            scene, self.sky, self.star_fluxes, moves, halos.raised, self.levels
-        )
+        halos = halo_errors(self.estimate)
+        errors = standard_errors(self.estimate, moves, halos.raised, self.levels)
         is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (star_fluxes > 0)
         _warn_of_undetermined(scene.stars[is_lost], bool(np.isnan(halos.errors).any()))
         if self.psf_refinement is not None:

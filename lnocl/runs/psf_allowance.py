@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from lnocl.process import ignored_warnings
-from lnocl.runs.guarded_runs import Estimate, GuardedRuns, estimate_scatter, rings_of
+from lnocl.runs.guarded_runs import GuardedRuns, Judged, estimate_scatter, rings_of
 from lnocl.runs.start import make_model
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.observation import Observation
 from lnocl.scene.psf_misfit import smoothing_near_stars
 from lnocl.scene.rings import Rings
@@ -31,7 +32,7 @@ class Allowance:
         The images, with the PSFs that are used.
     runs : GuardedRuns
         The runs that have judged them.
-    estimate : Estimate
+    estimate : Judged
         Their last estimate, with these PSFs.
     scatter : ndarray of float64, shape (p, ky, kx)
         Standard deviations of the PSFs' pixels; of shape (0, ky, kx) where they are not known.
@@ -45,7 +46,7 @@ class Allowance:
     """
 
     def __init__(
-        self, observation: Observation, runs: GuardedRuns, estimate: Estimate, scatter: Array
+        self, observation: Observation, runs: GuardedRuns, estimate: Judged, scatter: Array
     ) -> None:
         misfit = estimate.misfit
         self._observation, self._estimate, self._held = observation, estimate, runs.held
@@ -80,8 +81,8 @@ class Allowance:
         """
         if not self._shown.any():
             return None
-        scene, fluxes = self._scene(pad)
-        return smoothing_near_stars(scene, make_model(scene), fluxes, self._shown, STRENGTH)
+        whole = self._whole(pad)
+        return smoothing_near_stars(whole, make_model(whole.scene), self._shown, STRENGTH)
 
     def scatter(self) -> Array:
         """Return the standard deviations of the PSFs' pixels; of shape (0, ky, kx) for no error."""
@@ -95,24 +96,25 @@ class Allowance:
 
         Electrons per pixel of the sky: K is the mean over the PSFs, at the stars.
         """
-        scene, fluxes = self._scene(0)
+        whole = self._whole(0)
+        scene = whole.scene
         ny, nx = scene.observation.sky_shape
         light = np.zeros(scene.grid)
         for j in range(scene.n_images):
-            for s, flux in enumerate(fluxes):
+            for s, flux in enumerate(whole.star_fluxes):
                 cutout = scene.psf_on_sky(j, s)
-                light[cutout.window(scene.grid)] += flux * scene.unit * cutout.values
+                light[cutout.window(scene.grid)] += flux * cutout.values
         number = Rings((ny, nx), on_sky(scene.stars, scene.oversample), scene.oversample).number
         kappa = self.in_rings[np.minimum(number, len(self.in_rings) - 1)]
         return np.asarray(kappa * light[:ny, :nx] / scene.n_images**1.5)
 
-    def _scene(self, pad: int | str) -> tuple[Scene, Array]:
-        """Return the whole scene with the stars where they were found, and their fluxes."""
+    def _whole(self, pad: int | str) -> Estimate:
+        """Return the start of the whole scene, with the stars as they were found."""
         ny, nx = self._observation.shape
         stars = self._stars.copy()
         stars[self._held] += self._moved
         with ignored_warnings():  # those of the reconstruction are the same
             scene = Scene(self._observation, stars.clip(0, (nx - 1, ny - 1)), pad=pad)
-        fluxes = scene.start(None, None)[1]
-        fluxes[self._held] = self._estimate.fluxes * self._estimate.scene.unit / scene.unit
-        return scene, fluxes
+        start = Estimate.of_scaled(scene, *scene.start(None, None))
+        start.star_fluxes[self._held] = self._estimate.star_fluxes
+        return start

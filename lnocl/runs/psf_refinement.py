@@ -16,8 +16,8 @@ from lnocl.errors import counted, note, warn
 from lnocl.runs.guarded_runs import (
     FIRST_ERROR,
     GUARD,
-    Estimate,
     GuardedRuns,
+    Judged,
     estimate_scatter,
 )
 from lnocl.runs.outcome import Mended, PsfRefinement
@@ -58,7 +58,7 @@ class _State:
     """PSFs, the estimate by which they are judged, and whether stars may move for them."""
 
     psfs: Array
-    estimate: Estimate
+    estimate: Judged
     moves: bool
 
     @property
@@ -68,7 +68,7 @@ class _State:
     def is_mended_by(self, other: _State) -> bool:
         """Return whether other PSFs or positions mend enough to be taken."""
         before, after = self.misfit, other.misfit
-        if (other.estimate.fluxes < FADED * self.estimate.fluxes).any():
+        if (other.estimate.star_fluxes < FADED * self.estimate.star_fluxes).any():
             return False  # a sharper PSF, and the star's light in the extended source
         is_less = before.significance - after.significance > GONE
         return is_less and (not after.is_doubtful or after.kappa < MENDED * before.kappa)
@@ -230,7 +230,7 @@ def _is_trusted(tried: _State, state: _State, given: float) -> bool:
     The wings of free PSFs may take the light of a host, and their cores that of a star. The state
     is the one that they begin from; given is kappa before, which families may have lowered.
     """
-    before, after = state.estimate.fluxes, tried.estimate.fluxes
+    before, after = state.estimate.star_fluxes, tried.estimate.star_fluxes
     is_near = abs(after - before) <= state.misfit.kappa * before
     is_fitted = tried.misfit.kappa < FITTED * given
     return is_fitted and bool(is_near.all())
@@ -263,19 +263,19 @@ def _step(
     runs: GuardedRuns,
     families: PsfFamilies,
     parameters: PsfParameters,
-    estimate: Estimate,
+    estimate: Judged,
     moves: bool,
 ) -> tuple[PsfParameters, Array]:
     """Return the parameters and the stars after a few steps from an estimate."""
     stars = estimate.scene.stars
-    found = runs.moved(estimate, families.psfs(parameters), estimate.fluxes, stars)
+    found = runs.moved(estimate, families.psfs(parameters), estimate.star_fluxes, stars)
     for _ in range(STEPS):
-        change = step(found.scene, families, parameters, found.extended, found.fluxes, moves)
+        change = step(found, families, parameters, moves)
         parameters, stars = _follow(families, parameters, change.parameters), change.positions
         if moves:  # which a common shift is not told from
             parameters, common = families.without_common_shift(parameters)
             stars = stars + common / found.scene.oversample
-        found = runs.moved(found, families.psfs(parameters), change.fluxes, stars)
+        found = runs.moved(found, families.psfs(parameters), change.star_fluxes, stars)
     return parameters, found.scene.stars
 
 

@@ -50,8 +50,5 @@ class Repeated:
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in run:
                 pass
-        scene = run.scene
-        sky, star_fluxes = run.engine.extended() * scene.unit, run.star_fluxes()
         wanted = outcome.is_marginal, outcome.has_marginal_halos, outcome.has_levels
-        scene, sky, star_fluxes = marginalise(scene, sky, star_fluxes, *wanted)
-        return dataclasses.replace(outcome, scene=scene, sky=sky, star_fluxes=star_fluxes)
+        return dataclasses.replace(outcome, estimate=marginalise(run.estimate(), *wanted))

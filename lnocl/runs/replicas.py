@@ -11,6 +11,7 @@ import numpy as np
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.repeated import Repeated
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.star_prior import StarPrior
@@ -70,7 +71,7 @@ class Replicas:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
         width = resolution(scene)
         self._texture = Texture(
-            outcome.sky / scene.unit, scene.shown_stars, width, hidden_radii(scene, width)
+            outcome.estimate.extended, scene.shown_stars, width, hidden_radii(scene, width)
         )
         self._model = Model(scene)
         observation = scene.observation
@@ -95,8 +96,7 @@ class Replicas:
             scene.n_images + 3
         )
         sky = self._texture.draw(np.random.default_rng(of_sky))
-        ny, nx = scene.observation.sky_shape
-        extended = sky[:ny, :nx] * scene.unit
+        extended = Estimate.of_scaled(scene, sky, self._outcome.estimate.fluxes).observed_sky
         drawn = Sky(extended, extended, self._outcome.star_fluxes, scene.stars)
         models = list(self._means(self._model, sky))
         counts = self._draw(models, of_images)
@@ -113,9 +113,8 @@ class Replicas:
     def _find(self, counts: Array, prior: StarPrior | None) -> Sky:
         """Return the reconstruction of an observation with these counts and this prior."""
         found = self._repeated.of(counts, prior)
-        ny, nx = found.observation.sky_shape
         places = found.scene.stars.copy()  # the scene moves its stars for the next
-        return Sky(found.sky[:ny, :nx], found.light().sky(), found.star_fluxes, places)
+        return Sky(found.estimate.observed_sky, found.light().sky(), found.star_fluxes, places)
 
     def _draw_psfs(self, seed: np.random.SeedSequence) -> Array:
         psfs = self._outcome.scene.observation.psfs
@@ -135,7 +134,7 @@ class Replicas:
     def _means(self, model: Model, sky: Array) -> Iterator[Array]:
         """Yield the model of each image, electrons."""
         scene = self._outcome.scene
-        images = model.images(sky, self._outcome.star_fluxes / scene.unit)
+        images = model.images(sky, self._outcome.estimate.fluxes)
         ny, nx = scene.observation.shape
         for j, image in enumerate(images):
             yield scene.in_electrons(image, j)[:ny, :nx]

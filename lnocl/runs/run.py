@@ -18,6 +18,7 @@ from lnocl.runs.outcome import Outcome
 from lnocl.runs.saved import LARGEST, Saved, Shape
 from lnocl.runs.start import Setup, Start, make_model, measure_steps, move_stars
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.observation import Observation
 from lnocl.scene.scene import Scene
 from lnocl.scene.stars import MAX_SHIFT
@@ -264,6 +265,11 @@ class Run:
         self.engine.move_stars()
         self.engine.start(extended, star_fluxes)
 
+    def estimate(self) -> Estimate:
+        """Return the estimate on the grid."""
+        extended, fluxes = self.engine.extended(), self.engine.star_fluxes()
+        return Estimate.of_scaled(self.scene, extended, fluxes)
+
     def star_positions(self) -> Array:
         """Return the star positions, pixels, shape (n, 2)."""
         return self.scene.stars
@@ -314,13 +320,9 @@ class Run:
     def outcome(self, stop_reason: str) -> Outcome:
         """Return the estimate and the record of a run that has ended."""
         self.finish()
-        sky = self.engine.extended()
-        sky *= self.scene.unit
         return Outcome(
             setup=self._setup,
-            scene=self.scene,
-            sky=sky,
-            star_fluxes=self.star_fluxes(),
+            estimate=self.estimate(),
             objectives=self.objectives(),
             stop_reason=stop_reason,
         )

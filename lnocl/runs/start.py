@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
@@ -111,6 +112,10 @@ class Start:
     def of_half(self, observation: Observation) -> Start:
         """Return this start for half of the counts."""
         return replace(self, scene=self.scene.of_half(observation))
+
+    def estimate(self) -> Estimate:
+        """Return the estimate that a run starts from."""
+        return Estimate.of_scaled(self.scene, self.extended, self.star_fluxes)
 
     def at(self, extended: Array, star_fluxes: Array, positions: Array) -> Start:
         """Return a start from another estimate."""

@@ -76,7 +76,7 @@ def told_prior(outcome: Outcome) -> StarPrior:
     scene, fluxes = outcome.scene, outcome.star_fluxes
     errors = np.full(len(fluxes), np.nan)
     found = standard_errors(
-        scene, outcome.sky, fluxes, outcome.moves, levels=outcome.levels, finished=FINISHED
+        outcome.estimate, outcome.moves, levels=outcome.levels, finished=FINISHED
     )
     errors[: scene.n_stars] = found[:, 0]
     return StarPrior.of(fluxes, errors)

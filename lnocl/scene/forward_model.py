@@ -13,6 +13,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.line_weights import TAPS
 from lnocl.scene.rotation import Rotation
 from lnocl.scene.scene import Scene
@@ -313,24 +314,21 @@ def images_of_sky(scene: Scene, extended: Array) -> Iterator[Array]:
         yield np.ascontiguousarray(sampled(turned(scene, j, sky), scene.oversample))
 
 
-def add_to_window(
-    image: Array, scene: Scene, sky: Array, star_fluxes: Array, j: int, first: tuple[int, int]
-) -> None:
+def add_to_window(image: Array, estimate: Estimate, j: int, first: tuple[int, int]) -> None:
     """Add sky, stars and halos, scaled, to an image of a window of the images' grid.
 
     Parameters
     ----------
     image : ndarray of float64, shape (h, w)
         What is there already, such as the background, scaled.
-    scene : Scene
-        What is modelled.
-    sky, star_fluxes : ndarray of float64, shapes (Ny, Nx) and (n,)
-        In electrons.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     j : int
         Which image.
     first : tuple of int
         Row and column of the first pixel of the window.
     """
+    scene, sky, fluxes = estimate.scene, estimate.sky, estimate.fluxes
     rows, columns = (range(at, at + n) for at, n in zip(first, image.shape, strict=True))
     if scene.rotations:
         seen = _turned_at(scene, j, sky, rows, columns)
@@ -339,7 +337,7 @@ def add_to_window(
     image += seen / scene.unit
     cutouts = scene.star_field.cutouts[j]
     for s in scene.star_field.reaching(j, first, image.shape):
-        cutouts[s].add_to(image, first, scene.image_grid, star_fluxes[s] / scene.unit)
+        cutouts[s].add_to(image, first, scene.image_grid, fluxes[s])
 
 
 def _turned_at(scene: Scene, j: int, sky: Array, rows: range, columns: range) -> Array:

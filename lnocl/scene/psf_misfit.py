@@ -21,9 +21,10 @@ import numpy as np
 import scipy.fft
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model, spread
 from lnocl.scene.rings import Rings
-from lnocl.scene.scene import MIN_MODEL, Scene
+from lnocl.scene.scene import MIN_MODEL
 
 # Pixels count where stars give more than this share of the model: below it, what does not fit is
 # more likely the structure of the sky.
@@ -89,33 +90,28 @@ class PsfMisfit(NamedTuple):
         return _kappa(math.sqrt(self.variance), self.norm)
 
 
-def measure_misfit(
-    scene: Scene, model: Model, extended: Array, fluxes: Array, settled: tuple[Array, Array]
-) -> PsfMisfit:
+def measure_misfit(estimate: Estimate, model: Model, settled: Estimate) -> PsfMisfit:
     """Return how far the images of a scene are from their models at its stars.
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     model : Model
         Of the scene.
-    extended : ndarray of float64, shape (Ny, Nx)
-        Extended source, on the grid and scaled.
-    fluxes : ndarray of float64, shape (n,)
-        Star fluxes, scaled.
-    settled : tuple of ndarray of float64
-        Extended source and star fluxes whose residuals are looked at: these, or nearby ones that
-        fit better (`lnocl.solvers.psf_fit.settle`).
+    settled : Estimate
+        That whose residuals are looked at: the estimate, or a near one that fits better
+        (`lnocl.solvers.psf_fit.settle`).
     """
+    scene, fluxes = estimate.scene, estimate.fluxes
     inside = tuple(map(slice, scene.observation.shape))
-    means = model.images(extended, fluxes)
-    found = model.forward(settled[0]) + model.background
+    means = model.images(estimate.extended, fluxes)
+    found = model.forward(settled.extended) + model.background
     squares, parts = np.zeros(scene.n_images), list[tuple[Array, ...]]()
     images = zip(
         scene.images(),
         model.starlight(fluxes),
-        model.starlight(settled[1]),
+        model.starlight(settled.fluxes),
         model.weights,
         strict=True,
     )
@@ -150,7 +146,7 @@ def measure_misfit(
 
 
 def smoothing_near_stars(
-    scene: Scene, model: Model, fluxes: Array, in_rings: Array, strength: float
+    estimate: Estimate, model: Model, in_rings: Array, strength: float
 ) -> Array:
     r"""Return the weight of the edge-preserving term that PSFs of such errors ask for.
 
@@ -164,12 +160,10 @@ def smoothing_near_stars(
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled.
+    estimate : Estimate
+        What is modelled, and how bright its stars are.
     model : Model
         Of the scene.
-    fluxes : ndarray of float64, shape (n,)
-        Star fluxes, scaled.
     in_rings : ndarray of float64
         kappa in each of the `Rings` round the stars; beyond the last it is that of the last.
     strength : float
@@ -180,6 +174,7 @@ def smoothing_near_stars(
     ndarray of float64, of the shape of the extended source
         For `lnocl.scene.penalty.Penalty.near_stars`.
     """
+    scene, fluxes = estimate.scene, estimate.fluxes
     ny, nx = scene.observation.shape
     spectra: Array | complex = 0.0
     images = zip(scene.images(), model.starlight(fluxes), strict=True)

@@ -27,7 +27,8 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
-from lnocl.scene.forward_model import Model, model_images
+from lnocl.scene.estimate import Estimate
+from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.texture import Texture, hidden_radii, resolution
 from lnocl.solvers.fluxes import precision, variances
@@ -55,26 +56,20 @@ class _Joint:
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled, with the stars where they are.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n_fluxes,)
-        Those of stars and halos, electrons.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     is_lit : ndarray of bool, shape (Ny, Nx), optional
         Where the extended source is expected; elsewhere it is expected to be dark.
     """
 
     def __init__(
         self,
-        scene: Scene,
+        estimate: Estimate,
         model: Model,
-        sky: Array,
-        star_fluxes: Array,
         is_lit: NDArray[np.bool_] | None = None,
     ) -> None:
-        extended, fluxes = sky / scene.unit, star_fluxes / scene.unit
-        models = list(model_images(scene, extended, fluxes))
+        scene, extended = estimate.scene, estimate.extended
+        models = list(estimate.models())
         totals = [np.maximum(mean, MIN_MODEL) for mean in models]
         precisions = [
             precision(scene, total, weights)
@@ -133,39 +128,33 @@ def _like_halos(scene: Scene, precisions: list[Array]) -> NDArray[np.int_]:
     return np.sort(order[(shares[order] > SHARED) | (np.arange(len(order)) < LEAST_STARS)])
 
 
-def marginal_halos(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array]:
-    """Return the extended source and the fluxes after such steps, the stars held.
+def marginal_halos(estimate: Estimate) -> Estimate:
+    """Return the estimate after such steps, the stars held.
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled, with the stars where they are.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel, zero or more.
-    star_fluxes : ndarray of float64, shape (n_fluxes,)
-        Those of stars and halos, electrons.
+    estimate : Estimate
+        Its extended source is zero or more.
     """
-    model, fluxes = Model(scene), star_fluxes.copy()
-    halos = fluxes[scene.n_stars :]  # a view
+    scene = estimate.scene
+    model, dark = Model(scene), np.zeros(scene.n_stars)
     for _ in range(STEPS):
-        is_lit = _significant(scene, model, sky / scene.unit, fluxes / scene.unit)
-        joint = _Joint(scene, model, sky, fluxes, is_lit)
+        joint = _Joint(estimate, model, _significant(estimate, model))
         information = np.diag(joint.fit.information)[joint.halos]
         # What a star or another halo can stand in for stays.
         is_told = np.isfinite(variances(joint.fit.information))[joint.halos]
-        change = np.where(is_told, joint.change(), 0.0) * scene.unit
-        change = np.maximum(change, -halos)
-        halos += change
-        won = model.starlight(np.append(np.zeros(scene.n_stars), change) / scene.unit)
-        sky = without(scene, model, sky, won)
-        if (abs(change) * np.sqrt(information) < SETTLED * scene.unit).all():
+        change = np.where(is_told, joint.change(), 0.0)
+        change = np.append(dark, np.maximum(change, -estimate.fluxes[scene.n_stars :]))
+        sky = without(estimate, model, model.starlight(change))
+        estimate = estimate.changed(sky, estimate.star_fluxes + change * scene.unit)
+        if (abs(change[scene.n_stars :]) * np.sqrt(information) < SETTLED).all():
             break
-    return sky, fluxes
+    return estimate
 
 
-def _significant(scene: Scene, model: Model, extended: Array, fluxes: Array) -> NDArray[np.bool_]:
+def _significant(estimate: Estimate, model: Model) -> NDArray[np.bool_]:
     """Return where the extended source is far above the noise of all images, and round there."""
-    models = model_images(scene, extended, fluxes)
+    scene, models = estimate.scene, estimate.models()
     # A pixel of an image has the noise of all pixels of the sky in it.
     precisions = [
         area * precision(scene, mean, w)
@@ -173,19 +162,20 @@ def _significant(scene: Scene, model: Model, extended: Array, fluxes: Array) -> 
     ]
     width = resolution(scene)
     # The light in a resolution over its noise: both are nearly flat over one.
-    smooth = gaussian_filter(extended, width / FWHM, mode="wrap")
+    smooth = gaussian_filter(estimate.extended, width / FWHM, mode="wrap")
     told = np.maximum(model.adjoint(precisions), 0.0)
     area = 4.0 * np.pi * (width / FWHM) ** 2
     is_lit = smooth * np.sqrt(area * told) > SIGNIFICANT
     return np.asarray(maximum_filter(is_lit, 2 * int(np.ceil(ROUND * width)) + 1, mode="wrap"))
 
 
-def without(scene: Scene, model: Model, sky: Array, lights: Iterable[Array]) -> Array:
+def without(estimate: Estimate, model: Model, lights: Iterable[Array]) -> Array:
     """Return the extended source less light that halos or levels won, or with what they lost.
 
     It changes by a share of itself, smoothed, so that it is dark where it was. `lights` are those
     that they won in each image, scaled.
     """
+    scene, sky = estimate.scene, estimate.sky
     weighted = (w * light for w, light in zip(model.weights, lights, strict=True))
     total = model.adjoint(model.weights)
     seen = scene.observed(total)
@@ -213,21 +203,18 @@ class HaloErrors(NamedTuple):
     raised: Array
 
 
-def halo_errors(scene: Scene, sky: Array, star_fluxes: Array) -> HaloErrors:
+def halo_errors(estimate: Estimate) -> HaloErrors:
     """Return the standard errors of halos, with stars and extended source marginalised.
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled, with the stars where they are.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n_fluxes,)
-        Those of stars and halos, electrons.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     """
+    scene = estimate.scene
     if not scene.n_halos:
         return HaloErrors(np.zeros(0), np.zeros(0))
-    joint, p = _Joint(scene, Model(scene), sky, star_fluxes), scene.n_images
+    joint, p = _Joint(estimate, Model(scene)), scene.n_images
     found = variances(joint.fit.information)[joint.halos].reshape(-1, p)
     some = np.unique(np.linspace(0, p - 1, MOST_IMAGES).round().astype(int))
     factors = np.full(len(found), np.inf)

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Observation
 from lnocl.scene.scene import MIN_MODEL, Scene
@@ -55,12 +56,8 @@ class Levels:
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled, with the stars where they are.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n_fluxes,)
-        Electrons, of stars and halos.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     are_fitted : bool
         Whether they are fitted, or else have the errors that they were given with.
 
@@ -73,10 +70,8 @@ class Levels:
         Their standard errors.
     """
 
-    def __init__(
-        self, scene: Scene, sky: Array, star_fluxes: Array, are_fitted: bool = True
-    ) -> None:
-        self._scene = scene
+    def __init__(self, estimate: Estimate, are_fitted: bool = True) -> None:
+        self._scene = scene = estimate.scene
         self._prior = scene.observation.background_error / scene.scale
         free, p = np.flatnonzero(self._prior).tolist(), scene.n_images
         # The unknowns are three of each image, and the amount of the wings.
@@ -87,7 +82,7 @@ class Levels:
         self._held: dict[int, tuple[Array, Array]] = {}  # the dark pixels, and the wings
         found, self._covariance = np.zeros(3 * len(free) + 1), self._given()
         if are_fitted:
-            found, self._covariance = self._fit(sky / scene.unit, star_fluxes / scene.unit)
+            found, self._covariance = self._fit(estimate.extended, estimate.fluxes)
         deviations = np.sqrt(np.diag(self._covariance))
         self.change, self.errors = np.zeros((2, p, 3))
         for j, at in self._places.items():
@@ -175,22 +170,19 @@ class Levels:
         return float(laid @ self._covariance @ (laid + more))
 
 
-def fit_levels(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Scene, Array]:
-    """Return the scene with levels as they are fitted, and the extended source beside them.
+def fit_levels(estimate: Estimate) -> Estimate:
+    """Return the estimate with levels as they are fitted, and the extended source beside them.
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled, with the stars where they are.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel, zero or more.
-    star_fluxes : ndarray of float64, shape (n_fluxes,)
-        Electrons.
+    estimate : Estimate
+        Its extended source is zero or more.
     """
-    change = Levels(scene, sky, star_fluxes).change
+    scene, change = estimate.scene, Levels(estimate).change
     other = copy(scene)
     other.observation = with_levels(scene.observation, change)
-    return other, without(scene, Model(scene), sky, lights(scene, change))
+    sky = without(estimate, Model(scene), lights(scene, change))
+    return Estimate(other, sky, estimate.star_fluxes)
 
 
 def planes(observation: Observation, y: NDArray, x: NDArray) -> Array:

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
-from lnocl.scene.forward_model import Model, images_of_sky, is_flat, model_images
-from lnocl.scene.scene import Scene
+from lnocl.scene.estimate import Estimate
+from lnocl.scene.forward_model import Model, images_of_sky, is_flat
 from lnocl.solvers.levels import Levels
 
 
@@ -33,21 +33,15 @@ class Light:
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled, with the stars where they are.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n,)
-        Electrons.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     levels : Levels, optional
         Those of the background, where they are not known.
     """
 
-    def __init__(
-        self, scene: Scene, sky: Array, star_fluxes: Array, levels: Levels | None = None
-    ) -> None:
-        self._scene, self._sky, self._star_fluxes = scene, sky, star_fluxes
-        self._levels = levels
+    def __init__(self, estimate: Estimate, levels: Levels | None = None) -> None:
+        self._estimate, self._levels = estimate, levels
+        self._scene = scene = estimate.scene
         self._map = Model(scene)
         total = self._map.adjoint(self._map.weights)
         self._per_weight = np.broadcast_to(1.0 / total[:1, :1], total.shape)
@@ -57,9 +51,8 @@ class Light:
 
     def _left(self) -> Iterator[Array]:
         """Yield ``(g_j - m_j) / A_j 1``, scaled."""
-        scene = self._scene
-        models = model_images(scene, self._sky / scene.unit, self._star_fluxes / scene.unit)
-        for image, model, total in zip(scene.images(), models, self._map.sums, strict=True):
+        each = zip(self._scene.images(), self._estimate.models(), self._map.sums, strict=True)
+        for image, model, total in each:
             image -= model
             image /= total
             yield image
@@ -69,7 +62,7 @@ class Light:
         scene, (ny, nx) = self._scene, self._scene.observation.sky_shape
         left = (w * each for w, each in zip(self._map.weights, self._left(), strict=True))
         change = self._map.adjoint(left) * self._per_weight * scene.unit
-        return np.asarray((self._sky + change)[:ny, :nx])
+        return np.asarray((self._estimate.sky + change)[:ny, :nx])
 
     def flux(self, shares: Array, star_flux_errors: Array) -> tuple[float, float]:
         """Return the sum of `sky` times shares of its pixels, and its standard error, electrons.
@@ -87,7 +80,7 @@ class Light:
             Standard errors of the stars and halos, electrons.
         """
         scene, (ny, nx) = self._scene, shares.shape
-        inside, star_fluxes = self._inside(shares), self._star_fluxes / scene.unit
+        inside, star_fluxes = self._inside(shares), self._estimate.fluxes
         errors = np.where(scene.is_shown, star_flux_errors, 0.0)
         of_counts, variances = 0.0, np.zeros(3)  # of the background, of all but stars, of stars
         factors = list(self._factors(shares))
@@ -106,8 +99,8 @@ class Light:
             if not inside.all():
                 image -= scene.star_field.light(j, np.where(inside, 0.0, star_fluxes))
             of_counts += float(np.einsum("yx,yx", factor, image))
-        of_sky = np.einsum("yx,yx", shares, self._sky[:ny, :nx])
-        of_sky -= np.einsum("yx,yx", self._map.adjoint(factors), self._sky)
+        of_sky = np.einsum("yx,yx", shares, self._estimate.sky[:ny, :nx])
+        of_sky -= np.einsum("yx,yx", self._map.adjoint(factors), self._estimate.sky)
         least, rest, photons = variances * scene.unit**2 / scene.scale
         of_stars = (errors[inside] ** 2).sum() - photons
         of_levels = 0.0 if self._levels is None else self._levels.variance(factors) * scene.unit**2

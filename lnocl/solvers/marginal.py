@@ -17,6 +17,7 @@ import numpy as np
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
 from lnocl.scene.texture import core
 from lnocl.solvers.fluxes import variances
@@ -26,25 +27,22 @@ from lnocl.solvers.near_star import NearStar, Surroundings
 FINISHED = 1e-4
 
 
-def marginal(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array]:
-    """Return the extended source and the star fluxes after that step, the positions held.
+def marginal(estimate: Estimate) -> Estimate:
+    """Return the estimate after that step, the positions held.
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled, with the stars where they are.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel, zero or more.
-    star_fluxes : ndarray of float64, shape (n,)
-        Electrons.
+    estimate : Estimate
+        Its extended source is zero or more.
 
     Returns
     -------
-    sky, star_fluxes : ndarray of float64
-        Those after the step. A star without light, or that the images do not determine, stays.
+    Estimate
+        That after the step. A star without light, or that the images do not determine, stays.
     """
-    around = Surroundings(scene, sky, star_fluxes, False)
-    after, fluxes = sky.copy(), star_fluxes.copy()
+    scene, star_fluxes = estimate.scene, estimate.star_fluxes
+    around = Surroundings(estimate, False)
+    after, fluxes = estimate.sky.copy(), star_fluxes.copy()
     n_epochs = scene.observation.n_epochs
     for first in range(0, scene.n_stars, n_epochs):
         # The star in all epochs that show it; one without light in any, or not determined, stays.
@@ -63,7 +61,7 @@ def marginal(scene: Scene, sky: Array, star_fluxes: Array) -> tuple[Array, Array
         light = _core_of(near, scene, first) * (near.expected + near.source.of(x)) * scene.unit
         light = np.maximum(light, -after[there])
         after[there] += _at_most(light, float((star_fluxes[star] - fluxes[star]).mean()))
-    return after, fluxes
+    return estimate.changed(after, fluxes)
 
 
 def _core_of(near: NearStar, scene: Scene, star: int) -> Array:

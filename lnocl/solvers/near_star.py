@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import movable_psfs
-from lnocl.scene.forward_model import LocalRotation, add_to_window, model_images, sampled, spread
+from lnocl.scene.estimate import Estimate
+from lnocl.scene.forward_model import LocalRotation, add_to_window, sampled, spread
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import along_sky
@@ -66,12 +67,8 @@ class Surroundings:
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled, with the stars where they are.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n,)
-        Electrons.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     moves : bool
         Whether positions are unknown too; else they are taken as known.
     raised : ndarray of float64, shape (n_shapes,), optional
@@ -88,15 +85,9 @@ class Surroundings:
         Halos of each image that are unknown.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        sky: Array,
-        star_fluxes: Array,
-        moves: bool,
-        raised: Array | None = None,
-    ) -> None:
-        self.scene, self.sky, self.star_fluxes, self.moves = scene, sky, star_fluxes, moves
+    def __init__(self, estimate: Estimate, moves: bool, raised: Array | None = None) -> None:
+        self.estimate, self.moves = estimate, moves
+        self.scene = scene = estimate.scene
         self.width = resolution(scene)
         self.hidden = hidden_radii(scene, self.width)
         self.psfs = movable_psfs(scene.scaled_psfs(), scene.observation, scene.image_grid)
@@ -108,7 +99,7 @@ class Surroundings:
         scene = self.scene
         weights = np.ones((1, 1, 1)) if scene.weights is None else scene.weights
         weights = np.broadcast_to(weights, (scene.n_images, *scene.image_grid))
-        models = model_images(scene, self.sky / scene.unit, self.star_fluxes / scene.unit)
+        models = self.estimate.models()
         return [precision(scene, model, w) for model, w in zip(models, weights, strict=True)]
 
     def halos(self, j: int) -> list[Cutout]:
@@ -161,7 +152,7 @@ class NearStar:
     """
 
     def __init__(self, around: Surroundings, star: int, finished: float) -> None:
-        scene, sky, width = around.scene, around.sky, around.width
+        scene, width = around.scene, around.width
         self.hidden = hidden_radius(scene, scene.stars[star], width)
         self.window = _window_round(scene, scene.stars[star], WINDOW * width + 2.0 * self.hidden)
         held = np.append(star, _neighbours(scene, star, width))
@@ -169,7 +160,7 @@ class NearStar:
         self.source = self._source_error(around, texture.amplitude[there], texture.width)
         self.held, self.n_held, self.resolution = held, len(held), width
         self._finished, self.n_of_stars = finished, len(held) * (3 if around.moves else 1)
-        self.expected = texture.mean[there] - sky[self.places(scene)] / scene.unit
+        self.expected = texture.mean[there] - around.estimate.part(self.places(scene))
         level = float(texture.mean[there].mean())
         self._level = LevelError(level, scene.gains * scene.areas, self.window.shape)
         beyond = self.source.images_of(self.expected)
@@ -281,7 +272,7 @@ class NearStar:
         counts, background, weights = _observed(scene, j, there)
         # Of images that are turned the grid is no period, so the window is not moved into it.
         model, first, shape = background.copy(), (there.y, there.x), self.window.shape
-        add_to_window(model, scene, around.sky, around.star_fluxes, j, first)
+        add_to_window(model, around.estimate, j, first)
         total = np.maximum(model, MIN_MODEL)
         lit = np.flatnonzero(scene.shown[held, j])
         slopes = [_cut(scene.star_cutout(j, s), there, grid) for s in held[lit]]
@@ -290,7 +281,7 @@ class NearStar:
             turn = scene.observation.turns[j]
             moved = [along_sky(psfs[s].with_slopes(*places[s]), turn) for s in held[lit]]
             for axis in (1, 2):
-                fluxes = around.star_fluxes[held[lit]] / scene.unit
+                fluxes = around.estimate.fluxes[held[lit]]
                 for flux, each in zip(fluxes, moved, strict=True):
                     slope = each._replace(values=flux * each.values[axis])
                     slopes.append(_cut(slope, there, grid))
@@ -307,7 +298,7 @@ class NearStar:
 
 def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slice], Texture]:
     """Return the texture round a window of the images, and where the window lies in it."""
-    scene, sky, width = around.scene, around.sky, around.width
+    scene, width = around.scene, around.width
     window = window.finer(scene.oversample)
     margin = int(np.ceil(MARGIN * width))
     (y, height), (x, breadth) = (
@@ -321,7 +312,7 @@ def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slic
         slice(first - start, first - start + k)
         for first, start, k in zip((window.y, window.x), (y, x), window.shape, strict=True)
     )
-    extended = sky[whole.of(scene.grid)] / scene.unit
+    extended = around.estimate.part(whole.of(scene.grid))
     return (there[0], there[1]), Texture(extended, stars[inside], width, around.hidden[inside])
 
 

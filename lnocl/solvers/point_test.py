@@ -12,7 +12,7 @@ import numpy as np
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
-from lnocl.scene.scene import Scene
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.texture import Texture, resolution
 from lnocl.solvers.fluxes import variances
 from lnocl.solvers.near_star import NearStar, Surroundings
@@ -22,9 +22,7 @@ FINISHED = 1e-4
 
 
 def point_flux(
-    scene: Scene,
-    sky: Array,
-    star_fluxes: Array,
+    estimate: Estimate,
     place: Array,
     flux: float,
     moves: bool,
@@ -34,12 +32,8 @@ def point_flux(
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n_fluxes,)
-        Electrons, of stars and halos.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     place : ndarray of float64, shape (2,)
         (x, y), pixels of the images.
     flux : float
@@ -49,14 +43,15 @@ def point_flux(
     raised : ndarray of float64, shape (n_shapes,)
         As of `lnocl.solvers.halos.halo_errors`: halos are unknown too.
     """
+    scene = estimate.scene
     n, n_epochs = scene.n_stars, scene.observation.n_epochs
     width = resolution(scene)
     there = on_sky(np.array([place]), scene.oversample)
     # The light of the point is in the estimate of the extended source, and its own now.
-    without = Texture(sky, there, width).mean
-    other = scene.with_star(place)
-    fluxes = np.insert(star_fluxes, n, [max(flux, 0.0)] * n_epochs)
-    near = NearStar(Surroundings(other, without, fluxes, moves, raised), n, FINISHED)
+    without = Texture(estimate.sky, there, width).mean
+    fluxes = np.insert(estimate.star_fluxes, n, [max(flux, 0.0)] * n_epochs)
+    other = Estimate(scene.with_star(place), without, fluxes)
+    near = NearStar(Surroundings(other, moves, raised), n, FINISHED)
     at = np.array([np.flatnonzero(near.held == s)[0] for s in range(n, n + n_epochs)])
     at = at[np.isfinite(variances(near.fit.information)[at])]
     if not len(at):

@@ -23,6 +23,7 @@ from scipy.ndimage import gaussian_filter
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky, pixel_spectrum
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model, sampled, spread
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
 from lnocl.scene.psf_pixels import PsfPixels
@@ -40,40 +41,32 @@ MAX_STEP, MAX_MOVE = 3.0, 0.5
 
 
 class PsfStep(NamedTuple):
-    """Changes of PSF parameters, and the stars' new fluxes and positions."""
+    """Changes of PSF parameters, and the stars' new fluxes, electrons, and positions."""
 
     parameters: PsfParameters
-    fluxes: Array
+    star_fluxes: Array
     positions: Array
 
 
 def step(
-    scene: Scene,
-    families: PsfFamilies,
-    parameters: PsfParameters,
-    extended: Array,
-    fluxes: Array,
-    moves: bool,
+    estimate: Estimate, families: PsfFamilies, parameters: PsfParameters, moves: bool
 ) -> PsfStep:
     """Return a step of Gauss and Newton for PSFs and stars, the extended source marginalised.
 
     Parameters
     ----------
-    scene : Scene
-        Its PSFs are those of the parameters.
+    estimate : Estimate
+        The PSFs of its scene are those of the parameters.
     families : PsfFamilies
         What the PSFs may be.
     parameters : PsfParameters
         The present ones.
-    extended : ndarray of float64, shape (Ny, Nx)
-        Extended source, on the grid and scaled.
-    fluxes : ndarray of float64, shape (n,)
-        Star fluxes, scaled.
     moves : bool
         Whether the stars' positions are fitted too.
     """
+    scene, extended, fluxes = estimate.scene, estimate.extended, estimate.fluxes
     model, values = Model(scene), parameters.values
-    images = _linearise(scene, families, values, model, extended, fluxes, moves)
+    images = _linearise(estimate, families, values, model, moves)
     n, n_psf = len(fluxes), values.size
     at, prior = np.zeros((2, n_psf + n * (3 if moves else 1)))
     at[:n_psf], prior[:n_psf] = values.ravel(), np.tile(families.prior**-2.0, len(values))
@@ -87,12 +80,11 @@ def step(
     moved = change[n_psf + n :].reshape(-1, n).T.clip(-MAX_MOVE, MAX_MOVE)
     pixels = parameters.pixels if families.pixels is None else changes[1]
     of_psfs = PsfParameters(change[:n_psf].reshape(values.shape), pixels)
+    to = Estimate.of_scaled(scene, extended, to).star_fluxes
     return PsfStep(of_psfs, to, scene.stars + moved if moves else scene.stars)
 
 
-def settle(
-    scene: Scene, model: Model, extended: Array, fluxes: Array, share: float
-) -> tuple[Array, Array]:
+def settle(estimate: Estimate, model: Model, share: float) -> Estimate:
     """Return the estimate nearest to one whose extended source may be off by a share of itself.
 
     It is that of the least squares with the PSFs held: ``f + share a C^(1/2) x``, which may be
@@ -100,22 +92,19 @@ def settle(
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     model : Model
         Of the scene.
-    extended : ndarray of float64, shape (Ny, Nx)
-        Extended source, on the grid and scaled.
-    fluxes : ndarray of float64, shape (n,)
-        Star fluxes, scaled.
     share : float
         The standard deviation of f, over its smoothed self.
     """
+    scene, extended, fluxes = estimate.scene, estimate.extended, estimate.fluxes
     held = PsfFamilies((), scene.observation)
-    images = _linearise(scene, held, held.first().values, model, extended, fluxes, False)
+    images = _linearise(estimate, held, held.first().values, model, False)
     error = _source_error(model, share * extended)
     change, (x, *_) = _fit(images, [error], np.zeros(len(fluxes))).solve(np.zeros(len(fluxes)))
-    return extended + error.of(x), fluxes + change
+    return Estimate.of_scaled(scene, extended + error.of(x), fluxes + change)
 
 
 def _fit(images: list[LinearImage], fields: Sequence[Field], prior: Array) -> LeastSquares:
@@ -128,14 +117,9 @@ def _source_error(model: Model, extended: Array) -> SourceError:
 
 
 def _linearise(
-    scene: Scene,
-    families: PsfFamilies,
-    values: Array,
-    model: Model,
-    extended: Array,
-    fluxes: Array,
-    moves: bool,
+    estimate: Estimate, families: PsfFamilies, values: Array, model: Model, moves: bool
 ) -> list[LinearImage]:
+    scene, extended, fluxes = estimate.scene, estimate.extended, estimate.fluxes
     p, k, n = scene.n_images, len(families.prior), len(fluxes)
     shared = p * k + np.arange(n * (3 if moves else 1))
     images = []

@@ -34,9 +34,10 @@ from scipy import ndimage
 
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model, spread
 from lnocl.scene.psf_pixels import CORRELATED
-from lnocl.scene.scene import MIN_MODEL, Scene
+from lnocl.scene.scene import MIN_MODEL
 from lnocl.scene.smooth_field import SmoothField
 from lnocl.scene.texture import ROUND, coarseness, resolution
 from lnocl.solvers.known_stars import KnownStars
@@ -144,12 +145,8 @@ class Null:
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled, with the stars where they are.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n_fluxes,)
-        Electrons, of stars and halos.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     moves : bool
         Whether positions of stars were fitted.
     psf_errors : tuple of ndarray of float64
@@ -172,19 +169,18 @@ class Null:
 
     def __init__(
         self,
-        scene: Scene,
-        sky: Array,
-        star_fluxes: Array,
+        estimate: Estimate,
         moves: bool,
         psf_errors: tuple[Array, Array],
     ) -> None:
-        self.scene, self._model = scene, Model(scene)
+        self.scene = scene = estimate.scene
+        self._model = Model(scene)
         self.resolution, self.disc = resolution(scene), DISC * coarseness(scene)
         self._psf_errors = psf_errors
-        fluxes = np.asarray(star_fluxes) / scene.unit
+        fluxes = estimate.fluxes
         self.stars = KnownStars(self._model, fluxes[: scene.n_stars], moves)
         self._starlight = list(self._model.starlight(fluxes))
-        self._sky = sky / scene.unit
+        self._sky = estimate.extended
         self.is_structured = np.zeros(scene.grid, bool)
         self.rings = self.stars.rings(RING * self.resolution)
         self._model_sky()

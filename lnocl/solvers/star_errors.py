@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
 from lnocl.solvers.fluxes import variances
 from lnocl.solvers.halos import halo_errors
@@ -34,9 +35,7 @@ FINISHED = 1e-8
 
 
 def standard_errors(
-    scene: Scene,
-    sky: Array,
-    star_fluxes: Array,
+    estimate: Estimate,
     moves: bool,
     raised: Array | None = None,
     levels: Levels | None = None,
@@ -46,12 +45,8 @@ def standard_errors(
 
     Parameters
     ----------
-    scene : Scene
-        What is modelled, with the stars where they are.
-    sky : ndarray of float64, shape (Ny, Nx)
-        Extended source on the grid, electrons per pixel.
-    star_fluxes : ndarray of float64, shape (n,)
-        Electrons.
+    estimate : Estimate
+        What is modelled, and how bright it is.
     moves : bool
         Whether positions were fitted too; else they are taken as known.
     raised : ndarray of float64, shape (n_shapes,), optional
@@ -68,8 +63,8 @@ def standard_errors(
         images do not determine a star.
     """
     if raised is None:
-        raised = halo_errors(scene, sky, star_fluxes).raised
-    around = Surroundings(scene, sky, star_fluxes, moves, raised)
+        raised = halo_errors(estimate).raised
+    scene, around = estimate.scene, Surroundings(estimate, moves, raised)
     errors = np.full((scene.n_stars, 3), np.nan)
     n_epochs, k = scene.observation.n_epochs, 3 if moves else 1
     for first in range(0, scene.n_stars, n_epochs):  # which lies there in all epochs

@@ -11,6 +11,7 @@ from turned_scenes import FLUXES, GRID, NX, NY, STARS, gaussian, observation
 
 import lnocl
 from lnocl.io.saved_results import read_result
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
 from lnocl.solvers.near_star import NearStar, Surroundings
 
@@ -218,7 +219,7 @@ def test_what_is_expected_under_a_star_does_not_hang_on_the_number_of_epochs():
     found = []
     for scene in (Scene(observation(epochs=EPOCHS), STARS), Scene(observation(), STARS)):
         fluxes = np.repeat(FLUXES, scene.n_stars // 2)
-        around = Surroundings(scene, scenes_turned.sky(), fluxes, moves=False)
+        around = Surroundings(Estimate(scene, scenes_turned.sky(), fluxes), moves=False)
         found.append(NearStar(around, 0, 1e-4).expected)
     np.testing.assert_allclose(*found, rtol=1e-12)
 

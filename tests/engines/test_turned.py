@@ -15,6 +15,7 @@ from turned_scenes import FLUXES, GRID, NX, NY, STARS, observation, psfs
 import lnocl
 from lnocl.engines.opencl import OpenCLEngine
 from lnocl.opencl.tuning import Tuning
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model, add_to_window, model_images
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.scene import Scene
@@ -282,7 +283,7 @@ def test_errors_of_stars_are_those_of_images_that_are_not_turned():
             np.array([image, image]), psf, background=5.0, transforms=lnocl.rotations(angles, star)
         )
         scene = Scene(given, [star])
-        around = Surroundings(scene, np.full(scene.grid, 15.0), np.array([3000.0]), True)
+        around = Surroundings(Estimate(scene, np.full(scene.grid, 15.0), np.array([3000.0])), True)
         near = NearStar(around, 0, 1e-6)
         errors.append(np.sqrt(np.diag(near.fit.information)))
     assert worst(errors[0], errors[1]) <= 0.02
@@ -307,7 +308,7 @@ def test_windows_over_an_edge(scale):
     image = list(model_images(scene, sky, np.zeros(0)))[1]
     for first in ((0, 0), (-8, -8)):
         window = np.zeros((20, 20))
-        add_to_window(window, scene, sky * scene.unit, np.zeros(0), 1, first)
+        add_to_window(window, Estimate(scene, sky * scene.unit, np.zeros(0)), 1, first)
         rows, columns = (slice(max(-at, 0), None) for at in first)
         expected = image[: 20 + min(first[0], 0), : 20 + min(first[1], 0)]
         assert worst(window[rows, columns], expected) <= 2e-3
@@ -334,7 +335,7 @@ def test_errors_of_a_star_near_an_edge(scale):
         scene = Scene(wider, [star + before])
         y, x = np.indices(scene.grid) - (12 + before)
         sky = 9.0 + 2e4 * scenes_turned.gaussian(x, y, 16.0 * np.eye(2))
-        around = Surroundings(scene, sky, np.array([3000.0]), False)
+        around = Surroundings(Estimate(scene, sky, np.array([3000.0])), False)
         found.append(np.sqrt(np.diag(NearStar(around, 0, 1e-6).fit.information)))
     assert worst(found[0], found[1]) <= 0.02
 
@@ -423,7 +424,7 @@ def test_stars_in_larger_pixels_are_marginal(degrees, scale):
     scene = Scene(given, [star])
     y, x = np.indices(scene.grid)
     sky = 1e6 * scenes_turned.gaussian(x - blob[0], y - blob[1], 100.0 * np.eye(2))
-    _, fluxes = marginal(scene, sky, np.array([1e6]))
+    fluxes = marginal(Estimate(scene, sky, np.array([1e6]))).star_fluxes
     assert fluxes == pytest.approx(1e6, rel=0.03)
 
 

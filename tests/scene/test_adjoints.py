@@ -12,6 +12,7 @@ import turned_scenes
 from scenes import make_psfs, make_smooth_psfs
 
 import lnocl
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import LocalRotation, Model
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.scene import Scene
@@ -115,7 +116,9 @@ def test_the_sky_round_a_star(kind, monkeypatch):
     monkeypatch.setattr(near_star, "WINDOW", 2.0)
     scene = a_scene(kind)
     sky = np.full(scene.grid, 3.0)
-    near = NearStar(Surroundings(scene, sky, np.full(scene.n_fluxes, 900.0), False), 0, 1e-8)
+    near = NearStar(
+        Surroundings(Estimate(scene, sky, np.full(scene.n_fluxes, 900.0)), False), 0, 1e-8
+    )
     source, shape = near.source, near.expected.shape
     assert shape != scene.grid
     x, y = abs(noise(*shape)), noise(P, *near.window.shape, seed=4)

@@ -5,6 +5,7 @@ import pytest
 from scenes import blur, make_psfs
 
 import lnocl
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_misfit import measure_misfit, smoothing_near_stars
 from lnocl.scene.psf_wings import without_noise
@@ -40,8 +41,13 @@ def a_scene(p=1, error=0.0, noise=True, seed=1, **known):
     return scene, SKY / scene.unit, np.array([FLUX / scene.unit])
 
 
+def stars_alone(scene, fluxes):
+    return Estimate.of_scaled(scene, np.zeros(scene.grid), fluxes)
+
+
 def misfit_of(scene, sky, fluxes):
-    return measure_misfit(scene, Model(scene), sky, fluxes, (sky, fluxes))
+    estimate = Estimate.of_scaled(scene, sky, fluxes)
+    return measure_misfit(estimate, Model(scene), estimate)
 
 
 @pytest.mark.parametrize("p", [1, 3])
@@ -103,7 +109,7 @@ def test_the_smoothing_is_the_deviation_of_the_gradient():
     error, draws = 0.1, []
     scene, _, fluxes = a_scene(noise=False)
     model, light = Model(scene), star_image(PSF) * FLUX
-    near = smoothing_near_stars(scene, model, fluxes, np.array([error]), 2.0)
+    near = smoothing_near_stars(stars_alone(scene, fluxes), model, np.array([error]), 2.0)
     mean = light + LEVEL + SKY
     for seed in range(400):
         rng = np.random.default_rng(seed)
@@ -148,7 +154,10 @@ class TestImagesThatDiffer:
         scene, squares = self.scene(), np.zeros(2)
         expected = excess = norm = 0.0
         scaled, flux = SKY / scene.unit, np.array([self.LIGHT / scene.unit])
-        found = measure_misfit(scene, Model(scene), scaled, flux, (1.2 * scaled, 0.9 * flux))
+        given, settled = (
+            Estimate.of_scaled(scene, a * scaled, b * flux) for a, b in ((1.0, 1.0), (1.2, 0.9))
+        )
+        found = measure_misfit(given, Model(scene), settled)
         for j, counts in enumerate(self.counts()):
             light, rings = self.light(j)
             model = light + self.LEVELS[j] + 5.0 * self.DEPTH[j]
@@ -177,7 +186,7 @@ class TestImagesThatDiffer:
                 expected += value * np.roll(share**2, (4 - v - dy, 5 - u - dx), (0, 1))
         scene = self.scene()
         fluxes = np.array([self.LIGHT / scene.unit])
-        near = smoothing_near_stars(scene, Model(scene), fluxes, in_rings, 2.0)
+        near = smoothing_near_stars(stars_alone(scene, fluxes), Model(scene), in_rings, 2.0)
         np.testing.assert_allclose(near, 2.0 * np.sqrt(expected), rtol=1e-9, atol=1e-8)
 
 
@@ -190,7 +199,8 @@ def test_smoothing_does_not_hang_on_the_unit_of_time():
         )
         scene = Scene(observation, [STAR])
         fluxes = np.array([FLUX / scene.unit])
-        found.append(smoothing_near_stars(scene, Model(scene), fluxes, np.array([0.1]), 2.0))
+        estimate = stars_alone(scene, fluxes)
+        found.append(smoothing_near_stars(estimate, Model(scene), np.array([0.1]), 2.0))
     np.testing.assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-6 * found[1].max())
 
 

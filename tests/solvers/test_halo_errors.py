@@ -6,6 +6,7 @@ from scenes import make_psfs
 from scipy.ndimage import gaussian_filter
 
 import lnocl
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.scene.texture import Texture, resolution
@@ -102,9 +103,9 @@ def test_errors_are_those_of_the_dense_matrix(seed, monkeypatch):
     monkeypatch.setattr(least_squares, "NEGLIGIBLE", 1e-7)
     scene, sky, fluxes, mean = an_estimate(seed=seed)
     deviations, change = dense(scene, sky, mean, True)
-    found = standard_errors(scene, sky, fluxes, False)[:, 0]
+    found = standard_errors(Estimate(scene, sky, fluxes), False)[:, 0]
     np.testing.assert_allclose(found, np.hypot(deviations, change)[:2], rtol=1e-5)
-    errors = halo_errors(scene, sky, fluxes).errors * scene.mean_exposure
+    errors = halo_errors(Estimate(scene, sky, fluxes)).errors * scene.mean_exposure
     deviations, _ = dense(scene, sky, mean, False)
     np.testing.assert_allclose(errors, deviations[2:], rtol=0.01)
 
@@ -113,8 +114,7 @@ def test_amounts_take_the_step_of_the_dense_matrix(monkeypatch):
     """With the sky expected to be dark but where it is significant, and that light missed."""
     monkeypatch.setattr(halos, "STEPS", 1)
     scene, sky, fluxes, mean = an_estimate(sky=0.3 * SKY, seed=1)
-    scaled = sky / scene.unit, fluxes / scene.unit
-    is_lit = halos._significant(scene, Model(scene), *scaled)
+    is_lit = halos._significant(Estimate(scene, sky, fluxes), Model(scene))
     assert 0.02 < is_lit.mean() < 0.9
     expected = np.where(is_lit, sky, 0.0)
     texture = Texture(expected, scene.stars, resolution(scene))
@@ -127,8 +127,8 @@ def test_amounts_take_the_step_of_the_dense_matrix(monkeypatch):
     left = scene.observation.images.ravel() - mean + missed
     change = np.linalg.solve(information, columns @ (left / mean))[len(STARS) : k]
     errors = np.sqrt(np.diag(np.linalg.inv(information)))[len(STARS) : k]
-    after, found = halos.marginal_halos(scene, sky, fluxes)
-    moved = (found - fluxes)[len(STARS) :] * scene.mean_exposure
+    found = halos.marginal_halos(Estimate(scene, sky, fluxes))
+    moved = (found.star_fluxes - fluxes)[len(STARS) :] * scene.mean_exposure
     assert abs(change).max() > errors.min()
     # Conjugate gradients end at a fiftieth of the gradient.
     assert abs(moved - np.maximum(change, -AMOUNTS.ravel())).max() <= 0.05 * errors.max()
@@ -143,14 +143,14 @@ def test_amounts_take_the_step_of_the_dense_matrix(monkeypatch):
         gaussian_filter(each, width, mode="wrap") for each in ((back / total).reshape(N, N), sky)
     ]
     np.testing.assert_allclose(
-        after, sky * (1.0 - np.clip(smooth[0] / smooth[1], -1, 1)), rtol=1e-9
+        found.sky, sky * (1.0 - np.clip(smooth[0] / smooth[1], -1, 1)), rtol=1e-9
     )
 
 
 def test_what_lies_beyond_a_window_is_the_information_of_each_image():
     scene, sky, fluxes, mean = an_estimate()
     raised = np.array([4.0, 1.5])
-    around = near_star.Surroundings(scene, sky, fluxes, False, raised)
+    around = near_star.Surroundings(Estimate(scene, sky, fluxes), False, raised)
     outside = np.ones((N, N), bool)
     outside[9:20, 11:17] = False
     for j, model in enumerate(mean.reshape(P, N, N)):
@@ -164,8 +164,8 @@ def test_what_lies_beyond_a_window_is_the_information_of_each_image():
 def test_a_halo_that_is_known_leaves_a_star_the_error_of_counts():
     """The halo that is nearly a star raises its error by much, the broad one hardly."""
     scene, sky, fluxes, _ = an_estimate()
-    found = standard_errors(scene, sky, fluxes, False)[:, 0]
-    around = near_star.Surroundings(scene, sky, fluxes, False)
+    found = standard_errors(Estimate(scene, sky, fluxes), False)[:, 0]
+    around = near_star.Surroundings(Estimate(scene, sky, fluxes), False)
     known = [near_star.NearStar(around, s, 1e-8).fit.variances([0])[0] ** 0.5 for s in (0, 1)]
     raised = found / (np.array(known) * scene.unit)
     assert raised[0] > 2.5
@@ -177,10 +177,10 @@ def test_a_window_and_what_lies_beyond_it_are_the_grid(monkeypatch, moves):
     """Broad halos are told from beyond the window, compact ones in it."""
     monkeypatch.setattr(near_star, "WINDOW", 4.0)
     scene, sky, fluxes, _ = an_estimate(sky=0.05 * SKY)
-    found = standard_errors(scene, sky, fluxes, moves)
+    found = standard_errors(Estimate(scene, sky, fluxes), moves)
     assert near_star._window_round(scene, STARS[0], resolution(scene)) != (N, N)
     monkeypatch.setattr(near_star, "WINDOW", 1000.0)
-    whole = standard_errors(scene, sky, fluxes, moves)
+    whole = standard_errors(Estimate(scene, sky, fluxes), moves)
     k = 3 if moves else 1
     assert abs(found[:, :k] / whole[:, :k] - 1.0).max() < 0.05
 
@@ -210,7 +210,7 @@ def test_a_faint_star_that_is_like_a_halo_is_as_unknown_beside_five_bright_ones(
     for bright in (others[:3], others):
         crowd = Scene(scene.observation, [*bright, STARS[0]])
         fluxes = np.r_[[5e3] * len(bright), FLUXES[1], AMOUNTS.ravel() / crowd.mean_exposure]
-        found.append(halo_errors(crowd, 0.01 * SKY, fluxes).errors)
+        found.append(halo_errors(Estimate(crowd, 0.01 * SKY, fluxes)).errors)
     np.testing.assert_allclose(found[1][:2], found[0][:2], rtol=0.05)
 
 

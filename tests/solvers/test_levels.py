@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import lnocl
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.solvers.levels import Levels
@@ -82,7 +83,7 @@ def explicit(scene):
 @pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
 def test_levels_on_a_dark_sky_are_those_of_explicit_least_squares(known):
     scene, sky = a_scene(known, np.random.default_rng(1), sky=0.0 * SKY)
-    found = Levels(scene, sky, FLUXES)
+    found = Levels(Estimate(scene, sky, FLUXES))
     for j, (change, errors) in enumerate(explicit(scene)):
         np.testing.assert_allclose(found.change[j], change, rtol=1e-8)
         np.testing.assert_allclose(found.errors[j], errors, rtol=1e-8)
@@ -94,14 +95,14 @@ def test_levels_beside_a_source_are_within_their_errors(known):
     truth = np.column_stack([[0.0, 0.0], RISES])
     for _ in range(12):
         scene, sky = a_scene(known, rng)
-        found = Levels(scene, sky, FLUXES)
+        found = Levels(Estimate(scene, sky, FLUXES))
         off.append((found.change - truth) / found.errors)
     assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3
 
 
 def test_a_known_level_stays_and_has_no_error():
     scene, sky = a_scene({}, errors=[0.0, 1.5])
-    found = Levels(scene, sky, FLUXES)
+    found = Levels(Estimate(scene, sky, FLUXES))
     assert not found.change[0].any()
     assert not found.errors[0].any()
     assert (found.change[1] != 0).all()
@@ -117,8 +118,8 @@ def test_the_error_of_a_sum_is_that_of_draws(monkeypatch):
         at = LEVELS + ERRORS * rng.standard_normal(2)
         rises = np.sqrt(LEVELS)[:, None] * rng.standard_normal((2, 2))
         scene, sky = a_scene({}, rng, source, at=at, rises=rises)
-        fitted = Levels(scene, sky, FLUXES)
-        light, planes = Light(scene, sky, FLUXES, fitted), as_planes(fitted.change)
+        fitted = Levels(Estimate(scene, sky, FLUXES))
+        light, planes = Light(Estimate(scene, sky, FLUXES), fitted), as_planes(fitted.change)
         sums = [light.flux(region, np.zeros(2)) for region in regions]
         more = [float((region * planes.mean(axis=0)).sum()) for region in regions]
         found.append([flux - less for (flux, _), less in zip(sums, more, strict=True)])
@@ -138,12 +139,13 @@ def test_a_star_changes_with_a_level_as_its_error_says():
     for given in (0.0, np.array([CHANGE, 0.0]), np.array([0.0, CHANGE])):
         observation = scene.observation.replace(background_error=np.broadcast_to(given, (2,)))
         there = Scene(observation, STARS, pad=8)
-        known = Levels(there, sky, FLUXES, are_fitted=False)
-        errors.append(standard_errors(there, sky, FLUXES, False, levels=known)[:, 0])
+        known = Levels(Estimate(there, sky, FLUXES), are_fitted=False)
+        errors.append(standard_errors(Estimate(there, sky, FLUXES), False, levels=known)[:, 0])
     for j in range(2):
         more = scene.observation.background + CHANGE * (np.arange(2) == j)
         higher = Scene(scene.observation.replace(background=more), STARS, pad=8)
-        shift = marginal(higher, sky, FLUXES)[1] - marginal(scene, sky, FLUXES)[1]
+        there, here = (marginal(Estimate(each, sky, FLUXES)) for each in (higher, scene))
+        shift = there.star_fluxes - here.star_fluxes
         added = np.sqrt(errors[1 + j] ** 2 - errors[0] ** 2)
         np.testing.assert_allclose(added, abs(shift), rtol=0.1)
 
@@ -152,7 +154,7 @@ def test_the_level_of_an_image_without_a_good_pixel_stays():
     mask = np.zeros((2, N, N), bool)
     mask[1] = True
     scene, sky = a_scene({"mask": mask}, np.random.default_rng(6))
-    found = Levels(scene, sky, FLUXES)
+    found = Levels(Estimate(scene, sky, FLUXES))
     assert not found.change[1].any()
     assert found.errors[1, 0] == pytest.approx(ERRORS[1])
     assert 0 < found.errors[0, 0] < ERRORS[0]

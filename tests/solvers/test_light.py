@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lnocl
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.solvers.light import Light
@@ -48,13 +49,13 @@ def a_scene(known, pad=8, rng=None, oversample=1, sky=SKY, fluxes=FLUXES, stars=
 
 
 def flux(scene, sky, fluxes=FLUXES, shares=SHARES):
-    return float((shares * Light(scene, sky, fluxes).sky()).sum())
+    return float((shares * Light(Estimate(scene, sky, fluxes)).sky()).sum())
 
 
 @pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
 def test_the_truth_stays(known):
     scene, sky = a_scene(known)
-    np.testing.assert_allclose(Light(scene, sky, FLUXES).sky(), SKY, atol=1e-9)
+    np.testing.assert_allclose(Light(Estimate(scene, sky, FLUXES)).sky(), SKY, atol=1e-9)
 
 
 @pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
@@ -69,7 +70,7 @@ def test_a_flat_error_of_the_estimate_is_taken_out(known, floor):
 def test_a_sky_finer_than_the_pixels_holds_the_same_light():
     fine = np.kron(SKY, np.ones((2, 2))) / 4
     scene, sky = a_scene({}, pad=0, oversample=2, sky=fine)
-    found = Light(scene, sky + 1.0, FLUXES).sky()
+    found = Light(Estimate(scene, sky + 1.0, FLUXES)).sky()
     np.testing.assert_allclose(found, fine, atol=1e-9)
 
 
@@ -91,7 +92,7 @@ def test_it_is_the_explicit_matrix():
         left += matrix.T @ (good * (image.ravel() - model))
         weight += matrix.T @ good
     expected = sky + (left / weight).reshape(N, N)
-    np.testing.assert_allclose(Light(scene, sky, FLUXES).sky(), expected, atol=1e-8)
+    np.testing.assert_allclose(Light(Estimate(scene, sky, FLUXES)).sky(), expected, atol=1e-8)
 
 
 PSF_AT_0 = np.roll(PSF, (-(N // 2), -(N // 2)), (0, 1))
@@ -107,7 +108,7 @@ def test_errors_are_the_scatter_of_sums(known):
     for _ in range(n):
         counts = rng.poisson(means.observation.images)
         scene = Scene(lnocl.Observation(counts, PSF, background=BACKGROUND, **known), pad=0)
-        light = Light(scene, 0.0 * sky, dark)
+        light = Light(Estimate(scene, 0.0 * sky, dark))
         fluxes.append((SHARES * light.sky()).sum())
         stated.append(light.flux(SHARES, dark)[1])
     # The standard deviation of n values has a relative error of 1 / sqrt(2 n).
@@ -117,7 +118,7 @@ def test_errors_are_the_scatter_of_sums(known):
 
 def test_errors_of_stars_are_those_of_what_is_round_them():
     scene, sky = a_scene({}, pad=0)
-    light, none = Light(scene, sky, FLUXES), np.zeros(2)
+    light, none = Light(Estimate(scene, sky, FLUXES)), np.zeros(2)
     alone = light.flux(SHARES, none)[1]
     # The second star lies beyond the region.
     assert light.flux(SHARES, np.array([3e4, 1e6]))[1] == pytest.approx(
@@ -135,12 +136,12 @@ def test_light_scales_with_the_unit_of_counts(power, exposure):
     """Counts 2^k times as large, or exposures, give a sky as many times as bright, or faint."""
     counts, time = 2.0 ** round(power), 2.0 ** round(exposure)
     scene, sky = a_scene({}, pad=0, rng=np.random.default_rng(3))
-    before = Light(scene, 0.9 * sky, FLUXES)
+    before = Light(Estimate(scene, 0.9 * sky, FLUXES))
     observation = lnocl.Observation(
         counts * scene.observation.images, PSF, background=counts * BACKGROUND, exposure=time
     )
     factor = counts / time
-    after = Light(Scene(observation, STARS), 0.9 * factor * sky, factor * FLUXES)
+    after = Light(Estimate(Scene(observation, STARS), 0.9 * factor * sky, factor * FLUXES))
     np.testing.assert_allclose(after.sky(), factor * before.sky(), rtol=1e-12)
     errors = np.array([100.0, 100.0])
     noise = [each.flux(SHARES, k * errors)[1] for each, k in ((before, 1), (after, factor))]
@@ -153,7 +154,7 @@ def test_light_scales_with_the_unit_of_counts(power, exposure):
 @pytest.mark.parametrize("pad", [0, 8])
 def test_fluxes_are_sums_of_the_light(known, pad):
     scene, sky = a_scene(known, pad=pad, rng=np.random.default_rng(2))
-    light = Light(scene, 0.8 * sky + 1.0, FLUXES)
+    light = Light(Estimate(scene, 0.8 * sky + 1.0, FLUXES))
     for shares in (SHARES, np.ones((N, N))):
         found = light.flux(shares, np.zeros(2))[0]
         assert found == pytest.approx((shares * light.sky()).sum(), rel=1e-10)

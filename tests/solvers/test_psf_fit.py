@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import lnocl
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_families import PsfFamilies
 from lnocl.scene.scene import Scene
@@ -54,7 +55,9 @@ def test_slopes_are_the_derivatives_of_the_models(known):
     k, h = len(family.prior), 1e-6
     sky, fluxes = SKY / 10.0, FLUXES / 100.0
     start = family.first()
-    images = psf_fit._linearise(scene, family, start.values, Model(scene), sky, fluxes, True)
+    images = psf_fit._linearise(
+        Estimate.of_scaled(scene, sky, fluxes), family, start.values, Model(scene), True
+    )
     unknowns = np.concatenate([start.values.ravel(), np.zeros(6)])
 
     def models(unknowns):
@@ -102,7 +105,8 @@ def test_the_step_is_that_of_the_whole_least_squares(known, moves, names, monkey
     at[0] = 0.2
     prior = np.zeros(len(at))
     prior[: P * len(family.prior)] = np.tile(family.prior**-2.0, P)
-    images = psf_fit._linearise(scene, family, family.first().values, model, sky, fluxes, moves)
+    estimate = Estimate.of_scaled(scene, sky, fluxes)
+    images = psf_fit._linearise(estimate, family, family.first().values, model, moves)
     fields = [psf_fit._source_error(model, sky)]
     if "pixels" in names:
         pixels = 0.3 * RNG.standard_normal((P, N, N))
@@ -164,14 +168,14 @@ def test_steps_are_bounded(monkeypatch):
     scene = a_scene()
     family = families(scene)
     start = family.first()
-    free = psf_fit.step(scene, family, start, SKY / 10.0, FLUXES, True)
+    free = psf_fit.step(Estimate.of_scaled(scene, SKY / 10.0, FLUXES), family, start, True)
     assert (abs(free.parameters.values) / family.prior).max() > 0.02
     monkeypatch.setattr(psf_fit, "MAX_STEP", 0.01)
     monkeypatch.setattr(psf_fit, "MAX_MOVE", 1e-4)
-    short = psf_fit.step(scene, family, start, SKY / 10.0, FLUXES, True)
+    short = psf_fit.step(Estimate.of_scaled(scene, SKY / 10.0, FLUXES), family, start, True)
     assert (abs(short.parameters.values) / family.prior).max() == pytest.approx(0.01)
     share = short.parameters.values / free.parameters.values
     np.testing.assert_allclose(share, share[0, 0], rtol=1e-9)
     assert abs(short.positions - STARS).max() == pytest.approx(1e-4)
-    faint = psf_fit.step(scene, family, start, SKY / 10.0, 1e4 * FLUXES, True)
-    assert (faint.fluxes >= 0.1 * 1e4 * FLUXES * (1 - 1e-12)).all()
+    faint = psf_fit.step(Estimate.of_scaled(scene, SKY / 10.0, 1e4 * FLUXES), family, start, True)
+    assert (faint.star_fluxes >= 0.1 * 1e4 * FLUXES * scene.unit * (1 - 1e-12)).all()

@@ -9,6 +9,7 @@ import turned_scenes
 from scipy import ndimage
 
 import lnocl
+from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
 from lnocl.solvers.completeness import needed
 from lnocl.solvers.false_alarms import Rarity, of_student, threshold
@@ -39,6 +40,11 @@ def scene_of(stars=STARS, exposure=1.0, **more):
     return Scene(observation, stars)
 
 
+def dark_null(scene, fluxes, moves=False, errors=NO_ERRORS):
+    """Return that of stars alone."""
+    return Null(Estimate(scene, np.zeros(scene.grid), fluxes), moves, errors)
+
+
 def matrices(scene):
     """Return what a point at each place, and each star, adds to the images: dense, in electrons."""
     points = np.zeros((2, N, N, N, N))
@@ -55,7 +61,7 @@ def matrices(scene):
 def test_score_and_information_are_those_of_matrices(sky):
     """Stars and level are projected out of the design, with the weights that the null has."""
     scene = scene_of()
-    null = Null(scene, sky, FLUXES, False, NO_ERRORS)
+    null = Null(Estimate(scene, sky, FLUXES), False, NO_ERRORS)
     assert not null.is_structured.any()
     found = null.score()
     points, stars = matrices(scene)
@@ -103,7 +109,7 @@ def test_scores_of_turned_images_and_their_information_are_explicit_sums():
     known = {"background": means, "exposure": exposures, "transforms": maps}
     psfs = [lopsided(x, y), lopsided(-y, x)]
     scene = Scene(lnocl.Observation(images, psfs, psf_centre="given", **known), [])
-    null = Null(scene, np.zeros(scene.grid), np.zeros(0), False, NO_ERRORS)
+    null = dark_null(scene, np.zeros(0))
     linear = null._linear
     score, information = np.zeros((2, 30))
     places = rng.integers(8, 32, (30, 2))
@@ -130,10 +136,7 @@ def test_an_image_without_information_changes_nothing(sigma):
     images[1] = 100.0
     both = lnocl.Observation(images, psfs, background=[100.0, 100.0], exposure=[1.0, 3e-4])
     alone = lnocl.Observation(images[:1], psfs[0], background=100.0)
-    maps = [
-        ScoreMap(Null(Scene(each, []), np.zeros((64, 64)), np.zeros(0), False, NO_ERRORS), 0.0)
-        for each in (alone, both)
-    ]
+    maps = [ScoreMap(dark_null(Scene(each, []), np.zeros(0)), 0.0) for each in (alone, both)]
     one, other = maps
     assert other.threshold(0.01) == pytest.approx(one.threshold(0.01), abs=2e-3)
     np.testing.assert_allclose(other.values, one.values, atol=0.02)
@@ -151,7 +154,7 @@ def test_the_curvature_is_that_of_the_noise(deep, sigma):
         images = np.random.default_rng(seed).poisson(means[:, None, None], (2, 80, 80)) * 1.0
         observation = lnocl.Observation(images, psfs, background=means, exposure=[1.0, deep])
         scene = Scene(observation, [])
-        score = Null(scene, np.zeros((80, 80)), np.zeros(0), False, NO_ERRORS).score()
+        score = dark_null(scene, np.zeros(0)).score()
         values = np.where(score.is_tested, score.values, np.nan)
         steps.append([np.nanmean(np.diff(values, axis=axis) ** 2) for axis in (0, 1)])
     # A difference is less than a slope, by the mean of (2 sin(k / 2) / k)^2.
@@ -177,7 +180,7 @@ def test_an_edge_has_alarms_of_its_own():
 
 def test_a_maximum_beside_others_has_what_points_there_leave():
     """Values of independent noise with a Gaussian's correlation, fitted by all points at once."""
-    null = Null(scene_of(), np.zeros((N, N)), FLUXES, False, NO_ERRORS)
+    null = dark_null(scene_of(), FLUXES)
     found, places = ScoreMap(null, 0.0), np.array([[10.0, 10.0], [12.3, 10.6], [9.1, 13.0]])
     gram = found._correlated(places[:, None] - places)
     values = gram @ (5.0, 40.0, 20.0)  # of three points, the first the faintest
@@ -189,7 +192,7 @@ def test_a_maximum_beside_others_has_what_points_there_leave():
 def test_stars_have_the_information_of_explicit_products():
     """Of two images, one across the edge of the grid, with their places."""
     scene = scene_of([(1.2, 30.4), (6.7, 30.9)])
-    null = Null(scene, np.zeros((N, N)), FLUXES, True, NO_ERRORS)
+    null = dark_null(scene, FLUXES, True)
     stars, precisions = null.stars, null._linear.precisions
     laid = np.array([[each.on_grid((N, N)).ravel() for each in images] for images in stars._images])
     expected = np.einsum("kjn,jn,ljn->kl", laid, np.reshape(precisions, (2, -1)), laid)
@@ -205,7 +208,7 @@ def test_a_psf_that_rings_below_the_sky_leaves_no_place_untold(turn):
     known = {} if turn is None else {"transforms": lnocl.rotations([turn], (31.5, 31.5))}
     scene = Scene(lnocl.Observation(images, psf, background=20.0, **known), [(31.3, 30.6)])
     errors = np.array([0.0, 4.0, 90.0]), np.array([0.03, 0.02])
-    null = Null(scene, np.zeros(scene.grid), np.array([1e7]), False, errors)
+    null = dark_null(scene, np.array([1e7]), errors=errors)
     found = ScoreMap(null, 0.0)
     assert (found.score.of_psfs >= 0).all()
     assert np.isfinite(found.significance[found.score.is_tested]).all()
@@ -219,7 +222,7 @@ def test_sky_without_counts_is_tested():
     images = np.random.default_rng(0).poisson(0.5, (1, 64, 64)).astype(float)
     images[:, :, 20:] = 0.0
     scene = Scene(lnocl.Observation(images, PSFS[:1]), [])
-    found = ScoreMap(Null(scene, np.zeros((64, 64)), np.zeros(0), False, NO_ERRORS), 0.0)
+    found = ScoreMap(dark_null(scene, np.zeros(0)), 0.0)
     assert np.isfinite(found.significance[2:-2, 2:-2]).all()
     assert found.significance[2:-2, 26:-8].max() < 1.5
 
@@ -227,7 +230,10 @@ def test_sky_without_counts_is_tested():
 def test_the_score_is_that_of_units_and_exposures():
     """Twice the exposure on half the flux is the same score, in units of its noise."""
     one, other = (
-        ScoreMap(Null(scene_of(exposure=e), np.zeros((N, N)), FLUXES / e, False, NO_ERRORS), 0.0)
+        ScoreMap(
+            dark_null(scene_of(exposure=e), FLUXES / e),
+            0.0,
+        )
         for e in (1.0, 2.0)
     )
     np.testing.assert_allclose(one.values, other.values, atol=1e-6)
@@ -239,17 +245,13 @@ def test_permuted_images_have_the_same_score():
     observation = scene.observation
     swapped = lnocl.Observation(observation.images[::-1], PSFS[::-1], background=5.0)
     one, other = (
-        ScoreMap(Null(each, np.zeros((N, N)), FLUXES, False, NO_ERRORS), 0.0).values
-        for each in (scene, Scene(swapped, STARS))
+        ScoreMap(dark_null(each, FLUXES), 0.0).values for each in (scene, Scene(swapped, STARS))
     )
     np.testing.assert_allclose(one, other, atol=1e-9)
 
 
 def test_stars_that_moved_take_more_of_the_information():
-    found = [
-        Null(scene_of(), np.zeros((N, N)), FLUXES, moves, NO_ERRORS).score().information
-        for moves in (False, True)
-    ]
+    found = [dark_null(scene_of(), FLUXES, moves).score().information for moves in (False, True)]
     held, moved = found
     both = np.isfinite(held) & np.isfinite(moved)
     assert np.isfinite(moved).sum() < np.isfinite(held).sum()
@@ -260,8 +262,8 @@ def test_stars_that_moved_take_more_of_the_information():
 def test_stars_at_one_place_are_one():
     scene = scene_of([STARS[0], STARS[1]])
     scene.move_stars([STARS[0], STARS[0]])
-    found = Null(scene, np.zeros((N, N)), FLUXES, False, NO_ERRORS).score()
-    alone = Null(scene_of([STARS[0]]), np.zeros((N, N)), FLUXES[:1], False, NO_ERRORS).score()
+    found = dark_null(scene, FLUXES).score()
+    alone = dark_null(scene_of([STARS[0]]), FLUXES[:1]).score()
     assert np.isfinite(found.score).all()
     assert (found.is_tested == alone.is_tested).mean() > 0.95
 
@@ -285,12 +287,12 @@ def test_values_of_turned_images_scatter_as_noise_does(degrees, scale):
         images = rng.poisson(50.0, (1, n, n)).astype(float)
         observation = lnocl.Observation(images, psf, background=50.0, transforms=maps)
         scene = Scene(observation, [])
-        score = Null(scene, np.zeros(scene.grid), np.zeros(0), False, NO_ERRORS).score()
+        score = dark_null(scene, np.zeros(0)).score()
         values.append(np.where(score.is_tested, score.values, np.nan))
         star = scene.with_star(place).star_image(0, 0)[:n, :n]
         images[0] += rng.poisson(900.0 * star.clip(0))
         found = lnocl.Observation(images, psf, background=50.0, transforms=maps)
-        null = Null(Scene(found, []), np.zeros(scene.grid), np.zeros(0), False, NO_ERRORS)
+        null = dark_null(Scene(found, []), np.zeros(0))
         fluxes.append(ScoreMap(null, 0.0).fluxes[27, 38])
     assert np.nanmean(np.square(values)) == pytest.approx(1.0, abs=0.08)
     assert np.mean(fluxes) == pytest.approx(900.0, rel=0.06)
@@ -302,7 +304,7 @@ def test_values_scatter_as_noise_does():
     for seed in range(40):
         images = np.random.default_rng(seed).poisson(30.0, (1, 64, 64)).astype(float)
         scene = Scene(lnocl.Observation(images, PSFS[:1], background=30.0), [(30.3, 33.1)])
-        score = Null(scene, np.zeros((64, 64)), np.zeros(1), False, NO_ERRORS).score()
+        score = dark_null(scene, np.zeros(1)).score()
         values.append(np.where(score.is_tested, score.values, np.nan))
     assert np.nanmean(np.square(values)) == pytest.approx(1.0, abs=0.03)
     near = np.array(values)[:, 28:39, 25:36]
@@ -321,7 +323,7 @@ def test_a_bright_source_is_no_part_of_what_lies_round_it():
     observation = lnocl.Observation(rng.poisson(20.0 + bright).astype(float), psf, background=20.0)
     result = lnocl.deconvolve(observation, stop=None, n_iter=100, engine="numpy")
     outcome = result._outcome
-    null = Null(outcome.scene, outcome.sky, np.zeros(0), False, NO_ERRORS)
+    null = Null(Estimate(outcome.scene, outcome.sky, np.zeros(0)), False, NO_ERRORS)
     assert null.is_structured[32, 32]
     assert null.is_structured.mean() < 0.05
     values = ScoreMap(null, 0.0).values
@@ -338,7 +340,7 @@ def test_an_estimate_below_the_level_takes_nothing_from_the_variance():
     scene = Scene(lnocl.Observation(images, PSFS[:1], background=1.0), [])
     sky = np.full((64, 64), 100.0)
     sky[24:41, 24:41] = 0.0
-    null = Null(scene, sky, np.zeros(0), False, NO_ERRORS)
+    null = Null(Estimate(scene, sky, np.zeros(0)), False, NO_ERRORS)
     assert null.is_structured[32, 32]
     assert null._linear.variances[0].min() * scene.scale > 10.0
 
