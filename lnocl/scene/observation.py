@@ -295,9 +295,9 @@ class Observation:
         self._hold_psf_modes(psf_modes)
         self._hold_psf_scatter(psf_scatter)
         # With all bad pixels known: a map is fitted to the good ones of its image.
+        self._orientations: tuple[Orientation, ...] = ()
         self._hold_maps(offsets, transforms)
         self._hold_epochs(epochs)
-        self._orientations: tuple[Orientation, ...] = ()
         self._given_shape = self.shape
         self._frame = self._shape_of_sky(shapes)
         with np.errstate(over="ignore"):
@@ -400,12 +400,11 @@ class Observation:
         """The map from the sky to each image as given, shape (p, 2, 3), pixels."""
         if not self._orientations:
             return np.concatenate([self.turns, self.offsets[:, :, None]], axis=2)
-        maps = np.empty((self.n_images, 2, 3))
-        for j, orientation in enumerate(self._orientations):
-            basis = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
-            at = [orientation.place_back(each, self.shape) for each in self.places(j, basis)]
-            maps[j] = np.array([at[1] - at[0], at[2] - at[0], at[0]]).T
-        return maps
+        held = np.concatenate([self.turns, self.offsets[:, :, None]], axis=2)
+        pairs = zip(held, self._orientations, strict=True)
+        return np.array(
+            [_followed(each, partial(back.place_back, shape=self.shape)) for each, back in pairs]
+        )
 
     @property
     def is_mapped(self) -> bool:
@@ -449,6 +448,10 @@ class Observation:
         held["offsets"] = np.array([each.place(at, shape) for each, at in places])
         left = np.array([rotation(angle) for _, angle in nearest])
         held["turns"] = left / self.scales[:, None, None]
+        held["_maps"] = [
+            _followed(each, partial(orientation.place, shape=shape))
+            for each, orientation in zip(self._maps, orientations, strict=True)
+        ]
         held["_orientations"] = orientations
         return other
 
@@ -547,10 +550,11 @@ class Observation:
         """Hold the offsets or transforms of changes, or those before beside what is changed."""
         if before._orientations and "transforms" in changes:
             raise InputError("the images were turned upright; give `transforms` to an Observation")
-        maps = np.concatenate([before.turns, before.offsets[:, :, None]], axis=2)
-        transforms = changes.get("transforms", maps if before.is_mapped else None)
+        transforms = changes.get("transforms", before._maps if before.is_mapped else None)
         is_kept = transforms is None and "transforms" not in changes
-        if changes.keys() & set(MOVES) or self._is_of_other_shape("transforms", before):
+        # The map of an image is fitted to its good pixels.
+        has_changed = transforms is not None and not np.array_equal(self.mask, before.mask)
+        if changes.keys() & set(MOVES) or has_changed or self.images.shape != before.images.shape:
             offsets = changes.get("offsets", before.offsets if is_kept else None)
             self._hold_maps(offsets, transforms)
         elif transforms is not None:
@@ -832,9 +836,11 @@ class Observation:
         if transforms is None:
             self.turns = np.broadcast_to(np.eye(2), (self.n_images, 2, 2))
             self.offsets = self._check_offsets(offsets)
+            self._maps = list(np.concatenate([self.turns, self.offsets[:, :, None]], axis=2))
             return
         self._refuse_beside_transforms(offsets is not None)
         exact = check_transforms(transforms, [self.good_box(j) for j in range(self.n_images)])
+        self._maps = list(numbers("transforms", transforms))  # before they were made exact
         self.turns, self.offsets = exact[:, :, :2].copy(), exact[:, :, 2].copy()
         self._refuse_one_psf_for_scales()
 
@@ -918,6 +924,12 @@ def mean_exposure(observation: Observation) -> float:
     if not np.isfinite(mean):
         raise InputError("the exposures are too large to be summed: divide them by a constant")
     return mean
+
+
+def _followed(each: Array, place: Callable[[Array], Array]) -> Array:
+    """Return a map of places, shape (2, 3), followed by another."""
+    at = [place(each @ (x, y, 1.0)) for x, y in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))]
+    return np.array([at[1] - at[0], at[2] - at[0], at[0]]).T
 
 
 def _range(values: Array) -> str:

@@ -733,12 +733,17 @@ def test_epochs_without_a_label_are_refused(labels, message):
 # --- Bad pixels and where images lie
 
 
-def test_bad_pixels_are_the_same_however_they_are_marked():
-    """The map of an image is fitted to its good pixels, so that these are known before."""
-    images, bad = np.full((2, 40, 50), 5.0), np.zeros((2, 40, 50), bool)
+def sheared_images():
+    """Return images, their bad pixels, and maps of them that are fitted to the good ones."""
+    images, bad = np.arange(4000.0).reshape(2, 40, 50) % 9, np.zeros((2, 40, 50), bool)
     bad[1, :, :9], bad[1, 31:] = True, True
     sheared = np.array([np.eye(2, 3), [(1.0, 1e-3, 0.3), (2e-4, 1.0, -0.7)]])
-    known = {"psfs": np.ones((3, 3)), "transforms": sheared}
+    return images, bad, {"psfs": np.ones((3, 3)), "transforms": sheared}
+
+
+def test_bad_pixels_are_the_same_however_they_are_marked():
+    """The map of an image is fitted to its good pixels, so that these are known before."""
+    images, bad, known = sheared_images()
     wanted = lnocl.Observation(images, mask=bad, **known)
     whole = lnocl.Observation(images, **known)
     assert abs(wanted.offsets - whole.offsets).max() > 1e-3  # so that it shows
@@ -762,6 +767,29 @@ def test_bad_pixels_are_the_same_however_they_are_marked():
     with pytest.warns(lnocl.LnoclWarning, match="not finite and were masked"):
         found = lnocl.Observation(np.where(bad, np.nan, images), **known)
     np.testing.assert_array_equal(found.transforms, wanted.transforms)
+
+
+def test_bad_pixels_that_are_replaced_are_those_of_a_new_observation():
+    images, bad, known = sheared_images()
+    whole = lnocl.Observation(images, **known)
+    wanted = arrays_of(lnocl.Observation(images, mask=bad, **known))
+    for changes in ({"mask": bad}, {"images": np.ma.array(images, mask=bad)}):
+        found = arrays_of(whole.replace(**changes))
+        for name, values in wanted.items():
+            np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def test_bad_pixels_that_are_replaced_upright_are_those_of_a_new_observation():
+    images, bad, known = sheared_images()
+    quarter = np.array([(0.0, -1.0), (1.0, 0.0)])
+    known["transforms"][1] = quarter @ known["transforms"][1] + [(0.0, 0.0, 49.0), (0.0, 0.0, 0.0)]
+    wanted = lnocl.Observation(images, mask=bad, **known).upright()
+    upright = lnocl.Observation(images, **known).upright()
+    assert abs(wanted.offsets - upright.offsets).max() > 1e-3
+    found = upright.replace(mask=wanted.mask)
+    np.testing.assert_array_equal(found.images, wanted.images)
+    np.testing.assert_allclose(found.turns, wanted.turns, atol=1e-15)
+    np.testing.assert_allclose(found.offsets, wanted.offsets, atol=1e-13)
 
 
 def test_attributes_cannot_be_set():
