@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,11 +19,14 @@ from lnocl.scene.arrays import (
     refuse_masked,
     refuse_unless,
     stack,
+    together,
     values_and_mask,
 )
+from lnocl.scene.geometry import read_geometry
 from lnocl.scene.halos import read_halos
 from lnocl.scene.psfs import read_ideal_psfs, read_pixels, read_psfs
-from lnocl.scene.uncertainties import is_uncertainty
+from lnocl.scene.transforms import of_one_shape, refuse_other_shapes
+from lnocl.scene.uncertainties import is_uncertainty, without_source
 
 if TYPE_CHECKING:
     from lnocl.scene.observation import Observation
@@ -242,3 +245,77 @@ FIELDS = {
         Field("halos", read_halos, "", "pixels", of_images=1),
     )
 }
+
+
+def in_one_shape(given: dict[str, Any], shapes: Sequence[tuple[int, int]]) -> dict[str, Any]:
+    """Return images of several shapes, and their maps, with bad pixels added to smaller ones."""
+    found = {}
+    for name, field in FIELDS.items():
+        if field.axes == "pixels" and field.of_images == 0:
+            refuse_other_shapes(name, given[name], shapes)
+            found[name] = of_one_shape(given[name], field.beyond)
+    return found
+
+
+def hold(
+    held: Observation,
+    parameters: dict[str, Any],
+    before: Observation | None = None,
+    shapes: Sequence[tuple[int, int]] = (),
+) -> Given:
+    """Hold what is given in an observation, checked, beside what is kept of another.
+
+    Parameters
+    ----------
+    held : Observation
+        A new one, or a copy of `before`.
+    parameters : dict of str to Any
+        By their names.
+    before : Observation, optional
+        The rest is that of it, read again where what it is checked beside differs.
+    shapes : sequence of tuple of int, optional
+        Those of the images as they were given, where these differ.
+
+    Returns
+    -------
+    Given
+        The parameters in plain numbers.
+    """
+    given = Given(parameters)
+    for name, field in FIELDS.items():
+        if before is not None and name not in parameters and _differs(field, held, before):
+            values: Any = (name == "psfs" and before.psf_fields) or getattr(before, name)
+            given.values[name] = values if np.size(values) else None
+        if name in given.values:
+            value = given.values[name]
+            of_all = (value, given.bad) if name == "mask" else value
+            setattr(held, name, field.read(field, of_all, held))
+    held.geometry = read_geometry(given.values, held, before, shapes)
+    with np.errstate(over="ignore", invalid="ignore"):  # bad pixels hold anything
+        for name in given.rates:
+            rates, exposure = together(getattr(held, name), held.exposure)
+            setattr(held, name, rates * exposure)
+    return given
+
+
+def _differs(field: Field, held: Observation, before: Observation) -> bool:
+    """Return whether what a parameter is checked beside differs from before."""
+    if held.images.shape != before.images.shape:
+        return True
+    if field.axes == "psf":
+        return held.psfs.shape != before.psfs.shape
+    is_map = field.axes == "pixels" and getattr(before, field.name).ndim > 2
+    return is_map and held.mask is not before.mask
+
+
+def noise_beyond_counts(held: Observation, given: Given) -> Array:
+    """Return the read noise that the uncertainty of images leaves beside that of their counts."""
+    if held.read_noise.any():
+        raise InputError(
+            "give `read_noise`, or images with their uncertainty, which includes it, not both"
+        )
+    variances = np.asarray(given.variances).reshape(held.images.shape)
+    if "images" in given.rates:
+        variances, exposure = together(variances, held.exposure)
+        variances = variances * exposure**2
+    return without_source(variances, held.images, held.mask)

@@ -218,7 +218,7 @@ def read_geometry(
     elif maps is None:
         found = Geometry.shifted(offsets, images[0], held.shape)
     else:
-        boxes = [held.good_box(j) for j in range(images[0])]
+        boxes = [good_box(mask) for mask in held.mask]
         found = Geometry.mapped(maps, boxes, held.shape, shapes)
     if known and (has_shape or known.orientations):
         kept = "frame", "given_shape", "orientations"
@@ -230,6 +230,15 @@ def read_geometry(
             "sky's; give one for each image, on its own pixels"
         )
     return found
+
+
+def good_box(mask: NDArray[np.bool_]) -> Box:
+    """Return the rows and columns that hold the good pixels of an image; all if it has none."""
+    if mask.all():
+        return range(mask.shape[0]), range(mask.shape[1])
+    held = (np.flatnonzero(~mask.all(axis=axis)) for axis in (1, 0))
+    rows, columns = (range(int(at[0]), int(at[-1]) + 1) for at in held)
+    return rows, columns
 
 
 def _offsets(offsets: ArrayLike, n_images: int, shape: Shape) -> Array:

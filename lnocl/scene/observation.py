@@ -10,20 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.errors import InputError, counted, warn
+from lnocl.errors import InputError, counted
 from lnocl.notebook import html_card
-from lnocl.scene.arrays import Array, pixels, together
-from lnocl.scene.fields import FIELDS, Field, Given, refuse_all_bad
-from lnocl.scene.geometry import MOVES, Geometry, read_geometry
+from lnocl.scene.arrays import Array, together
+from lnocl.scene.counts import refuse_overflow, without_negative
+from lnocl.scene.fields import FIELDS, hold, in_one_shape, noise_beyond_counts, refuse_all_bad
+from lnocl.scene.geometry import MOVES, Geometry, good_box
 from lnocl.scene.halos import refuse_dark
 from lnocl.scene.psf_field import PsfField
 from lnocl.scene.psfs import PsfCentre, at_middle, normalised, own
-from lnocl.scene.transforms import of_one_shape, refuse_other_shapes, shapes_of
-from lnocl.scene.uncertainties import without_source
-
-# Most electrons in a pixel: sums of squares of a sky of so many remain far from the largest number,
-# and float32, in which results are written, holds their sum.
-MAX_COUNTS = 1e30
+from lnocl.scene.transforms import of_one_shape, shapes_of
 
 # What goes with PSFs, and is left out where they are cut.
 PIXELS = tuple(name for name, field in FIELDS.items() if field.axes == "pixels")
@@ -250,9 +246,9 @@ class Observation:
         given = {name: value for name, value in locals().items() if name in (*FIELDS, *MOVES)}
         shapes = shapes_of(images) if transforms is not None else []
         if len(set(shapes)) > 1:
-            given |= _in_one_shape(given, shapes)
+            given |= in_one_shape(given, shapes)
         given["psfs"] = of_one_shape(psfs, 0.0, about_centre=True)
-        read = self._hold(given, shapes=shapes)
+        read = hold(self, given, shapes=shapes)
         into = partial(normalised, psf_centre=psf_centre)
         self.psf_fields = tuple(field.mapped(into) for field in self.psf_fields)
         if self.psf_fields:
@@ -263,55 +259,10 @@ class Observation:
             self.ideal_psfs = into(self.ideal_psfs)
         with np.errstate(over="ignore"):
             if read.variances is not None:
-                self.read_noise = self._read_noise_of(read)
+                self.read_noise = noise_beyond_counts(self, read)
             for name in ("images", "background"):
                 setattr(self, name, np.add(*together(getattr(self, name), self.read_noise**2)))
         self._closed()
-
-    def _hold(
-        self,
-        parameters: dict[str, Any],
-        before: Observation | None = None,
-        shapes: Sequence[tuple[int, int]] = (),
-    ) -> Given:
-        """Hold what is given, checked, and what was held before where it does not change."""
-        given = Given(parameters)
-        for name, field in FIELDS.items():
-            if before is not None and name not in parameters and self._differs(field, before):
-                values: Any = before.psf_fields if name == "psfs" else ()
-                values = values or getattr(before, name)
-                given.values[name] = values if np.size(values) else None
-            if name in given.values:
-                value = given.values[name]
-                of_all = (value, given.bad) if name == "mask" else value
-                setattr(self, name, field.read(field, of_all, self))
-        self.geometry = read_geometry(given.values, self, before, shapes)
-        with np.errstate(over="ignore", invalid="ignore"):  # bad pixels hold anything
-            for name in given.rates:
-                rates, exposure = together(getattr(self, name), self.exposure)
-                setattr(self, name, rates * exposure)
-        return given
-
-    def _differs(self, field: Field, before: Observation) -> bool:
-        """Return whether what a parameter is checked beside differs from before."""
-        if self.images.shape != before.images.shape:
-            return True
-        if field.axes == "psf":
-            return self.psfs.shape != before.psfs.shape
-        is_map = field.axes == "pixels" and getattr(before, field.name).ndim > 2
-        return is_map and self.mask is not before.mask
-
-    def _read_noise_of(self, given: Given) -> Array:
-        """Return the noise of images beyond that of their counts, by their uncertainty."""
-        if self.read_noise.any():
-            raise InputError(
-                "give `read_noise`, or images with their uncertainty, which includes it, not both"
-            )
-        variances = np.asarray(given.variances).reshape(self.images.shape)
-        if "images" in given.rates:
-            variances, exposure = together(variances, self.exposure)
-            variances = variances * exposure**2
-        return without_source(variances, self.images, self.mask)
 
     def __setattr__(self, name: str, value: object) -> None:
         if "_is_checked" in vars(self):
@@ -414,12 +365,7 @@ class Observation:
 
     def good_box(self, j: int) -> tuple[range, range]:
         """Return the rows and columns of image j that hold its good pixels; all if it has none."""
-        good = ~self.mask[j]
-        if not good.any():
-            return range(self.shape[0]), range(self.shape[1])
-        held = (np.flatnonzero(good.any(axis=axis)) for axis in (1, 0))
-        rows, columns = (range(int(at[0]), int(at[-1]) + 1) for at in held)
-        return rows, columns
+        return good_box(self.mask[j])
 
     def upright(self) -> Observation:
         """Return the observation with quarter turns and flips of its images undone, by index.
@@ -494,7 +440,7 @@ class Observation:
         if changes.get("pupils") is not None:
             changes = {"ideal_psfs": None, **changes}
         other = self._with({})
-        if other._hold({"mask": self.mask, **changes}, self).variances is not None:
+        if hold(other, {"mask": self.mask, **changes}, self).variances is not None:
             raise InputError("`images` with an uncertainty replace none; give `read_noise` too")
         other._refuse_freed_pixels(self, changes)
         return other._closed()
@@ -542,35 +488,14 @@ class Observation:
         """Refuse counts out of range, and hold all arrays as they are from now on."""
         if self.images[self.mask].any():
             self.images = np.where(self.mask, 0.0, self.images)
-        self._refuse_overflow()
-        self._clip_negative()
+        refuse_overflow({"images": self.images, "background": self.background})
+        self.images = without_negative(self.images, bool(self.read_noise.any()))
         for name, values in self._arrays().items():
             if values.flags.writeable:  # the array itself may be the caller's
                 vars(self)[name] = values.view()
                 vars(self)[name].flags.writeable = False
         self._is_checked = True
         return self
-
-    def _refuse_overflow(self) -> None:
-        for name, values in (("images", self.images), ("background", self.background)):
-            if not (values <= MAX_COUNTS).all():
-                raise InputError(
-                    f"the {name}, with `exposure` and the square of `read_noise`, must be at most "
-                    f"{MAX_COUNTS:g} electrons per pixel: divide the counts and `read_noise` by a "
-                    "constant"
-                )
-
-    def _clip_negative(self) -> None:
-        if n_negative := int((self.images < 0).sum()):
-            self.images = np.maximum(self.images, 0.0)
-            words = pixels(n_negative, "image", "negative", "set to 0")
-            if self.read_noise.any():
-                warn(f"{words}, with the square of `read_noise` added")
-                return
-            warn(
-                f"{words}; if the sky was subtracted, give the noise that it left as `read_noise`, "
-                "or add the sky to the images and give it as `background`"
-            )
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {name: each for name, each in vars(self).items() if isinstance(each, np.ndarray)}
@@ -596,33 +521,6 @@ class Observation:
             rows["halos"] = f"{len(self.halos)}, fitted in each image"
         image = np.where(self.mask[0], np.nan, self.images[0])
         return html_card("lnocl.Observation", rows, image)
-
-
-def _in_one_shape(given: dict[str, Any], shapes: Sequence[tuple[int, int]]) -> dict[str, Any]:
-    """Return images of several shapes, and their maps, with bad pixels added to smaller ones."""
-    found = {}
-    for name, field in FIELDS.items():
-        if field.axes == "pixels" and field.of_images == 0:
-            refuse_other_shapes(name, given[name], shapes)
-            found[name] = of_one_shape(given[name], field.beyond)
-    return found
-
-
-def mean_exposure(observation: Observation) -> float:
-    """Return the mean of the exposures, of good pixels where they are maps.
-
-    Raises
-    ------
-    InputError
-        They are too large to be summed.
-    """
-    exposures = observation.exposure
-    with np.errstate(over="ignore"):
-        seen = exposures[~observation.mask] if exposures.ndim == 3 else exposures
-        mean = float(seen.mean())
-    if not np.isfinite(mean):
-        raise InputError("the exposures are too large to be summed: divide them by a constant")
-    return mean
 
 
 def _range(values: Array) -> str:
