@@ -211,16 +211,14 @@ def read_geometry(
     }
     if maps is not None and (names := [name for name, is_given in beside.items() if is_given]):
         raise InputError(f"`transforms` are not taken beside {names[0]}; give one of them")
-    has_shape = before is not None and images == before.images.shape
-    has_mask = before is not None and held.mask is before.mask
-    if known and is_kept and has_shape and (maps is None or has_mask):
+    if before is not None and known and is_kept and held.mask is before.mask:
         found = known
     elif maps is None:
         found = Geometry.shifted(offsets, images[0], held.shape)
     else:
         boxes = [good_box(mask) for mask in held.mask]
         found = Geometry.mapped(maps, boxes, held.shape, shapes)
-    if known and (has_shape or known.orientations):
+    if known and (known.orientations or held.shape == known.shape):
         kept = "frame", "given_shape", "orientations"
         found = replace(found, **{name: getattr(known, name) for name in kept})
     low, high = min(found.scales), max(found.scales)
