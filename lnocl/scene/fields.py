@@ -44,22 +44,21 @@ class Given:
     Parameters
     ----------
     parameters : dict of str to Any
-        As a caller gives them, by their names.
+        As a caller gives them, by their names; `mask` is one of them.
 
     Attributes
     ----------
     values : dict of str to Any
-        In electrons and seconds; maps are masked where they were.
+        In electrons and seconds; maps are masked where they were. Beside that of `mask` is a list
+        of the pixels that other parameters show to be bad.
     rates : set of str
         Those of them that are electrons per second.
     variances : ndarray of float64 or None
         Of all noise of the images, where they have an uncertainty; per second squared of rates.
-    bad : list of ndarray of bool
-        Pixels that other parameters than `mask` show to be bad.
     """
 
     def __init__(self, parameters: dict[str, Any]) -> None:
-        self.values, self.rates, self.bad = dict[str, Any](), set[str](), list[Mask]()
+        self.values, self.rates, self._bad = dict[str, Any](), set[str](), list[Mask]()
         self.variances: Array | None = None
         has_exposure = parameters.get("exposure") is not None
         for name, value in parameters.items():
@@ -67,7 +66,8 @@ class Given:
             if name == "images":
                 self.variances = containers.variances(name, value, name in self.rates)
         if self.variances is not None:
-            self.bad.append(self.variances == 0)
+            self._bad.append(self.variances == 0)
+        self.values["mask"] = parameters["mask"], self._bad
 
     def _plain(self, name: str, value: Any, has_exposure: bool) -> Any:
         unit = FIELDS[name].unit if name in FIELDS else ""
@@ -75,18 +75,18 @@ class Given:
             value = containers.seconds(1.0 if value is None else value)
             values, masked = values_and_mask(name, value)
             if values.ndim > 1:
-                self.bad.append((values == 0) & ~masked)
+                self._bad.append((values == 0) & ~masked)
             return value
         if name == "read_noise" and is_uncertainty(value):
             value = containers.deviations(name, value)
-            self.bad.append(np.equal(value, 0))
+            self._bad.append(np.equal(value, 0))
         if not unit:
             return value
         value, is_rate = containers.counts(name, value, has_exposure if unit == "counts" else None)
         self.rates |= {name} if is_rate else set()
         if name == "images":
             value, masked = values_and_mask(name, value)
-            self.bad.append(masked)
+            self._bad.append(masked)
         return value
 
 
@@ -270,7 +270,7 @@ def hold(
     held : Observation
         A new one, or a copy of `before`.
     parameters : dict of str to Any
-        By their names.
+        By their names; `mask` is one of them.
     before : Observation, optional
         The rest is that of it, read again where what it is checked beside differs.
     shapes : sequence of tuple of int, optional
@@ -287,9 +287,7 @@ def hold(
             values: Any = (name == "psfs" and before.psf_fields) or getattr(before, name)
             given.values[name] = values if np.size(values) else None
         if name in given.values:
-            value = given.values[name]
-            of_all = (value, given.bad) if name == "mask" else value
-            setattr(held, name, field.read(field, of_all, held))
+            setattr(held, name, field.read(field, given.values[name], held))
     held.geometry = read_geometry(given.values, held, before, shapes)
     with np.errstate(over="ignore", invalid="ignore"):  # bad pixels hold anything
         for name in given.rates:
