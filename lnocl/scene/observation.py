@@ -22,7 +22,6 @@ from lnocl.scene.psfs import PsfCentre, at_middle, normalised, own
 from lnocl.scene.transforms import of_one_shape, shapes_of
 
 # What goes with PSFs, and is left out where they are cut.
-PIXELS = tuple(name for name, field in FIELDS.items() if field.axes == "pixels")
 BESIDE_PSFS = tuple(
     name for name, field in FIELDS.items() if field.axes == "psf" and name != "psfs"
 )
@@ -449,7 +448,8 @@ class Observation:
         """Refuse to take pixels for good again of which nothing is held."""
         freed = before.mask & ~self.mask if self.mask.shape == before.mask.shape else np.False_
         n_freed = int(np.count_nonzero(freed))
-        held = {name: getattr(before, name) for name in PIXELS if name not in ("mask", *changes)}
+        maps = [name for name, field in FIELDS.items() if field.axes == "pixels"]
+        held = {name: getattr(before, name) for name in maps if name not in ("mask", *changes)}
         missing = [f"`{name}`" for name, each in held.items() if each.ndim > 2 and each.size]
         if n_freed and missing:
             raise InputError(
