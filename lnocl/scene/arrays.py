@@ -95,13 +95,17 @@ def stack(name: str, values: ArrayLike, n_images: int = 0) -> Array:
         )
     if array.size == 0:
         raise InputError(f"`{name}` is empty: its shape is {array.shape}")
-    may_be_colours = array.ndim == 3 and len(array) != n_images
-    if may_be_colours and array.shape[2] <= MAX_CHANNELS and min(array.shape[:2]) >= MIN_SIDE:
+    if are_colours(array.shape) and len(array) != n_images:
         raise InputError(
             f"`{name}` has shape {array.shape}, but its axes are (p, ny, nx): of colours give one, "
             f"{name}[:, :, 0]; if they are of one sky, np.moveaxis({name}, -1, 0)"
         )
     return array.reshape((-1, *array.shape[-2:]))
+
+
+def are_colours(shape: tuple[int, ...]) -> bool:
+    """Return whether a shape is that of one image in several colours, which are the last axis."""
+    return len(shape) == 3 and shape[2] <= MAX_CHANNELS and min(shape[:2]) >= MIN_SIDE
 
 
 def together(*levels: Array) -> list[Array]:
