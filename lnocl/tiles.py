@@ -25,8 +25,9 @@ from lnocl.runs.plan import plan as make_plan
 from lnocl.runs.preparation import Prepared, prepare
 from lnocl.runs.progress import Progress
 from lnocl.scene.arrays import Array
+from lnocl.scene.counts import mean_exposure
 from lnocl.scene.grid import length_for
-from lnocl.scene.observation import Observation, mean_exposure
+from lnocl.scene.observation import Observation
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import EDGE, Scene

@@ -10,7 +10,7 @@ from lnocl.commands.options import SEVERAL, number_or_word, option, whole_or_wor
 from lnocl.deconvolution import deconvolve
 from lnocl.io.names import NOISE, PSF_ERRORS
 from lnocl.runs.options import ENGINES, PRECISIONS
-from lnocl.scene.observation import OVERSAMPLES
+from lnocl.scene.fields import OVERSAMPLES
 from lnocl.scene.psf_families import FAMILIES
 from lnocl.solvers import SOLVERS
 

@@ -17,10 +17,8 @@ from lnocl.io.headers import finer_cards, make_wcs, quiet_log, readable
 from lnocl.io.names import parse_name
 from lnocl.io.selection import choose, describe, find, has_pixels, name_of, only
 from lnocl.process import ignored_warnings
+from lnocl.scene.arrays import are_colours
 from lnocl.scene.transforms import enlarged
-
-# A last axis that is so short, with longer ones before it, is none of pixels.
-MAX_CHANNELS = 4
 
 # Beginnings of CTYPE3 of cubes whose planes are not of one sky: colours, energies, velocities,
 # polarisations.
@@ -310,7 +308,7 @@ def _check_shape(
     found = f"{path} has an image of {counted(len(shape), 'dimension')}"
     if alone and len(shape) not in (2, 3):
         raise InputError(f"{found}; two are needed, or three for a cube of images: cut the others")
-    if len(shape) == 3 and shape[-1] <= MAX_CHANNELS < min(shape[:-1]):
+    if are_colours(shape):
         raise InputError(
             f"{path} has the shape {shape}: its last axis is of colours or channels; give one of "
             "them, as an image of its own"

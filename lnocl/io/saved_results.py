@@ -17,7 +17,7 @@ from lnocl.io.fitsfile import FitsFile, open_fits
 from lnocl.io.headers import number, readable
 from lnocl.io.selection import has_pixels
 from lnocl.scene.detector import on_sky
-from lnocl.scene.observation import OVERSAMPLES
+from lnocl.scene.fields import OVERSAMPLES
 
 Columns = dict[str, NDArray[np.float64]]
 

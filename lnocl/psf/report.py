@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 from lnocl.errors import InputError
 from lnocl.scene.arrays import numbers
 from lnocl.scene.cores import centre, fwhm, off_centre
-from lnocl.scene.observation import FAR_OFF_CENTRE, LITTLE_OFF_CENTRE, MUCH_NEGATIVE
+from lnocl.scene.psfs import FAR_OFF_CENTRE, LITTLE_OFF_CENTRE, MUCH_NEGATIVE
 from lnocl.scene.quantities import bare
 
 # Wings and border are squares round the centre, as shares of half the side.

@@ -22,13 +22,9 @@ from lnocl.runs.saved import Saved
 from lnocl.runs.start import Setup
 from lnocl.runs.stopping import Rule
 from lnocl.scene.arrays import numbers
+from lnocl.scene.fields import FIELDS
 from lnocl.solvers.engine import State
 
-OBSERVED = (
-    *("images", "psfs", "background", "background_error", "mask", "exposure", "offsets", "turns"),
-    *("epochs", "halos"),
-    *("oversample", "effective_psfs"),
-)
 # The widest value: a SHA-256 in hexadecimal, or the repr of a parameter or name of a device.
 WIDTH = 256
 # More than there are parameters, and than the state of held-out counts has arrays: a hostile file
@@ -87,7 +83,7 @@ def describe(setup: Setup, **parameters: Any) -> dict[str, str]:
     observation = setup.observation
     bound = {
         "version": version("lnocl"),
-        **{name: getattr(observation, name) for name in OBSERVED},
+        **{name: getattr(observation, name) for name in (*FIELDS, "offsets", "turns")},
         **{name: value for name, value in vars(setup).items() if name != "observation"},
         **parameters,
     }

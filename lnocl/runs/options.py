@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError, note, warn
-from lnocl.scene.arrays import Array, flag
+from lnocl.scene.arrays import Array, flag, numbers
 from lnocl.scene.containers import counts
 from lnocl.scene.freedoms import refusal
-from lnocl.scene.observation import Observation, numbers
+from lnocl.scene.observation import Observation
 from lnocl.scene.psf_families import FAMILIES
 from lnocl.solvers import SOLVERS
 

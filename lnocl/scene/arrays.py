@@ -10,6 +10,10 @@ from lnocl.scene.quantities import in_unit
 
 Array = NDArray[np.float64]
 
+# An array whose last axis is so short, and the others so long, has its channels last.
+MAX_CHANNELS = 4
+MIN_SIDE = 8
+
 # The advice where these have masked values, which only images and frames of stars may have.
 UNMASK = {
     "psfs": "repair {them} first, as lnocl.psf.make_psf does",
@@ -76,6 +80,51 @@ def booleans(name: str, values: ArrayLike) -> NDArray[np.bool_]:
             f"`{name}` is of type {given.dtype}; give booleans, True where a pixel is bad"
         )
     return given
+
+
+def stack(name: str, values: ArrayLike, n_images: int = 0) -> Array:
+    """Return one or several two-dimensional arrays as a stack; several may be one for each image.
+
+    They are in float64, and not copied where they are already.
+    """
+    array = numbers(name, values, copy=False)
+    if array.ndim not in (2, 3):
+        raise InputError(
+            f"`{name}` has {counted(array.ndim, 'dimension')}; give two, or three for several "
+            f"`{name}`"
+        )
+    if array.size == 0:
+        raise InputError(f"`{name}` is empty: its shape is {array.shape}")
+    if are_colours(array.shape) and len(array) != n_images:
+        raise InputError(
+            f"`{name}` has shape {array.shape}, but its axes are (p, ny, nx): of colours give one, "
+            f"{name}[:, :, 0]; if they are of one sky, np.moveaxis({name}, -1, 0)"
+        )
+    return array.reshape((-1, *array.shape[-2:]))
+
+
+def are_colours(shape: tuple[int, ...]) -> bool:
+    """Return whether a shape is that of one image in several colours, which are the last axis."""
+    return len(shape) == 3 and shape[2] <= MAX_CHANNELS and min(shape[:2]) >= MIN_SIDE
+
+
+def together(*levels: Array) -> list[Array]:
+    """Return numbers (p,) and maps (p, ny, nx) so that they broadcast over each other."""
+    are_maps = any(each.ndim == 3 for each in levels)
+    return [each[:, None, None] if are_maps and each.ndim < 3 else each for each in levels]
+
+
+def refuse_unless(name: str, values: Array, requirement: str, holds: NDArray[np.bool_]) -> None:
+    """Refuse values that are not finite, or do not hold a requirement."""
+    good = holds & np.isfinite(values)
+    if not good.all():
+        raise InputError(f"{name} must be {requirement}; {values[~good].flat[0]:g} was given")
+
+
+def pixels(n: int, kind: str, state: str, remedy: str) -> str:
+    """Return a sentence on pixels that agrees in number."""
+    noun, are, were = ("pixel", "is", "was") if n == 1 else ("pixels", "are", "were")
+    return f"{n} {kind} {noun} {are} {state} and {were} {remedy}"
 
 
 def flag(name: str, value: object) -> bool:

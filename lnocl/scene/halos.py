@@ -14,30 +14,34 @@ from lnocl.scene.quantities import bare
 from lnocl.scene.shifting import Cutout
 
 if TYPE_CHECKING:
+    from lnocl.scene.fields import Field
     from lnocl.scene.observation import Observation
 
 
-def check_halos(halos: ArrayLike | None, mask: NDArray[np.bool_]) -> Array:
+def read_halos(_: Field, halos: ArrayLike | None, held: Observation) -> Array:
     """Return the shapes of halos, shape (n, p, ny, nx), of unit sum; n is 0 where none are given.
 
     Parameters
     ----------
+    _ : Field
+        That of `halos`.
     halos : array_like, shape (n, p, ny, nx), (n, 1, ny, nx), (p, ny, nx) or (ny, nx), or None
         Finite and not negative where a pixel is good, and not 0 on all good pixels of an image.
-    mask : ndarray of bool, shape (p, ny, nx)
-        True where a pixel of an image is bad; halos are 0 there.
+    held : Observation
+        Its mask, True where a pixel of an image is bad; halos are 0 there.
     """
+    mask = held.mask
     if halos is None:
         return np.zeros((0, *mask.shape))
     array, masked = values_and_mask("halos", bare("halos", halos))
     given = _of_each(array, mask.shape)
     refuse_masked("halos", _of_each(masked, mask.shape) & ~mask)
-    held = np.where(mask, 0.0, numbers("halos", given, copy=False))
-    refuse_values(held)
-    refuse_dark(held, mask)
+    shapes = np.where(mask, 0.0, numbers("halos", given, copy=False))
+    refuse_values(shapes)
+    refuse_dark(shapes, mask)
     # First by their largest values, lest the sum overflows.
-    held /= held.max(axis=(2, 3), keepdims=True)
-    return np.asarray(held / held.sum(axis=(2, 3), keepdims=True))
+    shapes /= shapes.max(axis=(2, 3), keepdims=True)
+    return np.asarray(shapes / shapes.sum(axis=(2, 3), keepdims=True))
 
 
 def _of_each(array: NDArray, images: tuple[int, ...]) -> NDArray:

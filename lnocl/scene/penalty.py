@@ -11,8 +11,9 @@ import numpy as np
 
 from lnocl.errors import InputError
 from lnocl.scene.arrays import Array
+from lnocl.scene.counts import mean_exposure
 from lnocl.scene.detector import seen_psfs
-from lnocl.scene.observation import Observation, mean_exposure
+from lnocl.scene.observation import Observation
 from lnocl.scene.star_prior import StarPrior
 
 # A larger weight leaves nothing of the data term of images at unit mean.

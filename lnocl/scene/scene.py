@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.errors import InputError, counted, warn
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, numbers
 from lnocl.scene.band_matrix import BandMatrix
+from lnocl.scene.counts import mean_exposure
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
 from lnocl.scene.grid import grid_of, psf_shape
 from lnocl.scene.halos import halo_cutouts
-from lnocl.scene.observation import Observation, mean_exposure, numbers
+from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
 from lnocl.scene.rotation import Rotation, turned_psf
 from lnocl.scene.shifting import Cutout, MovablePsf

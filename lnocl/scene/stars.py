@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from lnocl.errors import InputError
 from lnocl.scene import star_tables
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, numbers
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import DetectorPsf
-from lnocl.scene.observation import Observation, numbers
+from lnocl.scene.observation import Observation
 from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf
 
 # Pixels of a flattened array: a slice where they are all of it, which takes no gathering.

@@ -201,19 +201,26 @@ class Orientation(NamedTuple):
         y, x = (slice(None, None, -1 if each else 1) for each in self.reversed)
         return array[..., y, x]
 
-    def place(self, position: Array, shape: tuple[int, int]) -> Array:
-        """Return where (x, y) of an image of a shape is in `of` it."""
-        x, y = position[::-1] if self.swaps else position
+    def map(self, shape: tuple[int, int]) -> Array:
+        """Return where places (x, y) of an image of a shape are in `of` it, shape (2, 3)."""
         ny, nx = shape[::-1] if self.swaps else shape
         is_y, is_x = self.reversed
-        return np.array([nx - 1 - x if is_x else x, ny - 1 - y if is_y else y])
+        x = (-1.0, 0.0, nx - 1) if is_x else (1.0, 0.0, 0.0)
+        y = (0.0, -1.0, ny - 1) if is_y else (0.0, 1.0, 0.0)
+        return np.array([x, y])[:, [1, 0, 2] if self.swaps else [0, 1, 2]]
 
-    def place_back(self, position: Array, shape: tuple[int, int]) -> Array:
-        """Return where (x, y) of `of` an image, of this shape, is in the image."""
-        x, y = position
-        (is_y, is_x), (ny, nx) = self.reversed, shape
-        x, y = nx - 1 - x if is_x else x, ny - 1 - y if is_y else y
-        return np.array([y, x] if self.swaps else [x, y])
+
+def followed(maps: Array, by: Array) -> Array:
+    """Return maps of places, shape (p, 2, 3), each followed by another."""
+    found = by[:, :, :2] @ maps
+    found[:, :, 2] += by[:, :, 2]
+    return found
+
+
+def undone(maps: Array) -> Array:
+    """Return the inverses of maps by quarter turns, flips and shifts, shape (p, 2, 3)."""
+    back = maps[:, :, :2].swapaxes(1, 2)
+    return np.concatenate([back, -back @ maps[:, :, 2:]], axis=2)
 
 
 def shapes_of(values: Any) -> list[tuple[int, int]]:
@@ -258,8 +265,12 @@ def refuse_other_shapes(name: str, values: Any, shapes: Sequence[tuple[int, int]
             )
 
 
-def enlarged(array: NDArray[Any], shape: tuple[int, int], fill: float = 0.0) -> NDArray[Any]:
-    """Return an array with rows and columns added at its end."""
-    missing = [n - k for n, k in zip(shape, array.shape[-2:], strict=True)]
-    widths = [(0, 0)] * (array.ndim - 2) + [(0, n) for n in missing]
-    return np.pad(array, widths, constant_values=fill) if any(missing) else array
+def enlarged(
+    array: NDArray[Any], shape: tuple[int, int], fill: float = 0.0, is_centred: bool = False
+) -> NDArray[Any]:
+    """Return an array with rows and columns added at its end, or about its centre ``n // 2``."""
+    widths = [(0, 0)] * (array.ndim - 2)
+    for n, k in zip(shape, array.shape[-2:], strict=True):
+        at = n // 2 - k // 2 if is_centred else 0
+        widths.append((at, n - k - at))
+    return np.pad(array, widths, constant_values=fill) if np.any(widths) else array

@@ -188,6 +188,7 @@ CHANGES = {
     "background": lambda made: {"observation": made.observation(background=8.5)},
     "mask": lambda made: {"observation": made.observation(mask=None)},
     "exposure": lambda made: {"observation": made.observation(exposure=2.0)},
+    "psf_scatter": lambda made: {"observation": made.observation(psf_scatter=made.psfs)},
     "offsets": lambda made: {"observation": made.observation(offsets=[(0, 0), (1, 0)])},
     "stars": lambda made: {"stars": made.stars[::-1]},
     "mu": lambda made: {"mu": 1.0000001e-3},

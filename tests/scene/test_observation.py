@@ -12,6 +12,8 @@ from scenes import paper
 
 import lnocl
 from lnocl.errors import InputError
+from lnocl.scene.fields import FIELDS
+from lnocl.scene.geometry import MOVES
 
 PSF = np.array([[0.0, 1.0, 0.0], [1.0, 4.0, 2.0]])
 IMAGES = np.arange(1.0, 49.0).reshape(3, 4, 4)
@@ -78,14 +80,15 @@ def test_read_noise_squared_is_added_to_images_and_background(read_noise, backgr
 
 
 def arrays_of(observation):
-    return {name: each for name, each in vars(observation).items() if isinstance(each, np.ndarray)}
+    held = {name: getattr(observation, name) for name in (*FIELDS, "offsets", "turns")}
+    return {name: each for name, each in held.items() if isinstance(each, np.ndarray)}
 
 
 @pytest.mark.parametrize("name", ["background", "read_noise", "exposure"])
 def test_one_map_serves_all_images(name):
     for mask in (None, IMAGES % 5 == 0):
-        one = vars(observe(**{name: IMAGES[1]}, mask=mask))
-        each = vars(observe(**{name: np.array([IMAGES[1]] * 3)}, mask=mask))
+        one = arrays_of(observe(**{name: IMAGES[1]}, mask=mask))
+        each = arrays_of(observe(**{name: np.array([IMAGES[1]] * 3)}, mask=mask))
         for attribute, values in each.items():
             np.testing.assert_array_equal(one[attribute], values)
         assert one["background" if name == "read_noise" else name].shape == IMAGES.shape
@@ -203,9 +206,9 @@ GIVEN = {
 
 @pytest.mark.parametrize("name", GIVEN)
 def test_masked_arrays_with_nothing_masked_are_plain_arrays(name):
-    expected = vars(observe(**{name: GIVEN[name]}))
+    expected = arrays_of(observe(**{name: GIVEN[name]}))
     for given in (np.ma.array(GIVEN[name]), masked(GIVEN[name], 0)):
-        for attribute, values in vars(observe(**{name: given})).items():
+        for attribute, values in arrays_of(observe(**{name: given})).items():
             np.testing.assert_array_equal(values, expected[attribute])
             assert type(values) is type(expected[attribute])
 
@@ -484,24 +487,8 @@ def test_the_arrays_of_an_observation_are_read_only(maps):
     given = {"background": 1.0, "read_noise": 2.0, "exposure": 3.0}
     given = {name: np.full(shape, value) if maps else value for name, value in given.items()}
     observation = lnocl.Observation(np.ones(shape), np.ones((1, 1)), **given)
-    names = (
-        "images",
-        "psfs",
-        "background",
-        "background_error",
-        "read_noise",
-        "mask",
-        "exposure",
-        "offsets",
-        "turns",
-        "epochs",
-        "halos",
-        "ideal_psfs",
-        "psf_modes",
-        "pupils",
-        "psf_scatter",
-    )
-    assert set(arrays_of(observation)) == set(names)
+    names = arrays_of(observation)
+    assert set(names) == {*FIELDS, "offsets", "turns"} - {"oversample", "effective_psfs"}
     for name in names:
         with pytest.raises(ValueError, match="read-only"):
             getattr(observation, name)[...] = 0
@@ -647,6 +634,11 @@ def test_replace_takes_every_parameter_but_the_treatment_of_centres():
     assert set(WRONG) == names - {"psf_centre"}
 
 
+def test_every_parameter_is_a_row_of_the_table_of_fields():
+    names = set(inspect.signature(lnocl.Observation).parameters)
+    assert {*FIELDS, *MOVES} == names - {"psf_centre"}
+
+
 RIGHT = {
     "mask": MASK_89,
     "background": np.where(MASK_89, 0.0, 3.0),
@@ -663,13 +655,32 @@ RIGHT = {
 }
 
 
+def made(make, **given):
+    """Return what all attributes hold, or why it is refused."""
+    try:
+        observation = make(**given)
+    except InputError as error:
+        return {"refused": str(error)}
+    others = ("oversample", "effective_psfs", "sky_shape", "transforms")
+    return arrays_of(observation) | {name: getattr(observation, name) for name in others}
+
+
 @pytest.mark.parametrize("name", RIGHT)
-def test_replace_makes_what_an_observation_of_these_is(name):
+@pytest.mark.parametrize("before", [None, *RIGHT])
+def test_replace_makes_what_an_observation_of_these_is(name, before):
     given = {"images": np.full((2, 8, 9), 5.0), "psfs": np.ones((2, 3, 3))}
-    new = lnocl.Observation(**given, **{name: RIGHT[name]})
-    other = lnocl.Observation(**given).replace(**{name: RIGHT[name]})
-    for attribute, values in vars(new).items():
-        np.testing.assert_array_equal(getattr(other, attribute), values, err_msg=attribute)
+    if before:
+        given[before] = RIGHT[before]
+    other = made(lnocl.Observation(**given).replace, **{name: RIGHT[name]})
+    if name == "transforms":  # which take the place of offsets
+        given.pop("offsets", None)
+    new = made(lnocl.Observation, **{**given, name: RIGHT[name]})
+    assert other.keys() == new.keys()
+    for attribute, expected in new.items():
+        if attribute == "halos" and expected.size:  # of unit sum, before and with another mask
+            np.testing.assert_allclose(other[attribute], expected, rtol=2e-16)
+        else:
+            np.testing.assert_array_equal(other[attribute], expected, err_msg=attribute)
 
 
 @pytest.mark.parametrize(
@@ -691,11 +702,52 @@ def test_replace_makes_what_an_observation_of_these_is(name):
             {"mask": None},
             "mask frees 16 pixels of which nothing is held",
         ),
+        (
+            {"mask": MASK_89, "halos": HALO_89},
+            {"mask": None, "images": np.ones((2, 8, 9))},
+            "mask frees 16 pixels of which nothing is held; give halos with it",
+        ),
     ],
 )
 def test_replace_refuses_what_does_not_go_with_the_rest(known, changes, message):
     observation = lnocl.Observation(np.full((2, 8, 9), 5.0), np.ones((3, 3)), **known)
     assert message in error_of(observation.replace, **changes)
+
+
+NOT_KNOWN = np.where(MASK_89, np.nan, 2.0)
+UNKNOWN = {
+    "images": {"images": np.broadcast_to(NOT_KNOWN, (2, 8, 9))},
+    "exposure": {"exposure": np.where(MASK_89, 0.0, 2.0)},
+    "read_noise": {"read_noise": StdDevUncertainty(np.where(MASK_89, 0.0, 2.0))},
+}
+
+
+@pytest.mark.filterwarnings("ignore:.* image pixels are not finite")
+@pytest.mark.parametrize("marks", UNKNOWN)
+@pytest.mark.parametrize("name", ["background", "exposure", "read_noise", "halos"])
+def test_whatever_shows_bad_pixels_shows_them_to_all_others(marks, name):
+    """In an observation and in one that is replaced, by whatever comes first."""
+    given = {"images": np.full((2, 8, 9), 5.0), "psfs": np.ones((3, 3))}
+    changes = {name: np.ma.array(NOT_KNOWN, mask=MASK_89), **UNKNOWN[marks]}
+    found = lnocl.Observation(**{**given, **changes})
+    np.testing.assert_array_equal(found.mask, [MASK_89] * 2)
+    replaced = lnocl.Observation(**given).replace(**changes)
+    for attribute in ("mask", "exposure", "read_noise", "halos"):
+        expected = getattr(found, attribute)
+        np.testing.assert_array_equal(getattr(replaced, attribute), expected, err_msg=attribute)
+
+
+def test_replaced_counts_per_time_are_multiplied_by_the_exposure():
+    given = {"images": np.full((2, 8, 9), 5.0), "psfs": np.ones((3, 3))}
+    changes = {
+        "images": np.full((2, 8, 9), 7.0) * u.electron / u.s,
+        "background": np.array([0.5, 1.0]) * u.electron / u.min,
+        "exposure": [60.0, 30.0] * u.s,
+    }
+    other = lnocl.Observation(**given).replace(**changes)
+    expected = lnocl.Observation(**{**given, **changes})
+    for name, values in arrays_of(expected).items():
+        np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
 
 
 def test_replaced_offsets_stay_where_images_are_turned_no_more():
@@ -733,12 +785,17 @@ def test_epochs_without_a_label_are_refused(labels, message):
 # --- Bad pixels and where images lie
 
 
-def test_bad_pixels_are_the_same_however_they_are_marked():
-    """The map of an image is fitted to its good pixels, so that these are known before."""
-    images, bad = np.full((2, 40, 50), 5.0), np.zeros((2, 40, 50), bool)
+def sheared_images():
+    """Return images, their bad pixels, and maps of them that are fitted to the good ones."""
+    images, bad = np.arange(4000.0).reshape(2, 40, 50) % 9, np.zeros((2, 40, 50), bool)
     bad[1, :, :9], bad[1, 31:] = True, True
     sheared = np.array([np.eye(2, 3), [(1.0, 1e-3, 0.3), (2e-4, 1.0, -0.7)]])
-    known = {"psfs": np.ones((3, 3)), "transforms": sheared}
+    return images, bad, {"psfs": np.ones((3, 3)), "transforms": sheared}
+
+
+def test_bad_pixels_are_the_same_however_they_are_marked():
+    """The map of an image is fitted to its good pixels, so that these are known before."""
+    images, bad, known = sheared_images()
     wanted = lnocl.Observation(images, mask=bad, **known)
     whole = lnocl.Observation(images, **known)
     assert abs(wanted.offsets - whole.offsets).max() > 1e-3  # so that it shows
@@ -762,6 +819,40 @@ def test_bad_pixels_are_the_same_however_they_are_marked():
     with pytest.warns(lnocl.LnoclWarning, match="not finite and were masked"):
         found = lnocl.Observation(np.where(bad, np.nan, images), **known)
     np.testing.assert_array_equal(found.transforms, wanted.transforms)
+
+
+def test_bad_pixels_that_are_replaced_are_those_of_a_new_observation():
+    images, bad, known = sheared_images()
+    whole = lnocl.Observation(images, **known)
+    wanted = arrays_of(lnocl.Observation(images, mask=bad, **known))
+    for changes in ({"mask": bad}, {"images": np.ma.array(images, mask=bad)}):
+        found = arrays_of(whole.replace(**changes))
+        for name, values in wanted.items():
+            np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def test_bad_pixels_that_are_replaced_upright_are_those_of_a_new_observation():
+    images, bad, known = sheared_images()
+    quarter = np.array([(0.0, -1.0), (1.0, 0.0)])
+    known["transforms"][1] = quarter @ known["transforms"][1] + [(0.0, 0.0, 49.0), (0.0, 0.0, 0.0)]
+    wanted = lnocl.Observation(images, mask=bad, **known).upright()
+    upright = lnocl.Observation(images, **known).upright()
+    assert abs(wanted.offsets - upright.offsets).max() > 1e-3
+    found = upright.replace(mask=wanted.mask)
+    np.testing.assert_array_equal(found.images, wanted.images)
+    np.testing.assert_allclose(found.turns, wanted.turns, atol=1e-15)
+    np.testing.assert_allclose(found.offsets, wanted.offsets, atol=1e-13)
+
+
+def test_a_window_of_turned_images_shows_places_where_the_whole_does():
+    maps = lnocl.rotations([0.0, 30.0], (20, 15)) * [[[1.0]], [[0.5]]]
+    psfs = np.ones((2, 3, 3))
+    whole = lnocl.Observation(np.full((2, 40, 50), 5.0), psfs, transforms=maps)
+    part = whole.window(range(4, 30), range(7, 47))
+    assert part.shape == part.sky_shape == (26, 40)
+    at, corner = np.array([(3.0, 4.0), (20.0, 11.5)]), (7, 4)
+    for j in range(2):
+        np.testing.assert_allclose(part.places(j, at) + corner, whole.places(j, at + corner))
 
 
 def test_attributes_cannot_be_set():
