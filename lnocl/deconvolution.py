@@ -105,42 +105,50 @@ def deconvolve(
         (`lnocl.scene.star_tables.IN_PIXELS`). SExtractor counts from 1, and is converted. Between
         pixels a star's image is the PSF moved in its spectrum (`lnocl.scene.shifting.place`).
     mu : float, optional
-        Weight of the Tikhonov term on the extended source, per electron; zero or more.
+        Weight of the Tikhonov term on the extended source, per electron, zero or more.
     smoothing : float or "auto", optional
-        Weight λ of the edge-preserving term (`lnocl.scene.penalty.Penalty`), zero or more, without
-        unit. The length δ is three times the mean of the extended source. The term keeps the noise
-        down that grows with the iterations, most of all beside bright stars. "auto" is a tenth of
-        the noise of the data term's gradient, ``0.1 sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, with e_j
-        over their mean and < > the mean over pixels. With held-out counts it is 0, or 1, 3 or 10
-        times that, whichever they choose (:doc:`/validation/sgp`). Where PSFs do not fit the stars
-        it is 3 times that. It is more near the stars, as far as rings round these show an error of
-        the PSFs. See Notes.
+        Weight of an edge-preserving term against noise (`lnocl.scene.penalty.Penalty`), zero or
+        more, or "auto", that which suits the noise of the counts.
+
+        The weight is λ in the objective, without unit. The length δ is three times the mean of the
+        extended source. The term keeps the noise down that grows with the iterations, most of all
+        beside bright stars. "auto" is a tenth of the noise of the data term's gradient, ``0.1
+        sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, with e_j over their mean and < > the mean over
+        pixels. With held-out counts it is 0, or 1, 3 or 10 times that, whichever they choose
+        (:doc:`/validation/sgp`). Where PSFs do not fit the stars it is 3 times that. It is more
+        near the stars, as far as rings round these show an error of the PSFs. See Notes.
     solver : {"sgp", "sgm"}, optional
-        Iteration to use. "sgp" is the scaled gradient projection method. It solves for the star
-        fluxes at the start, so that those given matter little. "sgm" is the split-gradient method,
-        the paper's.
+        Iteration to use: "sgp", the scaled gradient projection method; or "sgm", the split-gradient
+        method, the paper's, which needs ten times the iterations and more.
+
+        "sgp" solves for the star fluxes at the start, so that those given matter little.
     n_iter : int, optional
-        Iterations to do, 1 or more. Where `stop` or a callback may end the run sooner, the largest
-        number of them.
+        Largest number of iterations, 1 or more.
+
+        So many are done unless `stop` or a callback ends the run sooner.
     stop : "held-out", "discrepancy", float or None, optional
-        Rule by which to stop before `n_iter`. "held-out": the result is that of the iteration that
-        held-out counts choose (see Notes); where PSFs do not fit, which held-out counts do not
-        notice, when the objective falls by less than 1e-6 of itself. "discrepancy": when the data
-        term has fallen to its expectation for Poisson counts of the model's means. A number in
-        (0, 1): when the relative change of the objective in an iteration, averaged over ten, is
-        below it. None: at `n_iter`.
+        When to stop before `n_iter`: "held-out", at the iteration that held-out counts choose;
+        "discrepancy", when the data are fitted as well as noise allows; a number below 1, when the
+        objective changes relatively by less in an iteration; or None.
+
+        With "held-out" see Notes; where PSFs do not fit, which held-out counts do not notice, the
+        run ends when the objective falls by less than 1e-6 of itself. With "discrepancy" it ends
+        when the data term has fallen to its expectation for Poisson counts of the model's means.
+        The change that a number is compared with is averaged over ten iterations.
     precision : {"single", "double"}, optional
         Arithmetic of the OpenCL engine. The NumPy reference always computes in double.
     engine : {"opencl", "numpy"}, optional
         Where the iterations are computed: OpenCL, or the plain NumPy reference.
     device : str, optional
-        OpenCL device as ``PLATFORM[:DEVICE]``, each an index or a part of the name (see
-        `lnocl.opencl.device.choose`). By default that of the environment variable PYOPENCL_CTX,
-        else the first GPU, else the first CPU.
+        OpenCL device as ``PLATFORM[:DEVICE]``, each an index or a part of the name, as ``lnocl
+        devices`` lists them (see `lnocl.opencl.device.choose`). By default that of the environment
+        variable PYOPENCL_CTX, else the first GPU, else the first CPU.
     pad : int or "auto", optional
-        Unobserved pixels round the images, at least. "auto" is 0 unless light runs over the edge of
-        an image. There it is the radius that holds nine tenths of the PSFs' light, at most half the
-        shorter side (:doc:`/validation/frames`). Each axis of the grid is then the next of
+        Smallest number of unobserved pixels round the images. "auto": where light runs over the
+        edge as many as the PSFs need, else 0.
+
+        They need the radius that holds nine tenths of their light, at most half the shorter side
+        (:doc:`/validation/frames`). Each axis of the grid is then the next of
         `lnocl.scene.grid.LENGTHS`: powers of two, and 3, 5, 7 or 9 times one from 16 up. It is at
         least as long as the PSFs or twice the images. The model is periodic where images have such
         lengths, PSFs are no larger, and ``pad=0``.
@@ -161,22 +169,31 @@ def deconvolve(
         objective or the quantity of the stopping rule. Elsewhere the logger "lnocl.progress" has a
         line each minute.
     refine_positions : bool or "auto", optional
-        Move the stars to where they are most likely, at most 3 pixels away. Fisher scoring of all
-        fluxes and positions does so, with the extended source held fixed
-        (`lnocl.solvers.positions`). It runs at the start and after 3, 6, 12, 24 ... iterations.
-        "auto": where that mends a misfit, and `smoothing` is "auto" too. See Notes.
+        Fit the positions of the stars too, each within 3 pixels of the one given, or take them as
+        given. By default they are fitted where that mends a misfit at the stars, and `smoothing` is
+        "auto".
+
+        Fisher scoring of all fluxes and positions moves the stars, with the extended source held
+        fixed (`lnocl.solvers.positions`). It runs at the start and after 3, 6, 12, 24 ...
+        iterations. See Notes.
     refine_psfs : iterable of {"shift", "jitter", "strehl", "pupil", "modes", "pixels"}, or "auto"
-        Parameters of each PSF to fit before the reconstruction where it does not fit, with the
-        stars, and with the extended source marginalised. "auto", where `smoothing` is "auto" too,
-        is jitter, for several images shift, strehl, pupil and modes where the observation has what
-        they need, and then pixels. An empty sequence is for none. See Notes. At least one star.
+        What is fitted of PSFs to the stars before the reconstruction, where they do not fit: shift,
+        jitter (a blur, or a sharpening), strehl (needs `ideal_psfs` or `pupils`), pupil (phases;
+        needs `pupils`), modes (needs `psf_modes`), pixels. They are used where they fit better. By
+        default, where `smoothing` is "auto", these are jitter, of several images shift, those that
+        need what is given, and pixels.
+
+        The extended source is marginalised. An empty sequence is for none. See Notes. At least one
+        star.
     checkpoint : str or path, optional
-        File for checkpoints (FITS): written after the first iteration, then every
-        minute, and at the end. Each replaces the one before once it is complete. With held-out
-        counts it holds both halves and about twenty estimates of each.
+        File for the state of the run (FITS), saved after the first iteration, every minute and at
+        the end.
+
+        Each checkpoint replaces the one before once it is complete. With held-out counts it holds
+        both halves and about twenty estimates of each.
     resume : str or path, optional
-        Checkpoint to resume from. Everything else must be as it was when it was written. The result
-        is then bit for bit that of a run that was never interrupted.
+        Checkpoint to continue from. Everything else must be as it was when it was written. The
+        result is then bit for bit that of a run that was never interrupted.
 
     Returns
     -------

@@ -11,9 +11,9 @@ from scipy.special import erf
 
 from lnocl.blemishes import flat_tops, sharp_pixels
 from lnocl.errors import InputError, LnoclError, counted, note, warn
-from lnocl.matched_filter import DARKER, PointSources, around, find_points, in_boxes, pixels_at
+from lnocl.matched_filter import PointSources, around, find_points, in_boxes, pixels_at
 from lnocl.process import ignored_warnings
-from lnocl.scene.arrays import Array, numbers
+from lnocl.scene.arrays import Array, darker_noise, numbers
 from lnocl.scene.cores import fwhm, peak
 from lnocl.scene.quantities import bare, in_unit, split
 
@@ -297,7 +297,7 @@ def _measured_psf(image: Array, threshold: float, is_all: bool) -> Array:
     from astropy.modeling.models import Const2D, Moffat2D
 
     smooth = ndimage.gaussian_filter(image, FIRST_WIDTH / 2.355)
-    lowest = threshold * float(np.median(smooth) - np.quantile(smooth, DARKER))
+    lowest = threshold * darker_noise(smooth)
     apart = 2 * round(FIRST_WIDTH) + 1
     y, x = np.nonzero((smooth == ndimage.maximum_filter(smooth, apart)) & (smooth > lowest))
     fits = []

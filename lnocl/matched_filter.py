@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 from scipy.spatial import KDTree
 
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, darker_noise
 from lnocl.scene.cores import centre, fwhm
 
 Window = tuple[slice, slice]
@@ -35,8 +35,6 @@ NEIGHBOURS, NEAR, APART, STEPS = 4, 2.5, 0.9, 8
 SWEEPS, FARTHEST = 2, 0.5
 # Noise that is lower by less than this share than before brings no new maxima.
 LOWER = 0.02
-# A Gaussian is one standard deviation below its median in this share of all.
-DARKER = 0.1587
 # A box with more bad pixels than this, percent, says nothing of the sky.
 MOST_BAD = 50.0
 # A place with less weight than this share of the most has too few good pixels.
@@ -185,8 +183,7 @@ class _Search:
         is_good = (self.weights > 0) & (signal != 0)
         if not is_good.any():
             return np.full(signal.shape, np.inf)
-        good = signal[is_good]
-        dark = max(1.0, float(np.median(good) - np.quantile(good, DARKER)))
+        dark = max(1.0, darker_noise(signal[is_good]))
         return np.maximum(dark, in_boxes(signal, ~is_good, 2 * self.profile.half + 1)[1])
 
     def take_out(self, star: Array, share: float = 1.0) -> None:

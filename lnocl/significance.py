@@ -19,7 +19,7 @@ import numpy as np
 from lnocl.errors import InputError
 from lnocl.plotting.significance import SignificanceView, draw_significance
 from lnocl.runs.outcome import Outcome
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, whole
 from lnocl.scene.detector import on_sky
 from lnocl.scene.quantities import in_unit
 from lnocl.scene.texture import SHARE_NEAR
@@ -461,10 +461,8 @@ def check_injections(n: object, seed: object) -> None:
     InputError
         n is not a whole number of 1 or more, or the seed not one of 0 or more.
     """
-    if not (isinstance(n, (int, np.integer)) and n >= 1):
-        raise InputError(f"`injections` must be a whole number, 1 or more; {n} was given")
-    if not (isinstance(seed, (int, np.integer)) and seed >= 0):
-        raise InputError(f"`seed` must be a whole number, 0 or more; {seed} was given")
+    whole("injections", n, 1)
+    whole("seed", seed, 0)
 
 
 def check_completeness(completeness: object) -> None:

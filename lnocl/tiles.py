@@ -24,7 +24,7 @@ from lnocl.runs.outcome import CURVE_DTYPE, Outcome, PsfRefinement
 from lnocl.runs.plan import plan as make_plan
 from lnocl.runs.preparation import Prepared, prepare
 from lnocl.runs.progress import Progress
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, whole
 from lnocl.scene.counts import mean_exposure
 from lnocl.scene.grid import length_for
 from lnocl.scene.observation import Observation
@@ -339,9 +339,7 @@ def _pad(observation: Observation, pad: Any) -> int:
     """Return the pad of all tiles: light runs over the edges of some, wherever they are cut."""
     if isinstance(pad, str) and pad == "auto":
         return max(recommend_pad(observation), int(np.ceil(abs(observation.offsets).max())))
-    if not (isinstance(pad, (int, np.integer)) and pad >= 0):
-        raise InputError(f"`pad` must be a whole number, 0 or more, or auto; {pad} was given")
-    return int(pad)
+    return whole("pad", pad, 0, ", or auto")
 
 
 def _refuse_turned(observation: Observation) -> None:
@@ -366,14 +364,15 @@ def _lay(observation: Observation, tile: int | None, pad: int) -> list[tuple[_Sp
     if tile is None:
         tile = length_for(SIDES * max(sides)) if observation.psf_fields else LARGE_TILE
     least = 2 * (max(margins) + pad) + 16
-    if not (isinstance(tile, (int, np.integer)) and tile >= least):
-        raise InputError(
-            f"`tile` must be a whole number of {least} pixels or more, for margins of half a PSF "
-            f"and the offsets, {max(margins)} pixels, and a pad of {pad} on each side; {tile} was "
-            "given"
-        )
+    tile = whole(
+        "tile",
+        tile,
+        least,
+        f", for margins of half a PSF and the offsets, {max(margins)} pixels, and a pad of {pad} "
+        "on each side",
+    )
     rows, columns = (
-        _divide(size, int(tile) - 2 * pad, margin)
+        _divide(size, tile - 2 * pad, margin)
         for size, margin in zip(observation.shape, margins, strict=True)
     )
     return list(itertools.product(rows, columns))

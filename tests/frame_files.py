@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from lnocl.io.frames import Calibration, read_frames
+from lnocl.io.calibration import Calibration
+from lnocl.io.frames import read_frames
 
 SHAPE = (10, 12)
 IMAGES = np.random.default_rng(3).poisson(50.0, (2, *SHAPE)).astype(float)

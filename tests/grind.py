@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
+from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
 from scenes import Recipe, worst
 
 from lnocl.errors import MisfitWarning
@@ -39,7 +40,7 @@ CASES = {
     "group, sky four times as fine": (
         (16, 32),
         Tuning(1, 2, group=4),
-        harness.FOUR_TIMES_AS_FINE,
+        FOUR_TIMES_AS_FINE,
         "sd",
     ),
     "turned": ((16, 32), Tuning(4, 4), harness.TURNED, "sD"),
@@ -202,7 +203,7 @@ def run_kernels(case, dtype, names):
     grid, tuning, scene, _ = CASES[case]
     context = cl.Context([choose().device])
     tuning = None if tuning == ON_GPU else tuning
-    bare = KernelHarness(context, grid, dtype, tuning, **harness.SCENES[scene])
+    bare = KernelHarness(context, grid, dtype, tuning, **SCENES[scene])
     assert (bare.program.tuning.group > 1) == case.startswith("group")
     assert bare.program.tuning.scratch_is_global == (case in DEVICE_OPTIONS)
     given = harness.inputs(bare)

@@ -492,7 +492,7 @@ def test_a_psf_of_one_pixel_has_margins_too():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tile": 30}, "tile must be a whole number of 46 pixels or more"),
+        ({"tile": 30}, "tile must be a whole number, 46 or more, for margins of half a PSF"),
         ({"tile": 80.0}, "tile must be a whole number"),
         ({"tile": 80, "pad": -1}, "pad must be a whole number, 0 or more"),
         ({"tile": 80, "checkpoint": "c"}, "checkpoint is no option of tiles"),
@@ -583,7 +583,7 @@ def test_stdpsf_files_are_read(tmp_path, monkeypatch):
     [
         (["--checkpoint", "c.fits"], "--checkpoint is not for tiles; leave it out"),
         (["--refine-psfs", "jitter"], "--refine-psfs is not for tiles; leave it out"),
-        (["--tile", "20"], "--tile must be a whole number of"),
+        (["--tile", "20"], "--tile must be a whole number, "),
         (["--oversample", "2"], "give --effective-psfs"),
     ],
 )

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 SUMMARY = "summary.ecsv"
 # Lines of the table that is shown; the summary has all.
 MAX_ROWS = 40
-# Seconds between two writings of the summary.
-WRITE_EVERY = 10.0
 
 WAITING, STARTED, DONE, FAILED = "waiting", "started", "done", "failed"
 
@@ -76,10 +74,7 @@ OPTIONS = [
         "targets that are done there with the same row are not done again",
     ),
     options.OVERWRITE.but(help="do all targets anew, and replace files in DIR"),
-    options.PARALLEL.but(
-        help="targets at once: a number of processes, or current-scheduler, the workers of the "
-        "scheduler of Dask that DASK_SCHEDULER_ADDRESS names (default: one after the other)"
-    ),
+    options.parallel("targets"),
     option(
         "--array",
         type=_part,
@@ -290,7 +285,7 @@ def _run(arguments: argparse.Namespace) -> None:
         with Progress(len(due), "target", not arguments.quiet) as bar:
             for record in _records(folder, due, start, arguments.parallel):
                 bar.update(words=f"{record.name} {record.status}")
-                if time.monotonic() - written > WRITE_EVERY:
+                if time.monotonic() - written > messages.WRITE_EVERY:
                     _write_summary(folder, targets, start)
                     written = time.monotonic()
     except BaseException:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 
 from lnocl.commands import messages, options
+from lnocl.commands.declared import BACKGROUND, DEVICE, READ_NOISE
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.errors import InputError
 
-OF_IMAGES = options.PSFS, options.BACKGROUND, options.READ_NOISE, options.STARS
+OF_IMAGES = options.PSFS, BACKGROUND, READ_NOISE, options.STARS
 OPTIONS = [
     options.IMAGES.but(nargs="*"),
     *(each.but(needs=("images",)) for each in OF_IMAGES),
@@ -34,7 +35,7 @@ OPTIONS = [
         metavar="N",
         help="pixels along each side of the demo's scene (default: 256)",
     ),
-    options.DEVICE,
+    DEVICE,
     option(
         "-o", "--output", metavar="STEM", help="write the table to STEM.ecsv, a plot to STEM.png"
     ),
@@ -44,7 +45,8 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.io.frames import Calibration, read_frames
+    from lnocl.io.calibration import Calibration
+    from lnocl.io.frames import read_frames
     from lnocl.opencl import device
     from lnocl.studies import bench
 

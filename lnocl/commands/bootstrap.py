@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lnocl.commands.messages import MAX_LISTED, WRITE_EVERY
 from lnocl.errors import FileError, InputError
 from lnocl.scene.apertures import Aperture
 
@@ -25,10 +26,6 @@ if TYPE_CHECKING:
     from lnocl.runs.bootstrap import Bootstrap, Part
 
 
-# Seconds between two writings of the replicas so far.
-WRITE_EVERY = 10.0
-# Quantities whose errors are printed, unless more regions were given.
-MAX_LISTED = 12
 # Names of quantities of stars; others are of regions and profiles.
 _OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)")
 

@@ -8,7 +8,6 @@ import os
 import signal
 from typing import TYPE_CHECKING
 
-from lnocl.commands.options import option
 from lnocl.commands.signals import ENDING, first_handled
 from lnocl.errors import InputError, LnoclError, counted
 from lnocl.io import atomic
@@ -17,24 +16,6 @@ if TYPE_CHECKING:
     from lnocl.result import Result
 
 SIGNALS = (signal.SIGINT, *ENDING)
-
-
-OPTIONS = [
-    option(
-        "--checkpoint",
-        metavar="FILE",
-        is_repeated=False,
-        help="save the state of the run every minute, at the end and on Ctrl-C",
-    ),
-    option(
-        "--resume",
-        metavar="FILE",
-        is_input=True,
-        is_repeated=False,
-        help="continue from a checkpoint of the same inputs and parameters; the result is bit for "
-        "bit that of a run that was never interrupted",
-    ),
-]
 
 
 def check(arguments: argparse.Namespace) -> None:

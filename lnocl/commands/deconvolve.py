@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 def read(arguments: argparse.Namespace) -> tuple[Frames, dict[str, Any]]:
     """Read what the arguments of ``lnocl deconvolve`` name; return it, and the values given."""
     from lnocl.io import missions
-    from lnocl.io.frames import Calibration, read_frames
+    from lnocl.io.calibration import Calibration
+    from lnocl.io.frames import read_frames
     from lnocl.scene.uncertainties import OtherNoiseError
 
     given = {**vars(arguments), "device": _device_spec(arguments)}

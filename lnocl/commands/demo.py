@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import shlex
 
-from lnocl.commands import deconvolve, messages, options, simulate
+from lnocl.commands import deconvolve, messages, simulate
+from lnocl.commands.declared import DEVICE
 from lnocl.commands.options import option, output_folder
 from lnocl.commands.parser import Command, Parser
 
@@ -18,7 +19,7 @@ OPTIONS = [
         metavar="N",
         help="pixels along each side (default: %(default)s)",
     ),
-    options.DEVICE,
+    DEVICE,
 ]
 
 

@@ -9,9 +9,11 @@ import numpy as np
 
 from lnocl.commands import messages, options, pictures
 from lnocl.commands.again import Again
-from lnocl.commands.options import option
+from lnocl.commands.declared import parameter
+from lnocl.commands.messages import MAX_LISTED
 from lnocl.commands.parser import Command
 from lnocl.errors import counted
+from lnocl.result import Result
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -20,41 +22,14 @@ if TYPE_CHECKING:
     from lnocl.io.saved_results import SavedResult
     from lnocl.significance import Significance
 
-# Detections that are printed.
-MAX_LISTED = 12
-
-WIDTH = option(
-    "--width",
-    type=float,
-    default=0.0,
-    metavar="FWHM",
-    help="full width at half maximum of the sources, pixels of the images (default: %(default)s, "
-    "points)",
-)
-FALSE_ALARMS = option(
-    "--false-alarms",
-    type=float,
-    default=0.01,
-    metavar="N",
-    help="number of false alarms expected in the whole field, from which the threshold follows "
-    "(default: %(default)s)",
+SOURCES = (
+    parameter(Result.significance, "width", metavar="FWHM"),
+    parameter(Result.significance, "false_alarms", metavar="N"),
 )
 OPTIONS = [
-    option(
-        "result",
-        metavar="RESULT.fits",
-        is_input=True,
-        help="file that lnocl deconvolve has written; the detections and the map of "
-        "signal-to-noise are added to it",
-    ),
-    WIDTH,
-    FALSE_ALARMS,
-    option(
-        "-o",
-        "--output",
-        metavar="TABLE.ecsv",
-        help="table of the detections too, in a format by its ending: .ecsv, .csv or .fits",
-    ),
+    options.result("the detections and the map of signal-to-noise are added to it"),
+    *SOURCES,
+    options.table_output("detections too", metavar="TABLE.ecsv"),
     options.PICTURE.but(help="picture of the map with the detections and their numbers"),
     options.OVERWRITE.but(help="replace TABLE and FILE.png if they exist"),
     options.QUIET,

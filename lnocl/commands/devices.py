@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from lnocl.commands import messages, options
+from lnocl.commands.declared import DEVICE
 from lnocl.commands.parser import Command
 
 
@@ -58,9 +59,7 @@ COMMAND = Command(
                 help="time iterations with vectors of several widths (CPU) or groups of several "
                 "sizes (GPU), and use the fastest on this device from now on",
             ),
-            options.DEVICE.but(
-                needs=("tune",), help="with --tune: the device, as PLATFORM[:DEVICE]"
-            ),
+            DEVICE.but(needs=("tune",), help="with --tune: the device, as PLATFORM[:DEVICE]"),
         ]
     },
     _run,

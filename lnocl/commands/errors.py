@@ -7,30 +7,19 @@ from typing import TYPE_CHECKING
 
 from lnocl.commands import bootstrap, messages, options
 from lnocl.commands.again import Again
+from lnocl.commands.declared import parameter
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.errors import note
+from lnocl.result import Result
 
 if TYPE_CHECKING:
     from lnocl.io.frames import Frames
     from lnocl.runs.bootstrap import Part
 
 OPTIONS = [
-    option(
-        "result",
-        metavar="RESULT.fits",
-        is_input=True,
-        help="file that lnocl deconvolve has written; its errors are added to it, after those of "
-        "replicas that it has",
-    ),
-    option(
-        "--bootstrap",
-        type=int,
-        default=50,
-        metavar="N",
-        help="replicas, each about as long as the run, for the errors of stars, regions and "
-        "pixels; ten or more (default: %(default)s)",
-    ),
+    options.result("its errors are added to it, after those of replicas that it has"),
+    parameter(Result.bootstrap, "n", "--bootstrap"),
     option(
         "--regions",
         metavar="FILE",
@@ -45,18 +34,8 @@ OPTIONS = [
         help="boxes along whose longer sides light and width are measured, pixel by pixel: such a "
         "file; lnocl plot draws them with their errors",
     ),
-    option(
-        "--seed",
-        type=int,
-        default=0,
-        metavar="S",
-        help="of the replicas, 0 or more (default: %(default)s); the same seed gives the same "
-        "errors",
-    ),
-    options.PARALLEL.but(
-        help="replicas at once: a number of processes, or current-scheduler, the workers of the "
-        "scheduler of Dask that DASK_SCHEDULER_ADDRESS names (default: one after the other)"
-    ),
+    parameter(Result.bootstrap, "seed", metavar="S"),
+    options.parallel("replicas"),
     options.OVERWRITE.but(help="begin anew, without the replicas that RESULT.fits has"),
     options.QUIET,
 ]

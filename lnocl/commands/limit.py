@@ -23,15 +23,8 @@ COMPLETENESS, PUT_IN = (0.5, 0.9, 0.95), (0.5, 0.9)
 RARE = 1e-3
 
 OPTIONS = [
-    option(
-        "result",
-        metavar="RESULT.fits",
-        is_input=True,
-        help="file that lnocl deconvolve has written; curves and maps of the limits are added to "
-        "it",
-    ),
-    detect.WIDTH,
-    detect.FALSE_ALARMS,
+    options.result("curves and maps of the limits are added to it"),
+    *detect.SOURCES,
     option(
         "--injections",
         type=int,
@@ -48,12 +41,7 @@ OPTIONS = [
         needs=("injections",),
         help="of these sources, 0 or more (default: %(default)s)",
     ),
-    option(
-        "-o",
-        "--output",
-        metavar="TABLE.ecsv",
-        help="table of the curves too, in a format by its ending: .ecsv, .csv or .fits",
-    ),
+    options.table_output("curves too", metavar="TABLE.ecsv"),
     options.PICTURE.but(help="picture of the map of the limits and of their curves"),
     options.OVERWRITE.but(help="replace TABLE and FILE.png if they exist"),
     options.QUIET,

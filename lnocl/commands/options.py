@@ -308,35 +308,6 @@ PSFS = option(
     help="FITS file with a PSF, centred at (ky // 2, kx // 2): one for all images or one for each, "
     "or one file with a cube of them",
 )
-BACKGROUND = option(
-    "--background",
-    **SEVERAL,
-    type=number_or_word,
-    metavar="B",
-    card=("BKG", "background, electrons"),
-    checksum="BSUM",
-    help="electrons per pixel, a FITS file with a map of them, or auto, measured and then fitted "
-    "with the rest; below 0 where too much sky was subtracted; one for all images or one for each "
-    "(default: 0)",
-)
-READ_NOISE = option(
-    "--read-noise",
-    **SEVERAL,
-    type=number_or_word,
-    metavar="S",
-    card=("RON", "read noise, electrons"),
-    checksum="RSUM",
-    help="standard deviation in electrons, a FITS file with a map of it, a keyword of the images' "
-    "headers such as RDNOISE, or auto, what the scatter of the sky has beyond the noise of its "
-    "counts; one for all images or one for each (default: 0; auto where the sky was subtracted)",
-)
-SATURATION = option(
-    "--saturation",
-    type=finite,
-    metavar="V",
-    card=("SATURATE", "saturation level, unit of the input"),
-    help="pixels of this value and above are bad, in the unit of the images",
-)
 STARS = option(
     "--star",
     action="append",
@@ -356,12 +327,6 @@ STAR_TABLE = option(
     help="table of stars in any format of astropy, with columns x and y, or ra and dec, or as "
     "photutils, SExtractor, Gaia and VizieR name them",
 )
-DEVICE = option(
-    "--device",
-    metavar="SPEC",
-    help="OpenCL device as PLATFORM[:DEVICE], each an index or a part of the name, as lnocl "
-    "devices lists them (default: that of PYOPENCL_CTX, else the first GPU, else the first CPU)",
-)
 OVERWRITE = option(
     "--overwrite", action="store_true", is_repeated=False, help="replace files that exist"
 )
@@ -370,18 +335,32 @@ QUIET = option(
 )
 
 
-PARALLEL = option(
-    "--parallel",
-    type=processes,
-    default=False,
-    metavar="N",
-    is_repeated=False,
-)
-PICTURE = option(
-    "--plot",
-    metavar="FILE.png",
-    is_repeated=False,
-)
+PICTURE = option("--plot", metavar="FILE.png", is_repeated=False)
+
+
+def result(use: str) -> Option:
+    """Return the argument for the file of a result, to which something is added."""
+    words = f"file that lnocl deconvolve has written; {use}"
+    return option("result", metavar="RESULT.fits", is_input=True, help=words)
+
+
+def table_output(content: str, **keywords: Any) -> Option:
+    """Return the option for a file with a table."""
+    words = f"table of the {content}, in a format by its ending: .ecsv, .csv or .fits"
+    return option("-o", "--output", help=words, **keywords)
+
+
+def parallel(parts: str) -> Option:
+    """Return the option for where parts of the work are done."""
+    return option(
+        "--parallel",
+        type=processes,
+        default=False,
+        metavar="N",
+        is_repeated=False,
+        help=f"{parts} at once: a number of processes, or current-scheduler, the workers of the "
+        "scheduler of Dask that DASK_SCHEDULER_ADDRESS names (default: one after the other)",
+    )
 
 
 def output_folder(content: str, **keywords: Any) -> list[Option]:

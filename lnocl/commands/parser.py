@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, NoReturn
 
+from lnocl.commands.messages import in_shell
 from lnocl.commands.options import Options
 from lnocl.errors import InputError
 from lnocl.io.names import file_of
@@ -38,10 +39,12 @@ class Command(NamedTuple):
         parser.epilog = self.epilog
         needed = (each for options in self.options.values() for each in options if each.is_needed)
         parser.usage = " ".join(["%(prog)s", *(each.usage() for each in needed), "[options]"])
+        flags = self.flags()
         for heading, options in self.options.items():
             group = parser.add_argument_group(heading) if heading else parser
             for each in options:
-                group.add_argument(*each.flags, **each.keywords)
+                words = in_shell(each.keywords["help"], flags)
+                group.add_argument(*each.flags, **{**each.keywords, "help": words})
 
     def refuse_ignored(self, arguments: argparse.Namespace) -> None:
         """Refuse options that would be ignored, as others that they need are left out.

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.commands import messages, options, pictures, record
+from lnocl.commands.declared import SATURATION
 from lnocl.commands.options import number_or_word, option
 from lnocl.commands.parser import Command
 from lnocl.errors import InputError, counted
@@ -83,9 +85,7 @@ OPTIONS = [
         help="FITS file of the frame's shape, not 0 where a pixel is bad; bad pixels are "
         "interpolated, and so are those that are NaN in the frame",
     ),
-    options.SATURATION.but(
-        help="pixels of this value and above, in the unit of the frame, are bad too"
-    ),
+    SATURATION.but(help="pixels of this value and above, in the unit of the frame, are bad too"),
     option(
         "--rotate",
         nargs="+",
@@ -124,10 +124,9 @@ def _run(arguments: argparse.Namespace) -> None:
         _make_modes(arguments)
         return
     _check_outputs(arguments)
-    folder = os.getcwd()
 
     from lnocl import psf
-    from lnocl.io import fitsread, fitswrite
+    from lnocl.io import fitsread
 
     sha256: dict[str, list[str]] = {}
     mask = None
@@ -144,35 +143,20 @@ def _run(arguments: argparse.Namespace) -> None:
         frame,
         arguments.rotate,
         position=positions,
-        size=arguments.size,
         background=background,
         mask=mask,
-        saturation=arguments.saturation,
-        recentre=arguments.recentre,
-        clip_negative=arguments.clip_negative,
+        **_parameters(arguments),
     )
     lines = _lines(stars, arguments.rotate)
     if len(arguments.frames) > 1:
         lines.insert(0, f"{len(arguments.frames)} frames: their stars are laid side by side")
-    psfs = np.array([star.psf for star in stars])
-    scatters = None if stars[0].scatter is None else np.array([star.scatter for star in stars])
-    given = vars(arguments)
-    fitswrite.write_image(
-        arguments.output,
-        _squeezed(psfs),
-        cards=record.make_cards(
-            OPTIONS,
-            {**given, "background": stars[0].background},
-            sha256,
-            _result_cards(stars),
-        ),
-        overwrite=arguments.overwrite,
-        notes=lines,
-        commands=record.make_commands("psf", OPTIONS, given, folder),
-        others={} if scatters is None else {"SCATTER": _squeezed(scatters)},
-    )
+    scatters = [star.scatter for star in stars if star.scatter is not None]
+    others = {"SCATTER": _squeezed(scatters)} if scatters else {}
+    psfs = _squeezed([star.psf for star in stars])
+    used = {"background": stars[0].background}
+    _write(arguments, psfs, others, sha256, lines, used, _result_cards(stars))
     k = psfs.shape[-1]
-    made = counted(len(psfs), "PSF") if len(psfs) > 1 else "a PSF"
+    made = counted(len(stars), "PSF") if len(stars) > 1 else "a PSF"
     lines.append(
         f"written to {arguments.output}: {made} of {k} x {k} pixels, the star's centre at "
         f"({k // 2}, {k // 2})"
@@ -181,6 +165,36 @@ def _run(arguments: argparse.Namespace) -> None:
         lines.append(pictures.draw(arguments, _figure(arguments, stars)))
     if not arguments.quiet:
         messages.say(lines)
+
+
+def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the parameters of all functions that make PSFs."""
+    names = "size", "saturation", "recentre", "clip_negative"
+    return {name: getattr(arguments, name) for name in names}
+
+
+def _write(
+    arguments: argparse.Namespace,
+    image: NDArray[np.float64],
+    others: Mapping[str, NDArray[np.float64]],
+    sha256: Mapping[str, Sequence[str]],
+    lines: Sequence[str],
+    used: Mapping[str, Any] = MappingProxyType({}),
+    results: Sequence[Card] = (),
+) -> None:
+    """Write PSFs with the lines said of them, and the command that makes them again."""
+    from lnocl.io import fitswrite
+
+    given = vars(arguments)
+    fitswrite.write_image(
+        arguments.output,
+        image,
+        cards=record.make_cards(OPTIONS, {**given, **used}, sha256, results),
+        overwrite=arguments.overwrite,
+        notes=lines,
+        commands=record.make_commands("psf", OPTIONS, given, os.getcwd()),
+        others=others,
+    )
 
 
 def _joined(
@@ -211,10 +225,9 @@ def _make_modes(arguments: argparse.Namespace) -> None:
         raise InputError(
             "--modes makes one PSF of all frames; leave --plot, --rotate and --mask out"
         )
-    folder = os.getcwd()
 
     from lnocl import psf
-    from lnocl.io import fitsread, fitswrite
+    from lnocl.io import fitsread
 
     with messages.shown_log(arguments.quiet):
         stack = fitsread.read_stack(arguments.frames)
@@ -224,11 +237,8 @@ def _make_modes(arguments: argparse.Namespace) -> None:
             frame,
             rotate=arguments.rotate[0],
             position=positions,
-            size=arguments.size,
             background=arguments.background,
-            saturation=arguments.saturation,
-            recentre=arguments.recentre,
-            clip_negative=arguments.clip_negative,
+            **_parameters(arguments),
         )
         for frame in stack.data
     ]
@@ -239,7 +249,6 @@ def _make_modes(arguments: argparse.Namespace) -> None:
             f"{sizes[0]} or less"
         )
     found = psf.find_modes([star.psf for star in stars], arguments.modes)
-    given = vars(arguments)
     lines = [
         f"frame {j}: the star at ({star.centre[0]:.2f}, {star.centre[1]:.2f}), flux {star.flux:.6g}"
         for j, star in enumerate(stars, 1)
@@ -249,15 +258,8 @@ def _make_modes(arguments: argparse.Namespace) -> None:
         f"the PSFs differ from their mean by {100 * scatter:.2g} %; "
         f"{counted(arguments.modes, 'mode')} of {100 * found.share:.3g} % of that variance"
     )
-    fitswrite.write_image(
-        arguments.output,
-        found.mean,
-        cards=record.make_cards(OPTIONS, given, {"frames": stack.sha256}, []),
-        overwrite=arguments.overwrite,
-        notes=lines,
-        commands=record.make_commands("psf", OPTIONS, given, folder),
-        others={"MODES": found.modes, "SCATTER": found.scatter},
-    )
+    others = {"MODES": found.modes, "SCATTER": found.scatter}
+    _write(arguments, found.mean, others, {"frames": stack.sha256}, lines)
     k = len(found.mean)
     lines.append(
         f"written to {arguments.output}: the mean of {len(stars)} PSFs of {k} x {k} pixels"
@@ -309,24 +311,19 @@ def _report(arguments: argparse.Namespace) -> None:
     messages.say(lines)
 
 
-def _squeezed(images: NDArray[np.float64]) -> NDArray[np.float64]:
+def _squeezed(images: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return a cube, or the one image in it."""
-    return images if len(images) > 1 else images[0]
-
-
-def _read_image(path: str) -> tuple[NDArray[np.float64], list[str]]:
-    """Return the one image of a file, and the file's checksum in a list."""
-    from lnocl.io import fitsread
-
-    stack = fitsread.read_single(path)
-    return stack.data[0], stack.sha256
+    return np.array(images) if len(images) > 1 else images[0]
 
 
 def _read_mask(
     path: str, frame_path: str, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.bool_], list[str]]:
     """Return where a mask is not 0, NaN included, and the file's checksum in a list."""
-    values, checksum = _read_image(path)
+    from lnocl.io import fitsread
+
+    stack = fitsread.read_single(path)
+    values = stack.data[0]
     if values.shape != shape:
         raise InputError(
             f"the mask {path} has the shape {values.shape} and {frame_path} {shape}; they must be "
@@ -338,7 +335,7 @@ def _read_mask(
             f"the mask {path} leaves no good pixel: it is 0 nowhere; give one that is 0 where the "
             "frame is good"
         )
-    return bad, checksum
+    return bad, stack.sha256
 
 
 def _lines(stars: Sequence[StarPsf], angles: Sequence[float]) -> list[str]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 
 from lnocl import __version__
-from lnocl.commands import messages, options
+from lnocl.commands import messages
+from lnocl.commands.declared import DEVICE
 from lnocl.commands.parser import Command
 
 
@@ -28,7 +29,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 COMMAND = Command(
     "try every kernel and short deconvolutions on a device, and say whether they are right",
-    {"": [options.DEVICE]},
+    {"": [DEVICE]},
     _run,
     "Exit status: 0 all is right, 1 something is wrong, 2 wrong use.",
 )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.commands import messages, options, pictures
+from lnocl.commands.declared import SATURATION
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.errors import InputError, counted
@@ -18,13 +19,7 @@ if TYPE_CHECKING:
 
 OPTIONS = [
     option("image", metavar="IMAGE", is_input=True, help="FITS file with an image"),
-    option(
-        "-o",
-        "--output",
-        required=True,
-        metavar="STARS.ecsv",
-        help="table of the stars, in a format by its ending: .ecsv, .csv or .fits",
-    ),
+    options.table_output("stars", metavar="STARS.ecsv", required=True),
     option(
         "--psf",
         metavar="PSF",
@@ -48,9 +43,7 @@ OPTIONS = [
         "(default: of JWST and HST what their files have); "
         "pixels that are NaN are bad too",
     ),
-    options.SATURATION.but(
-        help="pixels of this value and above are saturated, in the unit of the image"
-    ),
+    SATURATION.but(help="pixels of this value and above are saturated, in the unit of the image"),
     options.PICTURE.but(help="picture of the image with the stars and their numbers"),
     options.OVERWRITE,
     options.QUIET,

@@ -17,8 +17,6 @@ from lnocl.io.names import file_of
 if TYPE_CHECKING:
     from astropy.table import Row, Table
 
-# The formats of tables, by their endings, as astropy names them.
-FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
 NAME = "name"
 # What the batch gives itself.
 OWN = ("output", "overwrite", "quiet", "resume", "checkpoint", "parallel")
@@ -89,13 +87,13 @@ def read_targets(path: str) -> list[Target]:
 def _read(path: str) -> Table:
     from astropy.table import Table
 
-    ending = next((end for end in FORMATS if path.lower().endswith(end)), None)
-    if ending is None:
-        raise InputError(f"{path} is no table of targets; its name ends in {', '.join(FORMATS)}")
+    from lnocl.io.tables import format_of
+
+    kind = format_of(path, "targets")
     try:
         # Excel begins them with a mark of the encoding.
-        given = {} if ending == ".fits" else {"encoding": "utf-8-sig"}
-        return Table.read(path, format=FORMATS[ending], **given)
+        given = {} if kind == "fits" else {"encoding": "utf-8-sig"}
+        return Table.read(path, format=kind, **given)
     except FileNotFoundError as error:
         raise FileError(f"{path} does not exist") from error
     except Exception as error:  # of its readers, which raise any

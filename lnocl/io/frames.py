@@ -12,6 +12,7 @@ from astropy.units import dimensionless_unscaled
 from numpy.typing import NDArray
 
 from lnocl.errors import InputError, counted, note, warn
+from lnocl.io.calibration import Calibration, Word
 from lnocl.io.fitsread import (
     keyword_number,
     read_contents,
@@ -22,7 +23,7 @@ from lnocl.io.fitsread import (
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
 from lnocl.io.headers import CONVERTERS
 from lnocl.io.levels import is_rate, sky_level, sky_noise
-from lnocl.io.maps import Maps, Word
+from lnocl.io.maps import Maps
 from lnocl.io.names import ERR, PSF_ERRORS, parse_kind
 from lnocl.io.noise import NoiseMap, electrons_by_variance, read_noise_map
 from lnocl.io.pixel_scales import warn_of_pixel_scales
@@ -30,7 +31,7 @@ from lnocl.io.places import read_epochs, read_places
 from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.arrays import Array
-from lnocl.scene.observation import Observation, PsfCentre
+from lnocl.scene.observation import Observation
 from lnocl.scene.transforms import enlarged
 
 Mask = NDArray[np.bool_]
@@ -43,78 +44,6 @@ MUCH_MASKED = 0.1
 FLAT = "flat"
 # Of images with more negative pixels than this share the sky was subtracted.
 SUBTRACTED = 0.01
-
-
-class Calibration(NamedTuple):
-    """The calibration of images in files; a `Word` is a number, a file, or as listed.
-
-    Attributes
-    ----------
-    background : sequence of Word
-        Electrons per pixel, one or one for each image: a number, a map, or ``"auto"``, the
-        mode of the image (`lnocl.io.levels`), which is then fitted with the rest.
-    read_noise : sequence of Word
-        Standard deviation, electrons: numbers, maps, a keyword of the headers, of the images or
-        their files, or ``"auto"``, what the sigma-clipped scatter of the image has beyond the noise
-        of its counts.
-    noise : sequence of str
-        Maps of noise in units of the images, 0 where a pixel is bad, as ``KIND=FILE``: of all noise
-        but that of the source one over the variance (ivar), the variance (var) or its root (rms);
-        or the standard deviation of all noise, that of the source's counts too (err). ``"err"``
-        alone is the extension ERR of each image's file.
-    exposure : sequence of Word
-        Seconds: numbers, maps, or a keyword of the headers, of the images or their files.
-    mask : sequence of str
-        Maps, not 0 where a pixel is bad; ``"wht"``, the extension WHT of each image's file, 0 where
-        a pixel is bad; or ``"dq"``, its extension DQ. ``"dq:16,64"`` names the flags that are no
-        fault, as for `flags.bad_pixels`; by default they are those of the mission.
-    saturation : float, optional
-        Pixels of this value and above, in units of the images, are bad.
-    gain : float or str, optional
-        Electrons for each adu or count, or for each of whatever unit the images have; or a keyword
-        of the headers, of the images or their files; or the extension of the images' files with the
-        variance of their counts, such as JWST's ``"VAR_POISSON"``. Counts per time stay counts per
-        time.
-    align : {"wcs"}, optional
-        Offsets, rotations, flips and scales from the headers' coordinates; images, and PSFs, may
-        then have several shapes.
-    angle : sequence of float or str
-        Parallactic angles, degrees: one for each image, a keyword of the headers, or a file.
-    epoch : sequence of float or str
-        Labels of the epochs of the images: one for each, a keyword of their headers, or ``"each"``.
-    centre : tuple of float, optional
-        (x, y) of the place that the field turns about, pixels; by default the middle,
-        ``(nx // 2, ny // 2)``.
-    psf_centre : {"check", "fit", "given"}
-        As for `Observation`.
-    oversample, effective_psfs : int, bool
-        As for `Observation`.
-    halos : sequence of str
-        Shapes of halos, as for `Observation`: files with one for all images, or one for each; or
-        ``"flat"``.
-    psf_errors : sequence of str
-        Files that tell how PSFs may be wrong, as ``KIND=FILE`` with a kind of `names.PSF_ERRORS`,
-        as for `Observation`: the extension that is called as the kind, such as the SCATTER that
-        `lnocl psf` writes beside a PSF, or else the image. There is one file of modes, for all
-        PSFs.
-    """
-
-    background: Sequence[Word] = (0.0,)
-    read_noise: Sequence[Word] = (0.0,)
-    noise: Sequence[str] = ()
-    exposure: Sequence[Word] = ()
-    mask: Sequence[str] = ()
-    saturation: float | None = None
-    gain: Word | None = None
-    align: str | None = None
-    angle: Sequence[Word] = ()
-    centre: tuple[float, float] | None = None
-    epoch: Sequence[Word] = ()
-    oversample: int = 1
-    effective_psfs: bool = False
-    psf_centre: PsfCentre = "check"
-    psf_errors: Sequence[str] = ()
-    halos: Sequence[str] = ()
 
 
 class Frames(NamedTuple):

@@ -8,13 +8,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lnocl.errors import InputError, counted
+from lnocl.io.calibration import Word
 from lnocl.io.fitsread import read_stack
 from lnocl.io.names import file_of
 from lnocl.scene import units
 from lnocl.scene.arrays import Array
 from lnocl.scene.transforms import enlarged
-
-Word = str | float
 
 # Units that maps are taken in.
 UNITS = {"background": units.COUNTS, "read_noise": units.COUNTS, "exposure": ("second",)}

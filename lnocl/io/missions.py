@@ -29,7 +29,7 @@ def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
     path : str
         The first image.
     given : mapping of str to value
-        What is given, of the fields of `frames.Calibration`.
+        What is given, of the fields of `calibration.Calibration`.
 
     Returns
     -------

@@ -16,8 +16,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.transforms import rotations, scale_of
 
 if TYPE_CHECKING:
-    from lnocl.io.frames import Calibration
-    from lnocl.io.maps import Word
+    from lnocl.io.calibration import Calibration, Word
 
 
 class Places(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError
 from lnocl.psf.centring import Mask
-from lnocl.scene.arrays import Array, booleans, numbers, values_and_mask
+from lnocl.scene.arrays import Array, booleans, numbers, values_and_mask, whole
 from lnocl.scene.quantities import in_unit
 
 MIN_SIZE = 3
@@ -57,15 +56,7 @@ def saturation_level(saturation: float | None) -> float:
 
 def whole_size(size: int | None) -> int | None:
     """Return the side of the PSF, pixels; None where the largest is to be taken."""
-    if size is None:
-        return None
-    try:
-        side = operator.index(size)
-    except TypeError:
-        side = 0
-    if side < MIN_SIZE or isinstance(size, bool | np.bool_):
-        raise InputError(f"`size` must be a whole number of {MIN_SIZE} or more; {size!r} was given")
-    return side
+    return None if size is None else whole("size", size, MIN_SIZE)
 
 
 def wrapped_angles(rotate: Sequence[float]) -> list[float]:

@@ -17,6 +17,7 @@ from lnocl.psf import checks, effective, resampling, steps
 from lnocl.psf.centring import Mask, Pixel, Point
 from lnocl.scene.arrays import Array, flag
 from lnocl.scene.quantities import in_unit, split
+from lnocl.scene.shifting import MARGIN
 
 
 @dataclass(frozen=True)
@@ -368,7 +369,7 @@ def make_psfs(
         steps.refuse_hole(unrepairable, pixel)
     scatter: Array | None = None
     combined: tuple[str, ...] = ()
-    far = max(resampling.reach(side, angle) for angle in angles) + steps.MARGIN
+    far = max(resampling.reach(side, angle) for angle in angles) + MARGIN
     lowered, others = list[str](), list[str]()
     if width:
         more, masked, others = steps.find_neighbours(light, unusable, centres, width, far)
@@ -431,7 +432,7 @@ def _make_square(
     clip_negative: bool,
 ) -> _Square:
     lines = []
-    work = before = steps.cut_square(light, pixel, resampling.reach(side, angle) + steps.MARGIN)
+    work = before = steps.cut_square(light, pixel, resampling.reach(side, angle) + MARGIN)
     if shift is not None:
         work = resampling.shift(work, shift)
     if angle:

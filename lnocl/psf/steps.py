@@ -19,9 +19,8 @@ from lnocl.psf.repair import WINDOW, repair
 from lnocl.psf.wings import FROM, distance, fit_sky
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array, numbers
+from lnocl.scene.shifting import MARGIN
 
-# Pixels around the crop while it is shifted and rotated: both wrap round its edges.
-MARGIN = 16
 # The background is lowered by so many of its errors or more, and by this share of the flux; where
 # the farthest pixels are above it by less than this share of that. Of a larger share it is warned.
 CERTAIN, LITTLE, TRUSTED, MUCH = 5.0, 0.001, 0.5, 0.01

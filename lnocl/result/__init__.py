@@ -518,7 +518,7 @@ class Result:
         Parameters
         ----------
         n : int, optional
-            Replicas, ten or more.
+            Replicas, ten or more. Each is a run of as many iterations as the result's.
         regions : str, path or iterable of regions.Region, optional
             Regions whose light of the extended source is measured. A name is that of a file of
             them, as DS9 writes. Others are objects of the package regions. They are in pixels of
@@ -528,7 +528,8 @@ class Result:
         header : astropy.io.fits.Header, optional
             Header of the first image, for regions on the sky.
         seed : int, optional
-            Zero or more. The same seed gives the same numbers on the same device.
+            Seed of the replicas, zero or more. The same seed gives the same errors on the same
+            device.
         progress : bool, optional
             Show progress, as `lnocl.deconvolve` does.
         earlier : Bootstrap, optional
@@ -605,9 +606,10 @@ class Result:
         Parameters
         ----------
         width : float, optional
-            Full width at half maximum of the source, pixels of the images; 0 for a point.
+            Full width at half maximum of the sources, pixels of the images; 0 for points.
         false_alarms : float, optional
-            Number of false alarms expected in the whole field, from 1e-200 to 10.
+            Number of false alarms expected in the whole field, from 1e-200 to 10. The threshold
+            follows from it.
 
         Returns
         -------

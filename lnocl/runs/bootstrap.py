@@ -17,7 +17,7 @@ from lnocl.runs.outcome import Outcome
 from lnocl.runs.progress import Progress
 from lnocl.runs.replicas import Replicas, Sky
 from lnocl.scene.apertures import AMOUNT, FLUX, FWHM, LENGTH, Aperture, Label, Profile
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, whole
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
@@ -355,13 +355,8 @@ def check_number(n: object, seed: object) -> None:
     InputError
         n is not a whole number of ten or more, or the seed is not one of zero or more.
     """
-    if not (isinstance(n, (int, np.integer)) and n >= MIN_REPLICAS):
-        raise InputError(
-            f"`bootstrap` takes a whole number of replicas, {MIN_REPLICAS} or more, such as 50; "
-            f"{n} was given"
-        )
-    if not (isinstance(seed, (int, np.integer)) and seed >= 0):
-        raise InputError(f"`seed` must be a whole number, 0 or more; {seed} was given")
+    whole("bootstrap", n, MIN_REPLICAS, ", such as 50")
+    whole("seed", seed, 0)
 
 
 class _Measured(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError, note, warn
-from lnocl.scene.arrays import Array, flag, numbers
+from lnocl.scene.arrays import Array, flag, numbers, whole
 from lnocl.scene.containers import counts
 from lnocl.scene.freedoms import refusal
 from lnocl.scene.observation import Observation
@@ -169,9 +169,7 @@ def check_length(n_iter: object, stop: object) -> None:
         `n_iter` is not a whole number from 1 to `MAX_ITERATIONS`; `stop` is not a known rule or a
         number between 0 and 1.
     """
-    if not (isinstance(n_iter, (int, np.integer)) and n_iter >= 1):
-        raise InputError(f"`n_iter` must be a whole number, 1 or more; {n_iter} was given")
-    if n_iter > MAX_ITERATIONS:
+    if whole("n_iter", n_iter, 1) > MAX_ITERATIONS:
         raise InputError(f"`n_iter` must be {MAX_ITERATIONS} at most; {n_iter} was given")
     is_change = isinstance(stop, Real) and 0 < cast(float, stop) < 1
     if not (stop is None or is_change or (isinstance(stop, str) and stop in STOPS)):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import operator
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -21,6 +24,8 @@ UNMASK = {
     "read_noise": "fill {them} and add {their} mask to `mask`",
     "exposure": "fill {them} and add {their} mask to `mask`",
 }
+# A Gaussian is one standard deviation below its median in this share of all.
+DARKER = 0.1587
 
 
 def values_and_mask(name: str, values: ArrayLike) -> tuple[NDArray, NDArray[np.bool_]]:
@@ -132,3 +137,24 @@ def flag(name: str, value: object) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise InputError(f"`{name}` must be True or False; {value!r} was given")
     return bool(value)
+
+
+def whole(name: str, value: Any, least: int, more: str = "") -> int:
+    """Return a whole number; refuse one below the least, and anything else.
+
+    `more` is what the message says of it besides.
+    """
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < least:
+        raise InputError(
+            f"`{name}` must be a whole number, {least} or more{more}; {value} was given"
+        )
+    return number
+
+
+def darker_noise(values: Array) -> float:
+    """Return the standard deviation of values by their darker half: the brighter may have light."""
+    return float(np.median(values) - np.quantile(values, DARKER))

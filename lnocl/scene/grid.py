@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from lnocl.errors import InputError, note
+from lnocl.scene.arrays import whole
 from lnocl.scene.line_weights import TAPS
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import choose_pad
@@ -46,13 +47,12 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
         reason = "light runs" if pad else "no light runs"
         note("`pad` chosen: %d pixels, as %s over the edge of the images", pad, reason)
     shape = extent(observation) if observation.is_turned else observation.shape
-    if not (isinstance(pad, (int, np.integer)) and pad >= 0):
-        raise InputError(f"`pad` must be a whole number, 0 or more, or auto; {pad} was given")
+    pad = whole("pad", pad, 0, ", or auto")
     # Light that is farther from its source than the images are wide reaches none of them.
     most = MAX_AXIS // observation.oversample
     sizes = (-(-k // observation.oversample) for k in psf_shape(observation))
     reach = (min(k, 2 * n, most) for n, k in zip(shape, sizes, strict=True))
-    ny, nx = (max(n + 2 * int(pad), k) for n, k in zip(shape, reach, strict=True))
+    ny, nx = (max(n + 2 * pad, k) for n, k in zip(shape, reach, strict=True))
     if max(ny, nx) > most:
         also = f" and oversample={observation.oversample}" if observation.oversample > 1 else ""
         raise InputError(

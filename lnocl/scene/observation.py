@@ -93,18 +93,20 @@ class Observation:
         The epoch of each image, such as its night: numbers or text. Stars have a flux in each
         epoch, the rest of the sky is common. By default all images are of one epoch.
     oversample : {1, 2, 4}, optional
-        Pixels of the sky, and of the PSFs, to one of the images along each axis. The model of a
-        pixel is the sum over its pixels of the sky. It is meant for detectors with fewer than two
-        pixels to the PSF's width. Positions and offsets stay in pixels of the images.
+        Pixels of the sky, and of the PSFs, to one of the images along each axis, for detectors with
+        fewer than two pixels to the PSF's width. Offsets of fractions of a pixel then add
+        resolution.
+
+        The model of a pixel is the sum over its pixels of the sky. Positions and offsets stay in
+        pixels of the images.
     effective_psfs : bool, optional
-        Whether the PSFs are effective PSFs. Each sample then holds the light that a pixel of the
-        images collects, as those of photutils and STDPSF files do. Otherwise it holds the light
-        that a pixel of the sky collects, as STPSF's OVERSAMP and OVERDIST do. Without oversampling
-        both are the same.
+        Whether each sample of the PSFs holds the light that a pixel of the images collects, as in
+        effective PSFs of photutils and STDPSF files. Otherwise it holds what a pixel of the PSF
+        collects, as in STPSF's OVERSAMP and OVERDIST. Without `oversample` both are the same.
     psf_centre : {"check", "fit", "given"}, optional
-        Treatment of a PSF whose core lies off its centre, and which would move the sky. "check"
-        refuses it where it is off by 0.8 pixels or more, and warns from 0.25 on. "fit" moves it to
-        its centre (`lnocl.scene.shifting.place`). "given" leaves it as it is.
+        Treatment of a PSF whose core lies off its centre, (ky // 2, kx // 2), and which would move
+        the sky: "check" refuses it where it is off by 0.8 pixels or more, and warns from 0.25 on;
+        "fit" moves it to its centre (`lnocl.scene.shifting.place`); "given" leaves it as it is.
     ideal_psfs : array_like, shape (p, ky, kx) or (ky, kx), optional
         The PSFs without aberrations, limited by diffraction alone, for ``refine_psfs`` "strehl".
         Shape, centre and normalisation are those of `psfs`. By default those of `pupils`.

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.line_weights import TAPS, LineSampling, shifted, undone, whole_and_weights
+from lnocl.scene.shifting import MARGIN
 from lnocl.scene.transforms import rotation
 
 if TYPE_CHECKING:
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 # Rows whose phases are products of two that are tabled: that of the first row of so many, and that
 # of a row among them.
 PHASE_ROWS = 16
-# Pixels round a PSF that is turned, in which its ringing dies out, and the step of its side.
-MARGIN, STEP = 16, 32
+# The step of the side of a PSF that is turned, pixels.
+STEP = 32
 
 
 class Rotation:

@@ -9,6 +9,7 @@ from astropy import constants
 from astropy import units as u
 
 from lnocl.errors import InputError
+from lnocl.scene.arrays import whole
 from lnocl.simulation.checks import check_share, number, numbers, positive
 
 MAG_PER_ARCSEC2 = u.mag / u.arcsec**2
@@ -107,8 +108,7 @@ class Experiment:
         object.__setattr__(self, "angles", angles * u.deg)
         check_share("throughput", self.throughput)
         check_share("strehl", self.strehl)
-        if not (isinstance(self.seed, (int, np.integer)) and self.seed >= 0):
-            raise InputError(f"`seed` must be a whole number, 0 or more; {self.seed} was given")
+        whole("seed", self.seed, 0)
 
     def source_electrons(self, magnitude: u.Quantity) -> float:
         r"""Return the electrons that one image holds of a source.

@@ -20,13 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, darker_noise
 
 if TYPE_CHECKING:
     from lnocl.solvers.score import Score
 
-# A Gaussian is one standard deviation below its median in this share of all.
-DARKER = 0.1587
 # A field scatters more than counts where it does by so many of its errors.
 CLEARLY = 4.0
 # Rings are looked at where PSFs that are wrong by so much would add this share of the noise.
@@ -95,7 +93,7 @@ def _shared(values: Array, independent: float) -> float:
     """Return how much more than counts a whole field scatters, by its darker half."""
     if not values.size:
         return 1.0
-    found = float(np.median(values) - np.quantile(values, DARKER))
+    found = darker_noise(values)
     return found if found > 1.0 + CLEARLY / math.sqrt(independent * values.size) else 1.0
 
 

@@ -22,7 +22,7 @@ from lnocl.plotting.curves import draw_costs
 from lnocl.plotting.figure import check_matplotlib, save_figure
 from lnocl.result import Estimate, Result
 from lnocl.runs.options import PAPER
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, whole
 from lnocl.scene.observation import Observation
 from lnocl.simulation import hh34, simulate
 
@@ -90,8 +90,7 @@ def check(n_iter: int, accuracy: float, stem: str | None, overwrite: bool) -> No
     FileError
         A file exists and must not be overwritten, or cannot be written.
     """
-    if n_iter < PARTS[0]:
-        raise InputError(f"`n_iter` must be a whole number, {PARTS[0]} or more; {n_iter} was given")
+    whole("n_iter", n_iter, PARTS[0])
     if not (math.isfinite(accuracy) and accuracy > 0):
         raise InputError(f"`accuracy` must be positive and finite; {accuracy} was given")
     if stem is not None:

@@ -25,10 +25,8 @@ from lnocl.scene.scene import MIN_MODEL
 THREE_IMAGES = "three images, two stars, mask, background map, map of smoothing"
 TWICE_AS_FINE = "sky twice as fine, three images, two stars, mask, background map"
 TURNED = "three images turned, two stars, mask, background map"
-FOUR_TIMES_AS_FINE = "sky four times as fine, exposure map, mu"
 SCENES: dict[str, dict[str, Any]] = {
     "plain": {"n_images": 1},
-    "two images, star, mu": {"n_images": 2, "n_stars": 1, "has_mu": True},
     THREE_IMAGES: {
         "n_images": 3,
         "n_stars": 2,
@@ -36,12 +34,6 @@ SCENES: dict[str, dict[str, Any]] = {
         "has_background_map": True,
         "has_smoothing": True,
         "has_smoothing_map": True,
-    },
-    "mask, mu, smoothing": {
-        "n_images": 1,
-        "has_weights": True,
-        "has_mu": True,
-        "has_smoothing": True,
     },
     "exposure map, mu": {
         "n_images": 2,
@@ -64,15 +56,6 @@ SCENES: dict[str, dict[str, Any]] = {
         "has_weights": True,
         "has_background_map": True,
         "has_turns": True,
-    },
-    FOUR_TIMES_AS_FINE: {
-        "n_images": 2,
-        "n_stars": 1,
-        "has_mu": True,
-        "has_weights": True,
-        "has_exposure_map": True,
-        "has_background_map": True,
-        "oversample": 4,
     },
 }
 

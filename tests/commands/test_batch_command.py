@@ -266,6 +266,15 @@ def test_tables_that_are_no_use_are_refused(text, message, capsys):
     assert not os.path.exists("out")
 
 
+def test_a_table_of_another_format_is_refused(capsys):
+    Path("targets.txt").write_text("images\na.fits\n")
+    assert cli.main(["batch", "targets.txt", "-o", "out"]) == 2
+    assert one_complaint(capsys.readouterr()) == (
+        "the table of targets is ECSV, CSV or FITS; give it a name ending in .ecsv, .csv or .fits, "
+        "not targets.txt"
+    )
+
+
 def test_names_that_leave_the_folder_are_rows_that_fail():
     write_targets("../up,a.fits,k1.fits,,1", ".hidden,a.fits,k1.fits,,1", GOOD[0])
     assert batch("--quiet") == 1

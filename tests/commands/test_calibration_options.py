@@ -16,7 +16,8 @@ from scenes import paper
 from wcs_headers import NORTH_UP
 
 from lnocl.commands import cli
-from lnocl.io.frames import Calibration, read_frames
+from lnocl.io.calibration import Calibration
+from lnocl.io.frames import read_frames
 from lnocl.io.saved_results import read_result
 from lnocl.studies.figures import view_of
 

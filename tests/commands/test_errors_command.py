@@ -246,7 +246,7 @@ def test_replicas_of_another_command_meanwhile_are_kept(monkeypatch, capsys):
 
 
 WRONG_USES = [
-    (["--bootstrap", "9"], 2, "--bootstrap takes a whole number of replicas, 10 or more"),
+    (["--bootstrap", "9"], 2, "--bootstrap must be a whole number, 10 or more"),
     (["--seed", "-3"], 2, "--seed must be a whole number, 0 or more; -3 was given"),
     (["--regions", "nix.reg"], 1, "nix.reg is not there: give a file of regions, such as DS9"),
     (["--regions", "empty.reg"], 1, "empty.reg holds no regions"),

@@ -1,7 +1,11 @@
 """The tables of options: parser, messages, cards and the repeated command follow from them."""
 
+from __future__ import annotations
+
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -9,8 +13,9 @@ from astropy.io import fits
 from commandline import NUMPY, one_complaint, run
 
 from lnocl.commands import cli, deconvolve, messages, psf, record
+from lnocl.commands.declared import parameter
 from lnocl.commands.options import EITHER, option, position
-from lnocl.io.frames import Calibration
+from lnocl.io.calibration import Calibration
 
 pytestmark = pytest.mark.usefixtures("command_folder")
 
@@ -220,3 +225,107 @@ def test_processes_are_refused_where_there_are_no_tiles(capsys):
     assert run("--parallel", "2") == 2
     message = "--parallel does nothing without tiles: give --tile too, or leave it out"
     assert one_complaint(capsys.readouterr()) == message
+
+
+class TestDeclared:
+    """Options from the signature and the docstring of a function."""
+
+    @staticmethod
+    def function(
+        n: int = 3,
+        size: int | Literal["auto"] = "auto",
+        width: float = 0.5,
+        weight: float | Literal["auto"] | None = None,
+        engine: Literal["fast", "exact"] = "fast",
+        centred: bool = False,
+        refine: bool | Literal["auto"] = "auto",
+        path: str | None = None,
+        align: Literal["wcs"] | None = None,
+        levels: Sequence[str | float] = (0.0,),
+        files: Sequence[str] = (),
+    ):
+        """Do it.
+
+        Parameters
+        ----------
+        n : int, optional
+            Largest number of
+            rounds, 1 or more (see `lnocl.scene.penalty.Penalty`).
+
+            What the reference says besides.
+        size : int or "auto", optional
+            FITS pixels. By default "auto", of `engine`, 50 %.
+        width : float, optional
+            Width, or None (:doc:`/theory/model`), as ``nx // 2``.
+        weight : float, "auto" or None
+            OpenCL weight.
+        centred : bool, optional
+            Whether it is.
+        levels : sequence of float or str
+            Electrons.
+        """
+
+    @pytest.mark.parametrize(
+        ("name", "words", "value"),
+        [
+            ("n", ["--n", "4"], 4),
+            ("n", [], 3),
+            ("size", ["--size", "4"], 4),
+            ("size", ["--size", "auto"], "auto"),
+            ("width", ["--width", "4"], 4.0),
+            ("weight", ["--weight", "auto"], "auto"),
+            ("weight", ["--weight", "2"], 2.0),
+            ("weight", [], None),
+            ("engine", ["--engine", "exact"], "exact"),
+            ("centred", ["--centred"], True),
+            ("centred", [], False),
+            ("refine", ["--refine"], True),
+            ("refine", ["--no-refine"], False),
+            ("refine", [], None),
+            ("path", ["--path", "4"], "4"),
+            ("align", ["--align", "wcs"], "wcs"),
+            ("levels", ["--levels", "4", "a", "--levels", "-1"], [4.0, "a", -1.0]),
+            ("levels", [], None),
+            ("files", ["--files", "4"], ["4"]),
+        ],
+    )
+    def test_words_are_converted_to_the_type_of_the_signature(self, name, words, value):
+        made = parameter(self.function, name)
+        parser = argparse.ArgumentParser()
+        parser.add_argument(*made.flags, **made.keywords)
+        found = getattr(parser.parse_args(words), name)
+        assert (found, type(found)) == (value, type(value))
+
+    def test_other_words_than_the_choices_of_the_signature_are_refused(self):
+        assert parameter(self.function, "engine").keywords["choices"] == ("fast", "exact")
+        assert parameter(self.function, "align").keywords["choices"] == ("wcs",)
+
+    @pytest.mark.parametrize(
+        ("name", "text"),
+        [
+            ("n", "largest number of rounds, 1 or more (default: 3)"),
+            ("size", "FITS pixels. By default auto, of `engine`, 50 %%"),
+            ("width", "width, or none, as nx // 2 (default: 0.5)"),
+            ("weight", "OpenCL weight"),
+            ("centred", "it is"),
+            ("path", ""),
+            ("levels", "electrons"),
+        ],
+    )
+    def test_the_help_is_the_first_paragraph_of_the_docstring(self, name, text):
+        assert parameter(self.function, name).keywords["help"] == text
+
+    def test_what_the_shell_gives_takes_the_place_of_what_is_declared(self):
+        made = parameter(self.function, "n", "-n", also="of tiles", dest="rounds", default=None)
+        assert (made.name, made.default) == ("rounds", None)
+        assert made.keywords["help"].endswith("1 or more; of tiles (default: 3)")
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_option_has_a_help_of_ascii_words_that_names_flags(name, capsys):
+    with pytest.raises(SystemExit):
+        cli.main([name, "--help"])
+    shown = capsys.readouterr().out
+    assert shown.isascii()
+    assert "`" not in shown
+    assert all(each.keywords["help"] for g in cli.COMMANDS[name].options.values() for each in g)

@@ -448,7 +448,7 @@ REFUSED = {
     "background inf": ({}, ["--background", "-inf"], 2, "--background is -inf; give one finite"),
     "angle": ({}, ["--rotate", "0", "inf"], 2, "--rotate is inf; give one finite number"),
     "angle of words": ({}, ["--rotate", "x"], 2, "argument --rotate: invalid float value: 'x'"),
-    "size": ({}, ["--size", "2"], 2, "--size must be a whole number of 3 or more; 2 was given"),
+    "size": ({}, ["--size", "2"], 2, "--size must be a whole number, 3 or more; 2 was given"),
     "size large": ({}, ["--size", "60"], 2, "reaches beyond the frame; give a size of 59 or less"),
     "size rotated": ({}, ["--size", "50", "--rotate", "0", "45"], 2, "rotated by 45 degrees"),
     "picture name": ({}, ["--plot", "a.pdf"], 2, "a name ending in .png, not a.pdf"),

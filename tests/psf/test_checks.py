@@ -40,9 +40,9 @@ REFUSED = {
     "position (70, 3) is outside the frame of 70 x 61 pixels; give x and y, 0-based": {
         "position": (70, 3)
     },
-    "size must be a whole number of 3 or more; 2 was given": {"size": 2},
-    "size must be a whole number of 3 or more; 8.0 was given": {"size": 8.0},
-    "size must be a whole number of 3 or more; True was given": {"size": True},
+    "size must be a whole number, 3 or more; 2 was given": {"size": 2},
+    "size must be a whole number, 3 or more; 8.0 was given": {"size": 8.0},
+    "size must be a whole number, 3 or more; True was given": {"size": True},
     "a PSF of 300 x 300 pixels around the star at x = 30, y = 29 reaches beyond the frame; "
     "give a size of 59 or less": {"size": 300},
     "the star at x = 0, y = 29 is at the edge of the frame; give another": {

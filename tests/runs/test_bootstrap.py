@@ -387,7 +387,7 @@ def test_rates_are_called_rates():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"n": 9}, r"^bootstrap takes a whole number of replicas, 10 or more, such as 50; 9 was"),
+        ({"n": 9}, r"^bootstrap must be a whole number, 10 or more, such as 50; 9 was"),
         ({"n": 10.0}, "10.0 was given"),
         ({"n": 10, "seed": -1}, "^seed must be a whole number, 0 or more; -1 was given"),
     ],

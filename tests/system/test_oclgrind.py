@@ -19,8 +19,9 @@ from pathlib import Path
 
 import grind
 import pytest
+from kernel_scenes import SCENES
 
-from lnocl.verify import comparison, harness
+from lnocl.verify import comparison
 
 HERE = Path(__file__).parents[1]
 DEFINITION = re.compile(r"\b(?:KERNEL|(?:__)?kernel)\s+void\s+(\w+)")
@@ -103,13 +104,13 @@ def test_no_kernel_is_at_fault(case, dtype):
     if is_deconvolution:
         expected = kernels() - NOT_IN_A_DECONVOLUTION
     else:
-        expected = set(comparison.kernels_of(harness.SCENES[grind.CASES[case][2]]))
+        expected = set(comparison.kernels_of(SCENES[grind.CASES[case][2]]))
     assert set(json.loads(launched)) == expected
 
 
 def test_no_kernel_is_left_out():
     scenes = {scene for _, _, scene, _ in grind.CASES.values()} - {grind.DECONVOLUTION}
-    tried = {name for scene in scenes for name in comparison.kernels_of(harness.SCENES[scene])}
+    tried = {name for scene in scenes for name in comparison.kernels_of(SCENES[scene])}
     assert tried == kernels()
 
 

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from kernel_scenes import SCENES
 
 from lnocl import __version__
 from lnocl.commands import cli
@@ -142,7 +143,7 @@ def test_a_good_device_is_right(capsys):
 
 def test_the_cases_have_every_option():
     told = {option for _, scene in selftest.CASES for option in harness.SCENES[scene]}
-    assert told == {option for scene in harness.SCENES.values() for option in scene}
+    assert told == {option for scene in SCENES.values() for option in scene}
     assert {harness.SCENES[scene].get("has_weights", False) for _, scene in selftest.CASES} == {
         True,
         False,

@@ -1,0 +1,103 @@
+"""The calibration of images in files, which options of the shell declare too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+from lnocl.scene.observation import PsfCentre
+
+Word = str | float
+
+
+class Calibration(NamedTuple):
+    """The calibration of images in files; a `Word` is a number, a file, or as listed.
+
+    Attributes
+    ----------
+    background : sequence of Word
+        Electrons per pixel, a FITS file with a map of them, or "auto", measured and then fitted
+        with the rest; below 0 where too much sky was subtracted; one for all images or one for each
+        (default: 0).
+
+        What is measured is the mode of the image (`lnocl.io.levels`).
+    read_noise : sequence of Word
+        Standard deviation in electrons, a FITS file with a map of it, a keyword of the images'
+        headers such as RDNOISE, or "auto", what the scatter of the sky has beyond the noise of its
+        counts; one for all images or one for each (default: 0; auto where the sky was subtracted).
+
+        A keyword may be in the header of the image or of its file. The scatter is sigma-clipped.
+    noise : sequence of str
+        FITS file with the noise of each pixel in units of the images, 0 where a pixel is bad: of
+        sky and read noise 1 / variance (ivar=FILE), variance (var=FILE) or standard deviation
+        (rms=FILE); or the standard deviation of all noise, that of the source's counts too
+        (err=FILE; err alone is the extension ERR of each image); one for all images or one for
+        each.
+    exposure : sequence of Word
+        Seconds, a FITS file with a map of them, or a keyword of the images' headers such as
+        EXPTIME; one for all images or one for each. Rates are multiplied by it; the result of
+        counts is then per second.
+    mask : sequence of str
+        FITS file that is not 0 where a pixel is bad; or dq, the extension DQ of each image, or wht,
+        where its extension WHT is 0; one for all images or one for each. dq:BITS names the flags
+        that are no fault, as in dq:16,64, or dq:~1 for all but 1; dq:0 for none (default: of JWST
+        ~1,512, of HST those of pixels that were corrected, else 0).
+
+        Flags are as for `flags.bad_pixels`.
+    saturation : float, optional
+        Pixels of this value and above are bad, in the unit of the images.
+    gain : float or str, optional
+        Electrons for each adu, or for each of whatever unit the images have; or a keyword of the
+        images' headers such as GAIN; or their extension with the variance of counts, as VAR_POISSON
+        of JWST (default: 1 for counts; for other units what their VAR_POISSON, `noise` err or ERR
+        shows).
+
+        Counts per time stay counts per time.
+    align : {"wcs"}, optional
+        Take offsets, rotations, flips and scales of the images from their sky coordinates (default:
+        they have none); the sky has the pixels of the first image, or of one whose pixels are
+        smaller, and images may have several shapes.
+
+        So may their PSFs.
+    angle : sequence of float or str
+        Parallactic angles of images of an altazimuth telescope without derotator, degrees: a
+        keyword of their headers such as PARANG, a file (FITS, or text with a number a line), or one
+        number for each image. The extended source has north up.
+    centre : tuple of float, optional
+        With `angle`: where the field turns about, pixels (default: the middle, nx // 2, ny // 2).
+    epoch : sequence of float or str
+        Epochs of the images, in each of which a star has a flux of its own, as a quasar that
+        varies: each, for one an image; a keyword of their headers such as DATE-OBS; or a label for
+        each image (default: one epoch).
+    oversample, effective_psfs, psf_centre
+        As for `Observation`.
+    psf_errors : sequence of str
+        FITS files of the shape of the PSFs that tell how these may be wrong: ideal=FILE, a PSF
+        without aberrations; pupil=FILE, the transmission of a pupil in the frequencies of the PSFs,
+        its middle at (ky // 2, kx // 2); scatter=FILE, the standard deviation of the pixels of a
+        PSF of unit sum, which the smoothing near stars follows; of these one for all images or one
+        for each; modes=FILE, a cube of the ways in which all PSFs may differ, one standard
+        deviation each. Each may be an extension of its name beside a PSF, as ``lnocl psf`` writes
+        SCATTER and MODES.
+    halos : sequence of str
+        Light of known shape and unknown amount, such as the speckles round a star, of which the
+        amount is fitted in each image: a FITS file with its image, or a cube of one for each; or
+        flat, a level of the background; may be repeated.
+    """
+
+    background: Sequence[Word] = (0.0,)
+    read_noise: Sequence[Word] = (0.0,)
+    noise: Sequence[str] = ()
+    exposure: Sequence[Word] = ()
+    mask: Sequence[str] = ()
+    saturation: float | None = None
+    gain: Word | None = None
+    align: Literal["wcs"] | None = None
+    angle: Sequence[Word] = ()
+    centre: tuple[float, float] | None = None
+    epoch: Sequence[Word] = ()
+    oversample: int = 1
+    effective_psfs: bool = False
+    psf_centre: PsfCentre = "check"
+    psf_errors: Sequence[str] = ()
+    halos: Sequence[str] = ()
