@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from lnocl.commands.again import Again
     from lnocl.io.fitserrors import Held
     from lnocl.io.frames import Frames
-    from lnocl.result import Result
     from lnocl.runs.bootstrap import Bootstrap, Part
+    from lnocl.runs.outcome import Outcome
 
 
 # Seconds between two writings of the replicas so far.
@@ -35,7 +35,7 @@ _OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)")
 
 def add_errors(
     arguments: argparse.Namespace,
-    result: Result,
+    outcome: Outcome,
     again: Again,
     parts: Sequence[Part],
 ) -> list[str]:
@@ -45,8 +45,8 @@ def add_errors(
     ----------
     arguments : Namespace
         Those of ``lnocl errors``.
-    result : Result
-        What the file holds.
+    outcome : Outcome
+        What the run has found.
     again : Again
         The file, and what its result was made of.
     parts : list of Aperture or Profile
@@ -55,7 +55,7 @@ def add_errors(
     from lnocl.io.fitserrors import read_replicas
     from lnocl.runs.bootstrap import bootstrap, without_replicas
 
-    outcome, seed, frames = result._outcome, arguments.seed, again.frames
+    seed, frames = arguments.seed, again.frames
     latest: list[Bootstrap] = []
     written = time.monotonic()
 

@@ -75,9 +75,9 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Again]:
-    """Return the significance of sources in a result, whose run is made again, and that run."""
+    """Return the significance of sources in a result, and what its run was made of."""
     from lnocl.io import atomic, tables
-    from lnocl.significance import check_alarms, check_width
+    from lnocl.significance import check_alarms, check_width, significance
 
     check_width(arguments.width)
     check_alarms(arguments.false_alarms)
@@ -90,7 +90,7 @@ def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Aga
 
     check()  # before the result is read; then that nothing that it was made of is replaced
     again = Again.read(arguments.result, arguments.quiet, check)
-    return again.solve().significance(arguments.width, arguments.false_alarms), again
+    return significance(again.outcome(), arguments.width, arguments.false_alarms), again
 
 
 def in_unit(table: QTable, frames: Frames) -> QTable:

@@ -73,9 +73,9 @@ def _run(arguments: argparse.Namespace) -> None:
         parts = _parts(arguments, again.frames)
         if not arguments.overwrite:
             bootstrap.check_earlier(arguments.result, arguments.seed, parts)
-    found = again.solve()
+    outcome = again.outcome()
     with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
-        lines = bootstrap.add_errors(arguments, found, again, parts)
+        lines = bootstrap.add_errors(arguments, outcome, again, parts)
     if not arguments.quiet:
         messages.say([*lines, f"added to {arguments.result}"])
 

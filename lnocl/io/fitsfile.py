@@ -129,6 +129,23 @@ class FitsFile:
                 )
         return columns
 
+    def row(self, hdu: Any) -> dict[str, NDArray[Any]]:
+        """Return the first row of a table: arrays, and numbers and texts of no dimension.
+
+        Warns
+        -----
+        UserWarning
+            Data that do not match their DATASUM.
+        """
+        self._verify(hdu)
+        values = {name: np.asarray(hdu.data[name][0]) for name in hdu.columns.names}
+        for name, value in values.items():
+            if value.dtype.kind == "U":
+                values[name] = np.asarray(unescaped(value.item()))
+            else:
+                values[name] = value.astype(value.dtype.newbyteorder("="))
+        return values
+
     def _verify(self, hdu: Any) -> None:
         where = place_of(hdu)
         if where["datLoc"] + where["datSpan"] > self._length:
@@ -147,6 +164,11 @@ class FitsFile:
         """Return the checksum of the file, in hexadecimal; call it last."""
         self._stream.seek(0)
         return hashlib.file_digest(self._stream, "sha256").hexdigest()
+
+
+def unescaped(text: str) -> str:
+    """Return the text that `fitswrite.ascii_of` has escaped."""
+    return text.encode("ascii").decode("unicode_escape")
 
 
 def check_header(path: str, content: IO[bytes], length: int, start: int) -> None:

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from astropy.io import fits
@@ -19,6 +19,9 @@ from lnocl.io.headers import finer_cards
 
 # A HISTORY card holds 72 characters; the last one may be needed for a backslash and a space.
 HISTORY_WIDTH = 70
+
+# The codes of FITS for the types of numbers.
+CODES = {"b1": "L", "u1": "B", "i4": "J", "i8": "K", "f4": "E", "f8": "D"}
 
 Card = tuple[str, str | int | float, str]
 
@@ -55,6 +58,7 @@ def write_result(
     doubtful: ArrayLike | None = None,
     messages: Sequence[str] = (),
     halos: NDArray[np.void] | None = None,
+    estimate: Mapping[str, NDArray[Any]] = MappingProxyType({}),
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
@@ -112,6 +116,8 @@ def write_result(
         The messages of the run, a line each: the table ``MESSAGES``.
     halos : ndarray with fields ``halo``, ``image``, ``flux`` and ``flux_error``, optional
         The amounts of halos, electrons of their image.
+    estimate : mapping of str to ndarray, optional
+        What the run has found, from which all goes on: the columns of the one row of ``ESTIMATE``.
 
     Raises
     ------
@@ -143,6 +149,7 @@ def write_result(
             *([] if psf_errors is None else [_table("PSFERRORS", psf_errors)]),
             *([] if doubtful is None else [_flags("DOUBTFUL", doubtful, of_sky)]),
             *([_lines("MESSAGES", "message", messages)] if messages else []),
+            *([_row("ESTIMATE", estimate)] if estimate else []),
         ]
     )
     with whole_file(path, overwrite) as stream:
@@ -313,6 +320,20 @@ def _table(name: str, rows: NDArray[np.void]) -> fits.BinTableHDU:
 def _lines(name: str, column: str, lines: Sequence[str]) -> fits.BinTableHDU:
     texts = np.array([ascii_of(line) for line in lines])
     columns = [fits.Column(column, f"{texts.dtype.itemsize // 4}A", array=texts)]
+    return fits.BinTableHDU.from_columns(columns, name=name)
+
+
+def _row(name: str, values: Mapping[str, NDArray[Any]]) -> fits.BinTableHDU:
+    """Return a table of one row, whose columns have arrays of any shape, numbers and texts."""
+    columns = []
+    for column, value in values.items():
+        if value.dtype.kind == "U":
+            text = ascii_of(value.item())
+            columns.append(fits.Column(column, f"{max(len(text), 1)}A", array=[text]))
+            continue
+        shape = f"({','.join(map(str, value.shape[::-1]))})" if value.ndim else None
+        kind = f"{value.size}{CODES[value.dtype.str[1:]]}"
+        columns.append(fits.Column(column, kind, dim=shape, array=value[None]))
     return fits.BinTableHDU.from_columns(columns, name=name)
 
 

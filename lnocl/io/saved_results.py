@@ -13,7 +13,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError
-from lnocl.io.fitsfile import FitsFile, open_fits
+from lnocl.io.fitsfile import FitsFile, open_fits, unescaped
 from lnocl.io.headers import number, readable
 from lnocl.io.selection import has_pixels
 from lnocl.scene.detector import on_sky
@@ -187,6 +187,21 @@ def read_result(path: str) -> SavedResult:
     )
 
 
+def read_estimate(path: str) -> dict[str, NDArray[Any]]:
+    """Return what the run of a result has found, as `fitswrite.write_result` takes it, if any.
+
+    Raises
+    ------
+    FileError
+        The file is missing or damaged.
+    """
+    with open_fits(path) as file:
+        for hdu in file.hdus():
+            if hdu.name == "ESTIMATE" and isinstance(hdu, fits.BinTableHDU):
+                return file.row(hdu)
+    return {}
+
+
 def _unquoted(quoted: re.Match[str]) -> str:
     raw = quoted[1].encode("ascii").decode("unicode_escape").encode("latin-1")
     return shlex.quote(os.fsdecode(raw))
@@ -196,7 +211,7 @@ def _texts(file: FitsFile, table: Any) -> list[str]:
     """Return the lines of the table of messages."""
     if "message" not in table.columns.names or table.columns["message"].format[-1:] != "A":
         raise FileError(f"{file.path} has no column message of text in {table.name}")
-    return [str(line).encode("ascii").decode("unicode_escape") for line in table.data["message"]]
+    return [unescaped(str(line)) for line in table.data["message"]]
 
 
 def _fault(

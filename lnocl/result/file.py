@@ -12,11 +12,14 @@ import numpy as np
 from lnocl.io import sky
 from lnocl.io.fitsread import wcs_cards
 from lnocl.io.fitswrite import Card, StarColumn, column_unit, write_result
+from lnocl.result.kept import Parts, to_parts
+from lnocl.runs.outcome import Outcome
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
     from lnocl.result import Result
+    from lnocl.scene.observation import Observation
 
 
 def write_file(
@@ -30,6 +33,7 @@ def write_file(
     has_cubes: bool = True,
     commands: Iterable[Sequence[str]] = (),
     messages: Sequence[str] = (),
+    given: Observation | None = None,
 ) -> None:
     """Write a result: the file is there complete, or not at all.
 
@@ -51,6 +55,9 @@ def write_file(
         Whether the models and the residuals of the images are added.
     commands, messages
         As for `lnocl.io.fitswrite.write_result`.
+    given : Observation, optional
+        What the result is of, where the commands lead to it: what the run has found is added then,
+        so that errors and detections begin there.
 
     Raises
     ------
@@ -100,7 +107,14 @@ def write_file(
         doubtful=None if refinement is None else result.doubtful,
         messages=messages,
         halos=result._halo_table() if result.halo_fluxes.size else None,
+        estimate=_estimate(result, given),
     )
+
+
+def _estimate(result: Result, given: Observation | None) -> Parts:
+    """Return what the run has found; nothing of tiles, nor where nothing leads to the images."""
+    outcome = result._findings
+    return {} if given is None or not isinstance(outcome, Outcome) else to_parts(outcome, given)
 
 
 def _star_columns(

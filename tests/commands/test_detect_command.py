@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.table import Table
 from commandline import gaussian, one_complaint
 
-from lnocl.commands import cli
+from lnocl.commands import cli, deconvolve
 from lnocl.io.fitsfindings import read_findings
 
 N = 64
@@ -59,6 +59,22 @@ def test_detections_are_said_written_and_added(output, capsys):
         assert [hdu.name for hdu in hdus][-2:] == ["DETECTIONS", "SIGNAL"]
         assert hdus["SIGNAL"].header["CRVAL1"] == 15.25
         assert hdus["DETECTIONS"].header["FALSALRM"] == 0.01
+
+
+def test_detections_and_limits_begin_at_once(monkeypatch, capsys):
+    """They are those of a file of before, which has to make its run again."""
+    commands = ["detect", "out.fits"], ["limit", "out.fits", "--injections", "4"]
+    found = []
+    for solve in (None, deconvolve.solve):
+        monkeypatch.setattr(deconvolve, "solve", solve)
+        for command in commands:
+            assert cli.main(command) == 0
+        found.append({name: fits.getdata("out.fits", name) for name in ("SIGNAL", "LIMITS", *MAPS)})
+        found[-1]["said"] = capsys.readouterr().out
+        with fits.open("out.fits", mode="update") as hdus:
+            for name in {"ESTIMATE", "SIGNAL", "LIMITS"} & {hdu.name for hdu in hdus}:
+                del hdus[name]
+    np.testing.assert_equal(found[1], found[0])
 
 
 def test_detections_replace_those_that_are_there(capsys):
