@@ -91,9 +91,11 @@ class Again:
         InputError
             It is not that of the file; or the run was interrupted, and has to be made again.
         """
-        from lnocl.io.saved_results import read_estimate
+        from lnocl.io.parts import read_parts
 
-        path, parts = self.saved.path, read_estimate(self.saved.path)
+        path = self.saved.path
+        held = read_parts(path, ["ESTIMATE"]).values()
+        parts = {name: np.asarray(row) for each in held for name, (row,) in each.values.items()}
         found = from_parts(parts, self.frames.observation)
         if found is None:
             if self.saved.header.get("STOPPED") == "interrupt":

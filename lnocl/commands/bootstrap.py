@@ -99,13 +99,12 @@ def check_earlier(path: str, seed: int, parts: Sequence[Part]) -> None:
         The file has such replicas.
     """
     from lnocl.io.fitserrors import read_replicas
-    from lnocl.io.fitswrite import ascii_of
 
     held = read_replicas(path)
     if held is None:
         return
     names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
-    given = {ascii_of(each.name).strip() for each in parts}
+    given = {each.name.strip() for each in parts}
     if held.seed != seed or not all(any(name.startswith(g) for g in given) for name in names):
         raise _of_others(path, held.seed, list(names))
 
@@ -121,13 +120,12 @@ def _of_others(path: str, seed: int, names: Sequence[str]) -> InputError:
 def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None:
     """Return the replicas that a file has; refuse those of something else."""
     from lnocl.io.fitserrors import read_replicas
-    from lnocl.io.fitswrite import ascii_of
 
     held = read_replicas(path)
     if held is None:
         return None
     is_same = (
-        held.names == [ascii_of(each.name).strip() for each in expected.quantities]
+        held.names == [each.name.strip() for each in expected.quantities]
         and np.array_equal(held.values, expected.values / expected.units(frames.electrons))
         and held.sums.shape == expected.sums.shape
         and held.seed == expected.seed
@@ -139,24 +137,27 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
 
 
 def _write(again: Again, found: Bootstrap, parts: Sequence[Part], before: Held | None) -> None:
-    from lnocl.io.fitserrors import write_errors
+    from lnocl.io.fitserrors import Held, write_errors
 
     frames = again.frames
     quantities = found.to_table(frames.electrons, frames.unit)
+    quantities["name"] = [name.strip() for name in quantities["name"]]
+    names, values = quantities["name"].tolist(), np.array(quantities["value"], np.float64)
+    measured = quantities[[each.at is None for each in found.quantities]]
     write_errors(
         again.saved,
         quantities,
-        _table_of(_regions(parts), quantities[[each.at is None for each in found.quantities]]),
-        (
-            found.error_map / frames.electrons,
-            found.bias_map / frames.electrons,
-            found.share_map,
-        ),
-        found.errors,
-        found.of_psfs,
-        found.sums,
-        found.seed,
-        found.resolution,
+        Held(names, values, found.errors, found.of_psfs, found.sums, found.seed),
+        {
+            "REGIONS": _table_of(_regions(parts), measured),
+            "ERROR": found.error_map / frames.electrons,
+            "BIAS": found.bias_map / frames.electrons,
+            "SHARE": found.share_map,
+        },
+        [
+            ("NREPL", found.n, "replicas"),
+            ("RESOLUT", found.resolution, "FWHM that maps are smoothed to, pixels"),
+        ],
         frames.unit,
         before,
     )

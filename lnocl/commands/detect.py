@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from lnocl.io.frames import Frames
-    from lnocl.io.saved_results import SavedResult
     from lnocl.significance import Significance
 
 # Detections that are printed.
@@ -62,9 +61,12 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    from lnocl.io.fitsadd import add_parts
+
     found, again = find(arguments, "detections")
-    table = in_unit(found.detections, again.frames)
-    _write(again.saved, found, table)
+    table, unit = in_unit(found.detections, again.frames), again.frames.unit
+    parts = {"DETECTIONS": table, "SIGNAL": found.signal_to_noise}
+    add_parts(again.saved, parts, cards(found, unit), unit)
     lines = [*_told(found, table), *output(arguments, table, "detections")]
     if arguments.plot is not None:
         from lnocl.plotting.significance import draw_significance
@@ -109,20 +111,13 @@ def in_unit(table: QTable, frames: Frames) -> QTable:
     return table
 
 
-def _write(saved: SavedResult, found: Significance, table: QTable) -> None:
-    """Add the detections to the file of the result."""
-    from lnocl.io.fitsfindings import DETECTIONS, SIGNAL, write_findings
-
-    maps = {SIGNAL: (found.signal_to_noise, "")}
-    write_findings(saved, DETECTIONS, table, maps, cards(found))
-
-
-def cards(found: Significance) -> list[tuple[str, Any, str]]:
-    """Return the header cards that say what was looked for."""
+def cards(found: Significance, unit: str) -> list[tuple[str, Any, str]]:
+    """Return the header cards that say what was looked for, and the unit of fluxes."""
     return [
         ("SRCWIDTH", found.width, "FWHM of the sources, pixels; 0: points"),
         ("FALSALRM", found.false_alarms, "false alarms expected in the field"),
         ("THRESHOL", found.threshold, "signal-to-noise of detections"),
+        ("FLUXUNIT", unit, "unit of fluxes"),
     ]
 
 

@@ -61,7 +61,7 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.io.fitsfindings import LIMIT, LIMITS, write_findings
+    from lnocl.io.fitsadd import add_parts
     from lnocl.significance import check_injections
 
     check_injections(arguments.injections or 1, arguments.seed)
@@ -70,11 +70,11 @@ def _run(arguments: argparse.Namespace) -> None:
     curves = found.contrast_curves(COMPLETENESS)
     table = detect.in_unit(curves, frames)
     maps = {
-        f"{LIMIT}{100 * share:g}": (found.limit(share) / frames.electrons, frames.unit)
-        for share in COMPLETENESS
+        f"LIMIT{100 * share:g}": found.limit(share) / frames.electrons for share in COMPLETENESS
     }
-    write_findings(again.saved, LIMITS, table, maps, detect.cards(found))
-    lines = _told(found, table, maps[f"{LIMIT}50"][0], frames.unit)
+    cards = detect.cards(found, frames.unit)
+    add_parts(again.saved, {"LIMITS": table, **maps}, cards, frames.unit)
+    lines = _told(found, table, maps["LIMIT50"], frames.unit)
     with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
         lines += _checked(found, arguments)
     lines += detect.output(arguments, table, "limits")

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 import lnocl
 from lnocl.io.fitswrite import write_result
-from lnocl.io.saved_results import read_estimate
+from lnocl.io.parts import Column, read_parts
 from lnocl.result.kept import from_parts, to_parts
 from lnocl.runs.replicas import Replicas
 from lnocl.significance import significance
@@ -69,8 +69,11 @@ def case(request, tmp_path_factory):
     observation, stars, options = request.param()
     outcome = lnocl.deconvolve(observation, stars, **{**RUN, **options})._outcome
     parts = to_parts(outcome, observation)
-    write_result(path, np.ones((8, 8)), [], [], estimate=parts)
-    return outcome, request.param()[0], read_estimate(path), parts
+    columns = [Column(name, value[None]) for name, value in parts.items()]
+    write_result(path, np.ones((8, 8)), [], [], {"ESTIMATE": columns})
+    read = read_parts(path, ["ESTIMATE"])["ESTIMATE"].values
+    read = {name: np.asarray(values[0]) for name, values in read.items()}
+    return outcome, request.param()[0], read, parts
 
 
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
