@@ -90,33 +90,6 @@ def add_errors(
     return _summarise(found, parts, frames)
 
 
-def check_earlier(path: str, seed: int, parts: Sequence[Part]) -> None:
-    """Refuse replicas in a file of another seed, or of other regions and profiles.
-
-    Raises
-    ------
-    InputError
-        The file has such replicas.
-    """
-    from lnocl.io.fitserrors import read_replicas
-
-    held = read_replicas(path)
-    if held is None:
-        return
-    names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
-    given = {each.name.strip() for each in parts}
-    if held.seed != seed or not all(any(name.startswith(g) for g in given) for name in names):
-        raise _of_others(path, held.seed, list(names))
-
-
-def _of_others(path: str, seed: int, names: Sequence[str]) -> InputError:
-    regions = f"the regions {', '.join(names[:3])}" if names else "no regions"
-    return InputError(
-        f"{path} has replicas with `seed` {seed} of {regions}: give the same `regions`, `profiles` "
-        "and `seed`, or take `overwrite` to begin anew"
-    )
-
-
 def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None:
     """Return the replicas that a file has; refuse those of something else."""
     from lnocl.io.fitserrors import read_replicas
@@ -132,7 +105,11 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
     )
     if not is_same:
         names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
-        raise _of_others(path, held.seed, list(names))
+        regions = f"the regions {', '.join([*names][:3])}" if names else "no regions"
+        raise InputError(
+            f"{path} has replicas with `seed` {held.seed} of {regions}: give the same `regions`, "
+            "`profiles` and `seed`, or take `overwrite` to begin anew"
+        )
     return dataclasses.replace(expected, errors=held.errors, of_psfs=held.of_psfs, sums=held.sums)
 
 

@@ -677,11 +677,12 @@ class Result:
         """Write a FITS file, which ``lnocl plot`` and ``lnocl report`` read.
 
         It is the file of ``lnocl deconvolve --residuals``, without the options, the command and
-        the messages of the run. The primary HDU holds the extended source. The tables STARS,
-        HALOS, HISTORY and HELDOUT hold the stars, the amounts of halos, the objectives, and the
-        errors that held-out counts estimate. The cubes MODELS and RESIDUALS hold those of each
-        image. PSFS and others are added where PSFs were refined. Units are electrons, per second
-        where exposures were given.
+        the messages of the run, and without ESTIMATE, which needs a command that leads to the
+        images. The primary HDU holds the extended source. The tables STARS, HALOS, HISTORY and
+        HELDOUT hold the stars, the amounts of halos, the objectives, and the errors that held-out
+        counts estimate. The cubes MODELS and RESIDUALS hold those of each image. PSFS and others
+        are added where PSFs were refined. Units are electrons, per second where exposures were
+        given.
 
         Parameters
         ----------

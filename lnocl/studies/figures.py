@@ -133,28 +133,21 @@ def report(path: str) -> str:
 
 def _found(path: str, saved: SavedResult) -> SignificanceView | None:
     """Return the detections and limits of a saved result; None where it has none."""
-    found = read_parts(path, ("DETECTIONS", "LIMITS", "SIGNAL", "LIMIT50"))
-    tables = {
-        name: {column: values.tolist() for column, values in found[name].values.items()}
-        for name in ("DETECTIONS", "LIMITS")
-        if name in found
-    }
-    if not tables:
+    parts = read_parts(path, ("DETECTIONS", "LIMITS", "SIGNAL", "LIMIT50"))
+    found = {name: part.values for name, part in parts.items()}
+    table = parts.get("LIMITS", parts.get("DETECTIONS"))
+    if table is None:
         return None
-    cards = found[max(tables)].header
-    signal, limit = (
-        found[name].values if name in found else None for name in ("SIGNAL", "LIMIT50")
-    )
     return SignificanceView(
         list(dict.fromkeys(saved.stars)),  # of a star in several epochs one
         saved.oversample,
-        number(path, cards, "THRESHOL") or np.nan,
-        number(path, cards, "SRCWIDTH") or 0.0,
-        str(cards.get("FLUXUNIT", "")),
-        signal,
-        tables.get("DETECTIONS"),
-        limit,
-        tables.get("LIMITS"),
+        number(path, table.header, "THRESHOL") or np.nan,
+        number(path, table.header, "SRCWIDTH") or 0.0,
+        str(table.header.get("FLUXUNIT", "")),
+        found.get("SIGNAL"),
+        found.get("DETECTIONS"),
+        found.get("LIMIT50"),
+        found.get("LIMITS"),
     )
 
 
