@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 # Stars that a notebook lists.
 MAX_LISTED = 10
 
-HALOS_DTYPE = np.dtype(
-    [("halo", np.int64), ("image", np.int64), ("flux", np.float64), ("flux_error", np.float64)]
-)
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
 
@@ -745,13 +742,6 @@ class Result:
     @property
     def _unit(self) -> str:
         return "electron" if (self._observation.exposure == 1.0).all() else "electron/s"
-
-    def _halo_table(self) -> NDArray[np.void]:
-        """Return the amounts of halos, a row for each halo and image, both counted from 1."""
-        rows = np.zeros(self.halo_fluxes.size, HALOS_DTYPE)
-        rows["halo"], rows["image"] = np.indices(self.halo_fluxes.shape).reshape(2, -1) + 1
-        rows["flux"], rows["flux_error"] = self.halo_fluxes.ravel(), self.halo_flux_errors.ravel()
-        return rows
 
     def _halo_lines(self) -> list[str]:
         """Return the amounts of each halo in words, electrons."""

@@ -12,9 +12,9 @@ import numpy as np
 from lnocl.io import sky
 from lnocl.io.fitsread import wcs_cards
 from lnocl.io.fitswrite import Card, column_unit, write_result
-from lnocl.io.parts import Column
+from lnocl.io.parts import PARTS, Column
 from lnocl.result.kept import to_parts
-from lnocl.runs.outcome import Outcome
+from lnocl.runs.outcome import Outcome, PsfRefinement
 
 if TYPE_CHECKING:
     from astropy.io import fits
@@ -82,10 +82,10 @@ def write_file(
         ("ONEUNIT", f"{float(electrons)} {result._unit}", "what one BUNIT is"),
         ("RESIDRMS", result.fit().rms, "rms residual, 1 by noise"),
         ("VERDICT", "; ".join(result.verdict()), ""),
-        *([] if refinement is None else refinement.cards()),
+        *([] if refinement is None else _psf_cards(refinement)),
     ]
     parts: dict[str, Any] = {
-        "HALOS": result._halo_table() if result.halo_fluxes.size else None,
+        "HALOS": _halos(result) if result.halo_fluxes.size else None,
         "HISTORY": result.history,
         "HELDOUT": result.held_out if result.held_out.size else None,
     }
@@ -93,12 +93,7 @@ def write_file(
         models = result.models()
         parts |= {"MODELS": models, "RESIDUALS": result._residuals(models)}
     if refinement is not None:
-        parts |= {
-            "PSFFIT": refinement.table(),
-            "PSFS": result.psfs,
-            "PSFERRORS": refinement.errors_table(),
-            "DOUBTFUL": result.doubtful,
-        }
+        parts |= _psf_parts(result, refinement)
     parts["MESSAGES"] = [Column("message", messages)] if messages else None
     outcome = result._findings
     if given is not None and isinstance(outcome, Outcome):
@@ -120,6 +115,39 @@ def write_file(
         commands=commands,
         overwrite=overwrite,
     )
+
+
+def _psf_cards(refinement: PsfRefinement) -> list[Card]:
+    """Return whether PSFs were refined, their misfits and their error."""
+    before, after = refinement.misfit
+    return [
+        ("PSFUSED", refinement.is_accepted, "whether refined PSFs are used"),
+        ("PSFMIS1", before, "chi squared at stars, PSFs as given"),
+        ("PSFMIS2", after, "chi squared at stars, PSFs used"),
+        ("PSFERR", refinement.psf_error, "relative error that the PSFs used have"),
+    ]
+
+
+def _psf_parts(result: Result, refinement: PsfRefinement) -> dict[str, Any]:
+    """Return the parameters of the PSFs, the PSFs, their error in rings, and what it may fake."""
+    names = [name.replace(" ", "_") for name in refinement.parameters]
+    edges, errors = refinement.edges, refinement.errors_in_rings
+    return {
+        "PSFFIT": [
+            Column("image", np.arange(1, len(refinement.values) + 1)),
+            *map(Column, names, refinement.values.T),
+        ],
+        "PSFS": result.psfs,
+        "PSFERRORS": [*map(Column, ("from", "to", "error"), (edges[:-1], edges[1:], errors))],
+        "DOUBTFUL": result.doubtful,
+    }
+
+
+def _halos(result: Result) -> list[Column]:
+    """Return the amounts of halos, a row for each halo and image, both counted from 1."""
+    numbers = np.indices(result.halo_fluxes.shape) + 1
+    columns = [*numbers, result.halo_fluxes, result.halo_flux_errors]
+    return [*map(Column, PARTS["HALOS"].columns, map(np.ravel, columns))]
 
 
 def _star_columns(
