@@ -97,13 +97,7 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
     held = read_replicas(path)
     if held is None:
         return None
-    is_same = (
-        held.names == [each.name.strip() for each in expected.quantities]
-        and np.array_equal(held.values, expected.values / expected.units(frames.electrons))
-        and held.sums.shape == expected.sums.shape
-        and held.seed == expected.seed
-    )
-    if not is_same:
+    if not _held(expected, frames).is_start_of(held):
         names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
         regions = f"the regions {', '.join([*names][:3])}" if names else "no regions"
         raise InputError(
@@ -113,18 +107,25 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
     return dataclasses.replace(expected, errors=held.errors, of_psfs=held.of_psfs, sums=held.sums)
 
 
+def _held(found: Bootstrap, frames: Frames) -> Held:
+    from lnocl.io.fitserrors import Held
+
+    names = [each.name.strip() for each in found.quantities]
+    values = found.values / found.units(frames.electrons)
+    return Held(names, values, found.errors, found.of_psfs, found.sums, found.seed)
+
+
 def _write(again: Again, found: Bootstrap, parts: Sequence[Part], before: Held | None) -> None:
-    from lnocl.io.fitserrors import Held, write_errors
+    from lnocl.io.fitserrors import write_errors
 
     frames = again.frames
     quantities = found.to_table(frames.electrons, frames.unit)
     quantities["name"] = [name.strip() for name in quantities["name"]]
-    names, values = quantities["name"].tolist(), np.array(quantities["value"], np.float64)
     measured = quantities[[each.at is None for each in found.quantities]]
     write_errors(
         again.saved,
         quantities,
-        Held(names, values, found.errors, found.of_psfs, found.sums, found.seed),
+        _held(found, frames),
         {
             "REGIONS": _table_of(_regions(parts), measured),
             "ERROR": found.error_map / frames.electrons,

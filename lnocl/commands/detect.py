@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,13 +68,7 @@ def _run(arguments: argparse.Namespace) -> None:
     table, unit = in_unit(found.detections, again.frames), again.frames.unit
     parts = {"DETECTIONS": table, "SIGNAL": found.signal_to_noise}
     add_parts(again.saved, parts, cards(found, unit), unit)
-    lines = [*_told(found, table), *output(arguments, table, "detections")]
-    if arguments.plot is not None:
-        from lnocl.plotting.significance import draw_significance
-
-        lines.append(pictures.draw(arguments, draw_significance(found.view())))
-    if not arguments.quiet:
-        messages.say(lines)
+    finish(arguments, found, table, "detections", _told(found, table))
 
 
 def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Again]:
@@ -121,16 +116,31 @@ def cards(found: Significance, unit: str) -> list[tuple[str, Any, str]]:
     ]
 
 
-def output(arguments: argparse.Namespace, table: QTable, content: str) -> list[str]:
-    """Write a table to a file of its own, where one is asked for; return what was written."""
-    lines = [f"added to {arguments.result}"]
+def finish(
+    arguments: argparse.Namespace,
+    found: Significance,
+    table: QTable,
+    content: str,
+    lines: Sequence[str],
+    curves: QTable | None = None,
+) -> None:
+    """Write the table and the picture where they are asked for; say the lines, and what was done.
+
+    The picture is that of limits where their curves are given.
+    """
+    said = [*lines, f"added to {arguments.result}"]
     if arguments.output is not None:
         from lnocl.io.tables import write_table
 
         table.meta["ORIGIN"] = "x and y begin at 0"
         write_table(table, arguments.output, content, arguments.overwrite)
-        lines.append(f"written to {arguments.output}")
-    return lines
+        said.append(f"written to {arguments.output}")
+    if arguments.plot is not None:
+        from lnocl.plotting.significance import draw_significance
+
+        said.append(pictures.draw(arguments, draw_significance(found.view(curves))))
+    if not arguments.quiet:
+        messages.say(said)
 
 
 def _told(found: Significance, table: QTable) -> list[str]:

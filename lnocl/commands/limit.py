@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lnocl.commands import detect, messages, options, pictures
+from lnocl.commands import detect, messages, options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.errors import warn
@@ -77,13 +77,7 @@ def _run(arguments: argparse.Namespace) -> None:
     lines = _told(found, table, maps["LIMIT50"], frames.unit)
     with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
         lines += _checked(found, arguments)
-    lines += detect.output(arguments, table, "limits")
-    if arguments.plot is not None:
-        from lnocl.plotting.significance import draw_significance
-
-        lines.append(pictures.draw(arguments, draw_significance(found.view(curves))))
-    if not arguments.quiet:
-        messages.say(lines)
+    detect.finish(arguments, found, table, "limits", lines, curves)
 
 
 def _told(found: Significance, table: QTable, limit: np.ndarray, unit: str) -> list[str]:

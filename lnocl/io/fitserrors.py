@@ -50,6 +50,7 @@ class Held(NamedTuple):
         """Return whether others are these, or these and more."""
         return (
             (self.names, self.seed) == (other.names, other.seed)
+            and self.sums.shape == other.sums.shape
             and np.array_equal(self.values, other.values, equal_nan=True)
             and np.array_equal(self.errors, other.errors[: len(self.errors)], equal_nan=True)
         )

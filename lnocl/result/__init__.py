@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from lnocl.parallel import Parallel
-    from lnocl.runs.bootstrap import Bootstrap, Part
+    from lnocl.runs.bootstrap import Bootstrap
     from lnocl.significance import Significance
 
 # Stars that a notebook lists.
@@ -575,21 +575,14 @@ class Result:
         >>> errors.n
         12
         """
-        from lnocl.io.fitsread import sky_header
-        from lnocl.io.regions import read_apertures, read_profiles
+        from lnocl.io.regions import read_parts
         from lnocl.parallel import check_parallel
         from lnocl.runs.bootstrap import bootstrap, check_number
 
         check_number(n, seed)
         check_parallel(parallel)
         outcome = self._outcome
-        shape = self._observation.sky_shape
-        if header is not None:
-            header = sky_header(header, self._observation.oversample)
-        parts: list[Part] = []
-        for given, read in ((regions, read_apertures), (profiles, read_profiles)):
-            listed = given if isinstance(given, (str, os.PathLike)) else list(given)
-            parts += read(listed, header, shape) if listed else []
+        parts = read_parts(regions, profiles, header, self._observation)
         return bootstrap(outcome, n, parts, seed, progress, earlier, callback, parallel)
 
     def significance(self, width: float = 0.0, false_alarms: float = 0.01) -> Significance:

@@ -132,10 +132,9 @@ def _digest(parts: Mapping[str, NDArray[Any]], observation: Observation) -> str:
     digest = hashlib.sha256(version("lnocl").encode())
     for values in (parts, vars(observation)):
         for name, value in sorted(values.items()):
-            if isinstance(value, np.ndarray):
-                kind = str(value) if value.dtype.kind == "U" else value.dtype.str
-                digest.update(repr((name, kind, value.shape)).encode())
-                digest.update(b"" if value.dtype.kind == "U" else np.ascontiguousarray(value).data)
+            if isinstance(value, np.ndarray) and value.dtype.kind != "U":
+                digest.update(repr((name, value.dtype.str, value.shape)).encode())
+                digest.update(np.ascontiguousarray(value).data)
             else:
-                digest.update(repr((name, value)).encode())
+                digest.update(repr((name, str(value))).encode())
     return digest.hexdigest()
