@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -111,6 +111,8 @@ class Again:
             with messages.shown_log(self.run.quiet):
                 note("%s: the run is made again", why)
             found = self._solve()
+        # The command names the device that the run has chosen.
+        found = replace(found, setup=replace(found.setup, device=self.run.device))
         self._refuse_another(found)
         return found
 

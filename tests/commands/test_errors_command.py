@@ -13,6 +13,7 @@ from astropy.io import fits
 
 import lnocl
 from lnocl.commands import bootstrap, cli
+from lnocl.commands.again import Again
 from lnocl.plotting.profiles import draw_bands
 
 pytest.importorskip("regions", reason="regions is not installed")
@@ -223,6 +224,13 @@ def test_no_run_is_made_again_where_the_file_has_what_it_found(monkeypatch, caps
         hdus.append(expected["ESTIMATE"])
     assert cli.main([*ERRORS, "10", "--overwrite"]) == 0
     same_errors(held(), expected)
+
+
+def test_replicas_are_made_on_the_device_of_the_run(words, monkeypatch):
+    """It is named in the command, and may have been chosen among several."""
+    monkeypatch.setattr("lnocl.commands.deconvolve._device_spec", lambda arguments: "0:7")
+    assert cli.main(words) == 0
+    assert Again.read("out.fits", quiet=True).outcome().setup.device == "0:7"
 
 
 @pytest.mark.usefixtures("result")
