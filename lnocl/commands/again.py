@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -96,7 +96,8 @@ class Again:
         path = self.saved.path
         held = read_parts(path, ["ESTIMATE"]).values()
         parts = {name: np.asarray(row) for each in held for name, (row,) in each.values.items()}
-        found = from_parts(parts, self.frames.observation)
+        run = self.run.device, self.run.precision
+        found = from_parts(parts, self.frames.observation, *run)
         if found is None:
             if self.saved.header.get("STOPPED") == "interrupt":
                 raise InputError(
@@ -111,8 +112,6 @@ class Again:
             with messages.shown_log(self.run.quiet):
                 note("%s: the run is made again", why)
             found = self._solve()
-        # The command names the device that the run has chosen.
-        found = replace(found, setup=replace(found.setup, device=self.run.device))
         self._refuse_another(found)
         return found
 

@@ -28,6 +28,8 @@ Parts = dict[str, NDArray[Any]]
 Built = TypeVar("Built")
 
 DIGEST = "digest"
+# What the command of a run names, whether it was given or chosen.
+BY_COMMAND = "device", "precision"
 
 
 def to_parts(outcome: Outcome, given: Observation) -> Parts:
@@ -48,6 +50,8 @@ def to_parts(outcome: Outcome, given: Observation) -> Parts:
     scene, before = outcome.scene, given.upright()
     parts = {**dict(_flat(outcome)), **dict(_flat(scene.penalty, "penalty"))}
     parts["positions"] = scene.stars
+    for name in BY_COMMAND:
+        parts.pop(f"setup.{name}", None)
     for name in PARAMETERS:
         old, new = (np.asarray(getattr(each, name)) for each in (before, scene.observation))
         if not (old is new or np.array_equal(old, new)):
@@ -56,7 +60,9 @@ def to_parts(outcome: Outcome, given: Observation) -> Parts:
     return {**parts, DIGEST: np.asarray(_digest(parts, before))}
 
 
-def from_parts(parts: Mapping[str, NDArray[Any]], given: Observation) -> Outcome | None:
+def from_parts(
+    parts: Mapping[str, NDArray[Any]], given: Observation, device: str | None, precision: str
+) -> Outcome | None:
     """Return the outcome of a run, bit for bit, from the parts and the observation it was given.
 
     None where they are of another observation, or another version of lnocl, or damaged. The scene
@@ -66,7 +72,9 @@ def from_parts(parts: Mapping[str, NDArray[Any]], given: Observation) -> Outcome
     if DIGEST not in parts or parts.pop(DIGEST).item() != _digest(parts, before):
         return None
     observation = before.replace(**_part(parts, "observation."))
-    setup = _built(Setup, parts, "setup.", observation=observation)
+    setup = _built(
+        Setup, parts, "setup.", observation=observation, device=device, precision=precision
+    )
     has_prior = bool(_part(parts, "penalty.stars."))
     prior = _built(StarPrior, parts, "penalty.stars.") if has_prior else None
     with ignored_warnings():  # which the run has given

@@ -62,6 +62,10 @@ def turned():
 CASES = [mended, levelled, pytest.param(turned, marks=pytest.mark.exhaustive)]
 
 
+def again_from(parts, given):
+    return from_parts(parts, given, None, "single")
+
+
 @pytest.fixture(scope="module", params=CASES)
 def case(request, tmp_path_factory):
     """Return the outcome of a run, what it was given, and the parts that a file has of it."""
@@ -83,7 +87,7 @@ def test_a_file_gives_the_outcome_of_the_run_back(case):
     for name, values in written.items():
         assert read[name].dtype == values.dtype, name
         np.testing.assert_array_equal(read[name], values, name)
-    found = from_parts(read, given)
+    found = again_from(read, given)
     again = to_parts(found, given)
     assert again.keys() == written.keys()
     for name, values in written.items():
@@ -101,7 +105,7 @@ def test_a_file_gives_the_outcome_of_the_run_back(case):
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 def test_maps_and_replicas_of_both_are_equal(case):
     outcome, given, parts, _ = case
-    found = from_parts(parts, given)
+    found = again_from(parts, given)
     maps, others = (significance(each, 0.0, 0.01) for each in (outcome, found))
     for name in ("signal_to_noise", "flux", "flux_error", "threshold"):
         np.testing.assert_array_equal(getattr(maps, name), getattr(others, name), name)
@@ -116,10 +120,10 @@ def test_what_is_of_other_images_or_damaged_or_of_another_version_gives_nothing(
     _, given, parts, _ = case
     counts = given.images.copy()
     counts[0, 20, 20] += 1e-9
-    assert from_parts(parts, given.replace(images=counts)) is None
-    assert from_parts({**parts, "sky": parts["sky"][:-1]}, given) is None
-    assert from_parts({**parts, "setup.solver": np.asarray("sgm")}, given) is None
-    assert from_parts({name: parts[name] for name in parts if name != "positions"}, given) is None
-    assert from_parts({}, given) is None
+    assert again_from(parts, given.replace(images=counts)) is None
+    assert again_from({**parts, "sky": parts["sky"][:-1]}, given) is None
+    assert again_from({**parts, "setup.solver": np.asarray("sgm")}, given) is None
+    assert again_from({name: parts[name] for name in parts if name != "positions"}, given) is None
+    assert again_from({}, given) is None
     monkeypatch.setattr("lnocl.result.kept.version", lambda name: "0.0.1")
-    assert from_parts(parts, given) is None
+    assert again_from(parts, given) is None
