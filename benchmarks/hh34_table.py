@@ -78,7 +78,7 @@ def compute(path, simulation, method, mu, n_iter, every, patience, cards):
         found.extended,
         stars,
         [found.star_flux] if stars else [],
-        found.history[: best + 1],
+        {"HISTORY": found.history[: best + 1], "CURVE": found.curve},
         cards=[
             ("CREATOR", f"lnocl {__version__}", "program that wrote this file"),
             ("METHOD", method, "star in the image, or a component"),
@@ -90,7 +90,6 @@ def compute(path, simulation, method, mu, n_iter, every, patience, cards):
             *cards,
             ("MINUTES", (time.monotonic() - start) / 60, "that it took"),
         ],
-        curve=found.curve,
     )
 
 

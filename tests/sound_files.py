@@ -90,9 +90,9 @@ def result(path):
         dtype=[("smoothing", float), ("iteration", int), ("error", float)],
     )
     fitswrite.write_result(
-        path, COUNTS, [(12.0, 13.0)], [1e5], history, curve=curve, held_out=held_out,
+        path, COUNTS, [(12.0, 13.0)], [1e5],
+        {"HISTORY": history, "CURVE": curve, "HELDOUT": held_out, "MODELS": COUNTS[None]},
         cards=[("MU", 0.25, ""), ("PIXSCALE", 2.5, "")],
-        cubes={"MODELS": (COUNTS[None], "electron")},
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The run of a result, made again by its command."""
+"""What the run of a result has found, from its file, or from its command that is run again."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import numpy as np
 
 from lnocl.commands import deconvolve, messages
 from lnocl.commands.parser import Parser
-from lnocl.errors import FileError, InputError
+from lnocl.errors import FileError, InputError, note
 from lnocl.process import ignored_warnings
+from lnocl.result.kept import from_parts
 
 if TYPE_CHECKING:
     from lnocl.io.frames import Frames
     from lnocl.io.saved_results import SavedResult
-    from lnocl.result import Result
+    from lnocl.runs.outcome import Outcome
 
 # The run is taken for the same where pixels and fluxes are to this share of them, and pixels to
 # this share of the brightest: another device rounds otherwise.
@@ -54,7 +55,7 @@ class Again:
         Raises
         ------
         InputError
-            The run was interrupted, was made in tiles, or its command is not known.
+            The run was made in tiles, or its command is not known.
         FileError
             The result cannot be read or written, or its folder is not there.
         """
@@ -63,11 +64,6 @@ class Again:
 
         saved = read_result(path)
         atomic.check_fits_output(path, overwrite=True, is_updated=True)
-        if saved.header.get("STOPPED") == "interrupt":
-            raise InputError(
-                f"the run of {path} was interrupted, and its command gives another result: "
-                "deconvolve to the end"
-            )
         folder, run = _run_of(saved)
         run.quiet = quiet
         inputs = deconvolve.COMMAND.inputs(run)
@@ -87,29 +83,56 @@ class Again:
             )
         return cls(saved, frames, run, given)
 
-    def solve(self) -> Result:
-        """Return the result of the run.
+    def outcome(self) -> Outcome:
+        """Return the outcome of the run: as the file holds it, else of the run made again.
 
         Raises
         ------
         InputError
-            It is not that of the file.
+            It is not that of the file; or the run was interrupted, and has to be made again.
         """
+        from lnocl.io.parts import read_parts
+
+        path = self.saved.path
+        held = read_parts(path, ["ESTIMATE"]).values()
+        parts = {name: np.asarray(row) for each in held for name, (row,) in each.values.items()}
+        run = self.run.device, self.run.precision
+        found = from_parts(parts, self.frames.observation, *run)
+        if found is None:
+            if self.saved.header.get("STOPPED") == "interrupt":
+                raise InputError(
+                    f"the run of {path} was interrupted, and its command gives another result: "
+                    "deconvolve to the end"
+                )
+            why = (
+                f"what {path} holds of its run is of other images, or of another version of lnocl"
+                if parts
+                else f"{path} does not hold what its run has found"
+            )
+            with messages.shown_log(self.run.quiet):
+                note("%s: the run is made again", why)
+            found = self._solve()
+        self._refuse_another(found)
+        return found
+
+    def _solve(self) -> Outcome:
         with messages.shown_log(self.run.quiet, name=messages.PROGRESS), ignored_warnings():
-            found = deconvolve.solve(self.run, self.frames, self.given)
+            return deconvolve.solve(self.run, self.frames, self.given)._outcome
+
+    def _refuse_another(self, found: Outcome) -> None:
         expected = self.saved.extended * self.frames.electrons
         fluxes = self.saved.star_fluxes * self.frames.electrons
+        ny, nx = found.observation.sky_shape
         if (
-            found.extended.shape != expected.shape
-            or found.star_fluxes.size != fluxes.size
-            or not np.allclose(found.extended, expected, SAME, ROUNDING * abs(expected).max())
-            or not np.allclose(found.star_fluxes, fluxes, SAME, equal_nan=True)
+            expected.shape != (ny, nx)
+            or found.fluxes_of_stars.size != fluxes.size
+            or not np.allclose(found.sky[:ny, :nx], expected, SAME, ROUNDING * abs(expected).max())
+            or not np.allclose(found.fluxes_of_stars, fluxes, SAME, equal_nan=True)
         ):
             raise InputError(
                 f"the run of {self.saved.path} gives another result now: its images, PSFs or "
                 "options have changed; deconvolve again"
             )
-        return found
 
 
 def _run_of(saved: SavedResult) -> tuple[str, argparse.Namespace]:

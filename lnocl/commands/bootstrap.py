@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from lnocl.commands.again import Again
     from lnocl.io.fitserrors import Held
     from lnocl.io.frames import Frames
-    from lnocl.result import Result
     from lnocl.runs.bootstrap import Bootstrap, Part
+    from lnocl.runs.outcome import Outcome
 
 
 # Names of quantities of stars; others are of regions and profiles.
@@ -32,7 +32,7 @@ _OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)")
 
 def add_errors(
     arguments: argparse.Namespace,
-    result: Result,
+    outcome: Outcome,
     again: Again,
     parts: Sequence[Part],
 ) -> list[str]:
@@ -42,8 +42,8 @@ def add_errors(
     ----------
     arguments : Namespace
         Those of ``lnocl errors``.
-    result : Result
-        What the file holds.
+    outcome : Outcome
+        What the run has found.
     again : Again
         The file, and what its result was made of.
     parts : list of Aperture or Profile
@@ -52,7 +52,7 @@ def add_errors(
     from lnocl.io.fitserrors import read_replicas
     from lnocl.runs.bootstrap import bootstrap, without_replicas
 
-    outcome, seed, frames = result._outcome, arguments.seed, again.frames
+    seed, frames = arguments.seed, again.frames
     latest: list[Bootstrap] = []
     written = time.monotonic()
 
@@ -87,52 +87,29 @@ def add_errors(
     return _summarise(found, parts, frames)
 
 
-def check_earlier(path: str, seed: int, parts: Sequence[Part]) -> None:
-    """Refuse replicas in a file of another seed, or of other regions and profiles.
-
-    Raises
-    ------
-    InputError
-        The file has such replicas.
-    """
-    from lnocl.io.fitserrors import read_replicas
-    from lnocl.io.fitswrite import ascii_of
-
-    held = read_replicas(path)
-    if held is None:
-        return
-    names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
-    given = {ascii_of(each.name).strip() for each in parts}
-    if held.seed != seed or not all(any(name.startswith(g) for g in given) for name in names):
-        raise _of_others(path, held.seed, list(names))
-
-
-def _of_others(path: str, seed: int, names: Sequence[str]) -> InputError:
-    regions = f"the regions {', '.join(names[:3])}" if names else "no regions"
-    return InputError(
-        f"{path} has replicas with `seed` {seed} of {regions}: give the same `regions`, `profiles` "
-        "and `seed`, or take `overwrite` to begin anew"
-    )
-
-
 def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None:
     """Return the replicas that a file has; refuse those of something else."""
     from lnocl.io.fitserrors import read_replicas
-    from lnocl.io.fitswrite import ascii_of
 
     held = read_replicas(path)
     if held is None:
         return None
-    is_same = (
-        held.names == [ascii_of(each.name).strip() for each in expected.quantities]
-        and np.array_equal(held.values, expected.values / expected.units(frames.electrons))
-        and held.sums.shape == expected.sums.shape
-        and held.seed == expected.seed
-    )
-    if not is_same:
+    if not _held(expected, frames).is_start_of(held):
         names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
-        raise _of_others(path, held.seed, list(names))
+        regions = f"the regions {', '.join([*names][:3])}" if names else "no regions"
+        raise InputError(
+            f"{path} has replicas with `seed` {held.seed} of {regions}: give the same `regions`, "
+            "`profiles` and `seed`, or take `overwrite` to begin anew"
+        )
     return dataclasses.replace(expected, errors=held.errors, of_psfs=held.of_psfs, sums=held.sums)
+
+
+def _held(found: Bootstrap, frames: Frames) -> Held:
+    from lnocl.io.fitserrors import Held
+
+    names = [each.name.strip() for each in found.quantities]
+    values = found.values / found.units(frames.electrons)
+    return Held(names, values, found.errors, found.of_psfs, found.sums, found.seed)
 
 
 def _write(again: Again, found: Bootstrap, parts: Sequence[Part], before: Held | None) -> None:
@@ -140,20 +117,22 @@ def _write(again: Again, found: Bootstrap, parts: Sequence[Part], before: Held |
 
     frames = again.frames
     quantities = found.to_table(frames.electrons, frames.unit)
+    quantities["name"] = [name.strip() for name in quantities["name"]]
+    measured = quantities[[each.at is None for each in found.quantities]]
     write_errors(
         again.saved,
         quantities,
-        _table_of(_regions(parts), quantities[[each.at is None for each in found.quantities]]),
-        (
-            found.error_map / frames.electrons,
-            found.bias_map / frames.electrons,
-            found.share_map,
-        ),
-        found.errors,
-        found.of_psfs,
-        found.sums,
-        found.seed,
-        found.resolution,
+        _held(found, frames),
+        {
+            "REGIONS": _table_of(_regions(parts), measured),
+            "ERROR": found.error_map / frames.electrons,
+            "BIAS": found.bias_map / frames.electrons,
+            "SHARE": found.share_map,
+        },
+        [
+            ("NREPL", found.n, "replicas"),
+            ("RESOLUT", found.resolution, "FWHM that maps are smoothed to, pixels"),
+        ],
         frames.unit,
         before,
     )

@@ -139,6 +139,7 @@ def _write(
         has_cubes=arguments.residuals,
         commands=record.make_commands("deconvolve", ALL_OPTIONS, repeated, os.getcwd()),
         messages=lines,
+        given=frames.observation,
     )
 
 

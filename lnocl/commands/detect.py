@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from lnocl.io.frames import Frames
-    from lnocl.io.saved_results import SavedResult
     from lnocl.significance import Significance
 
 SOURCES = (
@@ -37,22 +37,19 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    found, again = find(arguments, "detections")
-    table = in_unit(found.detections, again.frames)
-    _write(again.saved, found, table)
-    lines = [*_told(found, table), *output(arguments, table, "detections")]
-    if arguments.plot is not None:
-        from lnocl.plotting.significance import draw_significance
+    from lnocl.io.fitsadd import add_parts
 
-        lines.append(pictures.draw(arguments, draw_significance(found.view())))
-    if not arguments.quiet:
-        messages.say(lines)
+    found, again = find(arguments, "detections")
+    table, unit = in_unit(found.detections, again.frames), again.frames.unit
+    parts = {"DETECTIONS": table, "SIGNAL": found.signal_to_noise}
+    add_parts(again.saved, parts, cards(found, unit), unit)
+    finish(arguments, found, table, "detections", _told(found, table))
 
 
 def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Again]:
-    """Return the significance of sources in a result, whose run is made again, and that run."""
+    """Return the significance of sources in a result, and what its run was made of."""
     from lnocl.io import atomic, tables
-    from lnocl.significance import check_alarms, check_width
+    from lnocl.significance import check_alarms, check_width, significance
 
     check_width(arguments.width)
     check_alarms(arguments.false_alarms)
@@ -65,7 +62,7 @@ def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Aga
 
     check()  # before the result is read; then that nothing that it was made of is replaced
     again = Again.read(arguments.result, arguments.quiet, check)
-    return again.solve().significance(arguments.width, arguments.false_alarms), again
+    return significance(again.outcome(), arguments.width, arguments.false_alarms), again
 
 
 def in_unit(table: QTable, frames: Frames) -> QTable:
@@ -84,33 +81,41 @@ def in_unit(table: QTable, frames: Frames) -> QTable:
     return table
 
 
-def _write(saved: SavedResult, found: Significance, table: QTable) -> None:
-    """Add the detections to the file of the result."""
-    from lnocl.io.fitsfindings import DETECTIONS, SIGNAL, write_findings
-
-    maps = {SIGNAL: (found.signal_to_noise, "")}
-    write_findings(saved, DETECTIONS, table, maps, cards(found))
-
-
-def cards(found: Significance) -> list[tuple[str, Any, str]]:
-    """Return the header cards that say what was looked for."""
+def cards(found: Significance, unit: str) -> list[tuple[str, Any, str]]:
+    """Return the header cards that say what was looked for, and the unit of fluxes."""
     return [
         ("SRCWIDTH", found.width, "FWHM of the sources, pixels; 0: points"),
         ("FALSALRM", found.false_alarms, "false alarms expected in the field"),
         ("THRESHOL", found.threshold, "signal-to-noise of detections"),
+        ("FLUXUNIT", unit, "unit of fluxes"),
     ]
 
 
-def output(arguments: argparse.Namespace, table: QTable, content: str) -> list[str]:
-    """Write a table to a file of its own, where one is asked for; return what was written."""
-    lines = [f"added to {arguments.result}"]
+def finish(
+    arguments: argparse.Namespace,
+    found: Significance,
+    table: QTable,
+    content: str,
+    lines: Sequence[str],
+    curves: QTable | None = None,
+) -> None:
+    """Write the table and the picture where they are asked for; say the lines, and what was done.
+
+    The picture is that of limits where their curves are given.
+    """
+    said = [*lines, f"added to {arguments.result}"]
     if arguments.output is not None:
         from lnocl.io.tables import write_table
 
         table.meta["ORIGIN"] = "x and y begin at 0"
         write_table(table, arguments.output, content, arguments.overwrite)
-        lines.append(f"written to {arguments.output}")
-    return lines
+        said.append(f"written to {arguments.output}")
+    if arguments.plot is not None:
+        from lnocl.plotting.significance import draw_significance
+
+        said.append(pictures.draw(arguments, draw_significance(found.view(curves))))
+    if not arguments.quiet:
+        messages.say(said)
 
 
 def _told(found: Significance, table: QTable) -> list[str]:

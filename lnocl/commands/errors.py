@@ -50,32 +50,26 @@ def _run(arguments: argparse.Namespace) -> None:
     again = Again.read(arguments.result, arguments.quiet)
     with messages.shown_log(arguments.quiet, COMMAND.flags()):
         parts = _parts(arguments, again.frames)
-        if not arguments.overwrite:
-            bootstrap.check_earlier(arguments.result, arguments.seed, parts)
-    found = again.solve()
+    outcome = again.outcome()
     with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
-        lines = bootstrap.add_errors(arguments, found, again, parts)
+        lines = bootstrap.add_errors(arguments, outcome, again, parts)
     if not arguments.quiet:
         messages.say([*lines, f"added to {arguments.result}"])
 
 
 def _parts(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
     """Return the regions and profiles that were given."""
-    if arguments.regions is None and arguments.profiles is None:
+    given = arguments.regions or (), arguments.profiles or ()
+    if not any(given):
         return []
-    from lnocl.io.fitsread import sky_header
-    from lnocl.io.regions import read_apertures, read_profiles
+    from lnocl.io.regions import read_parts
 
-    oversample = frames.observation.oversample
-    if oversample > 1:
+    if (oversample := frames.observation.oversample) > 1:
         note(
             "`regions` in pixels are in those of the extended source, %d to one of the images",
             oversample,
         )
-    where = sky_header(frames.header, oversample), frames.observation.sky_shape
-    apertures = [] if arguments.regions is None else read_apertures(arguments.regions, *where)
-    profiles = [] if arguments.profiles is None else read_profiles(arguments.profiles, *where)
-    return [*apertures, *profiles]
+    return read_parts(*given, frames.header, frames.observation)
 
 
 COMMAND = Command(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lnocl.commands import detect, messages, options, pictures
+from lnocl.commands import detect, messages, options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.errors import warn
@@ -49,7 +49,7 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lnocl.io.fitsfindings import LIMIT, LIMITS, write_findings
+    from lnocl.io.fitsadd import add_parts
     from lnocl.significance import check_injections
 
     check_injections(arguments.injections or 1, arguments.seed)
@@ -58,20 +58,14 @@ def _run(arguments: argparse.Namespace) -> None:
     curves = found.contrast_curves(COMPLETENESS)
     table = detect.in_unit(curves, frames)
     maps = {
-        f"{LIMIT}{100 * share:g}": (found.limit(share) / frames.electrons, frames.unit)
-        for share in COMPLETENESS
+        f"LIMIT{100 * share:g}": found.limit(share) / frames.electrons for share in COMPLETENESS
     }
-    write_findings(again.saved, LIMITS, table, maps, detect.cards(found))
-    lines = _told(found, table, maps[f"{LIMIT}50"][0], frames.unit)
+    cards = detect.cards(found, frames.unit)
+    add_parts(again.saved, {"LIMITS": table, **maps}, cards, frames.unit)
+    lines = _told(found, table, maps["LIMIT50"], frames.unit)
     with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
         lines += _checked(found, arguments)
-    lines += detect.output(arguments, table, "limits")
-    if arguments.plot is not None:
-        from lnocl.plotting.significance import draw_significance
-
-        lines.append(pictures.draw(arguments, draw_significance(found.view(curves))))
-    if not arguments.quiet:
-        messages.say(lines)
+    detect.finish(arguments, found, table, "limits", lines, curves)
 
 
 def _told(found: Significance, table: QTable, limit: np.ndarray, unit: str) -> list[str]:

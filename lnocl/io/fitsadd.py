@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import IO, Any
 
 import numpy as np
@@ -13,19 +13,22 @@ from lnocl.errors import FileError
 from lnocl.io.atomic import update_file
 from lnocl.io.fitsfile import FitsFile, open_fits
 from lnocl.io.fitsread import wcs_cards
+from lnocl.io.fitswrite import Card
 from lnocl.io.packed import BLOCK
+from lnocl.io.parts import SKY, hdu_of
 from lnocl.io.saved_results import SavedResult
 from lnocl.io.selection import has_pixels
 from lnocl.process import ignored_warnings
 
 
-def add_hdus(
+def add_parts(
     saved: SavedResult,
-    added: Sequence[fits.BinTableHDU | fits.ImageHDU],
-    maps: Mapping[str, str],
-    is_wanted: Callable[[FitsFile], bool] = lambda file: True,
+    parts: Mapping[str, Any],
+    cards: Iterable[Card] = (),
+    unit: str = "",
+    is_wanted: Callable[[FitsFile, Sequence[Any]], bool] = lambda file, hdus: True,
 ) -> None:
-    """Add HDUs to the file of a result, or replace those of the same names.
+    """Add parts to the file of a result, or replace those that it has.
 
     All others are copied byte by byte. What other processes add meanwhile is kept.
 
@@ -33,33 +36,34 @@ def add_hdus(
     ----------
     saved : SavedResult
         The result, as it was read. Its file is replaced once the new one is complete.
-    added : sequence of HDU
-        Each with a name.
-    maps : mapping of str to str
-        The unit of each that is a map of the sky, which gets the coordinates of the result.
+    parts : mapping of str to ndarray, Table or sequence of Column
+        Tables and images, as `lnocl.io.parts` declares them, by name.
+    cards : iterable of (keyword, value, comment), optional
+        Header cards of all.
+    unit : str, optional
+        That of the result.
     is_wanted : callable, optional
-        Whether to add them to the file as it is now.
+        Whether to add them to the file as it is now, with these HDUs.
 
     Raises
     ------
     FileError
         The file cannot be read or written, or holds another result now.
     """
+    places = {SKY: wcs_cards(saved.header)}
+    added = [hdu_of(name, content, places, unit) for name, content in parts.items()]
     for hdu in added:
-        if hdu.name in maps:
-            hdu.header.extend(wcs_cards(saved.header))
-            hdu.header["BUNIT"] = (maps[hdu.name], "per pixel")
+        hdu.header.extend(cards)
     content = io.BytesIO()
     fits.HDUList([fits.PrimaryHDU(), *added]).writeto(content, checksum=True)
-    names = {hdu.name for hdu in added}
 
     def write(stream: IO[bytes]) -> None:
         with ignored_warnings(), open_fits(saved.path) as file:  # which were shown once
-            is_new = is_wanted(file)
             hdus = list(file.hdus())
+            is_new = is_wanted(file, hdus)
             _refuse_another(saved, file, hdus)
             for k, hdu in enumerate(hdus):
-                if not (k and is_new and hdu.name in names):
+                if not (k and is_new and hdu.name in parts):
                     file.copy(hdu, stream)
         if is_new:
             stream.write(content.getbuffer()[BLOCK:])  # without the empty primary HDU
@@ -75,7 +79,7 @@ def _refuse_another(saved: SavedResult, file: FitsFile, hdus: Sequence[Any]) -> 
         image is None
         or not isinstance(stars, fits.BinTableHDU)
         or not np.array_equal(file.pixels(image), saved.extended, equal_nan=True)
-        or not np.array_equal(file.columns(stars)["flux"], saved.star_fluxes, equal_nan=True)
+        or not np.array_equal(file.table(stars)["flux"], saved.star_fluxes, equal_nan=True)
     ):
         raise FileError(
             f"{saved.path} holds another result than when it was read, and nothing is added to it: "

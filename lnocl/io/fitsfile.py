@@ -107,13 +107,8 @@ class FitsFile:
         self._verify(hdu)
         return np.array(hdu.data, dtype=np.float64)
 
-    def columns(self, hdu: Any) -> dict[str, NDArray[np.float64]]:
-        """Return the columns of a table, by name.
-
-        Raises
-        ------
-        FileError
-            A column with several numbers in a row.
+    def table(self, hdu: Any) -> dict[str, NDArray[Any]]:
+        """Return the columns of a table, by name: numbers, arrays of them, or text.
 
         Warns
         -----
@@ -121,13 +116,30 @@ class FitsFile:
             Data that do not match their DATASUM.
         """
         self._verify(hdu)
-        columns = {name: np.array(hdu.data[name], np.float64) for name in hdu.columns.names}
+        columns = {}
+        for name in hdu.columns.names:
+            values = np.asarray(hdu.data[name])
+            if values.dtype.kind in "SU":
+                texts = [_unescaped(str(text).rstrip()) for text in values.ravel().tolist()]
+                columns[name] = np.array(texts, str)
+            else:
+                columns[name] = values.astype(values.dtype.newbyteorder("="))
+        return columns
+
+    def numbers(self, table: str, columns: dict[str, NDArray[Any]]) -> dict[str, NDArray]:
+        """Return the columns of a table that has one number a row in each, as float64.
+
+        Raises
+        ------
+        FileError
+            A column with several numbers in a row.
+        """
         for name, values in columns.items():
             if values.ndim != 1:
                 raise FileError(
-                    f"{self.path} has several numbers in a row of column {name} of {hdu.name}"
+                    f"{self.path} has several numbers in a row of column {name} of {table}"
                 )
-        return columns
+        return {name: values.astype(np.float64) for name, values in columns.items()}
 
     def _verify(self, hdu: Any) -> None:
         where = place_of(hdu)
@@ -147,6 +159,11 @@ class FitsFile:
         """Return the checksum of the file, in hexadecimal; call it last."""
         self._stream.seek(0)
         return hashlib.file_digest(self._stream, "sha256").hexdigest()
+
+
+def _unescaped(text: str) -> str:
+    """Return the text that `lnocl.io.parts.ascii_of` has escaped."""
+    return text.encode("ascii").decode("unicode_escape")
 
 
 def check_header(path: str, content: IO[bytes], length: int, start: int) -> None:

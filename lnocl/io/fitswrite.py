@@ -8,14 +8,15 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lnocl.io.atomic import whole_file
 from lnocl.io.headers import finer_cards
+from lnocl.io.parts import IMAGES, SKY, Column, ascii_of, hdu_of
 
 # A HISTORY card holds 72 characters; the last one may be needed for a backslash and a space.
 HISTORY_WIDTH = 70
@@ -23,46 +24,26 @@ HISTORY_WIDTH = 70
 Card = tuple[str, str | int | float, str]
 
 
-class StarColumn(NamedTuple):
-    """A column of the table of stars."""
-
-    name: str
-    values: ArrayLike
-    unit: str
-    comment: str
-
-
 def write_result(
     path: str,
     extended: ArrayLike,
     stars: ArrayLike,
     star_fluxes: ArrayLike,
-    history: NDArray[np.void] | None = None,
+    parts: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    star_columns: Sequence[Column] = (),
+    unit: str = "electron",
     wcs: fits.Header | None = None,
+    transforms: ArrayLike = (),
+    oversample: int = 1,
     cards: Iterable[Card] = (),
     commands: Iterable[Sequence[str]] = (),
     overwrite: bool = False,
-    curve: NDArray[np.void] | None = None,
-    held_out: NDArray[np.void] | None = None,
-    unit: str = "electron",
-    star_columns: Sequence[StarColumn] = (),
-    cubes: Mapping[str, tuple[ArrayLike, str]] = MappingProxyType({}),
-    transforms: ArrayLike = (),
-    oversample: int = 1,
-    psf_fit: NDArray[np.void] | None = None,
-    psfs: ArrayLike | None = None,
-    psf_errors: NDArray[np.void] | None = None,
-    doubtful: ArrayLike | None = None,
-    messages: Sequence[str] = (),
-    halos: NDArray[np.void] | None = None,
 ) -> None:
     """Write a result, or a truth: the file is there complete, or not at all.
 
     The primary HDU holds the extended source, the table ``STARS`` the columns x, y, flux and any
-    others given, the table ``HISTORY`` iteration and objective, the table ``CURVE`` iteration,
-    rho, rho_star and magnitude, the table ``HELDOUT`` mu, smoothing, iteration and error, the table
-    ``PSFFIT`` parameters of PSFs, ``PSFS`` the PSFs, the table ``HALOS`` the amounts of halos. All
-    have CHECKSUM and DATASUM.
+    others given. Other HDUs hold the parts. All have CHECKSUM and DATASUM.
 
     Parameters
     ----------
@@ -74,44 +55,26 @@ def write_result(
         Positions (x, y) in pixels of the images, 0-based.
     star_fluxes : array_like, shape (n,)
         In this unit.
-    history : ndarray with fields ``iteration`` and ``objective``, optional
-        The objective after each iteration; a truth has no history.
+    parts : mapping of str to ndarray, Table or sequence of Column, optional
+        Further tables and images, as `lnocl.io.parts` declares them, by name; None is left out.
+    star_columns : sequence of Column, optional
+        Further columns of the table of stars.
+    unit : str, optional
+        Unit of extended source and fluxes.
     wcs : astropy.io.fits.Header, optional
         Cards of the coordinate systems of the images, from `fitsread.wcs_cards`.
+    transforms : array_like, shape (p, 2, 3), optional
+        Maps from the sky to the images, pixels. Where they are not all the same, no coordinate
+        system holds for all of a cube: it has the cards of `place_cards` instead, as the primary
+        header has beside its own.
+    oversample : int, optional
+        Pixels of the extended source to one of the images, along each axis.
     cards : iterable of (keyword, value, comment), optional
         Further cards of the primary header.
     commands : iterable of sequence of str, optional
         Shell commands that repeat the run, as words; the HISTORY lines spell them out.
     overwrite : bool, optional
         Whether an existing file may be replaced.
-    curve : ndarray with fields ``iteration``, ``rho``, ``rho_star`` and ``magnitude``, optional
-        Restoration errors and magnitude of the star, where the truth is known.
-    held_out : ndarray with fields ``smoothing``, ``iteration`` and ``error``, optional
-        Relative errors that held-out counts estimate, where they were asked.
-    unit : str, optional
-        Unit of extended source and fluxes.
-    star_columns : sequence of StarColumn, optional
-        Further columns of the table of stars.
-    cubes : mapping of str to (array_like, str), optional
-        Further images (p, ny, nx), by the name of their extension, with their unit.
-    transforms : array_like, shape (p, 2, 3), optional
-        Maps from the sky to these images, pixels. Where they are not all the same, no coordinate
-        system holds for all of a cube: it has the cards of `place_cards` instead, as the primary
-        header has beside its own.
-    oversample : int, optional
-        Pixels of the extended source to one of the images, along each axis.
-    psf_fit : ndarray with fields ``image`` and those of the parameters, optional
-        The parameters of the PSFs that were refined.
-    psfs : array_like, shape (p, ky, kx), optional
-        The PSFs of the model.
-    psf_errors : ndarray with fields ``from``, ``to`` and ``error``, optional
-        The relative error of the PSFs in rings round a star.
-    doubtful : array_like of bool, shape (ny, nx), optional
-        Pixels in which errors of the PSFs may have faked all there is.
-    messages : sequence of str, optional
-        The messages of the run, a line each: the table ``MESSAGES``.
-    halos : ndarray with fields ``halo``, ``image``, ``flux`` and ``flux_error``, optional
-        The amounts of halos, electrons of their image.
 
     Raises
     ------
@@ -121,7 +84,6 @@ def write_result(
     coordinates = fits.Header() if wcs is None else wcs
     is_shared = not np.any(np.asarray(transforms).reshape(-1, 2, 3) - np.eye(2, 3))
     places = [] if is_shared else place_cards(transforms)
-    shared = coordinates if is_shared else fits.Header(places)
     of_sky = coordinates if oversample == 1 else finer_cards(coordinates, oversample)
     header = of_sky.copy()
     header["BUNIT"] = (unit, "per pixel")
@@ -129,24 +91,20 @@ def write_result(
         header["OVERSAMP"] = (oversample, "pixels of this image to one of the frames")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "UTC, file written")
     _add_provenance(header, [*cards, *places], (), commands)
-    hdus = fits.HDUList(
-        [
-            fits.PrimaryHDU(np.asarray(extended, dtype=np.float64), header),
-            _star_table(stars, star_fluxes, unit, star_columns),
-            *([] if halos is None else [_table("HALOS", halos)]),
-            *([] if history is None else [_table("HISTORY", history)]),
-            *([] if curve is None else [_table("CURVE", curve)]),
-            *([] if held_out is None else [_table("HELDOUT", held_out)]),
-            *(_cube(name, *cube, shared) for name, cube in cubes.items()),
-            *([] if psf_fit is None else [_table("PSFFIT", psf_fit)]),
-            *([] if psfs is None else [fits.ImageHDU(np.asarray(psfs, np.float64), name="PSFS")]),
-            *([] if psf_errors is None else [_table("PSFERRORS", psf_errors)]),
-            *([] if doubtful is None else [_flags("DOUBTFUL", doubtful, of_sky)]),
-            *([_lines("MESSAGES", "message", messages)] if messages else []),
-        ]
-    )
+    x, y = np.asarray(stars, np.float64).reshape(-1, 2).T
+    of_stars = [
+        Column("x", x, "pix", "column, 0-based"),
+        Column("y", y, "pix", "row, 0-based"),
+        Column("flux", np.asarray(star_fluxes, np.float64), column_unit(unit), unit),
+        *star_columns,
+    ]
+    where = {SKY: of_sky, IMAGES: coordinates if is_shared else fits.Header(places)}
+    hdus = [fits.PrimaryHDU(np.asarray(extended, np.float64), header)]
+    for name, content in {"STARS": of_stars, **parts}.items():
+        if content is not None:
+            hdus.append(hdu_of(name, content, where, unit))
     with whole_file(path, overwrite) as stream:
-        hdus.writeto(stream, checksum=True)
+        fits.HDUList(hdus).writeto(stream, checksum=True)
 
 
 def write_image(
@@ -267,58 +225,6 @@ def _add_provenance(
     for words in commands:
         for line in history_lines(words):
             header.add_history(line)
-
-
-def _star_table(
-    stars: ArrayLike, fluxes: ArrayLike, unit: str, others: Sequence[StarColumn]
-) -> fits.BinTableHDU:
-    x, y = np.asarray(stars, dtype=np.float64).reshape(-1, 2).T
-    columns = [
-        StarColumn("x", x, "pix", "column, 0-based"),
-        StarColumn("y", y, "pix", "row, 0-based"),
-        StarColumn("flux", fluxes, column_unit(unit), unit),
-        *others,
-    ]
-    table = fits.BinTableHDU.from_columns(
-        [
-            fits.Column(c.name, "D", unit=c.unit, array=np.asarray(c.values, dtype=np.float64))
-            for c in columns
-        ],
-        name="STARS",
-    )
-    for i, column in enumerate(columns, 1):
-        table.header[f"TTYPE{i}"] = (column.name, column.comment)
-    return table
-
-
-def _cube(name: str, images: ArrayLike, unit: str, header: fits.Header) -> fits.ImageHDU:
-    hdu = fits.ImageHDU(np.asarray(images, dtype=np.float32), header, name=name)
-    if unit:
-        hdu.header["BUNIT"] = unit
-    return hdu
-
-
-def _flags(name: str, flags: ArrayLike, header: fits.Header) -> fits.ImageHDU:
-    return fits.ImageHDU(np.asarray(flags, dtype=np.uint8), header, name=name)
-
-
-def _table(name: str, rows: NDArray[np.void]) -> fits.BinTableHDU:
-    columns = [
-        fits.Column(field, "K" if rows[field].dtype.kind == "i" else "D", array=rows[field])
-        for field in rows.dtype.names or ()
-    ]
-    return fits.BinTableHDU.from_columns(columns, name=name)
-
-
-def _lines(name: str, column: str, lines: Sequence[str]) -> fits.BinTableHDU:
-    texts = np.array([ascii_of(line) for line in lines])
-    columns = [fits.Column(column, f"{texts.dtype.itemsize // 4}A", array=texts)]
-    return fits.BinTableHDU.from_columns(columns, name=name)
-
-
-def ascii_of(text: str) -> str:
-    """Return text in ASCII, as FITS needs, with escapes as in Python."""
-    return text.encode("unicode_escape").decode("ascii")
 
 
 def _shell_pieces(word: str) -> list[str]:

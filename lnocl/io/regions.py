@@ -11,17 +11,47 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lnocl.errors import FileError, InputError, LnoclError, note
+from lnocl.io.fitsread import sky_header
 from lnocl.io.sky import celestial_wcs
 from lnocl.scene.apertures import Aperture, Profile
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
+    from lnocl.scene.observation import Observation
+
 # The share of a region that rounding may leave outside an image.
 ROUNDING = 1e-9
 
 
 Given = str | os.PathLike[str] | Iterable[Any]
+
+
+def read_parts(
+    regions: Given, profiles: Given, header: fits.Header | None, observation: Observation
+) -> list[Aperture | Profile]:
+    """Return the regions and profiles in the extended source of an observation.
+
+    Parameters
+    ----------
+    regions, profiles : str, path or iterable of regions.Region
+        As for `read_apertures` and `read_profiles`, in pixels of the extended source.
+    header : astropy.io.fits.Header or None
+        Header of an image of the observation.
+    observation : Observation
+        What the extended source is of.
+
+    Raises
+    ------
+    InputError, FileError, LnoclError
+        As `read_apertures` and `read_profiles`.
+    """
+    where = None if header is None else sky_header(header, observation.oversample)
+    parts: list[Aperture | Profile] = []
+    for given, read in ((regions, read_apertures), (profiles, read_profiles)):
+        listed = given if isinstance(given, (str, os.PathLike)) else list(given)
+        parts += read(listed, where, observation.sky_shape) if listed else []
+    return parts
 
 
 def read_apertures(

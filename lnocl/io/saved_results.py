@@ -6,32 +6,24 @@ import os
 import re
 import shlex
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError
-from lnocl.io.fitsfile import FitsFile, open_fits
+from lnocl.io.fitsfile import open_fits
 from lnocl.io.headers import number, readable
+from lnocl.io.parts import no_result, parts_of
 from lnocl.io.selection import has_pixels
 from lnocl.scene.detector import on_sky
 from lnocl.scene.fields import OVERSAMPLES
 
 Columns = dict[str, NDArray[np.float64]]
 
-# The columns that a table must have.
-TABLES = {
-    "STARS": ("x", "y", "flux"),
-    "HALOS": ("halo", "image", "flux", "flux_error"),
-    "HISTORY": ("iteration", "objective"),
-    "CURVE": ("iteration", "rho", "rho_star", "magnitude"),
-    "HELDOUT": ("smoothing", "iteration", "error"),
-}
+TABLES = "STARS", "HALOS", "HISTORY", "CURVE", "HELDOUT"
 CUBES = ("MODELS", "RESIDUALS")
-
-
+READ = *TABLES, *CUBES, "DOUBTFUL", "MESSAGES"
 # Words of a shell with bytes that FITS does not allow, as `fitswrite.history_lines` writes them.
 QUOTED = re.compile(r"\$'((?:[^'\\]|\\.)*)'")
 
@@ -139,34 +131,21 @@ def read_result(path: str) -> SavedResult:
         A file that is missing, damaged or not FITS, or whose images and tables are not those of a
         result.
     """
-    image: tuple[NDArray[np.float64], fits.Header] | None = None
-    tables: dict[str, Columns] = {}
-    cubes: dict[str, NDArray[np.float64]] = {}
-    cards, doubtful, messages = fits.Header(), None, []
     with open_fits(path) as file:
-        for hdu in file.hdus():
-            is_table = isinstance(hdu, fits.BinTableHDU)
-            if image is None and has_pixels(hdu):
-                image = file.pixels(hdu), readable(hdu.header)
-            elif is_table and hdu.name in TABLES:
-                tables[hdu.name] = file.columns(hdu)
-            elif is_table and hdu.name == "MESSAGES":
-                messages = _texts(file, hdu)
-            elif has_pixels(hdu) and hdu.name in CUBES:
-                cubes[hdu.name], cards = file.pixels(hdu), readable(hdu.header)
-            elif has_pixels(hdu) and hdu.name == "DOUBTFUL":
-                doubtful = file.pixels(hdu) != 0
-    if image is None:
-        raise FileError(f"{path} holds no image")
-    extended, header = image
-    if len(cubes) < len(CUBES):
-        cubes = {}
+        hdus = list(file.hdus())
+        image = next((hdu for hdu in hdus if has_pixels(hdu)), None)
+        if image is None:
+            raise FileError(f"{path} holds no image")
+        extended, header = file.pixels(image), readable(image.header)
+        parts = parts_of(file, (hdu for hdu in hdus if hdu is not image), READ)
+        tables = {name: file.numbers(name, parts[name].values) for name in TABLES if name in parts}
+    found = {name: part.values for name, part in parts.items()}
+    cubes = {name: found[name] for name in CUBES} if {*CUBES} <= {*found} else {}
+    doubtful = found["DOUBTFUL"] != 0 if "DOUBTFUL" in found else None
     oversample = number(path, header, "OVERSAMP") or 1.0
     if fault := _fault(extended, tables, cubes, doubtful, oversample):
-        raise FileError(
-            f"{path} is not a result or truth written by lnocl, such as OUT.fits of lnocl "
-            f"deconvolve: {fault}"
-        )
+        raise no_result(path, fault)
+    cards = readable(parts[CUBES[-1]].header) if cubes else fits.Header()
     p = len(cubes["MODELS"]) if cubes else 0
     offsets = [
         [number(path, cards, f"OFF{axis}{j}") or 0.0 for axis in "XY"] for j in range(1, p + 1)
@@ -183,20 +162,13 @@ def read_result(path: str) -> SavedResult:
         np.reshape(offsets, (p, 2)),
         np.array(turns, float).reshape(p, 2, 2) if is_turned else None,
         doubtful,
-        messages,
+        found["MESSAGES"]["message"].tolist() if "MESSAGES" in found else [],
     )
 
 
 def _unquoted(quoted: re.Match[str]) -> str:
     raw = quoted[1].encode("ascii").decode("unicode_escape").encode("latin-1")
     return shlex.quote(os.fsdecode(raw))
-
-
-def _texts(file: FitsFile, table: Any) -> list[str]:
-    """Return the lines of the table of messages."""
-    if "message" not in table.columns.names or table.columns["message"].format[-1:] != "A":
-        raise FileError(f"{file.path} has no column message of text in {table.name}")
-    return [str(line).encode("ascii").decode("unicode_escape") for line in table.data["message"]]
 
 
 def _fault(
@@ -207,10 +179,8 @@ def _fault(
     oversample: float,
 ) -> str:
     """Return why these are not the parts of a result; nothing where they are."""
-    for table, names in TABLES.items():
-        for name in names:
-            if (table in tables or table == "STARS") and name not in tables.get(table, ()):
-                return f"there is no column {table} {name}"
+    if "STARS" not in tables:
+        return "there is no table STARS"
     if extended.ndim != 2:
         return "the image is a cube"
     if oversample not in OVERSAMPLES or any(n % oversample for n in extended.shape):

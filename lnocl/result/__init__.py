@@ -26,15 +26,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from lnocl.parallel import Parallel
-    from lnocl.runs.bootstrap import Bootstrap, Part
+    from lnocl.runs.bootstrap import Bootstrap
     from lnocl.significance import Significance
 
 # Stars that a notebook lists.
 MAX_LISTED = 10
 
-HALOS_DTYPE = np.dtype(
-    [("halo", np.int64), ("image", np.int64), ("flux", np.float64), ("flux_error", np.float64)]
-)
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
 
@@ -579,21 +576,14 @@ class Result:
         >>> errors.n
         12
         """
-        from lnocl.io.fitsread import sky_header
-        from lnocl.io.regions import read_apertures, read_profiles
+        from lnocl.io.regions import read_parts
         from lnocl.parallel import check_parallel
         from lnocl.runs.bootstrap import bootstrap, check_number
 
         check_number(n, seed)
         check_parallel(parallel)
         outcome = self._outcome
-        shape = self._observation.sky_shape
-        if header is not None:
-            header = sky_header(header, self._observation.oversample)
-        parts: list[Part] = []
-        for given, read in ((regions, read_apertures), (profiles, read_profiles)):
-            listed = given if isinstance(given, (str, os.PathLike)) else list(given)
-            parts += read(listed, header, shape) if listed else []
+        parts = read_parts(regions, profiles, header, self._observation)
         return bootstrap(outcome, n, parts, seed, progress, earlier, callback, parallel)
 
     def significance(self, width: float = 0.0, false_alarms: float = 0.01) -> Significance:
@@ -679,11 +669,12 @@ class Result:
         """Write a FITS file, which ``lnocl plot`` and ``lnocl report`` read.
 
         It is the file of ``lnocl deconvolve --residuals``, without the options, the command and
-        the messages of the run. The primary HDU holds the extended source. The tables STARS,
-        HALOS, HISTORY and HELDOUT hold the stars, the amounts of halos, the objectives, and the
-        errors that held-out counts estimate. The cubes MODELS and RESIDUALS hold those of each
-        image. PSFS and others are added where PSFs were refined. Units are electrons, per second
-        where exposures were given.
+        the messages of the run, and without ESTIMATE, which needs a command that leads to the
+        images. The primary HDU holds the extended source. The tables STARS, HALOS, HISTORY and
+        HELDOUT hold the stars, the amounts of halos, the objectives, and the errors that held-out
+        counts estimate. The cubes MODELS and RESIDUALS hold those of each image. PSFS and others
+        are added where PSFs were refined. Units are electrons, per second where exposures were
+        given.
 
         Parameters
         ----------
@@ -746,13 +737,6 @@ class Result:
     @property
     def _unit(self) -> str:
         return "electron" if (self._observation.exposure == 1.0).all() else "electron/s"
-
-    def _halo_table(self) -> NDArray[np.void]:
-        """Return the amounts of halos, a row for each halo and image, both counted from 1."""
-        rows = np.zeros(self.halo_fluxes.size, HALOS_DTYPE)
-        rows["halo"], rows["image"] = np.indices(self.halo_fluxes.shape).reshape(2, -1) + 1
-        rows["flux"], rows["flux_error"] = self.halo_fluxes.ravel(), self.halo_flux_errors.ravel()
-        return rows
 
     def _halo_lines(self) -> list[str]:
         """Return the amounts of each halo in words, electrons."""

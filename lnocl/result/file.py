@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lnocl.io import sky
 from lnocl.io.fitsread import wcs_cards
-from lnocl.io.fitswrite import Card, StarColumn, column_unit, write_result
+from lnocl.io.fitswrite import Card, column_unit, write_result
+from lnocl.io.parts import PARTS, Column
+from lnocl.result.kept import to_parts
+from lnocl.runs.outcome import Outcome, PsfRefinement
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
     from lnocl.result import Result
+    from lnocl.scene.observation import Observation
 
 
 def write_file(
@@ -30,6 +34,7 @@ def write_file(
     has_cubes: bool = True,
     commands: Iterable[Sequence[str]] = (),
     messages: Sequence[str] = (),
+    given: Observation | None = None,
 ) -> None:
     """Write a result: the file is there complete, or not at all.
 
@@ -49,8 +54,13 @@ def write_file(
         Unit of the file, and the electrons in it; by default that of the result.
     has_cubes : bool, optional
         Whether the models and the residuals of the images are added.
-    commands, messages
+    commands : iterable of sequence of str, optional
         As for `lnocl.io.fitswrite.write_result`.
+    messages : sequence of str, optional
+        The messages of the run, a line each.
+    given : Observation, optional
+        What the result is of, where the commands lead to it: what the run has found is added then,
+        so that errors and detections begin there.
 
     Raises
     ------
@@ -72,63 +82,100 @@ def write_file(
         ("ONEUNIT", f"{float(electrons)} {result._unit}", "what one BUNIT is"),
         ("RESIDRMS", result.fit().rms, "rms residual, 1 by noise"),
         ("VERDICT", "; ".join(result.verdict()), ""),
-        *([] if refinement is None else refinement.cards()),
+        *([] if refinement is None else _psf_cards(refinement)),
     ]
-    models = result.models() if has_cubes else None
+    parts: dict[str, Any] = {
+        "HALOS": _halos(result) if result.halo_fluxes.size else None,
+        "HISTORY": result.history,
+        "HELDOUT": result.held_out if result.held_out.size else None,
+    }
+    if has_cubes:
+        models = result.models()
+        parts |= {"MODELS": models, "RESIDUALS": result._residuals(models)}
+    if refinement is not None:
+        parts |= _psf_parts(result, refinement)
+    parts["MESSAGES"] = [Column("message", messages)] if messages else None
+    outcome = result._findings
+    if given is not None and isinstance(outcome, Outcome):
+        kept = to_parts(outcome, given)
+        parts["ESTIMATE"] = [Column(name, value[None]) for name, value in kept.items()]
     write_result(
         path,
         result.extended / electrons,
         result.star_positions,
         result.star_fluxes / electrons,
-        history=result.history,
+        parts,
+        star_columns=_star_columns(result, header, name, electrons),
+        unit=name,
         wcs=None if header is None else wcs_cards(header),
+        transforms=observation.transforms,
+        oversample=observation.oversample,
         # A card cannot hold what is not finite.
         cards=[*cards, *(c for c in own if isinstance(c[1], str) or math.isfinite(c[1]))],
         commands=commands,
         overwrite=overwrite,
-        held_out=result.held_out if result.held_out.size else None,
-        unit=name,
-        star_columns=_star_columns(result, header, name, electrons),
-        cubes={}
-        if models is None
-        else {"MODELS": (models, "electron"), "RESIDUALS": (result._residuals(models), "")},
-        transforms=observation.transforms,
-        oversample=observation.oversample,
-        psf_fit=None if refinement is None else refinement.table(),
-        psfs=None if refinement is None else result.psfs,
-        psf_errors=None if refinement is None else refinement.errors_table(),
-        doubtful=None if refinement is None else result.doubtful,
-        messages=messages,
-        halos=result._halo_table() if result.halo_fluxes.size else None,
     )
+
+
+def _psf_cards(refinement: PsfRefinement) -> list[Card]:
+    """Return whether PSFs were refined, their misfits and their error."""
+    before, after = refinement.misfit
+    return [
+        ("PSFUSED", refinement.is_accepted, "whether refined PSFs are used"),
+        ("PSFMIS1", before, "chi squared at stars, PSFs as given"),
+        ("PSFMIS2", after, "chi squared at stars, PSFs used"),
+        ("PSFERR", refinement.psf_error, "relative error that the PSFs used have"),
+    ]
+
+
+def _psf_parts(result: Result, refinement: PsfRefinement) -> dict[str, Any]:
+    """Return the parameters of the PSFs, the PSFs, their error in rings, and what it may fake."""
+    names = [name.replace(" ", "_") for name in refinement.parameters]
+    edges, errors = refinement.edges, refinement.errors_in_rings
+    return {
+        "PSFFIT": [
+            Column("image", np.arange(1, len(refinement.values) + 1)),
+            *map(Column, names, refinement.values.T),
+        ],
+        "PSFS": result.psfs,
+        "PSFERRORS": [*map(Column, ("from", "to", "error"), (edges[:-1], edges[1:], errors))],
+        "DOUBTFUL": result.doubtful,
+    }
+
+
+def _halos(result: Result) -> list[Column]:
+    """Return the amounts of halos, a row for each halo and image, both counted from 1."""
+    numbers = np.indices(result.halo_fluxes.shape) + 1
+    columns = [*numbers, result.halo_fluxes, result.halo_flux_errors]
+    return [*map(Column, PARTS["HALOS"].columns, map(np.ravel, columns))]
 
 
 def _star_columns(
     result: Result, header: fits.Header | None, unit: str, electrons: float
-) -> list[StarColumn]:
+) -> list[Column]:
     """Return the columns of the table of stars after positions and fluxes."""
     columns, positions = [], result.star_positions
     if np.isfinite(result.star_position_errors).any():
         x_error, y_error = result.star_position_errors.T
         columns += [
-            StarColumn("x_error", x_error, "pix", "standard error"),
-            StarColumn("y_error", y_error, "pix", "standard error"),
+            Column("x_error", x_error, "pix", "standard error"),
+            Column("y_error", y_error, "pix", "standard error"),
         ]
     flux_errors = result.star_flux_errors / electrons
-    columns.append(StarColumn("flux_error", flux_errors, column_unit(unit), "standard error"))
+    columns.append(Column("flux_error", flux_errors, column_unit(unit), "standard error"))
     if (n_epochs := result._observation.n_epochs) > 1:
-        epochs = np.arange(len(positions)) % n_epochs
-        columns.append(StarColumn("epoch", epochs, "", "number of the epoch, from 0 on"))
+        epochs = np.arange(len(positions)) % float(n_epochs)
+        columns.append(Column("epoch", epochs, "", "number of the epoch, from 0 on"))
     if header is not None and sky.has_celestial(header):
         ra, dec = sky.to_sky(positions, header).T
         columns += [
-            StarColumn("ra", ra, "deg", "right ascension, ICRS"),
-            StarColumn("dec", dec, "deg", "declination, ICRS"),
+            Column("ra", ra, "deg", "right ascension, ICRS"),
+            Column("dec", dec, "deg", "declination, ICRS"),
         ]
     at_stars = result.star_residuals()
     for part in ("core", "wings"):
         values = [getattr(found, part).rms for found in at_stars]
         comment = f"rms residual in the {part}, 1 by noise"
-        columns.append(StarColumn(f"{part}_rms", values, "", comment))
+        columns.append(Column(f"{part}_rms", values, "", comment))
     halos = [found.halo for found in at_stars]
-    return [*columns, StarColumn("halo", halos, "", "light all round it over its flux")]
+    return [*columns, Column("halo", halos, "", "light all round it over its flux")]

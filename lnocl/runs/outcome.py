@@ -90,33 +90,6 @@ class PsfRefinement:
     has_free_pixels: bool = False
     hidden_error: float = 0.0
 
-    def table(self) -> NDArray[np.void]:
-        """Return the parameters of the PSFs, a row an image, for a FITS table."""
-        names = [name.replace(" ", "_") for name in self.parameters]
-        rows = np.zeros(len(self.values), [("image", np.int64), *((name, float) for name in names)])
-        rows["image"] = np.arange(1, len(rows) + 1)
-        for name, values in zip(names, self.values.T, strict=True):
-            rows[name] = values
-        return rows
-
-    def errors_table(self) -> NDArray[np.void]:
-        """Return the relative error of the PSFs, a row a ring, for a FITS table."""
-        columns = {"from": self.edges[:-1], "to": self.edges[1:], "error": self.errors_in_rings}
-        rows = np.zeros(len(self.errors_in_rings), [(name, float) for name in columns])
-        for name, values in columns.items():
-            rows[name] = values
-        return rows
-
-    def cards(self) -> list[tuple[str, bool | float, str]]:
-        """Return whether PSFs were refined, their misfits and their error, as FITS cards."""
-        before, after = self.misfit
-        return [
-            ("PSFUSED", self.is_accepted, "whether refined PSFs are used"),
-            ("PSFMIS1", before, "chi squared at stars, PSFs as given"),
-            ("PSFMIS2", after, "chi squared at stars, PSFs used"),
-            ("PSFERR", self.psf_error, "relative error that the PSFs used have"),
-        ]
-
 
 class Mended(NamedTuple):
     """A setup whose PSFs and positions fit as well as could be found.

@@ -41,6 +41,11 @@ class Setup:
     initial_star_fluxes: Array | None = None
     settles_halos: bool = False
 
+    def scene(self, penalty: Penalty) -> Scene:
+        """Return the model of the observation, with the stars where they were given."""
+        max_shift = MAX_SHIFT if self.refine_positions else 0.0
+        return Scene(self.observation, self.stars, penalty, self.pad, max_shift)
+
     def engine_name(self) -> str:
         """Return the name of the engine: the device, its platform and driver.
 
@@ -146,8 +151,7 @@ def make_start(setup: Setup, penalty: Penalty) -> Start:
     InputError
         As `deconvolve`.
     """
-    max_shift = MAX_SHIFT if setup.refine_positions else 0.0
-    scene = Scene(setup.observation, setup.stars, penalty, setup.pad, max_shift)
+    scene = setup.scene(penalty)
     extended, star_fluxes = scene.start(setup.initial_extended, setup.initial_star_fluxes)
     refines = setup.refine_positions and scene.n_stars > 0
     scaling = None

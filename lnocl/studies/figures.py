@@ -10,8 +10,8 @@ import numpy as np
 
 from lnocl.errors import InputError
 from lnocl.io import atomic
-from lnocl.io.fitserrors import read_errors
-from lnocl.io.fitsfindings import read_findings
+from lnocl.io.headers import number
+from lnocl.io.parts import read_parts
 from lnocl.io.saved_results import SavedResult, read_result
 from lnocl.plotting.beside import draw_beside
 from lnocl.plotting.figure import check_matplotlib, save_figure
@@ -89,9 +89,12 @@ def draw(folder: str, results: Sequence[str], overwrite: bool = False) -> Iterat
 
 def read_profiles(path: str) -> list[tuple[str, Table, Table, str]]:
     """Return name, light, width and unit of light of each profile whose errors a result has."""
-    errors = read_errors(path)
-    if errors is None:
+    held = read_parts(path, ["ERRORS"])
+    if not held:
         return []
+    from astropy.table import Table  # which takes its time to load
+
+    errors = Table(held["ERRORS"].values)
     along = errors[np.isfinite(errors["at"])]
     names = list(dict.fromkeys(along["name"].tolist()))
     found = []
@@ -130,16 +133,22 @@ def report(path: str) -> str:
 
 def _found(path: str, saved: SavedResult) -> SignificanceView | None:
     """Return the detections and limits of a saved result; None where it has none."""
-    found = read_findings(path)
-    if found is None:
+    parts = read_parts(path, ("DETECTIONS", "LIMITS", "SIGNAL", "LIMIT50"))
+    found = {name: part.values for name, part in parts.items()}
+    table = parts.get("LIMITS", parts.get("DETECTIONS"))
+    if table is None:
         return None
-    detections, curves = (
-        None if table is None else {name: table[name].tolist() for name in table.colnames}
-        for table in (found.detections, found.limits)
+    return SignificanceView(
+        list(dict.fromkeys(saved.stars)),  # of a star in several epochs one
+        saved.oversample,
+        number(path, table.header, "THRESHOL") or np.nan,
+        number(path, table.header, "SRCWIDTH") or 0.0,
+        str(table.header.get("FLUXUNIT", "")),
+        found.get("SIGNAL"),
+        found.get("DETECTIONS"),
+        found.get("LIMIT50"),
+        found.get("LIMITS"),
     )
-    stars = list(dict.fromkeys(saved.stars))  # of a star in several epochs one
-    shown = stars, saved.oversample, found.threshold, found.width, found.unit
-    return SignificanceView(*shown, found.signal, detections, found.limit, curves)
 
 
 def view_of(saved: SavedResult) -> ResultView:

@@ -9,8 +9,8 @@ from astropy.io import fits
 from astropy.table import Table
 from commandline import gaussian, one_complaint
 
-from lnocl.commands import cli
-from lnocl.io.fitsfindings import read_findings
+from lnocl.commands import cli, deconvolve
+from lnocl.io.parts import read_parts
 
 N = 64
 WCS = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 15.25, "CRVAL2": -3.0,
@@ -49,16 +49,33 @@ def test_detections_are_said_written_and_added(output, capsys):
     assert table["kind"].tolist() == ["point"]
     assert abs(table["flux"][0] - 3000) < 4 * table["flux_error"][0]
     assert table["ra"][0] == pytest.approx(15.25 - 14e-4, abs=2e-5)
-    held = read_findings("out.fits")
-    assert held.threshold == pytest.approx(float(said[0].split()[3]), abs=0.01)
-    assert held.detections["x"][0] == pytest.approx(table["x"][0])
-    assert held.detections["kind"].tolist() == ["point"]
-    assert held.signal[19, 45] > 10
-    assert held.unit == "electron"
+    held = read_parts("out.fits", ["DETECTIONS", "SIGNAL"])
+    found, cards = held["DETECTIONS"]
+    assert cards["THRESHOL"] == pytest.approx(float(said[0].split()[3]), abs=0.01)
+    assert found["x"][0] == pytest.approx(table["x"][0])
+    assert found["kind"].tolist() == ["point"]
+    assert held["SIGNAL"].values[19, 45] > 10
+    assert cards["FLUXUNIT"] == "electron"
     with fits.open("out.fits") as hdus:
         assert [hdu.name for hdu in hdus][-2:] == ["DETECTIONS", "SIGNAL"]
         assert hdus["SIGNAL"].header["CRVAL1"] == 15.25
         assert hdus["DETECTIONS"].header["FALSALRM"] == 0.01
+
+
+def test_detections_and_limits_begin_at_once(monkeypatch, capsys):
+    """They are those of a file of before, which has to make its run again."""
+    commands = ["detect", "out.fits"], ["limit", "out.fits", "--injections", "4"]
+    found = []
+    for solve in (None, deconvolve.solve):
+        monkeypatch.setattr(deconvolve, "solve", solve)
+        for command in commands:
+            assert cli.main(command) == 0
+        found.append({name: fits.getdata("out.fits", name) for name in ("SIGNAL", "LIMITS", *MAPS)})
+        found[-1]["said"] = capsys.readouterr().out
+        with fits.open("out.fits", mode="update") as hdus:
+            for name in {"ESTIMATE", "SIGNAL", "LIMITS"} & {hdu.name for hdu in hdus}:
+                del hdus[name]
+    np.testing.assert_equal(found[1], found[0])
 
 
 def test_detections_replace_those_that_are_there(capsys):
@@ -84,8 +101,8 @@ def test_limits_are_said_written_added_and_checked(capsys):
     table = Table.read("limits.ecsv")
     assert {"star", "distance", "flux50", "contrast90", "magnitudes95"} <= set(table.colnames)
     assert (table["flux95"] > table["flux50"]).all()
-    held = read_findings("out.fits")
-    assert held.limit.shape == (N, N)
+    held = read_parts("out.fits", ["LIMIT50"])
+    assert held["LIMIT50"].values.shape == (N, N)
     with fits.open("out.fits") as hdus:
         assert [hdu.name for hdu in hdus][-4:] == ["LIMITS", *MAPS]
         assert hdus["LIMIT50"].header["BUNIT"] == "electron"
@@ -140,7 +157,7 @@ def test_fluxes_are_in_the_unit_of_the_images(unit, capsys):
     assert f" {unit}" in said
     table = Table.read("found.ecsv")
     assert abs(table["flux"][0] - 300) < 4 * table["flux_error"][0]
-    assert read_findings("adu.fits").unit == unit
+    assert fits.getheader("adu.fits", "DETECTIONS")["FLUXUNIT"] == unit.replace(" ", "")
 
 
 def test_a_star_without_light_has_no_limit_beside_it(capsys):

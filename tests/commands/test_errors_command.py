@@ -13,6 +13,7 @@ from astropy.io import fits
 
 import lnocl
 from lnocl.commands import bootstrap, cli
+from lnocl.commands.again import Again
 from lnocl.plotting.profiles import draw_bands
 
 pytest.importorskip("regions", reason="regions is not installed")
@@ -201,10 +202,44 @@ def test_without_stars_and_regions_pixels_have_errors(words):
     assert (found["ERROR"].data > 0).all()
 
 
+def forget_the_run():
+    """Leave a file as those of before, without what the run has found."""
+    with fits.open("out.fits", mode="update") as hdus:
+        del hdus["ESTIMATE"]
+
+
 @pytest.mark.usefixtures("result")
-def test_a_run_that_was_interrupted_has_no_errors(capsys):
+def test_no_run_is_made_again_where_the_file_has_what_it_found(monkeypatch, capsys):
+    assert cli.main([*ERRORS, "10"]) == 0
+    assert "the run is made again" not in capsys.readouterr().err
+    expected = held()
+    forget_the_run()
+    assert cli.main([*ERRORS, "10", "--overwrite"]) == 0
+    said = capsys.readouterr().err.splitlines()
+    line = "lnocl: out.fits does not hold what its run has found: the run is made again"
+    assert said.count(line) == 1
+    same_errors(held(), expected)
+    monkeypatch.setattr("lnocl.commands.deconvolve.solve", None)
+    with fits.open("out.fits", mode="append") as hdus:
+        hdus.append(expected["ESTIMATE"])
+    assert cli.main([*ERRORS, "10", "--overwrite"]) == 0
+    same_errors(held(), expected)
+
+
+def test_replicas_are_made_on_the_device_of_the_run(words, monkeypatch):
+    """It is named in the command, and may have been chosen among several."""
+    monkeypatch.setattr("lnocl.commands.deconvolve._device_spec", lambda arguments: "0:7")
+    assert cli.main(words) == 0
+    assert Again.read("out.fits", quiet=True).outcome().setup.device == "0:7"
+
+
+@pytest.mark.usefixtures("result")
+def test_a_run_that_was_interrupted_has_errors_but_is_not_made_again(capsys):
     fits.setval("out.fits", "STOPPED", value="interrupt")
-    assert cli.main(["errors", "out.fits"]) == 2
+    assert cli.main([*ERRORS, "10", "--quiet"]) == 0
+    forget_the_run()
+    capsys.readouterr()
+    assert cli.main([*ERRORS, "10"]) == 2
     assert "the run of out.fits was interrupted, and its command" in capsys.readouterr().err
     Path("out.fits").rename("out.fits.gz")
     assert cli.main(["errors", "out.fits.gz"]) != 0
@@ -282,11 +317,10 @@ def test_wrong_uses_are_one_line_and_leave_the_file(capsys):
 def test_what_has_changed_since_is_refused(capsys):
     images = fits.getdata("images.fits")
     fits.writeto("images.fits", images[:, ::-1], overwrite=True)
-    assert cli.main(["errors", "out.fits", "--quiet"]) == 2
-    assert (
-        "the run of out.fits gives another result now: its images, PSFs or"
-        in capsys.readouterr().err
-    )
+    assert cli.main(["errors", "out.fits"]) == 2
+    said = capsys.readouterr().err
+    assert "holds of its run is of other images, or of another version of lnocl: the run" in said
+    assert "the run of out.fits gives another result now: its images, PSFs or" in said
     Path("images.fits").unlink()
     assert cli.main(["errors", "out.fits", "--quiet"]) == 1
     assert "images.fits" in capsys.readouterr().err

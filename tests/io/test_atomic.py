@@ -26,8 +26,8 @@ FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
 def write_result(path, overwrite=False):
-    cubes = {"MODELS": (LARGE[None], "electron")}
-    fitswrite.write_result(path, LARGE, [(3.0, 4.5)], [17.25], cubes=cubes, overwrite=overwrite)
+    cubes = {"MODELS": LARGE[None]}
+    fitswrite.write_result(path, LARGE, [(3.0, 4.5)], [17.25], cubes, overwrite=overwrite)
 
 
 def write_image(path, overwrite=False):

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lnocl.io import fitswrite
+from lnocl.io.parts import Column
 
 IMAGE = np.arange(1.0, 121.0).reshape(10, 12)
 HISTORY = np.array([(0, 3.5), (1, 2.5)], dtype=[("iteration", np.int64), ("objective", float)])
@@ -24,7 +25,7 @@ def write(path, **changes):
             "extended": IMAGE,
             "stars": [(3.0, 4.5)],
             "star_fluxes": [17.25],
-            "history": HISTORY,
+            "parts": {"HISTORY": HISTORY, **changes.pop("parts", {})},
         }
         | changes
     )
@@ -49,9 +50,9 @@ class TestWriting:
 
     def test_further_columns_of_the_stars(self, tmp_path):
         columns = [
-            fitswrite.StarColumn("mag", [17.5], "mag", "by the zero point"),
-            fitswrite.StarColumn("ra", np.array([150.25]), "deg", "right ascension, ICRS"),
-            fitswrite.StarColumn("x_error", [0], "", "standard error"),
+            Column("mag", [17.5], "mag", "by the zero point"),
+            Column("ra", np.array([150.25]), "deg", "right ascension, ICRS"),
+            Column("x_error", [0], "", "standard error"),
         ]
         path = write(tmp_path / "out.fits", star_columns=columns, unit="electron/s")
         stars = QTable.read(path, hdu="STARS")
@@ -70,8 +71,8 @@ class TestWriting:
         cube = np.random.default_rng(2).normal(size=(3, *IMAGE.shape))
         cube[1, 2, 3] = np.nan
         wcs = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 4.5})
-        cubes = {"MODELS": (cube, "electron"), "RESIDUALS": (2.0 * cube, "")}
-        path = write(tmp_path / "out.fits", wcs=wcs, cubes=cubes, cards=[("MU", 0.25, "")])
+        cubes = {"MODELS": cube, "RESIDUALS": 2.0 * cube}
+        path = write(tmp_path / "out.fits", wcs=wcs, parts=cubes, cards=[("MU", 0.25, "")])
         with fits.open(path, checksum=True) as hdus:
             assert [hdu.name for hdu in hdus][3:] == ["MODELS", "RESIDUALS"]
             np.testing.assert_array_equal(hdus["MODELS"].data, cube.astype("f4"))
@@ -85,10 +86,10 @@ class TestWriting:
 
     def test_cubes_of_shifted_images_have_offsets_in_the_place_of_coordinates(self, tmp_path):
         wcs = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 4.5})
-        cubes = {"MODELS": (np.ones((2, *IMAGE.shape)), "electron")}
+        cubes = {"MODELS": np.ones((2, *IMAGE.shape))}
         maps = np.array([np.eye(2, 3)] * 2)
         maps[1, :, 2] = 7.0, -4.0
-        path = write(tmp_path / "out.fits", wcs=wcs, cubes=cubes, transforms=maps)
+        path = write(tmp_path / "out.fits", wcs=wcs, parts=cubes, transforms=maps)
         header = fits.getheader(path, "MODELS")
         assert not {"CTYPE1", "CTYPE2", "CRPIX1"} & set(header)
         assert [header[f"OFF{axis}"] for axis in ("X1", "Y1", "X2", "Y2")] == [0, 0, 7, -4]
@@ -97,11 +98,11 @@ class TestWriting:
         assert fitscheck.main(["--compliance", path]) == 0
         assert "R11_1" not in header
         maps[1, :, :2] = [[0.6, -0.8], [0.8, 0.6]]
-        path = write(tmp_path / "turned.fits", wcs=wcs, cubes=cubes, transforms=maps)
+        path = write(tmp_path / "turned.fits", wcs=wcs, parts=cubes, transforms=maps)
         header = fits.getheader(path, "MODELS")
         assert [header[f"R{ab}_2"] for ab in ("11", "12", "21", "22")] == [0.6, -0.8, 0.8, 0.6]
         maps[:] = np.eye(2, 3)
-        path = write(tmp_path / "same.fits", wcs=wcs, cubes=cubes, transforms=maps)
+        path = write(tmp_path / "same.fits", wcs=wcs, parts=cubes, transforms=maps)
         header = fits.getheader(path, "MODELS")
         assert header["CRPIX1"] == 4.5
         assert "OFFX1" not in header

@@ -15,6 +15,7 @@ from result_views import make_view
 
 from lnocl.commands import cli
 from lnocl.io import fitswrite
+from lnocl.io.parts import Column
 from lnocl.plotting import report
 from lnocl.plotting.report import make_report
 
@@ -120,20 +121,23 @@ def test_it_needs_no_other_file_and_evaluates_nothing_of_the_result():
     assert "default-src 'none'" in page
 
 
+def messages(*lines):
+    return [Column("message", lines)]
+
+
 class TestCommand:
     @pytest.fixture(autouse=True)
     def _folder(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
-        cube = np.ones((1, 32, 32))
+        cube, said = np.ones((1, 32, 32)), ["warning: it is noisy", "the model fits"]
         fitswrite.write_result(
             "a.fits",
             np.ones((32, 32)),
             [(3, 4)],
             [7.5],
+            {"MODELS": cube, "RESIDUALS": cube, "MESSAGES": messages(*said)},
             cards=[("OBJECT", "RW Aur", "")],
             commands=[["cd", "/home/me/" + "data" * 30], ["lnocl", "deconvolve", "b.fits"]],
-            cubes={"MODELS": (cube, "electron"), "RESIDUALS": (cube, "")},
-            messages=["warning: it is noisy", "the model fits"],
         )
 
     def test_a_result_becomes_a_page(self, capsys):
@@ -149,8 +153,8 @@ class TestCommand:
 
     def test_a_star_that_was_moved_over_the_edge_is_shown(self):
         cube = np.ones((1, 32, 32))
-        said = ["café \\ tab"]
-        fitswrite.write_result("b.fits", cube[0], [(-1, 4)], [7.5], messages=said)
+        said = {"MESSAGES": messages("café \\ tab")}
+        fitswrite.write_result("b.fits", cube[0], [(-1, 4)], [7.5], said)
         with fits.open("b.fits", mode="append") as file:
             file.append(fits.ImageHDU(1e308 * cube, name="MODELS"))
             file.append(fits.ImageHDU(np.inf * cube, name="RESIDUALS"))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from scenes import make_smooth_psfs
+from scipy.ndimage import gaussian_filter
 
 import lnocl
 from lnocl.commands import cli
@@ -20,11 +21,14 @@ from lnocl.studies.figures import view_of as view_of_file
 NY, NX, LEVEL = 40, 36, 12.0
 STARS = [(9.0, 12.0), (25.0, 29.0)]
 FLUXES = np.array([[6e3, 2e3, 4e3], [3e3, 9e3, 1e3]])
+BRIGHT = [2e4, 4e4]
 EXPOSURES = [1.0, 3.0, 0.5]
 WORDS = ["--psf-centre", "given", "--background", str(LEVEL), "--smoothing", "0.1", "--stop"]
 WORDS += ["none", "--n-iter", "3", "--engine", "numpy", "--pad", "0", "--residuals"]
 DECONVOLVE = inspect.signature(lnocl.deconvolve).parameters
 OPTIONS = {"smoothing": 0.1, "stop": None, "n_iter": 3, "engine": "numpy", "pad": 0}
+# What the command leads to, and what it has said.
+OF_SHELL = "MESSAGES", "ESTIMATE"
 WCS = {
     "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 65.0, "CRVAL2": 19.5,
     "CRPIX1": 10.0, "CRPIX2": 20.0, "CDELT1": -1e-4, "CDELT2": 1e-4,
@@ -34,31 +38,40 @@ HEADER = fits.Header({"BUNIT": "electron", "OBJECT": "RW Aur", "EXPTIME": 30.0, 
 
 @pytest.fixture(scope="module", autouse=True)
 def files(tmp_path_factory):
-    """Work in a folder with three images of two stars that vary, their PSFs, and a halo."""
+    """Work in a folder with three images of two stars that vary, their PSFs, and a halo.
+
+    And with an image, of number 3, that is blurred against its PSF.
+    """
     y, x = np.indices((NY, NX))
     halo = 1.0 / (4.0 + np.hypot(x - 9, 1.3 * (y - 12)))
     psfs, rng = make_smooth_psfs(3, (17, 17)), np.random.default_rng(0)
     psfs /= psfs.sum(axis=(1, 2), keepdims=True)
     with contextlib.chdir(tmp_path_factory.mktemp("result_file")):
-        for j, (psf, exposure) in enumerate(zip(psfs, EXPOSURES, strict=True)):
-            means = LEVEL + exposure * 4e3 * halo / halo.sum()
-            for (sx, sy), fluxes in zip(STARS, FLUXES, strict=True):
+        for j, psf in enumerate([*psfs, psfs[0]]):
+            exposure, fluxes = (EXPOSURES[j], FLUXES[:, j]) if j < 3 else (1.0, BRIGHT)
+            means = np.zeros((NY, NX))
+            for (sx, sy), flux in zip(STARS, fluxes, strict=True):
                 there = np.s_[int(sy) - 8 : int(sy) + 9, int(sx) - 8 : int(sx) + 9]
-                means[there] += exposure * fluxes[j] * psf
-            fits.writeto(f"image{j}.fits", rng.poisson(means).astype(float), HEADER)
+                means[there] += exposure * flux * psf
+            if j < 3:
+                means += exposure * 4e3 * halo / halo.sum()
+            else:
+                means = gaussian_filter(means, 1.0)
+            images = rng.poisson(means + LEVEL).astype(float)
+            fits.writeto(f"image{j}.fits", images, HEADER)
             fits.writeto(f"psf{j}.fits", psf)
             fits.writeto(f"scatter{j}.fits", 0.02 * psf)
         fits.writeto("halo.fits", halo)
         yield
 
 
-def both(*more, n_images=3, **options):
+def both(*more, numbers=(0, 1, 2), **options):
     """Return the result of Python, having written those of Python and of the shell."""
     given = {name: options.pop(name) for name in list(options) if name not in DECONVOLVE}
-    names = [[f"{name}{j}.fits" for j in range(n_images)] for name in ("image", "psf")]
+    names = [[f"{name}{j}.fits" for j in numbers] for name in ("image", "psf")]
     images, psfs = (np.array([fits.getdata(name) for name in each]) for each in names)
     observation = lnocl.Observation(images, psfs, background=LEVEL, psf_centre="given", **given)
-    result = lnocl.deconvolve(observation, STARS, **OPTIONS, **options)
+    result = lnocl.deconvolve(observation, STARS, **{**OPTIONS, **options})
     result.write("python.fits", header=HEADER, overwrite=True)
     stars = [word for x, y in STARS for word in ("--star", f"{x},{y}")]
     words = [*names[0], "--psf", *names[1], *stars, *WORDS, *more, "-o", "shell.fits"]
@@ -76,15 +89,23 @@ def psf_errors():
     options = ("--psf-errors", "scatter=scatter0.fits", "--refine-psfs", "none", "--refine")
     scatter = fits.getdata("scatter0.fits")
     more = {"refine_psfs": (), "refine_positions": True}
-    return both(*options, n_images=1, psf_scatter=scatter, **more)
+    return both(*options, numbers=[0], psf_scatter=scatter, **more)
 
 
 def turned():
     middle = NX // 2, NY // 2
-    return both("--angle", "10", "25", transforms=lnocl.rotations([-10, -25], middle), n_images=2)
+    return both(
+        "--angle", "10", "25", transforms=lnocl.rotations([-10, -25], middle), numbers=[0, 1]
+    )
 
 
-@pytest.fixture(scope="module", params=[epochs_and_halos, psf_errors, turned])
+def mended_and_chosen():
+    words = ["--smoothing", "auto", "--stop", "held-out", "--n-iter", "99"]
+    options = {"smoothing": "auto", "stop": "held-out", "n_iter": 99, "refine_psfs": ["jitter"]}
+    return both(*words, "--refine-psfs", "jitter", numbers=[3], **options)
+
+
+@pytest.fixture(scope="module", params=[epochs_and_halos, psf_errors, turned, mended_and_chosen])
 def case(request, files):
     return request.param, request.param()
 
@@ -101,7 +122,7 @@ def test_python_and_the_shell_write_the_same(case):
     words |= {each.checksum for each in ALL_OPTIONS if each.checksum}
     with fits.open("python.fits", checksum=True) as one, fits.open("shell.fits") as other:
         names = [hdu.name for hdu in one]
-        assert [hdu.name for hdu in other if hdu.name != "MESSAGES"] == names
+        assert [hdu.name for hdu in other if hdu.name not in OF_SHELL] == names
         for name in names:
             np.testing.assert_equal(one[name].data, other[name].data, name)
             found, expected = cards(other[name].header), cards(one[name].header)
@@ -113,6 +134,11 @@ def test_python_and_the_shell_write_the_same(case):
         assert one[0].header["OBJECT"] == "RW Aur"
         assert ("epoch" in one["STARS"].columns.names) == (run is epochs_and_halos)
         assert ("ra" in one["STARS"].columns.names) == (run is not turned)
+        of_psfs = {"PSFFIT", "PSFS", "PSFERRORS", "DOUBTFUL"}
+        assert of_psfs & {*names} == (of_psfs if run in (psf_errors, mended_and_chosen) else set())
+        assert ("HALOS" in names) == (run is epochs_and_halos)
+        assert ("HELDOUT" in names) == (run is mended_and_chosen)
+        assert one[0].header.get("PSFUSED", False) == (run is mended_and_chosen)
 
 
 def test_read_back_both_plot_as_the_result_does(case):

@@ -255,7 +255,7 @@ class TestPlot:
     def test_of_one_result_its_picture_is_drawn(self, capsys):
         image = np.ones((32, 32))
         history = np.array([(0, 3.5), (1, 2.5)], [("iteration", int), ("objective", float)])
-        fitswrite.write_result("a.fits", image, [], [], history)
+        fitswrite.write_result("a.fits", image, [], [], {"HISTORY": history})
         assert cli.main(["plot", "a.fits", "-o", "out"]) == 0
         assert capsys.readouterr().out.splitlines() == [
             "drew out/result.png",
@@ -265,10 +265,10 @@ class TestPlot:
         assert os.listdir("out") == ["result.png"]
 
     def test_several_results_of_several_stars_are_compared(self, capsys):
-        cubes = {"MODELS": (np.ones((1, 32, 32)), ""), "RESIDUALS": (np.ones((1, 32, 32)), "")}
+        cubes = {name: np.ones((1, 32, 32)) for name in ("MODELS", "RESIDUALS")}
         for name in "ab":
             fitswrite.write_result(
-                f"{name}.fits", np.ones((32, 32)), [(3, 4), (9, 9)], [2.0, 1.0], cubes=cubes
+                f"{name}.fits", np.ones((32, 32)), [(3, 4), (9, 9)], [2.0, 1.0], cubes
             )
         assert cli.main(["plot", "a.fits", "b.fits", "-o", "out"]) == 0
         drawn = ["drew out/result_1.png", "drew out/result_2.png", "drew out/objects.png"]
