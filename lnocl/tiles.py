@@ -25,7 +25,7 @@ from lnocl.runs.plan import plan as make_plan
 from lnocl.runs.preparation import Prepared, prepare
 from lnocl.runs.progress import Progress
 from lnocl.scene.arrays import Array, whole
-from lnocl.scene.counts import mean_exposure
+from lnocl.scene.counts import mean_exposure, means
 from lnocl.scene.grid import length_for
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import recommend_pad
@@ -629,7 +629,7 @@ class _Mosaic:
         """Return the light of the extended source and its standard error, electrons."""
         fluxes, errors = zip(*(found.flux for found in self._found), strict=True)
         # The level of an image is wrong in all its tiles alike.
-        exposure = self.observation.exposure.reshape(self.observation.n_images, -1).mean(axis=1)
+        exposure = means(self.observation.exposure, self.observation.mask)
         error = float(np.linalg.norm(self.observation.background_error)) / float(exposure.sum())
         n_pixels = self.observation.images[0].size
         return sum(fluxes), math.hypot(*errors, n_pixels * error)

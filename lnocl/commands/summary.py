@@ -13,6 +13,7 @@ from lnocl.errors import counted
 from lnocl.residuals import Fit, sharp_sources
 from lnocl.result import Result
 from lnocl.result.verdict import FITS, in_words
+from lnocl.scene.counts import means
 from lnocl.scene.observation import Observation
 from lnocl.scene.stars import MAX_SHIFT
 
@@ -117,8 +118,10 @@ def _shortness(arguments: argparse.Namespace, result: Result) -> list[str]:
 def _unnamed(result: Result, frames: Frames) -> list[str]:
     """Return a line on sources in the extended source that are as sharp as stars."""
     observation = frames.observation
-    background = float((_means(observation.background) / _areas(observation)).sum())
-    exposure = float(_means(observation.exposure).sum())  # of all images, whose noise tells
+    levels = means(observation.background, observation.mask)
+    background = float((levels / _areas(observation)).sum())
+    # Of all images, whose noise tells.
+    exposure = float(means(observation.exposure, observation.mask).sum())
     found = sharp_sources(result.extended * exposure, background, observation.oversample)
     found = found / (1.0, 1.0, exposure)
     offsets = found[:, None, :2] - result.star_positions
@@ -137,8 +140,9 @@ def _floor(result: Result, frames: Frames, unit: str) -> list[str]:
     """Return a line where the extended source is nowhere dark."""
     observation = frames.observation
     darkest = float(np.quantile(result.extended, DARK_SHARE))
-    counts = darkest * _areas(observation) * _means(observation.exposure)
-    if not (counts > FLOOR * np.sqrt(_means(observation.background) + counts)).any():
+    counts = darkest * _areas(observation) * means(observation.exposure, observation.mask)
+    levels = means(observation.background, observation.mask)
+    if not (counts > FLOOR * np.sqrt(levels + counts)).any():
         return []
     return [
         f"the extended source is hardly darker anywhere than {darkest / frames.electrons:.3g} "
@@ -149,11 +153,6 @@ def _floor(result: Result, frames: Frames, unit: str) -> list[str]:
 def _areas(observation: Observation) -> NDArray[np.float64]:
     """Return how many pixels of the sky are one of each image."""
     return np.asarray((observation.oversample * observation.scales) ** 2)
-
-
-def _means(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean of each image, of numbers or maps."""
-    return np.asarray(values.reshape(len(values), -1).mean(axis=1))
 
 
 def _flux(flux: float, error: float, frames: Frames) -> str:

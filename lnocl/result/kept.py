@@ -17,9 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.process import ignored_warnings
+from lnocl.runs.checkpoint import inputs_of
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome, PsfRefinement
 from lnocl.runs.start import Setup
-from lnocl.scene.observation import PARAMETERS, Observation
+from lnocl.scene.estimate import Estimate
+from lnocl.scene.fields import FIELDS
+from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.scene.star_prior import StarPrior
@@ -52,7 +55,7 @@ def to_parts(outcome: Outcome, given: Observation) -> Parts:
     parts["positions"] = scene.stars
     for name in BY_COMMAND:
         parts.pop(f"setup.{name}", None)
-    for name in PARAMETERS:
+    for name in FIELDS:
         old, new = (np.asarray(getattr(each, name)) for each in (before, scene.observation))
         if not (old is new or np.array_equal(old, new)):
             is_shared = new.ndim > 2 and new.strides[0] == 0  # one for all images
@@ -86,7 +89,7 @@ def from_parts(
         parts,
         "",
         setup=setup,
-        scene=scene,
+        estimate=_built(Estimate, parts, "estimate.", scene=scene),
         curve=_curve(parts),
         psf_refinement=_refinement(_part(parts, "psf_refinement.")),
     )
@@ -138,7 +141,7 @@ def _refinement(parts: Parts) -> PsfRefinement | None:
 def _digest(parts: Mapping[str, NDArray[Any]], observation: Observation) -> str:
     """Return the SHA-256 of parts, of the observation that they are of, and of the version."""
     digest = hashlib.sha256(version("lnocl").encode())
-    for values in (parts, vars(observation)):
+    for values in (parts, inputs_of(observation)):
         for name, value in sorted(values.items()):
             if isinstance(value, np.ndarray) and value.dtype.kind != "U":
                 digest.update(repr((name, value.dtype.str, value.shape)).encode())

@@ -23,6 +23,7 @@ from lnocl.runs.start import Setup
 from lnocl.runs.stopping import Rule
 from lnocl.scene.arrays import numbers
 from lnocl.scene.fields import FIELDS
+from lnocl.scene.observation import Observation
 from lnocl.solvers.engine import State
 
 # The widest value: a SHA-256 in hexadecimal, or the repr of a parameter or name of a device.
@@ -80,17 +81,22 @@ class Checkpoint:
 
 def describe(setup: Setup, **parameters: Any) -> dict[str, str]:
     """Return the inputs and parameters of a run: checksums of arrays, other values in words."""
-    observation = setup.observation
     bound = {
         "version": version("lnocl"),
-        **{name: getattr(observation, name) for name in (*FIELDS, "offsets", "turns")},
+        **inputs_of(setup.observation),
         **{name: value for name, value in vars(setup).items() if name != "observation"},
         **parameters,
     }
     bound |= {"device": setup.engine_name(), "tuning": setup.tuning_name()}
+    return {name: _describe(name, value) for name, value in bound.items()}
+
+
+def inputs_of(observation: Observation) -> dict[str, Any]:
+    """Return the parameters of an observation, by their names."""
+    bound = {name: getattr(observation, name) for name in (*FIELDS, "offsets", "turns")}
     if observation.psf_fields:
         bound["psf_fields"] = np.concatenate([each.numbers() for each in observation.psf_fields])
-    return {name: _describe(name, value) for name, value in bound.items()}
+    return bound
 
 
 def _describe(name: str, value: Any) -> str:

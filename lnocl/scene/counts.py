@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.errors import InputError, warn
 from lnocl.scene.arrays import Array, pixels
@@ -42,6 +43,17 @@ def without_negative(images: Array, has_read_noise: bool) -> Array:
         "or add the sky to the images and give it as `background`"
     )
     return np.maximum(images, 0.0)
+
+
+def means(values: Array, mask: NDArray[np.bool_]) -> Array:
+    """Return the number of each image, of maps the mean of good pixels; 0 where it has none.
+
+    Bad pixels of a map hold what belongs to no image, such as an exposure of 1.
+    """
+    if values.ndim == 1:
+        return values
+    pairs = zip(values, ~mask, strict=True)
+    return np.array([each[good].mean() if good.any() else 0.0 for each, good in pairs])
 
 
 def mean_exposure(observation: Observation) -> float:

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.counts import means
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Observation
@@ -217,7 +218,7 @@ def lights(scene: Scene, change: Array) -> Iterator[Array]:
 def _depths(scene: Scene) -> Array:
     """Return the information of each image on the light of a pixel of it, of any unit."""
     exposures, levels = (
-        np.maximum(each.reshape(scene.n_images, -1).mean(axis=1), MIN_MODEL)
+        np.maximum(means(each, scene.observation.mask), MIN_MODEL)
         for each in (scene.observation.exposure, scene.observation.background)
     )
     return np.asarray(exposures**2 / levels)
