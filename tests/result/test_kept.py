@@ -121,7 +121,7 @@ def test_what_is_of_other_images_or_damaged_or_of_another_version_gives_nothing(
     counts = given.images.copy()
     counts[0, 20, 20] += 1e-9
     assert again_from(parts, given.replace(images=counts)) is None
-    assert again_from({**parts, "sky": parts["sky"][:-1]}, given) is None
+    assert again_from({**parts, "estimate.sky": parts["estimate.sky"][:-1]}, given) is None
     assert again_from({**parts, "setup.solver": np.asarray("sgm")}, given) is None
     assert again_from({name: parts[name] for name in parts if name != "positions"}, given) is None
     assert again_from({}, given) is None
