@@ -399,7 +399,12 @@ def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) ->
     for words in outcome.levels_in_words():
         note("%s", words)
     may_free = "pixels" not in plan.families and not refusal("refine_psfs", outcome.observation)
-    return replace(outcome, psf_refinement=prepared.refinement, may_free_pixels=may_free)
+    return replace(
+        outcome,
+        psf_refinement=prepared.refinement,
+        may_free_pixels=may_free,
+        plan=str(plan),
+    )
 
 
 def reconstruct(

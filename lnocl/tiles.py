@@ -301,7 +301,7 @@ def deconvolve_tiles(
         chosen = _choose(observed, parallel, _Solver(replace(prepared, fits=False)))
         curve, reason = chosen.held_out, chosen.stop_reason
         prepared = _ending(prepared, chosen)
-    mosaic = _Mosaic(observation, positions)
+    mosaic = _Mosaic(observation, positions, str(plan))
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
         closing(work(_Solver(prepared).solving, observed, parallel)) as answers,
@@ -545,8 +545,8 @@ class _Mosaic:
 
     may_free_pixels = False
 
-    def __init__(self, observation: Observation, positions: Array) -> None:
-        n_stars = len(positions)
+    def __init__(self, observation: Observation, positions: Array, plan: str) -> None:
+        self.plan, n_stars = plan, len(positions)
         self.observation, self.given_positions = observation, positions
         self._extended = np.zeros(observation.sky_shape)
         self._weight = np.zeros(observation.sky_shape)

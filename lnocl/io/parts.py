@@ -56,6 +56,7 @@ PARTS = {
     "PSFS": Part(pixels="f8"),
     "PSFERRORS": Part(("from", "to", "error")),
     "DOUBTFUL": Part(pixels="u1", place=SKY),
+    "PLAN": Part(("step", "done")),
     "MESSAGES": Part(("message",)),
     # One row: what the run has found, from which all goes on (`lnocl.result.kept`).
     "ESTIMATE": Part(("digest",)),

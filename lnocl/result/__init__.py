@@ -66,6 +66,10 @@ class Findings(Protocol):
     def may_free_pixels(self) -> bool:
         """Whether the pixels of PSFs were not to be refined, and could be."""
 
+    @property
+    def plan(self) -> str:
+        """What the run was to do, a line for each step."""
+
     def models(self) -> Iterator[Array]:
         """Yield the m_j, electrons per pixel, shape (ny, nx)."""
 
@@ -670,11 +674,11 @@ class Result:
 
         It is the file of ``lnocl deconvolve --residuals``, without the options, the command and
         the messages of the run, and without ESTIMATE, which needs a command that leads to the
-        images. The primary HDU holds the extended source. The tables STARS, HALOS, HISTORY and
-        HELDOUT hold the stars, the amounts of halos, the objectives, and the errors that held-out
-        counts estimate. The cubes MODELS and RESIDUALS hold those of each image. PSFS and others
-        are added where PSFs were refined. Units are electrons, per second where exposures were
-        given.
+        images. The primary HDU holds the extended source. The tables STARS, HALOS, HISTORY,
+        HELDOUT and PLAN hold the stars, the amounts of halos, the objectives, the errors that
+        held-out counts estimate, and the plan. The cubes MODELS and RESIDUALS hold those of each
+        image. PSFS and others are added where PSFs were refined. Units are electrons, per second
+        where exposures were given.
 
         Parameters
         ----------
@@ -805,6 +809,14 @@ class Result:
     @cached_property
     def _star_residuals(self) -> list[StarResiduals]:
         return self._findings.star_residuals()
+
+    @property
+    def plan(self) -> str:
+        """The plan that the run had, a line for each step: whether it was to be done, or why not.
+
+        It is that of `lnocl.plan`, and the table PLAN of the result's file.
+        """
+        return self._findings.plan
 
     def verdict(self) -> list[str]:
         """Return that the model fits, or else where it does not and what to do, a line each.

@@ -94,6 +94,8 @@ def write_file(
         parts |= {"MODELS": models, "RESIDUALS": result._residuals(models)}
     if refinement is not None:
         parts |= _psf_parts(result, refinement)
+    steps = zip(*(line.split(": ", 1) for line in result.plan.splitlines()), strict=True)
+    parts["PLAN"] = list(map(Column, ("step", "done"), steps))
     parts["MESSAGES"] = [Column("message", messages)] if messages else None
     outcome = result._findings
     if given is not None and isinstance(outcome, Outcome):

@@ -93,7 +93,16 @@ class TestFrames:
         assert cli.main(words[1:]) == 0
         assert capsys.readouterr().out == captured.out
         again = outcome("out.fits")
-        names = {"PRIMARY", "STARS", "HISTORY", "MODELS", "RESIDUALS", "MESSAGES", "ESTIMATE"}
+        names = {
+            "PRIMARY",
+            "STARS",
+            "HISTORY",
+            "MODELS",
+            "RESIDUALS",
+            "PLAN",
+            "MESSAGES",
+            "ESTIMATE",
+        }
         assert set(again) == names
         for name, data in first.items():
             np.testing.assert_equal(again[name], data)

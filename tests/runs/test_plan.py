@@ -4,6 +4,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import lnocl
 from lnocl import deconvolution
@@ -96,3 +97,13 @@ def test_a_wrong_word_is_refused_before_any_work():
         pytest.raises(InputError, match="smoothing 'none' is not known; give a number or auto"),
     ):
         lnocl.deconvolve(observe(), STAR, smoothing="none", engine="numpy")
+
+
+def test_a_result_and_its_file_have_the_plan(tmp_path):
+    given = observe(2, epochs=[0, 1])
+    result = lnocl.deconvolve(given, STAR, n_iter=3, stop=None, engine="numpy")
+    assert result.plan == str(lnocl.plan(given, STAR, n_iter=3, stop=None))
+    result.write(str(tmp_path / "result.fits"))
+    with fits.open(tmp_path / "result.fits") as hdus:
+        rows = [": ".join(row) for row in hdus["PLAN"].data]
+    assert rows == result.plan.splitlines()
