@@ -1,14 +1,17 @@
-"""A saturated and a faint star in every kind of scene: each keeps its light, within its error.
+"""A saturated and a faint star in every kind of scene: what goes together.
 
 The scenes are drawn from Moffat functions at exact positions, by no code of lnocl.
 """
 
 import warnings
+from functools import cache
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 
 import lnocl
+from lnocl.io.saved_results import read_result
 
 N = 80
 Y, X = np.indices((N, N), float)
@@ -101,16 +104,115 @@ KINDS = [
 ]  # fmt: skip
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("kind", KINDS)
-def test_stars_keep_their_light_within_their_errors(kind):
-    """Four of them fail without the prior of the first star."""
+@cache
+def observe(kind):
+    """Return the observation of a kind, and the true fluxes."""
     images, psfs, known, fluxes = scene(kind)
     background = 60.0 if kind == "background measured" else known["background"]
     mean = images + np.reshape(background, (-1, 1, 1))
     counts = np.random.default_rng(31).poisson(mean).astype(float)
+    return lnocl.Observation(counts, psfs, **known), fluxes
+
+
+def run(kind, stars=STARS, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lnocl.LnoclWarning)  # of stars masked at their peaks
-        result = lnocl.deconvolve(lnocl.Observation(counts, psfs, **known), STARS)
+        return lnocl.deconvolve(observe(kind)[0], stars, **options)
+
+
+def keep_their_light(kind):
+    """Four of them fail without the prior of the first star."""
+    result, (_, fluxes) = run(kind), observe(kind)
     assert (abs(result.star_fluxes - fluxes) < 3 * result.star_flux_errors).all()
     np.testing.assert_allclose(result.star_fluxes, fluxes, rtol=0.05)
+
+
+def are_moved(kind):
+    """The faint star, which was given elsewhere, is moved to its place."""
+    given = [STARS[0], (57.8, 23.2)]
+    result = run(kind, given, refine_positions=True, smoothing=1.0, stop=1e-4)
+    errors = result.star_position_errors[-1]
+    assert np.hypot(*(result.star_positions[-1] - STARS[-1])) < 0.05
+    assert (abs(result.star_positions[-1] - STARS[-1]) < 4 * errors).all()
+
+
+def have_errors_by_replicas(kind):
+    result, (_, fluxes) = run(kind), observe(kind)
+    found = result.bootstrap(12, seed=3)
+    stars = [k for k, each in enumerate(found.quantities) if each.name.startswith("star")]
+    assert len(stars) == len(fluxes)
+    low, high = (each[stars] for each in found.interval(0.95))
+    assert ((low < fluxes) & (fluxes < high)).mean() >= 0.5
+    assert (abs(found.values[stars] - fluxes) < 4 * found.standard_errors[stars]).all()
+
+
+def are_detected(kind):
+    """The faint star, where the bright one alone is known."""
+    found = run(kind, STARS[:1]).significance(false_alarms=0.01)
+    table = found.detections
+    distances = np.hypot(table["x"].value - STARS[1][0], table["y"].value - STARS[1][1])
+    nearest = table[int(distances.argmin())]
+    assert distances.min() < 0.3
+    assert abs(nearest["flux"].value - FLUXES[1]) < 4 * nearest["flux_error"].value
+    assert (found.limit(0.5) > 0).any()
+
+
+def go_on_from_a_checkpoint(kind):
+    with TemporaryDirectory() as folder:
+        path = f"{folder}/run.fits"
+        given = {"n_iter": 12, "stop": None, "smoothing": 0.3}
+        whole = run(kind, **given)
+        run(kind, **given, checkpoint=path, callback=lambda k, _: k == 5)
+        found = run(kind, **given, resume=path)
+    for name in ("extended", "star_fluxes", "history"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+
+
+def agree_with_the_reference(kind):
+    given = {"n_iter": 12, "stop": None, "smoothing": 0.3}
+    expected = run(kind, **given, engine="numpy")
+    for precision, allowed in (("double", 1e-9), ("single", 2e-3)):
+        found = run(kind, **given, precision=precision)
+        for name in ("extended", "star_fluxes"):
+            values = getattr(expected, name)
+            difference = abs(getattr(found, name) - values).max()
+            assert difference < allowed * abs(values).max(), (precision, name, difference)
+
+
+def are_written_and_read(kind):
+    result = run(kind, n_iter=5, stop=None)
+    with TemporaryDirectory() as folder:
+        path = f"{folder}/result.fits"
+        result.write(path)
+        again = read_result(path)
+        np.testing.assert_array_equal(again.extended, result.extended)
+        np.testing.assert_array_equal(np.ravel(again.star_fluxes), result.star_fluxes)
+
+
+DONE = [
+    keep_their_light,
+    are_moved,
+    have_errors_by_replicas,
+    are_detected,
+    go_on_from_a_checkpoint,
+    agree_with_the_reference,
+    are_written_and_read,
+]
+# What does not go together yet, and the message that says so.
+REFUSED = {
+    ("epochs", are_moved): "`refine_positions` cannot be used where the images are of several",
+    ("PSF field", are_detected): "sources are tested with one PSF for each image",
+}
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("done", DONE, ids=lambda done: done.__name__)
+@pytest.mark.parametrize("kind", KINDS)
+def test_stars_of_every_kind(kind, done):
+    """Kinds of scenes, down, and what is done with each, across: each cell by its numbers."""
+    if (kind, done) not in REFUSED:
+        done(kind)
+        return
+    with pytest.raises(lnocl.errors.InputError) as refused:
+        done(kind)
+    assert refused.value.message.startswith(REFUSED[kind, done])

@@ -1,0 +1,63 @@
+"""The size of the package and the wall round its core: both may only get better.
+
+A line of code is one that holds more than a comment or a docstring.
+"""
+
+import ast
+import io
+import tokenize
+from functools import cache
+from pathlib import Path
+
+import pytest
+from test_layers import MODULES, PACKAGE, imports
+
+# Lines of code of the package and of its core, rounded up to tens; less code lowers them.
+BUDGET = {"package": 0, "core": 0}
+CORE = "scene", "engines", "opencl", "reference", "solvers", "runs"
+# What the core is not to know, nor the rooms round it.
+OUTSIDE = "astropy.io", "matplotlib", "dask", "distributed"
+ROOMS_OUTSIDE = "io", "plotting", "commands", "psf", "simulation", "verify", "studies", "result"
+# Modules of the core that know it still.
+STILL = {"runs.checkpoint"}
+SKIPPED = {
+    *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE),
+    *(tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER),
+}
+
+
+@cache
+def lines_of(path: Path) -> int:
+    source = path.read_text()
+    docs = set()
+    for node in ast.walk(ast.parse(source)):
+        body = getattr(node, "body", None)
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(
+            node
+        ):
+            docs |= set(range(body[0].lineno, body[0].end_lineno + 1))
+    lines = set()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type not in SKIPPED:
+            lines |= set(range(token.start[0], token.end[0] + 1))
+    return len(lines - docs)
+
+
+@pytest.mark.parametrize("part", BUDGET)
+def test_code_fits_its_budget_which_falls_with_it(part):
+    rooms = [PACKAGE / room for room in CORE] if part == "core" else [PACKAGE]
+    found = sum(lines_of(path) for room in rooms for path in room.rglob("*.py"))
+    assert found <= BUDGET[part]
+    assert found > BUDGET[part] - 100, "lower the budget"
+
+
+def test_the_core_knows_neither_files_nor_pictures_nor_clusters():
+    outside = (*OUTSIDE, *(f"lnocl.{room}" for room in ROOMS_OUTSIDE))
+    knowing = {
+        module
+        for module in MODULES
+        if module.split(".")[0] in CORE
+        for name in imports(module)
+        if any(f"{name}.".startswith(f"{each}.") for each in outside)
+    }
+    assert knowing == STILL
