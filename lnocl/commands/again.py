@@ -95,7 +95,12 @@ class Again:
 
         path = self.saved.path
         held = read_parts(path, ["ESTIMATE"]).values()
-        parts = {name: np.asarray(row) for each in held for name, (row,) in each.values.items()}
+        parts = {
+            name: np.asarray(rows[0])
+            for each in held
+            for name, rows in each.values.items()
+            if len(rows)
+        }
         run = self.run.device, self.run.precision
         found = from_parts(parts, self.frames.observation, *run)
         if found is None:

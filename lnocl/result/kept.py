@@ -72,7 +72,7 @@ def from_parts(
     does not hold the halos that the run has held; runs that are like it find what they hold.
     """
     parts, before = dict(parts), given.upright()
-    if DIGEST not in parts or parts.pop(DIGEST).item() != _digest(parts, before):
+    if DIGEST not in parts or str(parts.pop(DIGEST)) != _digest(parts, before):
         return None
     observation = before.replace(**_part(parts, "observation."))
     setup = _built(

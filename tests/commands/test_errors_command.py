@@ -226,6 +226,17 @@ def test_no_run_is_made_again_where_the_file_has_what_it_found(monkeypatch, caps
     same_errors(held(), expected)
 
 
+@pytest.mark.usefixtures("result")
+@pytest.mark.parametrize("n", [0, 3])
+def test_a_table_of_other_than_one_row_holds_no_run(n, capsys):
+    forget_the_run()
+    columns = [fits.Column(name, "D", array=np.ones(n)) for name in ("digest", "sky")]
+    with fits.open("out.fits", mode="append") as hdus:
+        hdus.append(fits.BinTableHDU.from_columns(columns, name="ESTIMATE"))
+    assert cli.main([*ERRORS, "10"]) == 0
+    assert capsys.readouterr().err.count(": the run is made again") == 1
+
+
 def test_replicas_are_made_on_the_device_of_the_run(words, monkeypatch):
     """It is named in the command, and may have been chosen among several."""
     monkeypatch.setattr("lnocl.commands.deconvolve._device_spec", lambda arguments: "0:7")

@@ -124,6 +124,7 @@ def test_what_is_of_other_images_or_damaged_or_of_another_version_gives_nothing(
     assert again_from({**parts, "estimate.sky": parts["estimate.sky"][:-1]}, given) is None
     assert again_from({**parts, "setup.solver": np.asarray("sgm")}, given) is None
     assert again_from({name: parts[name] for name in parts if name != "positions"}, given) is None
+    assert again_from({**parts, "digest": np.ones(3)}, given) is None
     assert again_from({}, given) is None
     monkeypatch.setattr("lnocl.result.kept.version", lambda name: "0.0.1")
     assert again_from(parts, given) is None
