@@ -403,7 +403,7 @@ def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) ->
         outcome,
         psf_refinement=prepared.refinement,
         may_free_pixels=may_free,
-        plan=str(plan),
+        plan=tuple(str(plan).splitlines()),
     )
 
 

@@ -21,6 +21,7 @@ from lnocl.result import Result, make_result
 from lnocl.result.verdict import warn_of_faults
 from lnocl.runs.options import StopName, check_observation
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome, PsfRefinement
+from lnocl.runs.plan import Plan
 from lnocl.runs.plan import plan as make_plan
 from lnocl.runs.preparation import Prepared, prepare
 from lnocl.runs.progress import Progress
@@ -301,7 +302,7 @@ def deconvolve_tiles(
         chosen = _choose(observed, parallel, _Solver(replace(prepared, fits=False)))
         curve, reason = chosen.held_out, chosen.stop_reason
         prepared = _ending(prepared, chosen)
-    mosaic = _Mosaic(observation, positions, str(plan))
+    mosaic = _Mosaic(observation, positions, plan)
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
         closing(work(_Solver(prepared).solving, observed, parallel)) as answers,
@@ -545,8 +546,8 @@ class _Mosaic:
 
     may_free_pixels = False
 
-    def __init__(self, observation: Observation, positions: Array, plan: str) -> None:
-        self.plan, n_stars = plan, len(positions)
+    def __init__(self, observation: Observation, positions: Array, plan: Plan) -> None:
+        self.plan, n_stars = tuple(str(plan).splitlines()), len(positions)
         self.observation, self.given_positions = observation, positions
         self._extended = np.zeros(observation.sky_shape)
         self._weight = np.zeros(observation.sky_shape)

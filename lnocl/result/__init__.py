@@ -67,7 +67,7 @@ class Findings(Protocol):
         """Whether the pixels of PSFs were not to be refined, and could be."""
 
     @property
-    def plan(self) -> str:
+    def plan(self) -> tuple[str, ...]:
         """What the run was to do, a line for each step."""
 
     def models(self) -> Iterator[Array]:
@@ -816,7 +816,7 @@ class Result:
 
         It is that of `lnocl.plan`, and the table PLAN of the result's file.
         """
-        return self._findings.plan
+        return "\n".join(self._findings.plan)
 
     def verdict(self) -> list[str]:
         """Return that the model fits, or else where it does not and what to do, a line each.

@@ -31,6 +31,8 @@ Parts = dict[str, NDArray[Any]]
 Built = TypeVar("Built")
 
 DIGEST = "digest"
+# Of texts of one part, which have none of it.
+SEPARATOR = "; "
 # What the command of a run names, whether it was given or chosen.
 BY_COMMAND = "device", "precision"
 
@@ -91,6 +93,7 @@ def from_parts(
         setup=setup,
         estimate=_built(Estimate, parts, "estimate.", scene=scene),
         curve=_curve(parts),
+        plan=_words(parts["plan"]),
         psf_refinement=_refinement(_part(parts, "psf_refinement.")),
     )
 
@@ -104,7 +107,7 @@ def _flat(value: Any, name: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
     else:
         if value is not None and not isinstance(value, (Observation, Scene)):
             is_words = isinstance(value, tuple) and all(isinstance(each, str) for each in value)
-            yield name, np.asarray("\n".join(value) if is_words else value)
+            yield name, np.asarray(SEPARATOR.join(value) if is_words else value)
         return
     for key, member in members.items():
         yield from _flat(member, f"{name}.{key}".lstrip("."))
@@ -122,6 +125,10 @@ def _built(kind: type[Built], parts: Mapping[str, NDArray[Any]], prefix: str, **
     return kind(**{name: values.get(name) for name in names} | more)
 
 
+def _words(joined: NDArray[np.str_]) -> tuple[str, ...]:
+    return tuple(joined.item().split(SEPARATOR)) if joined.item() else ()
+
+
 def _curve(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.void]:
     columns = _part(parts, "curve.")
     curve = np.zeros(len(columns["iteration"]), CURVE_DTYPE)
@@ -134,8 +141,7 @@ def _refinement(parts: Parts) -> PsfRefinement | None:
     if not parts:
         return None
     misfit = tuple(parts["misfit"].tolist())
-    names = tuple(parts["parameters"].item().split("\n")) if parts["parameters"].item() else ()
-    return _built(PsfRefinement, parts, "", parameters=names, misfit=misfit)
+    return _built(PsfRefinement, parts, "", parameters=_words(parts["parameters"]), misfit=misfit)
 
 
 def _digest(parts: Mapping[str, NDArray[Any]], observation: Observation) -> str:

@@ -166,7 +166,7 @@ class Outcome:
         Whether the amounts of halos are, likewise.
     may_free_pixels : bool
         Whether the pixels of PSFs were not to be refined, and could be.
-    plan : str
+    plan : tuple of str
         That of the run (`lnocl.runs.plan.Plan`), a line for each step.
     has_levels : bool
         Whether levels of the background were fitted.
@@ -182,7 +182,7 @@ class Outcome:
     has_marginal_halos: bool = False
     has_levels: bool = False
     may_free_pixels: bool = False
-    plan: str = ""
+    plan: tuple[str, ...] = ()
 
     @property
     def scene(self) -> Scene:
