@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from lnocl.runs.outcome import Outcome
 
 
-# Names of quantities of stars; others are of regions and profiles.
-_OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)")
+# Names of quantities of stars and halos; others are of regions and profiles.
+_OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)|halo \d+ image \d+")
 
 
 def add_errors(
@@ -87,6 +87,34 @@ def add_errors(
     return _summarise(found, parts, frames)
 
 
+def check_earlier(path: str, seed: int, parts: Sequence[Part]) -> None:
+    """Refuse replicas in a file of another seed, or of regions that are not given.
+
+    Raises
+    ------
+    InputError
+        The file has such replicas.
+    """
+    from lnocl.io.fitserrors import read_replicas
+
+    held = read_replicas(path)
+    if held is None:
+        return
+    given = tuple(each.name.strip() for each in parts)
+    others = [name for name in held.names if not _OF_STARS.fullmatch(name)]
+    if held.seed != seed or not all(name.startswith(given) for name in others):
+        raise _of_others(path, held)
+
+
+def _of_others(path: str, held: Held) -> InputError:
+    names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
+    regions = f"the regions {', '.join([*names][:3])}" if names else "no regions"
+    return InputError(
+        f"{path} has replicas with `seed` {held.seed} of {regions}: give the same `regions`, "
+        "`profiles` and `seed`, or take `overwrite` to begin anew"
+    )
+
+
 def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None:
     """Return the replicas that a file has; refuse those of something else."""
     from lnocl.io.fitserrors import read_replicas
@@ -95,12 +123,7 @@ def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None
     if held is None:
         return None
     if not _held(expected, frames).is_start_of(held):
-        names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
-        regions = f"the regions {', '.join([*names][:3])}" if names else "no regions"
-        raise InputError(
-            f"{path} has replicas with `seed` {held.seed} of {regions}: give the same `regions`, "
-            "`profiles` and `seed`, or take `overwrite` to begin anew"
-        )
+        raise _of_others(path, held)
     return dataclasses.replace(expected, errors=held.errors, of_psfs=held.of_psfs, sums=held.sums)
 
 

@@ -50,6 +50,8 @@ def _run(arguments: argparse.Namespace) -> None:
     again = Again.read(arguments.result, arguments.quiet)
     with messages.shown_log(arguments.quiet, COMMAND.flags()):
         parts = _parts(arguments, again.frames)
+        if not arguments.overwrite:  # before the run is made again, where it is
+            bootstrap.check_earlier(arguments.result, arguments.seed, parts)
     outcome = again.outcome()
     with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
         lines = bootstrap.add_errors(arguments, outcome, again, parts)

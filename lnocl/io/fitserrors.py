@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
 ERRORS, REPLICAS, SUMS = "ERRORS", "REPLICAS", "REPLSUMS"
+# Values are those of the same run to this share: another version may round otherwise.
+SAME = 1e-6
 
 
 class Held(NamedTuple):
@@ -51,7 +53,7 @@ class Held(NamedTuple):
         return (
             (self.names, self.seed) == (other.names, other.seed)
             and self.sums.shape == other.sums.shape
-            and np.array_equal(self.values, other.values, equal_nan=True)
+            and np.allclose(self.values, other.values, SAME, 0.0, equal_nan=True)
             and np.array_equal(self.errors, other.errors[: len(self.errors)], equal_nan=True)
         )
 

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lnocl.errors import note
 from lnocl.io import sky
 from lnocl.io.fitsread import wcs_cards
 from lnocl.io.fitswrite import Card, column_unit, write_result
-from lnocl.io.parts import PARTS, Column
+from lnocl.io.parts import MOST_BYTES, PARTS, Column
 from lnocl.result.kept import to_parts
 from lnocl.runs.outcome import Outcome, PsfRefinement
 
@@ -100,7 +101,10 @@ def write_file(
     outcome = result._findings
     if given is not None and isinstance(outcome, Outcome):
         kept = to_parts(outcome, given)
-        parts["ESTIMATE"] = [Column(name, value[None]) for name, value in kept.items()]
+        if sum(value.nbytes for value in kept.values()) < MOST_BYTES:
+            parts["ESTIMATE"] = [Column(name, value[None]) for name, value in kept.items()]
+        else:
+            note("the table ESTIMATE is left out, as it is too large: errors make the run again")
     write_result(
         path,
         result.extended / electrons,

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl.errors import InputError, counted
 from lnocl.notebook import html_card
 from lnocl.scene.arrays import Array, together
+from lnocl.scene.containers import variances
 from lnocl.scene.counts import refuse_overflow, without_negative
 from lnocl.scene.fields import FIELDS, hold, in_one_shape, noise_beyond_counts, refuse_all_bad
 from lnocl.scene.geometry import MOVES, Geometry, good_box
@@ -261,8 +262,10 @@ class Observation:
         with np.errstate(over="ignore"):
             if read.variances is not None:
                 self.read_noise = noise_beyond_counts(self, read)
-            for name in ("images", "background"):
-                setattr(self, name, np.add(*together(getattr(self, name), self.read_noise**2)))
+            self.background = np.add(*together(self.background, self.read_noise**2))
+            images, added = together(self.images, self.read_noise**2)
+            is_own = not np.may_share_memory(images, read.values["images"])
+            self.images = np.add(images, added, out=images if is_own else None)
         self._closed()
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -440,9 +443,10 @@ class Observation:
             )
         if changes.get("pupils") is not None:
             changes = {"ideal_psfs": None, **changes}
-        other = self._with({})
-        if hold(other, {"mask": self.mask, **changes}, self).variances is not None:
+        if variances("images", changes.get("images"), False) is not None:
             raise InputError("`images` with an uncertainty replace none; give `read_noise` too")
+        other = self._with({})
+        hold(other, {"mask": self.mask, **changes}, self)
         other._refuse_freed_pixels(self, changes)
         return other._closed()
 

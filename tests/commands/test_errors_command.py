@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from commandline import one_complaint
 
 import lnocl
 from lnocl.commands import bootstrap, cli
@@ -224,6 +225,24 @@ def test_no_run_is_made_again_where_the_file_has_what_it_found(monkeypatch, caps
         hdus.append(expected["ESTIMATE"])
     assert cli.main([*ERRORS, "10", "--overwrite"]) == 0
     same_errors(held(), expected)
+
+
+@pytest.mark.usefixtures("result")
+def test_another_seed_is_refused_before_a_run_is_made_again(monkeypatch, capsys):
+    assert cli.main([*ERRORS, "10", "--quiet"]) == 0
+    forget_the_run()
+    monkeypatch.setattr("lnocl.commands.deconvolve.solve", None)
+    assert cli.main([*ERRORS, "12", "--seed", "5"]) == 2
+    assert "has replicas with --seed 0" in one_complaint(capsys.readouterr())
+
+
+@pytest.mark.usefixtures("result")
+def test_replicas_of_a_run_that_rounds_otherwise_are_continued():
+    assert cli.main([*ERRORS, "10", "--quiet"]) == 0
+    with fits.open("out.fits", mode="update") as hdus:
+        hdus["ERRORS"].data["value"] *= 1.0 + 1e-8
+    assert cli.main([*ERRORS, "11", "--quiet"]) == 0
+    assert len(held()["REPLICAS"].data) == 11
 
 
 @pytest.mark.usefixtures("result")

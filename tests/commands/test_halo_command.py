@@ -76,6 +76,8 @@ def test_errors_of_halos_by_replicas(command, capsys):
     with fits.open("out.fits") as hdus:
         (names,) = (each.data["name"] for each in hdus if each.name == "ERRORS")
     assert [name.strip() for name in names][1:] == [f"halo 1 image {j}" for j in (1, 2, 3)]
+    assert cli.main(["errors", "out.fits", "--bootstrap", "11", "--quiet"]) == 0
+    assert len(fits.getdata("out.fits", "REPLICAS")) == 11
 
 
 WRONG = {

@@ -158,3 +158,13 @@ def test_read_back_both_plot_as_the_result_does(case):
             assert python == one
         else:
             np.testing.assert_allclose(python, one, rtol=1e-5, atol=1e-5, err_msg=field.name)
+
+
+def test_what_is_too_large_for_a_table_is_left_out_and_said(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("lnocl.result.file.MOST_BYTES", 10_000)
+    path = str(tmp_path / "large.fits")
+    words = ["deconvolve", "image0.fits", "--psf", "psf0.fits", *WORDS, "-o", path]
+    assert cli.main(words) == 0
+    assert "the table ESTIMATE is left out" in capsys.readouterr().err
+    with fits.open(path) as hdus:
+        assert "ESTIMATE" not in [hdu.name for hdu in hdus]

@@ -859,3 +859,21 @@ def test_attributes_cannot_be_set():
     observation = two_images()
     with pytest.raises(AttributeError, match=r"replace\(psfs=\.\.\.\) returns another"):
         observation.psfs = np.ones((2, 3, 3))
+
+
+def test_images_with_an_uncertainty_replace_none_of_any_shape():
+    given = lnocl.Observation(np.ones((3, 12, 14)), np.ones((3, 3)))
+    for shape in ((12, 14), (12, 12)):
+        errors = StdDevUncertainty(np.full(shape, 2.0))
+        images = CCDData(np.ones(shape), unit="electron", uncertainty=errors)
+        with pytest.raises(InputError, match="with an uncertainty replace none; give read_noise"):
+            given.replace(images=images)
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+def test_read_noise_is_added_to_no_array_of_the_caller(dtype):
+    images = np.full((2, 12, 14), 5.0, dtype)
+    found = lnocl.Observation(images, np.ones((3, 3)), read_noise=3.0)
+    assert (images == 5.0).all()
+    assert (found.images == 14.0).all()
+    assert not np.shares_memory(lnocl.Observation(images, np.ones((3, 3))).images, images)

@@ -132,7 +132,10 @@ class TestAdviceIsNotRefused:
         star = (STAR[0] + 0.6, STAR[1] - 0.3)
         (line,) = said(observation, star)
         assert ("give its place, take refine_positions, or mend" in line) == (n == 1)
-        refused = pytest.raises(lnocl.InputError, match="refine_positions cannot be used where the images are of several")
+        refused = pytest.raises(
+            lnocl.InputError,
+            match="refine_positions cannot be used where the images are of several",
+        )
         with refused if n > 1 else nullcontext():
             lnocl.deconvolve(
                 observation, [star], refine_positions=True, n_iter=1, engine="numpy", stop=None,
