@@ -19,8 +19,6 @@ CODES = {"b1": "L", "u1": "B", "i4": "J", "i8": "K", "f4": "E", "f8": "D"}
 SKY, IMAGES = "sky", "images"
 # What is in the unit of the result.
 LIGHT = "light"
-# A row of a table is less.
-MOST_BYTES = 2**31
 # Percent of sources that are found at a limit of which there is a map.
 COMPLETENESS = 50, 90, 95
 

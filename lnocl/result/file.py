@@ -13,7 +13,7 @@ from lnocl.errors import note
 from lnocl.io import sky
 from lnocl.io.fitsread import wcs_cards
 from lnocl.io.fitswrite import Card, column_unit, write_result
-from lnocl.io.parts import MOST_BYTES, PARTS, Column
+from lnocl.io.parts import PARTS, Column
 from lnocl.result.kept import to_parts
 from lnocl.runs.outcome import Outcome, PsfRefinement
 
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
     from lnocl.result import Result
     from lnocl.scene.observation import Observation
+
+
+# Of what a run has found, that a file keeps.
+MOST_BYTES = 2**26
 
 
 def write_file(
@@ -100,11 +104,12 @@ def write_file(
     parts["MESSAGES"] = [Column("message", messages)] if messages else None
     outcome = result._findings
     if given is not None and isinstance(outcome, Outcome):
-        kept = to_parts(outcome, given)
-        if sum(value.nbytes for value in kept.values()) < MOST_BYTES:
+        # It is held more than once while it is written.
+        kept = to_parts(outcome, given) if outcome.sky.nbytes <= MOST_BYTES else {}
+        if kept and sum(value.nbytes for value in kept.values()) <= MOST_BYTES:
             parts["ESTIMATE"] = [Column(name, value[None]) for name, value in kept.items()]
         else:
-            note("the table ESTIMATE is left out, as it is too large: errors make the run again")
+            note("the table ESTIMATE is left out, as it is large: errors make the run again")
     write_result(
         path,
         result.extended / electrons,

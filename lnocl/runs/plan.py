@@ -241,7 +241,7 @@ def plan(
     observation = observation.upright()
     initial = read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
     smoothing = read_smoothing(smoothing)
-    Penalty(mu, 0.0 if smoothing == "auto" else smoothing)  # which refuses weights out of range
+    Penalty(mu, 0.0 if isinstance(smoothing, str) else smoothing)  # refuses what is out of range
     setup = Setup(observation, positions, pad, solver, precision, engine, device, False, *initial)
     made = Plan(setup, mu, smoothing, int(n_iter), stop)
     is_auto = made.does(PSFS)

@@ -58,7 +58,8 @@ def check_file(path):
     """Check what every output must be: whole, and opened without a warning (warnings raise)."""
     assert fitscheck.main(["--compliance", str(path)]) == 0
     with fits.open(path, checksum=True) as hdus:
-        assert [hdu.name for hdu in hdus] == ["PRIMARY", "STARS", "HISTORY", "PLAN", "MESSAGES"]
+        names = ["PRIMARY", "STARS", "HISTORY", "PLAN", "MESSAGES", "ESTIMATE"]
+        assert [hdu.name for hdu in hdus] == names
         assert np.isfinite(hdus[0].data).all()
         assert (hdus[0].data >= 0).all()
         WCS(hdus[0].header)
