@@ -108,7 +108,7 @@ class TestLensedQuasar:
         assert all("does not fit at 4 of 4 stars" in line or "light lies" in line for line in told)
         check_file("out.fits")
         with fits.open("out.fits") as hdus:
-            extended, stars, history, _ = (hdu.data for hdu in hdus)
+            extended, stars, history, *_ = (hdu.data for hdu in hdus)
             kept = WCS(hdus[0].header)
         assert extended.shape == (120, 120)
         assert extended.sum() > 0
