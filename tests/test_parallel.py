@@ -84,6 +84,7 @@ def cluster_of_two():
 @pytest.fixture(scope="module")
 def client():
     with cluster_of_two() as client:
+        client.wait_for_workers(2, timeout=60)
         yield client
 
 

@@ -145,7 +145,7 @@ def whole(name: str, value: Any, least: int, more: str = "") -> int:
     `more` is what the message says of it besides.
     """
     try:
-        number = None if isinstance(value, bool) else operator.index(value)
+        number = None if isinstance(value, (bool, np.bool_)) else operator.index(value)
     except TypeError:
         number = None
     if number is None or number < least:
