@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from lnocl.scene.observation import Observation
 
 
-# Of what a run has found, that a file keeps.
+# The table ESTIMATE has this many bytes at most.
 MOST_BYTES = 2**26
 
 
@@ -104,7 +104,7 @@ def write_file(
     parts["MESSAGES"] = [Column("message", messages)] if messages else None
     outcome = result._findings
     if given is not None and isinstance(outcome, Outcome):
-        # It is held more than once while it is written.
+        # It is in memory more than once while it is written.
         kept = to_parts(outcome, given) if outcome.sky.nbytes <= MOST_BYTES else {}
         if kept and sum(value.nbytes for value in kept.values()) <= MOST_BYTES:
             parts["ESTIMATE"] = [Column(name, value[None]) for name, value in kept.items()]

@@ -1,4 +1,4 @@
-"""What a run has found, in parts that a file keeps, and from which all goes on as from the run.
+"""The outcome of a run as parts of a file, from which errors and detections begin.
 
 Images are not among them: they are read again as for the run. Of what the run has changed in its
 observation, such as PSFs that were refined or levels that were fitted, the parts have the new

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from lnocl.errors import InputError
 from lnocl.runs.options import (
@@ -21,7 +21,7 @@ from lnocl.runs.options import (
 )
 from lnocl.runs.start import Setup
 from lnocl.scene import freedoms
-from lnocl.scene.freedoms import refusal
+from lnocl.scene.freedoms import Condition, refusal
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.psf_families import Family
@@ -39,38 +39,23 @@ LEVELS, PSFS, HALOS, PRIOR, CHOICE, FIT, STARS = STEPS = (
 )
 
 
-class Rule(NamedTuple):
-    """What must hold of a plan for a step.
-
-    Attributes
-    ----------
-    holds : callable
-        Tells of a plan whether it does.
-    otherwise : str
-        What is said where it does not.
-    """
-
-    holds: Callable[[Plan], bool]
-    otherwise: str
+def _of_images(condition: Condition) -> Condition:
+    """Return a condition on images as one on a plan."""
+    return Condition(lambda plan: condition.holds(plan.setup.observation), condition.otherwise)
 
 
-def _of_images(condition: freedoms.Condition) -> Rule:
-    """Return the rule that a condition on images is."""
-    return Rule(lambda plan: condition.holds(plan.setup.observation), condition.otherwise)
-
-
-AUTO = Rule(lambda plan: plan.smoothing == "auto", "`smoothing` is a number")
-HAS_STARS = Rule(lambda plan: len(plan.setup.stars) > 0, "there are no stars")
-HAS_HALOS = Rule(lambda plan: len(plan.setup.observation.halos) > 0, "there are no halos")
-HAS_ERROR = Rule(
+AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number")
+HAS_STARS = Condition(lambda plan: len(plan.setup.stars) > 0, "there are no stars")
+HAS_HALOS = Condition(lambda plan: len(plan.setup.observation.halos) > 0, "there are no halos")
+HAS_ERROR = Condition(
     lambda plan: bool(plan.setup.observation.background_error.any()), "backgrounds have no error"
 )
-HELD_OUT = Rule(lambda plan: plan.stop == "held-out", "`stop` is another rule")
-WHOLE = Rule(lambda plan: not plan.in_tiles, "the images are divided into tiles")
-NOT_BEFORE = Rule(lambda plan: not plan.does(PSFS), "PSFs are judged before it")
+HELD_OUT = Condition(lambda plan: plan.stop == "held-out", "`stop` is another rule")
+WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into tiles")
+NOT_BEFORE = Condition(lambda plan: not plan.does(PSFS), "PSFs are judged before it")
 
 # What each step needs, in the order in which reasons are given.
-NEEDS: dict[str, tuple[Rule, ...]] = {
+NEEDS: dict[str, tuple[Condition, ...]] = {
     LEVELS: (AUTO, HAS_ERROR, WHOLE),
     PSFS: (AUTO, HAS_STARS, *map(_of_images, freedoms.NEEDS["refine_psfs"])),
     HALOS: (AUTO, HAS_HALOS),
@@ -80,11 +65,8 @@ NEEDS: dict[str, tuple[Rule, ...]] = {
     STARS: (AUTO, HAS_STARS, _of_images(freedoms.ONE_PSF)),
 }
 # Of steps that hang on what those before find: where they are done.
-WHERE = {
-    PRIOR: "unless PSFs are wrong",
-    CHOICE: "unless PSFs are wrong",
-    STARS: "where the model fits",
-}
+UNLESS_WRONG = "unless PSFs are wrong"
+WHERE = {PRIOR: UNLESS_WRONG, CHOICE: UNLESS_WRONG, STARS: "where the model fits"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +112,8 @@ class Plan:
     fit levels of backgrounds: no, backgrounds have no error
     judge PSFs before the run: no, the images are of several epochs
     settle halos: no, there are no halos
-    give stars a prior by a run with a fixed weight: yes, unless PSFs are wrong
-    choose the iteration by held-out counts: yes, unless PSFs are wrong
+    give stars a prior by a run with a fixed weight: yes
+    choose the iteration by held-out counts: yes
     judge the fit after the run: yes
     take marginal star fluxes: yes, where the model fits
     """
@@ -154,7 +136,7 @@ class Plan:
 
     def why_not(self, step: str) -> str:
         """Return why a step of `STEPS` is not done; nothing where it is."""
-        return next((rule.otherwise for rule in NEEDS[step] if not rule.holds(self)), "")
+        return next((each.otherwise for each in NEEDS[step] if not each.holds(self)), "")
 
     def does(self, step: str) -> bool:
         """Return whether a step of `STEPS` is done."""
@@ -169,7 +151,10 @@ class Plan:
             return f"yes, and fit {', '.join(self.families)}" if self.families else "yes"
         if why := self.why_not(step):
             return f"no, {why}"
-        return f"yes, {WHERE[step]}" if step in WHERE else "yes"
+        where = WHERE.get(step, "")
+        if where == UNLESS_WRONG and not self.does(PSFS):
+            where = ""
+        return ", ".join(filter(None, ("yes", where)))
 
     def notes(self) -> list[str]:
         """Return what of a plan is worth a line before the run."""

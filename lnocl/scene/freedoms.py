@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from lnocl.scene.observation import Observation
 
 
 class Condition(NamedTuple):
-    """What must hold of images for a fit.
+    """What must hold of images for a fit, or of a plan for a step.
 
     Attributes
     ----------
     holds : callable
-        Tells of an observation whether it does.
+        Tells of the subject whether it does.
     otherwise : str
         What is said where it does not.
     """
 
-    holds: Callable[[Observation], bool]
+    holds: Callable[[Any], bool]
     otherwise: str
 
 

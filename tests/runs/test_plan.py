@@ -91,6 +91,12 @@ def test_families_that_are_named_are_judged_whatever_the_smoothing():
     assert plan.why_not(STARS) == "`smoothing` is a number"
 
 
+def test_what_hangs_on_psfs_is_said_where_they_are_judged():
+    alone, both = lnocl.plan(observe(), STAR), lnocl.plan(observe(2, epochs=[0, 1]), STAR)
+    assert f"{CHOICE}: yes, unless PSFs are wrong" in str(alone)
+    assert f"{CHOICE}: yes\n" in str(both)
+
+
 def test_a_wrong_word_is_refused_before_any_work():
     with (
         patch.object(psf_refinement, "mend", side_effect=AssertionError),
