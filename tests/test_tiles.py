@@ -353,6 +353,23 @@ def test_one_tile_is_judged_as_the_whole_is(is_wrong, narrow):
         np.testing.assert_array_equal(getattr(result, name), getattr(whole, name), name)
 
 
+@pytest.mark.filterwarnings("ignore:the PSFs do not fit the stars, by 30 %")
+@pytest.mark.parametrize("tile", [48, 128])
+def test_a_weight_that_is_given_stays_in_tiles_beside_a_scatter_of_psfs(tile):
+    """Tiles added to it near stars, which one run does not."""
+    psf = np.exp(-(np.hypot(X, 1.2 * Y) ** 2) / 5.0)
+    sky = 5.0 + 40.0 * np.exp(-np.hypot(*(np.indices((64, 64)) - 30.0)) / 6.0)
+    sky[30, 28] += 3000.0
+    counts = np.random.default_rng(4).poisson(fftconvolve(sky, psf / psf.sum(), "same") + 9.0)
+    known = {"background": 9.0, "psf_scatter": 0.3 * psf / psf.sum()}
+    observation = lnocl.Observation(counts, psf, **known)
+    options = {**RUN, "smoothing": 0.02, "n_iter": 150, "pad": 0}
+    whole = lnocl.deconvolve(observation, [(28, 30)], **options)
+    found = lnocl.deconvolve_tiles(observation, [(28, 30)], tile=tile, **options)
+    np.testing.assert_allclose(found.star_fluxes, whole.star_fluxes, rtol=0.01)
+    np.testing.assert_allclose(found.extended.sum(), whole.extended.sum(), rtol=0.01)
+
+
 def test_tiles_come_near_a_psf_for_each_pixel():
     """Model against model: nine tiles leave a third of the error of one PSF for all."""
     sky, field = make_sky(3), make_field()
