@@ -1,5 +1,6 @@
 """Plans: which steps they have, and that runs take these and no others."""
 
+from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
@@ -10,7 +11,10 @@ import lnocl
 from lnocl import deconvolution
 from lnocl.errors import InputError
 from lnocl.runs import halos, psf_refinement
+from lnocl.runs.outcome import Mended
 from lnocl.runs.plan import CHOICE, FIT, HALOS, LEVELS, PRIOR, PSFS, STARS, STEPS
+from lnocl.runs.preparation import prepare
+from lnocl.scene.penalty import recommend_smoothing
 
 Y, X = np.indices((24, 24))
 PSF = np.exp(-((X[:17, :17] - 8.0) ** 2 + 1.3 * (Y[:17, :17] - 8.0) ** 2) / 3.0)
@@ -95,6 +99,21 @@ def test_what_hangs_on_psfs_is_said_where_they_are_judged():
     alone, both = lnocl.plan(observe(), STAR), lnocl.plan(observe(2, epochs=[0, 1]), STAR)
     assert f"{CHOICE}: yes, unless PSFs are wrong" in str(alone)
     assert f"{CHOICE}: yes\n" in str(both)
+
+
+def test_levels_are_not_fitted_in_tiles():
+    plan = replace(lnocl.plan(observe(background_error=1.0), STAR), in_tiles=True)
+    assert plan.why_not(LEVELS) == "the images are divided into tiles"
+
+
+def test_wrong_psfs_have_three_times_the_weight_and_no_held_out_counts(monkeypatch):
+    wrong = np.ones((24, 24))
+    monkeypatch.setattr(psf_refinement, "mend", lambda setup, *_: Mended(setup, None, wrong))
+    prepared = prepare(lnocl.plan(observe(), STAR))
+    (penalty,) = prepared.penalties
+    assert penalty.smoothing == 3.0 * recommend_smoothing(observe())
+    assert penalty.near_stars is wrong
+    assert (prepared.stop, prepared.steady, prepared.fits) == (1e-6, None, False)
 
 
 def test_a_wrong_word_is_refused_before_any_work():
