@@ -22,9 +22,10 @@ import scipy.fft
 from scipy.ndimage import gaussian_filter
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.camera import sampled, spread
 from lnocl.scene.detector import on_sky, pixel_spectrum
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model, sampled, spread
+from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.scene import MIN_MODEL, Scene
