@@ -123,7 +123,8 @@ INLINE cvec convolved(
 }
 
 /* spectra_j <- IFFT(otfs_j FFT(spectra_0)) along the columns: the row spectra of A_j f from f's, in
- * every OVERSAMPLE-th row. FFT(spectra_0) may be held in array 0, which is made last.
+ * every OVERSAMPLE-th row. FFT(spectra_0) may be held in array 0, which is made last. Array 0 is that
+ * of image `first`: an image alone, n_images of 1, has a sky of its own (transmit.cl).
  * spectra: n_images arrays, written but for their padding. otfs: n_images arrays, const;
  * otf_edges: [n_images][NY][2]. row_phases (HAS_TURNS), by which rows are multiplied then:
  * [n_images][COLUMN_BLOCKS][NY / PHASE_ROWS + PHASE_ROWS][2][BLOCK].
@@ -133,9 +134,12 @@ INLINE cvec convolved(
 KERNEL void convolve_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
     __global const real *restrict otf_edges, __global const vec *restrict row_phases,
-    const int n_images, __global const real *restrict column_roots,
+    const int first, const int n_images, __global const real *restrict column_roots,
     __global const real *restrict image_column_roots, SCRATCH vec *restrict scratch)
 {
+    spectra += (size_t)first * SPECTRA_SIZE;
+    otfs += (size_t)first * PIXELS_SIZE;
+    otf_edges += 2 * first * NY;
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
         SCRATCH_OF(scratch, columns);
@@ -158,7 +162,7 @@ KERNEL void convolve_columns(
             BARRIER;
             dit_inner(z, IMAGE_NY, image_column_roots);
 #if HAS_TURNS
-            __global const vec *phases = PHASES_OF(row_phases, image, block);
+            __global const vec *phases = PHASES_OF(row_phases, first + image, block);
             __global vec *to = columns + (size_t)image * SPECTRA_SIZE;
             finish_rows(z, NY, column_roots);
             FOR_EACH(piece, NY * SIDE) {
@@ -183,9 +187,12 @@ KERNEL void convolve_columns(
 KERNEL void correlate_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
     __global const real *restrict otf_edges, __global const vec *restrict row_phases,
-    const int n_images, __global const real *restrict column_roots,
+    const int first, const int n_images, __global const real *restrict column_roots,
     __global const real *restrict image_column_roots, SCRATCH vec *restrict scratch)
 {
+    spectra += (size_t)first * SPECTRA_SIZE;
+    otfs += (size_t)first * PIXELS_SIZE;
+    otf_edges += 2 * first * NY;
     FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
         SCRATCH_OF(scratch, columns);
@@ -193,7 +200,7 @@ KERNEL void correlate_columns(
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
 #if HAS_TURNS
-            __global const vec *phases = PHASES_OF(row_phases, image, block);
+            __global const vec *phases = PHASES_OF(row_phases, first + image, block);
             __global const vec *from = columns + (size_t)image * SPECTRA_SIZE;
             FOR_EACH(piece, NY * SIDE) {
                 const int y = piece / SIDE, lane = piece % SIDE;

@@ -49,6 +49,11 @@ POINT_SOURCE, EXTENDED = "point", "extended"
 
 def null_of(outcome: Outcome) -> Null:
     """Return the model of a reconstruction without sources beside its stars."""
+    if outcome.scene.transmission is not None:
+        raise InputError(
+            "sources are not tested behind a `transmission` yet; leave it out, or take the fluxes "
+            "and errors of stars placed where they may be"
+        )
     refinement = outcome.psf_refinement
     errors = np.zeros(1), np.zeros(0)
     if refinement is not None and refinement.psf_error:

@@ -349,6 +349,10 @@ def _refuse_turned(observation: Observation) -> None:
             "the amounts of `halos` are those in whole images, which tiles do not see; take "
             "deconvolve for the whole, or leave `halos` out"
         )
+    if len(observation.transmission):
+        raise InputError(
+            "tiles take no `transmission` yet; take deconvolve for the whole, or leave it out"
+        )
     if observation.is_mapped or observation.n_epochs > 1:
         raise InputError(
             "tiles are of images of one epoch that are not turned against the sky; take deconvolve "

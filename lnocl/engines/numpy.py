@@ -13,6 +13,7 @@ from lnocl.reference.scale import scale_rows
 from lnocl.reference.smooth import smooth
 from lnocl.reference.step import gradient_rows, step_rows
 from lnocl.reference.sums import collect_sums
+from lnocl.reference.transmit import gather_rows, transmit_rows
 from lnocl.reference.turn import irfft_sheared, ratio_sheared, unshear_columns
 from lnocl.scene.arrays import Array
 from lnocl.scene.forward_model import Model
@@ -90,9 +91,10 @@ class ReferenceEngine:
 
     def ratio(self) -> None:
         """Make the ratios of the estimate; record its objective."""
-        row_spectra = convolve_columns(
-            self._row_spectrum, self._otfs, self.scene.oversample, self._phases
-        )
+        skies = self._row_spectrum
+        if (transmission := self.scene.transmission) is not None:
+            skies = transmit_rows(self._extended, transmission)
+        row_spectra = convolve_columns(skies, self._otfs, self.scene.oversample, self._phases)
         observed = (
             self._images,
             self.scene.weights,
@@ -145,7 +147,16 @@ class ReferenceEngine:
 
     def correct(self) -> None:
         """Back-project the ratios to the correction."""
-        self._row_spectrum = correlate_columns(self._ratio_row_spectra, self._otfs, self._phases)
+        spectra, otfs, phases = self._ratio_row_spectra, self._otfs, self._phases
+        if (transmission := self.scene.transmission) is None:
+            self._row_spectrum = correlate_columns(spectra, otfs, phases)
+            return
+        alone = [slice(j, j + 1) for j in range(len(otfs))]
+        back = [
+            correlate_columns(spectra[j], otfs[j], None if phases is None else phases[j])
+            for j in alone
+        ]
+        self._row_spectrum = gather_rows(np.array(back), transmission)
 
     def scale(self) -> None:
         """Scale the estimate by its correction."""

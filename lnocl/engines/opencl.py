@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 import pyopencl as cl
@@ -15,6 +15,7 @@ from lnocl.opencl.launch import Launch, Launcher
 from lnocl.opencl.layout import Layout
 from lnocl.opencl.memory import Memory, Transfer, announce, held_bytes, refuse_if_too_large
 from lnocl.opencl.program import Program
+from lnocl.opencl.transmitted import TransmittedSky
 from lnocl.opencl.tuning import Tuning, describe_tuning
 from lnocl.opencl.turned import TurnedImages
 from lnocl.opencl.windows import StarWindows
@@ -212,6 +213,8 @@ class OpenCLEngine:
             "smooth_sums": program.row_blocks * pair,
             "objectives": (n_iter + 1) * pair,
             "row_phases": item,
+            "transmission": p * pixels if scene.transmission is not None else item,
+            "transmitted": pixels if scene.transmission is not None else item,
         }
         if self._turned:
             sizes |= self._turned.sizes()
@@ -252,13 +255,18 @@ class OpenCLEngine:
             "alpha": 0.0,
             "share": 0.0,
             "image": 0,
+            "first": 0,
             "image_blocks": self._observed_blocks,
         }
         return self._launcher.bind(name, {**self._memory.buffers, **numbers}, **others)
 
     def _bind_iteration(self) -> None:
         """Bind the kernels of an iteration, in its order."""
-        self._convolve = self._bind("convolve_columns")
+        self._convolve: Callable[[], object] = self._bind("convolve_columns")
+        self._correlate: Callable[[], object] = self._bind("correlate_columns")
+        if self.scene.transmission is not None:
+            seen = TransmittedSky(self._bind, self._memory, self.scene.n_images)
+            self._convolve, self._correlate = seen.convolve, seen.correlate
         if self._turned:
             self._turned.bind(self._bind, self._memory, self._queue)
         else:
@@ -266,7 +274,6 @@ class OpenCLEngine:
         if self.scene.is_smoothed:
             self._smooth = self._bind("smooth")
         self._collect = self._bind("collect_sums")
-        self._correlate = self._bind("correlate_columns")
         self._scale = self._bind("scale_rows")
 
     def _upload_scene(self) -> None:
@@ -284,6 +291,8 @@ class OpenCLEngine:
             memory.upload("background", background)
         if scene.smoothing_map is not None:
             memory.upload_pixels("smoothing_map", [scene.smoothing_map])
+        if scene.transmission is not None:
+            memory.upload_pixels("transmission", scene.transmission)
         self._make_otfs()
         memory.upload_integers("star_corners", self._stars.corners)
         memory.upload_integers("star_near", self._stars.near)
@@ -358,10 +367,12 @@ class OpenCLEngine:
 
     def _total_weight(self, weights: NDArray) -> Array:
         """Return sum_j A_j^T w_j."""
-        if self.scene.oversample > 1 or self._turned:  # rfft_rows takes no such images
+        scene = self.scene
+        # rfft_rows takes no images of other pixels.
+        if scene.oversample > 1 or self._turned or scene.transmission is not None:
             from lnocl.scene.forward_model import Model  # which loads scipy
 
-            model = Model(self.scene)
+            model = Model(scene)
             return model.adjoint(model.weights)
         spectra, size = self._memory.buffers["spectra"], self.layout.spectra_bytes
         transform = self._bind("rfft_rows", pixels=self._memory.buffers["extended"])
@@ -542,5 +553,5 @@ class OpenCLEngine:
     def _transform_estimate(self) -> None:
         """Make the row spectrum of an estimate that came from the host, and convolve it."""
         self._bind("rfft_rows", pixels=self._memory.buffers["extended"])()
-        self._bind("convolve_columns")()
+        self._convolve()
         self._pending_objective = None

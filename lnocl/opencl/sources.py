@@ -12,6 +12,7 @@ SOURCES = (
     "odd.cl",
     "fft.cl",
     "rows.cl",
+    "transmit.cl",
     "columns.cl",
     "convolve.cl",
     "sums.cl",

@@ -12,6 +12,7 @@ from lnocl.reference.scale import scale_rows
 from lnocl.reference.smooth import smooth
 from lnocl.reference.step import gradient_rows, step_rows
 from lnocl.reference.sums import collect_sums
+from lnocl.reference.transmit import gather_rows, transmit_rows
 from lnocl.reference.turn import (
     irfft_sheared,
     ratio_sheared,
@@ -25,6 +26,7 @@ __all__ = [
     "convolve_columns",
     "correlate_columns",
     "fft_columns",
+    "gather_rows",
     "gradient_rows",
     "ifft_columns",
     "irfft_rows",
@@ -38,5 +40,6 @@ __all__ = [
     "scale_rows",
     "smooth",
     "step_rows",
+    "transmit_rows",
     "unshear_columns",
 ]

@@ -1,5 +1,6 @@
-r"""Cameras: the maps from the sky's grid to the images, ``A_j = Sample o Turn o Blur``.
+r"""Cameras: the maps from the sky's grid to the images, ``A_j = Sample o Turn o Blur o Transmit``.
 
+- Transmit: where an image has a transmission, each pixel of the sky is multiplied by its share;
 - Blur: the sky is convolved with the response of image j (`lnocl.scene.scene.Scene.psf`), by its
   spectrum, round the edges of the grid;
 - Turn: where images are turned against the sky, three shears (`lnocl.scene.rotation`);
@@ -42,6 +43,8 @@ class LinearMap:
     ----------
     key : hashable
         Maps of equal keys take the same spectrum of a sky.
+    transmission : ndarray of float64 or None
+        The share of each pixel's light, of the shape of the sky.
     """
 
     _otf: Spectrum
@@ -51,6 +54,7 @@ class LinearMap:
     _seen: Part = ...  # where the image does
     _oversample = 1
     _workers: int | None = None
+    transmission: Array | None = None
 
     def forward(self, sky: Array) -> Array:
         """Return the image of a sky."""
@@ -62,7 +66,15 @@ class LinearMap:
 
     def spectrum(self, sky: Array) -> Spectrum:
         """Return the spectrum of a sky."""
-        return self._transform(sky, self._sky)
+        seen = sky if self.transmission is None else self.transmission * sky
+        return self._transform(seen, self._sky)
+
+    def shared_spectrum(self, sky: Array, spectra: dict[Hashable, Spectrum]) -> Spectrum:
+        """Return the spectrum of a sky, that which the map before left if it is of this `key`."""
+        if self.key not in spectra:
+            spectra.clear()
+            spectra[self.key] = self.spectrum(sky)
+        return spectra[self.key]
 
     def seen(self, spectrum: Spectrum) -> Array:
         """Return the image of the sky that has this spectrum."""
@@ -79,7 +91,8 @@ class LinearMap:
 
     def sky(self, spectrum: Spectrum) -> Array:
         """Return the sky of a spectrum, which is overwritten."""
-        return self._pixels(spectrum)[self._sky]
+        sky = self._pixels(spectrum)[self._sky]
+        return sky if self.transmission is None else self.transmission * sky
 
     def _transform(self, values: Array, there: Part) -> Spectrum:
         laid = values
@@ -115,7 +128,7 @@ class Camera(LinearMap):
         Shapes of the sky and of the image.
     flat, back_flat : float
         What a flat sky of ones is in the image, and a flat image of ones in the sky: both stay
-        flat.
+        flat, but for a transmission.
     """
 
     _workers = -1
@@ -126,13 +139,16 @@ class Camera(LinearMap):
         self.psf, self.image_grid = scene.psf_cutout(j), scene.image_grid
         self.rotation = scene.rotations[j] if scene.rotations else None
         self.place = scene.observation.turns[j], scene.observation.offsets[j]
+        if scene.transmission is not None:
+            self.transmission = scene.transmission[j]
+            self.key = self.grid, self.transmission.ctypes.data
         self.flat = float(self.psf.values.sum())
         self.back_flat = self.flat / float(scene.areas[j])
         self._window_otfs: dict[Hashable, Spectrum] = {}
 
     @cached_property
     def _otf(self) -> Spectrum:  # type: ignore[override]
-        return self.spectrum(self._scene.psf(self._j))
+        return self._transform(self._scene.psf(self._j), ...)
 
     def seen(self, spectrum: Spectrum) -> Array:
         """Return the image of the sky that has this spectrum."""
@@ -140,7 +156,7 @@ class Camera(LinearMap):
 
     def convolved(self, spectrum: Spectrum) -> Array:
         """Return the image before its pixels sample it, of the shape of the sky."""
-        sky = self.sky(self._otf * spectrum)
+        sky = self._pixels(self._otf * spectrum)
         return sky if self.rotation is None else self.rotation.forward(sky)
 
     def unsampled(self, image: Array) -> Spectrum:
@@ -165,7 +181,9 @@ class Camera(LinearMap):
             What to take instead of the squares of `point`.
         """
         elements = self.point() ** 2 if elements is None else elements
-        return self.sky(self.spectrum(self._shared_out(image)) * self.spectrum(elements).conj())
+        spectra = (self._transform(each, ...) for each in (self._shared_out(image), elements))
+        back = self._pixels(next(spectra) * next(spectra).conj())
+        return back if self.transmission is None else self.transmission**2 * back
 
     def _shared_out(self, image: Array) -> Array:
         """Return the pixels of an image where they lie on the sky's grid."""
@@ -182,6 +200,12 @@ class Camera(LinearMap):
             index = np.ravel_multi_index(tuple(corner), self.grid, mode="wrap")
             sky += np.bincount(index, share * image[y, x], sky.size)
         return sky.reshape(self.grid)
+
+    def of_ones(self) -> Array | float:
+        """Return the image of a sky of ones: a number where it is flat."""
+        if self.transmission is None:
+            return self.flat
+        return self.forward(np.ones(self.grid))
 
     def window(self, seen: Ranges, sky: Ranges | None = None) -> WindowCamera | TurnedWindow:
         """Return the map between a window of the sky and one of the image.
@@ -200,8 +224,7 @@ class Camera(LinearMap):
     def part(self, sky: Array, seen: Ranges) -> Array:
         """Return a window of the image of a sky."""
         there = self.window(seen)
-        rows, columns = there.reached
-        return there.forward(sky.take(rows, 0, mode="wrap").take(columns, 1, mode="wrap"))
+        return there.forward(_part(sky, there.reached))
 
     def reached(self, seen: Ranges) -> Ranges:
         """Return the rows and columns of the sky that reach a window of the image, not turned.
@@ -251,6 +274,8 @@ class WindowCamera(LinearMap):
         down, along = (_plan(*each) for each in zip(*axes, strict=True))
         (height, width), first, origin, (y, x) = zip(down, along, strict=True)
         self._grid = self.key = height, width
+        if camera.transmission is not None:
+            self.transmission, self.key = _part(camera.transmission, self.reached), id(self)
         self._otf = camera.part_otf(self._grid, first, origin)
         self._sky = window(0, 0, [len(at) for at in self.reached], self._grid)
         self._seen = window(y, x, [len(at) for at in fine], self._grid)
@@ -277,6 +302,8 @@ class TurnedWindow(LinearMap):
         self.reached = sky or ranges(first[::-1].tolist(), self._grid)
         y, x = (at.start - start for at, start in zip(self.reached, first[::-1], strict=True))
         self._sky = window(y, x, [len(at) for at in self.reached], self._grid)
+        if camera.transmission is not None:
+            self.transmission = _part(camera.transmission, self.reached)
         shift = turn @ first + shift - (columns[0], rows[0])
         box = range(self.shape[0]), range(self.shape[1])
         self._rotation = rotation = Rotation(rotation.angle, shift, self._grid, box, scale)
@@ -299,20 +326,19 @@ class TurnedWindow(LinearMap):
 
 def images_of(cameras: Iterable[Camera], sky: Array) -> Iterator[Array]:
     """Yield the ``A_j f``; nothing but one of them, and the spectrum of f, is held."""
-    if is_flat(sky):
-        for camera in cameras:
+    spectra: dict[Hashable, Spectrum] = {}
+    flat = is_flat(sky)
+    for camera in cameras:
+        if flat and camera.transmission is None:
             yield np.full(camera.image_grid, sky[0, 0] * camera.flat)
-    else:
-        yield from seen_by(cameras, sky)
+        else:
+            yield camera.seen(camera.shared_spectrum(sky, spectra))
 
 
 def seen_by(maps: Iterable[LinearMap], sky: Array) -> Iterator[Array]:
     """Yield the images that maps have of a sky."""
     spectra: dict[Hashable, Spectrum] = {}
-    for each in maps:
-        if each.key not in spectra:
-            spectra = {each.key: each.spectrum(sky)}
-        yield each.seen(spectra[each.key])
+    return (each.seen(each.shared_spectrum(sky, spectra)) for each in maps)
 
 
 def adjoint_of(maps: Iterable[LinearMap], images: Iterable[Array]) -> Array:
@@ -331,6 +357,11 @@ def adjoints_of(cameras: Sequence[Camera], images: Iterable[Array], factors: Arr
     Images that share their memory, as weights do, are transformed once; those of one value each
     are not. The result may be read-only: of such alone it is a view of one value, too.
     """
+    if cameras[0].transmission is not None:
+        skies = np.zeros((len(factors), *cameras[0].grid))
+        for camera, image, own in zip(cameras, images, factors.T, strict=True):
+            skies += own[:, None, None] * camera.adjoint(image)
+        return skies
     grid, flat, spectra = cameras[0].grid, np.zeros(len(factors)), list[Spectrum]()
     for image, members in _runs(images, cameras[0].rotation is None):
         shares, seen_by = factors[:, members], [cameras[j] for j in members]
@@ -354,7 +385,7 @@ def mixed_otf(cameras: Sequence[Camera], shares: Array) -> Spectrum:
     mixed = np.zeros(cameras[0].grid)
     for camera, share in zip(cameras, shares, strict=True):
         mixed[camera.psf.window(mixed.shape)] += share * camera.psf.values
-    return cameras[0].spectrum(mixed)
+    return cameras[0]._transform(mixed, ...)
 
 
 def _runs(images: Iterable[Array], may_share: bool) -> Iterator[tuple[Array, list[int]]]:
@@ -391,6 +422,11 @@ def ranges(first: Sequence[int], shape: Sequence[int]) -> Ranges:
     """Return the rows and columns of a window with a first pixel and a shape."""
     rows, columns = (range(at, at + n) for at, n in zip(first, shape, strict=True))
     return rows, columns
+
+
+def _part(sky: Array, there: Ranges) -> Array:
+    """Return rows and columns of the sky, round its edges."""
+    return sky.take(there[0], 0, mode="wrap").take(there[1], 1, mode="wrap")
 
 
 def _reached(seen: range, first: int, size: int, n: int) -> range:

@@ -101,8 +101,8 @@ class Field(NamedTuple):
         Returns what is held, of the field, its value without unit, and what is held above it.
     unit : {"counts", "electrons", "s", ""}
         What its unit is converted to; counts may be per time.
-    axes : {"pixels", "psf", ""}
-        Whether its last axes are those of an image, where it has so many, or those of a PSF.
+    axes : {"pixels", "psf", "sky", ""}
+        Whether its last axes are those of an image, where it has so many, of a PSF, or of the sky.
     in_bad : float
         What a map of levels holds in bad pixels.
     beyond : float or bool
@@ -116,7 +116,7 @@ class Field(NamedTuple):
     name: str
     read: Callable[[Field, Any, Observation], Any]
     unit: Literal["counts", "electrons", "s", ""] = ""
-    axes: Literal["pixels", "psf", ""] = ""
+    axes: Literal["pixels", "psf", "sky", ""] = ""
     in_bad: float = 0.0
     beyond: float | bool = 0.0
     is_positive: bool = False
@@ -224,6 +224,34 @@ def _epochs(_: Field, epochs: Any, held: Observation) -> NDArray[np.intp]:
     return numbered.astype(np.intp)
 
 
+def _transmission(field: Field, value: Any, held: Observation) -> Array:
+    """Return the share of the sky's light that each image gets, shape (p, Ny, Nx) or (0, 0, 0)."""
+    if value is None:
+        return np.zeros((0, 0, 0))
+    array, masked = values_and_mask(field.name, value)
+    refuse_masked(field.name, masked)
+    values = numbers(field.name, array, copy=False)
+    if values.ndim == 2:
+        values = np.broadcast_to(values, (held.n_images, *values.shape))
+    if values.ndim != 3 or len(values) != held.n_images:
+        raise InputError(
+            f"`{field.name}` has shape {values.shape}; give one of the sky's pixels, or one for "
+            f"each of the {held.n_images} images"
+        )
+    in_range = (values >= 0) & (values <= 1)
+    refuse_unless(f"`{field.name}`", values, "finite, zero or more, and at most 1", in_range)
+    if not values.any():
+        raise InputError(f"`{field.name}` is 0 everywhere, so nothing of the sky is seen")
+    return values
+
+
+def refuse_other_sky(held: Observation) -> None:
+    """Refuse a transmission that is not of the sky's pixels."""
+    shape, sky = held.transmission.shape, held.sky_shape
+    if shape[0] and shape[1:] != sky:
+        raise InputError(f"`transmission` has shape {shape}; the sky has {sky}")
+
+
 # In the order in which they are read: what a field is checked beside is above it.
 FIELDS = {
     field.name: field
@@ -243,6 +271,7 @@ FIELDS = {
         Field("background_error", _levels, "electrons"),
         Field("read_noise", _deviations, "electrons", "pixels"),
         Field("halos", read_halos, "", "pixels", of_images=1),
+        Field("transmission", _transmission, "", "sky"),
     )
 }
 
@@ -289,6 +318,7 @@ def hold(
         if name in given.values:
             setattr(held, name, field.read(field, given.values[name], held))
     held.geometry = read_geometry(given.values, held, before, shapes)
+    refuse_other_sky(held)
     with np.errstate(over="ignore", invalid="ignore"):  # bad pixels hold anything
         for name in given.rates:
             rates, exposure = together(getattr(held, name), held.exposure)

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from copy import copy
+from functools import cached_property
 
 import numpy as np
 
 from lnocl.scene.arrays import Array
-from lnocl.scene.camera import Camera, Ranges, adjoint_of, adjoints_of, images_of, is_flat, ranges
+from lnocl.scene.camera import (
+    Camera,
+    Ranges,
+    Spectrum,
+    adjoint_of,
+    adjoints_of,
+    images_of,
+    is_flat,
+    ranges,
+)
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Cutout
@@ -46,8 +56,8 @@ class Model:
     background : ndarray of float64, shape (p, 1, 1) or (p, ny, nx)
         b_j.
     sums : ndarray of float64, shape (p,)
-        What a flat sky of ones is in each image: it stays flat. So does the adjoint of a flat
-        image.
+        What a flat sky of ones is in each image: it stays flat, but for a transmission. So does
+        the adjoint of a flat image.
 
     Notes
     -----
@@ -74,6 +84,11 @@ class Model:
         other.scene, other.background = scene, self.background + np.array(more)
         return other
 
+    @cached_property
+    def of_ones(self) -> list[Array | float]:
+        """What a sky of ones is in each image: a number where it stays flat."""
+        return [camera.of_ones() for camera in self.cameras]
+
     def forward(self, extended: Array) -> Array:
         """Return the ``A_j f``, shape (p, ny, nx)."""
         images = np.empty(self.shape)
@@ -82,9 +97,10 @@ class Model:
         return images
 
     def convolved(self, extended: Array) -> Iterator[Array]:
-        """Return the ``A_j f`` before pixels sample them, each of shape (Ny, Nx)."""
-        spectrum = self.cameras[0].spectrum(extended)
-        return (camera.convolved(spectrum) for camera in self.cameras)
+        """Yield the ``A_j f`` before pixels sample them, each of shape (Ny, Nx)."""
+        spectra: dict[Hashable, Spectrum] = {}
+        for camera in self.cameras:
+            yield camera.convolved(camera.shared_spectrum(extended, spectra))
 
     def adjoint(self, arrays: Iterable[Array]) -> Array:
         """Return ``sum_j A_j^T x_j``, shape (Ny, Nx)."""
@@ -136,7 +152,7 @@ class Model:
 
     def images_at(self, boxes: Sequence[Box], extended: Array) -> Array:
         """Return the m_j without stars in a box of each; beyond it they may be 0."""
-        flat = is_flat(extended)
+        flat = is_flat(extended) and self.scene.transmission is None
         if not flat and (self.scene.rotations or self.are_large(boxes)):
             return self.images(extended, np.zeros(self.scene.n_fluxes))
         images = np.zeros(self.shape)

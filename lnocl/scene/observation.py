@@ -84,6 +84,11 @@ class Observation:
         turned and sampled in the model; no counts are resampled. PSFs are as the images show them,
         on their pixels, and hold what a pixel collects. Images, and PSFs, of several shapes may be
         given as lists of arrays, and maps with them; bad pixels are added to smaller ones.
+    transmission : array_like, shape (p, Ny, Nx) or (Ny, Nx), optional
+        Share of the light of each pixel of the sky that each image gets, 0 to 1, before the PSF
+        spreads it: that of a coronagraph, or of vignetting on the sky. One serves all images. The
+        sky and the fluxes of stars are those before it. A star behind 0 is left out. What dims the
+        light after the PSF, as bad pixels do, is an `exposure`.
     halos : array_like, shape (n, p, ny, nx), (n, 1, ny, nx), (p, ny, nx) or (ny, nx), optional
         Light of known shape and unknown amount, such as the speckles of a star behind a
         coronagraph: n shapes in each image, or one in each, or one for all images. Finite and zero
@@ -145,6 +150,8 @@ class Observation:
         As given, or 0; with `transforms` their shifts.
     turns : ndarray of float64, shape (p, 2, 2)
         The rotations, flips and scales of `transforms`; without it those of no turn.
+    transmission : ndarray of float64, shape (p, Ny, Nx)
+        As given; of shape (0, 0, 0) where it was not.
     halos : ndarray of float64, shape (n, p, ny, nx)
         Of unit sum in each image, 0 where a pixel is bad; n is 0 where none were given.
     epochs : ndarray of int, shape (p,)
@@ -170,6 +177,7 @@ class Observation:
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
         - A halo is 0 on all good pixels of an image.
+        - `transmission` is not of the sky's shape, out of range, or 0 everywhere.
         - A label of `epochs` is missing or not a number, or the labels have no order.
         - `transforms` are given beside `offsets`, `oversample` or PSFs that vary over the field,
           shear the images by more than 0.05 pixels, or are for pixels smaller than the sky's.
@@ -219,6 +227,7 @@ class Observation:
     background_error: Array
     read_noise: Array
     halos: Array
+    transmission: Array
     oversample: int
     effective_psfs: bool
     geometry: Geometry
@@ -236,6 +245,7 @@ class Observation:
         offsets: ArrayLike | None = None,
         transforms: ArrayLike | None = None,
         halos: ArrayLike | None = None,
+        transmission: ArrayLike | None = None,
         epochs: ArrayLike | None = None,
         oversample: int = 1,
         effective_psfs: bool = False,
@@ -382,7 +392,8 @@ class Observation:
             return self
         changes: dict[str, Any] = {"geometry": geometry}
         for name, field in FIELDS.items():
-            if field.axes and (values := getattr(self, name)).ndim > 2 and values.size:
+            values = getattr(self, name)
+            if field.axes in ("pixels", "psf") and values.ndim > 2 and values.size:
                 fill = field.beyond if field.axes == "pixels" else None
                 changes[name] = geometry.turned(values, fill, field.of_images)
         return self._with(changes)._closed()
@@ -474,6 +485,9 @@ class Observation:
         for name, field in FIELDS.items():
             if field.axes == "pixels" and (values := getattr(self, name)).ndim > 2:
                 changes[name] = values[..., rows.start : rows.stop, columns.start : columns.stop]
+        q = self.oversample
+        there = (slice(q * at.start, q * at.stop) for at in (rows, columns))
+        changes["transmission"] = self.transmission[:, *there]
         if self.psf_fields:
             fields = tuple(field.moved(-columns.start, -rows.start) for field in self.psf_fields)
             x, y = middle or ((len(columns) - 1) / 2.0, (len(rows) - 1) / 2.0)

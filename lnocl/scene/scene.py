@@ -94,6 +94,11 @@ class Scene:
         How each image is turned against the sky; empty where none is.
     areas : ndarray of float64, shape (p,)
         Pixels of the sky to one of each image.
+    transmission : ndarray of float64, shape (p, Ny, Nx), or None
+        The share of each pixel of the sky's light that an image gets, before its PSF; beyond the
+        sky's frame that of the nearest pixel.
+    seen_areas : ndarray of float64, shape (p,)
+        `areas` times its mean.
     scale : float
         Electrons per unit of the images.
     unit : float
@@ -169,6 +174,10 @@ class Scene:
         self.gains = np.ones(self.n_images) if has_map else relative
         self._psfs = movable_psfs(self.scaled_psfs(), observation, self.image_grid)
         self.areas = (self.oversample * observation.scales) ** 2
+        self.transmission = self._transmission()
+        self.seen_areas = self.areas.copy()
+        if self.transmission is not None:
+            self.seen_areas *= observation.transmission.mean(axis=(1, 2))
         self.rotations = self._rotations()
         self.weights = self._weigh(relative if has_map else None)
         self._halos = (
@@ -200,6 +209,26 @@ class Scene:
             Rotation(angles[j], shift, self.grid, observation.good_box(j), scales[j])
             for j, shift in enumerate(observation.offsets)
         ]
+
+    def _transmission(self) -> Array | None:
+        given = self.observation.transmission
+        if not len(given):
+            return None
+        beyond = [(0, n - k) for n, k in zip(self.grid, given.shape[1:], strict=True)]
+        if given.strides[0] or not any(map(any, beyond)):
+            return np.pad(given, [(0, 0), *beyond], mode="edge")
+        one = np.pad(given[0], beyond, mode="edge")
+        return np.broadcast_to(one, (self.n_images, *self.grid))
+
+    def transmitted(self, positions: Array) -> Array:
+        """Return the share of the light of points, (n, 2), that each image gets; shape (p, n)."""
+        if self.transmission is None:
+            return np.ones((self.n_images, len(positions)))
+        from scipy.ndimage import map_coordinates
+
+        at = on_sky(positions, self.oversample).T[::-1]
+        shares = (map_coordinates(t, at, order=1, mode="nearest") for t in self.transmission)
+        return np.array(list(shares))
 
     def psfs_of_sky(self) -> list[Array]:
         """Return the PSFs as the sky sees them, of unit sum: turned back, on the sky's pixels."""
@@ -317,15 +346,20 @@ class Scene:
     ) -> list[list[MovablePsf | DetectorPsf]]:
         """Return the PSF of each image at each of some positions, or a part of it, to be placed."""
         observation, fields = self.observation, self.observation.psf_fields
-        if not fields and part is None:
+        if not fields and part is None and self.transmission is None:
             return [[psf] * len(positions) for psf in self._psfs]
         movable = partial(movable_psfs, observation=observation, grid=self.image_grid)
-        if not fields:
+        if not fields and self.transmission is None:
             parts = movable([psf[part] for psf in self.scaled_psfs()])
             return [[psf] * len(positions) for psf in parts]
+        shares = self.gains[:, None] * self.transmitted(positions)
+        psfs = [
+            [field.at(*place) for place in positions + offset]
+            for field, offset in zip(fields, observation.offsets, strict=bool(fields))
+        ] or [[psf] * len(positions) for psf in observation.psfs]
         return [
-            movable([gain * field.at(*place)[part or ...] for place in positions + offset])
-            for field, gain, offset in zip(fields, self.gains, observation.offsets, strict=True)
+            movable([share * psf[part or ...] for share, psf in zip(*each, strict=True)])
+            for each in zip(shares, psfs, strict=True)
         ]
 
     @property
@@ -557,7 +591,7 @@ class Scene:
             weights = np.ones(self.image_grid) if self.weights is None else self.weights[j]
             counts += float((weights * image).sum())
             excess += float((weights * (image - background)).sum())
-            exposures += float(self.areas[j] * self.gains[j] * weights.sum())
+            exposures += float(self.seen_areas[j] * self.gains[j] * weights.sum())
         noise = math.sqrt(counts / self.scale)
         most = (BRIGHTER * max(excess, 0.0) + FLOOR * noise) / exposures
         with np.errstate(over="ignore"):
@@ -603,7 +637,7 @@ class Scene:
             excess[~observed] = 0.0
             light, n_there = float(excess.sum()), int(np.count_nonzero(observed))
             total, n_observed = total + light, n_observed + n_there
-            n_seen += self.areas[j] * n_there
+            n_seen += self.seen_areas[j] * n_there
             if not (self.n_fluxes and n_there):
                 continue
             covered = self._field.covered(j)
@@ -635,7 +669,7 @@ class Scene:
             observed = np.ones(image.shape, bool) if self.weights is None else self.weights[j] > 0
             n_there = int(np.count_nonzero(observed))
             total += float((image - background)[observed].sum())
-            n_observed, n_seen = n_observed + n_there, n_seen + self.areas[j] * n_there
+            n_observed, n_seen = n_observed + n_there, n_seen + self.seen_areas[j] * n_there
         least = max(1e-3 * total, n_observed * float(np.finfo(np.float32).eps))
         return max(total - float(fluxes @ self.star_weights), least) / n_seen
 
@@ -679,9 +713,10 @@ class Scene:
         if n_dark := int(is_dark.sum()):
             x, y = stars[is_dark][0]
             others = f", and so do {counted(n_dark - 1, 'other')}" if n_dark > 1 else ""
+            or_dark = "" if self.transmission is None else " or nothing is transmitted"
             warn(
-                f"the star at ({x:g}, {y:g}) lies where all images are masked{others}: it is left "
-                "out, and its flux is NaN"
+                f"the star at ({x:g}, {y:g}) lies where all images are masked{or_dark}{others}: it "
+                "is left out, and its flux is NaN"
             )
         of_epochs = of_epochs & ~is_dark[:, None]
         if n_lost := int(of_epochs.sum()):
@@ -698,7 +733,8 @@ class Scene:
         observed = ~self.observation.mask
         if relative is not None:
             return self._on_grid(np.where(observed, relative, 0.0))
-        if observed.all() and self.image_grid == self.observation.shape:
+        is_whole = observed.all() and self.image_grid == self.observation.shape
+        if is_whole and self.transmission is None:
             return None
         if (observed == observed[0]).all():
             return np.broadcast_to(self._on_grid(observed[0]), (self.n_images, *self.image_grid))

@@ -127,7 +127,7 @@ class LevelError:
     ----------
     deviation : float
         The standard deviation of the error, in the unit of the sky.
-    areas : ndarray of float64, shape (p,)
+    responses : ndarray of float64, shape (p, 1, 1) or (p, Ny, Nx)
         The light of a sky of 1 in a pixel of each image.
     shape : tuple of int
         Shape (Ny, Nx) of the images.
@@ -138,17 +138,18 @@ class LevelError:
         The current value, which is 0.
     """
 
-    def __init__(self, deviation: float, areas: Array, shape: tuple[int, int]) -> None:
-        self._levels, self._shape, self.at = deviation * areas, shape, np.zeros(1)
+    def __init__(self, deviation: float, responses: Array, shape: tuple[int, int]) -> None:
+        self._levels, self._shape, self.at = deviation * responses, shape, np.zeros(1)
 
     def forward(self, x: Array) -> Array:
         """Return the changes of the images, shape (p, Ny, Nx)."""
-        levels = x[0] * self._levels[:, None, None]
+        levels = x[0] * self._levels
         return np.broadcast_to(levels, (len(levels), *self._shape))
 
     def adjoint(self, images: Sequence[Array]) -> Array:
         """Return the transpose of `forward` applied to images, shape (1,)."""
-        return np.array([sum(a * y.sum() for a, y in zip(self._levels, images, strict=True))])
+        pairs = zip(self._levels, images, strict=True)
+        return np.array([sum(np.sum(a * (y if a.size > 1 else y.sum())) for a, y in pairs)])
 
 
 class LeastSquares:

@@ -52,11 +52,10 @@ class Light:
 
     def _left(self) -> Iterator[Array]:
         """Yield ``(g_j - m_j) / A_j 1``, scaled."""
-        each = zip(self._scene.images(), self._estimate.models(), self._map.sums, strict=True)
-        for image, model, total in each:
+        each = zip(self._scene.images(), self._estimate.models(), self._map.of_ones, strict=True)
+        for image, model, ones in each:
             image -= model
-            image /= total
-            yield image
+            yield _over(image, ones)
 
     def sky(self) -> Array:
         r"""Return :math:`\tilde f`, electrons per pixel, shape (ny, nx) of the observed sky."""
@@ -118,14 +117,14 @@ class Light:
         laid = np.zeros(scene.grid)
         laid[:ny, :nx] = shares
         laid *= self._per_weight
-        for weights, seen, total in zip(
-            self._map.weights, images_of(self._map.cameras, laid), self._map.sums, strict=True
+        for weights, seen, ones in zip(
+            self._map.weights, images_of(self._map.cameras, laid), self._map.of_ones, strict=True
         ):
-            if is_flat(seen) and is_flat(weights):
-                value = np.array(weights[0, 0] * seen[0, 0] / total)
+            if is_flat(seen) and is_flat(weights) and isinstance(ones, float):
+                value = np.array(weights[0, 0] * seen[0, 0] / ones)
                 yield np.broadcast_to(value, seen.shape)
             else:
-                yield weights * seen / total
+                yield _over(weights * seen, ones)
 
     def _inside(self, shares: Array) -> NDArray[np.bool_]:
         """Return which stars lie in pixels that are summed, as all halos are taken to."""
@@ -134,6 +133,14 @@ class Light:
         inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
         inside[inside] = shares[y[inside], x[inside]] > 0
         return np.append(inside, np.ones(scene.n_halos, bool))
+
+
+def _over(image: Array, ones: Array | float) -> Array:
+    """Return an image over that of a sky of ones; 0 where that is dark."""
+    if isinstance(ones, float):
+        image /= ones
+        return image
+    return np.divide(image, ones, out=np.zeros_like(image), where=ones > 0)
 
 
 def _quotient(factor: Array, weights: Array) -> Array:

@@ -163,10 +163,22 @@ class NearStar:
         self._finished, self.n_of_stars = finished, len(held) * (3 if around.moves else 1)
         self.expected = texture.mean[there] - around.estimate.part(self.places(scene))
         level = float(texture.mean[there].mean())
-        self._level = LevelError(level, scene.gains * scene.areas, self.window.shape)
+        self._level = LevelError(level, self._responses(around), self.window.shape)
         beyond = self.source.images_of(self.expected)
         self._images = [self._linearise(around, j, held, each) for j, each in enumerate(beyond)]
         self._prior = self._prior_of_halos(around)
+
+    def _responses(self, around: Surroundings) -> Array:
+        """Return what a flat sky of ones is in the window of each image."""
+        scene, window = around.scene, self.window
+        if scene.transmission is None:
+            return (scene.gains * scene.areas)[:, None, None]
+        ones = np.broadcast_to(1.0, scene.grid)
+        seen = (
+            camera.part(ones, _in_image(scene, j, window).ranges)
+            for j, camera in enumerate(around.cameras)
+        )
+        return np.array([_padded(each, window.shape) for each in seen])
 
     def places(self, scene: Scene) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Return the rows and columns of the window in the sky, on the grid."""

@@ -136,6 +136,11 @@ def _run_convolve_columns(harness: KernelHarness, given: SimpleNamespace) -> Pai
     oversample, phases = harness.program.oversample, _phases(given)
     expected = reference.convolve_columns(given.spectrum[0], given.otfs, oversample, phases)
     yield harness.take_image_spectra(out, given.p), _real_edges(expected)
+    # An image that has a sky of its own.
+    alone = {"first": given.p - 1, "n_images": 1}
+    out = harness.put_spectra([*others, *given.spectrum])
+    harness.launch("convolve_columns", spectra=out, **alone, **_put_otfs(harness, given))
+    yield harness.take_image_spectra(out, given.p)[-1], expected[-1]
 
 
 def _run_correlate_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
@@ -146,6 +151,36 @@ def _run_correlate_columns(harness: KernelHarness, given: SimpleNamespace) -> Pa
     yield harness.take_spectra(out)[0], expected
     others = harness.take_image_spectra(out, given.p)[1:]
     if not np.array_equal(others, _real_edges(given.image_spectra[1:])):
+        raise DeviceError("others than array 0 are written")
+    out = harness.put_spectra(given.image_spectra)
+    last = slice(given.p - 1, given.p)
+    alone = {"first": last.start, "n_images": 1}
+    harness.launch("correlate_columns", spectra=out, **alone, **_put_otfs(harness, given))
+    phases = _phases(given)
+    own = given.image_spectra[last], given.otfs[last], None if phases is None else phases[last]
+    yield harness.take_spectra(out, given.p)[-1], _real_edges(reference.correlate_columns(*own))
+
+
+def _run_transmit_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
+    out = harness.put_spectra(np.full((given.p, *given.spectrum.shape[1:]), np.nan))
+    extended, transmission = map(harness.put_pixels, (given.extended, given.transmission))
+    harness.launch("transmit_rows", spectra=out, extended=extended, transmission=transmission)
+    expected = reference.transmit_rows(given.extended, given.transmission)
+    yield harness.take_spectra(out, given.p), expected
+
+
+def _run_gather_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
+    row_spectra = reference.rfft_rows(given.transmission[::-1] * given.extended - 0.3)
+    row_spectra = rounded(row_spectra, harness.dtype)
+    out = harness.put_spectra(row_spectra)
+    before = harness.take_spectra(out, given.p)
+    transmission = harness.put_pixels(given.transmission)
+    harness.launch(
+        "gather_rows", spectra=out, transmission=transmission, transmitted=harness.empty_pixels()
+    )
+    expected = reference.gather_rows(row_spectra, given.transmission)
+    yield harness.take_spectra(out, given.p)[0], expected
+    if not np.array_equal(harness.take_spectra(out, given.p)[1:], before[1:]):
         raise DeviceError("others than array 0 are written")
 
 
@@ -499,6 +534,8 @@ KERNELS: dict[str, Callable[[KernelHarness, SimpleNamespace], Pairs]] = {
     "otf_columns": _run_otf_columns,
     "convolve_columns": _run_convolve_columns,
     "correlate_columns": _run_correlate_columns,
+    "transmit_rows": _run_transmit_rows,
+    "gather_rows": _run_gather_rows,
     "ratio_rows": _run_ratio_rows,
     "irfft_sheared": _run_irfft_sheared,
     "ratio_sheared": _run_ratio_sheared,

@@ -150,7 +150,7 @@ class KernelHarness:
 
         Arguments that the scene has no use for are small arrays.
         """
-        counts = {"n_images": self.n_images, "n_stars": self.n_stars}
+        counts = {"n_images": self.n_images, "n_stars": self.n_stars, "first": 0}
         given = {**counts, **arguments}
         for name in self.program.arguments[kernel]:
             if name not in given and name not in self.launcher.own:
@@ -314,6 +314,7 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         previous=own(rng.random((1, ny, nx)) * 0.5),
         gradient=own(rng.uniform(-0.2, 2.0, (1, ny, nx))),
         shift=own(rng.random((1, ny, nx))),
+        transmission=own(rng.random((p, ny, nx))),
         slope=own(rng.uniform(-0.5, 1.0, (1, ny, nx))) if has_smoothing else 0.0,
         curvature=own(rng.random((1, ny, nx))) if has_smoothing else 0.0,
         smoothing=float(np.float32(0.4)) if has_smoothing else 0.0,

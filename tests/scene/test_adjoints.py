@@ -38,8 +38,16 @@ MASK = RNG.random((P, *SHAPE)) < 0.03
 SMOOTH = make_smooth_psfs(P, (13, 15))
 
 
-def turned(maps):
-    return turned_scenes.observation(maps, psfs=SMOOTH, psf_centre="given")
+def turned(maps, transmission=None):
+    given = {"psfs": SMOOTH, "psf_centre": "given", "transmission": transmission}
+    return turned_scenes.observation(maps, **given)
+
+
+def shares(*shape):
+    """Return transmissions of three images, one of which hides a disc."""
+    y, x = np.indices(shape) / np.reshape(shape, (2, 1, 1))
+    hidden = np.clip(8.0 * np.hypot(y - 0.4, x - 0.6) - 0.5, 0.0, 1.0)
+    return np.array([0.3 + 0.6 * x * y, hidden, 1.0 - 0.7 * y])
 
 
 KINDS = {
@@ -55,6 +63,11 @@ KINDS = {
     ),
     "turned": lambda: turned(turned_scenes.transforms()),
     "scaled": lambda: turned(turned_scenes.scaled()),
+    "dimmed": lambda: observe(SMOOTH, offsets=OFFSETS, mask=MASK, transmission=shares(*SHAPE)),
+    "dimmed, finer": lambda: observe(
+        make_smooth_psfs(P, (18, 17)), offsets=OFFSETS, oversample=2, transmission=shares(80, 112)
+    ),
+    "dimmed, scaled": lambda: turned(turned_scenes.scaled(), shares(*turned_scenes.SHAPE)),
 }
 every_kind = pytest.mark.parametrize("kind", KINDS)
 
@@ -202,7 +215,8 @@ def test_the_sky_round_a_star(kind, monkeypatch):
     assert_adjoint(source.images_of, source._adjoint, x, y * weights)
     laid = np.zeros(scene.grid)
     laid[near.places(scene)] = x
-    images = Model(scene).forward(laid)
+    images, of_ones = map(Model(scene).forward, (laid, np.ones(scene.grid)))
+    responses = np.broadcast_to(near._responses(around), y.shape)
     for j, found in enumerate(source.images_of(x)):
         there = near_star._in_image(scene, j, near.window)
         expected = images[j][there.of(scene.image_grid)]
@@ -212,6 +226,8 @@ def test_the_sky_round_a_star(kind, monkeypatch):
         allowed = 1e-3 if scene.rotations else 1e-9
         difference = abs(found[:ny, :nx] - expected)[is_seen].max()
         assert difference <= allowed * expected[is_seen].max()
+        flat = of_ones[j][there.of(scene.image_grid)]
+        np.testing.assert_allclose(responses[j, :ny, :nx][is_seen], flat[is_seen], rtol=allowed)
 
 
 @pytest.mark.parametrize("kind", ["apart", "moved", "finer"])

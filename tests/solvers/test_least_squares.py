@@ -49,7 +49,7 @@ def test_threads_of_blas_change_no_bit():
 
 def test_a_level_is_the_transpose_of_its_effect():
     rng = np.random.default_rng(2)
-    level = LevelError(0.7, np.array([1.5, 0.4, 2.0]), (6, 9))
+    level = LevelError(0.7, np.array([1.5, 0.4, 2.0])[:, None, None], (6, 9))
     images = rng.standard_normal((3, 6, 9))
     forward = (level.forward(np.array([1.3])) * images).sum()
     assert forward == pytest.approx(1.3 * level.adjoint(images)[0], rel=1e-13)
