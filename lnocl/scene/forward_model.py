@@ -263,6 +263,45 @@ def turned(scene: Scene, j: int, sky: Array) -> Array:
     return scene.rotations[j].forward(sky) if scene.rotations else sky
 
 
+def spectrum_in_frame(scene: Scene, j: int, sky: Array) -> NDArray[np.complex128]:
+    """Return the spectrum of a sky, per pixel of it, in the frame of image j before its PSF.
+
+    Where the image is turned it has what the image's pixels can hold: that its PSF can show.
+    """
+    spectrum = scipy.fft.rfft2(sky, workers=-1)
+    u, v = np.fft.rfftfreq(scene.grid[1])[None, :], np.fft.fftfreq(scene.grid[0])[:, None]
+    if not scene.rotations:
+        dx, dy = scene.oversample * scene.observation.offsets[j]
+        return np.asarray(spectrum * np.exp(-2j * np.pi * (u * dx + v * dy)))
+    turn = scene.rotations[j]
+    c, s = turn.scale * math.cos(turn.angle), turn.scale * math.sin(turn.angle)
+    is_held = (abs(c * u - s * v) <= 0.5) & (abs(s * u + c * v) <= 0.5)
+    spectrum *= is_held * turn.undone()
+    seen = turn.forward(scipy.fft.irfft2(spectrum, scene.grid, workers=-1))
+    return np.asarray(scipy.fft.rfft2(seen, workers=-1))
+
+
+def laid_on_sky(scene: Scene, j: int, image: Array) -> Array:
+    """Return the pixels of an image, not negative, where they lie on the sky's grid.
+
+    Shears and their weights are made for what pixels hold, and would ring: pixels of an image that
+    is turned are shared out among the four of the sky round each.
+    """
+    if not scene.rotations:
+        return spread(image, scene.oversample)
+    y, x = np.nonzero(image)
+    at = np.stack([x, y], axis=1) - scene.observation.offsets[j]
+    places = np.linalg.solve(scene.observation.turns[j], at.T)[::-1]
+    first = np.floor(places).astype(int)
+    sky = np.zeros(math.prod(scene.grid))
+    for step in np.ndindex(2, 2):
+        corner = first + np.array(step)[:, None]
+        share = (1.0 - abs(places - corner)).prod(axis=0)
+        index = np.ravel_multi_index(tuple(corner), scene.grid, mode="wrap")
+        sky += np.bincount(index, share * image[y, x], sky.size)
+    return sky.reshape(scene.grid)
+
+
 def convolve_at(
     extended: Array, psf: Cutout, rows: range, columns: range, oversample: int = 1
 ) -> Array:

@@ -20,6 +20,7 @@ from lnocl.scene.grid import grid_of, psf_shape
 from lnocl.scene.halos import halo_cutouts
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
+from lnocl.scene.psf_field import Psfs
 from lnocl.scene.rotation import Rotation, turned_psf
 from lnocl.scene.shifting import Cutout, MovablePsf
 from lnocl.scene.stars import Covered, StarField, check_positions, covered_box
@@ -254,8 +255,8 @@ class Scene:
         half.scale, half.unit = self.scale / 2.0, self.unit / 2.0
         return half
 
-    def seen_through(self, psfs: Array) -> Scene:
-        """Return this scene with other PSFs, shape (p, ky, kx), as they are."""
+    def seen_through(self, psfs: Psfs) -> Scene:
+        """Return this scene with other PSFs, as they are."""
         other = copy(self)
         other.observation = self.observation.replace(psfs=psfs)
         other._psfs = movable_psfs(other.scaled_psfs(), other.observation, self.image_grid)
@@ -349,6 +350,16 @@ class Scene:
         return len(self.stars)
 
     @property
+    def n_epochs(self) -> int:
+        """Number of epochs, in each of which stars have a flux."""
+        return self.observation.n_epochs
+
+    @property
+    def places(self) -> Array:
+        """Positions of the stars, once each."""
+        return np.asarray(self.stars[:: self.n_epochs])
+
+    @property
     def n_halos(self) -> int:
         """Number of halos of all images together."""
         return self.n_fluxes - self.n_stars
@@ -361,9 +372,8 @@ class Scene:
     @property
     def shown_places(self) -> Array:
         """Positions of stars that any image shows, once each, shape (n_shown, 2)."""
-        n_epochs = self.observation.n_epochs
-        is_shown = self.is_shown[: self.n_stars].reshape(-1, n_epochs).any(axis=1)
-        return np.asarray(self.stars[::n_epochs][is_shown])
+        is_shown = self.is_shown[: self.n_stars].reshape(-1, self.n_epochs).any(axis=1)
+        return np.asarray(self.places[is_shown])
 
     @property
     def shown_stars(self) -> Array:
@@ -394,7 +404,7 @@ class Scene:
 
     def with_star(self, place: Array) -> Scene:
         """Return this scene with one more star, the last, at (x, y)."""
-        other, n, n_epochs = copy(self), self.n_stars, self.observation.n_epochs
+        other, n, n_epochs = copy(self), self.n_stars, self.n_epochs
         shown = np.arange(n_epochs)[:, None] == self.observation.epochs
         other.shown = np.insert(self.shown, [n] * n_epochs, shown, axis=0)
         positions = np.concatenate([self.stars, np.tile(place, (n_epochs, 1))])
@@ -648,7 +658,7 @@ class Scene:
         """
         if self.weights is None:
             light = field.shown.T.astype(np.float64)
-            if self.observation.n_epochs > 1:  # else a star is in all images, of mean exposure 1
+            if self.n_epochs > 1:  # else a star is in all images, of mean exposure 1
                 light[:, : len(field.positions)] *= self.gains[:, None]
             # Samples of an effective PSF a pixel apart may sum to another number.
             if self.oversample > 1 and self.observation.effective_psfs:
@@ -673,9 +683,9 @@ class Scene:
         self.shown[: len(is_lost)][is_lost] = False
         self.star_weights[: len(is_lost)][is_lost] = HELD
         self._field = self._place_stars(self.stars)
-        of_epochs = is_lost.reshape(-1, self.observation.n_epochs)
+        of_epochs = is_lost.reshape(-1, self.n_epochs)
         is_dark = np.asarray(of_epochs.all(axis=1))
-        stars = self.stars[:: self.observation.n_epochs]
+        stars = self.places
         if n_dark := int(is_dark.sum()):
             x, y = stars[is_dark][0]
             others = f", and so do {counted(n_dark - 1, 'other')}" if n_dark > 1 else ""
