@@ -18,11 +18,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model, laid_on_sky
+from lnocl.scene.forward_model import Model
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import MIN_MODEL
 
@@ -176,7 +175,7 @@ def smoothing_near_stars(
     """
     scene = estimate.scene
     ny, nx = scene.observation.shape
-    spectra: Array | complex = 0.0
+    variance = np.zeros(scene.grid)
     images = zip(scene.images(), model.starlight(_of_stars(estimate)), strict=True)
     for j, (counts, light) in enumerate(images):
         background = np.broadcast_to(model.background[j], light.shape)
@@ -185,10 +184,8 @@ def smoothing_near_stars(
         kappa = np.zeros(light.shape)
         kappa[:ny, :nx] = in_rings[np.minimum(number, len(in_rings) - 1)]
         share = (light / total).clip(0.0)
-        relative = laid_on_sky(scene, j, (model.weights[j] * kappa * share) ** 2)
-        squares = scipy.fft.rfft2(scene.point_response(j) ** 2)
-        spectra = spectra + squares.conj() * scipy.fft.rfft2(relative)
-    variance = scipy.fft.irfft2(spectra, scene.grid)
+        relative = model.weights[j] * kappa * share
+        variance += model.cameras[j].squares(relative**2)
     ny, nx = scene.observation.sky_shape
     deviation = np.sqrt(np.maximum(variance[:ny, :nx], 0.0))
     return np.asarray(strength * deviation)

@@ -22,12 +22,13 @@ import scipy.fft
 from scipy.ndimage import gaussian_filter
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.camera import sampled, spread
 from lnocl.scene.detector import on_sky, pixel_spectrum
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model, sampled, spectrum_in_frame, spread
+from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
 from lnocl.scene.psf_pixels import PsfPixels
-from lnocl.scene.scene import MIN_MODEL, Scene
+from lnocl.scene.scene import MIN_MODEL
 from lnocl.solvers.fluxes import MAX_FADING, precision
 from lnocl.solvers.least_squares import Field, LeastSquares, LinearImage, SourceError
 
@@ -72,7 +73,7 @@ def step(
     at[:n_psf], prior[:n_psf] = values.ravel(), np.tile(families.prior**-2.0, len(values))
     fields: list[Field] = [_source_error(model, extended)]
     if families.pixels is not None:
-        fields.append(_PixelErrors(scene, families.pixels, extended, fluxes, parameters.pixels))
+        fields.append(_PixelErrors(model, families.pixels, extended, fluxes, parameters.pixels))
     change, changes = _fit(images, fields, prior).solve(at)
     longest = (abs(change[:n_psf].reshape(values.shape)) / families.prior).max(initial=0.0)
     change *= MAX_STEP / max(longest, MAX_STEP)
@@ -134,16 +135,19 @@ def _linearise(
         lit, halos = np.split(shown, [np.searchsorted(shown, scene.n_stars)])
         stars = [scene.star_on_sky(j, s).on_grid(scene.grid) for s in lit]
         fixed = [scene.star_image(j, h) for h in halos]
-        starlight = sum(c * star for c, star in zip(fluxes[lit], stars, strict=True))
-        light = diffuse + starlight
+        light = diffuse + sum(c * star for c, star in zip(fluxes[lit], stars, strict=True))
         still = model.background[j] + sum(
             c * halo for c, halo in zip(fluxes[halos], fixed, strict=True)
         )
         total = np.maximum(sampled(light, q) + still, MIN_MODEL)
         factors, modes = families.slopes(j, scene.grid, values[j])
-        whole = _spectrum(scene, j, light, starlight, extended)
-        slopes = [scipy.fft.irfft2(factor * whole, scene.grid) for factor in factors]
-        slopes += [*_convolved(scene, j, extended, fluxes, modes), *stars]
+        whole = sky = scipy.fft.rfft2(light)
+        if modes or scene.rotations:
+            sky = _sky(model, j, extended, fluxes)
+        if scene.rotations:  # else slopes would ring by edges beyond the pixels that are used
+            whole = spectrum(scene.observation.psfs[j], scene.grid) * sky
+        changes = [*(factor * whole for factor in factors), *(mode * sky for mode in modes)]
+        slopes = [*(scipy.fft.irfft2(each, scene.grid) for each in changes), *stars]
         unknowns = [np.arange(j * k, (j + 1) * k), p * k + lit]
         if moves:
             turn = q * scene.observation.turns[j]
@@ -162,40 +166,15 @@ def _linearise(
     return images
 
 
-def _spectrum(
-    scene: Scene, j: int, light: Array, starlight: Array | int, extended: Array
-) -> Spectrum:
-    """Return the spectrum of the light of an image, before its pixels sample that.
-
-    That of an image that is turned is put together from the spectrum of its PSF: beyond the pixels
-    that are used the light itself has edges, and slopes would ring.
-    """
-    if not scene.rotations:
-        return np.asarray(scipy.fft.rfft2(light))
-    psf = spectrum(scene.gains[j] * scene.observation.psfs[j], scene.grid)
-    diffuse = scene.areas[j] * psf * spectrum_in_frame(scene, j, extended)
-    return np.asarray(diffuse + scipy.fft.rfft2(np.broadcast_to(starlight, scene.grid)))
-
-
-def _convolved(
-    scene: Scene, j: int, extended: Array, fluxes: Array, modes: Sequence[Spectrum]
-) -> Iterator[Array]:
-    """Yield the sky of an image seen through each mode."""
-    if not modes:
-        return
-    sky = _sky(scene, j, extended, fluxes)
-    for mode in modes:
-        yield scipy.fft.irfft2(mode * sky, scene.grid)
-
-
-def _sky(scene: Scene, j: int, extended: Array, fluxes: Array) -> Spectrum:
+def _sky(model: Model, j: int, extended: Array, fluxes: Array) -> Spectrum:
     """Return the spectrum of all that PSF j is convolved with: stars, extended source, pixels.
 
     It is in the frame of the image.
     """
+    scene = model.scene
     u, v = _frequencies(scene.grid)
     places = scene.star_field.places[j]
-    sky = scene.areas[j] / scene.oversample**2 * spectrum_in_frame(scene, j, extended)
+    sky = scene.areas[j] / scene.oversample**2 * model.cameras[j].in_frame(extended)
     for s in np.flatnonzero(scene.shown[: scene.n_stars, j]):
         x, y = on_sky(places[s], scene.oversample)
         sky = sky + fluxes[s] * np.exp(-2j * np.pi * (u * x + v * y))
@@ -230,11 +209,11 @@ class _PixelErrors:
     """The errors of the pixels of the PSFs, ``D_j * (f + sum_s c_s delta_s)``."""
 
     def __init__(
-        self, scene: Scene, pixels: PsfPixels, extended: Array, fluxes: Array, at: Array
+        self, model: Model, pixels: PsfPixels, extended: Array, fluxes: Array, at: Array
     ) -> None:
-        self._pixels, self._grid, self.at = pixels, scene.grid, at
-        self._oversample = scene.oversample
-        self._skies = [_sky(scene, j, extended, fluxes) for j in range(scene.n_images)]
+        self._pixels, self._grid, self.at = pixels, model.grid, at
+        self._oversample = model.oversample
+        self._skies = [_sky(model, j, extended, fluxes) for j in range(len(at))]
         places = [np.arange(k) - k // 2 for k in at.shape[1:]]
         self._places = np.ix_(*(at % n for at, n in zip(places, self._grid, strict=True)))
 

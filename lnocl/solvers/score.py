@@ -35,7 +35,7 @@ from scipy import ndimage
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model, laid_on_sky, spread
+from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import CORRELATED
 from lnocl.scene.scene import MIN_MODEL
 from lnocl.scene.smooth_field import SmoothField
@@ -243,20 +243,13 @@ class Null:
 
     def _adjoint(self, images: Sequence[Array], width: float = 0.0) -> Array:
         """Return ``sum_j <P_jx, x_j>`` at each place x of the grid."""
-        scene, total = self.scene, 0.0
-        for j, image in enumerate(images):
-            seen = scene.rotations[j].adjoint(image) if scene.rotations else image
-            spectrum = scipy.fft.rfft2(spread(seen, scene.oversample), workers=-1)
-            otf = scipy.fft.rfft2(self._psf(j, width), workers=-1)
-            total = total + np.conj(otf) * spectrum
-        return np.asarray(scipy.fft.irfft2(total, scene.grid, workers=-1))
+        total = self._model.adjoint(images)
+        return _blurred(total, width) if width else total
 
     def _powers(self, images: Sequence[Array], power: int, width: float = 0.0) -> Iterator[Array]:
         """Yield ``<P_jx^power, x_j>`` at each place x of the grid for each image x_j, 0 or more."""
-        for j, image in enumerate(images):
-            spectrum = scipy.fft.rfft2(laid_on_sky(self.scene, j, image), workers=-1)
-            spectrum *= np.conj(scipy.fft.rfft2(self.kernel(j, width) ** power, workers=-1))
-            yield np.asarray(scipy.fft.irfft2(spectrum, self.scene.grid, workers=-1))
+        for j, (camera, image) in enumerate(zip(self._model.cameras, images, strict=True)):
+            yield camera.squares(image, self.kernel(j, width) ** power)
 
     def _sum_of_powers(self, images: Sequence[Array], power: int, width: float = 0.0) -> Array:
         """Return ``sum_j <P_jx^power, x_j>`` at each place x, not below 0 by rounding."""
@@ -264,13 +257,8 @@ class Null:
 
     def kernel(self, j: int, width: float) -> Array:
         """Return what image j shows of a source at the origin, as wide as given."""
-        response = self.scene.point_response(j)
+        response = self._model.cameras[j].point()
         return _blurred(response, width) if width else response
-
-    def _psf(self, j: int, width: float) -> Array:
-        """Return what the sky is convolved with for image j and a source as wide as given."""
-        psf = self.scene.psf(j)
-        return _blurred(psf, width) if width else psf
 
     def _flat_response(self, linear: _Linear, width: float = 0.0) -> Array:
         sums = self._model.sums

@@ -140,7 +140,7 @@ def test_slopes_and_pixels_of_images_with_frames_and_psfs_of_their_own(known):
 
     white = np.random.default_rng(9).standard_normal(start.pixels.shape)
     x = gaussian_filter(white, (0, 1.5, 1.5), mode="wrap")
-    field = psf_fit._PixelErrors(scene, family.pixels, sky, fluxes, start.pixels)
+    field = psf_fit._PixelErrors(Model(scene), family.pixels, sky, fluxes, start.pixels)
     change = models(np.zeros(len(at)), x) - models(np.zeros(len(at)))
     found = np.array(list(field.forward(x)))[:, :N, :N]
     np.testing.assert_allclose(found, change, rtol=0, atol=2e-3 * abs(change).max())
@@ -178,7 +178,7 @@ def test_the_step_is_that_of_the_whole_least_squares(known, moves, names, monkey
     fields = [psf_fit._source_error(model, sky)]
     if "pixels" in names:
         pixels = 0.3 * RNG.standard_normal((P, N, N))
-        fields.append(psf_fit._PixelErrors(scene, family.pixels, sky, fluxes, pixels))
+        fields.append(psf_fit._PixelErrors(Model(scene), family.pixels, sky, fluxes, pixels))
     fit = psf_fit._fit(images, fields, prior)
     found, of_fields = fit.solve(at)
 
@@ -212,7 +212,7 @@ def test_pixels_change_the_images_as_another_psf_does():
     family, model = families(scene, ("pixels",)), Model(scene)
     sky, fluxes = SKY / 10.0, FLUXES / 100.0
     start = family.first()
-    field = psf_fit._PixelErrors(scene, family.pixels, sky, fluxes, start.pixels)
+    field = psf_fit._PixelErrors(Model(scene), family.pixels, sky, fluxes, start.pixels)
     # Fractions of a pixel lose the highest frequencies, which a step leaves in.
     white = np.random.default_rng(9).standard_normal(start.pixels.shape)
     x = gaussian_filter(white, (0, 1.5, 1.5), mode="wrap")
