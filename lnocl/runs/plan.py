@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from lnocl.errors import InputError
 from lnocl.runs.options import (
     EngineName,
     Precision,
@@ -20,7 +19,6 @@ from lnocl.runs.options import (
     read_start,
 )
 from lnocl.runs.start import Setup
-from lnocl.scene.freedoms import Condition, refusal
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.psf_families import Family
@@ -35,6 +33,21 @@ LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
     "choose the iteration by held-out counts",
     "take marginal star fluxes",
 )
+
+
+class Condition(NamedTuple):
+    """What must hold of a plan for a step.
+
+    Attributes
+    ----------
+    holds : callable
+        Tells of the plan whether it does.
+    otherwise : str
+        What is said where it does not.
+    """
+
+    holds: Callable[[Plan], bool]
+    otherwise: str
 
 
 AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number")
@@ -215,10 +228,7 @@ def plan(
     made = Plan(setup, mu, smoothing, int(n_iter), stop)
     is_auto = made.does(PSFS)
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
-    if refine_positions is True and (why := refusal("refine_positions", observation)):
-        raise InputError(why)
-    may_move = is_auto and not refusal("refine_positions", observation)
-    moves = refine_positions if may_move else refine_positions is True
+    moves = refine_positions if is_auto else refine_positions is True
     return replace(
         made,
         setup=replace(setup, refine_positions=moves is True, settles_halos=made.does(HALOS)),
