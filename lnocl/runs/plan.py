@@ -25,6 +25,7 @@ from lnocl.scene.freedoms import Condition, refusal
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.psf_families import Family
+from lnocl.scene.star_psfs import refuse_unowned
 from lnocl.scene.stars import check_positions
 from lnocl.solvers import SolverName
 
@@ -223,6 +224,7 @@ def plan(
     refine_positions = read_refine_positions(refine_positions)
     fits_stars = solver == "sgp" or refine_positions is True
     positions = check_positions(stars, observation)
+    refuse_unowned(observation, positions)
     observation = observation.upright()
     initial = read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
     smoothing = read_smoothing(smoothing)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
+from lnocl.scene.grid import psf_shape
 from lnocl.scene.line_weights import TAPS
 from lnocl.scene.rotation import Rotation
 from lnocl.scene.scene import Scene
@@ -426,8 +427,9 @@ def _window_of_correlations(
 
 def largest_window(scene: Scene) -> tuple[int, int]:
     """Return the largest shape of `Model.adjoint_of_cutouts` of star images, wherever these lie."""
-    grid, psf_shape = scene.grid, scene.observation.psfs.shape[1:]
+    grid, shapes = scene.grid, (scene.observation.psfs.shape[1:], psf_shape(scene.observation))
     if scene.rotations:
         return grid
-    height, width = (2 * (k + 2 * MARGIN + 2 * (scene.oversample - 1)) for k in psf_shape)
+    more = 2 * MARGIN + 2 * (scene.oversample - 1)
+    height, width = (k + of_star + 2 * more for k, of_star in zip(*shapes, strict=True))
     return grid if height >= grid[0] or width >= grid[1] else (height, width)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -94,9 +95,10 @@ class StarFit:
         self._given, self._observation = given, scene.observation
         n_images, turns = scene.n_images, scene.observation.turns
         part = _part(scene.scaled_psfs())
-        shape = scene.observation.psfs[0][part].shape
+        shape, own = scene.observation.psfs[0][part].shape, scene.observation.star_psfs.shape[2:]
+        shapes = [shape if k < 0 else own for k in scene.owned]
         squares = [
-            [_square(shape, place, scene) for place in self._observation.places(j, given)]
+            list(map(partial(_square, scene=scene), shapes, self._observation.places(j, given)))
             for j in range(n_images)
         ]
         covered = [covered_pixels(each, scene.image_grid) for each in squares]
