@@ -114,8 +114,8 @@ class StarResiduals(NamedTuple):
         In the wings, down to a thousandth of the peak.
     halo : float
         Light of the extended source that lies all round the star and falls outwards, as a share of
-        the star's flux; 0 for a star of flux 0. A PSF that is too narrow, or without wings, leaves
-        such light there.
+        what images show of the star; 0 for a star of flux 0. A PSF that is too narrow, or without
+        wings, leaves such light there.
     halo_share : float
         The same light as a share of all that lies round the star.
 
