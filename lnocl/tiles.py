@@ -27,7 +27,7 @@ from lnocl.runs.preparation import Prepared, prepare
 from lnocl.runs.progress import Progress
 from lnocl.scene.arrays import Array, whole
 from lnocl.scene.counts import mean_exposure, means
-from lnocl.scene.grid import length_for
+from lnocl.scene.grid import length_for, psf_shape
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.penalty import Penalty
@@ -358,7 +358,7 @@ def _refuse_turned(observation: Observation) -> None:
 
 def _lay(observation: Observation, tile: int | None, pad: int) -> list[tuple[_Span, _Span]]:
     """Return the tiles of the images along y and x, row by row."""
-    sides = [-(-k // observation.oversample) for k in observation.psfs.shape[1:]]
+    sides = [-(-k // observation.oversample) for k in psf_shape(observation)]
     # An image that is shifted shows the core of a tile beside it.
     shifts = np.ceil(abs(observation.offsets).max(axis=0)).astype(int).tolist()[::-1]
     margins = [max(k // 2, 1) + shift for k, shift in zip(sides, shifts, strict=True)]
@@ -532,7 +532,7 @@ def _light(tile: _Tile) -> float:
     level = observation.background
     level = level if level.ndim == 3 else level[:, None, None]
     light = np.where(observation.mask, 0.0, observation.images - level)
-    reach = max(observation.psfs.shape[1:]) / (2.0 * q)
+    reach = max(psf_shape(observation)) / (2.0 * q)
     rows, columns = (np.arange(n) for n in observation.shape)
     for image, offset in zip(light, observation.offsets, strict=True):
         for x, y in tile.stars + offset:

@@ -32,6 +32,7 @@ from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.arrays import Array
 from lnocl.scene.observation import Observation
+from lnocl.scene.psfs import check_psfs
 from lnocl.scene.transforms import enlarged
 
 Mask = NDArray[np.bool_]
@@ -159,6 +160,7 @@ class _Reader:
             effective_psfs=self._calibration.effective_psfs,
             psf_centre=self._calibration.psf_centre,
             **self._psf_errors(),
+            **self._star_psfs(),
             halos=self._halos(),
         )
         sha256 = {
@@ -206,6 +208,20 @@ class _Reader:
             held = [np.atleast_3d(part.T).T for part in parts if part is not None]
             found[PSF_ERRORS[kind]] = np.concatenate(held) if held else stack.data
         return found
+
+    def _star_psfs(self) -> dict[str, Any]:
+        """Return the PSFs of their own of stars, and the places of these."""
+        places, psfs = list[list[float]](), list[Array]()
+        for place, path in map(parse_kind, self._calibration.star_psfs):
+            stack = read_stack([path])
+            self._sha256.setdefault("star_psfs", []).extend(stack.sha256)
+            places.append([float(each) for each in place.split(",")])
+            psfs.append(check_psfs("star_psfs", stack.data, len(self._images.data)))
+        if not psfs:
+            return {}
+        ny, nx = np.max([psf.shape[1:] for psf in psfs], axis=0).tolist()
+        each = [enlarged(psf, (ny, nx), is_centred=True) for psf in psfs]
+        return {"star_places": places, "star_psfs": np.array(each)}
 
     def _electrons(self, exposure: Array | None) -> tuple[float, bool]:
         """Return the electrons in a unit of the images, and whether they are per second."""

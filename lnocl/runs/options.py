@@ -100,7 +100,8 @@ def check_families(
 ) -> tuple[str, ...]:
     """Return the families of PSFs that may be refined.
 
-    "auto" stands for those that any star shows, or for none where not all `is_auto`.
+    `positions` are those of stars that show them. "auto" stands for those that any star shows, or
+    for none where not all `is_auto`.
 
     Raises
     ------

@@ -63,8 +63,9 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
         light = observation.images[j] - observation.background[j]
         shown = np.flatnonzero(scene.shown[: scene.n_stars, j])
         positions = scene.star_field.places[j][shown]
-        nearest = KDTree(positions).query(positions, k=[2], p=np.inf)[0]  # infinite if alone
-        for k in np.flatnonzero(nearest >= 2 * reach).tolist():
+        nearest = KDTree(positions).query(positions, k=[2], p=np.inf)[0][:, 0]  # infinite if alone
+        is_of_psf = scene.owned[shown] < 0
+        for k in np.flatnonzero((nearest >= 2 * reach) & is_of_psf).tolist():
             s, position = int(shown[k]), positions[k]
             x, y = np.round(position).astype(int)
             rows, columns = (slice(at - reach, at + reach + 1) for at in (y, x))
@@ -100,11 +101,14 @@ def _compare(
 
 
 def _masked_stars(scene: Scene) -> Iterator[int]:
-    """Yield the stars whose middle is on a bad pixel, or outside, in every image."""
+    """Yield the stars whose middle is on a bad pixel, or outside, in every image.
+
+    Not those with PSFs of their own, which behind a mask have no middle.
+    """
     observation = scene.observation
     size = observation.shape[::-1]
     for s, star in enumerate(scene.stars):
-        if not scene.shown[s].any():  # of which is told otherwise
+        if not scene.shown[s].any() or scene.owned[s] >= 0:  # of the former is told otherwise
             continue
         places = [observation.places(j, star) for j in range(observation.n_images)]
         nearest = np.round(places).astype(int)
