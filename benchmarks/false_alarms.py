@@ -123,8 +123,8 @@ def measure(job):
 
 def try_formula(alarms, fields=1000, n=64):
     """Print the alarms of noise of known levels."""
-    from lnocl.solvers.false_alarms import Rarity, threshold
-    from lnocl.solvers.score_map import _near, _peaks
+    from lnocl.detection.false_alarms import Rarity, threshold
+    from lnocl.detection.score_map import _near, _peaks
 
     psf = np.fft.ifftshift(psf_at(n // 2, n // 2, n))
     otf, squares = scipy.fft.rfft2(psf).conj(), (psf**2).sum()

@@ -1,9 +1,9 @@
 """Whether there is a source at a place, and how faint one would have been found.
 
 The signal-to-noise of a source at each place follows from its score under the model without it
-(`lnocl.solvers.score`). Errors of PSFs and noise that neighbours share are part of it
-(`lnocl.solvers.score_noise`). The threshold follows from the false alarms that are allowed in the
-whole field (`lnocl.solvers.false_alarms`).
+(`lnocl.detection.score`). Errors of PSFs and noise that neighbours share are part of it
+(`lnocl.detection.score_noise`). The threshold follows from the false alarms that are allowed in the
+whole field (`lnocl.detection.false_alarms`).
 """
 
 from __future__ import annotations
@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lnocl.detection.point_test import point_flux
+from lnocl.detection.score import Null
+from lnocl.detection.score_map import ScoreMap
 from lnocl.errors import InputError
 from lnocl.plotting.significance import SignificanceView, draw_significance
 from lnocl.runs.outcome import Outcome
@@ -24,9 +27,6 @@ from lnocl.scene.detector import on_sky
 from lnocl.scene.quantities import in_unit
 from lnocl.scene.texture import SHARE_NEAR
 from lnocl.solvers.halos import halo_errors
-from lnocl.solvers.point_test import point_flux
-from lnocl.solvers.score import Null
-from lnocl.solvers.score_map import ScoreMap
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -90,8 +90,9 @@ class Significance:
     -----
     A source is "extended" where two things hold. There is light round it, between 0.85 and 1.65
     resolutions. And a point is fitted together with an extended source as bright as that light
-    (`lnocl.solvers.point_test`), and has less than three errors. All sources wider than a point are
-    "extended". How often noise alone raises an alarm was measured: :doc:`/validation/detections`.
+    (`lnocl.detection.point_test`), and has less than three errors. All sources wider than a point
+    are "extended". How often noise alone raises an alarm was measured:
+    :doc:`/validation/detections`.
 
     Examples
     --------

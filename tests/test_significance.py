@@ -8,11 +8,11 @@ import pytest
 from scipy import ndimage
 
 import lnocl
+from lnocl.detection.point_test import point_flux
 from lnocl.errors import InputError
 from lnocl.process import ignored_warnings
 from lnocl.runs.injections import Injections, spread_places
 from lnocl.significance import significance
-from lnocl.solvers.point_test import point_flux
 
 ROWS, COLUMNS = np.indices((33, 33)) - 16
 RADIUS = np.hypot(ROWS, COLUMNS)

@@ -32,6 +32,8 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lnocl.detection.known_stars import KnownStars
+from lnocl.detection.score_noise import noise_of
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
@@ -40,8 +42,6 @@ from lnocl.scene.psf_pixels import CORRELATED
 from lnocl.scene.scene import MIN_MODEL
 from lnocl.scene.smooth_field import SmoothField
 from lnocl.scene.texture import ROUND, coarseness, resolution
-from lnocl.solvers.known_stars import KnownStars
-from lnocl.solvers.score_noise import noise_of
 
 # Radius of the disc whose level is taken out, in widths of the PSFs, and of a disc for the counts'
 # level over that. Full width of the Gaussian that smooths the estimate, resolutions.

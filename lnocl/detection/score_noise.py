@@ -2,8 +2,8 @@ r"""How much more than counts alone a score scatters: shared noise, and errors o
 
 Noise that neighbours share scatters the darker half of the whole field. Errors e of the PSFs,
 relative to them, add ``e^2 X`` to the variance of the score u, where X follows from the light of
-the stars (`lnocl.solvers.score`). In each ring round the stars e is what the run has found, or what
-the ring shows,
+the stars (`lnocl.detection.score`). In each ring round the stars e is what the run has found, or
+what the ring shows,
 
 .. math:: \Big\langle \frac{u^2}{1 + e^2 X} \Big\rangle = 1,
 
@@ -23,7 +23,7 @@ from scipy import optimize
 from lnocl.scene.arrays import Array, darker_noise
 
 if TYPE_CHECKING:
-    from lnocl.solvers.score import Score
+    from lnocl.detection.score import Score
 
 # A field scatters more than counts where it does by so many of its errors.
 CLEARLY = 4.0

@@ -9,13 +9,13 @@ import turned_scenes
 from scipy import ndimage
 
 import lnocl
+from lnocl.detection.completeness import needed
+from lnocl.detection.false_alarms import Rarity, of_student, threshold
+from lnocl.detection.score import Null
+from lnocl.detection.score_map import ScoreMap, _peaks
+from lnocl.detection.score_noise import noise_of
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
-from lnocl.solvers.completeness import needed
-from lnocl.solvers.false_alarms import Rarity, of_student, threshold
-from lnocl.solvers.score import Null
-from lnocl.solvers.score_map import ScoreMap, _peaks
-from lnocl.solvers.score_noise import noise_of
 
 NO_ERRORS = np.zeros(1), np.zeros(0)
 ROWS, COLUMNS = np.indices((9, 9)) - 4

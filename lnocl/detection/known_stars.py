@@ -33,7 +33,7 @@ class Shared(NamedTuple):
     Attributes
     ----------
     score, flat, information : ndarray of float64
-        ``B^T G^-1 T_s``, ``B^T G^-1 W_s`` and ``B^T G^-1 B`` of `lnocl.solvers.score`.
+        ``B^T G^-1 T_s``, ``B^T G^-1 W_s`` and ``B^T G^-1 B`` of `lnocl.detection.score`.
     """
 
     score: Array

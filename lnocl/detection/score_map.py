@@ -10,11 +10,11 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lnocl.detection.completeness import needed, values_at
+from lnocl.detection.false_alarms import Rarity, of_student, threshold
+from lnocl.detection.score import Null
+from lnocl.detection.score_noise import MANY, noise_of
 from lnocl.scene.arrays import Array
-from lnocl.solvers.completeness import needed, values_at
-from lnocl.solvers.false_alarms import Rarity, of_student, threshold
-from lnocl.solvers.score import Null
-from lnocl.solvers.score_noise import MANY, noise_of
 
 # The extended source is looked for in a ring round a place, resolutions.
 AROUND = 0.85, 1.65

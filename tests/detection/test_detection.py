@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lnocl import matched_filter
+from lnocl.detection import search
 from lnocl.errors import InputError, LnoclError, LnoclWarning
 
 pytest.importorskip("photutils", reason="photutils is not installed")
@@ -172,16 +172,16 @@ def test_between_holes_there_are_next_to_no_stars(seed):
 
 def test_a_star_that_a_fit_moves_away_is_not_found_again(monkeypatch):
     """In a field of galaxies the same star was found without end."""
-    scenes = Path(__file__).parents[1] / "benchmarks" / "stars.py"
+    scenes = Path(__file__).parents[2] / "benchmarks" / "stars.py"
     counts, psf, *_ = runpy.run_path(str(scenes))["scene"]("moffat", "galaxies", 6, 740)
-    rounds, search = [], matched_filter._points_among
+    rounds, points_among = [], search._points_among
 
     def among(*given):
         rounds.append(given)
         assert len(rounds) < 20
-        return search(*given)
+        return points_among(*given)
 
-    monkeypatch.setattr(matched_filter, "_points_among", among)
+    monkeypatch.setattr(search, "_points_among", among)
     assert len(find_stars(counts, psf)) == 6
 
 
