@@ -10,6 +10,7 @@ from astropy.stats import sigma_clipped_stats
 from scipy.ndimage import binary_dilation, maximum_filter, shift
 from scipy.spatial import KDTree
 
+from lnocl.detection.fitting import step
 from lnocl.errors import InputError, counted
 from lnocl.psf.centring import Mask, Point, brightest
 from lnocl.psf.repair import repair
@@ -274,18 +275,16 @@ class _Stars:
         steps = np.zeros((len(self._places), 2))
         core = psf > CORE * psf.max()
         for s, c in enumerate(self._fluxes):
-            cutout = movable.with_slopes(*self._middle(s))
-            parts = cutout.values[0], c * cutout.values[2], c * cutout.values[1]
-            columns = [cutout._replace(values=part).on_grid(psf.shape) for part in parts]
-            used = core & self._good[self._window(s)]
-            if used.sum() < len(columns):
+            there = self._window(s)
+            star = movable.with_slopes(*self._middle(s)).on_grid(psf.shape)
+            used = core & self._good[there]
+            if used.sum() < len(star):
                 raise InputError(
                     f"the star at {self._name(s)} has too few good pixels; leave it out"
                 )
-            design = np.array([column[used] for column in columns]).T
-            found = np.linalg.lstsq(design, left[self._window(s)][used], rcond=None)[0]
-            self._fluxes[s] = max(c + found[0], c / 2)
-            steps[s] = found[1:].clip(-0.5, 0.5)
+            found, moves = step([star], np.array([c]), left[there] + c * star[0], used)
+            self._fluxes[s] = max(found[0], c / 2)
+            steps[s] = moves[0, ::-1]
         n = self._n_given
         self._places += steps - np.average(steps[:n], axis=0, weights=self._fluxes[:n])
 

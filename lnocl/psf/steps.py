@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from astropy.stats import mad_std, sigma_clipped_stats
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import label, maximum_filter, shift
-from scipy.optimize import least_squares
+from scipy.ndimage import label, maximum_filter
 
+from lnocl.detection.fitting import fit
 from lnocl.errors import InputError, counted, warn
 from lnocl.psf import resampling
 from lnocl.psf.centring import SEARCH, Mask, Pixel, Point, brightest, fit_gaussian
@@ -19,7 +19,7 @@ from lnocl.psf.repair import WINDOW, repair
 from lnocl.psf.wings import FROM, distance, fit_sky
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array, numbers
-from lnocl.scene.shifting import MARGIN
+from lnocl.scene.shifting import ENDLESS, MARGIN, MovablePsf
 
 # The background is lowered by so many of its errors or more, and by this share of the flux; where
 # the farthest pixels are above it by less than this share of that. Of a larger share it is warned.
@@ -250,17 +250,17 @@ def _plateaus(highest: Mask) -> list[list[Pixel]]:
 def _fit_star(light: Array, star: Point, start: Pixel, width: float) -> tuple[Point, float]:
     """Return where another star, scaled, explains the light at a pixel, and the rms of the rest."""
     pixel, half = nearest_pixel(star), math.ceil(WITHIN * width)
-    square, found = cut_square(light, pixel, half + WINDOW // 2), cut_square(light, start, half)
-    scale = light[start] / square.max()
+    square, found = cut_square(light, pixel, half + MARGIN), cut_square(light, start, half)
+    other, side = MovablePsf(square, ENDLESS), (2 * half + 1, 2 * half + 1)
 
-    def residuals(parameters: Array) -> Array:
-        move = np.subtract(pixel, star) + parameters[1:]
-        moved = middle_square(shift(square, move, mode="nearest"), 2 * half + 1)
-        return np.asarray(parameters[0] * scale * moved - found).ravel()
+    def moved(x: float, y: float) -> Array:
+        place = other.with_slopes(pixel[1] - star[1] + x, pixel[0] - star[0] + y)
+        return place.add_to(np.zeros((3, *side)), (-half, -half), ENDLESS)
 
-    fitted = least_squares(residuals, [1.0, 0.0, 0.0], method="lm")
-    place = float(start[0] + fitted.x[1]), float(start[1] + fitted.x[2])
-    return place, float(np.sqrt(np.mean(fitted.fun**2)))
+    scale = np.array([light[start] / square.max()])
+    (move,), (flux,) = fit(moved, np.zeros((1, 2)), scale, found, np.ones(side))
+    misfit = found - flux * moved(*move)[0]
+    return (start[0] + move[1], start[1] + move[0]), float(np.sqrt(np.mean(misfit**2)))
 
 
 def _touches(bad: Mask, place: Point, width: float) -> bool:

@@ -18,6 +18,9 @@ ALIASES = np.arange(-6, 7)
 # A smaller share of the light at the highest frequency is taken for rounding.
 MIN_NYQUIST = 1e-16
 
+# A grid that no PSF goes round.
+ENDLESS = 2**31, 2**31
+
 # Rows and columns of an array: slices, or arrays of indices where they wrap round its edge.
 Window = tuple[Any, Any]
 
@@ -34,8 +37,8 @@ class Cutout(NamedTuple):
 
     def on_grid(self, grid: tuple[int, int]) -> Array:
         """Return the values on the whole grid, 0 elsewhere."""
-        laid = np.zeros(grid)
-        laid[self.window(grid)] = self.values
+        laid = np.zeros((*self.values.shape[:-2], *grid))
+        laid[..., *self.window(grid)] = self.values
         return laid
 
     def window(self, grid: tuple[int, int]) -> Window:
@@ -58,8 +61,8 @@ class Cutout(NamedTuple):
         The window has a first row and column, and may go round the edges of the grid.
         """
         y, x = (self.rows(grid) - first[0]) % grid[0], (self.columns(grid) - first[1]) % grid[1]
-        y_in, x_in = y < light.shape[0], x < light.shape[1]
-        light[np.ix_(y[y_in], x[x_in])] += flux * self.values[np.ix_(y_in, x_in)]
+        y_in, x_in = y < light.shape[-2], x < light.shape[-1]
+        light[..., *np.ix_(y[y_in], x[x_in])] += flux * self.values[..., *np.ix_(y_in, x_in)]
         return light
 
     def aligned(self, grid: tuple[int, int]) -> Cutout:

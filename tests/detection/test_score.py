@@ -11,8 +11,9 @@ from scipy import ndimage
 import lnocl
 from lnocl.detection.completeness import needed
 from lnocl.detection.false_alarms import Rarity, of_student, threshold
+from lnocl.detection.maxima import peaks
 from lnocl.detection.score import Null
-from lnocl.detection.score_map import ScoreMap, _peaks
+from lnocl.detection.score_map import ScoreMap
 from lnocl.detection.score_noise import noise_of
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
@@ -476,11 +477,20 @@ def test_noise_that_is_shared_scatters_the_whole_field():
 
 def test_the_peak_of_a_gaussian_is_found_between_pixels():
     rows, columns = np.indices((3, 3)) - 1.0
-    dx, dy = np.array([0.3, -0.45]), np.array([-0.2, 0.1])
-    near = np.exp(-((rows[..., None] - dy) ** 2 + (columns[..., None] - dx) ** 2) / 4) * 7.0
-    moves, values = _peaks(near)
-    np.testing.assert_allclose(moves, np.stack([dx, dy], axis=1), atol=1e-12)
-    np.testing.assert_allclose(values, 7.0)
-    moves, values = _peaks(near - 6.0)  # of which some are negative
-    assert abs(moves - np.stack([dx, dy], axis=1)).max() < 0.1
-    assert abs(values - 1.0).max() < 0.1
+    middle = np.array([1])
+    for dx, dy in ((0.3, -0.2), (-0.45, 0.1)):
+        near = np.exp(-((rows - dy) ** 2 + (columns - dx) ** 2) / 4) * 7.0
+        moves, values = peaks(near, middle, middle, "wrap")
+        np.testing.assert_allclose(moves, [(dx, dy)], atol=1e-12)
+        np.testing.assert_allclose(values, 7.0)
+        moves, values = peaks(near - 6.0, middle, middle, "wrap")  # of which some are negative
+        assert abs(moves - (dx, dy)).max() < 0.1
+        assert abs(values - 1.0).max() < 0.1
+
+
+def test_a_peak_at_an_edge_stays_there():
+    values = np.zeros((4, 5))
+    values[0, 4], values[1, 4], values[0, 3] = 3.0, 1.0, 2.0
+    moves, higher = peaks(values, np.array([0]), np.array([4]), "reflect")
+    assert moves.tolist() == [[0.0, 0.0]]
+    assert higher.tolist() == [3.0]
