@@ -22,7 +22,7 @@ from lnocl.detection.score_map import ScoreMap
 from lnocl.errors import InputError
 from lnocl.plotting.significance import SignificanceView, draw_significance
 from lnocl.runs.outcome import Outcome
-from lnocl.scene.arrays import Array, whole
+from lnocl.scene.arrays import Array, number_in, whole
 from lnocl.scene.detector import on_sky
 from lnocl.scene.quantities import in_unit
 from lnocl.scene.texture import SHARE_NEAR
@@ -165,7 +165,7 @@ class Significance:
         (True, True)
         """
         completeness = in_unit("completeness", completeness, "")
-        check_completeness(completeness)
+        number_in("completeness", completeness, "between 0 and 1", lambda given: 0 < given < 1)
         found, outcome = self._map, self._outcome
         fluxes = np.maximum(found.needed(self._at_threshold, completeness), self._told_from_source)
         ny, nx = outcome.observation.sky_shape
@@ -308,9 +308,8 @@ class Significance:
         from astropy.units import electron, mag, pix
 
         shares = np.atleast_1d(in_unit("completeness", completeness, "")).tolist()
-        for each in shares:
-            check_completeness(each)
-        limits = {f"{100 * each:g}": self.limit(each) for each in shares}
+        found = [self.limit(each) for each in shares]
+        limits = {f"{100 * each:g}": limit for each, limit in zip(shares, found, strict=True)}
         observation, scene = self._outcome.observation, self._outcome.scene
         n_epochs = observation.n_epochs
         fluxes = self._outcome.mean_fluxes
@@ -387,8 +386,7 @@ class Significance:
 
 def significance(outcome: Outcome, width: float, false_alarms: float) -> Significance:
     """Return the sources beside the stars of a reconstruction, `lnocl.Result.significance`."""
-    check_width(width)
-    check_alarms(false_alarms)
+    check_search(width, false_alarms)
     observation = outcome.observation
     if observation.psf_fields:
         raise InputError(
@@ -424,34 +422,19 @@ def _plain(table: QTable) -> dict[str, Array]:
     return {name: np.asarray(table[name]) for name in table.colnames}
 
 
-def check_width(width: object) -> None:
-    """Refuse a width that is none.
+def check_search(width: object, false_alarms: object) -> None:
+    """Refuse a width that is none, and a number of false alarms that no threshold has.
 
     Raises
     ------
     InputError
-        It is not a finite number of 0 or more.
+        The width is not a finite number of 0 or more, or the alarms not one from 1e-200 to 10.
     """
-    if not (isinstance(width, (int, float, np.number)) and 0 <= width < math.inf):
-        raise InputError(f"`width` must be a finite number of pixels, 0 or more; {width} was given")
-
-
-def check_alarms(false_alarms: object) -> None:
-    """Refuse a number of false alarms that no threshold has.
-
-    Raises
-    ------
-    InputError
-        It is not a number from 1e-200 to 10.
-    """
-    if not (
-        isinstance(false_alarms, (int, float, np.number))
-        and FEWEST_ALARMS <= false_alarms <= MOST_ALARMS
-    ):
-        raise InputError(
-            f"`false_alarms` is the number expected in the whole field, {FEWEST_ALARMS:g} to "
-            f"{MOST_ALARMS:g}, such as 0.01; {false_alarms} was given"
-        )
+    requirement = "a finite number of pixels, 0 or more"
+    number_in("width", width, requirement, lambda given: 0 <= given < math.inf)
+    least, most = FEWEST_ALARMS, MOST_ALARMS
+    requirement = f"the number expected in the whole field, {least:g} to {most:g}, such as 0.01"
+    number_in("false_alarms", false_alarms, requirement, lambda given: least <= given <= most)
 
 
 def check_injections(n: object, seed: object) -> None:
@@ -464,18 +447,6 @@ def check_injections(n: object, seed: object) -> None:
     """
     whole("injections", n, 1)
     whole("seed", seed, 0)
-
-
-def check_completeness(completeness: object) -> None:
-    """Refuse a probability of being found that is none.
-
-    Raises
-    ------
-    InputError
-        It is not a number between 0 and 1.
-    """
-    if not (isinstance(completeness, (int, float, np.number)) and 0 < completeness < 1):
-        raise InputError(f"`completeness` lies between 0 and 1; {completeness} was given")
 
 
 def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> QTable:

@@ -10,12 +10,13 @@ from scipy import ndimage
 from scipy.special import erf
 
 from lnocl.detection.blemishes import flat_tops, sharp_pixels
+from lnocl.detection.checks import read_image, read_psf
 from lnocl.detection.search import PointSources, around, find_points, in_boxes, pixels_at
 from lnocl.errors import InputError, LnoclError, counted, note, warn
 from lnocl.process import ignored_warnings
-from lnocl.scene.arrays import Array, darker_noise, numbers
+from lnocl.scene.arrays import Array, darker_noise
 from lnocl.scene.cores import fwhm, peak
-from lnocl.scene.quantities import bare, in_unit, split
+from lnocl.scene.quantities import in_unit, split
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -87,8 +88,8 @@ def find_stars(
     Parameters
     ----------
     image : array_like, shape (ny, nx)
-        In any linear unit. Pixels that are not finite are bad. So are blocks of exactly 0 in an
-        image that is not of whole counts.
+        In any linear unit. Pixels that are masked or not finite are bad. So are blocks of exactly 0
+        in an image that is not of whole counts.
     psf : array_like, shape (ky, kx), optional
         Its PSF, with its peak at (ky // 2, kx // 2). Without it, it is a round Moffat function as
         wide as the image's own stars.
@@ -150,9 +151,14 @@ def find_stars(
     threshold = in_unit("threshold", threshold, "")
     if saturation is not None:
         saturation = in_unit("saturation", saturation, unit or "")
-    pixels, bad = _check(image, mask, threshold)
+    if not threshold > 0:
+        raise InputError(f"`threshold` must be more than 0; {threshold:g} was given")
+    pixels, bad = read_image("image", image, mask)
+    bad |= _outside(pixels)
+    if bad.all():
+        raise InputError("image has no good pixel; give another, or another mask")
     sought = min(threshold, SOUGHT)
-    shape = None if psf is None else _check_psf(psf)
+    shape = None if psf is None else read_psf(psf)
     width = FIRST_WIDTH if shape is None else fwhm(shape)
     above, noise = _above_sky(pixels, bad, width)
     saturated = bad | _saturated(pixels, above / noise, bad, saturation) | _holes(above)
@@ -199,27 +205,6 @@ def _sharpest_psf() -> Array:
     return np.outer(profile, profile) / profile.sum() ** 2
 
 
-def _check(image: ArrayLike, mask: ArrayLike | None, threshold: float) -> tuple[Array, Mask]:
-    """Return the pixels, and which of them are bad."""
-    pixels = numbers("image", image)
-    if pixels.ndim != 2:
-        raise InputError(f"image has {counted(pixels.ndim, 'dimension')}; give one image")
-    if not threshold > 0:
-        raise InputError(f"`threshold` must be more than 0; {threshold:g} was given")
-    bad = ~np.isfinite(pixels) | _outside(pixels)
-    if mask is not None:
-        given = np.asarray(mask)
-        if given.dtype != np.bool_ or given.shape != pixels.shape:
-            raise InputError(
-                f"`mask` of type {given.dtype} and shape {given.shape} must be booleans of the "
-                f"shape of image, {pixels.shape}"
-            )
-        bad |= given
-    if bad.all():
-        raise InputError("image has no good pixel; give another, or another mask")
-    return pixels, bad
-
-
 def _outside(pixels: Array) -> Mask:
     """Return blocks of pixels of exactly 0 in an image that is not of whole counts.
 
@@ -234,15 +219,6 @@ def _outside(pixels: Array) -> Mask:
 def _are_counts(values: Array) -> bool:
     """Return whether these are whole counts, and not all of them alike."""
     return bool((values >= 0).all() and (values == np.round(values)).all() and np.ptp(values) > 0)
-
-
-def _check_psf(psf: ArrayLike) -> Array:
-    light = numbers("psf", bare("psf", psf))
-    if light.ndim != 2 or not np.isfinite(light).all() or not light.sum() > 0:
-        raise InputError(
-            f"`psf` of shape {light.shape} must be one image of finite numbers with a positive sum"
-        )
-    return light / light.sum()
 
 
 def _require_photutils() -> None:

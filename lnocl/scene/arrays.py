@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -153,6 +154,14 @@ def whole(name: str, value: Any, least: int, more: str = "") -> int:
             f"`{name}` must be a whole number, {least} or more{more}; {value} was given"
         )
     return number
+
+
+def number_in(
+    name: str, value: Any, requirement: str, holds: Callable[[Any], bool | np.bool_]
+) -> None:
+    """Refuse what is no number, or does not hold a requirement."""
+    if not (isinstance(value, (int, float, np.number)) and holds(value)):
+        raise InputError(f"`{name}` must be {requirement}; {value} was given")
 
 
 def darker_noise(values: Array) -> float:

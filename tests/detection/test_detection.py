@@ -248,12 +248,16 @@ class TestSaturated:
 @pytest.mark.parametrize(
     ("image", "given", "message"),
     [
-        (np.ones((2, 9, 9)), {}, "image has 3 dimensions; give one image"),
+        (np.ones((2, 9, 9)), {}, r"image has shape \(2, 9, 9\); give one image"),
         (np.full((9, 9), np.nan), {}, "image has no good pixel"),
         (np.ones((9, 9)), {"threshold": 0.0}, "threshold must be more than 0; 0 was given"),
         (np.ones((9, 9)), {"threshold": np.nan}, "threshold must be more than 0; nan was given"),
-        (np.ones((9, 9)), {"mask": np.zeros((9, 8), bool)}, r"shape \(9, 8\) must be booleans"),
-        (np.ones((9, 9)), {"mask": np.zeros((9, 9))}, "mask of type float64"),
+        (
+            np.ones((9, 9)),
+            {"mask": np.zeros((9, 8), bool)},
+            r"the image has \(9, 9\)",
+        ),
+        (np.ones((9, 9)), {"mask": np.zeros((9, 9))}, "mask is of type float64; give booleans"),
         (np.ones((9, 9)), {"psf": np.zeros((5, 5))}, "psf of shape .* positive"),
         (np.ones((9, 9)), {"psf": np.ones(5)}, "psf of shape"),
     ],
