@@ -60,10 +60,7 @@ def threshold(alarms: float, cells: float, edge: float = 0.0) -> float:
 
     if excess(1.0) <= 0:  # where the number falls, from 1 on
         return 1.0
-    high = 2.0
-    while excess(high) > 0:
-        high *= 2.0
-    return float(optimize.brentq(excess, 1.0, high))
+    return float(optimize.brentq(excess, 1.0, HIGHEST))
 
 
 class Rarity:

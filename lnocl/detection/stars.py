@@ -15,7 +15,7 @@ from lnocl.detection.search import PointSources, around, find_points, in_boxes, 
 from lnocl.errors import InputError, LnoclError, counted, note, warn
 from lnocl.process import ignored_warnings
 from lnocl.scene.arrays import Array, darker_noise
-from lnocl.scene.cores import fwhm, peak
+from lnocl.scene.cores import core, fwhm
 from lnocl.scene.quantities import in_unit, split
 
 if TYPE_CHECKING:
@@ -309,11 +309,9 @@ def _narrow(fits: list[tuple[float, float, float]]) -> Array:
 
 def _elongation(window: Array) -> float:
     """Return the length of what is above half the peak of a star, over its width."""
-    at = peak(window)
-    labels, _ = ndimage.label(window > window[at] / 2)
-    core = np.nonzero(labels == labels[at])
+    at = np.nonzero(core(window, 0.5))
     # Pixels have a variance of 1/12 of their own.
-    variances = np.linalg.eigvalsh(np.cov(core, aweights=window[core], ddof=0)) + 1.0 / 12.0
+    variances = np.linalg.eigvalsh(np.cov(at, aweights=window[at], ddof=0)) + 1.0 / 12.0
     return float(np.sqrt(variances[1] / variances[0]))
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from astropy.stats import mad_std, sigma_clipped_stats
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import label, maximum_filter
+from scipy.ndimage import label, maximum_filter, value_indices
 
 from lnocl.detection.fitting import fit
 from lnocl.errors import InputError, counted, warn
@@ -212,7 +212,10 @@ def find_neighbours(
     highest = (light == maximum_filter(light, 2 * math.ceil(width) + 1)) & ~bad
     brightest_given = max(centres, key=lambda centre: light[nearest_pixel(centre)])
     stars, others, n_others = list[Point](), list[Point](), 0
-    for plateau in _plateaus(highest & (light > SIGNIFICANT * noise)):
+    # A maximum has several pixels where it is flat, as that of a saturated star.
+    labels, _ = label(highest & (light > SIGNIFICANT * noise), np.ones((3, 3)))
+    for pixels in value_indices(labels, ignore_value=0).values():
+        plateau = np.transpose(pixels).tolist()
         row, column = plateau[len(plateau) // 2]
         offsets = np.abs(np.array(centres) - (row, column))
         peaks = [light[nearest_pixel(centres[s])] for s in range(len(centres))]
@@ -224,7 +227,8 @@ def find_neighbours(
         is_there = math.dist(place, (row, column)) < width
         is_alike = misfit < math.hypot(ALIKE * light[row, column], NOISY * noise)
         is_new = all(math.dist(place, star) > width for star in stars)
-        if is_there and is_alike and is_new and not _touches(bad | far, place, width):
+        core = cut_square(bad | far, nearest_pixel(place), math.ceil(width / 2))
+        if is_there and is_alike and is_new and not core.any():
             stars.append(place)
         else:
             others += plateau
@@ -236,15 +240,6 @@ def find_neighbours(
         f"{counted(n_others, 'other source')} masked"
     )
     return stars, far | (distance(bad.shape, others) < MASKED * width), [line]
-
-
-def _plateaus(highest: Mask) -> list[list[Pixel]]:
-    """Return the pixels of each maximum, several where it is flat, as of a saturated star."""
-    labels, n = label(highest, np.ones((3, 3)))
-    places = [list[Pixel]() for _ in range(n)]
-    for row, column in np.argwhere(highest).tolist():
-        places[labels[row, column] - 1].append((row, column))
-    return places
 
 
 def _fit_star(light: Array, star: Point, start: Pixel, width: float) -> tuple[Point, float]:
@@ -261,11 +256,6 @@ def _fit_star(light: Array, star: Point, start: Pixel, width: float) -> tuple[Po
     (move,), (flux,) = fit(moved, np.zeros((1, 2)), scale, found, np.ones(side))
     misfit = found - flux * moved(*move)[0]
     return (start[0] + move[1], start[1] + move[0]), float(np.sqrt(np.mean(misfit**2)))
-
-
-def _touches(bad: Mask, place: Point, width: float) -> bool:
-    """Return whether pixels of a core are bad."""
-    return bool(cut_square(bad, nearest_pixel(place), math.ceil(width / 2)).any())
 
 
 def _largest(shape: tuple[int, ...], pixel: Pixel, angle: float) -> int:
