@@ -32,10 +32,9 @@ if TYPE_CHECKING:
     from astropy.table import QTable
     from matplotlib.figure import Figure
 
-# A point is told from the extended source where it is so many errors above what that may be.
-POINT = 3.0
-# There is light round a place where the score there is so many times its noise.
-THERE = 3.0
+# A point is told from the extended source where it is so many errors above what that may be, and
+# there is light round a place where the score there is so many times its noise.
+CLEAR = 3.0
 # A source that was put in is found by a detection within so many resolutions.
 NEAR = 0.7
 # Error of a place between pixels, pixels of the sky.
@@ -267,7 +266,7 @@ class Significance:
         """
         if self._map.width:
             return np.zeros(self._map.values.shape)
-        return np.asarray(POINT * SHARE_NEAR * self._null.brightest_structure() * self._map.unit)
+        return np.asarray(CLEAR * SHARE_NEAR * self._null.brightest_structure() * self._map.unit)
 
     def contrast_curves(self, completeness: Sequence[float] | float = (0.5, 0.9, 0.95)) -> QTable:
         """Return the faintest sources that would be found, against the distance from each star.
@@ -465,11 +464,11 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
     for i, place in enumerate(places):
         if found.width:
             kinds[i] = EXTENDED
-        elif found.light_round(place, values[i], null.resolution) > THERE:
+        elif found.light_round(place, values[i], null.resolution) > CLEAR:
             fluxes[i], errors[i] = point_flux(
                 outcome.estimate, pixels[i], fluxes[i], outcome.moves, raised
             )
-            kinds[i] = POINT_SOURCE if fluxes[i] > POINT * errors[i] else EXTENDED
+            kinds[i] = POINT_SOURCE if fluxes[i] > CLEAR * errors[i] else EXTENDED
     # Of a maximum between pixels the place errs by its noise, and by how it is interpolated.
     curvature = np.moveaxis(found.score.curvature[:, :, *at], -1, 0)
     spread = np.sqrt(np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2))[:, ::-1]

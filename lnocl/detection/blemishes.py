@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, Mask
 from lnocl.scene.shifting import ENDLESS, MovablePsf
-
-Mask = NDArray[np.bool_]
 
 # The pairs of pixels on both sides of one: beside it, above and below, and across.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))

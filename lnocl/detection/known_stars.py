@@ -15,14 +15,12 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.shifting import Cutout, window
-from lnocl.scene.stars import along_sky
+from lnocl.scene.stars import FAINT, along_sky
 
 # Stars and sources share nothing farther apart than so many resolutions.
 APART = 4.0
 # Combinations of stars with less than this share of their information tell nothing.
 SAME = 1e-6
-# Outer rows and columns of a star below this share of its largest value are left out.
-DARK = 1e-6
 # Side of the squares of the sky whose stars are taken out together, resolutions.
 TILE = 8.0
 
@@ -74,7 +72,7 @@ class KnownStars:
             for axis in (1, 2):
                 images.append([each._replace(values=each.values[axis]) for each in slopes])
         each = 3 if moves else 1
-        trimmed = [[c.trimmed(DARK * float(abs(c.values).max())) for c in k] for k in images]
+        trimmed = [[c.trimmed(FAINT * float(abs(c.values).max())) for c in k] for k in images]
         return trimmed, [k // each for k in range(len(images))]
 
     def shared(

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 
+# A maximum is a source's where it is so many times its noise, unless another threshold is given.
+SIGNIFICANT = 5.0
 # A maximum lies at most so far from the middle of its pixel, pixels.
 FARTHEST = 0.7
 

@@ -5,27 +5,23 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.special import erf
 
 from lnocl.detection.blemishes import flat_tops, sharp_pixels
 from lnocl.detection.checks import read_image, read_psf
+from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.detection.search import PointSources, around, find_points, in_boxes, pixels_at
 from lnocl.errors import InputError, LnoclError, counted, note, warn
 from lnocl.process import ignored_warnings
-from lnocl.scene.arrays import Array, darker_noise
+from lnocl.scene.arrays import Array, Mask, darker_noise
 from lnocl.scene.cores import core, fwhm
 from lnocl.scene.quantities import in_unit, split
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-Mask = NDArray[np.bool_]
-
-# Stars are sought from this significance on, whatever the threshold: the noise in which they are
-# seen is that without them.
-SOUGHT = 5.0
 # No stars are narrower than this, full width at half maximum, pixels, where no PSF is known.
 SHARPEST = 1.5
 # The sky's level is a median over boxes of so many PSF widths, and of this many pixels or more.
@@ -157,7 +153,8 @@ def find_stars(
     bad |= _outside(pixels)
     if bad.all():
         raise InputError("image has no good pixel; give another, or another mask")
-    sought = min(threshold, SOUGHT)
+    # The noise in which stars are seen is that without them, whatever the threshold.
+    sought = min(threshold, SIGNIFICANT)
     shape = None if psf is None else read_psf(psf)
     width = FIRST_WIDTH if shape is None else fwhm(shape)
     above, noise = _above_sky(pixels, bad, width)

@@ -14,9 +14,8 @@ from scipy import optimize
 from scipy.ndimage import maximum_filter, median_filter
 
 from lnocl.errors import InputError
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, Mask
 
-Mask = NDArray[np.bool_]
 # Places in an image, row before column.
 Pixel = tuple[int, int]
 Point = tuple[float, float]

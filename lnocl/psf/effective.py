@@ -11,11 +11,12 @@ from scipy.ndimage import binary_dilation, maximum_filter, shift
 from scipy.spatial import KDTree
 
 from lnocl.detection.fitting import step
+from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.errors import InputError, counted
-from lnocl.psf.centring import Mask, Point, brightest
+from lnocl.psf.centring import Point, brightest
 from lnocl.psf.repair import repair
 from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, Mask
 from lnocl.scene.shifting import MovablePsf
 
 # Rounds of fitting the stars and adding what is left of them to the PSF.
@@ -23,8 +24,8 @@ ROUNDS = 20
 # The first rounds take each pixel for the star nearest to it, so that no star is another's wings.
 FIRST_ROUNDS = 3
 # Outside its core, a star's pixel is a neighbour's where it exceeds another star's by this share,
-# and by so many times the noise; and so are the pixels beside it.
-EXCESS, SIGNIFICANCE, BESIDE = 0.5, 5.0, 2
+# significantly; and so are so many pixels beside it.
+EXCESS, BESIDE = 0.5, 2
 # Half the side of the square whose light is a star's first flux.
 APERTURE = 3
 # A star's core is where it is above this share of its peak; there it is fitted.
@@ -237,7 +238,7 @@ class _Stars:
         for s, c in enumerate(self._fluxes):
             for t, other in enumerate(self._fluxes):
                 noise = self._noise * np.hypot(1 / c, 1 / other)
-                limit = (1 + EXCESS) * most[t] + SIGNIFICANCE * noise
+                limit = (1 + EXCESS) * most[t] + SIGNIFICANT * noise
                 outside = most[t] < CORE * most[t].max()
                 foreign[s] |= good[s] & good[t] & outside & (own[s] > limit)
             foreign[s] = binary_dilation(foreign[s], iterations=BESIDE)

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from lnocl.detection.checks import read_image
 from lnocl.errors import InputError
 from lnocl.psf import checks, effective, resampling, steps
-from lnocl.psf.centring import Mask, Pixel, Point
-from lnocl.scene.arrays import Array, flag
+from lnocl.psf.centring import Pixel, Point
+from lnocl.scene.arrays import Array, Mask, flag
 from lnocl.scene.quantities import in_unit, split
 from lnocl.scene.shifting import MARGIN
 

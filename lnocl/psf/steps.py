@@ -11,14 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label, maximum_filter, value_indices
 
 from lnocl.detection.fitting import fit
+from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.errors import InputError, counted, warn
 from lnocl.psf import resampling
-from lnocl.psf.centring import SEARCH, Mask, Pixel, Point, brightest, fit_gaussian
+from lnocl.psf.centring import SEARCH, Pixel, Point, brightest, fit_gaussian
 from lnocl.psf.checks import MIN_SIZE, one_number
 from lnocl.psf.repair import WINDOW, repair
 from lnocl.psf.wings import FROM, distance, fit_sky
 from lnocl.scene.apertures import FWHM
-from lnocl.scene.arrays import Array, numbers
+from lnocl.scene.arrays import Array, Mask, numbers
 from lnocl.scene.shifting import ENDLESS, MARGIN, MovablePsf
 
 # The background is lowered by so many of its errors or more, and by this share of the flux; where
@@ -28,9 +29,9 @@ CERTAIN, LITTLE, TRUSTED, MUCH = 5.0, 0.001, 0.5, 0.01
 MIN_SKY = 100
 # Width of the frame's border, as a share of the shorter side.
 BORDER = 1 / 16
-# Another star is a maximum so many widths from the given ones, above this share of the peak of one
-# that it is near, and so many times the noise: what is nearer or fainter may be rings and speckles.
-APART, BRIGHT, SIGNIFICANT = 3.0, 0.05, 5.0
+# Another star is a maximum in the wings of the given ones, above this share of the peak of one that
+# it is near: what is nearer or fainter may be rings and speckles.
+BRIGHT = 0.05
 # It is a star where the brightest given one, moved there, leaves no more than this share of its
 # peak and so many times the noise (rms), to so many widths; else it is masked.
 WITHIN, ALIKE, NOISY, MASKED = 1.5, 0.05, 2.0, 2.0
@@ -219,9 +220,9 @@ def find_neighbours(
         row, column = plateau[len(plateau) // 2]
         offsets = np.abs(np.array(centres) - (row, column))
         peaks = [light[nearest_pixel(centres[s])] for s in range(len(centres))]
-        is_near = offsets.max(axis=1) < half + APART * width
+        is_near = offsets.max(axis=1) < half + FROM * width
         is_bright = light[row, column] > BRIGHT * np.array(peaks)
-        if np.hypot(*offsets.T).min() < APART * width or not (is_near & is_bright).any():
+        if np.hypot(*offsets.T).min() < FROM * width or not (is_near & is_bright).any():
             continue
         place, misfit = _fit_star(light, brightest_given, (row, column), width)
         is_there = math.dist(place, (row, column)) < width

@@ -13,6 +13,7 @@ from lnocl.errors import InputError, counted
 from lnocl.scene.quantities import in_unit
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # An array whose last axis is so short, and the others so long, has its channels last.
 MAX_CHANNELS = 4
