@@ -332,19 +332,17 @@ class Significance:
     def _rings(self, place: Array, limits: Mapping[str, Array]) -> Iterator[tuple[float, ...]]:
         """Yield distance, share that is tested, and medians of limits of rings round a place."""
         q = self._outcome.observation.oversample
+        from scipy.ndimage import value_indices
+
         rows, columns = np.indices(self.signal_to_noise.shape)
         distance = np.hypot(rows - place[1], columns - place[0]) / q
         ring = (distance / self.resolution).astype(int)
         is_tested = np.isfinite(self.signal_to_noise)
         sizes = np.bincount(ring.ravel())
-        order = np.argsort(ring[is_tested], kind="stable")
-        numbers, first = np.unique(ring[is_tested][order], return_index=True)
-        parts = [
-            np.split(each[is_tested][order], first[1:]) for each in (distance, *limits.values())
-        ]
-        for k, (away, *values) in zip(numbers.tolist(), zip(*parts, strict=True), strict=True):
-            medians = (float(np.median(each)) for each in values)
-            yield float(away.mean()), len(away) / float(sizes[k]), *medians
+        rings = value_indices(np.where(is_tested, ring, -1), ignore_value=-1)
+        for k, there in sorted(rings.items()):
+            medians = (float(np.median(each[there])) for each in limits.values())
+            yield float(distance[there].mean()), len(there[0]) / float(sizes[k]), *medians
 
     def view(self, curves: QTable | None = None) -> SignificanceView:
         """Return what the picture of detections, and of limits with their curves, shows."""

@@ -183,17 +183,14 @@ class _Search:
         apart = max(1, round(SEPARATION * self.profile.width))
         is_new = smooth == ndimage.maximum_filter(smooth, 2 * apart + 1)
         is_new &= signal > self.threshold * self.noise
-        is_new &= signal > OF_WINGS * self._wings(signal)
+        # Of a rough PSF the wings are the brightest within its width.
+        wings = ndimage.maximum_filter(abs(self.whole - signal), 2 * self.rough_within + 1)
+        is_new &= signal > OF_WINGS * wings
         y, x = np.nonzero(is_new)
         order = np.argsort(-signal[y, x])
         y, x = y[order], x[order]
         places = np.stack([x, y], axis=1) + peaks(smooth, y, x, "reflect")[0]
         return places, flux[y, x], signal[y, x]
-
-    def _wings(self, signal: Array) -> Array:
-        """Return the signal of the stars; of a rough PSF the largest within its width."""
-        wings = np.abs(self.whole - signal)
-        return ndimage.maximum_filter(wings, 2 * self.rough_within + 1)
 
     def is_point(self, places: Array, least: float = POINT_SHARE) -> bool:
         """Return whether the first of these places has a point, given sources at the others.
@@ -255,13 +252,9 @@ class _Search:
         there, far = self.profile.window(x, y, self.left.shape), self.profile.width / 2
         moves = [(0.0, 0.0), (far, 0.0), (-far, 0.0), (0.0, far), (0.0, -far)]
         cores = [self.profile.at(there, x + dx, y + dy) for dx, dy in moves]
-        own = [float((core * cores[0]).sum()) for core in cores]
-        seen = [
-            float((core * self.left[there]).sum()) + flux * at
-            for core, at in zip(cores, own, strict=True)
-        ]
         squares = []
-        for middle, *beside in (seen, own):
+        for light in (self.left[there] + flux * cores[0], cores[0]):
+            middle, *beside = (float((core * light).sum()) for core in cores)
             if not 0 < np.mean(beside) < middle:
                 return np.nan
             squares.append(4.0 * np.log(2.0) * far**2 / np.log(middle / np.mean(beside)))

@@ -238,10 +238,10 @@ def _above_sky(pixels: Array, bad: Mask, width: float) -> tuple[Array, Array]:
     filled = _filled(pixels, bad, width)
     level, _ = in_boxes(filled, bad, box)
     rough = filled - ndimage.gaussian_filter(filled, SMOOTHER * width)
-    impulse = np.zeros((4 * box + 1, 4 * box + 1))
-    impulse[2 * box, 2 * box] = 1.0
-    kernel = impulse - ndimage.gaussian_filter(impulse, SMOOTHER * width)
-    noise = in_boxes(rough, bad, box)[1] / np.sqrt((kernel**2).sum())
+    impulse = np.eye(1, 4 * box + 1, 2 * box)[0]
+    kernel = ndimage.gaussian_filter1d(impulse, SMOOTHER * width)
+    squares = 1.0 - 2.0 * kernel.max() ** 2 + (kernel**2).sum() ** 2  # of an impulse less the same
+    noise = in_boxes(rough, bad, box)[1] / np.sqrt(squares)
     if _are_counts(pixels[~bad]):
         means = ndimage.uniform_filter(np.where(bad, 0.0, pixels), box)[~bad]
         noise = np.maximum(noise, np.sqrt(max(float(np.quantile(means, 0.25)), 1.0 / box**2)))

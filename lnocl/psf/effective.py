@@ -215,16 +215,15 @@ class _Stars:
     def _finished(self, psf: Array, shown: Array, weight: Array) -> EffectivePsf:
         left, _ = self._residual(psf)
         n = (shown > 0).sum(axis=0)
-        apart = [
-            (self._centred(left, s) * shown[s]) ** 2 / self._fluxes[s] for s in range(len(shown))
-        ]
+        apart = np.array([self._centred(left, s) / c for s, c in enumerate(self._fluxes)])
+        squares = np.einsum("s,syx->yx", self._fluxes, (apart * shown) ** 2)
         few = np.where(n > 1, weight * (n - 1) / np.maximum(n, 1), np.inf)
-        scatter = np.sqrt(sum(apart) / few)
+        scatter = np.sqrt(squares / few)
         total = psf.sum()
         core = psf > CORE * psf.max()
         stars = []
         for s, (y, x) in enumerate(self._places - self._half):
-            parts = (self._centred(left, s) / self._fluxes[s])[core & (shown[s] > 0)]
+            parts = apart[s][core & (shown[s] > 0)]
             misfit = float(np.sqrt(np.mean(parts**2)) / psf.max()) if parts.size else np.nan
             stars.append(FittedStar(float(x), float(y), float(self._fluxes[s] * total), misfit))
         return EffectivePsf(psf / total, scatter / total, stars, self._n_neighbours)
