@@ -79,11 +79,11 @@ class Cutout(NamedTuple):
 
         One pixel is left, at least.
         """
-        large = abs(self.values) > least
+        large = abs(self.values).reshape(-1, *self.values.shape[-2:]).max(axis=0) > least
         rows, columns = (np.flatnonzero(large.any(axis=axis)) for axis in (1, 0))
         if not len(rows):
-            return Cutout(self.values[:1, :1], self.y, self.x)
-        inner = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+            return Cutout(self.values[..., :1, :1], self.y, self.x)
+        inner = np.s_[..., rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         values = np.ascontiguousarray(self.values[inner])
         return Cutout(values, self.y + int(rows[0]), self.x + int(columns[0]))
 

@@ -195,9 +195,11 @@ def test_stars_have_the_information_of_explicit_products():
     scene = scene_of([(1.2, 30.4), (6.7, 30.9)])
     null = dark_null(scene, FLUXES, True)
     stars, precisions = null.stars, null._linear.precisions
-    laid = np.array([[each.on_grid((N, N)).ravel() for each in images] for images in stars._images])
-    expected = np.einsum("kjn,jn,ljn->kl", laid, np.reshape(precisions, (2, -1)), laid)
-    np.testing.assert_allclose(stars._gram(range(6), precisions), expected, rtol=1e-9)
+    laid = np.array([[each.on_grid((N, N)) for each in images] for images in stars._cutouts])
+    laid = laid.reshape(2, 2, 3, -1)
+    expected = np.einsum("jskn,jn,jtln->kslt", laid, np.reshape(precisions, (2, -1)), laid)
+    found = stars._gram(precisions).dense()
+    np.testing.assert_allclose(found, expected.reshape(6, 6), rtol=1e-9)
 
 
 @pytest.mark.parametrize("turn", [None, 30.0])
