@@ -82,8 +82,7 @@ def _least_shares(psf: Array) -> Array:
     movable, shares = MovablePsf(psf, ENDLESS), []
     for y, x in product(PLACES, PLACES):
         star = movable.at(x, y).add_to(np.zeros((3, 3)), (-1, -1), ENDLESS)
-        beside = [star[1 + dy, 1 + dx] + star[1 - dy, 1 - dx] for dy, dx in DIRECTIONS]
-        shares.append(np.array(beside) / star[1, 1])
+        shares.append([_beside(star, each)[1, 1] / star[1, 1] for each in DIRECTIONS])
     return np.min(shares, axis=0).clip(0.0)
 
 

@@ -243,6 +243,7 @@ class TestSaturated:
         mask = np.zeros(SHAPE, bool)
         mask[10, 90] = True
         assert_found(find_stars(image, PSF, mask=mask))
+        assert_found(find_stars(np.ma.masked_array(image, mask), PSF))
 
 
 @pytest.mark.parametrize(

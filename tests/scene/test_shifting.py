@@ -262,6 +262,19 @@ class TestStamp:
         assert cutout.values.size < values.size
         assert Cutout(values, 1, 1).trimmed(9.0).values.shape == (1, 1)
 
+    def test_several_functions_are_laid_added_and_trimmed_as_each_is(self):
+        values = np.random.default_rng(1).normal(size=(3, 5, 6))
+        values[:, 0] = values[:, :, 5] = 0.0
+        cutout, grid = Cutout(values, -2, 9), (12, 11)
+        parts = [Cutout(each, -2, 9) for each in values]
+        expected = np.array([part.on_grid(grid) for part in parts])
+        np.testing.assert_array_equal(cutout.on_grid(grid), expected)
+        np.testing.assert_array_equal(cutout.trimmed(0.0).on_grid(grid), expected)
+        assert cutout.trimmed(0.0).values.shape == (3, 4, 5)
+        first, light = (10, 8), np.ones((3, 4, 4))
+        added = [part.add_to(np.ones((4, 4)), first, grid, 2.0) for part in parts]
+        np.testing.assert_array_equal(cutout.add_to(light, first, grid, 2.0), added)
+
 
 @given(k=st.integers(1, 40), n=st.integers(1, 12), axis=st.integers(0, 1))
 def test_fold_wraps_wings_round(k, n, axis):
