@@ -449,6 +449,7 @@ def check_injections(n: object, seed: object) -> None:
 def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> QTable:
     from astropy.table import QTable
     from astropy.units import electron, pix
+    from scipy.spatial import KDTree
 
     places, values, gaussian = found.maxima(least)
     scene, q = outcome.scene, outcome.observation.oversample
@@ -473,10 +474,7 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
     ratio = np.maximum(found.fluxes[at] / found.errors[at], 1.0)
     moved = np.hypot(spread / ratio[:, None], INTERPOLATED) / q
     stars = scene.stars[:: outcome.observation.n_epochs]
-    nearest, distance = np.zeros(len(places), int), np.full(len(places), np.inf)
-    if len(stars) and len(places):
-        away = np.hypot(*(pixels[:, None] - stars).transpose(2, 0, 1))
-        nearest, distance = away.argmin(axis=1) + 1, away.min(axis=1)
+    distance, nearest = KDTree(stars).query(pixels)
     return QTable(
         {
             "x": pixels[:, 0] * pix,
@@ -486,7 +484,7 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
             "flux": fluxes * electron,
             "flux_error": errors * electron,
             "significance": gaussian,
-            "star": nearest,
+            "star": np.where(np.isfinite(distance), nearest + 1, 0),
             "distance": distance * pix,
             "kind": kinds,
         }

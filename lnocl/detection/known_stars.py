@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import reduce
+from itertools import product
 from operator import add
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from lnocl.scene.arrays import Array
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
-from lnocl.scene.shifting import Cutout
+from lnocl.scene.shifting import Cutout, window
 from lnocl.scene.stars import FAINT, Order, StarImages, along_sky
 
 # Stars and sources share nothing farther apart than so many resolutions.
@@ -113,8 +114,8 @@ class KnownStars:
         ]
         firsts = np.array([each[1:] for each in common]).reshape(-1, 2)
         sizes = np.array([each.values.shape for each in common]).reshape(-1, 2)
-        for here in _tiles(grid, int(np.ceil(TILE * resolution))):
-            first, shape = (here[0].start, here[1].start), _shape(here)
+        for first, shape in _tiles(grid, int(np.ceil(TILE * resolution))):
+            here = window(*first, shape, grid)
             reach = (firsts - first) % grid < shape, (first - firsts) % grid < sizes
             near = np.flatnonzero(np.logical_or(*reach).all(axis=1)).tolist()
             if not near:
@@ -200,15 +201,10 @@ def _wider(cutout: Cutout, width: float) -> Cutout:
     return cutout._replace(values=blurred)
 
 
-def _tiles(grid: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
-    for top in range(0, grid[0], side):
-        for left in range(0, grid[1], side):
-            yield slice(top, min(top + side, grid[0])), slice(left, min(left + side, grid[1]))
-
-
-def _shape(window: tuple[slice, slice]) -> tuple[int, int]:
-    rows, columns = (side.stop - side.start for side in window)
-    return rows, columns
+def _tiles(grid: tuple[int, int], side: int) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """Yield the first pixel and the shape of each."""
+    for y, x in product(range(0, grid[0], side), range(0, grid[1], side)):
+        yield (y, x), (min(side, grid[0] - y), min(side, grid[1] - x))
 
 
 def _cut_round(cutout: Cutout, place: Array, half: int, grid: tuple[int, int]) -> Cutout:

@@ -74,6 +74,21 @@ class Cutout(NamedTuple):
         values = np.roll(self.values, (y[0], x[0]), axis=(0, 1)) if y[0] or x[0] else self.values
         return Cutout(values, y[1], x[1])
 
+    def blurred(self, deviation: float, grid: tuple[int, int]) -> Cutout:
+        """Return the values convolved with a Gaussian of this standard deviation, pixels.
+
+        They may go round the edges of the grid.
+        """
+        if not deviation:
+            return self
+        from scipy.ndimage import gaussian_filter
+
+        margin = 2 * int(np.ceil(4.0 * deviation))
+        more = [min(margin, n - size) for n, size in zip(grid, self.values.shape, strict=True)]
+        wide = np.pad(self.values, [(n // 2, n - n // 2) for n in more])
+        values = gaussian_filter(wide, deviation, mode="wrap")
+        return Cutout(values, self.y - more[0] // 2, self.x - more[1] // 2)
+
     def trimmed(self, least: float) -> Cutout:
         """Return the cutout without outer rows and columns whose values all are this or less.
 
