@@ -13,11 +13,12 @@ import pytest
 from test_layers import MODULES, PACKAGE, imports
 
 # Lines of code of the package and of its core, rounded up to tens; less code lowers them.
-BUDGET = {"package": 24_010, "core": 11_750}
+BUDGET = {"package": 23_980, "core": 11_100}
 CORE = "scene", "engines", "opencl", "reference", "solvers", "runs"
 # What the core is not to know, nor the rooms round it.
 OUTSIDE = "astropy.io", "matplotlib", "dask", "distributed"
-ROOMS_OUTSIDE = "io", "plotting", "commands", "psf", "simulation", "verify", "studies", "result"
+ROOMS_OUTSIDE = {"io", "plotting", "commands", "detection", "psf", "simulation", "verify"}
+ROOMS_OUTSIDE |= {"studies", "result"}
 # Modules of the core that know it still.
 STILL = {"runs.checkpoint"}
 SKIPPED = {

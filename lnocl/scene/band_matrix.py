@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cached_property
 
@@ -37,14 +38,15 @@ class BandMatrix:
         """The elements of each unknown with itself."""
         return np.asarray(self.band[0, self.places])
 
+    def block(self, unknowns: Sequence[int] | NDArray[np.int_]) -> Array:
+        """Return the elements of some of the unknowns, shape (n, n)."""
+        at = self.places[unknowns]
+        apart, first = abs(at - at[:, None]), np.minimum(at, at[:, None])
+        return np.where(apart < len(self.band), self.band[apart % len(self.band), first], 0.0)
+
     def dense(self) -> Array:
         """Return all elements, shape (m, m)."""
-        m = len(self.places)
-        ordered = np.zeros((m, m))
-        for d, elements in enumerate(self.band):
-            at = np.arange(m - d)
-            ordered[at, at + d] = ordered[at + d, at] = elements[: m - d]
-        return ordered[np.ix_(self.places, self.places)]
+        return self.block(np.arange(len(self.places)))
 
     def scaled(self, units: Array) -> BandMatrix:
         """Return the matrix with each unknown in other units: its rows and columns times these."""

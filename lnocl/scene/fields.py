@@ -12,6 +12,7 @@ from lnocl.errors import InputError, warn
 from lnocl.scene import containers
 from lnocl.scene.arrays import (
     Array,
+    Mask,
     booleans,
     flag,
     numbers,
@@ -31,8 +32,6 @@ from lnocl.scene.uncertainties import is_uncertainty, without_source
 
 if TYPE_CHECKING:
     from lnocl.scene.observation import Observation
-
-Mask = NDArray[np.bool_]
 
 # Pixels of the sky to one of an image, along each axis. The frequencies that an image cannot tell
 # apart are neighbours in the transform's order where this is a power of two (kernels/convolve.cl).

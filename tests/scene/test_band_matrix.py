@@ -25,6 +25,7 @@ def test_it_is_the_dense_matrix_and_its_inverse():
     matrix, units, x = of_dense(dense, places), rng.uniform(1, 9, 6), rng.normal(size=(6, 2))
     assert matrix.band.shape == (3, 6)
     np.testing.assert_array_equal(matrix.dense(), dense)
+    np.testing.assert_array_equal(matrix.block([4, 0, 2]), dense[np.ix_([4, 0, 2], [4, 0, 2])])
     np.testing.assert_array_equal(matrix.diagonal, np.diag(dense))
     scaled = units[:, None] * units * dense
     np.testing.assert_allclose(matrix.scaled(units).dense(), scaled, rtol=1e-15)
