@@ -15,7 +15,7 @@ FLOORS = [
     {"simulation", "plotting"},
     {"engines"},
     {"runs"},
-    {"significance"},
+    {"significance", "checkpoint"},
     {"result"},
     {"deconvolution"},
     {"tiles"},
