@@ -229,9 +229,8 @@ class _Reader:
         factor *= 1.0 if gain is None else gain
         if not units.is_known(self._unit()):
             if exposure is not None:
-                means = exposure.reshape(len(exposure), -1).mean(axis=1)
                 are_rates = all(
-                    is_rate(factor * image, means[min(j, len(means) - 1)])
+                    is_rate(factor * image, exposure[min(j, len(exposure) - 1)])
                     for j, image in enumerate(self._images.data)
                 )
             name = "electrons" if gain is None else "counts"
