@@ -98,10 +98,10 @@ def read(path: str) -> Checkpoint:
 
     arrays: State = {}
     with open_fits(path, "is not a checkpoint, or a damaged one") as file:
-        primary, table, *images = file.hdus()
-        ended, digest = str(primary.header["ENDED"]), primary.header["DIGEST"]
-        described = {str(row["name"]): str(row["value"]) for row in table.data}
-        for hdu in images:
+        hdus = list(file.hdus())
+        ended, digest = str(hdus[0].header["ENDED"]), hdus[0].header["DIGEST"]
+        described = {str(row["name"]): str(row["value"]) for row in hdus[1].data}
+        for hdu in hdus[2:]:
             arrays[hdu.name.lower()] = _array(hdu)
             del hdu.data
         if digest != digest_of({"ended": ended}, described, arrays):

@@ -360,15 +360,11 @@ def check_number(n: object, seed: object) -> None:
 
 
 class _Measured(NamedTuple):
-    """Errors in a replica: of the quantities, those that PSFs add, and of the smoothed pixels.
-
-    And in which of these there is light, as the answer is brighter than the error.
-    """
+    """What a replica adds to the arrays of `Bootstrap` of these names."""
 
     errors: Array
     of_psfs: Array
-    pixels: Array
-    is_there: NDArray[np.bool_]
+    sums: Array
 
 
 class _Measuring:
@@ -394,7 +390,9 @@ class _Measuring:
             of_psfs = (_measure(self._outcome, last, self._parts) - seen)[None]
             seen = seen + of_psfs[0]
         smooth = self._smooth(last.extended - replica.drawn.extended)
-        return _Measured((seen - drawn)[None], of_psfs, smooth, self._smooth_answer > smooth)
+        # There is light where the answer is brighter than the error.
+        sums = np.array([smooth, smooth**2, self._smooth_answer > smooth])
+        return _Measured((seen - drawn)[None], of_psfs, sums)
 
 
 def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
@@ -403,7 +401,7 @@ def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
         found,
         errors=np.concatenate([found.errors, measured.errors]),
         of_psfs=np.concatenate([found.of_psfs, measured.of_psfs]),
-        sums=found.sums + np.array([measured.pixels, measured.pixels**2, measured.is_there]),
+        sums=found.sums + measured.sums,
     )
 
 
