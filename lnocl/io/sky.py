@@ -489,24 +489,15 @@ def _transform(
         left = abs(there - nearest @ points).max()
         if left <= MAX_OFFSET_VARIATION:
             return np.column_stack([nearest, middle + mean - nearest @ middle])
+    turn = "mirrored"
+    if np.linalg.det(u @ v) > 0:
+        turn = f"rotated by {rotation_angle(nearest):z.2f} degrees and scaled by {scale:.4f}"
     raise InputError(
-        f"{path} is {_describe_turn(moved, nx)} relative to {first_path}, and after rotation, "
-        f"scale and shift pixels are up to {left:.2g} off: images are never resampled; cut them to "
-        "where it is less"
+        f"{path} is {turn} relative to {first_path}, and after rotation, scale and shift pixels "
+        f"are up to {left:.2g} off: images are never resampled; cut them to where it is less"
     )
 
 
 def rotation_angle(transform: NDArray[np.float64]) -> float:
     """Return by how many degrees a map turns, from the x axis towards the y axis."""
     return float(np.degrees(np.arctan2(transform[1, 0], transform[0, 0])))
-
-
-def _describe_turn(moved: Pairs, nx: int) -> str:
-    """Say how an image lies to the first, from where the points of that one lie in it."""
-    along_x = moved[:, POINTS // 2, -1] - moved[:, POINTS // 2, 0]
-    along_y = moved[:, -1, POINTS // 2] - moved[:, 0, POINTS // 2]
-    if along_x[0] * along_y[1] - along_x[1] * along_y[0] < 0:
-        return "mirrored"
-    angle = np.degrees(np.arctan2(along_x[1], along_x[0]))
-    scale = np.hypot(*along_x) / max(nx - 1, 1)
-    return f"rotated by {angle:z.2f} degrees and scaled by {scale:.4f}"
