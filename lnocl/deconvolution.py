@@ -12,13 +12,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lnocl.checkpoint import Checkpointer
 from lnocl.errors import DivergedError, NotFiniteError, note, warn
 from lnocl.result import Callback, Estimate, Iterating, Result, make_result
 from lnocl.result.verdict import warn_of_faults
-from lnocl.runs.checkpoint import Checkpointer, describe
 from lnocl.runs.halves import Halves
 from lnocl.runs.held_out import HeldOutCounts
-from lnocl.runs.held_out import most_bytes as most_bytes_of_halves
+from lnocl.runs.inputs import describe
 from lnocl.runs.options import (
     EngineName,
     Precision,
@@ -31,7 +31,7 @@ from lnocl.runs.plan import HALOS, LEVELS, Plan
 from lnocl.runs.plan import plan as make_plan
 from lnocl.runs.preparation import Prepared, prepare, quietly
 from lnocl.runs.progress import Progress
-from lnocl.runs.run import Run, most_bytes
+from lnocl.runs.run import Run
 from lnocl.runs.start import Start, make_start
 from lnocl.runs.steady import run_steadily, told_prior
 from lnocl.runs.stopping import Rule, make_rule
@@ -375,10 +375,10 @@ def deconvolve(
         n_iter=plan.n_iter,
         stop=prepared.stop,
     )
-    checkpoints = partial(Checkpointer, describe=inputs, path=checkpoint, resume=resume)
+    checkpointer = Checkpointer(inputs, checkpoint, resume)
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
-    outcome = reconstruct(prepared, callback, progress, checkpoints)
+    outcome = reconstruct(prepared, callback, progress, checkpointer)
     outcome = _finish(outcome, plan, prepared, progress)
     result = make_result(outcome)
     warn_of_faults(result, progress)
@@ -409,7 +409,7 @@ def reconstruct(
     prepared: Prepared,
     callback: Callback | None = None,
     progress: bool = False,
-    checkpoints: Callable[[Callable[[], int]], Checkpointer] = Checkpointer,
+    checkpointer: Checkpointer | None = None,
 ) -> Outcome:
     """Return the outcome with the first penalty, or with those that held-out counts choose.
 
@@ -420,11 +420,12 @@ def reconstruct(
         of the others (`lnocl.runs.steady`); it is the outcome where held-out counts find no end.
     callback, progress
         As for `deconvolve`.
-    checkpoints : callable
-        Returns what writes checkpoints, given what returns the bytes that they may take.
+    checkpointer : Checkpointer, optional
+        Writes checkpoints, and holds the one to resume from.
     """
     setup, penalties, steady = prepared.setup, prepared.penalties, prepared.steady
     n_iter, stop = prepared.n_iter, prepared.stop
+    checkpointer = checkpointer or Checkpointer()
     if setup.engine == "opencl" and setup.precision == "single":
         warn_of_rounding(n_iter)
     with quietly():
@@ -436,9 +437,6 @@ def reconstruct(
                 start = settle_halos(start)
         warn_of_noise(setup.observation)
         warn_of_stars(start.scene, setup.refine_positions)
-        measure = most_bytes_of_halves if stop == "held-out" else most_bytes
-        largest = partial(measure, start, n_iter)
-        checkpointer = checkpoints(largest)
         told = None
         if steady is not None and start.scene.n_stars:
             told = _run_steadily(start, steady, n_iter, progress)
@@ -456,7 +454,7 @@ def reconstruct(
             return outcome if told is None else replace(told, curve=outcome.curve)
         with Progress(n_iter, "it", bool(progress), "iterations") as bar:
             run = Run(start.penalised(penalties[0]), n_iter)
-            del start, largest  # which hold arrays of the grid
+            del start  # which holds arrays of the grid
             return run.outcome(_complete(run, make_rule(stop), callback, bar, checkpointer))
 
 

@@ -13,7 +13,7 @@ import pytest
 from test_layers import MODULES, PACKAGE, imports
 
 # Lines of code of the package and of its core, rounded up to tens; less code lowers them.
-BUDGET = {"package": 23_980, "core": 11_100}
+BUDGET = {"package": 23_390, "core": 10_740}
 CORE = "scene", "engines", "opencl", "reference", "solvers", "runs"
 # What the core is not to know, nor the rooms round it.
 OUTSIDE = "astropy.io", "matplotlib", "dask", "distributed"
@@ -61,4 +61,4 @@ def test_the_core_knows_neither_files_nor_pictures_nor_clusters():
         for name in imports(module)
         if any(f"{name}.".startswith(f"{each}.") for each in outside)
     }
-    assert knowing == STILL
+    assert not knowing

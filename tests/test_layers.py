@@ -17,7 +17,7 @@ FLOORS = [
     {"simulation", "plotting"},
     {"engines"},
     {"runs"},
-    {"significance"},
+    {"significance", "checkpoint"},
     {"result"},
     {"deconvolution"},
     {"tiles"},
