@@ -97,9 +97,7 @@ RECIPES = {
         same("validation", "positions"),
     ),
     "trade": Recipe(
-        "10 min",
-        "python benchmarks/settings.py --size 1024 --output $OUT/trade",
-        {"validation/trade.png": "trade.png"},
+        "10 min", "lnocl bench --size 1024 -o $OUT/trade", {"validation/trade.png": "trade.png"}
     ),
     "psf_wrong": Recipe(
         "5 min",

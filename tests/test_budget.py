@@ -13,14 +13,12 @@ import pytest
 from test_layers import MODULES, PACKAGE, imports
 
 # Lines of code of the package and of its core, rounded up to tens; less code lowers them.
-BUDGET = {"package": 23_390, "core": 10_740}
+BUDGET = {"package": 23_640, "core": 10_740}
 CORE = "scene", "engines", "opencl", "reference", "solvers", "runs"
 # What the core is not to know, nor the rooms round it.
 OUTSIDE = "astropy.io", "matplotlib", "dask", "distributed"
 ROOMS_OUTSIDE = {"io", "plotting", "commands", "detection", "psf", "simulation", "verify"}
 ROOMS_OUTSIDE |= {"studies", "result"}
-# Modules of the core that know it still.
-STILL = {"runs.checkpoint"}
 SKIPPED = {
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE),
     *(tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER),

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from lnocl import loading
 from lnocl.commands import (
     batch,
+    bench,
     deconvolve,
     demo,
     detect,
@@ -39,6 +40,7 @@ COMMANDS = {
     "report": report.COMMAND,
     "demo": demo.COMMAND,
     "simulate": simulate.COMMAND,
+    "bench": bench.COMMAND,
     "devices": devices.COMMAND,
     "selftest": selftest.COMMAND,
 }

@@ -201,7 +201,7 @@ class _Reader:
         places, psfs = list[list[float]](), list[Array]()
         for place, path in map(parse_kind, self._calibration.star_psfs):
             stack = read_stack([path])
-            self._sha256.setdefault("star_psfs", []).extend(stack.sha256)
+            self._maps.sha256.setdefault("star_psfs", []).extend(stack.sha256)
             places.append([float(each) for each in place.split(",")])
             psfs.append(check_psfs("star_psfs", stack.data, len(self._images.data)))
         if not psfs:

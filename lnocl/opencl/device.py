@@ -95,7 +95,7 @@ def tell(choice: Choice) -> None:
 def _tell(name: str, reason: str, spec: str) -> None:
     note(
         "%s is taken, %s; `device` %s takes the CPU, which may be faster than a small GPU: lnocl "
-        "devices --tune times either",
+        "bench times either",
         name,
         reason,
         spec,

@@ -1,1 +1,1 @@
-"""The demo, the tuning of a device, simulations as files, and pictures of files."""
+"""The demo, the benchmark of speed against accuracy, and pictures of files."""

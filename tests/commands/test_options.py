@@ -186,6 +186,10 @@ NEEDED = {
     "deconvolve i.fits --psf p.fits -o o.fits --star-psf 1,2=q.fits": "--star or --stars",
     "limit r.fits --injections 0 --seed 3": "--injections",
     "devices --device 0": "--tune",
+    "bench --psf p.fits": "images",
+    "bench --background 3": "images",
+    "bench --read-noise 3": "images",
+    "bench --star 3,4": "images",
 }
 
 

@@ -63,7 +63,7 @@ def test_a_gpu_that_is_taken_unasked_is_named_once_and_the_cpu_beside_it(machine
         device.tell(device.choose(spec))
     assert caplog.messages == [
         "Fast GPU (Vendor, 1) is taken, the first GPU; device 0:0 takes the CPU, which may be "
-        "faster than a small GPU: lnocl devices --tune times either"
+        "faster than a small GPU: lnocl bench times either"
     ]
     machine.pop(0)
     assert device.choose().instead is None
