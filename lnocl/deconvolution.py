@@ -27,7 +27,7 @@ from lnocl.runs.options import (
     warn_of_rounding,
 )
 from lnocl.runs.outcome import Outcome
-from lnocl.runs.plan import FIT, HALOS, LEVELS, Plan
+from lnocl.runs.plan import HALOS, LEVELS, PSFS, STARS, Plan
 from lnocl.runs.plan import plan as make_plan
 from lnocl.runs.preparation import Prepared, prepare, quietly
 from lnocl.runs.progress import Progress
@@ -298,9 +298,11 @@ def deconvolve(
     ends where the objective hardly changes any more (:doc:`/validation/psf`). Where single rings
     show an error and all of them together show none, held-out counts choose λ. Where `smoothing` is
     a number, it stays as it is, scatter or not, and PSFs are judged only where `refine_psfs` names
-    families or a scatter is given. PSFs that vary over the field are not judged, nor, unless
-    families are named, those of more than 64 stars in the window. Stars whose positions are not
-    refined are taken to be where they are given.
+    families or a scatter is given. Those of more than 64 stars in the window are judged only where
+    families are named. Stars whose positions are not refined are taken to be where they are given.
+
+    Images that are turned, of several epochs or with halos are judged alike, each PSF in the frame
+    of its image. Of PSFs that vary over an image all are changed alike.
 
     **Star fluxes are marginal** where PSFs were judged and fit. What lies under a star belongs to
     it or to the extended source, and early iterations leave it to the star. So after the last
@@ -387,7 +389,7 @@ def deconvolve(
 def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) -> Outcome:
     """Return an outcome with what the plan has marginal, and how well PSFs fit."""
     is_fit = prepared.fits
-    if plan.does(FIT):
+    if plan.does(STARS) and not plan.does(PSFS):  # as stars have PSFs of their own
         is_fit = not any(star.is_misfit for star in outcome.star_residuals())
     if prepared.stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):
         is_fit = False  # what leaves them without an end leaves marginal fluxes without sense
@@ -398,11 +400,11 @@ def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) ->
             outcome = outcome.marginal(is_fit, has_halos, has_levels)
     for words in outcome.levels_in_words():
         note("%s", words)
-    may_free = "pixels" not in plan.families and not refusal("refine_psfs", outcome.observation)
     return replace(
         outcome,
         psf_refinement=prepared.refinement,
-        may_free_pixels=may_free,
+        may_free_pixels="pixels" not in plan.families
+        and not refusal("refine_psfs", outcome.observation),
         plan=tuple(str(plan).splitlines()),
     )
 

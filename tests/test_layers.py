@@ -1,6 +1,7 @@
 """The rooms of the package, from the ground up: an import goes down or stays in its room."""
 
 import ast
+import re
 from pathlib import Path
 
 import lnocl
@@ -77,3 +78,15 @@ def test_imports_go_down_or_stay_in_their_room():
 def test_only_the_opencl_rooms_know_pyopencl():
     knows = {m for m in MODULES if any(name.split(".")[0] == "pyopencl" for name in imports(m))}
     assert {m for m in knows if not {m, m.split(".")[0]} & KNOWS_OPENCL} == set()
+
+
+def test_only_cameras_and_kernels_see_the_sky_through_a_response():
+    """So a term of what images see of the sky is added in one place on the host."""
+    response = re.compile(
+        r"\.(psf|psf_cutout|point_response)\(j|rotations\[|\.undone\(|_phases\(\)"
+    )
+    sees = {
+        m for m in MODULES if response.search((PACKAGE / f"{m.replace('.', '/')}.py").read_text())
+    }
+    of_kernels = {m for m in sees if m.split(".")[0] in ("engines", "opencl", "verify")}
+    assert sees - of_kernels == {"scene.camera", "scene.rotation", "scene.scene"}

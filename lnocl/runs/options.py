@@ -106,9 +106,9 @@ def check_families(
     Raises
     ------
     InputError
-        A name is unknown, or one text is given instead of several; there is no star; the PSFs vary
-        over the field; ideal PSFs, pupils or modes are lacking; pupils differ in their apertures;
-        a shift of one image is asked for beside free positions.
+        A name is unknown, or one text is given instead of several; there is no star, or one with a
+        PSF of its own; ideal PSFs, pupils or modes are lacking; pupils differ in their apertures; a
+        shift of one image is asked for beside free positions.
     """
     if len(observation.psf_scatter) and not len(positions):
         raise InputError(

@@ -29,20 +29,14 @@ from lnocl.scene.star_psfs import refuse_unowned
 from lnocl.scene.stars import check_positions
 from lnocl.solvers import SolverName
 
-LEVELS, PSFS, HALOS, PRIOR, CHOICE, FIT, STARS = STEPS = (
+LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
     "fit levels of backgrounds",
     "judge PSFs before the run",
     "settle halos",
     "give stars a prior by a run with a fixed weight",
     "choose the iteration by held-out counts",
-    "judge the fit after the run",
     "take marginal star fluxes",
 )
-
-
-def _of_images(condition: Condition) -> Condition:
-    """Return a condition on images as one on a plan."""
-    return Condition(lambda plan: condition.holds(plan.setup.observation), condition.otherwise)
 
 
 AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number")
@@ -53,21 +47,22 @@ HAS_ERROR = Condition(
 )
 HELD_OUT = Condition(lambda plan: plan.stop == "held-out", "`stop` is another rule")
 WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into tiles")
-NOT_BEFORE = Condition(lambda plan: not plan.does(PSFS), "PSFs are judged before it")
+ALL_ONE_PSF = Condition(
+    lambda plan: freedoms.ALL_ONE_PSF.holds(plan.setup.observation), freedoms.ALL_ONE_PSF.otherwise
+)
 
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
     LEVELS: (AUTO, HAS_ERROR, WHOLE),
-    PSFS: (AUTO, HAS_STARS, *map(_of_images, freedoms.NEEDS["refine_psfs"])),
+    PSFS: (AUTO, HAS_STARS, ALL_ONE_PSF),
     HALOS: (AUTO, HAS_HALOS),
     PRIOR: (AUTO, HELD_OUT, HAS_STARS),
     CHOICE: (HELD_OUT,),
-    FIT: (AUTO, HAS_STARS, _of_images(freedoms.ONE_PSF), NOT_BEFORE),
-    STARS: (AUTO, HAS_STARS, _of_images(freedoms.ONE_PSF)),
+    STARS: (AUTO, HAS_STARS),
 }
 # Of steps that hang on what those before find: where they are done.
 UNLESS_WRONG = "unless PSFs are wrong"
-WHERE = {PRIOR: UNLESS_WRONG, CHOICE: UNLESS_WRONG, STARS: "where the model fits"}
+WHERE = {PRIOR: UNLESS_WRONG, CHOICE: UNLESS_WRONG, STARS: "where PSFs fit"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +106,11 @@ class Plan:
     >>> obs = lnocl.Observation(np.stack([image] * 2), np.ones((3, 3)), epochs=[0, 1])
     >>> print(lnocl.plan(obs, [(8, 5)]))
     fit levels of backgrounds: no, backgrounds have no error
-    judge PSFs before the run: no, the images are of several epochs
+    judge PSFs before the run: yes, and fit shift, jitter, pixels
     settle halos: no, there are no halos
-    give stars a prior by a run with a fixed weight: yes
-    choose the iteration by held-out counts: yes
-    judge the fit after the run: yes
-    take marginal star fluxes: yes, where the model fits
+    give stars a prior by a run with a fixed weight: yes, unless PSFs are wrong
+    choose the iteration by held-out counts: yes, unless PSFs are wrong
+    take marginal star fluxes: yes, where PSFs fit
     """
 
     setup: Setup
@@ -156,12 +150,6 @@ class Plan:
         if where == UNLESS_WRONG and not self.does(PSFS):
             where = ""
         return ", ".join(filter(None, ("yes", where)))
-
-    def notes(self) -> list[str]:
-        """Return what of a plan is worth a line before the run."""
-        if not self.does(FIT):
-            return []
-        return [f"PSFs are not judged before the run, as {self.why_not(PSFS)}"]
 
     def __str__(self) -> str:
         """Return a line for each step."""
@@ -235,7 +223,8 @@ def plan(
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
     if refine_positions is True and (why := refusal("refine_positions", observation)):
         raise InputError(why)
-    moves = refine_positions if is_auto else refine_positions is True
+    may_move = is_auto and not refusal("refine_positions", observation)
+    moves = refine_positions if may_move else refine_positions is True
     return replace(
         made,
         setup=replace(setup, refine_positions=moves is True, settles_halos=made.does(HALOS)),

@@ -12,7 +12,7 @@ import numpy as np
 from lnocl.errors import NotFiniteError, note
 from lnocl.runs.options import StopName
 from lnocl.runs.outcome import Mended, PsfRefinement
-from lnocl.runs.plan import LEVELS, PSFS, Plan
+from lnocl.runs.plan import LEVELS, PSFS, STARS, Plan
 from lnocl.runs.progress import Progress
 from lnocl.runs.start import Setup
 from lnocl.runs.steady import STEADY, steady_penalty
@@ -75,9 +75,9 @@ def quietly() -> np.errstate:
 
 def prepare(plan: Plan, progress: bool = False) -> Prepared:
     """Return the run of a plan, after levels are fitted and PSFs and positions judged."""
-    for words in plan.notes():
-        note("%s", words)
     setup = plan.setup
+    if plan.does(STARS) and not plan.does(PSFS):
+        note("PSFs are not judged, as %s", plan.why_not(PSFS))
     if plan.does(LEVELS):
         from lnocl.runs.halos import settle_levels  # which loads scipy
 

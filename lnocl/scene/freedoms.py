@@ -23,19 +23,16 @@ class Condition(NamedTuple):
     otherwise: str
 
 
-ONE_PSF = Condition(lambda images: not images.psf_fields, "PSFs vary over the field")
-UPRIGHT = Condition(lambda images: not images.is_turned, "the images are turned against the sky")
 ONE_EPOCH = Condition(lambda images: images.n_epochs == 1, "the images are of several epochs")
 ALL_ONE_PSF = Condition(
     lambda images: not len(images.star_psfs), "stars have PSFs of their own, which tell of no other"
 )
-NO_HALOS = Condition(lambda images: not len(images.halos), "the images have halos")
 
 # What each parameter of `lnocl.deconvolve` needs, in the order in which reasons are given.
 NEEDS = {
     "refine_positions": (ONE_EPOCH,),
-    "refine_psfs": (ONE_PSF, ALL_ONE_PSF, UPRIGHT, ONE_EPOCH, NO_HALOS),
-    "psf_scatter": (ONE_PSF, ALL_ONE_PSF, UPRIGHT, ONE_EPOCH, NO_HALOS),
+    "refine_psfs": (ALL_ONE_PSF,),
+    "psf_scatter": (ALL_ONE_PSF,),
 }
 
 

@@ -18,7 +18,7 @@ from lnocl.scene.counts import refuse_overflow, without_negative
 from lnocl.scene.fields import FIELDS, hold, in_one_shape, noise_beyond_counts, refuse_all_bad
 from lnocl.scene.geometry import MOVES, Geometry, good_box
 from lnocl.scene.halos import refuse_dark
-from lnocl.scene.psf_field import PsfField
+from lnocl.scene.psf_field import PsfField, Psfs
 from lnocl.scene.psfs import PsfCentre, at_middle, normalised, own
 from lnocl.scene.transforms import of_one_shape, shapes_of
 
@@ -349,6 +349,11 @@ class Observation:
     def n_epochs(self) -> int:
         """Number of epochs, in each of which stars have a flux."""
         return int(self.epochs.max()) + 1
+
+    @property
+    def psfs_over_images(self) -> Psfs:
+        """The PSFs, or where they vary over images the field of each."""
+        return self.psf_fields or self.psfs
 
     @property
     def offsets(self) -> Array:

@@ -18,11 +18,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model, spread
+from lnocl.scene.forward_model import Model
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import MIN_MODEL
 
@@ -110,7 +109,7 @@ def measure_misfit(estimate: Estimate, model: Model, settled: Estimate) -> PsfMi
     squares, parts = np.zeros(scene.n_images), list[tuple[Array, ...]]()
     images = zip(
         scene.images(),
-        model.starlight(fluxes),
+        model.starlight(_of_stars(estimate)),
         model.starlight(settled.fluxes),
         model.weights,
         strict=True,
@@ -174,10 +173,10 @@ def smoothing_near_stars(
     ndarray of float64, of the shape of the extended source
         For `lnocl.scene.penalty.Penalty.near_stars`.
     """
-    scene, fluxes = estimate.scene, estimate.fluxes
+    scene = estimate.scene
     ny, nx = scene.observation.shape
-    spectra: Array | complex = 0.0
-    images = zip(scene.images(), model.starlight(fluxes), strict=True)
+    variance = np.zeros(scene.grid)
+    images = zip(scene.images(), model.starlight(_of_stars(estimate)), strict=True)
     for j, (counts, light) in enumerate(images):
         background = np.broadcast_to(model.background[j], light.shape)
         total = np.maximum(np.maximum(counts, light + background), MIN_MODEL)
@@ -185,13 +184,17 @@ def smoothing_near_stars(
         kappa = np.zeros(light.shape)
         kappa[:ny, :nx] = in_rings[np.minimum(number, len(in_rings) - 1)]
         share = (light / total).clip(0.0)
-        relative = spread(model.weights[j] * kappa * share, scene.oversample)
-        squares = scipy.fft.rfft2(scene.psf(j) ** 2)
-        spectra = spectra + squares.conj() * scipy.fft.rfft2(relative**2)
-    variance = scipy.fft.irfft2(spectra, scene.grid)
+        relative = model.weights[j] * kappa * share
+        variance += model.cameras[j].squares(relative**2)
     ny, nx = scene.observation.sky_shape
     deviation = np.sqrt(np.maximum(variance[:ny, :nx], 0.0))
     return np.asarray(strength * deviation)
+
+
+def _of_stars(estimate: Estimate) -> Array:
+    """Return the fluxes, scaled, those of halos, which no PSF has made, being 0."""
+    is_star = np.arange(estimate.scene.n_fluxes) < estimate.scene.n_stars
+    return np.where(is_star, estimate.fluxes, 0.0)
 
 
 def _kappa(excess: float, norm: float) -> float:

@@ -20,6 +20,7 @@ from lnocl.scene.grid import grid_of, psf_shape
 from lnocl.scene.halos import halo_cutouts
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
+from lnocl.scene.psf_field import Psfs
 from lnocl.scene.rotation import Rotation, turned_psf
 from lnocl.scene.shifting import Cutout, MovablePsf
 from lnocl.scene.star_psfs import StarPsfs, owned
@@ -175,7 +176,7 @@ class Scene:
         self.areas = (self.oversample * observation.scales) ** 2
         self.rotations = self._rotations()
         movable = partial(movable_psfs, observation=observation, grid=self.image_grid)
-        self._own = StarPsfs(observation, self.gains, movable, self.grid, self.rotations)
+        self._own = StarPsfs(observation, self.gains, movable, self.grid)
         self.weights = self._weigh(relative if has_map else None)
         self._halos = (
             halo_cutouts(observation.halos, self.weights, has_map, self.image_grid)
@@ -260,8 +261,8 @@ class Scene:
         half.scale, half.unit = self.scale / 2.0, self.unit / 2.0
         return half
 
-    def seen_through(self, psfs: Array) -> Scene:
-        """Return this scene with other PSFs, shape (p, ky, kx), as they are."""
+    def seen_through(self, psfs: Psfs) -> Scene:
+        """Return this scene with other PSFs, as they are."""
         other = copy(self)
         other.observation = self.observation.replace(psfs=psfs)
         other._psfs = movable_psfs(other.scaled_psfs(), other.observation, self.image_grid)
@@ -364,6 +365,16 @@ class Scene:
         return len(self.stars)
 
     @property
+    def n_epochs(self) -> int:
+        """Number of epochs, in each of which stars have a flux."""
+        return self.observation.n_epochs
+
+    @property
+    def places(self) -> Array:
+        """Positions of the stars, once each."""
+        return np.asarray(self.stars[:: self.n_epochs])
+
+    @property
     def n_halos(self) -> int:
         """Number of halos of all images together."""
         return self.n_fluxes - self.n_stars
@@ -376,9 +387,8 @@ class Scene:
     @property
     def shown_places(self) -> Array:
         """Positions of stars that any image shows, once each, shape (n_shown, 2)."""
-        n_epochs = self.observation.n_epochs
-        is_shown = self.is_shown[: self.n_stars].reshape(-1, n_epochs).any(axis=1)
-        return np.asarray(self.stars[::n_epochs][is_shown])
+        is_shown = self.is_shown[: self.n_stars].reshape(-1, self.n_epochs).any(axis=1)
+        return np.asarray(self.places[is_shown])
 
     @property
     def shown_stars(self) -> Array:
@@ -409,7 +419,7 @@ class Scene:
 
     def with_star(self, place: Array) -> Scene:
         """Return this scene with one more star, the last, at (x, y)."""
-        other, n, n_epochs = copy(self), self.n_stars, self.observation.n_epochs
+        other, n, n_epochs = copy(self), self.n_stars, self.n_epochs
         shown = np.arange(n_epochs)[:, None] == self.observation.epochs
         other.shown = np.insert(self.shown, [n] * n_epochs, shown, axis=0)
         positions = np.concatenate([self.stars, np.tile(place, (n_epochs, 1))])
@@ -502,7 +512,8 @@ class Scene:
     def psf_on_sky(self, j: int, s: int) -> Cutout:
         """Return PSF j on the sky's grid, at star s."""
         if self.owned[s] >= 0:
-            fine = self._own.of_sky(self.owned[s], j)
+            rotation = self.rotations[j] if self.rotations else None
+            fine = self._own.of_sky(self.owned[s], j, rotation)
         else:
             fine = self._psfs_of_sky[j] if self.rotations else self._psfs[j].fine
         return fine.at(*on_sky(self.stars[s], self.oversample))
@@ -676,7 +687,7 @@ class Scene:
         has_own = np.append(owners >= 0, np.zeros(len(field) - len(owners), bool))
         if self.weights is None:
             light = field.shown.T.astype(np.float64)
-            if self.observation.n_epochs > 1:  # else a star is in all images, of mean exposure 1
+            if self.n_epochs > 1:  # else a star is in all images, of mean exposure 1
                 light[:, : len(field.positions)] *= self.gains[:, None]
             # Samples of an effective PSF a pixel apart may sum to another number.
             is_summed = has_own | (self.oversample > 1 and self.observation.effective_psfs)
@@ -703,9 +714,9 @@ class Scene:
         self.shown[: len(is_lost)][is_lost] = False
         self.star_weights[: len(is_lost)][is_lost] = HELD
         self._field = self._place_stars(self.stars)
-        of_epochs = is_lost.reshape(-1, self.observation.n_epochs)
+        of_epochs = is_lost.reshape(-1, self.n_epochs)
         is_dark = np.asarray(of_epochs.all(axis=1))
-        stars = self.stars[:: self.observation.n_epochs]
+        stars = self.places
         if n_dark := int(is_dark.sum()):
             x, y = stars[is_dark][0]
             others = f", and so do {counted(n_dark - 1, 'other')}" if n_dark > 1 else ""

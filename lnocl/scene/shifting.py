@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -85,7 +86,7 @@ class Cutout(NamedTuple):
         return Cutout(values, self.y + int(rows[0]), self.x + int(columns[0]))
 
 
-def window(y: int, x: int, shape: tuple[int, ...], grid: tuple[int, int]) -> Window:
+def window(y: int, x: int, shape: Sequence[int], grid: tuple[int, int]) -> Window:
     """Return the index of a window of this shape on a periodic grid, its first pixel at (y, x)."""
     first = y % grid[0], x % grid[1]
     last = first[0] + shape[0], first[1] + shape[1]

@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.camera import images_of, is_flat
 from lnocl.scene.detector import on_sky
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model, images_of_sky, is_flat
+from lnocl.scene.forward_model import Model
 from lnocl.solvers.levels import Levels
 
 
@@ -118,7 +119,7 @@ class Light:
         laid[:ny, :nx] = shares
         laid *= self._per_weight
         for weights, seen, total in zip(
-            self._map.weights, images_of_sky(scene, laid), self._map.sums, strict=True
+            self._map.weights, images_of(self._map.cameras, laid), self._map.sums, strict=True
         ):
             if is_flat(seen) and is_flat(weights):
                 value = np.array(weights[0, 0] * seen[0, 0] / total)

@@ -18,9 +18,9 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
-from lnocl.scene.detector import movable_psfs
+from lnocl.scene.camera import Camera, Ranges, adjoint_of, ranges, seen_by
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import LocalRotation, add_to_window, sampled, spread
+from lnocl.scene.forward_model import add_to_window
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import along_sky
@@ -53,9 +53,10 @@ class Window(NamedTuple):
         )
         return rows[:, None], columns
 
-    def moved(self, dx: int, dy: int) -> Window:
-        """Return it moved by whole pixels."""
-        return self._replace(y=self.y + dy, x=self.x + dx)
+    @property
+    def ranges(self) -> Ranges:
+        """Its rows and columns, without an end."""
+        return ranges((self.y, self.x), self.shape)
 
     def finer(self, q: int) -> Window:
         """Return the pixels of a sky q times as fine that it holds."""
@@ -90,7 +91,7 @@ class Surroundings:
         self.scene = scene = estimate.scene
         self.width = resolution(scene)
         self.hidden = hidden_radii(scene, self.width)
-        self.psfs = movable_psfs(scene.scaled_psfs(), scene.observation, scene.image_grid)
+        self.cameras = [Camera(scene, j) for j in range(scene.n_images)]
         self.n_shapes = 0 if raised is None else len(raised)
         self._roots = np.zeros(0) if raised is None else raised**-0.5
         self._precisions = self._find_precisions() if self.n_shapes else []
@@ -200,63 +201,20 @@ class NearStar:
 
     def _source_error(self, around: Surroundings, amplitude: Array, width: float) -> SourceError:
         """Return the error of the extended source in the window, and its change there."""
-        scene = around.scene
-        if scene.rotations:
-            return self._turned_error(scene, amplitude, width)
-        q, window = scene.oversample, self.window.finer(scene.oversample)
-        # Twice the window, in which nothing wraps round; or the grid, on which it does.
-        height, breadth = (min(2 * k, n) for k, n in zip(window.shape, scene.grid, strict=True))
-        shape = height, breadth
-        whole = Window(-(height // 2), -(breadth // 2), shape)
-        otfs = []
-        for psf, offset in zip(around.psfs, scene.observation.offsets, strict=True):
-            cut = _cut(psf.response(*(offset - np.round(offset))), whole, scene.grid)
-            otfs.append(scipy.fft.rfft2(np.roll(cut, (whole.y, whole.x), axis=(0, 1))))
-        inside = (..., *map(slice, window.shape))
-
-        def forward(sky: Array) -> Array:
-            images = scipy.fft.irfft2(otfs * scipy.fft.rfft2(sky, shape), shape)
-            return np.asarray(sampled(images[inside], q))
-
-        def adjoint(images: Iterable[Array]) -> Array:
-            total = np.zeros_like(otfs[0])
-            for otf, image in zip(otfs, images, strict=True):
-                if image.any():  # what a flux of one epoch changes is dark in all others
-                    total += np.conj(otf) * scipy.fft.rfft2(spread(image, q), shape)
-            return np.asarray(scipy.fft.irfft2(total, shape)[inside])
-
-        return SourceError(forward, adjoint, amplitude, width)
-
-    def _turned_error(self, scene: Scene, amplitude: Array, width: float) -> SourceError:
-        """Return the same where images are turned against the sky."""
-        window, locals_ = self.window, []
-        for j in range(scene.n_images):
-            there = _in_image(scene, j, window)
-            rows, columns = (
-                range(first, first + k)
-                for first, k in zip((there.y, there.x), there.shape, strict=True)
-            )
-            locals_.append(LocalRotation(scene, j, rows, columns))
-        grids = [(len(local.rows), len(local.columns)) for local in locals_]
-        places = [
-            window.moved(-local.columns.start, -local.rows.start).of(grid)
-            for local, grid in zip(locals_, grids, strict=True)
+        scene, window = around.scene, self.window
+        sky = window.finer(scene.oversample).ranges
+        there = [_in_image(scene, j, window).ranges for j in range(scene.n_images)]
+        windows = [
+            camera.window(seen, sky) for camera, seen in zip(around.cameras, there, strict=True)
         ]
 
         def forward(sky: Array) -> Array:
-            images = []
-            for local, grid, at in zip(locals_, grids, places, strict=True):
-                laid = np.zeros(grid)
-                laid[at] = sky
-                images.append(_padded(local.image(laid), window.shape))
-            return np.array(images)
+            return np.array([_padded(each, window.shape) for each in seen_by(windows, sky)])
 
         def adjoint(images: Iterable[Array]) -> Array:
-            back = (
-                local.adjoint(image[: local.shape[0], : local.shape[1]])[at]
-                for local, at, image in zip(locals_, places, images, strict=True)
-            )
-            return np.asarray(sum(back))
+            pairs = zip(windows, images, strict=True)
+            held = (image[: each.shape[0], : each.shape[1]] for each, image in pairs)
+            return adjoint_of(windows, held)
 
         return SourceError(forward, adjoint, amplitude, width)
 

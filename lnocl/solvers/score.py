@@ -35,7 +35,7 @@ from scipy import ndimage
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model, spread
+from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import CORRELATED
 from lnocl.scene.scene import MIN_MODEL
 from lnocl.scene.smooth_field import SmoothField
@@ -243,55 +243,22 @@ class Null:
 
     def _adjoint(self, images: Sequence[Array], width: float = 0.0) -> Array:
         """Return ``sum_j <P_jx, x_j>`` at each place x of the grid."""
-        scene, total = self.scene, 0.0
-        for j, image in enumerate(images):
-            seen = scene.rotations[j].adjoint(image) if scene.rotations else image
-            spectrum = scipy.fft.rfft2(spread(seen, scene.oversample), workers=-1)
-            otf = scipy.fft.rfft2(self._psf(j, width), workers=-1)
-            total = total + np.conj(otf) * spectrum
-        return np.asarray(scipy.fft.irfft2(total, scene.grid, workers=-1))
+        total = self._model.adjoint(images)
+        return _blurred(total, width) if width else total
 
     def _powers(self, images: Sequence[Array], power: int, width: float = 0.0) -> Iterator[Array]:
-        """Yield ``<P_jx^power, x_j>`` at each place x of the grid for each image x_j, 0 or more.
-
-        Shears and their weights are made for what pixels hold, and would ring: pixels of an image
-        that is turned are shared out among the four of the sky round each.
-        """
-        for j, image in enumerate(images):
-            spectrum = scipy.fft.rfft2(self._on_sky(j, image), workers=-1)
-            spectrum *= np.conj(scipy.fft.rfft2(self.kernel(j, width) ** power, workers=-1))
-            yield np.asarray(scipy.fft.irfft2(spectrum, self.scene.grid, workers=-1))
+        """Yield ``<P_jx^power, x_j>`` at each place x of the grid for each image x_j, 0 or more."""
+        for j, (camera, image) in enumerate(zip(self._model.cameras, images, strict=True)):
+            yield camera.squares(image, self.kernel(j, width) ** power)
 
     def _sum_of_powers(self, images: Sequence[Array], power: int, width: float = 0.0) -> Array:
         """Return ``sum_j <P_jx^power, x_j>`` at each place x, not below 0 by rounding."""
         return np.maximum(sum(self._powers(images, power, width)), 0.0)
 
-    def _on_sky(self, j: int, image: Array) -> Array:
-        """Return the pixels of an image where they lie on the sky's grid."""
-        scene = self.scene
-        if not scene.rotations:
-            return spread(image, scene.oversample)
-        y, x = np.nonzero(image)
-        at = np.stack([x, y], axis=1) - scene.observation.offsets[j]
-        places = np.linalg.solve(scene.observation.turns[j], at.T)[::-1]
-        first = np.floor(places).astype(int)
-        sky = np.zeros(math.prod(scene.grid))
-        for step in np.ndindex(2, 2):
-            corner = first + np.array(step)[:, None]
-            share = (1.0 - abs(places - corner)).prod(axis=0)
-            index = np.ravel_multi_index(tuple(corner), scene.grid, mode="wrap")
-            sky += np.bincount(index, share * image[y, x], sky.size)
-        return sky.reshape(scene.grid)
-
     def kernel(self, j: int, width: float) -> Array:
         """Return what image j shows of a source at the origin, as wide as given."""
-        response = self.scene.point_response(j)
+        response = self._model.cameras[j].point()
         return _blurred(response, width) if width else response
-
-    def _psf(self, j: int, width: float) -> Array:
-        """Return what the sky is convolved with for image j and a source as wide as given."""
-        psf = self.scene.psf(j)
-        return _blurred(psf, width) if width else psf
 
     def _flat_response(self, linear: _Linear, width: float = 0.0) -> Array:
         sums = self._model.sums

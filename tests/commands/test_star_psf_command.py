@@ -52,7 +52,7 @@ def command(tmp_path, monkeypatch):
 
 def test_the_command_does_what_the_function_does_and_is_repeated(command, capsys):
     assert cli.main([*command, "--star-psf", "22,25=behind.fits"]) == 0
-    assert "not judged before the run, as stars have PSFs of their own" in capsys.readouterr().err
+    assert "PSFs are not judged, as stars have PSFs of their own" in capsys.readouterr().err
     found = lnocl.deconvolve(observation(), [STAR, PLANET], n_iter=12, stop=None, engine="numpy")
     saved = read_result("out.fits")
     np.testing.assert_allclose(saved.star_fluxes, found.star_fluxes, rtol=1e-9)

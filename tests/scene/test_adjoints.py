@@ -12,8 +12,9 @@ import turned_scenes
 from scenes import make_psfs, make_smooth_psfs
 
 import lnocl
+from lnocl.scene.camera import Camera
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import LocalRotation, Model
+from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.scene import Scene
 from lnocl.solvers import near_star
@@ -46,7 +47,12 @@ KINDS = {
     "shared": lambda: observe(make_psfs(1, (7, 8)), offsets=np.round(OFFSETS)),
     "moved": lambda: observe(SMOOTH, offsets=OFFSETS, mask=MASK),
     "mapped": lambda: observe(SMOOTH, offsets=OFFSETS, exposure=SECONDS),
+    "halves": lambda: observe(SMOOTH, offsets=np.round(OFFSETS) + 0.5),
+    "wide": lambda: observe(make_smooth_psfs(P, (39, 52)), offsets=OFFSETS),
     "finer": lambda: observe(make_smooth_psfs(P, (18, 17)), offsets=OFFSETS, oversample=2),
+    "effective": lambda: observe(
+        make_smooth_psfs(P, (18, 17)), offsets=OFFSETS, oversample=2, effective_psfs=True
+    ),
     "turned": lambda: turned(turned_scenes.transforms()),
     "scaled": lambda: turned(turned_scenes.scaled()),
 }
@@ -102,12 +108,63 @@ def test_cutouts_of_stars(kind):
     np.testing.assert_allclose(found, whole, atol=allowed * abs(whole).max())
 
 
-@pytest.mark.parametrize("kind", ["turned", "scaled"])
-def test_a_window_of_a_turned_image(kind):
+@every_kind
+def test_the_matrix_of_a_camera(kind):
+    """Against stars in the middle of pixels of the sky, which no shears turn."""
+    scene = a_scene(kind)
+    q, (height, width) = scene.oversample, scene.grid
+    # What is turned does not go round.
+    inner = (6, 6, 16, 34) if scene.rotations else (0, 0, height, width)
+    places = [np.linspace(*inner[k::2], 7, endpoint=False) for k in (0, 1)]
+    rng = np.random.default_rng(5)
     for j in range(P):
-        local = LocalRotation(a_scene(kind), j, range(3, 14), range(6, 23))
-        x = noise(len(local.rows), len(local.columns))
-        assert_adjoint(local.image, local.adjoint, x, noise(*local.shape, seed=4))
+        camera, weights = Camera(scene, j), rng.random(scene.image_grid)
+        assert_adjoint(camera.forward, camera.adjoint, noise(*scene.grid), weights - 0.5)
+        is_seen = np.ones(weights.shape, bool) if scene.weights is None else scene.weights[j] > 0
+        squares = camera.squares(weights * is_seen)
+        for v, u in np.stack(places, axis=1).astype(int):
+            sky = np.zeros(scene.grid)
+            sky[v, u] = 1.0
+            star = (np.array([u, v]) - (q - 1) / 2) / q
+            (psf,) = scene.star_psfs(star[None])[j]
+            expected = psf.at(*scene.observation.places(j, star)).on_grid(scene.image_grid)
+            allowed = 1e-2 if scene.rotations else 1e-14  # shears turn no single pixel
+            difference = abs(camera.forward(sky) - expected)[is_seen]
+            assert difference.max() <= allowed * expected.max()
+            left = (1e-2 if scene.rotations else 1e-14) * squares.max()
+            assert squares[v, u] == pytest.approx((expected**2 * weights)[is_seen].sum(), abs=left)
+
+
+WINDOWS = {
+    "inside": (range(3, 14), range(6, 23)),
+    "round the edges": (range(-4, 5), range(30, 43)),
+    "an axis": (range(2, 5), range(-7, 49)),
+}
+
+
+@pytest.mark.parametrize("place", WINDOWS)
+@every_kind
+def test_a_window_of_a_camera(kind, place):
+    """Between all that reaches it, and between a part of that, and the image."""
+    scene = a_scene(kind)
+    if scene.rotations and place != "inside":
+        pytest.skip("the grid of an image that is turned is no period")
+    seen, q = WINDOWS[place], scene.oversample
+    for j in range(P):
+        camera = Camera(scene, j)
+        for sky in (None, [range(q * at.start + 2, q * at.stop + 3) for at in seen]):
+            window = camera.window(seen, sky)
+            ends = zip(window.reached, scene.grid, strict=True)
+            there = np.ix_(*(np.array(at) % n for at, n in ends))
+            x, laid = abs(noise(*scene.grid))[there], np.zeros(scene.grid)
+            assert_adjoint(window.forward, window.adjoint, x, noise(*window.shape, seed=4))
+            laid[there] = x
+            expected = camera.forward(laid)
+            for axis, at in enumerate(seen):
+                expected = expected.take(at, axis, mode="wrap")
+            # The weights that turn an image have an error of their own.
+            allowed = 2e-3 if scene.rotations else 1e-13
+            assert abs(window.forward(x) - expected).max() <= allowed * abs(expected).max()
 
 
 @every_kind
@@ -138,12 +195,12 @@ def test_the_sky_round_a_star(kind, monkeypatch):
         assert difference <= allowed * expected[is_seen].max()
 
 
-@pytest.mark.parametrize("kind", ["apart", "moved", "finer"])
+@pytest.mark.parametrize("kind", ["apart", "moved", "finer", "turned", "scaled"])
 def test_errors_of_the_pixels_of_psfs(kind):
     scene = a_scene(kind)
     psfs = scene.observation.psfs
     pixels = PsfPixels(psfs, 0.1 * abs(psfs) + 1e-4, scene.oversample)
     sky = abs(noise(*scene.grid, seed=5))
-    errors = _PixelErrors(scene, pixels, sky, np.array([40.0, 7.0]), np.zeros(psfs.shape))
+    errors = _PixelErrors(Model(scene), pixels, sky, np.array([40.0, 7.0]), np.zeros(psfs.shape))
     x, y = noise(*psfs.shape), noise(P, *scene.image_grid, seed=4)
     assert_adjoint(lambda x: list(errors.forward(x)), errors.adjoint, x, y)

@@ -145,7 +145,7 @@ def test_light_of_a_window_is_that_of_the_stars_that_reach_it(monkeypatch):
     observation = lnocl.Observation(rng.poisson(50.0, (256, 256)), make_smooth_psfs(1, (7, 8)))
     scene = Scene(observation, stars, pad=0)
     laid, add_to = [], Cutout.add_to
-    monkeypatch.setattr(Cutout, "add_to", lambda *args: [laid.append(args), add_to(*args)])
+    monkeypatch.setattr(Cutout, "add_to", lambda *args: laid.append(args) or add_to(*args))
     first, image = (10, 90), np.zeros((40, 50))
     fluxes = rng.uniform(1.0, 2.0, 60)
     add_to_window(image, Estimate(scene, np.zeros(scene.grid), fluxes), 0, first)
