@@ -35,7 +35,6 @@ from lnocl.runs.run import Run, most_bytes
 from lnocl.runs.start import Start, make_start
 from lnocl.runs.steady import run_steadily, told_prior
 from lnocl.runs.stopping import Rule, make_rule
-from lnocl.scene.freedoms import refusal
 from lnocl.scene.noise_check import warn_of_noise
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
@@ -403,8 +402,7 @@ def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) ->
     return replace(
         outcome,
         psf_refinement=prepared.refinement,
-        may_free_pixels="pixels" not in plan.families
-        and not refusal("refine_psfs", outcome.observation),
+        may_free_pixels="pixels" not in plan.families and not len(outcome.observation.star_psfs),
         plan=tuple(str(plan).splitlines()),
     )
 

@@ -12,10 +12,12 @@ from numpy.typing import ArrayLike
 from lnocl.errors import InputError, note, warn
 from lnocl.scene.arrays import Array, flag, numbers, whole
 from lnocl.scene.containers import counts
-from lnocl.scene.freedoms import refusal
 from lnocl.scene.observation import Observation
 from lnocl.scene.psf_families import FAMILIES
 from lnocl.solvers import SOLVERS
+
+# Why PSFs are not judged.
+OWN_PSFS = "stars have PSFs of their own, which tell of no other"
 
 # The iteration of La Camera et al. (2012), whatever the defaults; mu and n_iter are given too.
 PAPER: dict[str, Any] = {"solver": "sgm", "stop": None, "smoothing": 0.0, "pad": 0}
@@ -126,8 +128,8 @@ def check_families(
             raise InputError(f"`refine_psfs` {name!r} is not known; give {', '.join(FAMILIES)}")
     asked = {"refine_psfs": bool(found), "psf_scatter": len(observation.psf_scatter) > 0}
     for name in (name for name, is_asked in asked.items() if is_asked):
-        if why := refusal(name, observation):
-            raise InputError(why)
+        if len(observation.star_psfs):
+            raise InputError(f"`{name}` cannot be used where {OWN_PSFS}; leave it out")
     if found and not len(positions):
         raise InputError("`refine_psfs` needs a star, whose image shows the PSF; give stars")
     for name, needed in NEEDS.items():

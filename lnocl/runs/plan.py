@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from lnocl.errors import InputError
 from lnocl.runs.options import (
+    OWN_PSFS,
     EngineName,
     Precision,
     StopName,
@@ -20,8 +20,6 @@ from lnocl.runs.options import (
     read_start,
 )
 from lnocl.runs.start import Setup
-from lnocl.scene import freedoms
-from lnocl.scene.freedoms import Condition, refusal
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.psf_families import Family
@@ -39,6 +37,21 @@ LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
 )
 
 
+class Condition(NamedTuple):
+    """What must hold of a plan for a step.
+
+    Attributes
+    ----------
+    holds : callable
+        Tells of the plan whether it does.
+    otherwise : str
+        What is said where it does not.
+    """
+
+    holds: Callable[[Plan], bool]
+    otherwise: str
+
+
 AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number")
 HAS_STARS = Condition(lambda plan: len(plan.setup.stars) > 0, "there are no stars")
 HAS_HALOS = Condition(lambda plan: len(plan.setup.observation.halos) > 0, "there are no halos")
@@ -47,9 +60,7 @@ HAS_ERROR = Condition(
 )
 HELD_OUT = Condition(lambda plan: plan.stop == "held-out", "`stop` is another rule")
 WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into tiles")
-ALL_ONE_PSF = Condition(
-    lambda plan: freedoms.ALL_ONE_PSF.holds(plan.setup.observation), freedoms.ALL_ONE_PSF.otherwise
-)
+ALL_ONE_PSF = Condition(lambda plan: not len(plan.setup.observation.star_psfs), OWN_PSFS)
 
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
@@ -221,10 +232,7 @@ def plan(
     made = Plan(setup, mu, smoothing, int(n_iter), stop)
     is_auto = made.does(PSFS)
     families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
-    if refine_positions is True and (why := refusal("refine_positions", observation)):
-        raise InputError(why)
-    may_move = is_auto and not refusal("refine_positions", observation)
-    moves = refine_positions if may_move else refine_positions is True
+    moves = refine_positions if is_auto else refine_positions is True
     return replace(
         made,
         setup=replace(setup, refine_positions=moves is True, settles_halos=made.does(HALOS)),

@@ -11,7 +11,6 @@ from lnocl.errors import counted, warn
 from lnocl.scene.arrays import Array
 from lnocl.scene.cores import centroid, fwhm
 from lnocl.scene.detector import seen_psfs
-from lnocl.scene.freedoms import refusal
 from lnocl.scene.scene import Scene
 
 # The square in which a star is looked at reaches so many widths of its PSF from it, at least and at
@@ -165,9 +164,8 @@ def warn_of_stars(scene: Scene, moves: bool) -> None:
     farthest = max(found, key=StarCheck.excess_distance)
     if farthest.excess_distance() > 0 and not moves:
         (dx, dy), (x, y) = farthest.offset, scene.stars[farthest.star]
-        move = "" if refusal("refine_positions", scene.observation) else ", take `refine_positions`"
         warn(
             f"the star at ({x:.7g}, {y:.7g}) lies ({dx:z.2f}, {dy:z.2f}) pixels from there in "
-            f"`images[{farthest.image}]`: give its place{move}, or mend the centre of "
-            f"`psfs[{farthest.image}]`"
+            f"`images[{farthest.image}]`: give its place, take `refine_positions`, or mend the "
+            f"centre of `psfs[{farthest.image}]`"
         )

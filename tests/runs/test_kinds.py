@@ -209,7 +209,6 @@ DONE = [
 ]
 # What does not go together yet, and the message that says so.
 REFUSED = {
-    ("epochs", are_moved): "`refine_positions` cannot be used where the images are of several",
     ("PSF field", are_detected): "sources are tested with one PSF for each image",
 }
 

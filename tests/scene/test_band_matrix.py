@@ -48,6 +48,21 @@ def test_unknowns_that_nothing_tells_apart_share():
     np.testing.assert_allclose(found, 1.5, rtol=1e-3)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_unknowns_that_are_one_are_summed(seed):
+    rng = np.random.default_rng(seed)
+    m, width = 11, 3
+    owners = rng.permutation(np.append(np.arange(6), rng.integers(0, 6, m - 6)))
+    band = np.asfortranarray(rng.uniform(0.1, 1.0, (width + 1, m)))
+    band[0] += 2 * width
+    matrix = BandMatrix(band, rng.permutation(m))
+    tied, which = matrix.tied(owners), np.eye(6)[owners]
+    expected = which.T @ matrix.dense() @ which
+    np.testing.assert_allclose(tied.dense(), expected, rtol=1e-14)
+    x = rng.standard_normal(6)
+    np.testing.assert_allclose(tied.solve(x), np.linalg.solve(expected, x), rtol=1e-10)
+
+
 def test_nothing_is_unknown_and_negative_matrices_are_refused():
     assert BandMatrix(np.zeros((1, 0)), np.zeros(0, int)).solve(np.zeros(0)).shape == (0,)
     with pytest.raises(np.linalg.LinAlgError):
