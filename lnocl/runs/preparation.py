@@ -12,7 +12,7 @@ import numpy as np
 from lnocl.errors import NotFiniteError, note
 from lnocl.runs.options import StopName
 from lnocl.runs.outcome import Mended, PsfRefinement
-from lnocl.runs.plan import LEVELS, PSFS, STARS, Plan
+from lnocl.runs.plan import LEVELS, PSFS, Plan
 from lnocl.runs.progress import Progress
 from lnocl.runs.start import Setup
 from lnocl.runs.steady import STEADY, steady_penalty
@@ -81,13 +81,13 @@ def prepare(plan: Plan, progress: bool = False) -> Prepared:
 
         with quietly(), Progress(None, "", bool(progress), "fitting levels", stays=False):
             setup = settle_levels(setup)
-    mended = _judge_psfs(plan, setup, progress) if plan.judges_psfs else Mended(setup, fits=True)
+    mended = _judge_psfs(plan, setup, progress) if plan.judges_psfs else Mended(setup)
     is_auto, stop = plan.does(PSFS), plan.stop
     are_wrong = is_auto and mended.near_stars is not None and not mended.fits
     penalties = _penalties(plan, mended, are_wrong)
     if are_wrong and stop == "held-out":  # which shares their error, and chooses too little
         stop = CONVERGED
-    steady, fits = steady_penalty(penalties), plan.does(STARS) and mended.fits
+    steady, fits = steady_penalty(penalties), is_auto and mended.fits
     return Prepared(mended.setup, penalties, plan.n_iter, stop, steady, mended.refinement, fits)
 
 

@@ -176,7 +176,7 @@ class Scene:
         self.areas = (self.oversample * observation.scales) ** 2
         self.rotations = self._rotations()
         movable = partial(movable_psfs, observation=observation, grid=self.image_grid)
-        self._own = StarPsfs(observation, self.gains, movable, self.grid, self.rotations)
+        self._own = StarPsfs(observation, self.gains, movable, self.grid)
         self.weights = self._weigh(relative if has_map else None)
         self._halos = (
             halo_cutouts(observation.halos, self.weights, has_map, self.image_grid)
@@ -517,7 +517,8 @@ class Scene:
     def psf_on_sky(self, j: int, s: int) -> Cutout:
         """Return PSF j on the sky's grid, at star s."""
         if self.owned[s] >= 0:
-            fine = self._own.of_sky(self.owned[s], j)
+            rotation = self.rotations[j] if self.rotations else None
+            fine = self._own.of_sky(self.owned[s], j, rotation)
         else:
             fine = self._psfs_of_sky[j] if self.rotations else self._psfs[j].fine
         return fine.at(*on_sky(self.stars[s], self.oversample))

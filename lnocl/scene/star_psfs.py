@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -101,8 +101,6 @@ class StarPsfs:
         Returns PSFs to be placed on the images' grid, as its pixels see them.
     grid : tuple of int
         Shape (Ny, Nx) of the sky's grid.
-    rotations : sequence of Rotation
-        How each image is turned against the sky; empty where none is.
 
     Attributes
     ----------
@@ -116,9 +114,8 @@ class StarPsfs:
         gains: Array,
         movable: Callable[[Array], list[MovablePsf | DetectorPsf]],
         grid: tuple[int, int],
-        rotations: Sequence[Rotation],
     ) -> None:
-        self._grid, self._rotations = grid, rotations
+        self._grid = grid
         self._scaled = gains[:, None, None] * observation.star_psfs
         self._movable = [movable(each) for each in self._scaled]
         self.shares = observation.star_psfs.sum(axis=(2, 3))
@@ -132,10 +129,9 @@ class StarPsfs:
                 of_image[s] = psf
         return psfs
 
-    def of_sky(self, k: int, j: int) -> MovablePsf:
-        """Return PSF k of image j as the sky sees it, on the sky's grid."""
-        if not self._rotations:
+    def of_sky(self, k: int, j: int, rotation: Rotation | None) -> MovablePsf:
+        """Return PSF k of image j, which may be turned, as the sky sees it, on the sky's grid."""
+        if rotation is None:
             return self._movable[k][j].fine
-        rotation = self._rotations[j]
         turned = turned_psf(self._scaled[k, j], rotation.angle, rotation.scale)
         return MovablePsf(turned, self._grid)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from lnocl.runs.inputs import inputs_of
 from scenes import make_psfs
 
 import lnocl
-from lnocl.runs.checkpoint import inputs_of
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model, largest_window
 from lnocl.scene.scene import Scene
@@ -155,7 +155,7 @@ def test_margins_of_tiles_hold_the_psf():
 
 
 def test_a_psf_of_its_own_like_the_common_one_gives_the_flux_over_its_share():
-    """Of epochs PSFs are not judged either way; some light under the star is not the star's."""
+    """With a number for smoothing PSFs are not judged either way."""
     under = 4e3 * placed(whole(make_psfs(1, (25, 25)))[0], STAR)
     counts = np.random.default_rng(5).poisson(
         [20 + 2e4 * placed(psf, STAR) + 2e3 * placed(psf, PLANET) + under for psf in PSFS]
@@ -164,7 +164,7 @@ def test_a_psf_of_its_own_like_the_common_one_gives_the_flux_over_its_share():
     of_own = observe(**given, star_psfs=PSFS / 8)
     of_common = observe(**given, star_psfs=None, star_places=None)
     own, common = (
-        lnocl.deconvolve(obs, [STAR, PLANET], n_iter=30, refine_psfs=(), engine="numpy")
+        lnocl.deconvolve(obs, [STAR, PLANET], n_iter=30, stop=None, smoothing=0.5, engine="numpy")
         for obs in (of_own, of_common)
     )
     factors = np.array([8.0, 8.0, 1.0, 1.0])
