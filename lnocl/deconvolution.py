@@ -27,7 +27,7 @@ from lnocl.runs.options import (
     warn_of_rounding,
 )
 from lnocl.runs.outcome import Outcome
-from lnocl.runs.plan import HALOS, LEVELS, PSFS, STARS, Plan
+from lnocl.runs.plan import HALOS, LEVELS, Plan
 from lnocl.runs.plan import plan as make_plan
 from lnocl.runs.preparation import Prepared, prepare, quietly
 from lnocl.runs.progress import Progress
@@ -388,8 +388,6 @@ def deconvolve(
 def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) -> Outcome:
     """Return an outcome with what the plan has marginal, and how well PSFs fit."""
     is_fit = prepared.fits
-    if plan.does(STARS) and not plan.does(PSFS):  # as stars have PSFs of their own
-        is_fit = not any(star.is_misfit for star in outcome.star_residuals())
     if prepared.stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):
         is_fit = False  # what leaves them without an end leaves marginal fluxes without sense
     has_halos, has_levels = plan.does(HALOS), plan.does(LEVELS)
@@ -402,7 +400,7 @@ def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) ->
     return replace(
         outcome,
         psf_refinement=prepared.refinement,
-        may_free_pixels="pixels" not in plan.families and not len(outcome.observation.star_psfs),
+        may_free_pixels="pixels" not in plan.families,
         plan=tuple(str(plan).splitlines()),
     )
 

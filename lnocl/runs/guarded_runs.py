@@ -107,6 +107,9 @@ class GuardedRuns:
         window = find_window(setup.stars, shown, self._side)
         self.observation, self._first, self.held = window
         self.stars = setup.stars[self.held] - self._first
+        if len(own := self.observation.star_psfs):
+            cut = np.array([self.cut(psfs) for psfs in own])
+            self.observation = self.observation.replace(star_psfs=cut)
         # One grid for all PSFs that are tried.
         pad = choose_pad(observation) if setup.pad == "auto" else setup.pad
         self._setup = replace(

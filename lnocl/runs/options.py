@@ -16,9 +16,6 @@ from lnocl.scene.observation import Observation
 from lnocl.scene.psf_families import FAMILIES
 from lnocl.solvers import SOLVERS
 
-# Why PSFs are not judged.
-OWN_PSFS = "stars have PSFs of their own, which tell of no other"
-
 # The iteration of La Camera et al. (2012), whatever the defaults; mu and n_iter are given too.
 PAPER: dict[str, Any] = {"solver": "sgm", "stop": None, "smoothing": 0.0, "pad": 0}
 
@@ -103,14 +100,15 @@ def check_families(
 ) -> tuple[str, ...]:
     """Return the families of PSFs that may be refined.
 
-    "auto" stands for those that any star shows, or for none where not all `is_auto`.
+    `positions` are those of stars that show them. "auto" stands for those that any star shows, or
+    for none where not all `is_auto`.
 
     Raises
     ------
     InputError
-        A name is unknown, or one text is given instead of several; there is no star, or one with a
-        PSF of its own; ideal PSFs, pupils or modes are lacking; pupils differ in their apertures; a
-        shift of one image is asked for beside free positions.
+        A name is unknown, or one text is given instead of several; there is no star; ideal PSFs,
+        pupils or modes are lacking; pupils differ in their apertures; a shift of one image is asked
+        for beside free positions.
     """
     if len(observation.psf_scatter) and not len(positions):
         raise InputError(
@@ -126,10 +124,6 @@ def check_families(
     for name in found:
         if not (isinstance(name, str) and name in FAMILIES):
             raise InputError(f"`refine_psfs` {name!r} is not known; give {', '.join(FAMILIES)}")
-    asked = {"refine_psfs": bool(found), "psf_scatter": len(observation.psf_scatter) > 0}
-    for name in (name for name, is_asked in asked.items() if is_asked):
-        if len(observation.star_psfs):
-            raise InputError(f"`{name}` cannot be used where {OWN_PSFS}; leave it out")
     if found and not len(positions):
         raise InputError("`refine_psfs` needs a star, whose image shows the PSF; give stars")
     for name, needed in NEEDS.items():

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 from lnocl.runs.options import (
-    OWN_PSFS,
     EngineName,
     Precision,
     StopName,
@@ -23,7 +22,7 @@ from lnocl.runs.start import Setup
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.psf_families import Family
-from lnocl.scene.star_psfs import refuse_unowned
+from lnocl.scene.star_psfs import owned, refuse_unowned
 from lnocl.scene.stars import check_positions
 from lnocl.solvers import SolverName
 
@@ -54,18 +53,21 @@ class Condition(NamedTuple):
 
 AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number")
 HAS_STARS = Condition(lambda plan: len(plan.setup.stars) > 0, "there are no stars")
+SHOWS_PSFS = Condition(
+    lambda plan: bool((owned(plan.setup.observation, plan.setup.stars) < 0).any()),
+    "all stars have PSFs of their own",
+)
 HAS_HALOS = Condition(lambda plan: len(plan.setup.observation.halos) > 0, "there are no halos")
 HAS_ERROR = Condition(
     lambda plan: bool(plan.setup.observation.background_error.any()), "backgrounds have no error"
 )
 HELD_OUT = Condition(lambda plan: plan.stop == "held-out", "`stop` is another rule")
 WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into tiles")
-ALL_ONE_PSF = Condition(lambda plan: not len(plan.setup.observation.star_psfs), OWN_PSFS)
 
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
     LEVELS: (AUTO, HAS_ERROR, WHOLE),
-    PSFS: (AUTO, HAS_STARS, ALL_ONE_PSF),
+    PSFS: (AUTO, HAS_STARS, SHOWS_PSFS),
     HALOS: (AUTO, HAS_HALOS),
     PRIOR: (AUTO, HELD_OUT, HAS_STARS),
     CHOICE: (HELD_OUT,),
@@ -231,7 +233,8 @@ def plan(
     setup = Setup(observation, positions, pad, solver, precision, engine, device, False, *initial)
     made = Plan(setup, mu, smoothing, int(n_iter), stop)
     is_auto = made.does(PSFS)
-    families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
+    showing = positions[owned(observation, positions) < 0]
+    families = check_families(refine_psfs, observation, showing, refine_positions, is_auto)
     moves = refine_positions if is_auto else refine_positions is True
     return replace(
         made,

@@ -76,20 +76,18 @@ def quietly() -> np.errstate:
 def prepare(plan: Plan, progress: bool = False) -> Prepared:
     """Return the run of a plan, after levels are fitted and PSFs and positions judged."""
     setup = plan.setup
-    if plan.does(STARS) and not plan.does(PSFS):
-        note("PSFs are not judged, as %s", plan.why_not(PSFS))
     if plan.does(LEVELS):
         from lnocl.runs.halos import settle_levels  # which loads scipy
 
         with quietly(), Progress(None, "", bool(progress), "fitting levels", stays=False):
             setup = settle_levels(setup)
-    mended = _judge_psfs(plan, setup, progress) if plan.judges_psfs else Mended(setup)
+    mended = _judge_psfs(plan, setup, progress) if plan.judges_psfs else Mended(setup, fits=True)
     is_auto, stop = plan.does(PSFS), plan.stop
     are_wrong = is_auto and mended.near_stars is not None and not mended.fits
     penalties = _penalties(plan, mended, are_wrong)
     if are_wrong and stop == "held-out":  # which shares their error, and chooses too little
         stop = CONVERGED
-    steady, fits = steady_penalty(penalties), is_auto and mended.fits
+    steady, fits = steady_penalty(penalties), plan.does(STARS) and mended.fits
     return Prepared(mended.setup, penalties, plan.n_iter, stop, steady, mended.refinement, fits)
 
 

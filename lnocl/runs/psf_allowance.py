@@ -101,7 +101,7 @@ class Allowance:
         ny, nx = scene.observation.sky_shape
         light = np.zeros(scene.grid)
         for j in range(scene.n_images):
-            for s in np.flatnonzero(scene.shown[: scene.n_stars, j]).tolist():
+            for s in np.flatnonzero(scene.shown[:, j] & scene.through_psfs).tolist():
                 cutout = scene.psf_on_sky(j, s)
                 light[cutout.window(scene.grid)] += whole.star_fluxes[s] * cutout.values
         number = Rings((ny, nx), on_sky(scene.stars, scene.oversample), scene.oversample).number

@@ -24,7 +24,9 @@ from lnocl.scene.transforms import of_one_shape, shapes_of
 
 # What goes with PSFs, and is left out where they are cut.
 BESIDE_PSFS = tuple(
-    name for name, field in FIELDS.items() if field.axes == "psf" and name != "psfs"
+    name
+    for name, field in FIELDS.items()
+    if field.axes == "psf" and name not in ("psfs", "star_psfs")
 )
 
 

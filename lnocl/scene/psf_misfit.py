@@ -192,9 +192,8 @@ def smoothing_near_stars(
 
 
 def _of_stars(estimate: Estimate) -> Array:
-    """Return the fluxes, scaled, those of halos, which no PSF has made, being 0."""
-    is_star = np.arange(estimate.scene.n_fluxes) < estimate.scene.n_stars
-    return np.where(is_star, estimate.fluxes, 0.0)
+    """Return the fluxes, scaled, but 0 for those that the PSFs of the images do not show."""
+    return np.where(estimate.scene.through_psfs, estimate.fluxes, 0.0)
 
 
 def _kappa(excess: float, norm: float) -> float:

@@ -375,6 +375,11 @@ class Scene:
         return np.asarray(self.stars[:: self.n_epochs])
 
     @property
+    def through_psfs(self) -> NDArray[np.bool_]:
+        """Which fluxes the PSFs of the images show: not halos, nor stars with PSFs of their own."""
+        return np.append(self.owned < 0, np.zeros(self.n_halos, bool))
+
+    @property
     def n_halos(self) -> int:
         """Number of halos of all images together."""
         return self.n_fluxes - self.n_stars

@@ -170,9 +170,9 @@ class StarFit:
         steps = TRIAL_STEP * np.array([(dx, dy) for dx in (0, -1, 1) for dy in (0, -1, 1)])
         tried = np.array([self._look_round(s, stars, lights, steps) for s in range(len(stars[0]))])
         objectives, fluxes = tried.reshape(-1, self._n_epochs, len(steps), 2).transpose(3, 0, 1, 2)
-        at = np.argmin(objectives.sum(axis=1), axis=1)
-        fluxes = np.take_along_axis(fluxes, at[:, None, None], axis=2)
-        moved = stars.positions + np.repeat(steps[at], self._n_epochs, axis=0)
+        nearest = np.argmin(objectives.sum(axis=1), axis=1)
+        fluxes = np.take_along_axis(fluxes, nearest[:, None, None], axis=2)
+        moved = stars.positions + np.repeat(steps[nearest], self._n_epochs, axis=0)
         return Stars(fluxes.ravel(), moved)
 
     def _look_round(
@@ -205,7 +205,7 @@ class StarFit:
         for _ in range(MAX_STEPS):
             gradient, information = self._derivatives(trial)
             if self._n_epochs > 1:
-                gradient = np.bincount(self._owners, gradient)
+                gradient = np.asarray(np.bincount(self._owners, gradient), np.float64)
                 information = information.tied(self._owners)
             step = -information.solve(gradient)[self._owners]
             for _ in range(MAX_HALVED):

@@ -122,8 +122,8 @@ def _linearise(
 ) -> list[LinearImage]:
     """Return the images near the estimate: slopes in PSFs, all fluxes, perhaps all x, and all y.
 
-    The PSF of an image changes light as the image has it, before its pixels sample that. Halos are
-    as they are given.
+    The PSF of an image changes light as the image has it, before its pixels sample that. Halos and
+    stars with PSFs of their own are as they are given.
     """
     scene, extended, fluxes = estimate.scene, estimate.extended, estimate.fluxes
     p, k, n, q = scene.n_images, len(families.prior), len(fluxes), scene.oversample
@@ -131,13 +131,15 @@ def _linearise(
     for j, (counts, weights, diffuse) in enumerate(
         zip(scene.images(), model.weights, model.convolved(extended), strict=True)
     ):
-        shown = np.flatnonzero(scene.shown[:, j])
-        lit, halos = np.split(shown, [np.searchsorted(shown, scene.n_stars)])
-        stars = [scene.star_on_sky(j, s).on_grid(scene.grid) for s in lit]
-        fixed = [scene.star_image(j, h) for h in halos]
+        lit, others = (
+            np.flatnonzero(scene.shown[:, j] & each)
+            for each in (scene.through_psfs, ~scene.through_psfs)
+        )
+        stars = [scene.star_on_sky(j, s).on_grid(scene.grid) for s in lit.tolist()]
+        fixed = [scene.star_image(j, s) for s in others.tolist()]
         light = diffuse + sum(c * star for c, star in zip(fluxes[lit], stars, strict=True))
         still = model.background[j] + sum(
-            c * halo for c, halo in zip(fluxes[halos], fixed, strict=True)
+            c * light for c, light in zip(fluxes[others], fixed, strict=True)
         )
         total = np.maximum(sampled(light, q) + still, MIN_MODEL)
         factors, modes = families.slopes(j, scene.grid, values[j])
@@ -158,7 +160,7 @@ def _linearise(
         images.append(
             LinearImage(
                 np.array(slopes).reshape(len(slopes), -1),
-                np.concatenate([*unknowns, p * k + halos]),
+                np.concatenate([*unknowns, p * k + others]),
                 counts - total,
                 precision(scene, total, weights),
             )
@@ -175,7 +177,7 @@ def _sky(model: Model, j: int, extended: Array, fluxes: Array) -> Spectrum:
     u, v = _frequencies(scene.grid)
     places = scene.star_field.places[j]
     sky = scene.areas[j] / scene.oversample**2 * model.cameras[j].in_frame(extended)
-    for s in np.flatnonzero(scene.shown[: scene.n_stars, j]):
+    for s in np.flatnonzero(scene.shown[:, j] & scene.through_psfs):
         x, y = on_sky(places[s], scene.oversample)
         sky = sky + fluxes[s] * np.exp(-2j * np.pi * (u * x + v * y))
     return np.asarray(sky * (scene.gains[j] * pixel_spectrum(v, u, scene.observation)))
