@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from lnocl.runs.inputs import inputs_of
 from scenes import make_psfs
 
 import lnocl
+from lnocl.runs.inputs import inputs_of
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model, largest_window
 from lnocl.scene.scene import Scene
