@@ -123,8 +123,8 @@ def measure(job):
 
 def try_formula(alarms, fields=1000, n=64):
     """Print the alarms of noise of known levels."""
-    from lnocl.solvers.false_alarms import Rarity, threshold
-    from lnocl.solvers.score_map import _near, _peaks
+    from lnocl.detection.false_alarms import Rarity, threshold
+    from lnocl.detection.maxima import peaks
 
     psf = np.fft.ifftshift(psf_at(n // 2, n // 2, n))
     otf, squares = scipy.fft.rfft2(psf).conj(), (psf**2).sum()
@@ -140,9 +140,9 @@ def try_formula(alarms, fields=1000, n=64):
             values = scipy.fft.irfft2(scipy.fft.rfft2(counts) * otf, (n, n))
             values /= np.sqrt(level * squares)
             y, x = np.nonzero((values == maximum_filter(values, 3, mode="wrap")) & (values > 2))
-            peaks = _peaks(_near(values, y, x))[1]
-            gaussian = rarity(peaks, np.full(peaks.shape, skewness / np.sqrt(level)))
-            found += (gaussian > least).sum(), (peaks > least).sum()
+            highest = peaks(values, y, x, "wrap")[1]
+            gaussian = rarity(highest, np.full(highest.shape, skewness / np.sqrt(level)))
+            found += (gaussian > least).sum(), (highest > least).sum()
         corrected, plain = found / fields
         print(f"{level:g} counts: {corrected:.3f} of {alarms:g}, {plain:.3f} without correction")
 

@@ -12,13 +12,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lnocl.checkpoint import Checkpointer
 from lnocl.errors import DivergedError, NotFiniteError, note, warn
 from lnocl.result import Callback, Estimate, Iterating, Result, make_result
 from lnocl.result.verdict import warn_of_faults
-from lnocl.runs.checkpoint import Checkpointer, describe
 from lnocl.runs.halves import Halves
 from lnocl.runs.held_out import HeldOutCounts
-from lnocl.runs.held_out import most_bytes as most_bytes_of_halves
+from lnocl.runs.inputs import describe
 from lnocl.runs.options import (
     EngineName,
     Precision,
@@ -27,15 +27,14 @@ from lnocl.runs.options import (
     warn_of_rounding,
 )
 from lnocl.runs.outcome import Outcome
-from lnocl.runs.plan import FIT, HALOS, LEVELS, Plan
+from lnocl.runs.plan import HALOS, LEVELS, PSFS, STARS, Plan
 from lnocl.runs.plan import plan as make_plan
 from lnocl.runs.preparation import Prepared, prepare, quietly
 from lnocl.runs.progress import Progress
-from lnocl.runs.run import Run, most_bytes
+from lnocl.runs.run import Run
 from lnocl.runs.start import Start, make_start
 from lnocl.runs.steady import run_steadily, told_prior
 from lnocl.runs.stopping import Rule, make_rule
-from lnocl.scene.freedoms import refusal
 from lnocl.scene.noise_check import warn_of_noise
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
@@ -298,9 +297,11 @@ def deconvolve(
     ends where the objective hardly changes any more (:doc:`/validation/psf`). Where single rings
     show an error and all of them together show none, held-out counts choose λ. Where `smoothing` is
     a number, it stays as it is, scatter or not, and PSFs are judged only where `refine_psfs` names
-    families or a scatter is given. PSFs that vary over the field are not judged, nor, unless
-    families are named, those of more than 64 stars in the window. Stars whose positions are not
-    refined are taken to be where they are given.
+    families or a scatter is given. Those of more than 64 stars in the window are judged only where
+    families are named. Stars whose positions are not refined are taken to be where they are given.
+
+    Images that are turned, of several epochs or with halos are judged alike, each PSF in the frame
+    of its image. Of PSFs that vary over an image all are changed alike.
 
     **Star fluxes are marginal** where PSFs were judged and fit. What lies under a star belongs to
     it or to the extended source, and early iterations leave it to the star. So after the last
@@ -374,10 +375,10 @@ def deconvolve(
         n_iter=plan.n_iter,
         stop=prepared.stop,
     )
-    checkpoints = partial(Checkpointer, describe=inputs, path=checkpoint, resume=resume)
+    checkpointer = Checkpointer(inputs, checkpoint, resume)
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
-    outcome = reconstruct(prepared, callback, progress, checkpoints)
+    outcome = reconstruct(prepared, callback, progress, checkpointer)
     outcome = _finish(outcome, plan, prepared, progress)
     result = make_result(outcome)
     warn_of_faults(result, progress)
@@ -387,7 +388,7 @@ def deconvolve(
 def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) -> Outcome:
     """Return an outcome with what the plan has marginal, and how well PSFs fit."""
     is_fit = prepared.fits
-    if plan.does(FIT):
+    if plan.does(STARS) and not plan.does(PSFS):  # as all stars have PSFs of their own
         is_fit = not any(star.is_misfit for star in outcome.star_residuals())
     if prepared.stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):
         is_fit = False  # what leaves them without an end leaves marginal fluxes without sense
@@ -398,11 +399,10 @@ def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) ->
             outcome = outcome.marginal(is_fit, has_halos, has_levels)
     for words in outcome.levels_in_words():
         note("%s", words)
-    may_free = "pixels" not in plan.families and not refusal("refine_psfs", outcome.observation)
     return replace(
         outcome,
         psf_refinement=prepared.refinement,
-        may_free_pixels=may_free,
+        may_free_pixels="pixels" not in plan.families,
         plan=tuple(str(plan).splitlines()),
     )
 
@@ -411,7 +411,7 @@ def reconstruct(
     prepared: Prepared,
     callback: Callback | None = None,
     progress: bool = False,
-    checkpoints: Callable[[Callable[[], int]], Checkpointer] = Checkpointer,
+    checkpointer: Checkpointer | None = None,
 ) -> Outcome:
     """Return the outcome with the first penalty, or with those that held-out counts choose.
 
@@ -422,11 +422,12 @@ def reconstruct(
         of the others (`lnocl.runs.steady`); it is the outcome where held-out counts find no end.
     callback, progress
         As for `deconvolve`.
-    checkpoints : callable
-        Returns what writes checkpoints, given what returns the bytes that they may take.
+    checkpointer : Checkpointer, optional
+        Writes checkpoints, and holds the one to resume from.
     """
     setup, penalties, steady = prepared.setup, prepared.penalties, prepared.steady
     n_iter, stop = prepared.n_iter, prepared.stop
+    checkpointer = checkpointer or Checkpointer()
     if setup.engine == "opencl" and setup.precision == "single":
         warn_of_rounding(n_iter)
     with quietly():
@@ -438,9 +439,6 @@ def reconstruct(
                 start = settle_halos(start)
         warn_of_noise(setup.observation)
         warn_of_stars(start.scene, setup.refine_positions)
-        measure = most_bytes_of_halves if stop == "held-out" else most_bytes
-        largest = partial(measure, start, n_iter)
-        checkpointer = checkpoints(largest)
         told = None
         if steady is not None and start.scene.n_stars:
             told = _run_steadily(start, steady, n_iter, progress)
@@ -458,7 +456,7 @@ def reconstruct(
             return outcome if told is None else replace(told, curve=outcome.curve)
         with Progress(n_iter, "it", bool(progress), "iterations") as bar:
             run = Run(start.penalised(penalties[0]), n_iter)
-            del start, largest  # which hold arrays of the grid
+            del start  # which holds arrays of the grid
             return run.outcome(_complete(run, make_rule(stop), callback, bar, checkpointer))
 
 

@@ -205,27 +205,23 @@ def _answers(
     instead: Callable[[Task, str], Answer] | None,
 ) -> Generator[tuple[int, Answer]]:
     """Yield the place of each task and its answer, as they are done; send what was lost anew."""
-    waiting = dict(enumerate(tasks))
     shown: set[tuple[type[Warning], str]] = set()
-    n_fruitless = 0
-    while waiting:
-        n_before, suspects = len(waiting), []
+    rounds, n_fruitless = list(filter(None, [dict(enumerate(tasks))])), 0
+    while rounds:
+        waiting = rounds.pop(0)
+        n_before, is_alone = len(waiting), len(waiting) == 1
         for k, found in _round(client, make, waiting):
-            if isinstance(found, _Ended):
-                suspects.append(k)
-                continue
-            del waiting[k]
-            yield k, _pass_on(found, shown)
-        # Another task may have ended the workers that these waited for.
-        for suspect in suspects:
-            for k, found in _round(client, make, {suspect: waiting[suspect]}):
-                task = waiting.pop(k)
-                if not isinstance(found, _Ended):
-                    yield k, _pass_on(found, shown)
-                elif instead is None:
-                    raise LnoclError(f"{found.why}; see what their logs say")
-                else:
-                    yield k, instead(task, found.why)
+            task = waiting.pop(k)
+            if not isinstance(found, _Ended):
+                yield k, _pass_on(found, shown)
+            elif not is_alone:  # another task may have ended the workers that it waited for
+                rounds.append({k: task})
+            elif instead is None:
+                raise LnoclError(f"{found.why}; see what their logs say")
+            else:
+                yield k, instead(task, found.why)
+        if waiting:
+            rounds.insert(0, waiting)
         n_fruitless = n_fruitless + 1 if len(waiting) == n_before else 0
         if n_fruitless > MAX_FRUITLESS:
             raise LnoclError(

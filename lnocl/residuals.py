@@ -114,8 +114,8 @@ class StarResiduals(NamedTuple):
         In the wings, down to a thousandth of the peak.
     halo : float
         Light of the extended source that lies all round the star and falls outwards, as a share of
-        the star's flux; 0 for a star of flux 0. A PSF that is too narrow, or without wings, leaves
-        such light there.
+        what images show of the star; 0 for a star of flux 0. A PSF that is too narrow, or without
+        wings, leaves such light there.
     halo_share : float
         The same light as a share of all that lies round the star.
 
@@ -218,18 +218,19 @@ def judge_stars(estimate: Estimate) -> list[StarResiduals]:
     found, scene = [], estimate.scene
     background = [np.broadcast_to(each, scene.image_grid) for each in scene.background()]
     width = min(fwhm(psf) for psf in scene.observation.psfs) if scene.n_stars else 0.0
-    psfs = seen_psfs(scene.observation) if scene.n_stars else np.zeros((0, 0, 0))
+    psfs = [seen_psfs(scene.observation, each) for each in scene.observation.star_psfs]
+    psfs += [seen_psfs(scene.observation)] if scene.n_stars else []  # the last, of all others
     on_pixels = on_sky(scene.stars, scene.oversample)
     n = scene.n_stars
     stars = zip(scene.stars, on_pixels, estimate.star_fluxes[:n], scene.shown[:n], strict=True)
-    for position, on_pixel, flux, shown in stars:
+    for s, (position, on_pixel, flux, shown) in enumerate(stars):
         core, wings = Fit(), Fit()
         for j in np.flatnonzero(shown).tolist():
-            psf = psfs[j]
-            fits = _fits_at(estimate, background[j], j, psf, position)
+            fits = _fits_at(estimate, background[j], j, psfs[scene.owned[s]][j], position)
             core, wings = core.plus(fits[0]), wings.plus(fits[1])
         halo, light = _halo(estimate.observed_sky, on_pixel, width)
-        shares = (halo / each if each > 0 else 0.0 for each in (float(flux), light))
+        shown_flux = float(flux) * scene.share_shown(s)
+        shares = (halo / each if each > 0 else 0.0 for each in (shown_flux, light))
         found.append(StarResiduals(core, wings, *shares))
     return found
 

@@ -1,9 +1,9 @@
 """Whether there is a source at a place, and how faint one would have been found.
 
 The signal-to-noise of a source at each place follows from its score under the model without it
-(`lnocl.solvers.score`). Errors of PSFs and noise that neighbours share are part of it
-(`lnocl.solvers.score_noise`). The threshold follows from the false alarms that are allowed in the
-whole field (`lnocl.solvers.false_alarms`).
+(`lnocl.detection.score`). Errors of PSFs and noise that neighbours share are part of it
+(`lnocl.detection.score_noise`). The threshold follows from the false alarms that are allowed in the
+whole field (`lnocl.detection.false_alarms`).
 """
 
 from __future__ import annotations
@@ -16,26 +16,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lnocl.detection.point_test import point_flux
+from lnocl.detection.score import Null
+from lnocl.detection.score_map import ScoreMap
 from lnocl.errors import InputError
 from lnocl.plotting.significance import SignificanceView, draw_significance
 from lnocl.runs.outcome import Outcome
-from lnocl.scene.arrays import Array, whole
+from lnocl.scene.arrays import Array, number_in, whole
 from lnocl.scene.detector import on_sky
 from lnocl.scene.quantities import in_unit
 from lnocl.scene.texture import SHARE_NEAR
 from lnocl.solvers.halos import halo_errors
-from lnocl.solvers.point_test import point_flux
-from lnocl.solvers.score import Null
-from lnocl.solvers.score_map import ScoreMap
 
 if TYPE_CHECKING:
     from astropy.table import QTable
     from matplotlib.figure import Figure
 
-# A point is told from the extended source where it is so many errors above what that may be.
-POINT = 3.0
-# There is light round a place where the score there is so many times its noise.
-THERE = 3.0
+# A point is told from the extended source where it is so many errors above what that may be, and
+# there is light round a place where the score there is so many times its noise.
+CLEAR = 3.0
 # A source that was put in is found by a detection within so many resolutions.
 NEAR = 0.7
 # Error of a place between pixels, pixels of the sky.
@@ -95,8 +94,9 @@ class Significance:
     -----
     A source is "extended" where two things hold. There is light round it, between 0.85 and 1.65
     resolutions. And a point is fitted together with an extended source as bright as that light
-    (`lnocl.solvers.point_test`), and has less than three errors. All sources wider than a point are
-    "extended". How often noise alone raises an alarm was measured: :doc:`/validation/detections`.
+    (`lnocl.detection.point_test`), and has less than three errors. All sources wider than a point
+    are "extended". How often noise alone raises an alarm was measured:
+    :doc:`/validation/detections`.
 
     Examples
     --------
@@ -169,7 +169,7 @@ class Significance:
         (True, True)
         """
         completeness = in_unit("completeness", completeness, "")
-        check_completeness(completeness)
+        number_in("completeness", completeness, "between 0 and 1", lambda given: 0 < given < 1)
         found, outcome = self._map, self._outcome
         fluxes = np.maximum(found.needed(self._at_threshold, completeness), self._told_from_source)
         ny, nx = outcome.observation.sky_shape
@@ -271,7 +271,7 @@ class Significance:
         """
         if self._map.width:
             return np.zeros(self._map.values.shape)
-        return np.asarray(POINT * SHARE_NEAR * self._null.brightest_structure() * self._map.unit)
+        return np.asarray(CLEAR * SHARE_NEAR * self._null.brightest_structure() * self._map.unit)
 
     def contrast_curves(self, completeness: Sequence[float] | float = (0.5, 0.9, 0.95)) -> QTable:
         """Return the faintest sources that would be found, against the distance from each star.
@@ -312,9 +312,8 @@ class Significance:
         from astropy.units import electron, mag, pix
 
         shares = np.atleast_1d(in_unit("completeness", completeness, "")).tolist()
-        for each in shares:
-            check_completeness(each)
-        limits = {f"{100 * each:g}": self.limit(each) for each in shares}
+        found = [self.limit(each) for each in shares]
+        limits = {f"{100 * each:g}": limit for each, limit in zip(shares, found, strict=True)}
         observation, scene = self._outcome.observation, self._outcome.scene
         n_epochs = observation.n_epochs
         fluxes = self._outcome.mean_fluxes
@@ -338,19 +337,17 @@ class Significance:
     def _rings(self, place: Array, limits: Mapping[str, Array]) -> Iterator[tuple[float, ...]]:
         """Yield distance, share that is tested, and medians of limits of rings round a place."""
         q = self._outcome.observation.oversample
+        from scipy.ndimage import value_indices
+
         rows, columns = np.indices(self.signal_to_noise.shape)
         distance = np.hypot(rows - place[1], columns - place[0]) / q
         ring = (distance / self.resolution).astype(int)
         is_tested = np.isfinite(self.signal_to_noise)
         sizes = np.bincount(ring.ravel())
-        order = np.argsort(ring[is_tested], kind="stable")
-        numbers, first = np.unique(ring[is_tested][order], return_index=True)
-        parts = [
-            np.split(each[is_tested][order], first[1:]) for each in (distance, *limits.values())
-        ]
-        for k, (away, *values) in zip(numbers.tolist(), zip(*parts, strict=True), strict=True):
-            medians = (float(np.median(each)) for each in values)
-            yield float(away.mean()), len(away) / float(sizes[k]), *medians
+        rings = value_indices(np.where(is_tested, ring, -1), ignore_value=-1)
+        for k, there in sorted(rings.items()):
+            medians = (float(np.median(each[there])) for each in limits.values())
+            yield float(distance[there].mean()), len(there[0]) / float(sizes[k]), *medians
 
     def view(self, curves: QTable | None = None) -> SignificanceView:
         """Return what the picture of detections, and of limits with their curves, shows."""
@@ -391,8 +388,7 @@ class Significance:
 
 def significance(outcome: Outcome, width: float, false_alarms: float) -> Significance:
     """Return the sources beside the stars of a reconstruction, `lnocl.Result.significance`."""
-    check_width(width)
-    check_alarms(false_alarms)
+    check_search(width, false_alarms)
     observation = outcome.observation
     if observation.psf_fields:
         raise InputError(
@@ -428,34 +424,19 @@ def _plain(table: QTable) -> dict[str, Array]:
     return {name: np.asarray(table[name]) for name in table.colnames}
 
 
-def check_width(width: object) -> None:
-    """Refuse a width that is none.
+def check_search(width: object, false_alarms: object) -> None:
+    """Refuse a width that is none, and a number of false alarms that no threshold has.
 
     Raises
     ------
     InputError
-        It is not a finite number of 0 or more.
+        The width is not a finite number of 0 or more, or the alarms not one from 1e-200 to 10.
     """
-    if not (isinstance(width, (int, float, np.number)) and 0 <= width < math.inf):
-        raise InputError(f"`width` must be a finite number of pixels, 0 or more; {width} was given")
-
-
-def check_alarms(false_alarms: object) -> None:
-    """Refuse a number of false alarms that no threshold has.
-
-    Raises
-    ------
-    InputError
-        It is not a number from 1e-200 to 10.
-    """
-    if not (
-        isinstance(false_alarms, (int, float, np.number))
-        and FEWEST_ALARMS <= false_alarms <= MOST_ALARMS
-    ):
-        raise InputError(
-            f"`false_alarms` is the number expected in the whole field, {FEWEST_ALARMS:g} to "
-            f"{MOST_ALARMS:g}, such as 0.01; {false_alarms} was given"
-        )
+    requirement = "a finite number of pixels, 0 or more"
+    number_in("width", width, requirement, lambda given: 0 <= given < math.inf)
+    least, most = FEWEST_ALARMS, MOST_ALARMS
+    requirement = f"the number expected in the whole field, {least:g} to {most:g}, such as 0.01"
+    number_in("false_alarms", false_alarms, requirement, lambda given: least <= given <= most)
 
 
 def check_injections(n: object, seed: object) -> None:
@@ -470,21 +451,10 @@ def check_injections(n: object, seed: object) -> None:
     whole("seed", seed, 0)
 
 
-def check_completeness(completeness: object) -> None:
-    """Refuse a probability of being found that is none.
-
-    Raises
-    ------
-    InputError
-        It is not a number between 0 and 1.
-    """
-    if not (isinstance(completeness, (int, float, np.number)) and 0 < completeness < 1):
-        raise InputError(f"`completeness` lies between 0 and 1; {completeness} was given")
-
-
 def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> QTable:
     from astropy.table import QTable
     from astropy.units import electron, pix
+    from scipy.spatial import KDTree
 
     places, values, gaussian = found.maxima(least)
     scene, q = outcome.scene, outcome.observation.oversample
@@ -498,21 +468,18 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
     for i, place in enumerate(places):
         if found.width:
             kinds[i] = EXTENDED
-        elif found.light_round(place, values[i], null.resolution) > THERE:
+        elif found.light_round(place, values[i], null.resolution) > CLEAR:
             fluxes[i], errors[i] = point_flux(
                 outcome.estimate, pixels[i], fluxes[i], outcome.moves, raised
             )
-            kinds[i] = POINT_SOURCE if fluxes[i] > POINT * errors[i] else EXTENDED
+            kinds[i] = POINT_SOURCE if fluxes[i] > CLEAR * errors[i] else EXTENDED
     # Of a maximum between pixels the place errs by its noise, and by how it is interpolated.
     curvature = np.moveaxis(found.score.curvature[:, :, *at], -1, 0)
     spread = np.sqrt(np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2))[:, ::-1]
     ratio = np.maximum(found.fluxes[at] / found.errors[at], 1.0)
     moved = np.hypot(spread / ratio[:, None], INTERPOLATED) / q
     stars = scene.stars[:: outcome.observation.n_epochs]
-    nearest, distance = np.zeros(len(places), int), np.full(len(places), np.inf)
-    if len(stars) and len(places):
-        away = np.hypot(*(pixels[:, None] - stars).transpose(2, 0, 1))
-        nearest, distance = away.argmin(axis=1) + 1, away.min(axis=1)
+    distance, nearest = KDTree(stars).query(pixels)
     return QTable(
         {
             "x": pixels[:, 0] * pix,
@@ -522,7 +489,7 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
             "flux": fluxes * electron,
             "flux_error": errors * electron,
             "significance": gaussian,
-            "star": nearest,
+            "star": np.where(np.isfinite(distance), nearest + 1, 0),
             "distance": distance * pix,
             "kind": kinds,
         }

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
@@ -20,17 +21,16 @@ from lnocl.residuals import StarResiduals
 from lnocl.result import Result, make_result
 from lnocl.result.verdict import warn_of_faults
 from lnocl.runs.options import StopName, check_observation
-from lnocl.runs.outcome import CURVE_DTYPE, Outcome, PsfRefinement
+from lnocl.runs.outcome import Outcome
 from lnocl.runs.plan import Plan
 from lnocl.runs.plan import plan as make_plan
 from lnocl.runs.preparation import Prepared, prepare
 from lnocl.runs.progress import Progress
 from lnocl.scene.arrays import Array, whole
 from lnocl.scene.counts import mean_exposure, means
-from lnocl.scene.grid import length_for
+from lnocl.scene.grid import length_for, psf_shape
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import recommend_pad
-from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import EDGE, Scene
 
 # The side of a tile in those of the PSFs, where these vary: docs/validation/tiles.md.
@@ -160,16 +160,29 @@ class _Tile(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """What a tile has found: its extended source, in electrons, and what it stands for alone."""
+    """What a tile has found: the result of its window, and what it stands for alone.
 
-    extended: Array
+    Attributes
+    ----------
+    result : Result
+        Without what it would be computed from.
+    models : ndarray of float64
+        Of the images in its core.
+    flux : tuple of float
+        Of the extended source there, and its standard error, electrons.
+    stars : ndarray of float64, shape (k, 6)
+        Positions in the window, fluxes, and their errors, of its own stars.
+    at_stars : list of StarResiduals
+        How well the model fits at these.
+    messages : list of str
+        Warnings.
+    """
+
+    result: Result
     models: Array
     flux: tuple[float, float]
     stars: Array
     at_stars: list[StarResiduals]
-    history: NDArray[np.void]
-    stop_reason: str
-    device: str
     messages: list[str]
 
 
@@ -297,27 +310,25 @@ def deconvolve_tiles(
     pad = tile_pad if len(tiles) > 1 else pad
     # It goes to other processes, without the whole images.
     prepared = prepared.of(observed[0].observation, observed[0].stars, pad=pad)
-    curve, reason, chosen = np.zeros(0, CURVE_DTYPE), "", None
+    chosen = None
     if isinstance(prepared.stop, str):
-        chosen = _choose(observed, parallel, _Solver(replace(prepared, fits=False)))
-        curve, reason = chosen.held_out, chosen.stop_reason
+        chosen = _choose(observed, parallel, replace(prepared, fits=False))
         prepared = _ending(prepared, chosen)
     mosaic = _Mosaic(observation, positions, plan)
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
-        closing(work(_Solver(prepared).solving, observed, parallel)) as answers,
+        closing(work(partial(partial, _solve, prepared), observed, parallel)) as answers,
     ):
         for each, found in zip(observed, answers, strict=True):
             mosaic.add(each, found)
             bar.update()
     _warn_of_tiles(mosaic.messages)
-    n_done = chosen and chosen.n_iter
-    result = mosaic.result(prepared.penalties[0], curve, reason, n_done, prepared.refinement)
+    result = mosaic.result(chosen)
     warn_of_faults(result, progress)
     return result
 
 
-def _ending(prepared: Prepared, choice: _Choice) -> Prepared:
+def _ending(prepared: Prepared, choice: Result) -> Prepared:
     """Return the runs of all tiles after some have chosen."""
     penalty = replace(prepared.penalties[0], smoothing=choice.smoothing)
     prepared = replace(prepared, penalties=[penalty], n_iter=max(choice.n_iter, 1))
@@ -362,7 +373,7 @@ def _refuse_turned(observation: Observation) -> None:
 
 def _lay(observation: Observation, tile: int | None, pad: int) -> list[tuple[_Span, _Span]]:
     """Return the tiles of the images along y and x, row by row."""
-    sides = [-(-k // observation.oversample) for k in observation.psfs.shape[1:]]
+    sides = [-(-k // observation.oversample) for k in psf_shape(observation)]
     # An image that is shifted shows the core of a tile beside it.
     shifts = np.ceil(abs(observation.offsets).max(axis=0)).astype(int).tolist()[::-1]
     margins = [max(k // 2, 1) + shift for k, shift in zip(sides, shifts, strict=True)]
@@ -437,93 +448,70 @@ def _are_own(positions: Array, spans: tuple[_Span, _Span]) -> NDArray[np.bool_]:
     return are_own
 
 
-def _choose(
-    tiles: Sequence[_Tile],
-    parallel: Parallel,
-    solver: _Solver,
-) -> _Choice:
-    """Return the choice in the middle of those of the tiles with the brightest extended source.
+def _choose(tiles: Sequence[_Tile], parallel: Parallel, prepared: Prepared) -> Result:
+    """Return the result in the middle of those of the tiles with the brightest extended source.
 
     One tile alone may be misled: of 1024 x 1024 fields, single tiles chose 5 to 136 iterations
     where 8 was best (docs/validation/tiles.md).
     """
     brightest = sorted(tiles, key=_light)[-N_CHOOSING:]
-    with closing(work(solver.choosing, brightest, parallel)) as answers:
+    with closing(work(partial(partial, _choice, prepared), brightest, parallel)) as answers:
         choices = sorted(answers, key=lambda each: each.n_iter)
     return choices[len(choices) // 2]
 
 
-class _Choice(NamedTuple):
-    """What a tile chooses."""
-
-    n_iter: int
-    smoothing: float
-    stop_reason: str
-    held_out: NDArray[np.void]
+def _choice(prepared: Prepared, tile: _Tile) -> Result:
+    with ignored_warnings(LnoclWarning):  # the tile is done again
+        outcome = _outcome(prepared, tile.without_unseen_neighbours())
+        return _alone(make_result(outcome), extended=np.zeros(0))
 
 
-class _Solver(NamedTuple):
-    """The run that tiles share; its setup takes the observation and the stars of each."""
+def _alone(result: Result, **changes: Any) -> Result:
+    """Return a result without what it is computed from, to go from process to process."""
+    return replace(result, _findings=cast(Any, None), **changes)
 
-    prepared: Prepared
 
-    def choosing(self) -> Callable[[_Tile], _Choice]:
-        """Return the function that has a tile choose iterations and smoothing."""
-        return self._choose
+def _outcome(prepared: Prepared, tile: _Tile) -> Outcome:
+    prepared = prepared.of(tile.observation, tile.stars).penalised(near_stars=tile.near_stars)
+    outcome = reconstruct(prepared)
+    if prepared.fits and len(tile.stars):
+        outcome = outcome.marginal(stars=True, halos=False, levels=False)
+    return replace(outcome, psf_refinement=prepared.refinement)
 
-    def solving(self) -> Callable[[_Tile], _Found]:
-        """Return the function that reconstructs a tile."""
-        return self._solve
 
-    def _choose(self, tile: _Tile) -> _Choice:
-        with ignored_warnings(LnoclWarning):  # the tile is done again
-            result = make_result(self._outcome(tile.without_unseen_neighbours()))
-        return _Choice(result.n_iter, result.smoothing, result.stop_reason, result.held_out)
+def _solve(prepared: Prepared, tile: _Tile) -> _Found:
+    from lnocl.solvers.light import Light  # which loads scipy
 
-    def _outcome(self, tile: _Tile) -> Outcome:
-        prepared = self.prepared.of(tile.observation, tile.stars)
-        prepared = prepared.penalised(near_stars=tile.near_stars)
-        outcome = reconstruct(prepared)
-        if prepared.fits and len(tile.stars):
-            outcome = outcome.marginal(stars=True, halos=False, levels=False)
-        return replace(outcome, psf_refinement=prepared.refinement)
-
-    def _solve(self, tile: _Tile) -> _Found:
-        tile = tile.without_unseen_neighbours()
-        begins = "tile that begins at pixel ({1}, {0}), where positions there begin".format(
-            *(span.window.start for span in tile.spans)
-        )
-        with recorded_warnings() as recorded:
-            try:
-                outcome = self._outcome(tile)
-            except InputError as error:
-                raise InputError(f"{begins}: {error.message}") from error
-            errors = outcome.star_errors()
-        from lnocl.solvers.light import Light  # which loads scipy
-
-        result, q = make_result(outcome), tile.observation.oversample
-        rows, columns = (
-            slice(span.core.start - span.window.start, span.core.stop - span.window.start)
-            for span in tile.spans
-        )
-        within = np.zeros(result.extended.shape)
-        within[q * rows.start : q * rows.stop, q * columns.start : q * columns.stop] = 1.0
-        at_stars = result.star_residuals()
-        return _Found(
-            result.extended,
-            result.models()[:, rows, columns],
-            Light(outcome.estimate).flux(within, errors[0]),
-            np.column_stack([result.star_positions, result.star_fluxes, *errors])[tile.own],
-            [at_stars[s] for s in tile.own],
-            result.history,
-            result.stop_reason,
-            result.device,
-            [
-                f"{begins}: {getattr(each.message, 'message', each.message)}"
-                for each in recorded
-                if issubclass(each.category, LnoclWarning)
-            ],
-        )
+    tile = tile.without_unseen_neighbours()
+    begins = "tile that begins at pixel ({1}, {0}), where positions there begin".format(
+        *(span.window.start for span in tile.spans)
+    )
+    with recorded_warnings() as recorded:
+        try:
+            outcome = _outcome(prepared, tile)
+        except InputError as error:
+            raise InputError(f"{begins}: {error.message}") from error
+        errors = outcome.star_errors()
+    result, q = make_result(outcome), tile.observation.oversample
+    rows, columns = (
+        slice(span.core.start - span.window.start, span.core.stop - span.window.start)
+        for span in tile.spans
+    )
+    within = np.zeros(result.extended.shape)
+    within[q * rows.start : q * rows.stop, q * columns.start : q * columns.stop] = 1.0
+    at_stars = result.star_residuals()
+    return _Found(
+        _alone(result),
+        result.models()[:, rows, columns],
+        Light(outcome.estimate).flux(within, errors[0]),
+        np.column_stack([result.star_positions, result.star_fluxes, *errors])[tile.own],
+        [at_stars[s] for s in tile.own],
+        [
+            f"{begins}: {getattr(each.message, 'message', each.message)}"
+            for each in recorded
+            if issubclass(each.category, LnoclWarning)
+        ],
+    )
 
 
 def _light(tile: _Tile) -> float:
@@ -536,7 +524,7 @@ def _light(tile: _Tile) -> float:
     level = observation.background
     level = level if level.ndim == 3 else level[:, None, None]
     light = np.where(observation.mask, 0.0, observation.images - level)
-    reach = max(observation.psfs.shape[1:]) / (2.0 * q)
+    reach = max(psf_shape(observation)) / (2.0 * q)
     rows, columns = (np.arange(n) for n in observation.shape)
     for image, offset in zip(light, observation.offsets, strict=True):
         for x, y in tile.stars + offset:
@@ -559,7 +547,8 @@ class _Mosaic:
         self._stars = np.full((n_stars, 6), np.nan)
         self._at_stars: list[StarResiduals | None] = [None] * n_stars
         self._tiles: list[tuple[Any, ...]] = []
-        self._found: list[_Found] = []
+        self._results: list[Result] = []
+        self._fluxes: list[tuple[float, float]] = []
         self.messages: list[str] = []
 
     def add(self, tile: _Tile, found: _Found) -> None:
@@ -568,55 +557,42 @@ class _Mosaic:
         y, x = tile.spans
         weights = np.multiply.outer(y.weights(q), x.weights(q))
         there = tuple(slice(q * s.window.start, q * s.window.stop) for s in tile.spans)
-        self._extended[there] += weights * found.extended
+        self._extended[there] += weights * found.result.extended
         self._weight[there] += weights
         self._models[:, y.core.start : y.core.stop, x.core.start : x.core.stop] = found.models
-        self._tiles.append(
-            (x.core.start, y.core.start, len(x.core), len(y.core), len(found.history) - 1,
-             found.history["objective"][-1])
-        )  # fmt: skip
+        last = found.result.history[-1]
+        self._tiles.append((x.core.start, y.core.start, len(x.core), len(y.core), *last))
         self.messages += found.messages
         self._stars[tile.numbers] = found.stars
         self._stars[tile.numbers, :2] += x.window.start, y.window.start
         for s, at_star in zip(tile.numbers, found.at_stars, strict=True):
             self._at_stars[s] = at_star
-        self._found.append(found._replace(extended=np.zeros(0), models=np.zeros(0)))
+        self._results.append(replace(found.result, extended=np.zeros(0)))
+        self._fluxes.append(found.flux)
 
-    def result(
-        self,
-        penalty: Penalty,
-        curve: NDArray[np.void],
-        reason: str,
-        n_iter: int | None,
-        refinement: PsfRefinement | None,
-    ) -> TiledResult:
-        """Return it all."""
-        longest = max(self._found, key=lambda each: len(each.history))
+    def result(self, chosen: Result | None) -> TiledResult:
+        """Return it all, with the choice that was made for all tiles."""
+        longest = max(self._results, key=lambda each: each.n_iter)
         history = longest.history.copy()
         history["objective"] = 0.0
-        for found in self._found:
-            objective = found.history["objective"]
+        for each in self._results:
+            objective = each.history["objective"]
             history["objective"][: len(objective)] += objective
             history["objective"][len(objective) :] += objective[-1]
         extended = np.divide(
             self._extended, self._weight, out=self._extended, where=self._weight > 0
         )
-        return TiledResult(
-            extended=extended,
-            star_fluxes=self._stars[:, 2],
-            star_positions=self._stars[:, :2],
-            n_iter=len(history) - 1 if n_iter is None else n_iter,
-            stop_reason=reason or longest.stop_reason,
-            device=longest.device,
-            history=history,
-            mu=penalty.mu,
-            smoothing=penalty.smoothing,
-            held_out=curve,
-            psf_refinement=refinement,
-            halo_fluxes=self.of_halos(np.zeros(0)),
-            _findings=self,
-            tiles=np.array(self._tiles, TILE_DTYPE),
-        )
+        choice = chosen or longest
+        same = {name: getattr(choice, name) for name in ("n_iter", "stop_reason", "held_out")}
+        found = {
+            "extended": extended,
+            "star_fluxes": self._stars[:, 2],
+            "star_positions": self._stars[:, :2],
+            "history": history,
+            "_findings": self,
+            "tiles": np.array(self._tiles, TILE_DTYPE),
+        }
+        return TiledResult(**vars(longest) | same | found)
 
     def models(self) -> Iterator[Array]:
         """Yield the models of the images."""
@@ -632,7 +608,7 @@ class _Mosaic:
 
     def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
         """Return the light of the extended source and its standard error, electrons."""
-        fluxes, errors = zip(*(found.flux for found in self._found), strict=True)
+        fluxes, errors = zip(*self._fluxes, strict=True)
         # The level of an image is wrong in all its tiles alike.
         exposure = means(self.observation.exposure, self.observation.mask)
         error = float(np.linalg.norm(self.observation.background_error)) / float(exposure.sum())

@@ -13,10 +13,10 @@ from astropy.table import Table
 from scenes import make_psfs
 from wcs_headers import PHYSICAL, SIP
 
+from lnocl import checkpoint
 from lnocl.io import fitsread, fitswrite, saved_results, sky
 from lnocl.io.calibration import Calibration
 from lnocl.io.frames import read_frames
-from lnocl.runs import checkpoint
 from lnocl.simulation import load_target
 from lnocl.studies import figures
 

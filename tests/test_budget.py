@@ -13,13 +13,12 @@ import pytest
 from test_layers import MODULES, PACKAGE, imports
 
 # Lines of code of the package and of its core, rounded up to tens; less code lowers them.
-BUDGET = {"package": 24_040, "core": 11_780}
+BUDGET = {"package": 23_850, "core": 10_910}
 CORE = "scene", "engines", "opencl", "reference", "solvers", "runs"
 # What the core is not to know, nor the rooms round it.
 OUTSIDE = "astropy.io", "matplotlib", "dask", "distributed"
-ROOMS_OUTSIDE = "io", "plotting", "commands", "psf", "simulation", "verify", "studies", "result"
-# Modules of the core that know it still.
-STILL = {"runs.checkpoint"}
+ROOMS_OUTSIDE = {"io", "plotting", "commands", "detection", "psf", "simulation", "verify"}
+ROOMS_OUTSIDE |= {"studies", "result"}
 SKIPPED = {
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE),
     *(tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER),
@@ -60,4 +59,4 @@ def test_the_core_knows_neither_files_nor_pictures_nor_clusters():
         for name in imports(module)
         if any(f"{name}.".startswith(f"{each}.") for each in outside)
     }
-    assert knowing == STILL
+    assert not knowing

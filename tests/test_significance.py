@@ -8,11 +8,11 @@ import pytest
 from scipy import ndimage
 
 import lnocl
+from lnocl.detection.point_test import point_flux
 from lnocl.errors import InputError
 from lnocl.process import ignored_warnings
 from lnocl.runs.injections import Injections, spread_places
 from lnocl.significance import significance
-from lnocl.solvers.point_test import point_flux
 
 ROWS, COLUMNS = np.indices((33, 33)) - 16
 RADIUS = np.hypot(ROWS, COLUMNS)
@@ -293,10 +293,16 @@ def test_a_star_without_light_has_no_curve_in_the_picture():
         (lambda r: r.significance(false_alarms=0), "1e-200 to 10, such as 0.01; 0 was"),
         (lambda r: r.significance(false_alarms=11), "1e-200 to 10"),
         (lambda r: r.significance(false_alarms=5e-324), "1e-200 to 10"),
-        (lambda r: r.significance().contrast_curves(None), "completeness lies between 0 and 1; N"),
-        (lambda r: r.significance().contrast_curves("ab"), "completeness lies between 0 and 1; a"),
-        (lambda r: r.significance().contrast_curves([[0.5]]), "completeness lies between 0 and"),
-        (lambda r: r.significance().limit(1.0), "completeness lies between 0 and 1; 1.0"),
+        (
+            lambda r: r.significance().contrast_curves(None),
+            "completeness must be between 0 and 1; ",
+        ),
+        (
+            lambda r: r.significance().contrast_curves("ab"),
+            "completeness must be between 0 and 1; ",
+        ),
+        (lambda r: r.significance().contrast_curves([[0.5]]), "completeness must be between 0 and"),
+        (lambda r: r.significance().limit(1.0), "completeness must be between 0 and 1; 1.0"),
         (lambda r: r.significance().inject(0), "injections must be a whole number, 1 or more"),
         (lambda r: r.significance().inject(3, 0.5, -1), "seed must be a whole number"),
     ],

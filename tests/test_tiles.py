@@ -194,17 +194,6 @@ def test_fields_are_part_of_what_a_checkpoint_is_of(tmp_path):
     lnocl.deconvolve(lnocl.Observation(image, make_field()), resume=path, **run)
 
 
-@pytest.mark.parametrize(
-    "more", [{"refine_psfs": ["jitter"]}, {"psf_scatter": np.full((21, 21), 1e-4)}]
-)
-def test_psfs_that_vary_are_not_refined(more):
-    scatter = {name: more[name] for name in more if name == "psf_scatter"}
-    refine = {name: more[name] for name in more if name == "refine_psfs"}
-    observation = lnocl.Observation(make_sky(), make_field(), **scatter)
-    with pytest.raises(InputError, match=f"{next(iter(more))} cannot be used where PSFs vary"):
-        lnocl.deconvolve(observation, [(5, 5)], **refine, **RUN)
-
-
 # --- Tiles
 
 
@@ -580,8 +569,9 @@ def test_a_grid_of_psfs_is_taken_tile_by_tile(tmp_path, monkeypatch, capsys):
     varied = lnocl.Observation(observation.images, PsfField(psfs, nodes), background=5.0)
     expected = lnocl.deconvolve_tiles(varied, stars, tile=80, pad=4, n_iter=5, **RUN)
     found = outcome("out.fits")
-    np.testing.assert_allclose(found["PRIMARY"], expected.extended, rtol=1e-5)
-    np.testing.assert_allclose(found["STARS"]["flux"], expected.star_fluxes, rtol=1e-9)
+    # The PSFs differ by 1e-16, and refined from there by 1e-6.
+    np.testing.assert_allclose(found["PRIMARY"], expected.extended, rtol=1e-3)
+    np.testing.assert_allclose(found["STARS"]["flux"], expected.star_fluxes, rtol=1e-5)
     assert cli.main([*words, "--overwrite", "--pad", "4"]) == 0  # without being told
 
 

@@ -4,13 +4,14 @@
 
 The files of the folder naco-betapic are those of rolls.py, and fetch.py fetches them: 61 frames of
 beta Pictoris (NaCo, L'; Absil et al. 2013), their parallactic angles and the PSF. Here no planet is
-given. The background of each frame is a model of the halo, as there, made once from all frames. A
-planet is partly in it, so that only a share of its light is left, its throughput.
+given, so that no place can be left out of what the star's PSF is made of. The background of each
+frame is the mean of all frames and five principal components, in four rings. A planet is partly in
+it, so that only a share of its light is left, its throughput.
 
-First it is asked what the frames show. Then beta Pictoris b is taken out, with the flux that
-rolls.py finds. Planets that are put into the raw frames, before the background is made, give the
-throughput. Limits over throughput are contrasts, and those of VIP stand beside them. In the end
-planets of the fluxes of these limits are put in, and those found are counted.
+First it is asked what the frames show. Then beta Pictoris b is taken out, with a flux found so.
+Planets that are put into the raw frames, before the background is made, give the throughput.
+Limits over throughput are contrasts, and those of VIP stand beside them. In the end planets of the
+fluxes of these limits are put in, and those found are counted.
 
 The threshold is 5. Contrasts are those of sources five standard deviations of their ring bright, as
 measured without b. Rings near the star have few resolutions. Contrasts are therefore raised, as
@@ -36,10 +37,10 @@ from lnocl.psf.make import make_psf
 
 SHARED = Path(__file__).parents[3] / "shared/data"
 
-# As in rolls.py, where they are explained.
+# As in rolls.py, where they are explained, but for rings and components of the background.
 CENTRE, GAIN, GROUP, RINGS, COMPONENTS, FWHM = 51.0, 10.0, 2.0, (8, 16, 24, 34, 99), 5, 4.6
 APERTURE, STAR = 1.227, 764939.6
-PLANET, FLUX = (16.583, 44.721), 634.4  # the flux that rolls.py finds, VIP's unit
+PLANET, FLUX = (16.583, 44.721), 634.4  # flux by such a background, VIP's unit
 
 EDGE = 46  # no planet is farther from the star, pixels
 ALARMS = 0.0485  # false alarms that make the threshold 5

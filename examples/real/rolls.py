@@ -6,19 +6,18 @@ The files of the folder naco-betapic are 61 frames of beta Pictoris behind a vor
 (NaCo, L'; Absil et al. 2013), their parallactic angles and the PSF beside the coronagraph; fetch.py
 fetches them. The field turns by 81 degrees.
 
-The halo of the star hardly turns, and its speckles vary. So the background of each frame is the
-mean of all frames and five principal components, in four rings. A planet is in these too. Its first
-flux is far too low, and it is then taken out of the frames that the background is made of: flux
-found and flux taken out agree in the end, by the secant method. What the first fit finds of a
-planet, its throughput, also divides its error.
+The star behind the mask has PSFs of its own, and the planet that beside the mask. Those of the star
+are made of the frames: each is the mean and the principal components of the others in which the
+field is turned so far that the planet is elsewhere, as they fit a ring without the planet's place.
+What is found of the planet is taken out of the frames that they are made of, until both agree. So
+the flux is that of the fit: nothing is corrected for what a planet loses to the star.
 
 The noise of neighbouring pixels is correlated. Read noise is therefore that of a pixel, times the
-scatter of fluxes at empty places of the same radius over their formal error.
+scatter of fluxes at empty places of the same radius, found alike, over their formal error.
 """
 
 import sys
 import warnings
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +30,12 @@ FOLDER = Path(__file__).parents[3] / "shared/data/naco-betapic"
 CENTRE = 51.0  # x and y of the dark hole behind which the star is, the same in all frames to 0.06
 GAIN = 10.0  # makes the noise of counts small beside that of speckles
 GROUP = 2.0  # degrees; frames within are averaged
-RINGS = (8, 16, 24, 34, 99)
-COMPONENTS = 5
+INNER, OUTER = 8, 47  # pixels; what is nearer or farther is masked
+RING = 10  # of so many pixels on each side of the planet the star's PSF is fitted
+COMPONENTS = 15
 FWHM = 4.6
-ROUNDS = 4
+APART, NEAR = 0.7, 1.2  # FWHM that a planet has moved, and round its place that is left out
+ROUNDS = 8
 
 # VIP's unit of flux is the light within one FWHM. Its tutorials have 1.227 counts of the PSF there
 # and 764939.6 of the star; they take beta Pictoris b out at this place (r, theta) with flux 700. A
@@ -58,7 +59,6 @@ psf /= psf.sum()
 n = cube.shape[-1]
 rows, columns = np.indices((n, n))
 radius = np.hypot(rows - CENTRE, columns - CENTRE)
-mask = (radius < RINGS[0]) | (radius > 47)
 group = ((angles - angles.min()) // GROUP).astype(int)
 groups = [np.flatnonzero(group == i) for i in np.unique(group)]
 grouped_angles = np.array([angles[i].mean() for i in groups])
@@ -74,93 +74,113 @@ def place(r, theta):
     return CENTRE + r * np.cos(np.radians(theta)), CENTRE + r * np.sin(np.radians(theta))
 
 
-def planet(position, of_angles):
-    """Return images of a planet of flux 1: the sky is turned by minus the parallactic angle."""
+def planet(position, sign=-1):
+    """Return images of a planet of flux 1, and its places: the sky turns as angles fall."""
     side = psf.shape[0] + 2
     wide, half = np.pad(psf, 1), side // 2
-    images = np.zeros((len(of_angles), n + 2 * side, n + 2 * side))
-    places = lnocl.rotations(-of_angles, (CENTRE, CENTRE)) @ (*position, 1)
+    images = np.zeros((len(angles), n + 2 * side, n + 2 * side))
+    places = lnocl.rotations(sign * angles, (CENTRE, CENTRE)) @ (*position, 1)
     for image, (x, y) in zip(images, places, strict=True):
         row, column = round(y), round(x)
         window = image[row + side - half :, column + side - half :]
         window[:side, :side] = shift(wide, (y - row, x - column))
-    return images[:, side:-side, side:-side]
+    return grouped(images[:, side:-side, side:-side]), grouped(places)
 
 
-def halo(frames):
-    """Return mean and principal components of frames, ring by ring."""
-    model = np.repeat(frames.mean(axis=0)[None], len(frames), axis=0)
-    for inner, outer in pairwise(RINGS):
-        ring = (radius >= inner) & (radius < outer)
-        varying = frames[:, ring] - model[:, ring]
-        vectors = np.linalg.eigh(varying @ varying.T)[1][:, -COMPONENTS:]
-        model[:, ring] += vectors @ (vectors.T @ varying)
-    return model
+def ring_of(r):
+    """Return the pixels in which a planet at a radius is fitted."""
+    return (radius > max(INNER, r - RING)) & (radius < min(OUTER, r + RING))
 
 
-def pixel_noise(left):
+def star_light(images, places, r):
+    """Return the light of the star in the ring of each image, of the others."""
+    ring = ring_of(r)
+    pixels, light = images[:, ring], np.zeros_like(images)
+    x, y = columns[ring], rows[ring]
+    for j, place in enumerate(places):
+        away = 2 * r * np.sin(np.radians(abs(grouped_angles - grouped_angles[j])) / 2)
+        others = pixels[away > APART * FWHM]
+        mean = others.mean(axis=0)
+        vectors = np.linalg.eigh((others - mean) @ (others - mean).T)[1][:, -COMPONENTS:]
+        parts = np.vstack([mean, vectors.T @ (others - mean)])
+        is_far = np.hypot(x - place[0], y - place[1]) > NEAR * FWHM
+        far = parts[:, is_far]
+        light[j, ring] = np.linalg.solve(far @ far.T, far @ pixels[j, is_far]) @ parts
+    return light
+
+
+def least_squares(images, source, places, r, flux=0.0, rounds=ROUNDS):
+    """Return the flux of a planet by least squares, and what the images have beside the star."""
+    ring = ring_of(r)
+    for _ in range(rounds):
+        left = images - star_light(images - flux * source, places, r)
+        flux = (source * left)[:, ring].sum() / (source[:, ring] ** 2).sum()
+    return flux, left
+
+
+def pixel_noise(left, ring):
     """Return the noise of a pixel by its radius, robust against what stands out."""
-    at = np.arange(RINGS[0], 48)
-    rings = [left[:, abs(radius - r) < 2] for r in at]
+    at = np.arange(radius[ring].min(), radius[ring].max())
+    rings = [left[:, ring & (abs(radius - r) < 2)] for r in at]
     return np.interp(radius, at, [1.4826 * np.median(abs(each)) for each in rings])
 
 
-def empty_places(r, theta):
-    """Return images of planets on a circle, a FWHM apart, two FWHM from one place."""
-    step = np.degrees(FWHM / r)
-    others = np.arange(theta + 2 * step, theta + 360 - 2 * step, step)
-    return [planet(place(r, each), grouped_angles) for each in others]
+def scatter(images, r, theta, noise):
+    """Return the scatter of fluxes at empty places on a circle over their formal error."""
+    step, ring, in_errors = np.degrees(FWHM / r), ring_of(r), []
+    for each in np.arange(theta + 2 * step, theta + 360 - 2 * step, step):
+        source, places = planet(place(r, each))
+        flux, _ = least_squares(images, source, places, r)
+        error = np.sqrt((source**2 * noise**2)[:, ring].sum()) / (source[:, ring] ** 2).sum()
+        in_errors.append(flux / error)
+    return np.sqrt(np.mean(np.square(in_errors)))
 
 
-def fit(frames, r, theta, sign=-1):
-    """Return flux, error, throughput and the flux of the first fit of a planet at a place."""
-    position, empty = place(r, theta), empty_places(r, theta)
-    images, own = grouped(frames), planet(position, angles)
+def fit(images, r, theta, sign=-1):
+    """Return the flux of a planet and its error, and that of the star, all in counts."""
+    position, ring = place(r, theta), ring_of(r)
+    source, places = planet(position, sign)
+    flux, left = least_squares(images, source, places, r)
+    noise = pixel_noise(left - flux * source, ring)
+    noise = noise * scatter(images - flux * source, r, theta, noise)
     transforms = lnocl.rotations(sign * grouped_angles, (CENTRE, CENTRE))
-    flux = first = 0.0
-    throughput = 0.3
-    for i in range(ROUNDS):
-        without = frames - flux * own
-        background = grouped(halo(without))
-        left = grouped(without) - background
-        noise = pixel_noise(left)
-        weight = np.where(mask, 0.0, noise**-2)
-        in_errors = [(p * left * weight).sum() / np.sqrt((p**2 * weight).sum()) for p in empty]
-        noise = noise * np.sqrt(np.mean(np.square(in_errors)))
+    for _ in range(ROUNDS):
+        light = star_light(images - flux * source, places, r)
+        # The centre of the star's PSF is the pixel of the star; its flux is that beside the mask.
+        star_psfs = np.pad(light, ((0, 0), (0, 2), (0, 2))) / (STAR / unit)
         # The counts have noise of their own, which read noise need not have.
-        background = GAIN * background.clip(0)
-        read_noise = np.sqrt(((GAIN * noise) ** 2 - background).clip(1))
+        read_noise = np.sqrt(((GAIN * noise) ** 2 - GAIN * images.clip(0)).clip(1))
         with warnings.catch_warnings():
             # A pixel's noise is below the read noise given, as that is meant for a whole planet.
-            warnings.filterwarnings("ignore", "the (noise|background) of image")
+            warnings.filterwarnings("ignore", "the (noise|background|residuals)")
             observation = lnocl.Observation(
-                GAIN * images, psf, background=background, read_noise=read_noise, mask=mask,
-                transforms=transforms,
+                GAIN * images, psf, read_noise=read_noise, mask=~ring, transforms=transforms,
+                star_psfs=star_psfs, star_places=(CENTRE, CENTRE),
             )  # fmt: skip
-            result = lnocl.deconvolve(observation, [position], stop=None, n_iter=20)
-        found = result.star_fluxes[0] / GAIN
-        if i == 0:
-            first = found
-        elif flux > 0:
-            throughput = np.clip(1 - (found - first) / flux, 0.03, 1.0)
-        flux = max(flux + (found - flux) / throughput, 0.0)
-    return flux, result.star_flux_errors[0] / GAIN / throughput, throughput, first
+            result = lnocl.deconvolve(
+                observation, [(CENTRE, CENTRE), position], stop=None, n_iter=20
+            )
+        found, flux = flux, result.star_fluxes[1] / GAIN
+        if abs(flux - found) < 0.01 * result.star_flux_errors[1] / GAIN:
+            break
+    return flux, result.star_flux_errors[1] / GAIN, result.star_fluxes[0] / GAIN
 
 
-flux, error, throughput, first = fit(cube, *PLANET)
+images = grouped(cube)
+flux, error, star = fit(images, *PLANET)
 print(
     f"beta Pictoris b: flux {flux * unit:.0f} +- {error * unit:.0f} (elsewhere: 648 and 700), "
-    f"{-2.5 * np.log10(flux * unit / STAR):.2f} mag; first fit {first * unit:.0f}, "
-    f"throughput {throughput:.2f}"
+    f"{-2.5 * np.log10(flux / star):.2f} mag; star {star * unit:.0f}",
+    flush=True,
 )
-wrong = fit(cube, *PLANET, sign=1)[3]
-print(f"the same, turned the wrong way: first fit {wrong * unit:.0f}")
-cube -= flux * planet(place(*PLANET), angles)
+wrong, error, _ = fit(images, *PLANET, sign=1)
+print(f"the same, turned the wrong way: {wrong * unit:.0f} +- {error * unit:.0f}")
+images -= flux * planet(place(*PLANET))[0]
 for r, theta, truth in PUT_IN:
-    frames = cube + truth / unit * planet(place(r, theta), angles)
-    flux, error, throughput, first = (x * unit for x in fit(frames, r, theta))
+    put_in = images + truth / unit * planet(place(r, theta))[0]
+    flux, error, _ = (x * unit for x in fit(put_in, r, theta))
     print(
         f"r {r} theta {theta}: flux {flux:.0f} +- {error:.0f} of {truth}, ratio "
-        f"{flux / truth:.2f}, {(flux - truth) / error:+.1f} errors; first fit "
-        f"{first / truth:.2f}, throughput {throughput / unit:.2f}"
+        f"{flux / truth:.2f}, {(flux - truth) / error:+.1f} errors",
+        flush=True,
     )

@@ -280,19 +280,14 @@ def _run(arguments: argparse.Namespace) -> None:
             for each, record in zip(own, before, strict=True)
             if record.status != DONE and (record.status != FAILED or record.process)
         ]
-    written = time.monotonic()
-    try:
-        with Progress(len(due), "target", not arguments.quiet) as bar:
-            for record in _records(folder, due, start, arguments.parallel):
-                bar.update(words=f"{record.name} {record.status}")
-                if time.monotonic() - written > messages.WRITE_EVERY:
-                    _write_summary(folder, targets, start)
-                    written = time.monotonic()
-    except BaseException:
-        with contextlib.suppress(Exception):  # a library may have been cut short while it loaded
-            _write_summary(folder, targets, start)
-        raise
-    summary = _write_summary(folder, targets, start)
+    with (
+        running.written_as_done(partial(_write_summary, folder, targets, start)) as write_where_due,
+        Progress(len(due), "target", not arguments.quiet) as bar,
+    ):
+        for record in _records(folder, due, start, arguments.parallel):
+            bar.update(words=f"{record.name} {record.status}")
+            write_where_due()
+    summary = _summary(folder, targets, start)
     if not arguments.quiet:
         messages.say(_summarise(summary, n_old, folder))
     if arguments.plot is not None:
@@ -340,19 +335,20 @@ def _records(
         yield from records
 
 
-def _write_summary(folder: Folder, targets: Sequence[Target], start: str) -> Table:
-    """Write what became of all targets, those of other processes too, and return it."""
+def _summary(folder: Folder, targets: Sequence[Target], start: str) -> Table:
+    """Return what became of all targets, those of other processes too."""
     from astropy.table import Table
-
-    from lnocl.io.atomic import write_text
 
     records = [folder.state(each, start) for each in targets]
     summary = Table([dataclasses.asdict(each) for each in records])
     summary["seconds"].unit = "s"
-    text = io.StringIO()
-    summary.write(text, format="ascii.ecsv")
-    write_text(os.path.join(folder.path, SUMMARY), text.getvalue(), overwrite=True)
     return summary
+
+
+def _write_summary(folder: Folder, targets: Sequence[Target], start: str) -> None:
+    from lnocl.io.tables import write_table
+
+    write_table(_summary(folder, targets, start), folder.file(SUMMARY, ""), "targets", True)
 
 
 def _summarise(summary: Table, n_old: int, folder: Folder) -> list[str]:

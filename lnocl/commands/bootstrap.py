@@ -6,13 +6,13 @@ import argparse
 import contextlib
 import dataclasses
 import re
-import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lnocl.commands.messages import MAX_LISTED, WRITE_EVERY
+from lnocl.commands.messages import MAX_LISTED
+from lnocl.commands.running import written_as_done
 from lnocl.errors import FileError, InputError
 from lnocl.scene.apertures import Aperture
 
@@ -54,14 +54,10 @@ def add_errors(
 
     seed, frames = arguments.seed, again.frames
     latest: list[Bootstrap] = []
-    written = time.monotonic()
 
-    def look(found: Bootstrap) -> None:
-        nonlocal written
-        latest[:] = [found]
-        if time.monotonic() - written > WRITE_EVERY:
+    def write() -> None:
+        for found in latest:
             _write(again, found, parts, before)
-            written = time.monotonic()
 
     expected = without_replicas(outcome, parts, seed)
     before = earlier = None
@@ -70,20 +66,14 @@ def add_errors(
             before = read_replicas(again.saved.path)
     else:
         earlier = _earlier(again.saved.path, expected, frames)
-    try:
-        found = bootstrap(
-            outcome,
-            arguments.bootstrap,
-            parts,
-            seed,
-            not arguments.quiet,
-            earlier,
-            look,
-            arguments.parallel,
-        )
-    finally:
-        if latest:
-            _write(again, latest[0], parts, before)
+    with written_as_done(write) as write_where_due:
+
+        def look(found: Bootstrap) -> None:
+            latest[:] = [found]
+            write_where_due()
+
+        n, is_shown = arguments.bootstrap, not arguments.quiet
+        found = bootstrap(outcome, n, parts, seed, is_shown, earlier, look, arguments.parallel)
     return _summarise(found, parts, frames)
 
 

@@ -9,7 +9,7 @@ from lnocl.commands.declared import BACKGROUND, DEVICE, READ_NOISE, SATURATION, 
 from lnocl.commands.options import option
 from lnocl.deconvolution import deconvolve
 from lnocl.io.calibration import Calibration
-from lnocl.io.names import NOISE, PSF_ERRORS
+from lnocl.io.names import NOISE, PSF_ERRORS, STAR_PSFS
 from lnocl.scene.fields import OVERSAMPLES
 from lnocl.scene.observation import Observation
 from lnocl.scene.psf_families import FAMILIES
@@ -116,6 +116,19 @@ OPTIONS = {
             kinds=PSF_ERRORS,
             needs=("stars", "star_table"),
             checksum="DSUM",
+        ),
+        parameter(
+            Calibration,
+            "star_psfs",
+            "--star-psf",
+            action="append",
+            nargs=None,
+            dest="star_psfs",
+            kinds=STAR_PSFS,
+            type=options.placed_file,
+            metavar="X,Y=FILE",
+            needs=("stars", "star_table"),
+            checksum="QSUM",
         ),
     ],
     "reconstruction": [

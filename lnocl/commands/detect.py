@@ -49,10 +49,9 @@ def _run(arguments: argparse.Namespace) -> None:
 def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Again]:
     """Return the significance of sources in a result, and what its run was made of."""
     from lnocl.io import atomic, tables
-    from lnocl.significance import check_alarms, check_width, significance
+    from lnocl.significance import check_search, significance
 
-    check_width(arguments.width)
-    check_alarms(arguments.false_alarms)
+    check_search(arguments.width, arguments.false_alarms)
 
     def check() -> None:
         if arguments.output is not None:

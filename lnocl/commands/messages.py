@@ -15,8 +15,6 @@ from lnocl.errors import LnoclWarning, with_names
 
 # Rows of a table that are printed, unless more were asked for.
 MAX_LISTED = 12
-# Seconds between two writings of what is done so far.
-WRITE_EVERY = 10.0
 # The logger of lines of progress.
 PROGRESS = "lnocl.progress"
 

@@ -142,7 +142,7 @@ def option(
 ) -> Option:
     """Return an `Option`; all further keywords are for the parser."""
     if kinds is not None:
-        keywords |= {"type": partial(_of_kind, kinds), "metavar": "KIND=FILE"}
+        keywords = {"type": partial(_of_kind, kinds), "metavar": "KIND=FILE", **keywords}
     is_input = is_input or bool(checksum)
     return Option(flags, keywords, card, checksum, is_input, is_repeated, kinds or {}, needs)
 
@@ -151,6 +151,21 @@ def _of_kind(kinds: Mapping[str, str], word: str) -> str:
     kind, path = parse_kind(word)
     if kind not in kinds or not (path or word == ERR):
         raise argparse.ArgumentTypeError(f"{word!r} is not KIND=FILE; kinds are {', '.join(kinds)}")
+    return word
+
+
+def placed_file(word: str) -> str:
+    """Return a word ``X,Y=FILE``.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        Another text.
+    """
+    place, path = parse_kind(word)
+    pixel(place)
+    if not path:
+        raise argparse.ArgumentTypeError(f"{word!r} is not X,Y=FILE")
     return word
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 from lnocl import __version__
@@ -12,6 +14,9 @@ from lnocl.commands.parser import Command, Parser
 from lnocl.commands.signals import ENDING, Terminated, first_handled, terminate
 from lnocl.errors import LnoclError, LnoclWarning
 from lnocl.io.atomic import kept
+
+# Seconds between two writings of what is done so far.
+WRITE_EVERY = 10.0
 
 FAILED = 1
 INTERRUPTED = 130
@@ -67,3 +72,26 @@ def make_parser(commands: Mapping[str, Command]) -> Parser:
         command.add_arguments(subparser)
         subparser.set_defaults(command=command)
     return parser
+
+
+@contextlib.contextmanager
+def written_as_done(write: Callable[[], object]) -> Iterator[Callable[[], None]]:
+    """Yield a function that writes what is done, where that is due; it is written at the end too.
+
+    So it is where an error or a signal ends the work.
+    """
+    written = time.monotonic()
+
+    def look() -> None:
+        nonlocal written
+        if time.monotonic() - written > WRITE_EVERY:
+            write()
+            written = time.monotonic()
+
+    try:
+        yield look
+    except BaseException:
+        with contextlib.suppress(Exception):  # a library may have been cut short while it loaded
+            write()
+        raise
+    write()

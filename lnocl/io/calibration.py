@@ -83,6 +83,10 @@ class Calibration(NamedTuple):
         Light of known shape and unknown amount, such as the speckles round a star, of which the
         amount is fitted in each image: a FITS file with its image, or a cube of one for each; or
         flat, a level of the background; may be repeated.
+    star_psfs : sequence of str
+        PSF of its own of a star, such as one behind the mask of a coronagraph: the pixel of the
+        star that it is for, and a FITS file with its PSF, or a cube of one for each image, whose
+        sums are the shares of its light that the images show; may be repeated.
     """
 
     background: Sequence[Word] = (0.0,)
@@ -101,3 +105,4 @@ class Calibration(NamedTuple):
     psf_centre: PsfCentre = "check"
     psf_errors: Sequence[str] = ()
     halos: Sequence[str] = ()
+    star_psfs: Sequence[str] = ()

@@ -16,7 +16,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError, LnoclError, warn
-from lnocl.io.encoded import is_tiled, unpacked
+from lnocl.io.encoded import is_tiled, unpacked, verify
 from lnocl.io.packed import BLOCK, Blocks, check_sizes, copy_bytes, fits_content, place_of
 from lnocl.process import recorded_warnings
 
@@ -145,8 +145,7 @@ class FitsFile:
         where = place_of(hdu)
         if where["datLoc"] + where["datSpan"] > self._length:
             return  # astropy warns of missing padding, and cannot sum without it
-        if "DATASUM" in hdu.header and hdu.verify_datasum() == 0:
-            warn("the data do not match their DATASUM; the file may be damaged")
+        verify(hdu)
 
     def copy(self, hdu: Any, stream: IO[bytes]) -> None:
         """Copy an HDU as it is, but for the padding that it may lack."""

@@ -32,6 +32,7 @@ from lnocl.io.psf_grids import is_grid, read_grid
 from lnocl.scene import units
 from lnocl.scene.arrays import Array
 from lnocl.scene.observation import Observation
+from lnocl.scene.psfs import check_psfs
 from lnocl.scene.transforms import enlarged
 
 Mask = NDArray[np.bool_]
@@ -87,8 +88,7 @@ def read_frames(images: Sequence[str], psfs: Sequence[str], calibration: Calibra
     ----------
     images, psfs : sequence of str
         Files, as for `fitsread.read_stack`; PSFs may be grids (`lnocl.io.psf_grids`). The unit of
-        the images is that of their BUNIT; without
-        one they are in electrons.
+        the images is that of their BUNIT; without one they are in electrons.
     calibration : Calibration
         Their calibration.
 
@@ -115,8 +115,8 @@ class _Reader:
         if len(self._grids) not in (0, len(psfs)):
             raise InputError("give grids of PSFs for all images, or for none")
         self._maps = Maps(self._images.data.shape, self._images.shapes)
+        self._maps.sha256 |= {"images": self._images.sha256, "psfs": self._psfs.sha256}
         self._background_errors = np.zeros(len(self._images.data))
-        self._sha256: dict[str, list[str]] = {}
 
     def frames(self) -> Frames:
         """Return the observation in the files."""
@@ -141,7 +141,7 @@ class _Reader:
         read_noise = self._read_noise_words(counts, mask)
         places = read_places(self._images, self._paths, self._calibration)
         if places.sha256:
-            self._sha256["angle"] = places.sha256
+            self._maps.sha256["angle"] = places.sha256
         observation = Observation(
             _in_own_shapes(counts, self._images.shapes),
             self._grids or _in_own_shapes(self._psfs.data, self._psfs.shapes),
@@ -159,27 +159,16 @@ class _Reader:
             effective_psfs=self._calibration.effective_psfs,
             psf_centre=self._calibration.psf_centre,
             **self._psf_errors(),
+            **self._star_psfs(),
             halos=self._halos(),
         )
-        sha256 = {
-            "images": self._images.sha256,
-            "psfs": self._psfs.sha256,
-            **self._maps.sha256,
-            **self._sha256,
-        }
         unit = self._unit()
         name, of_unit = (units.spelled(unit), factor) if units.is_known(unit) else ("electron", 1.0)
         if exposure is not None and (name == "electron" or not are_rates):
             name += "/s"
+        sha256, gain = self._maps.sha256, self._gain
         return Frames(
-            observation,
-            places.header,
-            background,
-            read_noise,
-            sha256,
-            name,
-            of_unit,
-            self._gain,
+            observation, places.header, background, read_noise, sha256, name, of_unit, gain
         )
 
     def _halos(self) -> Array | None:
@@ -201,11 +190,25 @@ class _Reader:
         found = {}
         for kind, paths in files.items():
             stack = read_stack(paths)
-            self._sha256.setdefault("psf_errors", []).extend(stack.sha256)
+            self._maps.sha256.setdefault("psf_errors", []).extend(stack.sha256)
             parts = [read_extension(path, kind.upper()) for path in paths]
             held = [np.atleast_3d(part.T).T for part in parts if part is not None]
             found[PSF_ERRORS[kind]] = np.concatenate(held) if held else stack.data
         return found
+
+    def _star_psfs(self) -> dict[str, Any]:
+        """Return the PSFs of their own of stars, and the places of these."""
+        places, psfs = list[list[float]](), list[Array]()
+        for place, path in map(parse_kind, self._calibration.star_psfs):
+            stack = read_stack([path])
+            self._maps.sha256.setdefault("star_psfs", []).extend(stack.sha256)
+            places.append([float(each) for each in place.split(",")])
+            psfs.append(check_psfs("star_psfs", stack.data, len(self._images.data)))
+        if not psfs:
+            return {}
+        ny, nx = np.max([psf.shape[1:] for psf in psfs], axis=0).tolist()
+        each = [enlarged(psf, (ny, nx), is_centred=True) for psf in psfs]
+        return {"star_places": places, "star_psfs": np.array(each)}
 
     def _electrons(self, exposure: Array | None) -> tuple[float, bool]:
         """Return the electrons in a unit of the images, and whether they are per second."""
@@ -229,9 +232,8 @@ class _Reader:
         factor *= 1.0 if gain is None else gain
         if not units.is_known(self._unit()):
             if exposure is not None:
-                means = exposure.reshape(len(exposure), -1).mean(axis=1)
                 are_rates = all(
-                    is_rate(factor * image, means[min(j, len(means) - 1)])
+                    is_rate(factor * image, exposure[min(j, len(exposure) - 1)])
                     for j, image in enumerate(self._images.data)
                 )
             name = "electrons" if gain is None else "counts"

@@ -141,7 +141,7 @@ def clipped_sky(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
     return float(median), float(scatter)
 
 
-def is_rate(image: Array, seconds: float) -> bool:
+def is_rate(image: Array, exposure: Array | float) -> bool:
     """Return whether an image without unit is of electrons per second, by its noise.
 
     The variance of counts is at least their mean; in rates it is that over the exposure.
@@ -150,15 +150,16 @@ def is_rate(image: Array, seconds: float) -> bool:
     ----------
     image : ndarray of float64, shape (ny, nx)
         Electrons, or electrons per second.
-    seconds : float
-        The exposure.
+    exposure : float or ndarray of float64, shape (ny, nx)
+        Seconds; pixels without are left out.
     """
     from astropy.stats import sigma_clipped_stats
 
-    good = np.isfinite(image)
+    seconds = np.broadcast_to(exposure, image.shape)
+    good = np.isfinite(image) & (seconds > 0)
     pairs = good[:, LAG:] & good[:, :-LAG]
     if not pairs.any():
         return False
     variance = sigma_clipped_stats((image[:, LAG:] - image[:, :-LAG])[pairs])[2] ** 2 / 2.0
     mean = max(sigma_clipped_stats(image[good])[1], FEW)
-    return bool(0 < variance < mean / max(2.0, np.sqrt(seconds)))
+    return bool(0 < variance < mean / max(2.0, np.sqrt(seconds[good].mean())))

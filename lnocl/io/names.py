@@ -29,6 +29,8 @@ PSF_ERRORS = {
     "modes": "psf_modes",
     "scatter": "psf_scatter",
 }
+# Those of stars that have their own are named by the place.
+STAR_PSFS = {"X,Y": "star_psfs"}
 
 
 class ImageName(NamedTuple):

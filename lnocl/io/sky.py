@@ -20,7 +20,6 @@ from astropy.time import Time
 from astropy.utils.xml.iterparser import get_xml_iterator
 from astropy.wcs import WCS
 from astropy.wcs.utils import pixel_to_pixel
-from numpy.typing import NDArray
 
 from lnocl.errors import FileError, InputError, LnoclError, counted, note, warn
 from lnocl.io.fitsfile import open_fits, open_regular
@@ -29,6 +28,7 @@ from lnocl.io.headers import make_wcs, quiet_log
 from lnocl.io.packed import unpacked
 from lnocl.process import ignored_warnings
 from lnocl.scene import star_tables
+from lnocl.scene.arrays import Array
 from lnocl.scene.quantities import in_unit
 from lnocl.scene.units import parse
 
@@ -44,8 +44,6 @@ DATES = {"MJD-AVG": "mjd", "MJD-OBS": "mjd", "DATE-OBS": "fits"}
 MAX_ROWS, MAX_MEBIBYTES = 1_000_000, 128
 # Points across an image at which the offset is computed.
 POINTS = 5
-
-Pairs = NDArray[np.float64]
 
 
 def celestial_wcs(header: fits.Header, path: str, advice: str = "give positions in pixels") -> WCS:
@@ -98,7 +96,7 @@ def oversampling(header: fits.Header) -> float | None:
     return float(finer) if isinstance(finer, (int, float)) and 1 < finer < np.inf else None
 
 
-def to_sky(positions: Pairs, header: fits.Header) -> Pairs:
+def to_sky(positions: Array, header: fits.Header) -> Array:
     """Return right ascension and declination (ICRS, degrees) of pixel positions, shape (n, 2).
 
     Raises
@@ -106,8 +104,9 @@ def to_sky(positions: Pairs, header: fits.Header) -> Pairs:
     InputError
         An image without celestial coordinates that astropy can use.
     """
-    wcs = celestial_wcs(header, "the image")
-    found = wcs.pixel_to_world(*np.reshape(positions, (-1, 2)).T).icrs
+    found = (
+        celestial_wcs(header, "the image").pixel_to_world(*np.reshape(positions, (-1, 2)).T).icrs
+    )
     return np.array([found.ra.deg, found.dec.deg]).T
 
 
@@ -139,7 +138,7 @@ def _parse_sky(text: str) -> SkyCoord:
     )
 
 
-def to_pixels(coordinates: SkyCoord, wcs: WCS, path: str) -> Pairs:
+def to_pixels(coordinates: SkyCoord, wcs: WCS, path: str) -> Array:
     """Return the pixel positions (x, y), 0-based, of positions on the sky, shape (n, 2).
 
     Raises
@@ -157,12 +156,12 @@ def to_pixels(coordinates: SkyCoord, wcs: WCS, path: str) -> Pairs:
     return found
 
 
-def _pixel_to(convert: Callable[..., Any], *given: Any) -> Pairs:
+def _pixel_to(convert: Callable[..., Any], *given: Any) -> Array:
     with ignored_warnings():  # of SIP that does not converge far from the image
         return np.array(convert(*given), float)
 
 
-def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
+def read_stars(path: str, header: fits.Header, image: str) -> Array:
     """Return the pixel positions of the stars in a table.
 
     Parameters
@@ -215,7 +214,7 @@ def read_stars(path: str, header: fits.Header, image: str) -> Pairs:
     return _within(path, found, header, image)
 
 
-def _within(path: str, positions: Pairs, header: fits.Header, image: str) -> Pairs:
+def _within(path: str, positions: Array, header: fits.Header, image: str) -> Array:
     """Return the positions that lie on an image: catalogues hold its surroundings too.
 
     Raises
@@ -271,7 +270,7 @@ def _moved(path: str, of_sky: SkyCoord, table: Table, date: Time | None) -> SkyC
         lacking = "the image has no date" if date is None else "there is no column ref_epoch"
         note("%s: its proper motions are not heeded, as %s", path, lacking)
         return of_sky
-    motions: list[NDArray[np.float64]] = [
+    motions: list[Array] = [
         np.nan_to_num(np.ma.filled(np.ma.asarray(table[name], float), 0.0)) for name in names
     ]
     epoch = star_tables.column_numbers(table[of_epoch[0]], path, "yr")
@@ -290,7 +289,7 @@ def _moved(path: str, of_sky: SkyCoord, table: Table, date: Time | None) -> SkyC
 
 def _compare(
     path: str,
-    positions: Pairs,
+    positions: Array,
     names: Sequence[str],
     of_sky: SkyCoord,
     sky_names: Sequence[str],
@@ -331,7 +330,7 @@ def _read_table(path: str) -> Table:
         raise FileError(f"{path} cannot be read as a table: {reason}") from error
 
 
-def read_angles(path: str) -> tuple[NDArray[np.float64], str]:
+def read_angles(path: str) -> tuple[Array, str]:
     """Return the angles in a file, one for each image, and its SHA-256 checksum.
 
     Parameters
@@ -432,7 +431,7 @@ def transforms(
     paths: Sequence[str],
     shapes: Sequence[tuple[int, int]],
     of_sky: int = 0,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the map from one image, by default the first, to each, shape (p, 2, 3), pixels.
 
     It is a shift, the mean over that image of ``pixel_j(sky(pixel)) - pixel``, where this is the
@@ -465,7 +464,7 @@ def _transform(
     path: str,
     first_shape: tuple[int, int],
     shape: tuple[int, int],
-) -> NDArray[np.float64]:
+) -> Array:
     (ny, nx), size = first_shape, np.array(shape[::-1])
     x, y = np.meshgrid(np.linspace(0, nx - 1, POINTS), np.linspace(0, ny - 1, POINTS))
     moved = _pixel_to(pixel_to_pixel, first, wcs, x, y)
@@ -489,24 +488,15 @@ def _transform(
         left = abs(there - nearest @ points).max()
         if left <= MAX_OFFSET_VARIATION:
             return np.column_stack([nearest, middle + mean - nearest @ middle])
+    turn = "mirrored"
+    if np.linalg.det(u @ v) > 0:
+        turn = f"rotated by {rotation_angle(nearest):z.2f} degrees and scaled by {scale:.4f}"
     raise InputError(
-        f"{path} is {_describe_turn(moved, nx)} relative to {first_path}, and after rotation, "
-        f"scale and shift pixels are up to {left:.2g} off: images are never resampled; cut them to "
-        "where it is less"
+        f"{path} is {turn} relative to {first_path}, and after rotation, scale and shift pixels "
+        f"are up to {left:.2g} off: images are never resampled; cut them to where it is less"
     )
 
 
-def rotation_angle(transform: NDArray[np.float64]) -> float:
+def rotation_angle(transform: Array) -> float:
     """Return by how many degrees a map turns, from the x axis towards the y axis."""
     return float(np.degrees(np.arctan2(transform[1, 0], transform[0, 0])))
-
-
-def _describe_turn(moved: Pairs, nx: int) -> str:
-    """Say how an image lies to the first, from where the points of that one lie in it."""
-    along_x = moved[:, POINTS // 2, -1] - moved[:, POINTS // 2, 0]
-    along_y = moved[:, -1, POINTS // 2] - moved[:, 0, POINTS // 2]
-    if along_x[0] * along_y[1] - along_x[1] * along_y[0] < 0:
-        return "mirrored"
-    angle = np.degrees(np.arctan2(along_x[1], along_x[0]))
-    scale = np.hypot(*along_x) / max(nx - 1, 1)
-    return f"rotated by {angle:z.2f} degrees and scaled by {scale:.4f}"

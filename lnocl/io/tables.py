@@ -51,4 +51,4 @@ def write_table(table: Table, path: str, content: str, overwrite: bool) -> None:
             return
         text = io.StringIO()  # astropy writes texts to text streams
         table.write(text, format=kind)
-        stream.write(text.getvalue().encode())
+        stream.write(text.getvalue().encode("utf-8", "backslashreplace"))

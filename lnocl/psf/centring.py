@@ -14,9 +14,8 @@ from scipy import optimize
 from scipy.ndimage import maximum_filter, median_filter
 
 from lnocl.errors import InputError
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, Mask
 
-Mask = NDArray[np.bool_]
 # Places in an image, row before column.
 Pixel = tuple[int, int]
 Point = tuple[float, float]
@@ -33,7 +32,6 @@ MARGIN, WIDTHS = 4, 5
 MIN_IMPROVEMENT = 50
 # Good pixels that a Gaussian of four parameters and a constant are fitted to, at least.
 MIN_PIXELS = 9
-MAX_EVALUATIONS = 500
 
 
 def brightest(pixels: Array, bad: Mask) -> Pixel:
@@ -111,8 +109,8 @@ def fit_gaussian(light: Array, bad: Mask, start: Pixel, level: float) -> tuple[P
             f"no star is found within {SEARCH} pixels of ({start[1]}, {start[0]}); give its "
             "position, or another background"
         )
-    # Digits beyond these are rounding of the fit: a centred star stays where it is.
-    return (round(found[0], 9), round(found[1], 9)), found[2]
+    # Digits beyond these are rounding of the slopes: a centred star stays where it is.
+    return (round(found[0], 6), round(found[1], 6)), found[2]
 
 
 def _square(pixel: Pixel, half: int) -> tuple[slice, slice]:
@@ -127,28 +125,14 @@ def _fit(
     if len(light) < MIN_PIXELS:
         return None
 
-    def parts(parameters: Array) -> tuple[Array, Array, Array, Array]:
-        """Return distances along y and x in sigmas, their squares' sum, and the Gaussian."""
-        _, row, column, sigma, _ = parameters
-        down, right = (y - row) / max(sigma, MIN_SIGMA), (x - column) / max(sigma, MIN_SIGMA)
-        square = down**2 + right**2
-        return down, right, square, np.exp(-square / 2)
-
     def residuals(parameters: Array) -> Array:
-        height, *_, constant = parameters
-        return np.asarray(height * parts(parameters)[-1] + constant - light)
-
-    def derivatives(parameters: Array) -> Array:
-        down, right, square, gaussian = parts(parameters)
-        slope = parameters[0] / max(parameters[3], MIN_SIGMA) * gaussian
-        columns = gaussian, slope * down, slope * right, slope * square, np.ones_like(gaussian)
-        return np.stack(columns, axis=1)
+        height, row, column, sigma, constant = parameters
+        square = ((y - row) ** 2 + (x - column) ** 2) / max(sigma, MIN_SIGMA) ** 2
+        return np.asarray(height * np.exp(-square / 2) + constant - light)
 
     start = np.array([light.max(), *first, sigma, 0.0])
     with np.errstate(all="ignore"):
-        fitted = optimize.least_squares(
-            residuals, start, derivatives, method="lm", xtol=1e-7, max_nfev=MAX_EVALUATIONS
-        )
+        fitted = optimize.least_squares(residuals, start, method="lm", xtol=1e-7)
         left = float(np.var(fitted.fun))
     height, row, column, sigma, _ = map(float, fitted.x)
     improvement = len(light) * (float(np.var(light)) - left)

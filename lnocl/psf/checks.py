@@ -6,34 +6,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lnocl.errors import InputError
-from lnocl.psf.centring import Mask
-from lnocl.scene.arrays import Array, booleans, numbers, values_and_mask, whole
+from lnocl.scene.arrays import numbers, whole
 from lnocl.scene.quantities import in_unit
 
 MIN_SIZE = 3
-# Values beyond this have no finite variance in float64.
-LARGEST = 1e150
-
-
-def read_frame(frame: ArrayLike, mask: ArrayLike | None) -> tuple[Array, Mask]:
-    """Return a float64 copy with NaN in bad pixels, and a mask, True where a pixel is bad."""
-    given, masked = values_and_mask("frame", frame)
-    pixels = numbers("frame", given)
-    if pixels.ndim != 2 or pixels.size == 0:
-        raise InputError(f"frame has shape {pixels.shape}; give one image, (ny, nx)")
-    bad = ~np.isfinite(pixels) | masked
-    if mask is not None:
-        more = booleans("mask", mask)
-        if more.shape != pixels.shape:
-            raise InputError(f"`mask` has shape {more.shape}; the frame has {pixels.shape}")
-        bad |= more
-    pixels[bad] = np.nan
-    if (np.abs(pixels) > LARGEST).any():
-        raise InputError(f"frame holds values beyond {LARGEST:g}; give it in another unit")
-    return pixels, bad
 
 
 def one_number(name: str, value: object) -> float:

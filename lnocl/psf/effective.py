@@ -10,11 +10,13 @@ from astropy.stats import sigma_clipped_stats
 from scipy.ndimage import binary_dilation, maximum_filter, shift
 from scipy.spatial import KDTree
 
+from lnocl.detection.fitting import step
+from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.errors import InputError, counted
-from lnocl.psf.centring import Mask, Point, brightest
+from lnocl.psf.centring import Point, brightest
 from lnocl.psf.repair import repair
 from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, Mask
 from lnocl.scene.shifting import MovablePsf
 
 # Rounds of fitting the stars and adding what is left of them to the PSF.
@@ -22,8 +24,8 @@ ROUNDS = 20
 # The first rounds take each pixel for the star nearest to it, so that no star is another's wings.
 FIRST_ROUNDS = 3
 # Outside its core, a star's pixel is a neighbour's where it exceeds another star's by this share,
-# and by so many times the noise; and so are the pixels beside it.
-EXCESS, SIGNIFICANCE, BESIDE = 0.5, 5.0, 2
+# significantly; and so are so many pixels beside it.
+EXCESS, BESIDE = 0.5, 2
 # Half the side of the square whose light is a star's first flux.
 APERTURE = 3
 # A star's core is where it is above this share of its peak; there it is fitted.
@@ -213,16 +215,15 @@ class _Stars:
     def _finished(self, psf: Array, shown: Array, weight: Array) -> EffectivePsf:
         left, _ = self._residual(psf)
         n = (shown > 0).sum(axis=0)
-        apart = [
-            (self._centred(left, s) * shown[s]) ** 2 / self._fluxes[s] for s in range(len(shown))
-        ]
+        apart = np.array([self._centred(left, s) / c for s, c in enumerate(self._fluxes)])
+        squares = np.einsum("s,syx->yx", self._fluxes, (apart * shown) ** 2)
         few = np.where(n > 1, weight * (n - 1) / np.maximum(n, 1), np.inf)
-        scatter = np.sqrt(sum(apart) / few)
+        scatter = np.sqrt(squares / few)
         total = psf.sum()
         core = psf > CORE * psf.max()
         stars = []
         for s, (y, x) in enumerate(self._places - self._half):
-            parts = (self._centred(left, s) / self._fluxes[s])[core & (shown[s] > 0)]
+            parts = apart[s][core & (shown[s] > 0)]
             misfit = float(np.sqrt(np.mean(parts**2)) / psf.max()) if parts.size else np.nan
             stars.append(FittedStar(float(x), float(y), float(self._fluxes[s] * total), misfit))
         return EffectivePsf(psf / total, scatter / total, stars, self._n_neighbours)
@@ -236,7 +237,7 @@ class _Stars:
         for s, c in enumerate(self._fluxes):
             for t, other in enumerate(self._fluxes):
                 noise = self._noise * np.hypot(1 / c, 1 / other)
-                limit = (1 + EXCESS) * most[t] + SIGNIFICANCE * noise
+                limit = (1 + EXCESS) * most[t] + SIGNIFICANT * noise
                 outside = most[t] < CORE * most[t].max()
                 foreign[s] |= good[s] & good[t] & outside & (own[s] > limit)
             foreign[s] = binary_dilation(foreign[s], iterations=BESIDE)
@@ -274,18 +275,16 @@ class _Stars:
         steps = np.zeros((len(self._places), 2))
         core = psf > CORE * psf.max()
         for s, c in enumerate(self._fluxes):
-            cutout = movable.with_slopes(*self._middle(s))
-            parts = cutout.values[0], c * cutout.values[2], c * cutout.values[1]
-            columns = [cutout._replace(values=part).on_grid(psf.shape) for part in parts]
-            used = core & self._good[self._window(s)]
-            if used.sum() < len(columns):
+            there = self._window(s)
+            star = movable.with_slopes(*self._middle(s)).on_grid(psf.shape)
+            used = core & self._good[there]
+            if used.sum() < len(star):
                 raise InputError(
                     f"the star at {self._name(s)} has too few good pixels; leave it out"
                 )
-            design = np.array([column[used] for column in columns]).T
-            found = np.linalg.lstsq(design, left[self._window(s)][used], rcond=None)[0]
-            self._fluxes[s] = max(c + found[0], c / 2)
-            steps[s] = found[1:].clip(-0.5, 0.5)
+            found, moves = step([star], np.array([c]), left[there] + c * star[0], used)
+            self._fluxes[s] = max(found[0], c / 2)
+            steps[s] = moves[0, ::-1]
         n = self._n_given
         self._places += steps - np.average(steps[:n], axis=0, weights=self._fluxes[:n])
 

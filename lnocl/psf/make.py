@@ -12,10 +12,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lnocl.detection.checks import read_image
 from lnocl.errors import InputError
 from lnocl.psf import checks, effective, resampling, steps
-from lnocl.psf.centring import Mask, Pixel, Point
-from lnocl.scene.arrays import Array, flag
+from lnocl.psf.centring import Pixel, Point
+from lnocl.scene.arrays import Array, Mask, flag
 from lnocl.scene.quantities import in_unit, split
 from lnocl.scene.shifting import MARGIN
 
@@ -343,7 +344,7 @@ def make_psfs(
         saturation = in_unit("saturation", saturation, unit or "")
     if not isinstance(background, str):
         background = in_unit("background", background, unit or "")
-    given, bad = checks.read_frame(frame, mask)
+    given, bad = read_image("frame", frame, mask)
     saturated = ~bad & (given >= checks.saturation_level(saturation))
     unusable = bad | saturated
     side, angles = checks.whole_size(size), checks.wrapped_angles(rotate)

@@ -7,13 +7,10 @@ astropy's `interpolate_replace_nans` leaves 4 and 13 % there (benchmarks/librari
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import convolve1d, maximum_filter
 
-from lnocl.scene.arrays import Array
-
-Mask = NDArray[np.bool_]
+from lnocl.scene.arrays import Array, Mask
 
 # A bad pixel is repaired if in the square of side `WINDOW` around it are `MIN_GOOD` good ones. So
 # many lie on no two lines and on no conic, where the interpolation would not be unique.

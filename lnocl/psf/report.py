@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import median_filter
 
-from lnocl.errors import InputError
-from lnocl.scene.arrays import numbers
+from lnocl.detection.checks import read_psf
 from lnocl.scene.cores import centre, fwhm, off_centre
 from lnocl.scene.psfs import FAR_OFF_CENTRE, LITTLE_OFF_CENTRE, MUCH_NEGATIVE
-from lnocl.scene.quantities import bare
 
 # Wings and border are squares round the centre, as shares of half the side.
 WINGS, BORDER = (0.55, 0.7), (0.85, 1.0)
@@ -168,12 +166,7 @@ def examine(psf: ArrayLike) -> PsfReport:
     it is 1.00 pixels off its centre, and is refused: take --psf-centre fit
     its border is level: subtract a background, or make it larger
     """
-    light = numbers("psf", bare("psf", psf))
-    if light.ndim != 2 or not light.size or not np.isfinite(light).all() or not light.sum() > 0:
-        raise InputError(
-            f"`psf` of shape {light.shape} must be one image of finite numbers with a positive sum"
-        )
-    light = light / light.sum()
+    light = read_psf(psf)
     y, x = (
         abs(np.arange(n) - i) / max(n // 2, 1)
         for n, i in zip(light.shape, centre(light.shape), strict=True)

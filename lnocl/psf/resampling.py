@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import fft
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.rotation import turned_psf
 from lnocl.scene.shifting import place
 
 
@@ -42,7 +42,7 @@ def rotate(image: Array, angle: float) -> Array:
     Parameters
     ----------
     image : ndarray of float64, shape (n, n)
-        Of odd side; light that leaves it is wrapped round.
+        Of odd side; what lies beyond it is 0.
     angle : float
         Degrees from the x axis towards the y axis. Multiples of 90 are exact.
 
@@ -53,7 +53,11 @@ def rotate(image: Array, angle: float) -> Array:
     """
     quarters, rest = _quarters(angle)
     turned = np.rot90(image, -quarters)
-    return _shear(turned, rest) if rest else turned
+    if not rest:
+        return turned
+    wide = turned_psf(turned, -math.radians(rest))
+    part = slice(len(wide) // 2 - len(image) // 2, len(wide) // 2 - len(image) // 2 + len(image))
+    return wide[part, part]
 
 
 def reach(side: int, angle: float) -> int:
@@ -81,18 +85,3 @@ def _quarters(angle: float) -> tuple[int, float]:
     """Return quarter turns and the rest of an angle, degrees."""
     quarters = round(angle / 90)
     return quarters, angle - 90 * quarters
-
-
-def _shear(image: Array, angle: float) -> Array:
-    """Rotate by up to 45 degrees: along x, along y, and along x again."""
-    t = math.radians(angle)
-    n = len(image)
-    k, r = fft.fftfreq(n), np.arange(n) - n // 2
-
-    def along_x(rows: Array, slope: float) -> Array:
-        phase = np.exp(-2j * np.pi * slope * np.multiply.outer(r, k))
-        return np.asarray(fft.ifft(fft.fft(rows, axis=1) * phase, axis=1).real)
-
-    image = along_x(image, -math.tan(t / 2))
-    image = along_x(image.T, math.sin(t)).T
-    return along_x(image, -math.tan(t / 2))

@@ -8,18 +8,19 @@ from collections.abc import Sequence
 import numpy as np
 from astropy.stats import mad_std, sigma_clipped_stats
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import label, maximum_filter, shift
-from scipy.optimize import least_squares
+from scipy.ndimage import label, maximum_filter, value_indices
 
+from lnocl.detection.fitting import fit
+from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.errors import InputError, counted, warn
 from lnocl.psf import resampling
-from lnocl.psf.centring import SEARCH, Mask, Pixel, Point, brightest, fit_gaussian
+from lnocl.psf.centring import SEARCH, Pixel, Point, brightest, fit_gaussian
 from lnocl.psf.checks import MIN_SIZE, one_number
 from lnocl.psf.repair import WINDOW, repair
 from lnocl.psf.wings import FROM, distance, fit_sky
 from lnocl.scene.apertures import FWHM
-from lnocl.scene.arrays import Array, numbers
-from lnocl.scene.shifting import MARGIN
+from lnocl.scene.arrays import Array, Mask, numbers
+from lnocl.scene.shifting import ENDLESS, MARGIN, MovablePsf
 
 # The background is lowered by so many of its errors or more, and by this share of the flux; where
 # the farthest pixels are above it by less than this share of that. Of a larger share it is warned.
@@ -28,9 +29,9 @@ CERTAIN, LITTLE, TRUSTED, MUCH = 5.0, 0.001, 0.5, 0.01
 MIN_SKY = 100
 # Width of the frame's border, as a share of the shorter side.
 BORDER = 1 / 16
-# Another star is a maximum so many widths from the given ones, above this share of the peak of one
-# that it is near, and so many times the noise: what is nearer or fainter may be rings and speckles.
-APART, BRIGHT, SIGNIFICANT = 3.0, 0.05, 5.0
+# Another star is a maximum in the wings of the given ones, above this share of the peak of one that
+# it is near: what is nearer or fainter may be rings and speckles.
+BRIGHT = 0.05
 # It is a star where the brightest given one, moved there, leaves no more than this share of its
 # peak and so many times the noise (rms), to so many widths; else it is masked.
 WITHIN, ALIKE, NOISY, MASKED = 1.5, 0.05, 2.0, 2.0
@@ -212,19 +213,23 @@ def find_neighbours(
     highest = (light == maximum_filter(light, 2 * math.ceil(width) + 1)) & ~bad
     brightest_given = max(centres, key=lambda centre: light[nearest_pixel(centre)])
     stars, others, n_others = list[Point](), list[Point](), 0
-    for plateau in _plateaus(highest & (light > SIGNIFICANT * noise)):
+    # A maximum has several pixels where it is flat, as that of a saturated star.
+    labels, _ = label(highest & (light > SIGNIFICANT * noise), np.ones((3, 3)))
+    for pixels in value_indices(labels, ignore_value=0).values():
+        plateau = np.transpose(pixels).tolist()
         row, column = plateau[len(plateau) // 2]
         offsets = np.abs(np.array(centres) - (row, column))
         peaks = [light[nearest_pixel(centres[s])] for s in range(len(centres))]
-        is_near = offsets.max(axis=1) < half + APART * width
+        is_near = offsets.max(axis=1) < half + FROM * width
         is_bright = light[row, column] > BRIGHT * np.array(peaks)
-        if np.hypot(*offsets.T).min() < APART * width or not (is_near & is_bright).any():
+        if np.hypot(*offsets.T).min() < FROM * width or not (is_near & is_bright).any():
             continue
         place, misfit = _fit_star(light, brightest_given, (row, column), width)
         is_there = math.dist(place, (row, column)) < width
         is_alike = misfit < math.hypot(ALIKE * light[row, column], NOISY * noise)
         is_new = all(math.dist(place, star) > width for star in stars)
-        if is_there and is_alike and is_new and not _touches(bad | far, place, width):
+        core = cut_square(bad | far, nearest_pixel(place), math.ceil(width / 2))
+        if is_there and is_alike and is_new and not core.any():
             stars.append(place)
         else:
             others += plateau
@@ -238,34 +243,20 @@ def find_neighbours(
     return stars, far | (distance(bad.shape, others) < MASKED * width), [line]
 
 
-def _plateaus(highest: Mask) -> list[list[Pixel]]:
-    """Return the pixels of each maximum, several where it is flat, as of a saturated star."""
-    labels, n = label(highest, np.ones((3, 3)))
-    places = [list[Pixel]() for _ in range(n)]
-    for row, column in np.argwhere(highest).tolist():
-        places[labels[row, column] - 1].append((row, column))
-    return places
-
-
 def _fit_star(light: Array, star: Point, start: Pixel, width: float) -> tuple[Point, float]:
     """Return where another star, scaled, explains the light at a pixel, and the rms of the rest."""
     pixel, half = nearest_pixel(star), math.ceil(WITHIN * width)
-    square, found = cut_square(light, pixel, half + WINDOW // 2), cut_square(light, start, half)
-    scale = light[start] / square.max()
+    square, found = cut_square(light, pixel, half + MARGIN), cut_square(light, start, half)
+    other, side = MovablePsf(square, ENDLESS), (2 * half + 1, 2 * half + 1)
 
-    def residuals(parameters: Array) -> Array:
-        move = np.subtract(pixel, star) + parameters[1:]
-        moved = middle_square(shift(square, move, mode="nearest"), 2 * half + 1)
-        return np.asarray(parameters[0] * scale * moved - found).ravel()
+    def moved(x: float, y: float) -> Array:
+        place = other.with_slopes(pixel[1] - star[1] + x, pixel[0] - star[0] + y)
+        return place.add_to(np.zeros((3, *side)), (-half, -half), ENDLESS)
 
-    fitted = least_squares(residuals, [1.0, 0.0, 0.0], method="lm")
-    place = float(start[0] + fitted.x[1]), float(start[1] + fitted.x[2])
-    return place, float(np.sqrt(np.mean(fitted.fun**2)))
-
-
-def _touches(bad: Mask, place: Point, width: float) -> bool:
-    """Return whether pixels of a core are bad."""
-    return bool(cut_square(bad, nearest_pixel(place), math.ceil(width / 2)).any())
+    scale = np.array([light[start] / square.max()])
+    (move,), (flux,) = fit(moved, np.zeros((1, 2)), scale, found, np.ones(side))
+    misfit = found - flux * moved(*move)[0]
+    return (start[0] + move[1], start[1] + move[0]), float(np.sqrt(np.mean(misfit**2)))
 
 
 def _largest(shape: tuple[int, ...], pixel: Pixel, angle: float) -> int:

@@ -7,7 +7,6 @@ values. A digest binds them to the images and to the version of lnocl.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from importlib.metadata import version
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.process import ignored_warnings
-from lnocl.runs.checkpoint import inputs_of
+from lnocl.runs.inputs import digest_of, inputs_of
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome, PsfRefinement
 from lnocl.runs.start import Setup
 from lnocl.scene.estimate import Estimate
@@ -146,12 +145,4 @@ def _refinement(parts: Parts) -> PsfRefinement | None:
 
 def _digest(parts: Mapping[str, NDArray[Any]], observation: Observation) -> str:
     """Return the SHA-256 of parts, of the observation that they are of, and of the version."""
-    digest = hashlib.sha256(version("lnocl").encode())
-    for values in (parts, inputs_of(observation)):
-        for name, value in sorted(values.items()):
-            if isinstance(value, np.ndarray) and value.dtype.kind != "U":
-                digest.update(repr((name, value.dtype.str, value.shape)).encode())
-                digest.update(np.ascontiguousarray(value).data)
-            else:
-                digest.update(repr((name, str(value))).encode())
-    return digest.hexdigest()
+    return digest_of({"version": version("lnocl")}, parts, inputs_of(observation))

@@ -9,7 +9,6 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lnocl.errors import InputError
 from lnocl.parallel import Parallel, work
@@ -337,13 +336,12 @@ def bootstrap(
 def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Bootstrap:
     """Return the quantities of a reconstruction, measured on itself, without replicas."""
     width = resolution(outcome.scene)
-    quantities = _quantities(outcome, parts, width)
+    quantities, shares = _quantities(outcome, parts, width)
     stated = np.nan_to_num(_in_electrons(outcome, outcome.star_errors()[0]))
     pixels = np.zeros((3, *outcome.scene.observation.sky_shape))
     none = np.zeros((0, len(quantities)))
     is_rate = (outcome.scene.observation.exposure != 1.0).any()
     unit = "electron/s" if is_rate else "electron"
-    shares = _shares(outcome, parts, len(quantities))
     return Bootstrap(quantities, none, none, pixels, width, seed, unit, stated, shares)
 
 
@@ -360,15 +358,11 @@ def check_number(n: object, seed: object) -> None:
 
 
 class _Measured(NamedTuple):
-    """Errors in a replica: of the quantities, those that PSFs add, and of the smoothed pixels.
-
-    And in which of these there is light, as the answer is brighter than the error.
-    """
+    """What a replica adds to the arrays of `Bootstrap` of these names."""
 
     errors: Array
     of_psfs: Array
-    pixels: Array
-    is_there: NDArray[np.bool_]
+    sums: Array
 
 
 class _Measuring:
@@ -394,7 +388,9 @@ class _Measuring:
             of_psfs = (_measure(self._outcome, last, self._parts) - seen)[None]
             seen = seen + of_psfs[0]
         smooth = self._smooth(last.extended - replica.drawn.extended)
-        return _Measured((seen - drawn)[None], of_psfs, smooth, self._smooth_answer > smooth)
+        # There is light where the answer is brighter than the error.
+        sums = np.array([smooth, smooth**2, self._smooth_answer > smooth])
+        return _Measured((seen - drawn)[None], of_psfs, sums)
 
 
 def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
@@ -403,7 +399,7 @@ def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
         found,
         errors=np.concatenate([found.errors, measured.errors]),
         of_psfs=np.concatenate([found.of_psfs, measured.of_psfs]),
-        sums=found.sums + np.array([measured.pixels, measured.pixels**2, measured.is_there]),
+        sums=found.sums + measured.sums,
     )
 
 
@@ -422,52 +418,45 @@ def _in_electrons(outcome: Outcome, fluxes: Array) -> Array:
     return np.append(fluxes[:n], outcome.of_halos(fluxes).ravel())[is_shown]
 
 
-def _quantities(outcome: Outcome, parts: Sequence[Part], width: float) -> tuple[Quantity, ...]:
-    """Return the quantities in the order of `_measure`."""
+def _quantities(
+    outcome: Outcome, parts: Sequence[Part], width: float
+) -> tuple[tuple[Quantity, ...], Array]:
+    """Return the quantities in the order of `_measure`, and the share of each star's light in each.
+
+    The shares have a row for each quantity, and a column for each flux of a star or halo.
+    """
     scene = outcome.scene
-    ny, nx = scene.observation.sky_shape
-    moves = outcome.moves
-    n_epochs = scene.observation.n_epochs
+    n_epochs, images = scene.observation.n_epochs, range(scene.n_images)
     epochs = [f" epoch {e}" for e in range(n_epochs)] if n_epochs > 1 else [""]
     shown = np.flatnonzero(scene.is_shown[: scene.n_stars]).tolist()
     labels = [Label(f"star {s // n_epochs + 1}{epochs[s % n_epochs]} flux", FLUX) for s in shown]
-    labels += [
-        Label(f"halo {k + 1} image {j + 1}", AMOUNT)
-        for k in range(len(scene.observation.halos))
-        for j in range(scene.n_images)
-    ]
-    if moves:
+    halos = range(len(scene.observation.halos))
+    labels += [Label(f"halo {k + 1} image {j + 1}", AMOUNT) for k in halos for j in images]
+    n_fluxes = len(labels)
+    if outcome.moves:
         labels += [Label(f"star {s + 1} {axis}", LENGTH) for s in shown for axis in "xy"]
-    notes = [""] * len(labels)
-    labels += [label for part in parts for label in part.labels()]
-    observed = _observed(scene)[:ny, :nx] if parts else np.ones((0, 0), bool)
-    stars = on_sky(scene.stars, scene.oversample)
-    notes += [note for part in parts for note in _notes(part, stars, width, observed)]
+    notes, shares = [""] * len(labels), [*np.eye(len(labels), n_fluxes)]
+    if parts:
+        observed = _observed(scene)
+        cutouts = [[scene.psf_on_sky(j, s) for j in images] for s in shown]
+    for part in parts:
+        own, slices = part.labels(), part.slices if isinstance(part, Profile) else [part]
+        held = np.zeros((len(own), n_fluxes))  # widths hold no light
+        for k, i in np.ndindex(len(slices), len(shown)):
+            held[k, i] = _light_within(slices[k], cutouts[i], scene.grid)
+        own_notes = [_note(each, scene, width, observed) for each in slices]
+        if isinstance(part, Aperture) and part.n_pixels < np.pi / 4.0 * width**2:
+            own_notes = [BELOW]
+        notes += own_notes * (len(own) // len(slices))
+        labels, shares = labels + own, [*shares, *held]
     light = outcome.light().sky() if parts else outcome.sky
     sky = Sky(outcome.estimate.observed_sky, light, outcome.star_fluxes, scene.stars)
     values = _measure(outcome, sky, parts).tolist()
-    return tuple(
+    quantities = tuple(
         Quantity(label.name, label.kind, value, note, label.at)
         for label, value, note in zip(labels, values, notes, strict=True)
     )
-
-
-def _shares(outcome: Outcome, parts: Sequence[Part], n_quantities: int) -> Array:
-    """Return the share of each star's light in each quantity, in the order of `_measure`."""
-    scene = outcome.scene
-    shown = np.flatnonzero(scene.is_shown[: scene.n_stars]).tolist()
-    n_fluxes = len(shown) + scene.n_halos
-    shares = np.eye(n_quantities, n_fluxes)
-    for i, s in enumerate(shown):
-        cutouts = [scene.psf_on_sky(j, s) for j in range(scene.n_images)]
-        k = n_fluxes + 2 * len(shown) * outcome.moves
-        for part in parts:
-            slices = part.slices if isinstance(part, Profile) else [part]
-            shares[k : k + len(slices), i] = [
-                _light_within(each, cutouts, scene.grid) for each in slices
-            ]
-            k += len(part.labels())  # widths hold no light
-    return shares
+    return quantities, np.reshape(shares, (len(labels), n_fluxes))
 
 
 def _light_within(aperture: Aperture, cutouts: Sequence[Cutout], grid: tuple[int, int]) -> float:
@@ -478,31 +467,22 @@ def _light_within(aperture: Aperture, cutouts: Sequence[Cutout], grid: tuple[int
     return float((aperture.weights * light).sum())
 
 
-def _observed(scene: Scene) -> NDArray[np.bool_]:
-    """Return where the extended source was observed, on the grid."""
-    if scene.weights is None:
-        return np.ones(scene.grid, bool)
-    model = Model(scene)
-    return scene.observed(model.adjoint(model.weights))
+def _observed(scene: Scene) -> Array:
+    """Return 1 where the extended source was observed, else 0."""
+    observed = np.ones(scene.grid)
+    if scene.weights is not None:
+        model = Model(scene)
+        observed *= scene.observed(model.adjoint(model.weights))
+    ny, nx = scene.observation.sky_shape
+    return observed[:ny, :nx]
 
 
-def _notes(part: Part, stars: Array, width: float, observed: NDArray[np.bool_]) -> list[str]:
-    """Return why the errors of a part may not hold."""
-    if isinstance(part, Profile):
-        return 2 * [_note(each, stars, width, observed) for each in part.slices]
-    is_small = part.n_pixels < np.pi / 4.0 * width**2
-    return [BELOW if is_small else _note(part, stars, width, observed)]
-
-
-def _note(aperture: Aperture, stars: Array, width: float, observed: NDArray[np.bool_]) -> str:
-    if aperture.flux(observed.astype(np.float64)) < 0.5 * aperture.n_pixels:
+def _note(aperture: Aperture, scene: Scene, width: float, observed: Array) -> str:
+    """Return why the error of an aperture may not hold, as where a star's core fills most of it."""
+    if aperture.flux(observed) < 0.5 * aperture.n_pixels:
         return UNSEEN
-    return _under(aperture, stars, width)
-
-
-def _under(aperture: Aperture, stars: Array, width: float) -> str:
-    """Return a note where most of an aperture lies under the core of a star."""
     rows, columns = aperture.places
+    stars = on_sky(scene.stars, scene.oversample)
     is_core = [np.hypot(rows - y, columns - x) <= CORE * width for x, y in stars]
     most = max(((aperture.weights * each).sum() for each in is_core), default=0.0)
     return UNDER if most > 0.5 * aperture.n_pixels else ""

@@ -21,6 +21,7 @@ from scipy.spatial import KDTree
 
 from lnocl.errors import DivergedError
 from lnocl.process import ignored_notes, ignored_warnings
+from lnocl.runs.halos import hold_halos, settle_halos
 from lnocl.runs.run import Run
 from lnocl.runs.start import Setup, make_model, make_start
 from lnocl.runs.steady import STEADY
@@ -31,6 +32,7 @@ from lnocl.scene.noise_check import with_noise_shown
 from lnocl.scene.observation import BESIDE_PSFS, Observation
 from lnocl.scene.padding import choose_pad
 from lnocl.scene.penalty import Penalty, recommend_smoothing
+from lnocl.scene.psf_field import Psfs, mapped
 from lnocl.scene.psf_misfit import PsfMisfit, measure_misfit, smoothing_near_stars
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import Scene
@@ -102,7 +104,12 @@ class GuardedRuns:
         # PSFs that are cut to the window go without what has the shape of whole ones.
         shown = with_noise_shown(observation).replace(**dict.fromkeys(BESIDE_PSFS))
         self._side = choose_window(setup.stars, shown, observation.psfs.shape[1:])
-        self.observation, self.stars, self.held = find_window(setup.stars, shown, self._side)
+        window = find_window(setup.stars, shown, self._side)
+        self.observation, self._first, self.held = window
+        self.stars = setup.stars[self.held] - self._first
+        if len(own := self.observation.star_psfs):
+            cut = np.array([self.cut(psfs) for psfs in own])
+            self.observation = self.observation.replace(star_psfs=cut)
         # One grid for all PSFs that are tried.
         pad = choose_pad(observation) if setup.pad == "auto" else setup.pad
         self._setup = replace(
@@ -112,7 +119,7 @@ class GuardedRuns:
 
     def fit(
         self,
-        psfs: Array,
+        psfs: Psfs,
         stars: Array,
         moves: bool,
         error: float = FIRST_ERROR,
@@ -126,8 +133,8 @@ class GuardedRuns:
 
         Parameters
         ----------
-        psfs : ndarray of float64, shape (p, ky, kx)
-            The PSFs.
+        psfs : Psfs
+            Of the whole images.
         stars : ndarray of float64, shape (n, 2)
             The positions of the stars in the window; first guesses where they are moved.
         moves : bool
@@ -137,11 +144,15 @@ class GuardedRuns:
         guard : float
             The weight of the smoothing near stars for that error, in the units of `GUARD`.
         """
-        observation = self.observation.replace(psfs=self.cut(psfs))
-        inside = self._inside(stars)
-        setup = replace(self._setup, observation=observation, stars=inside, refine_positions=moves)
+        observation = self.seen_through(psfs)
+        setup = replace(
+            self._setup,
+            observation=observation,
+            stars=inside(stars, observation),
+            refine_positions=moves,
+        )
         with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
-            start = make_start(setup, Penalty())
+            start = settle_halos(make_start(setup, Penalty()))
             found = _judged(start.estimate(), _unknown(error))
             moved = replace(setup, refine_positions=False)
             rounds = (moved, FIRST_ITERATIONS), *[(setup, ITERATIONS)] * (MAX_ROUNDS - 1)
@@ -162,11 +173,11 @@ class GuardedRuns:
         penalty = Penalty(smoothing=self._smoothing, near_stars=near)
         setup = replace(
             setup,
-            stars=self._inside(found.scene.stars),
+            stars=inside(found.scene.places, self.observation),
             initial_extended=np.maximum(found.observed_sky, 0.0),
-            initial_star_fluxes=found.star_fluxes,
+            initial_star_fluxes=found.star_fluxes[: found.scene.n_stars],
         )
-        start = make_start(setup, penalty)
+        start = hold_halos(make_start(setup, penalty), found)
         # Stars are moved at the start of a round alone.
         run = Run(replace(start, setup=replace(start.setup, refine_positions=False)), n_iter)
         with suppress(DivergedError):  # by negative PSFs: the misfit tells how good the end is
@@ -178,32 +189,37 @@ class GuardedRuns:
             misfit = measure_misfit(estimate, model, settle(estimate, model, UNRESOLVED))
         return _judged(estimate, misfit)
 
-    def moved(self, estimate: Judged, psfs: Array, star_fluxes: Array, stars: Array) -> Judged:
+    def moved(self, estimate: Judged, psfs: Psfs, star_fluxes: Array, stars: Array) -> Judged:
         """Return an estimate with other PSFs, star fluxes and positions.
 
-        Its extended source and misfit are unchanged; stars are clipped to the window.
+        Its extended source and misfit are unchanged; stars that leave the images are clipped.
         """
-        ny, nx = self.observation.shape
-        observation = self.observation.replace(psfs=self.cut(psfs))
+        observation = self.seen_through(psfs)
         with ignored_warnings():
-            scene = Scene(observation, stars.clip(0, (nx - 1, ny - 1)), pad=self._setup.pad)
+            scene = Scene(observation, inside(stars, self.observation), pad=self._setup.pad)
         return replace(estimate, scene=scene, star_fluxes=star_fluxes)
 
-    def _inside(self, stars: Array) -> Array:
-        """Return star positions; those that no image shows are clipped to the window."""
-        last = np.array(self.observation.shape[::-1]) - 1
-        are_inside = self.observation.shows(stars)
-        return np.where(are_inside[:, None], stars, stars.clip(0, last))
+    def seen_through(self, psfs: Psfs) -> Observation:
+        """Return the window with PSFs of the whole images, cut to it."""
+        cut = mapped(psfs, lambda _, stack: self.cut(stack))
+        if isinstance(cut, tuple):
+            x, y = self._first
+            cut = tuple(field.moved(-x, -y) for field in cut)
+        return self.observation.replace(psfs=cut)
 
     def cut(self, psfs: Array) -> Array:
         """Return the middle of PSFs, at most as large as the window."""
         return psfs[:, *self._shown(psfs)]
 
-    def completed(self, psfs: Array, inner: Array) -> Array:
-        """Return PSFs of unit sum whose middle, as by `cut`, is replaced by `inner`."""
-        whole = psfs.copy()
-        whole[:, *self._shown(psfs)] = inner
-        return np.asarray(whole / whole.sum(axis=(1, 2), keepdims=True))
+    def completed(self, psfs: Psfs, changes: Sequence[Array]) -> Psfs:
+        """Return PSFs of unit sum, with what is added to the middle of those of each image."""
+
+        def complete(j: int, stack: Array) -> Array:
+            whole = stack.copy()
+            whole[:, *self._shown(stack)] += changes[j]
+            return np.asarray(whole / whole.sum(axis=(1, 2), keepdims=True))
+
+        return mapped(psfs, complete)
 
     def _shown(self, psfs: Array) -> tuple[slice, slice]:
         """Return the slices of the middle of PSFs that `cut` keeps."""
@@ -215,12 +231,18 @@ class GuardedRuns:
         return y, x
 
 
+def inside(stars: Array, observation: Observation) -> Array:
+    """Return star positions; those that no image shows are clipped to the first."""
+    last = np.array(observation.shape[::-1]) - 1
+    return np.where(observation.shows(stars)[:, None], stars, stars.clip(0, last))
+
+
 def choose_window(stars: Array, observation: Observation, psf_shape: Sequence[int]) -> int:
     """Return the side of the window in which PSFs of a shape are judged, pixels of the images."""
     side = WINDOW
     while side > LEAST_WINDOW:
         of_psf = math.prod(min(n, side * observation.oversample) for n in psf_shape)
-        if len(find_window(stars, observation, side)[1]) * of_psf <= MOST_PIXELS:
+        if np.count_nonzero(find_window(stars, observation, side)[2]) * of_psf <= MOST_PIXELS:
             break
         side //= 2
     return side
@@ -228,17 +250,19 @@ def choose_window(stars: Array, observation: Observation, psf_shape: Sequence[in
 
 def find_window(
     stars: Array, observation: Observation, side: int
-) -> tuple[Observation, Array, Array]:
+) -> tuple[Observation, NDArray[np.int_], NDArray[np.bool_]]:
     """Return the observation cut to the window that holds most stars.
 
-    Candidates lie round the middle of all stars and round each star, inside the images.
+    Candidates lie round the middle of all stars and round each star, inside the images. All images
+    are cut to the same rows and columns. Those that are turned stay whole where no window holds a
+    star in each of them.
 
     Returns
     -------
     observation : Observation
         The images in the window.
-    stars : ndarray of float64, shape (n, 2)
-        The positions (x, y) of its stars, from its first pixel.
+    first : ndarray of int, shape (2,)
+        (x, y) of its first pixel.
     held : ndarray of bool, shape (m,)
         Which of all m stars it holds.
     """
@@ -246,11 +270,17 @@ def find_window(
     last = np.array(observation.shape[::-1]) - size
     middle = (stars.min(axis=0) + stars.max(axis=0)) / 2.0
     firsts = np.clip(np.round(np.vstack([middle, stars])) - size // 2, 0, last).astype(int)
-    best = int(np.argmax(_count_in_windows(stars, firsts, observation.shape, side)))
-    low = firsts[best] - 0.5
-    held = np.all((stars >= low) & (stars < low + size), axis=1)
-    x, y = (range(int(at), int(at + n)) for at, n in zip(firsts[best], size, strict=True))
-    return observation.window(y, x), stars[held] - firsts[best], held
+    places = [stars]
+    if observation.is_turned:
+        places = [observation.places(j, stars) for j in range(observation.n_images)]
+    counts = [_count_in_windows(each, firsts, observation.shape, side) for each in places]
+    in_all = np.min(counts, axis=0)
+    first = firsts[int(np.argmax(in_all))]
+    if not in_all.any():
+        first, size = np.zeros(2, int), np.array(observation.shape[::-1])
+    x, y = (range(int(at), int(at + n)) for at, n in zip(first, size, strict=True))
+    cut = observation.window(y, x)
+    return cut, first, cut.shows(stars - first)
 
 
 def _count_in_windows(

@@ -26,14 +26,20 @@ N_ITER = 10
 
 def settle_halos(start: Start) -> Start:
     """Return a start of a scene that holds its halos; as it is where it has none to hold."""
-    setup, penalty = start.setup, start.scene.penalty
-    if not (setup.settles_halos and start.scene.n_halos):
+    if not (start.setup.settles_halos and start.scene.n_halos):
         return start
     with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
-        found = marginal_halos(_short_run(setup))
-    n = start.scene.n_stars
+        found = marginal_halos(_short_run(start.setup))
+    return hold_halos(start, found)
+
+
+def hold_halos(start: Start, found: Estimate) -> Start:
+    """Return a start of a scene whose halos are held at those of an estimate, if it has any."""
+    setup, n = start.setup, start.scene.n_stars
+    if not (setup.settles_halos and start.scene.n_halos):
+        return start
     fluxes = np.append(start.star_fluxes[:n], found.fluxes[n:])
-    held = start.scene.holding(fluxes, penalty)
+    held = start.scene.holding(fluxes, start.scene.penalty)
     extended = start.extended if setup.initial_extended is not None else held.start(None, None)[0]
     fluxes, scaling = measure_steps(setup, held, make_model(held), extended, fluxes)
     return replace(start, scene=held, extended=extended, star_fluxes=fluxes, scaling=scaling)

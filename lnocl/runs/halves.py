@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from lnocl.errors import DivergedError, NotFiniteError, warn
 from lnocl.runs.run import Run
-from lnocl.runs.saved import LARGEST, Saved
 from lnocl.runs.start import Start
 from lnocl.scene.arrays import Array
-from lnocl.scene.stars import MAX_SHIFT
 from lnocl.solvers.engine import State
 
 # The ratio of one iteration of which a snapshot is taken to that before.
@@ -162,29 +160,14 @@ class Halves:
             state |= {f"{HALVES}{k}_{name}": array for name, array in run.state().items()}
         return state
 
-    def restore(self, saved: Saved) -> None:
-        """Continue from the state in a checkpoint.
-
-        Raises
-        ------
-        FileError
-            The halves cannot have such a state.
-        """
-        states = []
+    def restore(self, state: State) -> None:
+        """Continue from this state."""
         for k, run in enumerate(self._runs):
-            with saved.part(f"{HALVES}{k}_"):
-                states.append(run.take(saved))
-        done = {int(state["progress"][0]) for state in states}
-        saved.refuse_unless(len(done) == 1, f"{HALVES}0_progress and {HALVES}1_progress differ")
-        self.snapshots = take(saved, SNAPSHOTS, self._start, self._n_iter)
-        self.done = self.first + done.pop()
-        iterations = [each.iteration for each in self.snapshots]
-        saved.refuse_unless(
-            iterations == sorted(set(iterations)) and iterations[-1] <= self.done < self._due(),
-            f"{SNAPSHOTS}_iteration does not lead to iteration {self.done}",
-        )
-        for run, state in zip(self._runs, states, strict=True):
-            run.restore(state)
+            prefix = f"{HALVES}{k}_"
+            own = {name for name in state if name.startswith(prefix)}
+            run.restore({name.removeprefix(prefix): state[name] for name in own})
+        self.snapshots = unpack(SNAPSHOTS, state)
+        self.done = self.first + self._runs[0].done
 
 
 def pack(name: str, snapshots: Sequence[Snapshot]) -> State:
@@ -193,26 +176,10 @@ def pack(name: str, snapshots: Sequence[Snapshot]) -> State:
     return {f"{name}_{field}": np.array(values) for field, values in columns}
 
 
-def take(saved: Saved, name: str, start: Start, n_iter: int) -> list[Snapshot]:
-    """Return the snapshots that a checkpoint holds under a name, of halves with such a start.
-
-    Raises
-    ------
-    FileError
-        No such halves have such snapshots within `n_iter` iterations.
-    """
-    reach = MAX_SHIFT * (1.0 + 1e-9) if start.refines else 0.0  # which rounding may exceed
-    stars = np.repeat(start.setup.stars, start.scene.observation.n_epochs, axis=0)
-    low, high = stars - reach, stars + reach
-    whole, double = np.dtype(np.int64), np.dtype(np.float64)
-    iterations = saved.take(f"{name}_iteration", whole, (range(1, n_iter + 1),), 1, n_iter)
-    k, n, n_fluxes = len(iterations), len(low), start.scene.n_fluxes
-    extended = saved.take(
-        f"{name}_extended", _dtype(start), (k, 2, *start.scene.grid), 0.0, LARGEST
-    )
-    star_fluxes = saved.take(f"{name}_star_fluxes", double, (k, 2, n_fluxes), 0.0, LARGEST)
-    positions = saved.take(f"{name}_positions", double, (k, 2, n, 2), low, high)
-    return list(map(Snapshot, iterations.tolist(), extended, star_fluxes, positions))
+def unpack(name: str, state: State) -> list[Snapshot]:
+    """Return the snapshots that are saved under a name."""
+    iterations, *others = (state.get(f"{name}_{field}", ()) for field in Snapshot._fields)
+    return list(map(Snapshot, map(int, iterations), *others))
 
 
 def _dtype(start: Start) -> np.dtype:

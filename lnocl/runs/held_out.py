@@ -19,10 +19,8 @@ from numpy.typing import NDArray
 from lnocl.errors import InputError, note, warn
 from lnocl.process import ignored_notes
 from lnocl.runs.assessment import assess
-from lnocl.runs.halves import Halves, Snapshot, next_snapshot, pack, take
+from lnocl.runs.halves import Halves, Snapshot, pack, unpack
 from lnocl.runs.outcome import CURVE_DTYPE, Outcome
-from lnocl.runs.run import most_bytes as most_bytes_of_run
-from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved, is_whole
 from lnocl.runs.start import Start
 from lnocl.runs.thinning import split_counts
 from lnocl.scene.arrays import Array
@@ -257,61 +255,31 @@ class HeldOutCounts:
             **pack("best", [best.chosen]),
         }
 
-    def restore(self, saved: Saved, ended: str) -> None:
-        """Continue from the state in a checkpoint.
-
-        Raises
-        ------
-        FileError
-            Held-out counts cannot have such a state.
-        """
-        saved.refuse_unless(ended in ("", "callback", "held-out"), f"it ended by {ended}")
-        if "trials" in saved:
-            self._restore_trials(saved)
-        if ended == "held-out":
-            saved.refuse_unless(self._best is not None, "trials is missing")
+    def restore(self, state: State, is_over: bool) -> None:
+        """Continue from this state; where the choice is over, no halves are run any more."""
+        if "trials" in state:
+            self._restore_trials(state)
+        if is_over:
             self._halves = None
         else:
-            saved.refuse_unless(len(self._curves) < len(self._penalties), "nothing is left to try")
-            most = LENGTH_RATIO * self._n_iter + MIN_ITERATIONS
-            (next_look,) = saved.take("next_look", np.dtype(np.int64), (1,), 1, most)
-            self._next_look, self._halves = int(next_look), self._begin()
-            self._halves.restore(saved)
-        saved.refuse_others()
+            self._next_look, self._halves = int(state["next_look"][0]), self._begin()
+            self._halves.restore(state)
 
-    def _restore_trials(self, saved: Saved) -> None:
-        n_iter, n_trials, most = self._n_iter, len(self._penalties), UNBOUNDED
-        low, high = [1, -most, 0, 0, 0], [n_iter, most, most, n_trials - 1, most]
-        numbers = saved.take("trials", FLOAT, (5,), low, high)
-        saved.refuse_unless(is_whole(numbers[[0, 3]]), "trials holds parts of iterations")
-        chosen, offset, squared_norm, trial, error = numbers.tolist()
-        lengths = saved.take(
-            "curve_lengths", np.dtype(np.int64), (range(1, n_trials + 1),), 1, n_iter
-        )
-        rows = saved.take("curves", FLOAT, (2 * int(lengths.sum()),), 0.0, most).reshape(2, -1)
-        saved.refuse_unless(is_whole(rows[0]), "curves holds parts of iterations")
-        saved.refuse_unless(trial < len(lengths), "trials is of a penalty that was not tried")
-        ends = np.cumsum(lengths)
-        for penalty, length, end in zip(self._penalties, lengths, ends, strict=False):
+    def _restore_trials(self, state: State) -> None:
+        chosen, offset, squared_norm, trial, error = state["trials"].tolist()
+        rows, end = state["curves"].reshape(2, -1), 0
+        for penalty, length in zip(self._penalties, state["curve_lengths"], strict=False):
             curve = np.zeros(length, CURVE_DTYPE)
             curve["smoothing"] = penalty.smoothing
-            curve["iteration"], curve["error"] = rows[:, end - length : end]
+            curve["iteration"], curve["error"] = rows[:, end : end + length]
             self._curves.append(curve)
-        held = {}
-        for name in ("reference", "origin", "best"):
-            held[name], *others = take(saved, name, self._start, n_iter)
-            saved.refuse_unless(not others, f"{name}_iteration holds more than one")
-        counts = {name: (held[name].iteration + 1,) for name in ("origin", "best")}
-        objectives = {
-            name: saved.take(f"{name}_objectives", FLOAT, count, -most, most)
-            for name, count in counts.items()
-        }
-        saved.refuse_unless(held["origin"].iteration <= chosen, "origin_iteration is too late")
-        self._first = _First(
-            int(chosen), offset, squared_norm, held["reference"], held["origin"],
-            objectives["origin"],
-        )  # fmt: skip
-        self._best = _Best(int(trial), error, held["best"], objectives["best"])
+            end += length
+        (reference,), (origin,), (best,) = (
+            unpack(name, state) for name in ("reference", "origin", "best")
+        )
+        objectives = state["origin_objectives"]
+        self._first = _First(int(chosen), offset, squared_norm, reference, origin, objectives)
+        self._best = _Best(int(trial), error, best, state["best_objectives"])
 
 
 class _First(NamedTuple):
@@ -344,13 +312,3 @@ class _Best(NamedTuple):
     error: float
     chosen: Snapshot
     objectives: Array
-
-
-def most_bytes(start: Start, n_iter: int) -> int:
-    """Return the most bytes that the state of held-out counts may take."""
-    n_snapshots, due = 4, 1
-    while due <= n_iter:
-        n_snapshots, due = n_snapshots + 1, next_snapshot(due)
-    numbers = 2 * math.prod(start.scene.grid) + 6 * start.scene.n_fluxes + 1
-    snapshots = (n_snapshots * (numbers + 99) + 2 * n_iter) * np.dtype(np.float64).itemsize
-    return 2 * most_bytes_of_run(start, n_iter) + snapshots

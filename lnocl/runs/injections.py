@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import ndimage
 
 from lnocl.runs.outcome import Outcome
 from lnocl.runs.repeated import Repeated
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
-from lnocl.scene.shifting import Cutout
 
 # Sources of one image lie so many resolutions apart, so that none is in the level round another.
 APART = 9.0
@@ -57,23 +55,13 @@ class Injections:
         for place, flux in zip(places, fluxes, strict=True):
             other = scene.with_star(place)
             for j in range(scene.n_images):
+                deviation = self._width / (scene.oversample * float(observation.scales[j]) * FWHM)
                 for s in range(scene.n_stars, scene.n_stars + observation.n_epochs):
-                    cutout = self._wide(other.star_cutout(j, s), j)
+                    cutout = other.star_cutout(j, s).blurred(deviation, scene.image_grid)
                     light[j][cutout.window(scene.image_grid)] += flux / scene.unit * cutout.values
         means = [scene.in_electrons(each, j)[:ny, :nx] for j, each in enumerate(light)]
         counts = rng.poisson(np.maximum(means, 0.0)).astype(np.float64)
         return np.where(observation.mask, 0.0, counts)
-
-    def _wide(self, cutout: Cutout, j: int) -> Cutout:
-        """Return the image of a source as wide as these, given that of a point."""
-        if not self._width or not cutout.values.any():
-            return cutout
-        scene = self._outcome.scene
-        scale = float(scene.observation.scales[j])
-        deviation = self._width / (scene.oversample * scale * FWHM)
-        margin = int(np.ceil(4.0 * deviation))
-        values = ndimage.gaussian_filter(np.pad(cutout.values, margin), deviation)
-        return Cutout(values, cutout.y - margin, cutout.x - margin)
 
 
 def spread_places(

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from lnocl.errors import InputError, note, warn
 from lnocl.scene.arrays import Array, flag, numbers, whole
 from lnocl.scene.containers import counts
-from lnocl.scene.freedoms import refusal
 from lnocl.scene.observation import Observation
 from lnocl.scene.psf_families import FAMILIES
 from lnocl.solvers import SOLVERS
@@ -101,14 +100,15 @@ def check_families(
 ) -> tuple[str, ...]:
     """Return the families of PSFs that may be refined.
 
-    "auto" stands for those that any star shows, or for none where not all `is_auto`.
+    `positions` are those of stars that show them. "auto" stands for those that any star shows, or
+    for none where not all `is_auto`.
 
     Raises
     ------
     InputError
-        A name is unknown, or one text is given instead of several; there is no star; the PSFs vary
-        over the field; ideal PSFs, pupils or modes are lacking; pupils differ in their apertures;
-        a shift of one image is asked for beside free positions.
+        A name is unknown, or one text is given instead of several; there is no star; ideal PSFs,
+        pupils or modes are lacking; pupils differ in their apertures; a shift of one image is asked
+        for beside free positions.
     """
     if len(observation.psf_scatter) and not len(positions):
         raise InputError(
@@ -124,10 +124,6 @@ def check_families(
     for name in found:
         if not (isinstance(name, str) and name in FAMILIES):
             raise InputError(f"`refine_psfs` {name!r} is not known; give {', '.join(FAMILIES)}")
-    asked = {"refine_psfs": bool(found), "psf_scatter": len(observation.psf_scatter) > 0}
-    for name in (name for name, is_asked in asked.items() if is_asked):
-        if why := refusal(name, observation):
-            raise InputError(why)
     if found and not len(positions):
         raise InputError("`refine_psfs` needs a star, whose image shows the PSF; give stars")
     for name, needed in NEEDS.items():

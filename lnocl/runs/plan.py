@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from lnocl.errors import InputError
 from lnocl.runs.options import (
     EngineName,
     Precision,
@@ -20,53 +19,63 @@ from lnocl.runs.options import (
     read_start,
 )
 from lnocl.runs.start import Setup
-from lnocl.scene import freedoms
-from lnocl.scene.freedoms import Condition, refusal
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.psf_families import Family
+from lnocl.scene.star_psfs import owned, refuse_unowned
 from lnocl.scene.stars import check_positions
 from lnocl.solvers import SolverName
 
-LEVELS, PSFS, HALOS, PRIOR, CHOICE, FIT, STARS = STEPS = (
+LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
     "fit levels of backgrounds",
     "judge PSFs before the run",
     "settle halos",
     "give stars a prior by a run with a fixed weight",
     "choose the iteration by held-out counts",
-    "judge the fit after the run",
     "take marginal star fluxes",
 )
 
 
-def _of_images(condition: Condition) -> Condition:
-    """Return a condition on images as one on a plan."""
-    return Condition(lambda plan: condition.holds(plan.setup.observation), condition.otherwise)
+class Condition(NamedTuple):
+    """What must hold of a plan for a step.
+
+    Attributes
+    ----------
+    holds : callable
+        Tells of the plan whether it does.
+    otherwise : str
+        What is said where it does not.
+    """
+
+    holds: Callable[[Plan], bool]
+    otherwise: str
 
 
 AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number")
 HAS_STARS = Condition(lambda plan: len(plan.setup.stars) > 0, "there are no stars")
+SHOWS_PSFS = Condition(
+    lambda plan: bool((owned(plan.setup.observation, plan.setup.stars) < 0).any()),
+    "all stars have PSFs of their own",
+)
 HAS_HALOS = Condition(lambda plan: len(plan.setup.observation.halos) > 0, "there are no halos")
 HAS_ERROR = Condition(
     lambda plan: bool(plan.setup.observation.background_error.any()), "backgrounds have no error"
 )
 HELD_OUT = Condition(lambda plan: plan.stop == "held-out", "`stop` is another rule")
 WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into tiles")
-NOT_BEFORE = Condition(lambda plan: not plan.does(PSFS), "PSFs are judged before it")
 
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
     LEVELS: (AUTO, HAS_ERROR, WHOLE),
-    PSFS: (AUTO, HAS_STARS, *map(_of_images, freedoms.NEEDS["refine_psfs"])),
+    PSFS: (AUTO, HAS_STARS, SHOWS_PSFS),
     HALOS: (AUTO, HAS_HALOS),
     PRIOR: (AUTO, HELD_OUT, HAS_STARS),
     CHOICE: (HELD_OUT,),
-    FIT: (AUTO, HAS_STARS, _of_images(freedoms.ONE_PSF), NOT_BEFORE),
-    STARS: (AUTO, HAS_STARS, _of_images(freedoms.ONE_PSF)),
+    STARS: (AUTO, HAS_STARS),
 }
 # Of steps that hang on what those before find: where they are done.
 UNLESS_WRONG = "unless PSFs are wrong"
-WHERE = {PRIOR: UNLESS_WRONG, CHOICE: UNLESS_WRONG, STARS: "where the model fits"}
+WHERE = {PRIOR: UNLESS_WRONG, CHOICE: UNLESS_WRONG, STARS: "where PSFs fit"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,12 +119,11 @@ class Plan:
     >>> obs = lnocl.Observation(np.stack([image] * 2), np.ones((3, 3)), epochs=[0, 1])
     >>> print(lnocl.plan(obs, [(8, 5)]))
     fit levels of backgrounds: no, backgrounds have no error
-    judge PSFs before the run: no, the images are of several epochs
+    judge PSFs before the run: yes, and fit shift, jitter, pixels
     settle halos: no, there are no halos
-    give stars a prior by a run with a fixed weight: yes
-    choose the iteration by held-out counts: yes
-    judge the fit after the run: yes
-    take marginal star fluxes: yes, where the model fits
+    give stars a prior by a run with a fixed weight: yes, unless PSFs are wrong
+    choose the iteration by held-out counts: yes, unless PSFs are wrong
+    take marginal star fluxes: yes, where PSFs fit
     """
 
     setup: Setup
@@ -155,12 +163,6 @@ class Plan:
         if where == UNLESS_WRONG and not self.does(PSFS):
             where = ""
         return ", ".join(filter(None, ("yes", where)))
-
-    def notes(self) -> list[str]:
-        """Return what of a plan is worth a line before the run."""
-        if not self.does(FIT):
-            return []
-        return [f"PSFs are not judged before the run, as {self.why_not(PSFS)}"]
 
     def __str__(self) -> str:
         """Return a line for each step."""
@@ -223,6 +225,7 @@ def plan(
     refine_positions = read_refine_positions(refine_positions)
     fits_stars = solver == "sgp" or refine_positions is True
     positions = check_positions(stars, observation)
+    refuse_unowned(observation, positions)
     observation = observation.upright()
     initial = read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
     smoothing = read_smoothing(smoothing)
@@ -230,9 +233,8 @@ def plan(
     setup = Setup(observation, positions, pad, solver, precision, engine, device, False, *initial)
     made = Plan(setup, mu, smoothing, int(n_iter), stop)
     is_auto = made.does(PSFS)
-    families = check_families(refine_psfs, observation, positions, refine_positions, is_auto)
-    if refine_positions is True and (why := refusal("refine_positions", observation)):
-        raise InputError(why)
+    showing = positions[owned(observation, positions) < 0]
+    families = check_families(refine_psfs, observation, showing, refine_positions, is_auto)
     moves = refine_positions if is_auto else refine_positions is True
     return replace(
         made,

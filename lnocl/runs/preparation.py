@@ -75,8 +75,6 @@ def quietly() -> np.errstate:
 
 def prepare(plan: Plan, progress: bool = False) -> Prepared:
     """Return the run of a plan, after levels are fitted and PSFs and positions judged."""
-    for words in plan.notes():
-        note("%s", words)
     setup = plan.setup
     if plan.does(LEVELS):
         from lnocl.runs.halos import settle_levels  # which loads scipy

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lnocl.process import ignored_warnings
-from lnocl.runs.guarded_runs import GuardedRuns, Judged, estimate_scatter, rings_of
+from lnocl.runs.guarded_runs import GuardedRuns, Judged, estimate_scatter, inside, rings_of
 from lnocl.runs.start import make_model
 from lnocl.scene.arrays import Array
 from lnocl.scene.detector import on_sky
@@ -50,7 +50,7 @@ class Allowance:
     ) -> None:
         misfit = estimate.misfit
         self._observation, self._estimate, self._held = observation, estimate, runs.held
-        self._moved = estimate.scene.stars - runs.stars
+        self._moved = estimate.scene.places - runs.stars
         self._stars = runs.all_stars
         self.error = misfit.kappa if misfit.is_significant else 0.0
         # Those that are told, and those that the smoothing follows.
@@ -101,20 +101,22 @@ class Allowance:
         ny, nx = scene.observation.sky_shape
         light = np.zeros(scene.grid)
         for j in range(scene.n_images):
-            for s, flux in enumerate(whole.star_fluxes):
+            for s in np.flatnonzero(scene.shown[:, j] & scene.through_psfs).tolist():
                 cutout = scene.psf_on_sky(j, s)
-                light[cutout.window(scene.grid)] += flux * cutout.values
+                light[cutout.window(scene.grid)] += whole.star_fluxes[s] * cutout.values
         number = Rings((ny, nx), on_sky(scene.stars, scene.oversample), scene.oversample).number
         kappa = self.in_rings[np.minimum(number, len(self.in_rings) - 1)]
         return np.asarray(kappa * light[:ny, :nx] / scene.n_images**1.5)
 
     def _whole(self, pad: int | str) -> Estimate:
         """Return the start of the whole scene, with the stars as they were found."""
-        ny, nx = self._observation.shape
         stars = self._stars.copy()
         stars[self._held] += self._moved
         with ignored_warnings():  # those of the reconstruction are the same
-            scene = Scene(self._observation, stars.clip(0, (nx - 1, ny - 1)), pad=pad)
+            scene = Scene(self._observation, inside(stars, self._observation), pad=pad)
         start = Estimate.of_scaled(scene, *scene.start(None, None))
-        start.star_fluxes[self._held] = self._estimate.star_fluxes
+        held = np.repeat(self._held, scene.n_epochs)
+        n = np.count_nonzero(held)
+        start.star_fluxes[: scene.n_stars][held] = self._estimate.star_fluxes[:n]
+        start.star_fluxes[scene.n_stars :] = self._estimate.star_fluxes[n:]
         return start

@@ -25,6 +25,7 @@ from lnocl.runs.psf_allowance import STRENGTH, Allowance
 from lnocl.runs.start import Setup
 from lnocl.scene.arrays import Array
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters
+from lnocl.scene.psf_field import Psfs, mapped
 from lnocl.scene.psf_misfit import PsfMisfit
 from lnocl.scene.psf_wings import without_noise
 from lnocl.solvers.psf_fit import step
@@ -57,7 +58,7 @@ MAX_HALVED = 10
 class _State:
     """PSFs, the estimate by which they are judged, and whether stars may move for them."""
 
-    psfs: Array
+    psfs: Psfs
     estimate: Judged
     moves: bool
 
@@ -68,7 +69,7 @@ class _State:
     def is_mended_by(self, other: _State) -> bool:
         """Return whether other PSFs or positions mend enough to be taken."""
         before, after = self.misfit, other.misfit
-        if (other.estimate.star_fluxes < FADED * self.estimate.star_fluxes).any():
+        if (_of_stars(other) < FADED * _of_stars(self)).any():
             return False  # a sharper PSF, and the star's light in the extended source
         is_less = before.significance - after.significance > GONE
         return is_less and (not after.is_doubtful or after.kappa < MENDED * before.kappa)
@@ -109,9 +110,8 @@ def mend(
         number = counted(len(runs.stars), "star")
         note(f"PSFs are not judged: {number} in the window; name `refine_psfs` to judge them")
         return Mended(setup)
-    given = _State(
-        observation.psfs, runs.fit(observation.psfs, runs.stars, moves is True), moves is True
-    )
+    psfs = observation.psfs_over_images
+    given = _State(psfs, runs.fit(psfs, runs.stars, moves is True), moves is True)
     state = given
     if state.misfit.is_doubtful and moves == "auto":
         state = _move(runs, state)
@@ -121,7 +121,7 @@ def mend(
     families = PsfFamilies(of_parameters, observation.replace(psfs=state.psfs))
     values, tried, left = np.zeros((observation.n_images, len(families.prior))), state, None
     is_fitted = False  # whether the PSFs used have these values
-    done = ["the noise of wings taken"] if state.psfs is not observation.psfs else []
+    done = ["the noise of wings taken"] if state.psfs is not psfs else []
     if state.misfit.is_doubtful and families.parameters:
         tried, values = _fit(runs, families, state, moves is not False)
         if is_fitted := state.is_mended_by(tried):
@@ -134,7 +134,7 @@ def mend(
         if _is_trusted(tried, loose, state.misfit.kappa):
             left, state, is_fitted = state.misfit, tried, first is fitted
             done.append("pixels fitted")
-    is_accepted = state.psfs is not observation.psfs
+    is_accepted = state.psfs is not psfs
     if is_accepted:
         observation = observation.replace(psfs=state.psfs)
     known = observation.psf_scatter
@@ -166,6 +166,11 @@ def mend(
     return Mended(changed, refinement, near_stars, not allowance.error)
 
 
+def _of_stars(state: _State) -> Array:
+    """Return the fluxes of the stars, electrons."""
+    return state.estimate.star_fluxes[: state.estimate.scene.n_stars]
+
+
 def _shows_pixels(misfit: PsfMisfit) -> bool:
     """Return whether a misfit is enough for free pixels, which else follow the noise."""
     return misfit.is_significant or misfit.kappa > FREED
@@ -179,8 +184,9 @@ def _move(runs: GuardedRuns, state: _State) -> _State:
 
 def _clean(runs: GuardedRuns, state: _State) -> _State:
     """Return the state with the noise taken from the wings of PSFs, where that lowers kappa."""
-    psfs = without_noise(state.psfs, runs.observation.oversample)
-    stars = state.estimate.scene.stars
+    q = runs.observation.oversample
+    psfs = mapped(state.psfs, lambda _, stack: without_noise(stack, q))
+    stars = state.estimate.scene.places
     cleaned = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
     return cleaned if cleaned.misfit.kappa < CLEANED * state.misfit.kappa else state
 
@@ -208,20 +214,21 @@ def _loosen(runs: GuardedRuns, state: _State) -> _State:
 
     One that is kept from the stars more strongly leaves its own errors to pixels that are free.
     """
-    stars = state.estimate.scene.stars
+    stars = state.estimate.scene.places
     return replace(state, estimate=runs.fit(state.psfs, stars, state.moves, guard=STRENGTH))
 
 
 def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) -> _State:
     """Return the state with PSFs whose pixels are free, as far as scatter or residuals show."""
-    observation = runs.observation.replace(psfs=runs.cut(state.psfs))
+    observation = runs.seen_through(state.psfs)
     scatter = runs.cut(scatter)
     if not len(scatter):
         rings = state.misfit.in_rings
         scatter = estimate_scatter(observation.psfs, rings, observation.oversample)
     families = PsfFamilies(("pixels",), observation, scatter)
-    found = _search(runs, families, families.first(), state, moves, STRENGTH)[1]
-    return replace(found, psfs=runs.completed(state.psfs, found.psfs))
+    parameters, found = _search(runs, families, families.first(), state, moves, STRENGTH)
+    changes = [families.correction(j, parameters) for j in range(observation.n_images)]
+    return replace(found, psfs=runs.completed(state.psfs, changes))
 
 
 def _is_trusted(tried: _State, state: _State, given: float) -> bool:
@@ -230,7 +237,7 @@ def _is_trusted(tried: _State, state: _State, given: float) -> bool:
     The wings of free PSFs may take the light of a host, and their cores that of a star. The state
     is the one that they begin from; given is kappa before, which families may have lowered.
     """
-    before, after = state.estimate.star_fluxes, tried.estimate.star_fluxes
+    before, after = _of_stars(state), _of_stars(tried)
     is_near = abs(after - before) <= state.misfit.kappa * before
     is_fitted = tried.misfit.kappa < FITTED * given
     return is_fitted and bool(is_near.all())
@@ -249,7 +256,7 @@ def _search(
     error, estimate = state.misfit.kappa, state.estimate
     for _ in range(ROUNDS):
         parameters, stars = _step(runs, families, parameters, estimate, moves)
-        psfs = families.psfs(parameters)
+        psfs = families.psfs_over_images(parameters)
         estimate = runs.fit(psfs, stars, moves, min(FIRST_ERROR, LOOSE * error), guard)
         gain = found[-1][1].misfit.significance - estimate.misfit.significance if found else np.inf
         found.append((parameters, _State(psfs, estimate, moves)))
@@ -267,16 +274,17 @@ def _step(
     moves: bool,
 ) -> tuple[PsfParameters, Array]:
     """Return the parameters and the stars after a few steps from an estimate."""
-    stars = estimate.scene.stars
-    found = runs.moved(estimate, families.psfs(parameters), estimate.star_fluxes, stars)
+    stars = estimate.scene.places
+    found = runs.moved(estimate, families.psfs_over_images(parameters), estimate.star_fluxes, stars)
     for _ in range(STEPS):
         change = step(found, families, parameters, moves)
         parameters, stars = _follow(families, parameters, change.parameters), change.positions
         if moves:  # which a common shift is not told from
             parameters, common = families.without_common_shift(parameters)
             stars = stars + common / found.scene.oversample
-        found = runs.moved(found, families.psfs(parameters), change.star_fluxes, stars)
-    return parameters, found.scene.stars
+        psfs = families.psfs_over_images(parameters)
+        found = runs.moved(found, psfs, change.star_fluxes, stars)
+    return parameters, found.scene.places
 
 
 def _follow(

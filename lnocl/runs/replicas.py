@@ -13,6 +13,7 @@ from lnocl.runs.repeated import Repeated
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
+from lnocl.scene.psf_field import Psfs, mapped
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.star_prior import StarPrior
 from lnocl.scene.texture import Texture, hidden_radii, resolution
@@ -116,7 +117,7 @@ class Replicas:
         places = found.scene.stars.copy()  # the scene moves its stars for the next
         return Sky(found.estimate.observed_sky, found.light().sky(), found.star_fluxes, places)
 
-    def _draw_psfs(self, seed: np.random.SeedSequence) -> Array:
+    def _draw_psfs(self, seed: np.random.SeedSequence) -> Psfs:
         psfs = self._outcome.scene.observation.psfs
         rng = np.random.default_rng(seed)
         # One PSF for all images has one error.
@@ -124,7 +125,8 @@ class Replicas:
         fields = rng.standard_normal(psfs[:1].shape if is_shared else psfs.shape)
         fields = np.broadcast_to(fields, psfs.shape)
         changes = [cast(PsfPixels, self._pixels).correction(j, x) for j, x in enumerate(fields)]
-        return np.asarray(psfs + np.array(changes))
+        over_images = self._outcome.scene.observation.psfs_over_images
+        return mapped(over_images, lambda j, stack: stack + changes[j])
 
     def _draw(self, models: Sequence[Array], seeds: Sequence[np.random.SeedSequence]) -> Array:
         """Return counts of these models, shape (p, ny, nx)."""

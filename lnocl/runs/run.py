@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from copy import copy
 from functools import cached_property
@@ -10,21 +9,19 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from lnocl.errors import refuse_not_finite
 from lnocl.runs.descent import Descent
 from lnocl.runs.outcome import Outcome
-from lnocl.runs.saved import LARGEST, Saved, Shape
 from lnocl.runs.start import Setup, Start, make_model, measure_steps, move_stars
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.observation import Observation
 from lnocl.scene.scene import Scene
-from lnocl.scene.stars import MAX_SHIFT
 from lnocl.solvers import SOLVERS
 from lnocl.solvers.engine import Engine, State
-from lnocl.solvers.sgp import ALPHA_BOUNDS, Steps
+from lnocl.solvers.sgp import Steps
 
 if TYPE_CHECKING:
     from lnocl.scene.forward_model import Model
@@ -157,58 +154,6 @@ class Run:
             self.engine.restore(state)
         return state, int(np.argmin(objectives)) == self.done
 
-    def take(self, saved: Saved) -> State:
-        """Return the state that a checkpoint holds, where this run could have it.
-
-        Raises
-        ------
-        FileError
-            An array is missing, of another type or shape, or holds numbers that it cannot have.
-        """
-        own = self.state()  # types and shapes of most are those that they have at any time
-        n = self.n_iter
-        progress = saved.take("progress", own["progress"].dtype, (3,), [0, 0, 0], [n, n, 1])
-        done, due = progress[:2].tolist()
-        least_due = done if self._refines else n
-        saved.refuse_unless(due >= least_due, f"progress holds {due}, and must be {least_due}")
-        state: State = {"progress": progress}
-        shapes: dict[str, Shape] = {name: array.shape for name, array in own.items()}
-        shapes["objectives"] = range(done, done + 2), *own["objectives"].shape[1:]
-        if self.engine.scaling is not None:
-            state["cross_windows"] = windows = self._take_windows(saved, own["cross_windows"])
-            shapes["cross_values"] = (int(windows[:, 2:].prod(axis=1).sum()),)
-            n = self.scene.n_fluxes
-            shapes["star_information"] = n, range(1, max(n, 1) + 1)
-        bounds: dict[str, tuple[ArrayLike, ArrayLike]] = {
-            "steps": ALPHA_BOUNDS,
-            "positions": self._bounds_of_stars(),
-            "star_order": (0, max(self.scene.n_fluxes - 1, 0)),
-            **dict.fromkeys(("extended", "previous", "shift", "star_fluxes"), (0.0, LARGEST)),
-        }
-        for name in [name for name in own if name not in state]:
-            state[name] = saved.take(name, own[name].dtype, shapes[name], *bounds.get(name, ()))
-        if self.engine.scaling is not None:
-            is_usable = self._restored_scaling(state).is_usable()
-            saved.refuse_unless(is_usable, "star_information holds no Fisher information")
-        return state
-
-    def _bounds_of_stars(self) -> tuple[ArrayLike, ArrayLike]:
-        if not self._refines:
-            return self.scene.stars, self.scene.stars
-        reach = MAX_SHIFT * (1.0 + 1e-9)  # which rounding may exceed
-        return self._setup.stars - reach, self._setup.stars + reach
-
-    def _take_windows(self, saved: Saved, own: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the windows of the cross information: first row, column, height, width."""
-        low: ArrayLike = own
-        high: ArrayLike = own
-        if self._refines:
-            from lnocl.scene.forward_model import largest_window
-
-            size = self.scene.grid if self.scene.n_halos else largest_window(self.scene)
-            low, high = [-LARGEST, -LARGEST, 1, 1], [LARGEST, LARGEST, *size]
-        return saved.take("cross_windows", own.dtype, own.shape, low, high)
-
     def restore(self, state: State) -> None:
         """Continue from the state of a run of the same observation and parameters."""
         self.done, self._due = (int(number) for number in state["progress"][:2])
@@ -218,7 +163,9 @@ class Run:
             self.scene.move_stars(state["positions"])
             self.engine.move_stars()
         if self.engine.scaling is not None:
-            self.engine.set_scaling(self._restored_scaling(state))
+            from lnocl.solvers.scaling import Scaling
+
+            self.engine.set_scaling(Scaling.from_state(state))
         self.engine.restore(state)
         self._forget_end()
 
@@ -246,11 +193,6 @@ class Run:
     def _model(self) -> Model:
         """The model of the scene; it follows the stars."""
         return make_model(self.scene)
-
-    def _restored_scaling(self, state: State) -> Scaling:
-        from lnocl.solvers.scaling import Scaling
-
-        return Scaling.from_state(state)
 
     def _refine(self) -> None:
         """Move the stars to where they are most likely, given the current extended source."""
@@ -344,14 +286,3 @@ def _make_engine(
     from lnocl.engines.opencl import OpenCLEngine
 
     return OpenCLEngine(scene, setup.precision, setup.device, n_iter, scaling=scaling, half=half)
-
-
-def most_bytes(start: Start, n_iter: int) -> int:
-    """Return the most bytes that the state of a run may take."""
-    from lnocl.solvers.scaling import most_cross_values
-
-    scene = start.scene
-    n, pixels = scene.n_fluxes, math.prod(scene.grid)
-    numbers = 4 * pixels + 2 * scene.grid[0] + most_cross_values(scene) + n * (n + 8)
-    numbers += 2 * n_iter + 64
-    return np.dtype(np.float64).itemsize * numbers

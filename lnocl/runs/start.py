@@ -185,7 +185,8 @@ def move_stars(
     from lnocl.solvers.positions import StarFit, Stars
 
     star_fluxes, halos = np.split(star_fluxes, [scene.n_stars])
-    fit = StarFit(scene, model, extended, setup.stars, halos)
+    given = np.repeat(setup.stars, scene.n_epochs, axis=0)
+    fit = StarFit(scene, model, extended, given, halos)
     current = Stars(star_fluxes, scene.stars)
     starts = [current, fit.look_round(current)] if look_round else [current]
     stars = min(map(fit.minimise, starts), key=fit.objective)

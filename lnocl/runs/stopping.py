@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from lnocl.errors import warn
 from lnocl.runs.run import Run
-from lnocl.runs.saved import FLOAT, UNBOUNDED, Saved
 from lnocl.scene.arrays import Array
 
 if TYPE_CHECKING:
@@ -37,18 +36,12 @@ class Rule:
         """Return the quantity that decides, for the progress bar."""
         return f"objective {run.objective():.6g}"
 
-    def state(self) -> list[float]:
+    def state(self) -> Array:
         """Return the numbers that `restore` needs."""
-        return []
+        return np.zeros(0)
 
-    def restore(self, saved: Saved, done: int) -> None:
-        """Continue from the state in a checkpoint of so many iterations.
-
-        Raises
-        ------
-        FileError
-            The rule cannot have such a state.
-        """
+    def restore(self, state: Array) -> None:
+        """Continue from this state."""
 
 
 class Change(Rule):
@@ -69,14 +62,13 @@ class Change(Rule):
         """Return the relative change an iteration."""
         return f"change {self._change():.2g}"
 
-    def state(self) -> list[float]:
+    def state(self) -> Array:
         """Return the last objectives."""
-        return list(self._recent)
+        return np.array(self._recent, np.float64)
 
-    def restore(self, saved: Saved, done: int) -> None:
-        """Continue with the last objectives in a checkpoint."""
-        count = min(done, CHANGE_WINDOW + 1)
-        self._recent.extend(saved.take("rule", FLOAT, (count,), -UNBOUNDED, UNBOUNDED).tolist())
+    def restore(self, state: Array) -> None:
+        """Continue with these last objectives."""
+        self._recent.extend(state.tolist())
 
     def _change(self) -> float:
         first, last = self._recent[0], self._recent[-1]
@@ -123,14 +115,13 @@ class Discrepancy(Rule):
         """Return the data term over its expectation."""
         return f"discrepancy {self._discrepancy(run):.4g}"
 
-    def state(self) -> list[float]:
+    def state(self) -> Array:
         """Return the expectation."""
-        return [self._expected]
+        return np.array([self._expected])
 
-    def restore(self, saved: Saved, done: int) -> None:
-        """Continue with the expectation in a checkpoint."""
-        least = np.finfo(FLOAT).tiny if done else 0.0
-        (self._expected,) = saved.take("rule", FLOAT, (1,), least, UNBOUNDED).tolist()
+    def restore(self, state: Array) -> None:
+        """Continue with this expectation."""
+        self._expected = float(state[0])
 
     def _discrepancy(self, run: Run) -> float:
         return 2.0 * run.engine.data_term() * run.scene.scale / self._expected

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from lnocl.errors import InputError, counted
 from lnocl.scene.quantities import in_unit
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # An array whose last axis is so short, and the others so long, has its channels last.
 MAX_CHANNELS = 4
@@ -153,6 +155,14 @@ def whole(name: str, value: Any, least: int, more: str = "") -> int:
             f"`{name}` must be a whole number, {least} or more{more}; {value} was given"
         )
     return number
+
+
+def number_in(
+    name: str, value: Any, requirement: str, holds: Callable[[Any], bool | np.bool_]
+) -> None:
+    """Refuse what is no number, or does not hold a requirement."""
+    if not (isinstance(value, (int, float, np.number)) and holds(value)):
+        raise InputError(f"`{name}` must be {requirement}; {value} was given")
 
 
 def darker_noise(values: Array) -> float:

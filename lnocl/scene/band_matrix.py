@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cached_property
 
@@ -37,14 +38,15 @@ class BandMatrix:
         """The elements of each unknown with itself."""
         return np.asarray(self.band[0, self.places])
 
+    def block(self, unknowns: Sequence[int] | NDArray[np.int_]) -> Array:
+        """Return the elements of some of the unknowns, shape (n, n)."""
+        at = self.places[unknowns]
+        apart, first = abs(at - at[:, None]), np.minimum(at, at[:, None])
+        return np.where(apart < len(self.band), self.band[apart % len(self.band), first], 0.0)
+
     def dense(self) -> Array:
         """Return all elements, shape (m, m)."""
-        m = len(self.places)
-        ordered = np.zeros((m, m))
-        for d, elements in enumerate(self.band):
-            at = np.arange(m - d)
-            ordered[at, at + d] = ordered[at + d, at] = elements[: m - d]
-        return ordered[np.ix_(self.places, self.places)]
+        return self.block(np.arange(len(self.places)))
 
     def scaled(self, units: Array) -> BandMatrix:
         """Return the matrix with each unknown in other units: its rows and columns times these."""
@@ -58,6 +60,29 @@ class BandMatrix:
         band = self.band * ordered
         band *= windows.T
         return BandMatrix(band, self.places)
+
+    def tied(self, owners: NDArray[np.int_]) -> BandMatrix:
+        """Return the matrix ``B^T M B`` of fewer unknowns, of which each of these is one.
+
+        Parameters
+        ----------
+        owners : ndarray of int, shape (m,)
+            The new unknown that each is; all of them have one, or more.
+        """
+        m, at = len(self.places), owners[np.argsort(self.places)]
+        places = np.argsort(np.argsort(np.unique(at, return_index=True)[1]))
+        at = places[at]
+        lags = [abs(at[d:] - at[: m - d]) for d in range(len(self.band))]
+        held = zip(lags, self.band, strict=True)
+        width = max(int(lag[elements[: len(lag)] != 0].max(initial=0)) for lag, elements in held)
+        band = np.zeros((width + 1, len(places)), order="F")
+        for d, (lag, elements) in enumerate(zip(lags, self.band, strict=True)):
+            first = np.minimum(at[d:], at[: m - d])
+            # An element beside the diagonal stands for two, which here may meet on it.
+            values = elements[: m - d] * np.where((lag == 0) & (d > 0), 2.0, 1.0)
+            is_there = lag <= width
+            np.add.at(band, (lag[is_there], first[is_there]), values[is_there])
+        return BandMatrix(band, places)
 
     def solve(self, x: Array) -> Array:
         """Return the inverse times x, shape (m,) or (m, several).

@@ -159,6 +159,21 @@ class Camera(LinearMap):
         sky = self._pixels(self._otf * spectrum)
         return sky if self.rotation is None else self.rotation.forward(sky)
 
+    def in_frame(self, sky: Array) -> Spectrum:
+        """Return the spectrum of a sky, per pixel of it, in the frame of the image before its PSF.
+
+        Where the image is turned it has what the image's pixels can hold: that its PSF can show.
+        """
+        spectrum, rotation, shift = self.spectrum(sky), self.rotation, self.place[1]
+        v, u = np.fft.fftfreq(self.grid[0])[:, None], np.fft.rfftfreq(self.grid[1])
+        if rotation is None:
+            dx, dy = self._oversample * shift
+            return np.asarray(spectrum * np.exp(-2j * np.pi * (u * dx + v * dy)))
+        c, s = (rotation.scale * f(rotation.angle) for f in (math.cos, math.sin))
+        is_held = (abs(c * u - s * v) <= 0.5) & (abs(s * u + c * v) <= 0.5)
+        seen = rotation.forward(self._pixels(spectrum * is_held * rotation.undone()))
+        return self._transform(seen, ...)
+
     def unsampled(self, image: Array) -> Spectrum:
         """Return the spectrum of an image where it lies on the sky."""
         return super().unsampled(self.rotation.adjoint(image) if self.rotation else image)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 
@@ -28,14 +29,18 @@ def peak(light: Array) -> tuple[int, int]:
     return int(y[nearest]), int(x[nearest])
 
 
-def centroid(light: Array) -> tuple[float, float]:
-    """Return row and column of the centre of light of a core, as far as it is above `CORE`."""
+def core(light: Array, share: float) -> NDArray[np.bool_]:
+    """Return the pixels above a share of the peak that are connected to it."""
     from scipy.ndimage import label
 
     at = peak(light)
-    weights = np.maximum(light - CORE * light[at], 0.0)
-    labels, _ = label(weights > 0)
-    weights[labels != labels[at]] = 0.0
+    labels, _ = label(light > share * light[at])
+    return np.asarray(labels == labels[at])
+
+
+def centroid(light: Array) -> tuple[float, float]:
+    """Return row and column of the centre of light of a core, as far as it is above `CORE`."""
+    weights = np.where(core(light, CORE), light - CORE * light[peak(light)], 0.0)
     y, x = np.indices(light.shape)
     total = weights.sum()
     return float((weights * y).sum() / total), float((weights * x).sum() / total)
@@ -60,21 +65,10 @@ def off_centre(psf: Array) -> tuple[float, float]:
 
 def fwhm(light: Array) -> float:
     """Return the full width of a core at half its maximum, pixels: of a disc of the same area."""
-    from scipy.ndimage import label, zoom
+    from scipy.ndimage import zoom
 
-    row, column = peak(light)
-    half = 2 + math.ceil(1.5 * _area(light, (row, column)) ** 0.5)
-    rows, columns = (slice(max(at - half, 0), at + half + 1) for at in (row, column))
+    half = 2 + math.ceil(1.5 * float(core(light, 0.5).sum()) ** 0.5)
+    rows, columns = (slice(max(at - half, 0), at + half + 1) for at in peak(light))
     window = light[rows, columns]
     fine = zoom(window, FINER, order=3, mode="nearest", grid_mode=True)
-    at = np.unravel_index(int(fine.argmax()), fine.shape)
-    labels, _ = label(fine > fine[at] / 2)
-    return math.sqrt(4.0 / math.pi * float((labels == labels[at]).sum())) / FINER
-
-
-def _area(light: Array, at: tuple[int, int]) -> float:
-    """Return the number of pixels above half the peak, connected to it."""
-    from scipy.ndimage import label
-
-    labels, _ = label(light > light[at] / 2)
-    return float((labels == labels[at]).sum())
+    return math.sqrt(4.0 / math.pi * float(core(fine, 0.5).sum())) / FINER

@@ -39,12 +39,12 @@ def pixel_spectrum(
     return np.asarray(along * across)
 
 
-def seen_psfs(observation: Observation) -> Array:
-    """Return the PSFs as the pixels of the images see a star in the middle of one.
+def seen_psfs(observation: Observation, psfs: Array | None = None) -> Array:
+    """Return the PSFs, or others, as the pixels of the images see a star in the middle of one.
 
     Shape (p, n, n), the star at ``n // 2``; without oversampling they are those given.
     """
-    q, psfs = observation.oversample, observation.psfs
+    q, psfs = observation.oversample, observation.psfs if psfs is None else psfs
     if q == 1:
         return psfs
     half = -(-max(psfs.shape[1:]) // (2 * q)) + 1

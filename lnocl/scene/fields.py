@@ -12,6 +12,7 @@ from lnocl.errors import InputError, warn
 from lnocl.scene import containers
 from lnocl.scene.arrays import (
     Array,
+    Mask,
     booleans,
     flag,
     numbers,
@@ -25,13 +26,12 @@ from lnocl.scene.arrays import (
 from lnocl.scene.geometry import read_geometry
 from lnocl.scene.halos import read_halos
 from lnocl.scene.psfs import read_ideal_psfs, read_pixels, read_psfs
+from lnocl.scene.star_psfs import read_star_places, read_star_psfs
 from lnocl.scene.transforms import of_one_shape, refuse_other_shapes
 from lnocl.scene.uncertainties import is_uncertainty, without_source
 
 if TYPE_CHECKING:
     from lnocl.scene.observation import Observation
-
-Mask = NDArray[np.bool_]
 
 # Pixels of the sky to one of an image, along each axis. The frequencies that an image cannot tell
 # apart are neighbours in the transform's order where this is a power of two (kernels/convolve.cl).
@@ -266,6 +266,8 @@ FIELDS = {
         Field("ideal_psfs", read_ideal_psfs, "", "psf"),
         Field("psf_modes", read_pixels, "", "psf"),
         Field("psf_scatter", read_pixels, "", "psf"),
+        Field("star_places", read_star_places),
+        Field("star_psfs", read_star_psfs, "", "psf", of_images=1),
         Field("epochs", _epochs),
         Field("background", _levels, "counts", "pixels"),
         Field("background_error", _levels, "electrons"),
@@ -331,7 +333,8 @@ def _differs(field: Field, held: Observation, before: Observation) -> bool:
     if held.images.shape != before.images.shape:
         return True
     if field.axes == "psf":
-        return held.psfs.shape != before.psfs.shape
+        is_same = len(held.star_places) == len(before.star_places)
+        return not is_same or held.psfs.shape != before.psfs.shape
     is_map = field.axes == "pixels" and getattr(before, field.name).ndim > 2
     return is_map and held.mask is not before.mask
 

@@ -21,6 +21,7 @@ from lnocl.scene.camera import (
     ranges,
 )
 from lnocl.scene.estimate import Estimate
+from lnocl.scene.grid import psf_shape
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Cutout
 
@@ -214,8 +215,9 @@ def _illuminate(image: Array, background: Array | float, starlight: Array) -> No
 
 def largest_window(scene: Scene) -> tuple[int, int]:
     """Return the largest shape of `Model.adjoint_of_cutouts` of star images, wherever these lie."""
-    grid, psf_shape = scene.grid, scene.observation.psfs.shape[1:]
+    grid, shapes = scene.grid, (scene.observation.psfs.shape[1:], psf_shape(scene.observation))
     if scene.rotations:
         return grid
-    height, width = (2 * (k + 2 * MARGIN + 2 * (scene.oversample - 1)) for k in psf_shape)
+    more = 2 * MARGIN + 2 * (scene.oversample - 1)
+    height, width = (k + of_star + 2 * more for k, of_star in zip(*shapes, strict=True))
     return grid if height >= grid[0] or width >= grid[1] else (height, width)

@@ -65,13 +65,16 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
 def psf_shape(observation: Observation) -> tuple[int, int]:
     """Return the shape of what holds all PSFs, pixels of the sky.
 
-    Where images have several scales that is what is not 0 of each, times its scale.
+    Where images have several scales that is what is not 0 of each, times its scale; but for those
+    of single stars, which are not those of the sky.
     """
     shape, scales = observation.psfs.shape[1:], observation.scales
+    own = observation.star_psfs.shape[2:]
     if (scales == 1.0).all():
-        return shape[0], shape[1]
+        return max(shape[0], own[0]), max(shape[1], own[1])
     psfs = zip(observation.psfs, scales, strict=True)
-    ky, kx = np.ceil(np.max([scale * np.array(cropped(psf).shape) for psf, scale in psfs], axis=0))
+    shapes = [own, *(scale * np.array(cropped(psf).shape) for psf, scale in psfs)]
+    ky, kx = np.ceil(np.max(shapes, axis=0))
     return int(ky), int(kx)
 
 

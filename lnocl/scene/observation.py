@@ -18,13 +18,15 @@ from lnocl.scene.counts import refuse_overflow, without_negative
 from lnocl.scene.fields import FIELDS, hold, in_one_shape, noise_beyond_counts, refuse_all_bad
 from lnocl.scene.geometry import MOVES, Geometry, good_box
 from lnocl.scene.halos import refuse_dark
-from lnocl.scene.psf_field import PsfField
+from lnocl.scene.psf_field import PsfField, Psfs
 from lnocl.scene.psfs import PsfCentre, at_middle, normalised, own
 from lnocl.scene.transforms import of_one_shape, shapes_of
 
 # What goes with PSFs, and is left out where they are cut.
 BESIDE_PSFS = tuple(
-    name for name, field in FIELDS.items() if field.axes == "psf" and name != "psfs"
+    name
+    for name, field in FIELDS.items()
+    if field.axes == "psf" and name not in ("psfs", "star_psfs")
 )
 
 
@@ -127,6 +129,16 @@ class Observation:
     psf_scatter : array_like, shape (p, ky, kx) or (ky, kx), optional
         Standard deviation of the pixels of the PSFs, as far as it is known, zero or more, in units
         of PSFs of unit sum. It serves the noise near stars, and ``refine_psfs`` "pixels".
+    star_psfs : array_like, shape (n, p, ky, kx), (p, ky, kx) or (ky, kx), optional
+        PSFs of their own of the stars at `star_places`, such as one behind the mask of a
+        coronagraph. All else has `psfs`: other stars, the extended source and what is tested. They
+        are in the axes of the images, of any shape, each with its star at ``(ky // 2, kx // 2)``.
+        They are neither normalised nor moved. Their sum is the share of the star's light that an
+        image shows, 1 without a mask; so the flux of the star is what it has beside the mask, in
+        the unit of `psfs`.
+    star_places : array_like, shape (n, 2) or (2,), optional
+        ``(x, y)`` of these stars, as they are given to `lnocl.deconvolve`: each PSF is that of the
+        nearest star, which lies within half a pixel.
 
     Attributes
     ----------
@@ -164,6 +176,10 @@ class Observation:
         As given; of length 0 where they were not.
     psf_modes : ndarray of float64, shape (p, n, ky, kx)
         As given; n is 0 where they were not.
+    star_psfs : ndarray of float64, shape (n, p, ky, kx)
+        As given; n is 0 where they were not.
+    star_places : ndarray of float64, shape (n, 2)
+        As given.
 
     Raises
     ------
@@ -174,6 +190,8 @@ class Observation:
         - Images have an uncertainty that is below the noise of their counts in most pixels, of a
           class without a variance, or beside read noise.
         - A PSF or its sum is not finite, its sum is not positive, or its core is off its centre.
+        - `star_psfs` and `star_places` are not of as many stars, two places are within a pixel, or
+          the sum of a PSF is more than 1.
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
         - A halo is 0 on all good pixels of an image.
@@ -222,6 +240,8 @@ class Observation:
     ideal_psfs: Array
     psf_modes: Array
     psf_scatter: Array
+    star_places: Array
+    star_psfs: Array
     epochs: NDArray[np.intp]
     background: Array
     background_error: Array
@@ -254,12 +274,15 @@ class Observation:
         pupils: ArrayLike | None = None,
         psf_modes: ArrayLike | None = None,
         psf_scatter: ArrayLike | None = None,
+        star_psfs: ArrayLike | None = None,
+        star_places: ArrayLike | None = None,
     ) -> None:
         given = {name: value for name, value in locals().items() if name in (*FIELDS, *MOVES)}
         shapes = shapes_of(images) if transforms is not None else []
         if len(set(shapes)) > 1:
             given |= in_one_shape(given, shapes)
-        given["psfs"] = of_one_shape(psfs, 0.0, about_centre=True)
+        for name in ("psfs", "star_psfs"):
+            given[name] = of_one_shape(given[name], 0.0, about_centre=True)
         read = hold(self, given, shapes=shapes)
         into = partial(normalised, psf_centre=psf_centre)
         self.psf_fields = tuple(field.mapped(into) for field in self.psf_fields)
@@ -338,6 +361,11 @@ class Observation:
     def n_epochs(self) -> int:
         """Number of epochs, in each of which stars have a flux."""
         return int(self.epochs.max()) + 1
+
+    @property
+    def psfs_over_images(self) -> Psfs:
+        """The PSFs, or where they vary over images the field of each."""
+        return self.psf_fields or self.psfs
 
     @property
     def offsets(self) -> Array:
@@ -481,7 +509,10 @@ class Observation:
 
         PSFs that vary are those of a place (x, y) there, by default of its middle.
         """
-        changes: dict[str, Any] = {"geometry": self.geometry.window(rows, columns)}
+        changes: dict[str, Any] = {
+            "geometry": self.geometry.window(rows, columns),
+            "star_places": self.star_places - (columns.start, rows.start),
+        }
         for name, field in FIELDS.items():
             if field.axes == "pixels" and (values := getattr(self, name)).ndim > 2:
                 changes[name] = values[..., rows.start : rows.stop, columns.start : columns.stop]

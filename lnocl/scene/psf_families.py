@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
+from lnocl.scene.psf_field import Kind, Psfs, mapped
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.pupils import Pupil
 from lnocl.scene.shifting import fold
@@ -108,6 +109,7 @@ class PsfFamilies:
         self, names: Sequence[str], observation: Observation, scatter: Array = NO_SCATTER
     ) -> None:
         self._names, self._psfs = names, observation.psfs
+        self._over_images = observation.psfs_over_images
         self._ideals, modes = observation.ideal_psfs, observation.psf_modes
         self._pupils = [Pupil(each) for each in observation.pupils] if "pupil" in names else []
         if "modes" not in names:
@@ -154,11 +156,26 @@ class PsfFamilies:
 
     def psfs(self, parameters: PsfParameters) -> Array:
         """Return the PSFs, shape (p, ky, kx), wrapped round."""
-        otfs = (self._otf(j, each) for j, each in enumerate(parameters.values))
-        psfs = np.array([np.fft.fftshift(np.fft.irfft2(otf, self._grid)) for otf in otfs])
-        if self.pixels is not None:
-            psfs += [self.pixels.correction(j, each) for j, each in enumerate(parameters.pixels)]
-        return psfs
+        return self._changed(self._psfs, parameters)
+
+    def psfs_over_images(self, parameters: PsfParameters) -> Psfs:
+        """Return those that vary over images, each changed as that of the middle, or the PSFs."""
+        return self._changed(self._over_images, parameters)
+
+    def correction(self, j: int, parameters: PsfParameters) -> Array:
+        """Return what free pixels add to PSF j, shape (ky, kx)."""
+        if self.pixels is None:
+            return np.zeros(self._grid)
+        return self.pixels.correction(j, parameters.pixels[j])
+
+    def _changed(self, psfs: Kind, parameters: PsfParameters) -> Kind:
+        def change(j: int, stack: Array) -> Array:
+            factor, added = self._of_otf(j, parameters.values[j])
+            otfs = (spectrum(psf, self._grid) * factor + added for psf in stack)
+            seen = [np.fft.fftshift(np.fft.irfft2(otf, self._grid)) for otf in otfs]
+            return np.array(seen) + self.correction(j, parameters)
+
+        return mapped(psfs, change)
 
     def without_common_shift(self, parameters: PsfParameters) -> tuple[PsfParameters, Array]:
         """Return parameters with shifts of mean 0 over the PSFs, and that mean, (x, y)."""
@@ -209,17 +226,18 @@ class PsfFamilies:
             factors.append(np.where(ideal > LEAST_OTF, np.log(given / ideal), 0.0))
         return factors
 
-    def _otf(self, j: int, values: Array) -> Spectrum:
+    def _of_otf(self, j: int, values: Array) -> tuple[Spectrum | float, Spectrum | float]:
+        """Return by what OTFs of image j are multiplied, and what is added to them then."""
         grid = self._grid
         exponents = self._exponents(j, grid)
         log = sum((t * b for t, b in zip(values, exponents, strict=False)), 0.0)
-        otf = spectrum(self._psfs[j], grid) * np.exp(log)
+        factor = np.exp(log)
         if self._pupils:
             now, ideal = self._pupils[j].psf(values[self._phases]), self._pupils[j].ideal_psf()
-            otf *= _ratio(spectrum(now, grid), spectrum(ideal, grid), 1.0)
+            factor = factor * _ratio(spectrum(now, grid), spectrum(ideal, grid), 1.0)
         modes = (spectrum(mode, grid) for mode in self._modes[j])
         linear = zip(values[self._phases.stop :], modes, strict=True)
-        return np.asarray(otf + sum((t * mode for t, mode in linear), 0.0))
+        return factor, sum((t * mode for t, mode in linear), 0.0)
 
 
 def _ratio(otf: Spectrum, other: Spectrum, otherwise: float) -> Spectrum:

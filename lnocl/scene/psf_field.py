@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -182,6 +183,22 @@ def _between(nodes: Array, at: float) -> tuple[int, Array]:
     i = int(np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2))
     share = float(np.clip((at - nodes[i]) / (nodes[i + 1] - nodes[i]), 0.0, 1.0))
     return i, np.array([1.0 - share, share])
+
+
+# PSFs of images: shape (p, ky, kx), or where they vary over images a field of each.
+Psfs = Array | tuple[PsfField, ...]
+Kind = TypeVar("Kind", Array, tuple[PsfField, ...], Psfs)
+
+
+def mapped(psfs: Kind, function: Callable[[int, Array], Array]) -> Kind:
+    """Return what a function makes of the PSFs of each image.
+
+    It takes the number of the image and a stack of its PSFs, shape (n, ky, kx): one, or those of
+    all nodes.
+    """
+    if isinstance(psfs, tuple):
+        return tuple(field.mapped(partial(function, j)) for j, field in enumerate(psfs))
+    return np.array([function(j, psf[None])[0] for j, psf in enumerate(psfs)])
 
 
 def read_fields(psfs: Any, n_images: int, oversample: int, are_effective: bool) -> list[PsfField]:

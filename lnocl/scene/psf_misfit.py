@@ -109,7 +109,7 @@ def measure_misfit(estimate: Estimate, model: Model, settled: Estimate) -> PsfMi
     squares, parts = np.zeros(scene.n_images), list[tuple[Array, ...]]()
     images = zip(
         scene.images(),
-        model.starlight(fluxes),
+        model.starlight(_of_stars(estimate)),
         model.starlight(settled.fluxes),
         model.weights,
         strict=True,
@@ -173,10 +173,10 @@ def smoothing_near_stars(
     ndarray of float64, of the shape of the extended source
         For `lnocl.scene.penalty.Penalty.near_stars`.
     """
-    scene, fluxes = estimate.scene, estimate.fluxes
+    scene = estimate.scene
     ny, nx = scene.observation.shape
     variance = np.zeros(scene.grid)
-    images = zip(scene.images(), model.starlight(fluxes), strict=True)
+    images = zip(scene.images(), model.starlight(_of_stars(estimate)), strict=True)
     for j, (counts, light) in enumerate(images):
         background = np.broadcast_to(model.background[j], light.shape)
         total = np.maximum(np.maximum(counts, light + background), MIN_MODEL)
@@ -189,6 +189,11 @@ def smoothing_near_stars(
     ny, nx = scene.observation.sky_shape
     deviation = np.sqrt(np.maximum(variance[:ny, :nx], 0.0))
     return np.asarray(strength * deviation)
+
+
+def _of_stars(estimate: Estimate) -> Array:
+    """Return the fluxes, scaled, but 0 for those that the PSFs of the images do not show."""
+    return np.where(estimate.scene.through_psfs, estimate.fluxes, 0.0)
 
 
 def _kappa(excess: float, norm: float) -> float:

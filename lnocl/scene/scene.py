@@ -20,8 +20,10 @@ from lnocl.scene.grid import grid_of, psf_shape
 from lnocl.scene.halos import halo_cutouts
 from lnocl.scene.observation import Observation
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
+from lnocl.scene.psf_field import Psfs
 from lnocl.scene.rotation import Rotation, turned_psf
 from lnocl.scene.shifting import Cutout, MovablePsf
+from lnocl.scene.star_psfs import StarPsfs, owned
 from lnocl.scene.stars import Covered, StarField, check_positions, covered_box
 
 # Below this share of its maximum the total weight of a pixel of the extended source is taken as
@@ -121,6 +123,8 @@ class Scene:
         where all were observed alike.
     gains : ndarray of float64, shape (p,)
         Relative exposures where they are numbers, else 1; the PSFs are multiplied by them.
+    owned : ndarray of int, shape (n,)
+        The PSF of its own that each star has, -1 where it has none.
     star_weights : ndarray of float64, shape (n_fluxes,)
         ``sum_j <P_js, w_j>``, of each image not less than 0: the shares of the star's light that
         were observed, summed; likewise of halos. `HELD` where a flux is to stay.
@@ -154,6 +158,7 @@ class Scene:
         positions = check_positions(stars, observation)
         self._max_shift = max_shift
         self.shown = self._shown(len(positions))
+        self.owned = np.repeat(owned(observation, positions), observation.n_epochs)
         positions = np.repeat(positions, observation.n_epochs, axis=0)
         self.oversample = observation.oversample
         self.image_grid = grid_of(observation, pad)
@@ -179,6 +184,8 @@ class Scene:
         if self.transmission is not None:
             self.seen_areas *= observation.transmission.mean(axis=(1, 2))
         self.rotations = self._rotations()
+        movable = partial(movable_psfs, observation=observation, grid=self.image_grid)
+        self._own = StarPsfs(observation, self.gains, movable, self.grid)
         self.weights = self._weigh(relative if has_map else None)
         self._halos = (
             halo_cutouts(observation.halos, self.weights, has_map, self.image_grid)
@@ -186,7 +193,7 @@ class Scene:
             else []
         )
         self._field = self._place_stars(positions)
-        self.star_weights, is_observed = self._weigh_stars(self._field)
+        self.star_weights, is_observed = self._weigh_stars(self._field, self.owned)
         self._leave_out_stars(~is_observed[: len(positions)])
         self.holds_halos = False
         self._warn_of_ringing()
@@ -283,8 +290,8 @@ class Scene:
         half.scale, half.unit = self.scale / 2.0, self.unit / 2.0
         return half
 
-    def seen_through(self, psfs: Array) -> Scene:
-        """Return this scene with other PSFs, shape (p, ky, kx), as they are."""
+    def seen_through(self, psfs: Psfs) -> Scene:
+        """Return this scene with other PSFs, as they are."""
         other = copy(self)
         other.observation = self.observation.replace(psfs=psfs)
         other._psfs = movable_psfs(other.scaled_psfs(), other.observation, self.image_grid)
@@ -320,7 +327,7 @@ class Scene:
         """
         before, weights = self.stars, self.star_weights
         self._field = self._place_stars(numbers("stars", stars))
-        self.star_weights, is_observed = self._weigh_stars(self._field)
+        self.star_weights, is_observed = self._weigh_stars(self._field, self.owned)
         if self.holds_halos:
             self.star_weights[self.n_stars :] = HELD
         if not is_observed.all():
@@ -331,9 +338,10 @@ class Scene:
     def observes(self, positions: Array) -> NDArray[np.bool_]:
         """Return which stars at these positions any image would observe."""
         shown = np.ones((len(positions), self.n_images), bool)
-        psfs = self.star_psfs(positions)
+        owners = owned(self.observation, positions)
+        psfs = self._own.into(self._common_psfs(positions), owners)
         field = StarField(psfs, self.observation, self.image_grid, positions, shown)
-        return self._weigh_stars(field)[1]
+        return self._weigh_stars(field, owners)[1]
 
     def _place_stars(self, positions: Array) -> StarField:
         psfs = self.star_psfs(positions)
@@ -344,7 +352,15 @@ class Scene:
     def star_psfs(
         self, positions: Array, part: tuple[slice, slice] | None = None
     ) -> list[list[MovablePsf | DetectorPsf]]:
-        """Return the PSF of each image at each of some positions, or a part of it, to be placed."""
+        """Return the PSF of each image at each star's position, or a part of it, to be placed.
+
+        PSFs of their own are whole.
+        """
+        return self._own.into(self._common_psfs(positions, part), self.owned)
+
+    def _common_psfs(
+        self, positions: Array, part: tuple[slice, slice] | None = None
+    ) -> list[list[MovablePsf | DetectorPsf]]:
         observation, fields = self.observation, self.observation.psf_fields
         if not fields and part is None and self.transmission is None:
             return [[psf] * len(positions) for psf in self._psfs]
@@ -383,6 +399,21 @@ class Scene:
         return len(self.stars)
 
     @property
+    def n_epochs(self) -> int:
+        """Number of epochs, in each of which stars have a flux."""
+        return self.observation.n_epochs
+
+    @property
+    def places(self) -> Array:
+        """Positions of the stars, once each."""
+        return np.asarray(self.stars[:: self.n_epochs])
+
+    @property
+    def through_psfs(self) -> NDArray[np.bool_]:
+        """Which fluxes the PSFs of the images show: not halos, nor stars with PSFs of their own."""
+        return np.append(self.owned < 0, np.zeros(self.n_halos, bool))
+
+    @property
     def n_halos(self) -> int:
         """Number of halos of all images together."""
         return self.n_fluxes - self.n_stars
@@ -395,9 +426,8 @@ class Scene:
     @property
     def shown_places(self) -> Array:
         """Positions of stars that any image shows, once each, shape (n_shown, 2)."""
-        n_epochs = self.observation.n_epochs
-        is_shown = self.is_shown[: self.n_stars].reshape(-1, n_epochs).any(axis=1)
-        return np.asarray(self.stars[::n_epochs][is_shown])
+        is_shown = self.is_shown[: self.n_stars].reshape(-1, self.n_epochs).any(axis=1)
+        return np.asarray(self.places[is_shown])
 
     @property
     def shown_stars(self) -> Array:
@@ -428,12 +458,13 @@ class Scene:
 
     def with_star(self, place: Array) -> Scene:
         """Return this scene with one more star, the last, at (x, y)."""
-        other, n, n_epochs = copy(self), self.n_stars, self.observation.n_epochs
+        other, n, n_epochs = copy(self), self.n_stars, self.n_epochs
         shown = np.arange(n_epochs)[:, None] == self.observation.epochs
         other.shown = np.insert(self.shown, [n] * n_epochs, shown, axis=0)
         positions = np.concatenate([self.stars, np.tile(place, (n_epochs, 1))])
+        other.owned = np.append(self.owned, [-1] * n_epochs)
         other._field = other._place_stars(positions)
-        other.star_weights, _ = other._weigh_stars(other._field)
+        other.star_weights, _ = other._weigh_stars(other._field, other.owned)
         return other
 
     def images(self) -> Iterator[Array]:
@@ -519,8 +550,18 @@ class Scene:
 
     def psf_on_sky(self, j: int, s: int) -> Cutout:
         """Return PSF j on the sky's grid, at star s."""
-        fine = self._psfs_of_sky[j] if self.rotations else self._psfs[j].fine
+        if self.owned[s] >= 0:
+            rotation = self.rotations[j] if self.rotations else None
+            fine = self._own.of_sky(self.owned[s], j, rotation)
+        else:
+            fine = self._psfs_of_sky[j] if self.rotations else self._psfs[j].fine
         return fine.at(*on_sky(self.stars[s], self.oversample))
+
+    def share_shown(self, s: int) -> float:
+        """Return the share of its light that images show of star s, without mask and edges."""
+        shown = self.shown[s]
+        is_own = self.owned[s] >= 0 and shown.any()
+        return float(self._own.shares[self.owned[s]][shown].mean()) if is_own else 1.0
 
     @property
     def star_field(self) -> StarField:
@@ -673,21 +714,24 @@ class Scene:
         least = max(1e-3 * total, n_observed * float(np.finfo(np.float32).eps))
         return max(total - float(fluxes @ self.star_weights), least) / n_seen
 
-    def _weigh_stars(self, field: StarField) -> tuple[Array, NDArray[np.bool_]]:
+    def _weigh_stars(
+        self, field: StarField, owners: NDArray[np.intp]
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Return ``sum_j <P_js, w_j>`` for each star, and whether any image observed it.
 
         An image did where `OBSERVED_SHARE` of the star's light falls on its good pixels, however
         short the exposure: it may be the only one that is not saturated. A sum that negative pixels
-        of a PSF make negative counts as 0.
+        of a PSF make negative counts as 0. PSFs of their own show a share of the light.
         """
+        has_own = np.append(owners >= 0, np.zeros(len(field) - len(owners), bool))
         if self.weights is None:
             light = field.shown.T.astype(np.float64)
-            if self.observation.n_epochs > 1:  # else a star is in all images, of mean exposure 1
+            if self.n_epochs > 1:  # else a star is in all images, of mean exposure 1
                 light[:, : len(field.positions)] *= self.gains[:, None]
             # Samples of an effective PSF a pixel apart may sum to another number.
-            if self.oversample > 1 and self.observation.effective_psfs:
-                sums = [[cutout.values.sum() for cutout in each] for each in field.cutouts]
-                light *= sums
+            is_summed = has_own | (self.oversample > 1 and self.observation.effective_psfs)
+            for s in np.flatnonzero(is_summed):
+                light[:, s] = [cutouts[s].values.sum() for cutouts in field.cutouts]
             return light.sum(axis=0), np.ones(len(field), bool)
         total, is_observed = np.zeros(len(field)), np.zeros(len(field), bool)
         for j, weights in enumerate(self.weights):
@@ -697,7 +741,9 @@ class Scene:
             light = np.array([float((cutout.values * w).sum()) for cutout, w in windows])
             on_good = np.array([float((cutout.values * (w > 0)).sum()) for cutout, w in windows])
             total += np.maximum(light, 0.0)
-            is_observed |= (on_good >= OBSERVED_SHARE * self.gains[j]) & (light > 0)
+            whole = np.full(len(field), self.gains[j])
+            whole[has_own] *= self._own.shares[owners[owners >= 0], j]
+            is_observed |= (on_good >= OBSERVED_SHARE * whole) & (light > 0)
         return total, is_observed
 
     def _leave_out_stars(self, is_lost: NDArray[np.bool_]) -> None:
@@ -707,9 +753,9 @@ class Scene:
         self.shown[: len(is_lost)][is_lost] = False
         self.star_weights[: len(is_lost)][is_lost] = HELD
         self._field = self._place_stars(self.stars)
-        of_epochs = is_lost.reshape(-1, self.observation.n_epochs)
+        of_epochs = is_lost.reshape(-1, self.n_epochs)
         is_dark = np.asarray(of_epochs.all(axis=1))
-        stars = self.stars[:: self.observation.n_epochs]
+        stars = self.places
         if n_dark := int(is_dark.sum()):
             x, y = stars[is_dark][0]
             others = f", and so do {counted(n_dark - 1, 'other')}" if n_dark > 1 else ""

@@ -19,6 +19,9 @@ ALIASES = np.arange(-6, 7)
 # A smaller share of the light at the highest frequency is taken for rounding.
 MIN_NYQUIST = 1e-16
 
+# A grid that no PSF goes round.
+ENDLESS = 2**31, 2**31
+
 # Rows and columns of an array: slices, or arrays of indices where they wrap round its edge.
 Window = tuple[Any, Any]
 
@@ -35,8 +38,8 @@ class Cutout(NamedTuple):
 
     def on_grid(self, grid: tuple[int, int]) -> Array:
         """Return the values on the whole grid, 0 elsewhere."""
-        laid = np.zeros(grid)
-        laid[self.window(grid)] = self.values
+        laid = np.zeros((*self.values.shape[:-2], *grid))
+        laid[..., *self.window(grid)] = self.values
         return laid
 
     def window(self, grid: tuple[int, int]) -> Window:
@@ -59,8 +62,8 @@ class Cutout(NamedTuple):
         The window has a first row and column, and may go round the edges of the grid.
         """
         y, x = (self.rows(grid) - first[0]) % grid[0], (self.columns(grid) - first[1]) % grid[1]
-        y_in, x_in = y < light.shape[0], x < light.shape[1]
-        light[np.ix_(y[y_in], x[x_in])] += flux * self.values[np.ix_(y_in, x_in)]
+        y_in, x_in = y < light.shape[-2], x < light.shape[-1]
+        light[..., *np.ix_(y[y_in], x[x_in])] += flux * self.values[..., *np.ix_(y_in, x_in)]
         return light
 
     def aligned(self, grid: tuple[int, int]) -> Cutout:
@@ -72,16 +75,31 @@ class Cutout(NamedTuple):
         values = np.roll(self.values, (y[0], x[0]), axis=(0, 1)) if y[0] or x[0] else self.values
         return Cutout(values, y[1], x[1])
 
+    def blurred(self, deviation: float, grid: tuple[int, int]) -> Cutout:
+        """Return the values convolved with a Gaussian of this standard deviation, pixels.
+
+        They may go round the edges of the grid.
+        """
+        if not deviation:
+            return self
+        from scipy.ndimage import gaussian_filter
+
+        margin = 2 * int(np.ceil(4.0 * deviation))
+        more = [min(margin, n - size) for n, size in zip(grid, self.values.shape, strict=True)]
+        wide = np.pad(self.values, [(n // 2, n - n // 2) for n in more])
+        values = gaussian_filter(wide, deviation, mode="wrap")
+        return Cutout(values, self.y - more[0] // 2, self.x - more[1] // 2)
+
     def trimmed(self, least: float) -> Cutout:
         """Return the cutout without outer rows and columns whose values all are this or less.
 
         One pixel is left, at least.
         """
-        large = abs(self.values) > least
+        large = abs(self.values).reshape(-1, *self.values.shape[-2:]).max(axis=0) > least
         rows, columns = (np.flatnonzero(large.any(axis=axis)) for axis in (1, 0))
         if not len(rows):
-            return Cutout(self.values[:1, :1], self.y, self.x)
-        inner = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+            return Cutout(self.values[..., :1, :1], self.y, self.x)
+        inner = np.s_[..., rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         values = np.ascontiguousarray(self.values[inner])
         return Cutout(values, self.y + int(rows[0]), self.x + int(columns[0]))
 

@@ -11,7 +11,6 @@ from lnocl.errors import counted, warn
 from lnocl.scene.arrays import Array
 from lnocl.scene.cores import centroid, fwhm
 from lnocl.scene.detector import seen_psfs
-from lnocl.scene.freedoms import refusal
 from lnocl.scene.scene import Scene
 
 # The square in which a star is looked at reaches so many widths of its PSF from it, at least and at
@@ -64,8 +63,9 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
         light = observation.images[j] - observation.background[j]
         shown = np.flatnonzero(scene.shown[: scene.n_stars, j])
         positions = scene.star_field.places[j][shown]
-        nearest = KDTree(positions).query(positions, k=[2], p=np.inf)[0]  # infinite if alone
-        for k in np.flatnonzero(nearest >= 2 * reach).tolist():
+        nearest = KDTree(positions).query(positions, k=[2], p=np.inf)[0][:, 0]  # infinite if alone
+        is_of_psf = scene.owned[shown] < 0
+        for k in np.flatnonzero((nearest >= 2 * reach) & is_of_psf).tolist():
             s, position = int(shown[k]), positions[k]
             x, y = np.round(position).astype(int)
             rows, columns = (slice(at - reach, at + reach + 1) for at in (y, x))
@@ -101,11 +101,14 @@ def _compare(
 
 
 def _masked_stars(scene: Scene) -> Iterator[int]:
-    """Yield the stars whose middle is on a bad pixel, or outside, in every image."""
+    """Yield the stars whose middle is on a bad pixel, or outside, in every image.
+
+    Not those with PSFs of their own, which behind a mask have no middle.
+    """
     observation = scene.observation
     size = observation.shape[::-1]
     for s, star in enumerate(scene.stars):
-        if not scene.shown[s].any():  # of which is told otherwise
+        if not scene.shown[s].any() or scene.owned[s] >= 0:  # of the former is told otherwise
             continue
         places = [observation.places(j, star) for j in range(observation.n_images)]
         nearest = np.round(places).astype(int)
@@ -161,9 +164,8 @@ def warn_of_stars(scene: Scene, moves: bool) -> None:
     farthest = max(found, key=StarCheck.excess_distance)
     if farthest.excess_distance() > 0 and not moves:
         (dx, dy), (x, y) = farthest.offset, scene.stars[farthest.star]
-        move = "" if refusal("refine_positions", scene.observation) else ", take `refine_positions`"
         warn(
             f"the star at ({x:.7g}, {y:.7g}) lies ({dx:z.2f}, {dy:z.2f}) pixels from there in "
-            f"`images[{farthest.image}]`: give its place{move}, or mend the centre of "
-            f"`psfs[{farthest.image}]`"
+            f"`images[{farthest.image}]`: give its place, take `refine_positions`, or mend the "
+            f"centre of `psfs[{farthest.image}]`"
         )

@@ -282,7 +282,8 @@ class StarField:
         ]
 
     @cached_property
-    def _order(self) -> Order:
+    def order(self) -> Order:
+        """The order of the stars, and of what is fixed, in matrices of their information."""
         if self._fixed:  # which fills the images, and so meets all stars
             return Order(np.arange(len(self)), len(self) - 1)
         images = zip(self.places, self.cores, strict=True)
@@ -327,7 +328,7 @@ class StarField:
             ]
             for cutouts in (self.cutouts[j], self.cores[j])
         )
-        return StarImages(covered, pieces, self._order, cores)
+        return StarImages(covered, pieces, self.order, cores)
 
 
 def _nothing_at(place: Array) -> Cutout:

@@ -9,7 +9,7 @@ import numpy as np
 from astropy import units as u
 
 from lnocl.errors import InputError
-from lnocl.scene.arrays import Array
+from lnocl.scene.arrays import Array, number_in
 
 MIN_SIZE = 32
 
@@ -47,8 +47,7 @@ def positive(name: str, value: Any, unit: u.UnitBase) -> float:
 
 def check_share(name: str, value: float) -> None:
     """Refuse a number outside (0, 1]."""
-    if not (isinstance(value, (int, float, np.floating)) and 0 < value <= 1):
-        raise InputError(f"`{name}` must be in (0, 1]; {value} was given")
+    number_in(name, value, "in (0, 1]", lambda given: 0 < given <= 1)
 
 
 def check_shape(shape: Any, minimum: int = MIN_SIZE) -> tuple[int, int]:

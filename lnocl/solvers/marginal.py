@@ -60,7 +60,8 @@ def marginal(estimate: Estimate) -> Estimate:
         there = near.places(scene)
         light = _core_of(near, scene, first) * (near.expected + near.source.of(x)) * scene.unit
         light = np.maximum(light, -after[there])
-        after[there] += _at_most(light, float((star_fluxes[star] - fluxes[star]).mean()))
+        lost = float((star_fluxes[star] - fluxes[star]).mean()) * scene.share_shown(first)
+        after[there] += _at_most(light, lost)
     return estimate.changed(after, fluxes)
 
 

@@ -140,8 +140,10 @@ class NearStar:
         The pixels of the images, without offset.
     held : ndarray of int, shape (n_held,)
         Stars that are fitted: this, which is the first, and those near it.
+    unknowns : ndarray of int, shape (n_held, 1 or 3)
+        Those of each: its flux, and perhaps x and y, which it has in all epochs.
     n_of_stars : int
-        Unknowns of these, all fluxes, perhaps all x, and all y. Halos follow, shape by shape.
+        Unknowns of all: fluxes, perhaps all x, and all y. Halos follow, shape by shape.
     resolution : float
         What all images resolve together, pixels of the sky.
     hidden : float
@@ -160,7 +162,8 @@ class NearStar:
         there, texture = _texture_in(self.window, around)
         self.source = self._source_error(around, texture.amplitude[there], texture.width)
         self.held, self.n_held, self.resolution = held, len(held), width
-        self._finished, self.n_of_stars = finished, len(held) * (3 if around.moves else 1)
+        self._finished, self.unknowns = finished, _unknowns(held, scene.n_epochs, around.moves)
+        self.n_of_stars = int(self.unknowns.max()) + 1
         self.expected = texture.mean[there] - around.estimate.part(self.places(scene))
         level = float(texture.mean[there].mean())
         self._level = LevelError(level, self._responses(around), self.window.shape)
@@ -255,8 +258,7 @@ class NearStar:
                 for flux, each in zip(fluxes, moved, strict=True):
                     slope = each._replace(values=flux * each.values[axis])
                     slopes.append(_cut(slope, there, grid))
-        n, p = self.n_held, scene.n_images
-        unknowns = np.concatenate([lit, lit + n, lit + 2 * n]) if around.moves else lit
+        p, unknowns = scene.n_images, self.unknowns[lit].T.ravel()
         slopes += [_cut(halo, there, grid) for halo in around.halos(j)]
         of_halos = self.n_of_stars + j + p * np.arange(around.n_shapes)
         unknowns, k = np.append(unknowns, of_halos), len(slopes)
@@ -264,6 +266,14 @@ class NearStar:
         laid = np.array([_padded(slope, shape) for slope in slopes])
         precisions = _padded(precision(scene, model, weights), shape)
         return LinearImage(laid.reshape(k, left.size), unknowns, left, precisions)
+
+
+def _unknowns(held: NDArray[np.int_], n_epochs: int, moves: bool) -> NDArray[np.int_]:
+    """Return the unknowns of stars in epochs: fluxes, all x, and all y, of a place each."""
+    n, numbers = len(held), dict[int, int]()
+    place = np.array([numbers.setdefault(s, len(numbers)) for s in (held // n_epochs).tolist()])
+    each = [np.arange(n), n + place, n + len(numbers) + place]
+    return np.stack(each if moves else each[:1], axis=1)
 
 
 def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slice], Texture]:

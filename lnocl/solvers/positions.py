@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -72,13 +73,14 @@ class StarFit:
     Parameters
     ----------
     scene : Scene
-        What is modelled; its stars are where the search begins.
+        What is modelled; its stars are where the search begins. A star is at one place in all
+        epochs.
     model : Model
         Of the scene.
     extended : ndarray of float64, shape (Ny, Nx)
         Extended source, on the grid and scaled.
     given : ndarray of float64, shape (n, 2)
-        Positions that the stars must stay within `MAX_SHIFT` of.
+        Positions that the stars, in each epoch, must stay within `MAX_SHIFT` of.
     halos : ndarray of float64, shape (n_halos,), optional
         Fluxes of the halos, which are held.
     """
@@ -94,9 +96,10 @@ class StarFit:
         self._given, self._observation = given, scene.observation
         n_images, turns = scene.n_images, scene.observation.turns
         part = _part(scene.scaled_psfs())
-        shape = scene.observation.psfs[0][part].shape
+        shape, own = scene.observation.psfs[0][part].shape, scene.observation.star_psfs.shape[2:]
+        shapes = [shape if k < 0 else own for k in scene.owned]
         squares = [
-            [_square(shape, place, scene) for place in self._observation.places(j, given)]
+            list(map(partial(_square, scene=scene), shapes, self._observation.places(j, given)))
             for j in range(n_images)
         ]
         covered = [covered_pixels(each, scene.image_grid) for each in squares]
@@ -108,7 +111,11 @@ class StarFit:
             )
             for cutouts in both
         ]
-        is_shown = scene.is_shown[: scene.n_stars]
+        # The unknowns that fluxes and positions of stars in epochs are, and the stars of a place.
+        n, self._n_epochs = scene.n_stars, scene.n_epochs
+        place = np.arange(n) // scene.n_epochs
+        n_places = n // scene.n_epochs
+        self._owners = np.concatenate([np.arange(n), n + place, n + n_places + place])
         is_turned = self._observation.is_turned
         scales = np.repeat(self._observation.scales, 2) if is_turned else None
         order = order_of(scene.stars, reached, scene.image_grid, scales)
@@ -119,13 +126,14 @@ class StarFit:
         self._likelihood = StarLikelihood.of_scene(scene, model, diffuse, covered)
         self._stars = [
             _MovableStars(psfs, turn, where, places_there, whole, around, order, is_shown)
-            for psfs, turn, places_there, where, whole, around in zip(
+            for psfs, turn, places_there, where, whole, around, is_shown in zip(
                 scene.star_psfs(scene.stars, part),
                 turns,
                 scene.star_field.places,
                 covered,
                 stars_of_images,
                 squares,
+                scene.shown[:n].T,
                 strict=True,
             )
         ]
@@ -154,27 +162,36 @@ class StarFit:
         return units * gradient, information.scaled(units)
 
     def look_round(self, stars: Stars) -> Stars:
-        """Return each star at the best of nine places, the others where they are, and its flux."""
+        """Return each star at the best of nine places, the others where they are, and its fluxes.
+
+        A star is at one place in all epochs.
+        """
         lights = [each.light(stars.fluxes) for each in self._try(stars).images]
-        fluxes, positions = stars.fluxes.copy(), stars.positions.copy()
         steps = TRIAL_STEP * np.array([(dx, dy) for dx in (0, -1, 1) for dy in (0, -1, 1)])
-        for s, position in enumerate(stars.positions):
-            pixels = [each.around[s] for each in self._stars]
-            images = self._images_around(s, position)
-            others = [
-                light[there] - stars.fluxes[s] * image
-                for light, there, image in zip(lights, pixels, images, strict=True)
-            ]
-            alone = self._likelihood.of_one(pixels, others)
-            tried = []
-            for step in steps:
-                images = self._images_around(s, position + step)
-                flux = max(alone.linear_flux(images), MAX_FADING * stars.fluxes[s])
-                models = alone.models([flux * image for image in images])
-                tried.append((alone.objective(models), flux))
-            best = int(np.argmin([objective for objective, _ in tried]))
-            positions[s], fluxes[s] = position + steps[best], tried[best][1]
-        return Stars(fluxes, positions)
+        tried = np.array([self._look_round(s, stars, lights, steps) for s in range(len(stars[0]))])
+        objectives, fluxes = tried.reshape(-1, self._n_epochs, len(steps), 2).transpose(3, 0, 1, 2)
+        nearest = np.argmin(objectives.sum(axis=1), axis=1)
+        fluxes = np.take_along_axis(fluxes, nearest[:, None, None], axis=2)
+        moved = stars.positions + np.repeat(steps[nearest], self._n_epochs, axis=0)
+        return Stars(fluxes.ravel(), moved)
+
+    def _look_round(
+        self, s: int, stars: Stars, lights: list[Array], steps: Array
+    ) -> list[tuple[float, float]]:
+        """Return the objective of a star in an epoch after each of some steps, and its flux."""
+        position, pixels = stars.positions[s], [each.around[s] for each in self._stars]
+        images = self._images_around(s, position)
+        others = [
+            light[there] - stars.fluxes[s] * image
+            for light, there, image in zip(lights, pixels, images, strict=True)
+        ]
+        alone, tried = self._likelihood.of_one(pixels, others), []
+        for step in steps:
+            images = self._images_around(s, position + step)
+            flux = max(alone.linear_flux(images), MAX_FADING * stars.fluxes[s])
+            models = alone.models([flux * image for image in images])
+            tried.append((alone.objective(models), flux))
+        return tried
 
     def _images_around(self, s: int, position: Array) -> list[Array]:
         return [
@@ -187,7 +204,10 @@ class StarFit:
         trial = self._try(stars)
         for _ in range(MAX_STEPS):
             gradient, information = self._derivatives(trial)
-            step = -information.solve(gradient)
+            if self._n_epochs > 1:
+                gradient = np.asarray(np.bincount(self._owners, gradient), np.float64)
+                information = information.tied(self._owners)
+            step = -information.solve(gradient)[self._owners]
             for _ in range(MAX_HALVED):
                 following = self._try(self._follow(trial.stars, step))
                 if following.objective <= trial.objective:
@@ -202,7 +222,7 @@ class StarFit:
                 ]
             )
             trial = following
-            if (abs(change) * np.sqrt(information.diagonal) < FINISHED).all():
+            if (abs(change) * np.sqrt(information.diagonal[self._owners]) < FINISHED).all():
                 break
         return trial.stars
 
@@ -236,7 +256,7 @@ class _MovableStars:
     order : Order
         Of the stars.
     is_shown : ndarray of bool, shape (n,)
-        Whether any image shows a star; others have no light, and stay.
+        Whether the image shows a star; others have no light in it.
 
     Attributes
     ----------

@@ -28,7 +28,7 @@ from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
 from lnocl.scene.psf_pixels import PsfPixels
-from lnocl.scene.scene import MIN_MODEL, Scene
+from lnocl.scene.scene import MIN_MODEL
 from lnocl.solvers.fluxes import MAX_FADING, precision
 from lnocl.solvers.least_squares import Field, LeastSquares, LinearImage, SourceError
 
@@ -42,7 +42,7 @@ MAX_STEP, MAX_MOVE = 3.0, 0.5
 
 
 class PsfStep(NamedTuple):
-    """Changes of PSF parameters, and the stars' new fluxes, electrons, and positions."""
+    """Changes of PSF parameters, new fluxes of stars and halos, electrons, and stars' positions."""
 
     parameters: PsfParameters
     star_fluxes: Array
@@ -68,21 +68,21 @@ def step(
     scene, extended, fluxes = estimate.scene, estimate.extended, estimate.fluxes
     model, values = Model(scene), parameters.values
     images = _linearise(estimate, families, values, model, moves)
-    n, n_psf = len(fluxes), values.size
-    at, prior = np.zeros((2, n_psf + n * (3 if moves else 1)))
+    n, n_psf, places = len(fluxes), values.size, scene.places
+    at, prior = np.zeros((2, n_psf + n + (places.size if moves else 0)))
     at[:n_psf], prior[:n_psf] = values.ravel(), np.tile(families.prior**-2.0, len(values))
     fields: list[Field] = [_source_error(model, extended)]
     if families.pixels is not None:
-        fields.append(_PixelErrors(scene, families.pixels, extended, fluxes, parameters.pixels))
+        fields.append(_PixelErrors(model, families.pixels, extended, fluxes, parameters.pixels))
     change, changes = _fit(images, fields, prior).solve(at)
     longest = (abs(change[:n_psf].reshape(values.shape)) / families.prior).max(initial=0.0)
     change *= MAX_STEP / max(longest, MAX_STEP)
     to = np.maximum(fluxes + change[n_psf : n_psf + n], MAX_FADING * fluxes)
-    moved = change[n_psf + n :].reshape(-1, n).T.clip(-MAX_MOVE, MAX_MOVE)
+    moved = change[n_psf + n :].reshape(-1, len(places)).T.clip(-MAX_MOVE, MAX_MOVE)
     pixels = parameters.pixels if families.pixels is None else changes[1]
     of_psfs = PsfParameters(change[:n_psf].reshape(values.shape), pixels)
     to = Estimate.of_scaled(scene, extended, to).star_fluxes
-    return PsfStep(of_psfs, to, scene.stars + moved if moves else scene.stars)
+    return PsfStep(of_psfs, to, places + moved if moves else places)
 
 
 def settle(estimate: Estimate, model: Model, share: float) -> Estimate:
@@ -120,26 +120,47 @@ def _source_error(model: Model, extended: Array) -> SourceError:
 def _linearise(
     estimate: Estimate, families: PsfFamilies, values: Array, model: Model, moves: bool
 ) -> list[LinearImage]:
+    """Return the images near the estimate: slopes in PSFs, all fluxes, perhaps all x, and all y.
+
+    The PSF of an image changes light as the image has it, before its pixels sample that. Halos and
+    stars with PSFs of their own are as they are given.
+    """
     scene, extended, fluxes = estimate.scene, estimate.extended, estimate.fluxes
-    p, k, n = scene.n_images, len(families.prior), len(fluxes)
-    shared = p * k + np.arange(n * (3 if moves else 1))
+    p, k, n, q = scene.n_images, len(families.prior), len(fluxes), scene.oversample
     images = []
     for j, (counts, weights, diffuse) in enumerate(
         zip(scene.images(), model.weights, model.convolved(extended), strict=True)
     ):
-        stars = [scene.star_on_sky(j, s).on_grid(scene.grid) for s in range(n)]
-        light = diffuse + sum(c * star for c, star in zip(fluxes, stars, strict=True))
-        seen = sampled(light, scene.oversample)
-        total = np.maximum(seen + model.background[j], MIN_MODEL)
+        lit, others = (
+            np.flatnonzero(scene.shown[:, j] & each)
+            for each in (scene.through_psfs, ~scene.through_psfs)
+        )
+        stars = [scene.star_on_sky(j, s).on_grid(scene.grid) for s in lit.tolist()]
+        fixed = [scene.star_image(j, s) for s in others.tolist()]
+        light = diffuse + sum(c * star for c, star in zip(fluxes[lit], stars, strict=True))
+        still = model.background[j] + sum(
+            c * light for c, light in zip(fluxes[others], fixed, strict=True)
+        )
+        total = np.maximum(sampled(light, q) + still, MIN_MODEL)
         factors, modes = families.slopes(j, scene.grid, values[j])
-        slopes = [*_scaled(light, factors), *_convolved(scene, j, extended, fluxes, modes), *stars]
+        whole = sky = scipy.fft.rfft2(light)
+        if modes or scene.rotations:
+            sky = _sky(model, j, extended, fluxes)
+        if scene.rotations:  # else slopes would ring by edges beyond the pixels that are used
+            whole = spectrum(scene.observation.psfs[j], scene.grid) * sky
+        changes = [*(factor * whole for factor in factors), *(mode * sky for mode in modes)]
+        slopes = [*(scipy.fft.irfft2(each, scene.grid) for each in changes), *stars]
+        unknowns = [np.arange(j * k, (j + 1) * k), p * k + lit]
         if moves:
-            slopes += _star_slopes(stars, scene.oversample * fluxes)
-        slopes = [sampled(slope, scene.oversample) for slope in slopes]
+            turn = q * scene.observation.turns[j]
+            slopes += _star_slopes(stars, fluxes[lit], turn)
+            x, y = p * k + n + np.arange(scene.places.size).reshape(2, -1)
+            unknowns += [x[lit // scene.n_epochs], y[lit // scene.n_epochs]]
+        slopes = [*(sampled(slope, q) for slope in slopes), *fixed]
         images.append(
             LinearImage(
                 np.array(slopes).reshape(len(slopes), -1),
-                np.concatenate([np.arange(j * k, (j + 1) * k), shared]),
+                np.concatenate([*unknowns, p * k + others]),
                 counts - total,
                 precision(scene, total, weights),
             )
@@ -147,41 +168,36 @@ def _linearise(
     return images
 
 
-def _scaled(light: Array, factors: Sequence[Any]) -> Iterator[Array]:
-    """Yield the light of an image, its spectrum multiplied by each factor."""
-    whole = scipy.fft.rfft2(light)
-    for factor in factors:
-        yield scipy.fft.irfft2(factor * whole, light.shape)
+def _sky(model: Model, j: int, extended: Array, fluxes: Array) -> Spectrum:
+    """Return the spectrum of all that PSF j is convolved with: stars, extended source, pixels.
 
-
-def _convolved(
-    scene: Scene, j: int, extended: Array, fluxes: Array, modes: Sequence[Spectrum]
-) -> Iterator[Array]:
-    """Yield the sky of an image seen through each mode."""
-    if not modes:
-        return
-    sky = _sky(scene, j, extended, fluxes)
-    for mode in modes:
-        yield scipy.fft.irfft2(mode * sky, scene.grid)
-
-
-def _sky(scene: Scene, j: int, extended: Array, fluxes: Array) -> Spectrum:
-    """Return the spectrum of all that PSF j is convolved with: stars, extended source, pixels."""
+    It is in the frame of the image.
+    """
+    scene = model.scene
     u, v = _frequencies(scene.grid)
-    dx, dy = scene.oversample * scene.observation.offsets[j]
-    sky = scipy.fft.rfft2(extended)
-    for c, (x, y) in zip(fluxes, on_sky(scene.stars, scene.oversample), strict=True):
-        sky = sky + c * np.exp(-2j * np.pi * (u * x + v * y))
-    seen = scene.gains[j] * pixel_spectrum(v, u, scene.observation)
-    return np.asarray(sky * (seen * np.exp(-2j * np.pi * (u * dx + v * dy))))
+    places, shares = scene.star_field.places[j], scene.transmitted(scene.stars)[j]
+    sky = scene.areas[j] / scene.oversample**2 * model.cameras[j].in_frame(extended)
+    for s in np.flatnonzero(scene.shown[:, j] & scene.through_psfs):
+        x, y = on_sky(places[s], scene.oversample)
+        sky = sky + shares[s] * fluxes[s] * np.exp(-2j * np.pi * (u * x + v * y))
+    return np.asarray(sky * (scene.gains[j] * pixel_spectrum(v, u, scene.observation)))
 
 
-def _star_slopes(stars: Sequence[Array], fluxes: Array) -> list[Array]:
-    """Return the derivatives of star images with respect to all x, and all y."""
+def _star_slopes(stars: Sequence[Array], fluxes: Array, turn: Array) -> list[Array]:
+    """Return the derivatives of star images along the sky's x, of all, and its y, of all.
+
+    A step along the sky is one by `turn`, shape (2, 2), in the pixels of these.
+    """
     slopes = []
-    for axis in (0, 1):
+    for along in turn.T:
+        factor = (
+            -2j
+            * np.pi
+            * sum(
+                step * each for step, each in zip(along, _frequencies(stars[0].shape), strict=True)
+            )
+        )
         for c, star in zip(fluxes, stars, strict=True):
-            factor = -2j * np.pi * _frequencies(star.shape)[axis]
             slopes.append(c * scipy.fft.irfft2(factor * scipy.fft.rfft2(star), star.shape))
     return slopes
 
@@ -195,11 +211,11 @@ class _PixelErrors:
     """The errors of the pixels of the PSFs, ``D_j * (f + sum_s c_s delta_s)``."""
 
     def __init__(
-        self, scene: Scene, pixels: PsfPixels, extended: Array, fluxes: Array, at: Array
+        self, model: Model, pixels: PsfPixels, extended: Array, fluxes: Array, at: Array
     ) -> None:
-        self._pixels, self._grid, self.at = pixels, scene.grid, at
-        self._oversample = scene.oversample
-        self._skies = [_sky(scene, j, extended, fluxes) for j in range(scene.n_images)]
+        self._pixels, self._grid, self.at = pixels, model.grid, at
+        self._oversample = model.oversample
+        self._skies = [_sky(model, j, extended, fluxes) for j in range(len(at))]
         places = [np.arange(k) - k // 2 for k in at.shape[1:]]
         self._places = np.ix_(*(at % n for at, n in zip(places, self._grid, strict=True)))
 

@@ -112,18 +112,6 @@ class Scaling:
         added[0, information.places] = prior.precision
         return replace(self, star_information=information + BandMatrix(added, information.places))
 
-    def is_usable(self) -> bool:
-        """Return whether the star information can be inverted, as that of any scene can."""
-        diagonal, places = self.star_information.diagonal, self.star_information.places
-        if not np.array_equal(np.sort(places), np.arange(len(places))):
-            return False
-        if not ((diagonal == 0) | (diagonal >= np.finfo(np.float32).tiny)).all():
-            return False
-        try:
-            return bool(np.isfinite(self.star_information.solve(diagonal)).all())
-        except np.linalg.LinAlgError:
-            return False
-
 
 def prepare(
     scene: Scene, model: Model, extended: Array, star_fluxes: Array
@@ -234,7 +222,8 @@ def _cross_information(
 ) -> tuple[Array, NDArray[np.int32]]:
     """Return the values and the windows of the cross information."""
     # Memory is taken where values are written, and a list of them would take it twice.
-    values = np.empty(most_cross_values(scene))
+    of_stars = scene.n_stars * math.prod(largest_window(scene))
+    values = np.empty(of_stars + scene.n_halos * math.prod(scene.grid))
     windows, end = np.empty((scene.n_fluxes, 4), np.int32), 0
     for s, at in enumerate(windows):
         cutout = model.adjoint_of_cutouts(
@@ -244,12 +233,6 @@ def _cross_information(
         begin, end = end, end + cutout.values.size
         values[begin:end] = cutout.values.ravel()
     return values[:end], windows
-
-
-def most_cross_values(scene: Scene) -> int:
-    """Return the most values that the cross information may have."""
-    of_stars = scene.n_stars * math.prod(largest_window(scene))
-    return of_stars + scene.n_halos * math.prod(scene.grid)
 
 
 def _box(covered: NDArray[np.bool_]) -> Box:

@@ -82,19 +82,19 @@ def _errors_of(
 ) -> Array:
     """Return the errors of stars that are fitted, of their fluxes and perhaps x and y."""
     fit, k = near.fit, len(near.fit.information)
-    unknowns = np.arange(near.n_of_stars).reshape(-1, near.n_held)[:, wanted].T
+    unknowns = near.unknowns[wanted]
     is_determined = np.isfinite(variances(fit.information))
     if not is_determined.any():
         return np.full(unknowns.shape, np.nan)
     change, _ = fit.solve(np.zeros(k))
     errors = np.full(unknowns.shape, np.nan)
     known = is_determined[unknowns]
-    at = unknowns[known]
+    at, again = np.unique(unknowns[known], return_inverse=True)
     if levels is None:
         found = fit.variances(at)
     else:
         rows = (fit.row(i) for i in at.tolist())
         shares = [(each, near.level_shares(scene, by_residuals)) for each, by_residuals in rows]
         found = np.array([each + levels.variance_of(share) for each, share in shares])
-    errors[known] = np.sqrt(found + change[at] ** 2)
+    errors[known] = np.sqrt(found + change[at] ** 2)[again]
     return errors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterator, Mapping
 from types import SimpleNamespace
@@ -14,13 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl import reference
 from lnocl.errors import DeviceError
 from lnocl.opencl.layout import reversed_order
-from lnocl.verify.harness import KernelHarness, rounded
+from lnocl.verify.harness import KernelHarness, Windows, rounded
 
 # What a kernel made, and what its twin made of the same.
 Pairs = Iterator[tuple[NDArray, NDArray]]
 
 # Kernels of images that are turned.
 SHEARED = "irfft_sheared", "ratio_sheared", "rfft_sheared", "unshear_columns", "sample_lines"
+
+# Inputs that are numbers, by the names of the kernels' arguments.
+NUMBERS = "mu", "smoothing", "edge"
 
 # Worst element over largest: three times what was measured over all cases of the tests on PoCL,
 # 3.3e-7 and 1.2e-15. With divisions and roots as far off as OpenCL allows it is 5.8e-7 in single.
@@ -69,9 +73,45 @@ def relative(found: ArrayLike, expected: ArrayLike) -> float:
     return float(worst / largest) if largest else np.inf
 
 
+def _twin(function: Callable[..., Any], given: SimpleNamespace, **special: Any) -> Any:
+    """Return what a twin makes of the inputs with its parameters' names, but for special ones."""
+    names = inspect.signature(function).parameters.keys() - special
+    return function(**{name: getattr(given, name) for name in names}, **special)
+
+
+def _launch(
+    harness: KernelHarness, given: SimpleNamespace, kernel: str, **special: Any
+) -> dict[str, Any]:
+    """Launch a kernel on the inputs with its arguments' names, but for special ones; return all."""
+    names = [name for name in harness.program.arguments[kernel] if name not in special]
+    arguments = {name: _put(harness, name, getattr(given, name, None)) for name in names}
+    arguments = {name: each for name, each in arguments.items() if each is not None} | special
+    harness.launch(kernel, **arguments)
+    return arguments
+
+
+def _put(harness: KernelHarness, name: str, values: Any) -> cl.Buffer | float | None:
+    """Return an input for a kernel: a number, pixels, or a number for each star."""
+    if name in NUMBERS:
+        return float(values)
+    if isinstance(values, np.ndarray):
+        return harness.put(values) if values.ndim == 1 else harness.put_pixels(values)
+    return None  # the scene has none
+
+
+def _put_windows(harness: KernelHarness, name: str, windows: Windows) -> dict[str, Any]:
+    """Return where windows lie, by the names of the kernels' arguments."""
+    return {
+        f"{name}_corners": harness.put(windows.corners, np.int32),
+        f"{name}_near": harness.put(windows.near, np.int32),
+        f"{name}_blocks": windows.n_blocks,
+        f"{name}_columns": windows.n_columns,
+    }
+
+
 def _run_rfft_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     out = harness.empty_spectra()
-    harness.launch("rfft_rows", spectra=out, pixels=harness.put_pixels(given.pixels))
+    _launch(harness, given, "rfft_rows", spectra=out)
     yield harness.take_spectra(out), reference.rfft_rows(given.pixels)
 
 
@@ -191,25 +231,17 @@ def _real_edges(row_spectra: NDArray) -> NDArray:
 
 
 def _run_ratio_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    spectra, objective, star_sums = reference.ratio_rows(
-        given.model_spectra,
-        given.images,
-        given.weights,
-        given.background,
-        given.star_images,
-        given.star_fluxes,
+    spectra, objective, star_sums = _twin(
+        reference.ratio_rows, given, row_spectra=given.model_spectra
     )
-    out = harness.put_spectra(given.model_spectra)
-    observed = _put_observed(harness, given, given.star_images)
+    out, observed = harness.put_spectra(given.model_spectra), _put_observed(harness, given)
     harness.launch("ratio_rows", spectra=out, **observed)
     yield harness.take_image_spectra(out, given.p), _real_edges(spectra)
     yield harness.take_sums(observed["ratio_sums"], 1), np.array([objective])
     yield _take_star_sums(harness, given, observed["star_sums"]), star_sums
 
 
-def _put_observed(
-    harness: KernelHarness, given: SimpleNamespace, star_images: NDArray
-) -> dict[str, Any]:
+def _put_observed(harness: KernelHarness, given: SimpleNamespace) -> dict[str, Any]:
     """Return all that models are compared with, stars, and room for the sums."""
     images, exposure = given.images, {}
     if given.has_exposure_map:
@@ -217,17 +249,14 @@ def _put_observed(
     elif given.weights is not None:
         images = np.where(given.weights, given.images, -1.0)
     put = harness.put_pixels if given.background.size > given.p else harness.put
-    windows = given.star_windows
+    n_sums = given.p * given.star_windows.n_blocks
     return {
         "ratio_sums": harness.put(np.full((harness.program.image_row_blocks * given.p, 2), np.nan)),
-        "star_sums": harness.put(np.full((given.n, given.p * windows.n_blocks, 2), np.nan)),
+        "star_sums": harness.put(np.full((given.n, n_sums, 2), np.nan)),
         "images": harness.put_pixels(images),
         "background": put(given.background),
-        "star_images": harness.put_windows(star_images, windows),
-        "star_corners": harness.put(windows.corners, np.int32),
-        "star_near": harness.put(windows.near, np.int32),
-        "star_blocks": windows.n_blocks,
-        "star_columns": windows.n_columns,
+        "star_images": harness.put_windows(given.star_images, given.star_windows),
+        **_put_windows(harness, "star", given.star_windows),
         "star_fluxes": harness.put(given.star_fluxes),
         **exposure,
     }
@@ -262,18 +291,15 @@ def _run_ratio_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         name: np.array([s.take_up(each) for s, each in zip(given.shears, arrays, strict=True)])
         for name, arrays in {**lying, "stars": given.star_images.swapaxes(0, 1)}.items()
     }
-    back, objective, star_sums = reference.ratio_sheared(
-        given.sheared,
-        np.array([each.column_shifts for each in given.rotations]),
-        np.array([each.image_shifts for each in given.rotations]),
-        own["images"],
-        own["weights"],
-        own["background"],
-        own["stars"].swapaxes(0, 1),
-        given.star_fluxes,
+    back, objective, star_sums = _twin(
+        reference.ratio_sheared,
+        given,
+        column_shifts=np.array([each.column_shifts for each in given.rotations]),
+        image_shifts=np.array([each.image_shifts for each in given.rotations]),
+        star_images=own.pop("stars").swapaxes(0, 1),
+        **own,
     )
-    observed = _put_observed(harness, given, given.star_images)
-    observed |= _put_columns(harness, given)
+    observed = _put_observed(harness, given) | _put_columns(harness, given)
     block = harness.program.tuning.block
     weights = harness.put([each.pack_image_weights(block) for each in given.shears])
     for first, count in _two_launches(given):
@@ -349,50 +375,23 @@ def _take_star_sums(harness: KernelHarness, given: SimpleNamespace, sums: cl.Buf
 
 
 def _run_scale_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    scaled, spectrum, squares, fluxes = reference.scale_rows(
-        given.correction_spectra,
-        given.extended,
-        given.inverse_weight,
-        given.mu,
-        given.star_fluxes,
-        given.star_corrections,
-        given.slope,
-        given.curvature,
+    scaled, spectrum, squares, fluxes = _twin(
+        reference.scale_rows, given, row_spectrum=given.correction_spectra
     )
-    out = harness.put_spectra(given.correction_spectra)
-    extended = harness.put_pixels(given.extended)
-    sums, star_fluxes = harness.empty_sums(), harness.put(given.star_fluxes)
-    harness.launch(
-        "scale_rows",
-        spectra=out,
-        extended=extended,
-        square_sums=sums,
-        star_fluxes=star_fluxes,
-        star_corrections=harness.put(given.star_corrections),
-        mu=given.mu,
-        **_put_weights(harness, given),
-    )
-    yield harness.take_pixels(extended), scaled
+    out, sums = harness.put_spectra(given.correction_spectra), harness.empty_sums()
+    there = _launch(harness, given, "scale_rows", spectra=out, square_sums=sums)
+    yield harness.take_pixels(there["extended"]), scaled
     yield harness.take_spectra(out), spectrum
-    yield harness.take(star_fluxes, -1), fluxes
+    yield harness.take(there["star_fluxes"], -1), fluxes
     if given.mu:
         yield harness.take_sums(sums, 1), np.array([squares])
 
 
 def _run_smooth(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     weight = given.smoothing if given.smoothing_map is None else given.smoothing_map
-    slope, curvature, value = reference.smooth(given.extended, weight, given.edge)
+    slope, curvature, value = _twin(reference.smooth, given, smoothing=weight)
     outs, sums = (harness.empty_pixels(), harness.empty_pixels()), harness.empty_sums()
-    harness.launch(
-        "smooth",
-        slope=outs[0],
-        curvature=outs[1],
-        smooth_sums=sums,
-        extended=harness.put_pixels(given.extended),
-        smoothing_map=harness.put_pixels(given.extended if given.smoothing_map is None else weight),
-        smoothing=given.smoothing,
-        edge=given.edge,
-    )
+    _launch(harness, given, "smooth", slope=outs[0], curvature=outs[1], smooth_sums=sums)
     yield harness.take_pixels(outs[0]), slope
     yield harness.take_pixels(outs[1]), curvature
     yield harness.take_sums(sums, 1), np.array([value])
@@ -408,18 +407,20 @@ def _run_collect_sums(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     star_sums = rounded(star_sums, harness.dtype)
     square_sums = rounded(rng.random((blocks, 2)), harness.dtype)
     smooth_sums = rounded(rng.random((blocks, 2)), harness.dtype)
-    objective, corrections = reference.collect_sums(
-        ratio_sums.sum(),
-        square_sums.sum(),
-        smooth_sums.sum() if given.smoothing else 0.0,
-        star_sums.sum(axis=(1, 2)),
-        given.star_weights,
-        given.mu,
+    objective, corrections = _twin(
+        reference.collect_sums,
+        given,
+        objective=ratio_sums.sum(),
+        squares=square_sums.sum(),
+        smoothness=smooth_sums.sum() if given.smoothing else 0.0,
+        star_sums=star_sums.sum(axis=(1, 2)),
     )
     objectives, data_term = harness.put(np.full((3, 2), -1.0)), harness.put(np.zeros(2))
     star_totals = harness.put(np.zeros((given.n, 2)))
     star_corrections = harness.put(np.zeros(given.n))
-    harness.launch(
+    _launch(
+        harness,
+        given,
         "collect_sums",
         objectives=objectives,
         data_term=data_term,
@@ -429,8 +430,6 @@ def _run_collect_sums(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         star_sums=harness.put(star_sums),
         square_sums=harness.put(square_sums),
         smooth_sums=harness.put(smooth_sums),
-        star_weights=harness.put(given.star_weights),
-        mu=given.mu,
         star_blocks=star_blocks,
         iteration=1,
     )
@@ -442,52 +441,27 @@ def _run_collect_sums(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 
 
 def _run_gradient_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    expected, change_step, change_change = reference.gradient_rows(
-        given.correction_spectra,
-        given.extended,
-        given.previous,
-        given.gradient,
-        given.shift,
-        given.inverse_weight,
-        given.mu,
-        given.slope,
-        given.curvature,
+    expected, change_step, change_change = _twin(
+        reference.gradient_rows, given, row_spectrum=given.correction_spectra
     )
-    gradient, sums = harness.put_pixels(given.gradient), harness.empty_sums(2)
-    harness.launch(
-        "gradient_rows",
-        spectra=harness.put_spectra(given.correction_spectra),
-        change_sums=sums,
-        gradient=gradient,
-        extended=harness.put_pixels(given.extended),
-        previous=harness.put_pixels(given.previous),
-        shift=harness.put_pixels(given.shift),
-        mu=given.mu,
-        **_put_weights(harness, given),
-    )
-    yield harness.take_pixels(gradient), expected
+    spectra, sums = harness.put_spectra(given.correction_spectra), harness.empty_sums(2)
+    there = _launch(harness, given, "gradient_rows", spectra=spectra, change_sums=sums)
+    yield harness.take_pixels(there["gradient"]), expected
     yield harness.take_sums(sums, 2), np.array([change_step, change_change])
 
 
 def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    alpha = float(np.float32(1.3))
+    alpha, windows = float(np.float32(1.3)), given.cross_windows
     for share in (1.0, float(np.float32(0.4))):
-        extended, spectrum, squares, slope, couplings = reference.step_rows(
-            given.extended,
-            given.gradient,
-            given.shift,
-            given.inverse_weight,
-            given.cross_information,
-            given.mu,
-            alpha,
-            share,
-            given.curvature,
+        extended, spectrum, squares, slope, couplings = _twin(
+            reference.step_rows, given, alpha=alpha, share=share
         )
         out, trial = harness.empty_spectra(), harness.empty_pixels()
         sums, square_sums = harness.empty_sums(), harness.empty_sums()
-        windows = given.cross_windows
         coupling_sums = harness.put(np.full((given.n, windows.n_blocks, 2), np.nan))
-        harness.launch(
+        _launch(
+            harness,
+            given,
             "step_rows",
             spectra=out,
             extended=trial,
@@ -495,17 +469,10 @@ def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
             coupling_sums=coupling_sums,
             square_sums=square_sums,
             previous=harness.put_pixels(given.extended),
-            gradient=harness.put_pixels(given.gradient),
-            shift=harness.put_pixels(given.shift),
             cross_information=harness.put_windows(given.cross_information, windows),
-            cross_corners=harness.put(windows.corners, np.int32),
-            cross_near=harness.put(windows.near, np.int32),
-            cross_blocks=windows.n_blocks,
-            cross_columns=windows.n_columns,
-            mu=given.mu,
+            **_put_windows(harness, "cross", windows),
             alpha=alpha,
             share=share,
-            **_put_weights(harness, given),
         )
         yield harness.take_pixels(trial), extended
         yield harness.take_spectra(out), spectrum
@@ -515,36 +482,6 @@ def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
             yield harness.take_sums(square_sums, 1), np.array([squares])
 
 
-def _put_weights(harness: KernelHarness, given: SimpleNamespace) -> dict[str, cl.Buffer]:
-    """Return the inverse weight, and slope and curvature where the scene is smoothed."""
-    buffers = {}
-    if given.weights is not None:
-        buffers["inverse_weight"] = harness.put_pixels(given.inverse_weight)
-    if given.smoothing:
-        buffers["slope"] = harness.put_pixels(given.slope)
-        buffers["curvature"] = harness.put_pixels(given.curvature)
-    return buffers
-
-
 KERNELS: dict[str, Callable[[KernelHarness, SimpleNamespace], Pairs]] = {
-    "rfft_rows": _run_rfft_rows,
-    "irfft_rows": _run_irfft_rows,
-    "fft_columns": _run_fft_columns,
-    "ifft_columns": _run_ifft_columns,
-    "otf_columns": _run_otf_columns,
-    "convolve_columns": _run_convolve_columns,
-    "correlate_columns": _run_correlate_columns,
-    "transmit_rows": _run_transmit_rows,
-    "gather_rows": _run_gather_rows,
-    "ratio_rows": _run_ratio_rows,
-    "irfft_sheared": _run_irfft_sheared,
-    "ratio_sheared": _run_ratio_sheared,
-    "rfft_sheared": _run_rfft_sheared,
-    "unshear_columns": _run_unshear_columns,
-    "sample_lines": _run_sample_lines,
-    "smooth": _run_smooth,
-    "scale_rows": _run_scale_rows,
-    "collect_sums": _run_collect_sums,
-    "gradient_rows": _run_gradient_rows,
-    "step_rows": _run_step_rows,
+    name.removeprefix("_run_"): run for name, run in globals().items() if name.startswith("_run_")
 }

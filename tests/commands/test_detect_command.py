@@ -205,7 +205,10 @@ def test_a_command_without_its_folder_is_made_where_one_is(capsys):
     ("words", "message"),
     [
         (["detect", "out.fits", "--width", "-2"], "--width must be a finite number of pixels"),
-        (["detect", "out.fits", "--false-alarms", "0"], "--false-alarms is the number expected"),
+        (
+            ["detect", "out.fits", "--false-alarms", "0"],
+            "--false-alarms must be the number",
+        ),
         (["detect", "out.fits", "-o", "found.reg"], "the table of detections is ECSV, CSV or FITS"),
         (["limit", "out.fits", "-o", "found.reg"], "the table of limits is ECSV, CSV or FITS"),
         (["limit", "out.fits", "--injections", "-3"], "--injections must be a whole number"),

@@ -379,7 +379,7 @@ def test_killed_errors_go_on_bit_for_bit(words, monkeypatch):
     expected = held()
     assert cli.main(words) == 0
     program = (
-        "import sys\nfrom lnocl.commands import bootstrap, cli\nbootstrap.WRITE_EVERY = 0.0\n"
+        "import sys\nfrom lnocl.commands import cli, running\nrunning.WRITE_EVERY = 0.0\n"
         "sys.exit(cli.main(sys.argv[1:]))"
     )
     options = [*ERRORS, "40", "--quiet"]

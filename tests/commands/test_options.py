@@ -183,6 +183,7 @@ NEEDED = {
     "deconvolve i.fits --psf p.fits -o o.fits --epoch each": "--star or --stars",
     "deconvolve i.fits --psf p.fits -o o.fits --refine": "--star or --stars",
     "deconvolve i.fits --psf p.fits -o o.fits --psf-errors ideal=d.fits": "--star or --stars",
+    "deconvolve i.fits --psf p.fits -o o.fits --star-psf 1,2=q.fits": "--star or --stars",
     "limit r.fits --injections 0 --seed 3": "--injections",
     "devices --device 0": "--tune",
     "bench --psf p.fits": "images",

@@ -290,8 +290,3 @@ def test_what_is_refused():
     same_places = lnocl.Observation(np.ones((2, 16, 16)), np.ones((3, 3)), epochs=[0, 1])
     with pytest.raises(lnocl.LnoclError, match="tiles are of images of one epoch"):
         lnocl.deconvolve_tiles(same_places, [(8, 8)], stop=None, n_iter=1, engine="numpy")
-    with pytest.raises(
-        lnocl.LnoclError,
-        match="cannot be used where the images are of several",
-    ):
-        paper(observation(epochs=EPOCHS), STARS, n_iter=1, refine_positions=True)

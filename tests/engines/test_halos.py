@@ -275,8 +275,6 @@ def test_what_is_not_taken_beside_halos():
     given = observation()
     with pytest.raises(lnocl.InputError, match="whole images, which tiles do not see"):
         lnocl.deconvolve_tiles(given, [STAR], engine="numpy")
-    with pytest.raises(lnocl.InputError, match="cannot be used where the images have halos"):
-        lnocl.deconvolve(given, [STAR], refine_psfs=["jitter"], engine="numpy")
     with pytest.raises(lnocl.InputError, match="is 0 on all good pixels"):
         given.replace(mask=np.arange(P)[:, None, None] == np.zeros((P, N, N)))
 

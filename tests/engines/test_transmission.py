@@ -118,11 +118,8 @@ def test_a_window_has_its_part_of_the_transmission():
     assert fine.window(range(2, 6), range(0, 8)).transmission.shape == (1, 8, 16)
 
 
-def test_what_knows_no_transmission_is_not_done_or_refused():
+def test_what_knows_no_transmission_is_refused():
     level = lnocl.Observation(np.ones((16, 16)), np.ones((3, 3)), transmission=np.ones((16, 16)))
-    assert "judge PSFs before the run: no, a transmission" in str(lnocl.plan(level, [(8, 8)]))
-    with pytest.raises(lnocl.InputError, match="refine_psfs cannot be used where a transmission"):
-        lnocl.deconvolve(level, [(8, 8)], refine_psfs=["shift"])
     with pytest.raises(lnocl.InputError, match="tiles take no transmission yet"):
         lnocl.deconvolve_tiles(level, tile=16)
     result = paper(level, n_iter=2, engine="numpy")

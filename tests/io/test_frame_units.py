@@ -94,6 +94,18 @@ class TestUnits:
         assert np.median(raw) == pytest.approx(np.median(counts) - added, abs=0.1)
         assert "1.fits has no BUNIT: by its noise it is in" in log.text
 
+    def test_bad_pixels_of_an_exposure_map_tell_nothing_of_the_unit(self):
+        """The noise of resampled electrons is a third of that of counts."""
+        counts = np.random.default_rng(1).normal(100.0, 33.0**0.5, (1, 40, 48))
+        save_images(counts)
+        exposure, mask = np.full((40, 48), 2000.0), np.zeros((40, 48))
+        exposure[3, 5:8], mask[3, 5:8] = np.nan, 1
+        save("exposure.fits", exposure)
+        save("mask.fits", mask)
+        found = read("1.fits", exposure=["exposure.fits"], mask=["mask.fits"])
+        good = mask == 0
+        np.testing.assert_array_equal(found.observation.images[0][good], counts[0][good])
+
     def test_the_gain_may_be_in_the_headers(self, log):
         save_images(BUNIT="adu", EGAIN=2.5)
         found = read(gain="EGAIN")

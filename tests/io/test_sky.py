@@ -102,7 +102,7 @@ class TestOffsets:
     @pytest.mark.parametrize(
         ("other", "message"),
         [
-            (with_sip(A_2_0=1e-2), "b.fits is rotated by 0.00 degrees and scaled by 0.9960 "
+            (with_sip(A_2_0=1e-2), "b.fits is rotated by 0.00 degrees and scaled by 0.9999 "
              "relative to a.fits, and after rotation, scale and shift pixels are up to 0.17 off: "
              "images are never resampled; cut them to where it is less"),
             (fits.Header(), "b.fits has no sky coordinates (WCS) that can be used; leave align"),

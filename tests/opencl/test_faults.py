@@ -13,10 +13,10 @@ from runtimes import on_pocl
 from scenes import paper
 
 import lnocl
+from lnocl import checkpoint
 from lnocl.engines import opencl
 from lnocl.engines.numpy import ReferenceEngine
 from lnocl.opencl import device, program
-from lnocl.runs import checkpoint
 
 # Of images of this shape, with a star and mu, kernel_cases.py has the program.
 WITH_STAR = {"stars": [(5, 6)], "mu": 1e-6}

@@ -7,8 +7,8 @@ import pytest
 from scenes import paper, same
 
 import lnocl
+from lnocl import checkpoint
 from lnocl.errors import DivergedError, NotFiniteError
-from lnocl.runs import checkpoint
 from lnocl.runs.descent import MAX_RISE, N_ABOVE, Descent, explain_rise
 from lnocl.scene.scene import Scene
 

@@ -31,6 +31,11 @@ def psf(fwhm=4.0, oversample=1):
     return moffat(x, y, fwhm)
 
 
+def behind(x, y):
+    """Return the PSF behind a mask: lopsided speckles, with a share of 0.1 of the light."""
+    return 0.1 * moffat(x + 0.3, y, 9.0) * (1.0 + 0.8 * np.cos(1.2 * x + 0.5) * np.cos(1.4 * y))
+
+
 def core(x=STARS[0][0], y=STARS[0][1]):
     return np.hypot(X - x, Y - y) < 6
 
@@ -90,6 +95,10 @@ def scene(kind):
             known |= {"oversample": 2, "effective_psfs": True}
         case "PSF field":
             psfs = lnocl.PsfField([psf(), psf()], [(0, 0), (N - 1, 0)])
+        case "own PSF":
+            images = [light(fluxes=FLUXES * [0, 1]) + FLUXES[0] * behind(X - 34.3, Y - 41.6)]
+            y, x = np.indices((81, 91)) - np.array([40, 45])[:, None, None]
+            known |= {"star_psfs": behind(x, y), "star_places": STARS[0]}
         case "one masked":
             images, psfs = [light(), light(5.0)], [psf(), psf(5.0)]
             known["mask"] = np.array([core(), np.zeros((N, N), bool)])
@@ -100,7 +109,7 @@ def scene(kind):
 
 KINDS = [
     "plain", "depths", "exposures", "exposure map", "offsets", "epochs", "halos", "turned",
-    "oversampled", "PSF field", "one masked", "background measured",
+    "oversampled", "PSF field", "own PSF", "one masked", "background measured",
 ]  # fmt: skip
 
 
@@ -200,7 +209,6 @@ DONE = [
 ]
 # What does not go together yet, and the message that says so.
 REFUSED = {
-    ("epochs", are_moved): "`refine_positions` cannot be used where the images are of several",
     ("PSF field", are_detected): "sources are tested with one PSF for each image",
 }
 

@@ -105,7 +105,9 @@ def test_noise_that_is_given_too_large_hides_no_wrong_psf():
 
 def state(kappa, flux):
     misfit = PsfMisfit(np.array([1.0 + 100.0 * kappa**2]), 1.0, 1.0, 100.0, np.zeros(1))
-    return _State(PSF, SimpleNamespace(misfit=misfit, star_fluxes=np.array([1e4, flux])), False)
+    fluxes, scene = np.array([1e4, flux]), SimpleNamespace(n_stars=2)
+    estimate = SimpleNamespace(misfit=misfit, star_fluxes=fluxes, scene=scene)
+    return _State(PSF, estimate, False)
 
 
 def test_a_sharper_psf_that_takes_the_star_away_is_refused():

@@ -210,20 +210,21 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
     observation = lnocl.Observation(np.ones((1, 100, 120)), np.ones((40, 5)))
     stars = np.array([(5.0, 90.0), (100.0, 20.0), (108.4, 24.0)])
     setup = Setup(observation, stars, 0, "sgp", "single", "numpy", None)
-    cut, found, held = guarded_runs.find_window(stars, observation, 32)
+    cut, first, held = guarded_runs.find_window(stars, observation, 32)
     assert cut.shape == (32, 32)
     np.testing.assert_array_equal(held, (False, True, True))
-    np.testing.assert_array_equal(found, stars[1:] - (84, 4))
+    np.testing.assert_array_equal(first, (84, 4))
     runs = guarded_runs.GuardedRuns(setup)
     inner = runs.cut(observation.psfs)
     assert inner.shape == (1, 32, 5)
-    whole = runs.completed(observation.psfs, 2.0 * inner)
+    np.testing.assert_array_equal(runs.stars, stars[1:] - (84, 4))
+    whole = runs.completed(observation.psfs, inner)
     np.testing.assert_allclose(whole[0, 4:36], 2.0 / (72 * 5))
     np.testing.assert_allclose(whole[0, :4], 1.0 / (72 * 5))
     whole = lnocl.Observation(np.ones((1, 20, 30)), np.ones((3, 3)))
-    cut, found, _ = guarded_runs.find_window(np.array([(3.0, 4.0)]), whole, 32)
+    cut, first, _ = guarded_runs.find_window(np.array([(3.0, 4.0)]), whole, 32)
     assert cut.shape == (20, 30)
-    np.testing.assert_array_equal(found, [(3.0, 4.0)])
+    np.testing.assert_array_equal(first, (0, 0))
 
 
 @pytest.mark.parametrize(
@@ -242,7 +243,7 @@ def test_many_stars_with_large_psfs_are_judged_in_a_smaller_window(n, oversample
     stars = chance.uniform((30.0, 40.0), (200.0, 210.0), (n, 2))
     found = guarded_runs.choose_window(stars, observation, psf_shape)
     assert found == side
-    held = guarded_runs.find_window(stars, observation, side)[1]
+    held = guarded_runs.find_window(stars, observation, side)[2]
     assert len(held) > 3
 
 

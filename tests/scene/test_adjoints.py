@@ -230,12 +230,12 @@ def test_the_sky_round_a_star(kind, monkeypatch):
         np.testing.assert_allclose(responses[j, :ny, :nx][is_seen], flat[is_seen], rtol=allowed)
 
 
-@pytest.mark.parametrize("kind", ["apart", "moved", "finer"])
+@pytest.mark.parametrize("kind", ["apart", "moved", "finer", "turned", "scaled"])
 def test_errors_of_the_pixels_of_psfs(kind):
     scene = a_scene(kind)
     psfs = scene.observation.psfs
     pixels = PsfPixels(psfs, 0.1 * abs(psfs) + 1e-4, scene.oversample)
     sky = abs(noise(*scene.grid, seed=5))
-    errors = _PixelErrors(scene, pixels, sky, np.array([40.0, 7.0]), np.zeros(psfs.shape))
+    errors = _PixelErrors(Model(scene), pixels, sky, np.array([40.0, 7.0]), np.zeros(psfs.shape))
     x, y = noise(*psfs.shape), noise(P, *scene.image_grid, seed=4)
     assert_adjoint(lambda x: list(errors.forward(x)), errors.adjoint, x, y)

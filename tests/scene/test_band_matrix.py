@@ -25,6 +25,7 @@ def test_it_is_the_dense_matrix_and_its_inverse():
     matrix, units, x = of_dense(dense, places), rng.uniform(1, 9, 6), rng.normal(size=(6, 2))
     assert matrix.band.shape == (3, 6)
     np.testing.assert_array_equal(matrix.dense(), dense)
+    np.testing.assert_array_equal(matrix.block([4, 0, 2]), dense[np.ix_([4, 0, 2], [4, 0, 2])])
     np.testing.assert_array_equal(matrix.diagonal, np.diag(dense))
     scaled = units[:, None] * units * dense
     np.testing.assert_allclose(matrix.scaled(units).dense(), scaled, rtol=1e-15)
@@ -46,6 +47,21 @@ def test_fluxes_and_positions_may_be_of_any_size():
 def test_unknowns_that_nothing_tells_apart_share():
     found = of_dense(np.ones((2, 2)), [0, 1]).solve(np.full(2, 3.0))
     np.testing.assert_allclose(found, 1.5, rtol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_unknowns_that_are_one_are_summed(seed):
+    rng = np.random.default_rng(seed)
+    m, width = 11, 3
+    owners = rng.permutation(np.append(np.arange(6), rng.integers(0, 6, m - 6)))
+    band = np.asfortranarray(rng.uniform(0.1, 1.0, (width + 1, m)))
+    band[0] += 2 * width
+    matrix = BandMatrix(band, rng.permutation(m))
+    tied, which = matrix.tied(owners), np.eye(6)[owners]
+    expected = which.T @ matrix.dense() @ which
+    np.testing.assert_allclose(tied.dense(), expected, rtol=1e-14)
+    x = rng.standard_normal(6)
+    np.testing.assert_allclose(tied.solve(x), np.linalg.solve(expected, x), rtol=1e-10)
 
 
 def test_nothing_is_unknown_and_negative_matrices_are_refused():

@@ -620,6 +620,8 @@ WRONG = {
     "pupils": [-PUPIL, np.zeros((3, 3)), np.ones((2, 5, 5)), np.ones((3, 3, 3))],
     "psf_modes": [np.ones((2, 4, 5, 5)), np.ones(3), np.full((1, 3, 3), np.nan)],
     "psf_scatter": [-np.ones((2, 3, 3)), np.ones((3, 3, 3)), np.zeros((3, 3))],
+    "star_psfs": [np.full((3, 3), 0.1), np.full((1, 2, 3, 3), 0.1), np.ones(3)],
+    "star_places": [np.ones(3), [(0.0, np.nan)], [(1.0, 1.0)], np.eye(2) * u.arcsec],
 }
 
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import gaussian_interpolation, gaussian_variance, make_psfs, worst
+from scipy.ndimage import gaussian_filter
 from scipy.special import erf, j1
 
 from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf, fold, place
@@ -261,6 +262,27 @@ class TestStamp:
         np.testing.assert_array_equal(found, Cutout(expected, -2, 30).on_grid((16, 40)))
         assert cutout.values.size < values.size
         assert Cutout(values, 1, 1).trimmed(9.0).values.shape == (1, 1)
+
+    @pytest.mark.parametrize("shape", [(5, 7), (12, 9), (12, 15)])
+    def test_blurred_goes_round_the_grid(self, shape):
+        cutout, grid = Cutout(np.random.default_rng(2).normal(size=shape), 9, -4), (12, 15)
+        found = cutout.blurred(1.3, grid)
+        assert all(np.array(found.values.shape) <= grid)
+        expected = gaussian_filter(cutout.on_grid(grid), 1.3, mode="wrap")
+        np.testing.assert_allclose(found.on_grid(grid), expected, atol=2e-15)
+
+    def test_several_functions_are_laid_added_and_trimmed_as_each_is(self):
+        values = np.random.default_rng(1).normal(size=(3, 5, 6))
+        values[:, 0] = values[:, :, 5] = 0.0
+        cutout, grid = Cutout(values, -2, 9), (12, 11)
+        parts = [Cutout(each, -2, 9) for each in values]
+        expected = np.array([part.on_grid(grid) for part in parts])
+        np.testing.assert_array_equal(cutout.on_grid(grid), expected)
+        np.testing.assert_array_equal(cutout.trimmed(0.0).on_grid(grid), expected)
+        assert cutout.trimmed(0.0).values.shape == (3, 4, 5)
+        first, light = (10, 8), np.ones((3, 4, 4))
+        added = [part.add_to(np.ones((4, 4)), first, grid, 2.0) for part in parts]
+        np.testing.assert_array_equal(cutout.add_to(light, first, grid, 2.0), added)
 
 
 @given(k=st.integers(1, 40), n=st.integers(1, 12), axis=st.integers(0, 1))

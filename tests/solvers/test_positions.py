@@ -190,6 +190,34 @@ def test_minimum_is_that_of_scipy(name):
     assert abs(found / errors - as_vector(stars) / errors).max() > 1.0
 
 
+@pytest.mark.usefixtures("whole_psfs")
+def test_a_star_is_at_one_place_in_all_epochs():
+    """Two stars in each other's light, in three images of two epochs, against SciPy."""
+    true = np.array([(14.3, 15.6), (17.9, 13.8)])
+    fluxes = np.array([9e3, 3e3, 2e3, 8e3])  # star by star, in its epochs
+    epochs, spots = [0, 1, 0], [gaussian(x, y) for x, y in true]
+    means = [8.0 + sum(fluxes[2 * s + e] * spots[s] for s in (0, 1)) for e in epochs]
+    images = np.random.default_rng(2).poisson(means).astype(float)
+    observation = lnocl.Observation(images, PSF, background=8.0, epochs=epochs)
+    given = true + np.array([(0.3, -0.2), (-0.4, 0.3)])
+    scene = Scene(observation, given, max_shift=MAX_SHIFT)
+    fit = StarFit(scene, Model(scene), np.full(scene.grid, 1e-6), np.repeat(given, 2, axis=0))
+    start = Stars(fluxes[::-1] / scene.unit, scene.stars)
+    found = fit.minimise(fit.look_round(start))
+    np.testing.assert_array_equal(found.positions[::2], found.positions[1::2])
+
+    def objective(z):
+        moved = Scene(observation, z[4:].reshape(2, 2))
+        return kl_div(images, Model(moved).images(np.zeros(scene.grid), z[:4] * 1e3 / moved.unit)
+                      * moved.scale).sum()  # fmt: skip
+
+    first = np.append(fluxes / 1e3, true)
+    best = minimize(objective, first, method="BFGS", options={"gtol": 1e-5}).x
+    np.testing.assert_allclose(found.fluxes * scene.unit, best[:4] * 1e3, rtol=2e-3)
+    np.testing.assert_allclose(found.positions[::2].ravel(), best[4:], rtol=0, atol=2e-3)
+    assert abs(found.positions[::2] - true).max() < 0.1
+
+
 @every_recipe
 def test_far_wings_say_little(name, monkeypatch):
     """The squares that are looked at, against all pixels: errors, and the minimum in errors."""

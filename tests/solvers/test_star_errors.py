@@ -29,6 +29,7 @@ KNOWN = {
     "alike": {},
     "masked and moved": {"mask": MASK, "offsets": OFFSETS, "exposure": [1.0, 1.5]},
     "map of read noise": {"read_noise": RNG.uniform(0.5, 3.0, (2, N, N)), "mask": MASK},
+    "epochs": {"epochs": [0, 1], "mask": MASK},
     "map of exposures": {"exposure": RNG.uniform(0.5, 1.5, (2, N, N)), "read_noise": 2.0},
 }
 
@@ -37,7 +38,8 @@ def a_scene(stars=STARS, sky=SKY, psfs=PSFS, seed=0, **known):
     """Return a scene of counts of this sky, and it and the fluxes, scaled."""
     shape = (len(psfs), *sky.shape)
     flat = Scene(lnocl.Observation(np.full(shape, 9.0), psfs, background=3.0, **known), stars)
-    fluxes = FLUXES[: len(stars)]
+    fluxes = np.repeat(FLUXES[: len(stars)], flat.n_epochs)
+    fluxes *= np.linspace(1.0, 0.6, len(fluxes)) if flat.n_epochs > 1 else 1.0
     light = Model(flat).images(sky / flat.unit, fluxes / flat.unit) * flat.scale
     if flat.has_exposure_map:
         light *= flat.weights
@@ -51,22 +53,25 @@ def a_scene(stars=STARS, sky=SKY, psfs=PSFS, seed=0, **known):
 
 
 def dense(scene, sky, fluxes, moves):
-    """Return the errors by explicit matrices, differences for the slopes of positions."""
-    model, texture = Model(scene), Texture(sky, scene.stars, resolution(scene))
+    """Return the errors by explicit matrices, differences for the slopes of positions.
+
+    A star is at one place in all epochs.
+    """
+    model, texture = Model(scene), Texture(sky, scene.shown_stars, resolution(scene))
     weights = scene.scale * model.weights / np.maximum(model.images(sky, fluxes), 1e-12)
-    n = len(fluxes)
+    n, places = len(fluxes), scene.places
 
     def light(fluxes, positions):
         moved = Scene(scene.observation, positions)
         return np.array(list(Model(moved).starlight(fluxes)))
 
-    columns = [light(unit, scene.stars) for unit in np.eye(n)]
+    columns = [light(unit, places) for unit in np.eye(n)]
     if moves:
         for axis in (0, 1):
-            for s in range(n):
-                step = np.zeros((n, 2))
+            for s in range(len(places)):
+                step = np.zeros(places.shape)
                 step[s, axis] = 1e-3
-                high, low = (light(fluxes, scene.stars + sign * step) for sign in (1, -1))
+                high, low = (light(fluxes, places + sign * step) for sign in (1, -1))
                 columns.append((high - low) / 2e-3)
     units = np.eye(N * N).reshape(-1, N, N)
     level = np.ones((len(weights), N, N)) * texture.mean.mean() * scene.gains[:, None, None]
@@ -79,7 +84,9 @@ def dense(scene, sky, fluxes, moves):
     left = (np.array(list(scene.images())) - expected) * weights
     change = np.linalg.solve(information, columns @ left.ravel())[:k]
     variances = np.diag(np.linalg.inv(information))[:k]
-    return np.hypot(np.sqrt(variances), change).reshape(-1, n).T
+    of_fluxes, of_places = np.split(np.hypot(np.sqrt(variances), change), [n])
+    of_places = of_places.reshape(-1, len(places)).T.repeat(scene.n_epochs, axis=0)
+    return np.column_stack([of_fluxes, of_places])
 
 
 @pytest.mark.filterwarnings("ignore:the images are shifted")

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from lnocl import checkpoint
 from lnocl.commands.signals import ENDING
-from lnocl.runs import checkpoint
 
 pytestmark = pytest.mark.system
 
 
 def start(command, *more, every=checkpoint.EVERY):
     program = (
-        "import sys\nfrom lnocl.commands import cli\nfrom lnocl.runs import checkpoint\n"
+        "import sys\nfrom lnocl.commands import cli\nfrom lnocl import checkpoint\n"
         f"checkpoint.EVERY = {every}\nsys.exit(cli.main(sys.argv[1:]))"
     )
     return subprocess.Popen(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lnocl import matched_filter
+from lnocl.detection import search
 from lnocl.errors import InputError, LnoclError, LnoclWarning
 
 pytest.importorskip("photutils", reason="photutils is not installed")
@@ -172,16 +172,16 @@ def test_between_holes_there_are_next_to_no_stars(seed):
 
 def test_a_star_that_a_fit_moves_away_is_not_found_again(monkeypatch):
     """In a field of galaxies the same star was found without end."""
-    scenes = Path(__file__).parents[1] / "benchmarks" / "stars.py"
+    scenes = Path(__file__).parents[2] / "benchmarks" / "stars.py"
     counts, psf, *_ = runpy.run_path(str(scenes))["scene"]("moffat", "galaxies", 6, 740)
-    rounds, search = [], matched_filter._points_among
+    rounds, points_among = [], search._points_among
 
     def among(*given):
         rounds.append(given)
         assert len(rounds) < 20
-        return search(*given)
+        return points_among(*given)
 
-    monkeypatch.setattr(matched_filter, "_points_among", among)
+    monkeypatch.setattr(search, "_points_among", among)
     assert len(find_stars(counts, psf)) == 6
 
 
@@ -243,17 +243,22 @@ class TestSaturated:
         mask = np.zeros(SHAPE, bool)
         mask[10, 90] = True
         assert_found(find_stars(image, PSF, mask=mask))
+        assert_found(find_stars(np.ma.masked_array(image, mask), PSF))
 
 
 @pytest.mark.parametrize(
     ("image", "given", "message"),
     [
-        (np.ones((2, 9, 9)), {}, "image has 3 dimensions; give one image"),
+        (np.ones((2, 9, 9)), {}, r"image has shape \(2, 9, 9\); give one image"),
         (np.full((9, 9), np.nan), {}, "image has no good pixel"),
         (np.ones((9, 9)), {"threshold": 0.0}, "threshold must be more than 0; 0 was given"),
         (np.ones((9, 9)), {"threshold": np.nan}, "threshold must be more than 0; nan was given"),
-        (np.ones((9, 9)), {"mask": np.zeros((9, 8), bool)}, r"shape \(9, 8\) must be booleans"),
-        (np.ones((9, 9)), {"mask": np.zeros((9, 9))}, "mask of type float64"),
+        (
+            np.ones((9, 9)),
+            {"mask": np.zeros((9, 8), bool)},
+            r"the image has \(9, 9\)",
+        ),
+        (np.ones((9, 9)), {"mask": np.zeros((9, 9))}, "mask is of type float64; give booleans"),
         (np.ones((9, 9)), {"psf": np.zeros((5, 5))}, "psf of shape .* positive"),
         (np.ones((9, 9)), {"psf": np.ones(5)}, "psf of shape"),
     ],

@@ -9,13 +9,14 @@ import turned_scenes
 from scipy import ndimage
 
 import lnocl
+from lnocl.detection.completeness import needed
+from lnocl.detection.false_alarms import Rarity, of_student, threshold
+from lnocl.detection.maxima import peaks
+from lnocl.detection.score import Null
+from lnocl.detection.score_map import ScoreMap
+from lnocl.detection.score_noise import noise_of
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
-from lnocl.solvers.completeness import needed
-from lnocl.solvers.false_alarms import Rarity, of_student, threshold
-from lnocl.solvers.score import Null
-from lnocl.solvers.score_map import ScoreMap, _peaks
-from lnocl.solvers.score_noise import noise_of
 
 NO_ERRORS = np.zeros(1), np.zeros(0)
 ROWS, COLUMNS = np.indices((9, 9)) - 4
@@ -194,9 +195,11 @@ def test_stars_have_the_information_of_explicit_products():
     scene = scene_of([(1.2, 30.4), (6.7, 30.9)])
     null = dark_null(scene, FLUXES, True)
     stars, precisions = null.stars, null._linear.precisions
-    laid = np.array([[each.on_grid((N, N)).ravel() for each in images] for images in stars._images])
-    expected = np.einsum("kjn,jn,ljn->kl", laid, np.reshape(precisions, (2, -1)), laid)
-    np.testing.assert_allclose(stars._gram(range(6), precisions), expected, rtol=1e-9)
+    laid = np.array([[each.on_grid((N, N)) for each in images] for images in stars._cutouts])
+    laid = laid.reshape(2, 2, 3, -1)
+    expected = np.einsum("jskn,jn,jtln->kslt", laid, np.reshape(precisions, (2, -1)), laid)
+    found = stars._gram(precisions).dense()
+    np.testing.assert_allclose(found, expected.reshape(6, 6), rtol=1e-9)
 
 
 @pytest.mark.parametrize("turn", [None, 30.0])
@@ -476,11 +479,20 @@ def test_noise_that_is_shared_scatters_the_whole_field():
 
 def test_the_peak_of_a_gaussian_is_found_between_pixels():
     rows, columns = np.indices((3, 3)) - 1.0
-    dx, dy = np.array([0.3, -0.45]), np.array([-0.2, 0.1])
-    near = np.exp(-((rows[..., None] - dy) ** 2 + (columns[..., None] - dx) ** 2) / 4) * 7.0
-    moves, values = _peaks(near)
-    np.testing.assert_allclose(moves, np.stack([dx, dy], axis=1), atol=1e-12)
-    np.testing.assert_allclose(values, 7.0)
-    moves, values = _peaks(near - 6.0)  # of which some are negative
-    assert abs(moves - np.stack([dx, dy], axis=1)).max() < 0.1
-    assert abs(values - 1.0).max() < 0.1
+    middle = np.array([1])
+    for dx, dy in ((0.3, -0.2), (-0.45, 0.1)):
+        near = np.exp(-((rows - dy) ** 2 + (columns - dx) ** 2) / 4) * 7.0
+        moves, values = peaks(near, middle, middle, "wrap")
+        np.testing.assert_allclose(moves, [(dx, dy)], atol=1e-12)
+        np.testing.assert_allclose(values, 7.0)
+        moves, values = peaks(near - 6.0, middle, middle, "wrap")  # of which some are negative
+        assert abs(moves - (dx, dy)).max() < 0.1
+        assert abs(values - 1.0).max() < 0.1
+
+
+def test_a_peak_at_an_edge_stays_there():
+    values = np.zeros((4, 5))
+    values[0, 4], values[1, 4], values[0, 3] = 3.0, 1.0, 2.0
+    moves, higher = peaks(values, np.array([0]), np.array([4]), "reflect")
+    assert moves.tolist() == [[0.0, 0.0]]
+    assert higher.tolist() == [3.0]

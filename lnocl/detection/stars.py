@@ -5,26 +5,23 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.special import erf
 
-from lnocl.blemishes import flat_tops, sharp_pixels
+from lnocl.detection.blemishes import flat_tops, sharp_pixels
+from lnocl.detection.checks import read_image, read_psf
+from lnocl.detection.maxima import SIGNIFICANT
+from lnocl.detection.search import PointSources, around, find_points, in_boxes, pixels_at
 from lnocl.errors import InputError, LnoclError, counted, note, warn
-from lnocl.matched_filter import PointSources, around, find_points, in_boxes, pixels_at
 from lnocl.process import ignored_warnings
-from lnocl.scene.arrays import Array, darker_noise, numbers
-from lnocl.scene.cores import fwhm, peak
-from lnocl.scene.quantities import bare, in_unit, split
+from lnocl.scene.arrays import Array, Mask, darker_noise
+from lnocl.scene.cores import core, fwhm
+from lnocl.scene.quantities import in_unit, split
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-Mask = NDArray[np.bool_]
-
-# Stars are sought from this significance on, whatever the threshold: the noise in which they are
-# seen is that without them.
-SOUGHT = 5.0
 # No stars are narrower than this, full width at half maximum, pixels, where no PSF is known.
 SHARPEST = 1.5
 # The sky's level is a median over boxes of so many PSF widths, and of this many pixels or more.
@@ -77,9 +74,9 @@ def find_stars(
     brightest first, so that their side lobes are no stars. Maxima in the wings of brighter stars
     are left out unless they are half as bright as those wings. So are extended sources: maxima that
     the PSF, smoothed by a Gaussian of 0.4 of its width, fits better than the PSF. Pixels sharper
-    than the PSF, as cosmic rays leave them, are bad (`lnocl.blemishes.sharp_pixels`), and sources
-    less than 0.6 times as wide are left out. Pixels of flat tops count as saturated, and a line of
-    the log says how many (`lnocl.blemishes.flat_tops`).
+    than the PSF, as cosmic rays leave them, are bad (`lnocl.detection.blemishes.sharp_pixels`), and
+    sources less than 0.6 times as wide are left out. Pixels of flat tops count as saturated, and a
+    line of the log says how many (`lnocl.detection.blemishes.flat_tops`).
 
     Stars are sought from 5 standard deviations on, also where the threshold is higher: the noise of
     the filtered image is that without them.
@@ -87,8 +84,8 @@ def find_stars(
     Parameters
     ----------
     image : array_like, shape (ny, nx)
-        In any linear unit. Pixels that are not finite are bad. So are blocks of exactly 0 in an
-        image that is not of whole counts.
+        In any linear unit. Pixels that are masked or not finite are bad. So are blocks of exactly 0
+        in an image that is not of whole counts.
     psf : array_like, shape (ky, kx), optional
         Its PSF, with its peak at (ky // 2, kx // 2). Without it, it is a round Moffat function as
         wide as the image's own stars.
@@ -150,9 +147,15 @@ def find_stars(
     threshold = in_unit("threshold", threshold, "")
     if saturation is not None:
         saturation = in_unit("saturation", saturation, unit or "")
-    pixels, bad = _check(image, mask, threshold)
-    sought = min(threshold, SOUGHT)
-    shape = None if psf is None else _check_psf(psf)
+    if not threshold > 0:
+        raise InputError(f"`threshold` must be more than 0; {threshold:g} was given")
+    pixels, bad = read_image("image", image, mask)
+    bad |= _outside(pixels)
+    if bad.all():
+        raise InputError("image has no good pixel; give another, or another mask")
+    # The noise in which stars are seen is that without them, whatever the threshold.
+    sought = min(threshold, SIGNIFICANT)
+    shape = None if psf is None else read_psf(psf)
     width = FIRST_WIDTH if shape is None else fwhm(shape)
     above, noise = _above_sky(pixels, bad, width)
     saturated = bad | _saturated(pixels, above / noise, bad, saturation) | _holes(above)
@@ -199,27 +202,6 @@ def _sharpest_psf() -> Array:
     return np.outer(profile, profile) / profile.sum() ** 2
 
 
-def _check(image: ArrayLike, mask: ArrayLike | None, threshold: float) -> tuple[Array, Mask]:
-    """Return the pixels, and which of them are bad."""
-    pixels = numbers("image", image)
-    if pixels.ndim != 2:
-        raise InputError(f"image has {counted(pixels.ndim, 'dimension')}; give one image")
-    if not threshold > 0:
-        raise InputError(f"`threshold` must be more than 0; {threshold:g} was given")
-    bad = ~np.isfinite(pixels) | _outside(pixels)
-    if mask is not None:
-        given = np.asarray(mask)
-        if given.dtype != np.bool_ or given.shape != pixels.shape:
-            raise InputError(
-                f"`mask` of type {given.dtype} and shape {given.shape} must be booleans of the "
-                f"shape of image, {pixels.shape}"
-            )
-        bad |= given
-    if bad.all():
-        raise InputError("image has no good pixel; give another, or another mask")
-    return pixels, bad
-
-
 def _outside(pixels: Array) -> Mask:
     """Return blocks of pixels of exactly 0 in an image that is not of whole counts.
 
@@ -234,15 +216,6 @@ def _outside(pixels: Array) -> Mask:
 def _are_counts(values: Array) -> bool:
     """Return whether these are whole counts, and not all of them alike."""
     return bool((values >= 0).all() and (values == np.round(values)).all() and np.ptp(values) > 0)
-
-
-def _check_psf(psf: ArrayLike) -> Array:
-    light = numbers("psf", bare("psf", psf))
-    if light.ndim != 2 or not np.isfinite(light).all() or not light.sum() > 0:
-        raise InputError(
-            f"`psf` of shape {light.shape} must be one image of finite numbers with a positive sum"
-        )
-    return light / light.sum()
 
 
 def _require_photutils() -> None:
@@ -265,10 +238,10 @@ def _above_sky(pixels: Array, bad: Mask, width: float) -> tuple[Array, Array]:
     filled = _filled(pixels, bad, width)
     level, _ = in_boxes(filled, bad, box)
     rough = filled - ndimage.gaussian_filter(filled, SMOOTHER * width)
-    impulse = np.zeros((4 * box + 1, 4 * box + 1))
-    impulse[2 * box, 2 * box] = 1.0
-    kernel = impulse - ndimage.gaussian_filter(impulse, SMOOTHER * width)
-    noise = in_boxes(rough, bad, box)[1] / np.sqrt((kernel**2).sum())
+    impulse = np.eye(1, 4 * box + 1, 2 * box)[0]
+    kernel = ndimage.gaussian_filter1d(impulse, SMOOTHER * width)
+    squares = 1.0 - 2.0 * kernel.max() ** 2 + (kernel**2).sum() ** 2  # of an impulse less the same
+    noise = in_boxes(rough, bad, box)[1] / np.sqrt(squares)
     if _are_counts(pixels[~bad]):
         means = ndimage.uniform_filter(np.where(bad, 0.0, pixels), box)[~bad]
         noise = np.maximum(noise, np.sqrt(max(float(np.quantile(means, 0.25)), 1.0 / box**2)))
@@ -333,11 +306,9 @@ def _narrow(fits: list[tuple[float, float, float]]) -> Array:
 
 def _elongation(window: Array) -> float:
     """Return the length of what is above half the peak of a star, over its width."""
-    at = peak(window)
-    labels, _ = ndimage.label(window > window[at] / 2)
-    core = np.nonzero(labels == labels[at])
+    at = np.nonzero(core(window, 0.5))
     # Pixels have a variance of 1/12 of their own.
-    variances = np.linalg.eigvalsh(np.cov(core, aweights=window[core], ddof=0)) + 1.0 / 12.0
+    variances = np.linalg.eigvalsh(np.cov(at, aweights=window[at], ddof=0)) + 1.0 / 12.0
     return float(np.sqrt(variances[1] / variances[0]))
 
 

@@ -2,8 +2,8 @@ r"""How much more than counts alone a score scatters: shared noise, and errors o
 
 Noise that neighbours share scatters the darker half of the whole field. Errors e of the PSFs,
 relative to them, add ``e^2 X`` to the variance of the score u, where X follows from the light of
-the stars (`lnocl.solvers.score`). In each ring round the stars e is what the run has found, or what
-the ring shows,
+the stars (`lnocl.detection.score`). In each ring round the stars e is what the run has found, or
+what the ring shows,
 
 .. math:: \Big\langle \frac{u^2}{1 + e^2 X} \Big\rangle = 1,
 
@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
+from scipy.ndimage import value_indices
 
 from lnocl.scene.arrays import Array, darker_noise
 
 if TYPE_CHECKING:
-    from lnocl.solvers.score import Score
+    from lnocl.detection.score import Score
 
 # A field scatters more than counts where it does by so many of its errors.
 CLEARLY = 4.0
@@ -71,11 +72,8 @@ def noise_of(score: Score, rings: NDArray[np.int_], empty: NDArray[np.bool_] | N
     shared = _shared(values[is_empty], independent)
     scatter = shared * np.sqrt(1.0 + score.of_psfs)
     degrees = np.full(values.shape, MANY)
-    y, x = np.nonzero((POSSIBLE**2 * score.starlit > TELLING) & score.is_tested)
-    _, ring = np.unique(rings[y, x], return_inverse=True)
-    ends = np.cumsum(np.bincount(ring))[:-1]
-    for at in np.split(np.argsort(ring, kind="stable"), ends) if len(y) else []:
-        there = y[at], x[at]
+    is_near = (POSSIBLE**2 * score.starlit > TELLING) & score.is_tested
+    for there in value_indices(np.where(is_near, rings, -1), ignore_value=-1).values():
         told_by = is_empty[there]
         squares, light = (values[there] / shared) ** 2, score.starlit[there]
         square, told = 0.0, 0.0

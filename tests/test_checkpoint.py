@@ -10,8 +10,8 @@ from astropy.io import fits
 from scenes import ENGINES, Recipe, make_smooth_psfs, paper
 
 import lnocl
+from lnocl import checkpoint
 from lnocl.engines.numpy import ReferenceEngine
-from lnocl.runs import checkpoint
 from lnocl.runs.run import FIRST_REFINED, Run
 
 STARS = Recipe((16, 32), 2, 2, mu=1e-3, smoothing=0.01, masked=0.05)
@@ -24,6 +24,7 @@ KINDS = {
     "change": (STARS, {"stop": 3e-4}),
     "discrepancy": (STARS, {"stop": "discrepancy"}),
     "held-out": (STARS, {"stop": "held-out", "smoothing": "auto"}),
+    "held-out, no star": (NO_STAR, {"stop": "held-out", "smoothing": "auto"}),
     "held-out, refined": (
         STARS,
         {"stop": "held-out", "smoothing": "auto", "refine_positions": True},
@@ -31,7 +32,7 @@ KINDS = {
 }
 # Those that CI alone tests: what is the same for both solvers, and the slowest.
 RARE = [("sgm", kind) for kind in ("refined", "change", "discrepancy", "held-out")]
-RARE += [(solver, "held-out, refined") for solver in ("sgm", "sgp")]
+RARE += [("sgm", "held-out, no star"), ("sgm", "held-out, refined"), ("sgp", "held-out, refined")]
 RUNS = [
     pytest.param(
         solver,
@@ -230,6 +231,8 @@ def test_another_device_version_or_tuning_is_refused(saved, tmp_path):
     }.items():
         path = str(tmp_path / f"{name}.fits")
         checkpoint.write(path, found.described | {name: "'other'"}, found.ended, found.arrays)
+        if name == "version":
+            fits.setval(path, "DIGEST", value="made otherwise")
         with pytest.raises(lnocl.InputError, match=words):
             STARS.make().deconvolve(n_iter=6, engine="numpy", resume=path)
 
@@ -270,8 +273,21 @@ def test_what_is_no_checkpoint_is_refused(content, tmp_path):
     with pytest.raises(lnocl.FileError, match="is not a checkpoint, or a damaged one"):
         checkpoint.read(str(path))
     fits.writeto(path, np.ones((4, 4)), overwrite=True)
-    with pytest.raises(lnocl.FileError):
+    with pytest.raises(lnocl.FileError, match="is not a checkpoint, or a damaged one"):
         checkpoint.read(str(path))
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [("extended", np.ones((8, 8))), ("steps", np.ones(4, "f4")), ("objectives", None)],
+)
+def test_arrays_that_are_not_like_those_of_the_run_are_refused(name, array, saved, tmp_path):
+    found, path = checkpoint.read(saved), str(tmp_path / "other.fits")
+    arrays = {key: value for key, value in found.arrays.items() if key != name}
+    arrays |= {} if array is None else {name: array}
+    checkpoint.write(path, found.described, found.ended, arrays)
+    with pytest.raises(lnocl.FileError, match=f"is of no such run, by its array {name}; start"):
+        STARS.make().deconvolve(n_iter=6, engine="numpy", resume=path)
 
 
 def test_the_checkpoint_of_another_run_is_not_replaced(saved):

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from lnocl.scene.arrays import Array
-
-Mask = NDArray[np.bool_]
+from lnocl.scene.arrays import Array, Mask
+from lnocl.scene.shifting import ENDLESS, MovablePsf
 
 # The pairs of pixels on both sides of one: beside it, above and below, and across.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -79,21 +77,13 @@ def _beside(values: Array, direction: tuple[int, int]) -> Array:
     return np.asarray(after + padded[1 - dy : 1 - dy + ny, 1 - dx : 1 - dx + nx])
 
 
-def _least_shares(psf: Array) -> list[float]:
+def _least_shares(psf: Array) -> Array:
     """Return the least share of its brightest pixel that a star has beside it, by direction."""
-    wide = np.pad(psf, 3)
-    row, column = (n // 2 + 3 for n in psf.shape)
-    spline = ndimage.spline_filter(wide, 3)
-    shares = []
-    for dy, dx in DIRECTIONS:
-        found = []
-        for y, x in product(PLACES, PLACES):
-            rows = row - y + dy * np.array([-1.0, 0.0, 1.0])
-            columns = column - x + dx * np.array([-1.0, 0.0, 1.0])
-            before, here, after = ndimage.map_coordinates(spline, [rows, columns], prefilter=False)
-            found.append((before + after) / here)
-        shares.append(max(float(min(found)), 0.0))
-    return shares
+    movable, shares = MovablePsf(psf, ENDLESS), []
+    for y, x in product(PLACES, PLACES):
+        star = movable.at(x, y).add_to(np.zeros((3, 3)), (-1, -1), ENDLESS)
+        shares.append([_beside(star, each)[1, 1] / star[1, 1] for each in DIRECTIONS])
+    return np.min(shares, axis=0).clip(0.0)
 
 
 def flat_tops(pixels: Array, significance: Array, bad: Mask) -> Mask:

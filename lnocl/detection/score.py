@@ -32,6 +32,9 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lnocl.detection.known_stars import KnownStars
+from lnocl.detection.maxima import SIGNIFICANT
+from lnocl.detection.score_noise import noise_of
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
@@ -40,8 +43,6 @@ from lnocl.scene.psf_pixels import CORRELATED
 from lnocl.scene.scene import MIN_MODEL
 from lnocl.scene.smooth_field import SmoothField
 from lnocl.scene.texture import ROUND, coarseness, resolution
-from lnocl.solvers.known_stars import KnownStars
-from lnocl.solvers.score_noise import noise_of
 
 # Radius of the disc whose level is taken out, in widths of the PSFs, and of a disc for the counts'
 # level over that. Full width of the Gaussian that smooths the estimate, resolutions.
@@ -52,8 +53,6 @@ PEAKED = 3.0
 FAR = 1e-3
 # A level is known where so much of the disc is level.
 SOME_LEVEL = 0.1
-# Structure is where the score is so many times its noise.
-STRUCTURED = 5.0
 # Nothing is tested where stars, or the level, leave less than this share of the information, or
 # where less was observed than this share of the most.
 LEFT, LEFT_BY_LEVEL, SEEN = 0.5, 0.2, 0.05
@@ -211,7 +210,7 @@ class Null:
         values = score.values / noise.scatter
         radius = int(np.ceil(self.resolution))
         disc = np.hypot(*np.ogrid[-radius : radius + 1, -radius : radius + 1]) <= radius
-        found = ndimage.binary_dilation(values > STRUCTURED, disc)
+        found = ndimage.binary_dilation(values > SIGNIFICANT, disc)
         return np.asarray(found)
 
     def _one_count(self) -> float:

@@ -2,39 +2,29 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
-from numbers import Real
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lnocl.errors import FileError, InputError, counted, warn
+from lnocl.errors import FileError, InputError, warn
 from lnocl.io.atomic import check_output, whole_file
 from lnocl.runs.held_out import HeldOutCounts
+from lnocl.runs.inputs import WIDTH, digest_of
 from lnocl.runs.run import Run
-from lnocl.runs.saved import Saved
-from lnocl.runs.start import Setup
 from lnocl.runs.stopping import Rule
-from lnocl.scene.arrays import numbers
-from lnocl.scene.fields import FIELDS
-from lnocl.scene.observation import Observation
 from lnocl.solvers.engine import State
 
-# The widest value: a SHA-256 in hexadecimal, or the repr of a parameter or name of a device.
-WIDTH = 256
-# More than there are parameters, and than the state of held-out counts has arrays: a hostile file
-# may have any number, compressed to nothing.
-MAX_ROWS = 100
-MAX_HDUS = 100
-ROW_BYTES = 32 + WIDTH
 # Seconds between two checkpoints.
 EVERY = 60.0
+# Arrays whose lengths follow what a run has done, and where its stars are.
+GROWING = "objectives", "rule", "cross_values", "star_information"
 
 
 @dataclass(frozen=True)
@@ -78,91 +68,65 @@ class Checkpoint:
                 f"differ{'s' * (len(differing) == 1)}; repeat its command as it was, or start anew"
             )
 
+    def state(self, own: State) -> State:
+        """Return the arrays, once they are known to be of the kind of those that a run has.
 
-def describe(setup: Setup, **parameters: Any) -> dict[str, str]:
-    """Return the inputs and parameters of a run: checksums of arrays, other values in words."""
-    bound = {
-        "version": version("lnocl"),
-        **inputs_of(setup.observation),
-        **{name: value for name, value in vars(setup).items() if name != "observation"},
-        **parameters,
-    }
-    bound |= {"device": setup.engine_name(), "tuning": setup.tuning_name()}
-    return {name: _describe(name, value) for name, value in bound.items()}
-
-
-def inputs_of(observation: Observation) -> dict[str, Any]:
-    """Return the parameters of an observation, by their names."""
-    bound = {name: getattr(observation, name) for name in (*FIELDS, "offsets", "turns")}
-    if observation.psf_fields:
-        bound["psf_fields"] = np.concatenate([each.numbers() for each in observation.psf_fields])
-    return bound
+        Raises
+        ------
+        FileError
+            One is missing, or of another type or shape: a run of another lnocl had it.
+        """
+        for name, array in own.items():
+            found = self.arrays.get(name, np.zeros(()))
+            grows = name.endswith(GROWING)
+            is_like = found.ndim == array.ndim if grows else found.shape == array.shape
+            if not (is_like and found.dtype == array.dtype):
+                raise FileError(
+                    f"the checkpoint {self.path} is of no such run, by its array {name}; start anew"
+                )
+        return self.arrays
 
 
-def _describe(name: str, value: Any) -> str:
-    if isinstance(value, (Real, np.bool_)):
-        value = float(value)  # so that 1, True and np.float32(1) are the same
-    if value is None or isinstance(value, (str, float)):
-        return ascii(value)[:WIDTH]
-    array = numbers(name, value).astype("<f8")
-    digest = hashlib.sha256(repr(array.shape).encode())
-    digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
-
-
-def read(path: str, most_bytes: float = math.inf) -> Checkpoint:
+def read(path: str) -> Checkpoint:
     """Read a checkpoint.
-
-    Parameters
-    ----------
-    path : str
-        File to read.
-    most_bytes : float, optional
-        Bytes that its arrays may take together: one that has more is not read.
 
     Raises
     ------
     FileError
-        The file is missing, not a checkpoint, truncated, altered, or too large.
+        The file is missing, not a checkpoint, truncated or altered.
     """
-    from astropy.io import fits  # runs without checkpoints need not load it
-
-    from lnocl.io.fitsfile import open_fits
+    from lnocl.io.fitsfile import open_fits  # runs without checkpoints need not load it
 
     arrays: State = {}
-    ended, digest, described = "", "", dict[str, str]()
     with open_fits(path, "is not a checkpoint, or a damaged one") as file:
-        for k, hdu in enumerate(file.hdus()):
-            if isinstance(hdu, fits.PrimaryHDU):
-                ended, digest = str(hdu.header["ENDED"]), hdu.header["DIGEST"]
-            elif hdu.name == "RUN" and hdu.size <= MAX_ROWS * ROW_BYTES:
-                described = {str(row["name"]): str(row["value"]) for row in hdu.data[:MAX_ROWS]}
-            elif _is_plain(hdu) and hdu.size <= most_bytes and k < MAX_HDUS:
-                most_bytes -= hdu.size
-                arrays[hdu.name.lower()] = np.array(hdu.data, hdu.data.dtype.newbyteorder("="))
-                del hdu.data
-            else:
-                raise FileError(
-                    f"the checkpoint {path} is of no such run: with extension {k}, {hdu.name}, it "
-                    "is too large; start anew"
-                )
-        if digest != _digest(described, ended, arrays):
+        hdus = list(file.hdus())
+        ended, digest = str(hdus[0].header["ENDED"]), hdus[0].header["DIGEST"]
+        described = {str(row["name"]): str(row["value"]) for row in hdus[1].data}
+        for hdu in hdus[2:]:
+            arrays[hdu.name.lower()] = _array(hdu)
+            del hdu.data
+        is_sound = digest == digest_of({"ended": ended}, described, arrays)
+        # Another version, which is refused as that, may have made it otherwise.
+        if not is_sound and described.get("version") == ascii(version("lnocl")):
             raise FileError(f"the checkpoint {path} is truncated or altered: its digest is wrong")
     return Checkpoint(path, described, ended, arrays)
 
 
-def _is_plain(hdu: Any) -> bool:
-    """Return whether an HDU is an image of as many bytes as its header says, as `write` makes."""
-    return type(hdu).__name__ == "ImageHDU" and not {"BSCALE", "BZERO", "BLANK"} & set(hdu.header)
+def _array(hdu: Any) -> NDArray[Any]:
+    """Return the array of an image; FITS has no empty ones, and the header says their shapes."""
+    if "EMPTY" in hdu.header:
+        shape = [int(length) for length in hdu.header["EMPTY"].split()]
+        return np.empty(shape, hdu.header["DTYPE"])
+    return np.array(hdu.data, hdu.data.dtype.newbyteorder("="))
 
 
-def _digest(described: Mapping[str, str], ended: str, arrays: State) -> str:
-    """Return the SHA-256 of the content of a checkpoint."""
-    digest = hashlib.sha256(repr((sorted(described.items()), ended)).encode())
-    for name, array in sorted(arrays.items()):
-        digest.update(repr((name, array.shape, array.dtype.str)).encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
+def _image(name: str, array: NDArray[Any]) -> Any:
+    from astropy.io import fits
+
+    image = fits.ImageHDU(array if array.size else None, name=name.upper())
+    if not array.size:
+        image.header.update(EMPTY=" ".join(map(str, array.shape)), DTYPE=array.dtype.str)
+    return image
 
 
 def write(
@@ -181,12 +145,11 @@ def write(
     """
     from astropy.io import fits
 
-    filled = {name: array for name, array in arrays.items() if array.size}  # FITS has no empty ones
     primary = fits.PrimaryHDU()
     primary.header["ENDED"] = ended, "why the run ended; empty where it had not"
-    primary.header["DIGEST"] = _digest(described, ended, filled)
+    primary.header["DIGEST"] = digest_of({"ended": ended}, described, arrays)
     table = np.array(list(described.items()), [("name", "U32"), ("value", f"U{WIDTH}")])
-    images = [fits.ImageHDU(array, name=name.upper()) for name, array in filled.items()]
+    images = [_image(name, array) for name, array in arrays.items()]
     hdus = fits.HDUList([primary, fits.BinTableHDU(table, name="RUN"), *images])
     with whole_file(path, overwrite) as stream:
         hdus.writeto(stream)
@@ -197,8 +160,6 @@ class Checkpointer:
 
     Parameters
     ----------
-    most_bytes : callable
-        Returns the bytes that the state of such a run may take; called where there is a checkpoint.
     describe : callable
         Returns the inputs and parameters of the run; called where there is a path or a checkpoint.
     path : str, optional
@@ -217,7 +178,6 @@ class Checkpointer:
 
     def __init__(
         self,
-        most_bytes: Callable[[], int],
         describe: Callable[[], dict[str, str]] = dict,
         path: object = None,
         resume: object = None,
@@ -225,7 +185,7 @@ class Checkpointer:
         self._path, source = _file_name("checkpoint", path), _file_name("resume", resume)
         self._saved_at = time.monotonic() if path is None else -math.inf
         self._best: State = {}
-        resumed = None if source is None else read(source, most_bytes())
+        resumed = None if source is None else read(source)
         self._may_replace = False
         if self._path is not None:
             self._may_replace = _are_same(self._path, source)
@@ -233,10 +193,9 @@ class Checkpointer:
             self._path = os.path.abspath(self._path)  # wherever the process goes
             self._refuse_to_replace(self._path)
         self._described = describe() if self._path is not None or resumed is not None else {}
-        self._ended, self._saved = "", None
         if resumed is not None:
             resumed.refuse_unless(self._described)
-            self._ended, self._saved = resumed.ended, Saved(resumed.path, resumed.arrays)
+        self._resumed = resumed
 
     def _refuse_to_replace(self, path: str) -> None:
         if os.path.lexists(path) and not self._may_replace:
@@ -255,22 +214,14 @@ class Checkpointer:
             The start is infinite or not a number.
         """
         self._best = run.state()
-        saved, ended = self._saved, self._ended
-        if saved is None:
+        resumed, self._resumed = self._resumed, None  # the memory need not hold it twice
+        if resumed is None:
             return ""
-        self._saved = None  # which the memory need not hold twice
-        state = run.take(saved)
-        done = int(state["progress"][0])
-        rule.restore(saved, done)
-        saved.refuse_others()
-        is_possible = ended in ("", "callback", "n_iter", "converged", rule.reason)
-        saved.refuse_unless(
-            is_possible and (ended != "n_iter" or done == run.n_iter),
-            f"it ended by {ended} after {counted(done, 'iteration')}",
-        )
+        state = resumed.state(self._best | {"rule": rule.state()})
+        rule.restore(state["rule"])
         run.restore(state)
         self._remember(*run.proven_state())
-        return "" if ended == "callback" else ended
+        return "" if resumed.ended == "callback" else resumed.ended
 
     def _remember(self, state: State, is_best: bool) -> None:
         """Hold the state of the least objective, for `return_to_best` to iterate from."""
@@ -307,7 +258,7 @@ class Checkpointer:
         if ended or self._is_due():
             state, is_best = run.proven_state()
             self._remember(state, is_best)
-            self._write(ended, state | {"rule": np.array(rule.state(), np.float64)})
+            self._write(ended, state | {"rule": rule.state()})
             if ended:
                 self._best = {}  # it is not returned to any more
 
@@ -319,9 +270,10 @@ class Checkpointer:
         FileError
             They cannot have been there.
         """
-        saved, self._saved = self._saved, None
-        if saved is not None:
-            held_out.restore(saved, self._ended)
+        resumed, self._resumed = self._resumed, None
+        if resumed is not None:
+            is_over = resumed.ended == "held-out"
+            held_out.restore(resumed.state({} if is_over else held_out.state()), is_over)
 
     def save_held_out(self, held_out: HeldOutCounts, ended: str = "") -> None:
         """Save the state of held-out counts where there is a file, and that is due or they ended.

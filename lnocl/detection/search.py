@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import ndimage
 from scipy.spatial import KDTree
 
+from lnocl.detection.fitting import STEPS, amounts, fit
+from lnocl.detection.maxima import peaks
 from lnocl.scene.arrays import Array, darker_noise
 from lnocl.scene.cores import centre, fwhm
+from lnocl.scene.shifting import ENDLESS, MARGIN, Cutout, MovablePsf
 
 Window = tuple[slice, slice]
 
@@ -29,10 +32,10 @@ SMOOTHING, SEPARATION = 0.35, 0.45
 # What lies in the wings of brighter stars must be brighter than this share of them: PSFs err.
 OF_WINGS = 0.5
 # So many of the brightest maxima within so many PSF widths may be fitted with one. Without any it
-# may be two stars, so many widths apart to begin with, whose places are fitted in so many steps.
-NEIGHBOURS, NEAR, APART, STEPS = 4, 2.5, 0.9, 8
-# Sweeps over stars after new ones are found, and the farthest move in one, pixels.
-SWEEPS, FARTHEST = 2, 0.5
+# may be two stars, so many widths apart to begin with.
+NEIGHBOURS, NEAR, APART = 4, 2.5, 0.9
+# Sweeps over stars after new ones are found.
+SWEEPS = 2
 # Noise that is lower by less than this share than before brings no new maxima.
 LOWER = 0.02
 # A box with more bad pixels than this, percent, says nothing of the sky.
@@ -65,7 +68,7 @@ class PointSources(NamedTuple):
 
 
 class _Profile:
-    """A PSF and its smoothed version at any place, by cubic splines."""
+    """A PSF and its smoothed version at any place of an image."""
 
     def __init__(self, psf: Array) -> None:
         self.shape = psf.shape
@@ -76,32 +79,35 @@ class _Profile:
         squares = np.cumsum(psf.ravel()[inwards] ** 2)
         within = radius.ravel()[inwards][np.searchsorted(squares, SQUARED_LIGHT * squares[-1])]
         self.half = int(np.ceil(within + self.width))
-        margin = self.half + 3
-        self._origin = row + margin, column + margin
-        wide = np.pad(psf, margin)
-        smooth = ndimage.gaussian_filter(wide, BROADER * self.width)
-        self._splines = [ndimage.spline_filter(each, 3) for each in (wide, smooth)]
+        far = self.half + MARGIN  # where what is cut off rings no more
+        core = np.pad(psf, far)[row : row + 2 * far + 1, column : column + 2 * far + 1]
+        smooth = ndimage.gaussian_filter(core, BROADER * self.width)
+        self._whole, *self._cores = (MovablePsf(part, ENDLESS) for part in (psf, core, smooth))
 
-    def at(
-        self, rows: slice, columns: slice, x: float, y: float, *, smooth: bool = False
-    ) -> tuple[Array, Array, Array]:
-        """Return the values at pixels of a star at (x, y), and their slopes along x and y of it."""
-        (row, wy, sy), (column, wx, sx) = _spline_weights(y), _spline_weights(x)
-        top, left = rows.start - row + self._origin[0] - 2, columns.start - column
-        left += self._origin[1] - 2
-        ny, nx = rows.stop - rows.start, columns.stop - columns.start
-        part = self._splines[smooth][top : top + ny + 3, left : left + nx + 3]
-        valued, sloping = (sum(w[k] * part[k : k + ny] for k in range(4)) for w in (wy, sy))
-        value, along_x = (sum(w[k] * valued[:, k : k + nx] for k in range(4)) for w in (wx, sx))
-        return value, along_x, sum(wx[k] * sloping[:, k : k + nx] for k in range(4))
+    def at(self, there: Window, x: float, y: float, *, smooth: bool = False) -> Array:
+        """Return the values of a star at (x, y) in a window round it."""
+        return _inside(self._cores[smooth].at(x, y), there)
+
+    def with_slopes(self, there: Window, x: float, y: float) -> Array:
+        """Return the values, and their slopes along x and y of the star, shape (3, h, w)."""
+        return _inside(self._cores[False].with_slopes(x, y), there)
 
     def window(self, x: float, y: float, shape: tuple[int, ...]) -> Window:
         """Return the rows and columns in which a star is fitted."""
         return around(x, y, (self.half, self.half), shape)
 
-    def reach(self, x: float, y: float, shape: tuple[int, ...]) -> Window:
-        """Return the rows and columns that the whole PSF covers."""
-        return around(x, y, (self.shape[0] // 2, self.shape[1] // 2), shape)
+    def whole(self, x: float, y: float, shape: tuple[int, ...]) -> tuple[Window, Array]:
+        """Return the rows and columns that the whole PSF covers, and its values there."""
+        there = around(x, y, (self.shape[0] // 2, self.shape[1] // 2), shape)
+        return there, _inside(self._whole.at(x, y), there)
+
+
+def _inside(star: Cutout, there: Window) -> Array:
+    """Return the values of a star in a window, 0 where it has none."""
+    rows, columns = there
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    laid = np.zeros((*star.values.shape[:-2], *shape))
+    return star.add_to(laid, (rows.start, columns.start), ENDLESS)
 
 
 def around(x: float, y: float, half: tuple[int, int], shape: tuple[int, ...]) -> Window:
@@ -111,53 +117,31 @@ def around(x: float, y: float, half: tuple[int, int], shape: tuple[int, ...]) ->
     return rows, columns
 
 
-def _spline_weights(place: float) -> tuple[int, Array, Array]:
-    """Return the pixel below a place, the weights of the four splines round it, and their slopes.
-
-    The slopes are those of a profile that moves with the place.
-    """
-    pixel = int(np.floor(place))
-    offset = np.arange(-2, 2) + (place - pixel)
-    t = np.abs(offset)
-    weights = np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.clip(2 - t, 0, None) ** 3 / 6)
-    steepness = np.where(t < 1, -2 * t + 1.5 * t**2, -(np.clip(2 - t, 0, None) ** 2) / 2)
-    return pixel, weights, steepness * np.sign(offset)
-
-
 class _MatchedFilter:
     """Least-squares fluxes of a PSF and of a constant in a disc round every pixel."""
 
     def __init__(self, profile: _Profile, weights: Array) -> None:
-        self._shape, half = weights.shape, profile.half
-        self._fine = [fft.next_fast_len(n + 2 * half, real=True) for n in weights.shape]
+        half = profile.half
         side = slice(-half, half + 1)
-        disc = (np.hypot(*np.ogrid[side, side]) <= half + 0.5).astype(float)
-        psf = profile.at(side, side, 0.0, 0.0)[0] * disc
-        self.peak = float(psf[half, half])
-        self._psf, self._disc = self._spectrum(psf), self._spectrum(disc)
-        known = fft.rfft2(weights, self._fine)
-        total = self._sums(known, self._disc)
-        self._share = self._sums(known, self._psf) / np.maximum(total, LEAST_WEIGHT * total.max())
-        information = self._sums(known, self._spectrum(psf**2))
-        information -= self._share**2 * total
+        self._disc = (np.hypot(*np.ogrid[side, side]) <= half + 0.5).astype(float)
+        self._psf = profile.at((side, side), 0.0, 0.0) * self._disc
+        total = _sums(weights, self._disc)
+        self._share = _sums(weights, self._psf) / np.maximum(total, LEAST_WEIGHT * total.max())
+        information = _sums(weights, self._psf**2) - self._share**2 * total
         is_known = information > LEAST_WEIGHT * information.max()
         self._information = np.where(is_known, information, np.inf)
 
-    def _spectrum(self, part: Array) -> NDArray[np.complex128]:
-        moved = np.zeros(self._fine)
-        moved[: part.shape[0], : part.shape[1]] = part
-        half = part.shape[0] // 2
-        return np.conj(fft.rfft2(np.roll(moved, (-half, -half), (0, 1))))
-
-    def _sums(self, spectrum: NDArray[np.complex128], part: NDArray[np.complex128]) -> Array:
-        ny, nx = self._shape
-        return fft.irfft2(spectrum * part, self._fine)[:ny, :nx]
-
     def __call__(self, weighted: Array) -> tuple[Array, Array]:
         """Return the fluxes in an image, given times its weights, and their signal-to-noise."""
-        spectrum = fft.rfft2(weighted, self._fine)
-        excess = self._sums(spectrum, self._psf) - self._share * self._sums(spectrum, self._disc)
+        excess = _sums(weighted, self._psf) - self._share * _sums(weighted, self._disc)
         return excess / self._information, excess / np.sqrt(self._information)
+
+
+def _sums(image: Array, part: Array) -> Array:
+    """Return the sums of an image times a part of odd sides that is centred on each pixel."""
+    from scipy.signal import oaconvolve  # which sources beside a model's do not need
+
+    return np.asarray(oaconvolve(image, part[::-1, ::-1], mode="same"))
 
 
 class _Search:
@@ -189,8 +173,8 @@ class _Search:
     def take_out(self, star: Array, share: float = 1.0) -> None:
         """Take this share of a star out of the image, given its place and flux."""
         x, y, flux = star[:3]
-        there = self.profile.reach(x, y, self.left.shape)
-        self.left[there] -= share * flux * self.profile.at(*there, x, y)[0]
+        there, values = self.profile.whole(x, y, self.left.shape)
+        self.left[there] -= share * flux * values
 
     def maxima(self) -> tuple[Array, Array, Array]:
         """Return the places, fluxes and signal of new maxima, the most significant first."""
@@ -199,17 +183,14 @@ class _Search:
         apart = max(1, round(SEPARATION * self.profile.width))
         is_new = smooth == ndimage.maximum_filter(smooth, 2 * apart + 1)
         is_new &= signal > self.threshold * self.noise
-        is_new &= signal > OF_WINGS * self._wings(signal)
+        # Of a rough PSF the wings are the brightest within its width.
+        wings = ndimage.maximum_filter(abs(self.whole - signal), 2 * self.rough_within + 1)
+        is_new &= signal > OF_WINGS * wings
         y, x = np.nonzero(is_new)
         order = np.argsort(-signal[y, x])
         y, x = y[order], x[order]
-        places = np.array([_vertices(smooth, y, x, 1), _vertices(smooth, y, x, 0)]).T
+        places = np.stack([x, y], axis=1) + peaks(smooth, y, x, "reflect")[0]
         return places, flux[y, x], signal[y, x]
-
-    def _wings(self, signal: Array) -> Array:
-        """Return the signal of the stars; of a rough PSF the largest within its width."""
-        wings = np.abs(self.whole - signal)
-        return ndimage.maximum_filter(wings, 2 * self.rough_within + 1)
 
     def is_point(self, places: Array, least: float = POINT_SHARE) -> bool:
         """Return whether the first of these places has a point, given sources at the others.
@@ -219,11 +200,12 @@ class _Search:
         x, y = places[0]
         there = self.profile.window(x, y, self.left.shape)
         parts = [
-            self.profile.at(*there, *place, smooth=smooth)[0].ravel()
+            self.profile.at(there, *place, smooth=smooth)
             for place in places
             for smooth in (False, True)
         ]
-        point, broad = self._solve(there, [*parts, np.ones(parts[0].size)])[:2]
+        parts.append(np.ones_like(parts[0]))
+        point, broad = amounts(parts, self.left[there], self.weights[there])[:2]
         sharp, smooth_peak = point * parts[0].max(), max(broad * parts[1].max(), 0.0)
         return bool(sharp > least * (sharp + smooth_peak))
 
@@ -252,31 +234,12 @@ class _Search:
         _, axes = np.linalg.eigh(np.cov(columns, rows, aweights=light[rows, columns], ddof=0))
         return place + np.outer([0.5, -0.5], APART * self.profile.width * axes[:, 1])
 
-    def untangle(self, places: Array) -> tuple[Array, Array]:
-        """Return places and fluxes of stars at about these places, as they fit best together."""
-        x, y = places[0]
-        there = self.profile.window(x, y, self.left.shape)
-        places = places.copy()
-        fluxes: Array = np.zeros(len(places))
-        for step in range(STEPS):
-            parts = [self.profile.at(*there, *place) for place in places]
-            values = [value.ravel() for value, _, _ in parts]
-            slopes = [flux * each.ravel() for flux, part in zip(fluxes, parts, strict=True)
-                      for each in part[1:]]  # fmt: skip
-            found = self._solve(
-                there, [*values, np.ones(values[0].size), *(slopes if step else [])]
-            )
-            fluxes = found[: len(places)]
-            moves = found[len(places) + 1 :].reshape(-1, 2)
-            if step:
-                places += np.clip(moves, -FARTHEST, FARTHEST)
-        return places, fluxes
-
-    def _solve(self, there: Window, parts: Sequence[Array]) -> Array:
-        """Return the amounts of some images that explain what is left in a window best."""
-        root = np.sqrt(self.weights[there]).ravel()
-        matrix = np.stack(parts, axis=1) * root[:, np.newaxis]
-        return np.asarray(np.linalg.lstsq(matrix, self.left[there].ravel() * root, rcond=1e-8)[0])
+    def fit(self, places: Array, fluxes: Array, n_steps: int = STEPS) -> tuple[Array, Array]:
+        """Return places and fluxes of stars near the first, as they fit best with a level."""
+        there = self.profile.window(places[0, 0], places[0, 1], self.left.shape)
+        star = partial(self.profile.with_slopes, there)
+        light, weights = self.left[there], self.weights[there]
+        return fit(star, places, fluxes, light, weights, [np.ones_like(light)], n_steps)
 
     def width(self, star: Array) -> float:
         """Return the width of a star's image without its neighbours; NaN where noise hides it.
@@ -286,26 +249,22 @@ class _Search:
         middle gives each.
         """
         x, y, flux = star[:3]
-        there, step = self.profile.window(x, y, self.left.shape), self.profile.width / 2
-        moves = [(0.0, 0.0), (step, 0.0), (-step, 0.0), (0.0, step), (0.0, -step)]
-        cores = [self.profile.at(*there, x + dx, y + dy)[0] for dx, dy in moves]
-        own = [float((core * cores[0]).sum()) for core in cores]
-        seen = [
-            float((core * self.left[there]).sum()) + flux * at
-            for core, at in zip(cores, own, strict=True)
-        ]
+        there, far = self.profile.window(x, y, self.left.shape), self.profile.width / 2
+        moves = [(0.0, 0.0), (far, 0.0), (-far, 0.0), (0.0, far), (0.0, -far)]
+        cores = [self.profile.at(there, x + dx, y + dy) for dx, dy in moves]
         squares = []
-        for middle, *beside in (seen, own):
+        for light in (self.left[there] + flux * cores[0], cores[0]):
+            middle, *beside = (float((core * light).sum()) for core in cores)
             if not 0 < np.mean(beside) < middle:
                 return np.nan
-            squares.append(4.0 * np.log(2.0) * step**2 / np.log(middle / np.mean(beside)))
+            squares.append(4.0 * np.log(2.0) * far**2 / np.log(middle / np.mean(beside)))
         square = squares[0] - squares[1] + self.profile.width**2
         return float(np.sqrt(square)) if square > 0 else np.nan
 
     def take_out_known(self, x: float, y: float) -> Array:
         """Return a star at a place, and take it out; all good pixels of the PSF give its flux."""
-        there = self.profile.reach(x, y, self.left.shape)
-        value, weights = self.profile.at(*there, x, y)[0], self.weights[there]
+        there, value = self.profile.whole(x, y, self.left.shape)
+        weights = self.weights[there]
         information = max(float((weights * value**2).sum()), np.finfo(float).tiny)
         flux = float((weights * value * self.left[there]).sum()) / information
         star = np.array([x, y, flux, flux * np.sqrt(information)])
@@ -323,23 +282,11 @@ class _Search:
                     self._fit(star)
 
     def _fit(self, star: Array) -> None:
-        x, y, flux = star[:3]
-        there = self.profile.window(x, y, self.left.shape)
-        value, along_x, along_y = self.profile.at(*there, x, y)
-        parts = [value, flux * along_x, flux * along_y, np.ones_like(value)]
-        matrix = np.stack([part.ravel() for part in parts], axis=1)
-        weighted = matrix * self.weights[there].reshape(-1, 1)
-        normal = weighted.T @ matrix
-        scale = np.sqrt(np.maximum(normal.diagonal(), np.finfo(float).tiny))
-        step = np.linalg.lstsq(
-            normal / np.outer(scale, scale), weighted.T @ self.left[there].ravel() / scale, 1e-9
-        )[0]
-        brighter, dx, dy, _ = step / scale
         self.take_out(star, -1.0)
         limits = np.array(self.left.shape[::-1]) - 0.5
-        move = np.clip([dx, dy], -FARTHEST, FARTHEST)
-        star[:2] = np.clip(star[:2] + move, -0.5, limits - 1e-6)
-        star[2] = max(flux + brighter, 0.0)
+        places, fluxes = self.fit(star[np.newaxis, :2], star[2:3], n_steps=1)
+        star[:2] = np.clip(places[0], -0.5, limits - 1e-6)
+        star[2] = max(fluxes[0], 0.0)
         self.take_out(star)
 
 
@@ -348,19 +295,6 @@ def pixels_at(x: Array, y: Array, shape: tuple[int, ...]) -> tuple[NDArray[np.in
     return tuple(
         np.round(at).astype(int).clip(0, n - 1) for at, n in zip((y, x), shape, strict=True)
     )
-
-
-def _vertices(values: Array, y: NDArray[np.int_], x: NDArray[np.int_], axis: int) -> Array:
-    """Return where parabolas through maxima and their neighbours along an axis are highest."""
-    at = (y, x)[axis]
-    inner = (at > 0) & (at < values.shape[axis] - 1)
-    step = np.array([1, 0]) if axis == 0 else np.array([0, 1])
-    before, here, after = (
-        values[(y + k * inner * step[0], x + k * inner * step[1])] for k in (-1, 0, 1)
-    )
-    bend = before - 2.0 * here + after
-    shift = np.divide(0.5 * (before - after), bend, out=np.zeros(len(at)), where=bend < 0)
-    return at + np.clip(shift, -0.5, 0.5)
 
 
 def in_boxes(pixels: Array, bad: NDArray[np.bool_], box: int) -> tuple[Array, Array]:
@@ -488,9 +422,8 @@ def _points_among(
         if not search.is_point(places[[i]]):
             near = sorted(tree.query_ball_point(place, NEAR * search.profile.width))
             others = [j for j in near if j != i][:NEIGHBOURS]
-            several, fluxes = search.untangle(
-                places[[i, *others]] if others else search.split(place)
-            )
+            several = places[[i, *others]] if others else search.split(place)
+            several, fluxes = search.fit(several, np.zeros(len(several)))
             order = np.argsort(-fluxes)
             several, fluxes = several[order], fluxes[order]
             is_near = np.hypot(*(several[0] - place)) < search.profile.width

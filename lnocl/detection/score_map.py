@@ -10,19 +10,17 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lnocl.detection.completeness import needed, values_at
+from lnocl.detection.false_alarms import Rarity, of_student, threshold
+from lnocl.detection.maxima import peaks
+from lnocl.detection.score import Null
+from lnocl.detection.score_noise import MANY, noise_of
 from lnocl.scene.arrays import Array
-from lnocl.solvers.completeness import needed, values_at
-from lnocl.solvers.false_alarms import Rarity, of_student, threshold
-from lnocl.solvers.score import Null
-from lnocl.solvers.score_noise import MANY, noise_of
+from lnocl.scene.texture import CORE, ROUND
 
-# The extended source is looked for in a ring round a place, resolutions.
-AROUND = 0.85, 1.65
 # Sources whose scores are correlated by less than this are apart, and what is left of a variance is
 # no less than its rounding.
 APART, ROUNDING = 0.02, 1e-6
-# A maximum lies at most so far from the middle of its pixel, pixels.
-FARTHEST = 0.7
 
 
 class ScoreMap:
@@ -113,7 +111,7 @@ class ScoreMap:
             Pixels of the sky.
         """
         rows, columns = self.values.shape
-        half = math.ceil(AROUND[1] * resolution) + 1
+        half = math.ceil(ROUND * resolution) + 1
         x, y = np.round(place).astype(int).tolist()
         side = np.arange(-half, half + 1)
         there = np.ix_((y + side) % rows, (x + side) % columns)
@@ -121,7 +119,7 @@ class ScoreMap:
         away = np.array(np.meshgrid(side - dx, side - dy))
         point = self._correlated(away.transpose(1, 2, 0))
         distance = np.hypot(*away) / resolution
-        is_round = (distance >= AROUND[0]) & (distance <= AROUND[1])
+        is_round = (distance >= CORE) & (distance <= ROUND)
         return float((self.values[there] - value * point)[is_round].max(initial=0.0))
 
     @cached_property
@@ -136,7 +134,7 @@ class ScoreMap:
 
     def peak_fluxes(self, y: NDArray[np.int_], x: NDArray[np.int_]) -> Array:
         """Return the fluxes, electrons, of maxima between pixels, at these rows and columns."""
-        return _peaks(_near(np.nan_to_num(self.fluxes), y, x))[1]
+        return peaks(np.nan_to_num(self.fluxes), y, x, "wrap")[1]
 
     def maxima(self, least: float) -> tuple[Array, Array, Array]:
         """Return maxima whose Gaussian values are above one, highest first.
@@ -153,7 +151,7 @@ class ScoreMap:
         """
         u = self.values
         y, x = np.nonzero((u == ndimage.maximum_filter(u, 3, mode="wrap")) & (u > 0))
-        moves, higher = _peaks(_near(u, y, x))
+        moves, higher = peaks(u, y, x, "wrap")
         gaussian = self.rarity(higher, (y, x))
         order = np.flatnonzero(gaussian > least)
         order = order[np.argsort(-gaussian[order])]
@@ -176,38 +174,3 @@ class ScoreMap:
         shares = scipy.linalg.solve(gram, common[near], assume_a="sym")
         left = max(1.0 - float(shares @ common[near]), ROUNDING)
         return float(values[0] - shares @ values[1:][near]) / math.sqrt(left)
-
-
-def _near(values: Array, y: NDArray[np.int_], x: NDArray[np.int_]) -> Array:
-    """Return the 3 x 3 values round each of n places of the periodic grid, shape (3, 3, n)."""
-    rows, columns = values.shape
-    steps = (-1, 0, 1)
-    near = [[values[(y + dy) % rows, (x + dx) % columns] for dx in steps] for dy in steps]
-    return np.array(near)
-
-
-def _peaks(near: Array) -> tuple[Array, Array]:
-    """Return where Gaussians through 3 x 3 values have their maxima, (n, 2), and their values.
-
-    Where a value is not positive they are parabolas.
-    """
-    moves, higher = _vertices(near)
-    is_positive = np.all(near > 0, axis=(0, 1))
-    of_logs, logs = _vertices(np.log(np.where(is_positive, near, 1.0)))
-    moves = np.where(is_positive[:, None], of_logs, moves)
-    return moves, np.where(is_positive, np.exp(logs), higher)
-
-
-def _vertices(near: Array) -> tuple[Array, Array]:
-    """Return where parabolas through 3 x 3 values have their maxima, (n, 2), and their values."""
-    middle = near[1, 1]
-    slope = np.stack([near[1, 2] - near[1, 0], near[2, 1] - near[0, 1]], axis=1) / 2.0
-    xx, yy = near[1, 2] + near[1, 0] - 2 * middle, near[2, 1] + near[0, 1] - 2 * middle
-    xy = (near[2, 2] + near[0, 0] - near[0, 2] - near[2, 0]) / 4.0
-    determinant = xx * yy - xy**2
-    is_peak = (determinant > 0) & (xx < 0)
-    safe = np.where(is_peak, determinant, 1.0)
-    moves = -np.stack([yy * slope[:, 0] - xy * slope[:, 1], xx * slope[:, 1] - xy * slope[:, 0]],
-                      axis=1) / safe[:, None]  # fmt: skip
-    moves = np.where(is_peak[:, None], moves, 0.0).clip(-FARTHEST, FARTHEST)
-    return moves, middle + (slope * moves).sum(axis=1) / 2.0

@@ -33,9 +33,7 @@ GAUSSIAN, MOST = 1e-3, 100.0
 N_TILTS, LARGEST = 400, 300.0
 # A Gaussian value in the table is this or more.
 LEAST = 1e-3
-# A field without noise exceeds a value in so many places.
-FEWEST = 1e-300
-# Rarer probabilities are lost in rounding.
+# Rarer probabilities, and fewer places in a field without noise, are lost in rounding.
 RAREST = 1e-300
 # Of the profile what is above this share of its peak matters.
 FAINT = 1e-4
@@ -56,14 +54,11 @@ def threshold(alarms: float, cells: float, edge: float = 0.0) -> float:
 
     def excess(u: float) -> float:
         of_area, of_edge = cells * u * (2.0 * math.pi) ** -1.5, edge / (4.0 * math.pi)
-        return math.log(max((of_area + of_edge) / alarms, FEWEST)) - u * u / 2.0
+        return math.log(max((of_area + of_edge) / alarms, RAREST)) - u * u / 2.0
 
     if excess(1.0) <= 0:  # where the number falls, from 1 on
         return 1.0
-    high = 2.0
-    while excess(high) > 0:
-        high *= 2.0
-    return float(optimize.brentq(excess, 1.0, high))
+    return float(optimize.brentq(excess, 1.0, HIGHEST))
 
 
 class Rarity:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import reduce
+from itertools import product
+from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -12,17 +15,16 @@ from scipy import ndimage
 
 from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
+from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.shifting import Cutout, window
-from lnocl.scene.stars import along_sky
+from lnocl.scene.stars import FAINT, Order, StarImages, along_sky
 
 # Stars and sources share nothing farther apart than so many resolutions.
 APART = 4.0
 # Combinations of stars with less than this share of their information tell nothing.
 SAME = 1e-6
-# Outer rows and columns of a star below this share of its largest value are left out.
-DARK = 1e-6
 # Side of the squares of the sky whose stars are taken out together, resolutions.
 TILE = 8.0
 
@@ -33,7 +35,7 @@ class Shared(NamedTuple):
     Attributes
     ----------
     score, flat, information : ndarray of float64
-        ``B^T G^-1 T_s``, ``B^T G^-1 W_s`` and ``B^T G^-1 B`` of `lnocl.solvers.score`.
+        ``B^T G^-1 T_s``, ``B^T G^-1 W_s`` and ``B^T G^-1 B`` of `lnocl.detection.score`.
     """
 
     score: Array
@@ -56,26 +58,27 @@ class KnownStars:
 
     def __init__(self, model: Model, fluxes: Array, moves: bool) -> None:
         self._model, self._scene, self._fluxes = model, model.scene, fluxes
-        self._images, self._owners = self._unknowns(moves)
+        scene, order = self._scene, self._scene.star_field.order
+        self._cutouts = [self._cutouts_in(j, moves) for j in range(scene.n_images)]
+        everywhere = np.ones(scene.image_grid, bool)
+        order = Order(order.places[: scene.n_stars], order.width)  # without halos
+        self._images = [
+            StarImages(everywhere, [[each] for each in cutouts], order) for cutouts in self._cutouts
+        ]
 
-    def _unknowns(self, moves: bool) -> tuple[list[list[Cutout]], list[int]]:
-        """Return what each unknown adds to each image, and the star that it is of."""
+    def _cutouts_in(self, j: int, moves: bool) -> list[Cutout]:
+        """Return what the unknowns of each star add to an image, shape (1 or 3, h, w) each."""
         scene, field = self._scene, self._scene.star_field
-        images: list[list[Cutout]] = []
+        found = []
         for s in range(scene.n_stars):
-            images.append([scene.star_cutout(j, s) for j in range(scene.n_images)])
-            if not moves:
-                continue
-            slopes = []
-            for j in range(scene.n_images):
+            star = scene.star_cutout(j, s)
+            star = star._replace(values=star.values[None])
+            if moves:
                 moved = field.psfs[j][s].with_slopes(*field.places[j][s])
-                moved = along_sky(moved, scene.observation.turns[j])
-                slopes.append(moved._replace(values=moved.values * scene.shown[s, j]))
-            for axis in (1, 2):
-                images.append([each._replace(values=each.values[axis]) for each in slopes])
-        each = 3 if moves else 1
-        trimmed = [[c.trimmed(DARK * float(abs(c.values).max())) for c in k] for k in images]
-        return trimmed, [k // each for k in range(len(images))]
+                star = along_sky(moved, scene.observation.turns[j])
+                star = star._replace(values=star.values * scene.shown[s, j])
+            found.append(star.trimmed(FAINT * float(abs(star.values).max())))
+        return found
 
     def shared(
         self,
@@ -95,58 +98,48 @@ class KnownStars:
         resolution : float
             That of all images together, pixels of the sky.
         """
-        grid, n = self._scene.grid, len(self._images)
-        found = Shared(*np.zeros((3, *grid)))
-        common, moments = list[Cutout](), np.zeros((2, n))
-        half = int(np.ceil(APART * resolution))
-        for k in range(n):
-            each, moments[:, k] = self._with_source(k, residuals, precisions, half)
-            common.append(_wider(each, width))
+        grid, n = self._scene.grid, self._scene.n_stars
+        found, half = Shared(*np.zeros((3, *grid))), int(np.ceil(APART * resolution))
+        if not n:
+            return found
+        gram, moments = self._gram(precisions), np.zeros((2, len(self._cutouts[0][0].values) * n))
+        for images, total, *each in zip(
+            self._images, self._model.sums, residuals, precisions, strict=True
+        ):
+            score, flat = (images.products(values.ravel()).ravel() for values in each)
+            moments += score, total * flat
+        common = [
+            _wider(self._with_source(*divmod(k, n), precisions, half), width)
+            for k in range(moments.shape[1])
+        ]
         firsts = np.array([each[1:] for each in common]).reshape(-1, 2)
         sizes = np.array([each.values.shape for each in common]).reshape(-1, 2)
-        for here in _tiles(grid, int(np.ceil(TILE * resolution))):
-            first, shape = (here[0].start, here[1].start), _shape(here)
+        for first, shape in _tiles(grid, int(np.ceil(TILE * resolution))):
+            here = window(*first, shape, grid)
             reach = (firsts - first) % grid < shape, (first - firsts) % grid < sizes
             near = np.flatnonzero(np.logical_or(*reach).all(axis=1)).tolist()
             if not near:
                 continue
             laid = np.array([common[k].add_to(np.zeros(shape), first, grid) for k in near])
             of_source = laid.reshape(len(near), -1)
-            solved = _inverse(self._gram(near, precisions)) @ of_source
+            solved = _inverse(gram.block(near)) @ of_source
             found.score[here], found.flat[here] = (moments[:, near] @ solved).reshape(2, *shape)
             found.information[here] = (of_source * solved).sum(axis=0).reshape(shape)
         return found
 
-    def _with_source(
-        self, k: int, residuals: Sequence[Array], precisions: Sequence[Array], half: int
-    ) -> tuple[Cutout, tuple[float, float]]:
-        """Return what an unknown shares with a point round its star, its score and response."""
-        scene, weighed, score, flat = self._scene, [], 0.0, 0.0
-        for j, cutout in enumerate(self._images[k]):
-            there = cutout.window(scene.image_grid)
-            values = cutout.values * precisions[j][there]
-            score += float((cutout.values * residuals[j][there]).sum())
-            flat += float(values.sum() * self._model.sums[j])
-            weighed.append(cutout._replace(values=values))
+    def _with_source(self, k: int, s: int, precisions: Sequence[Array], half: int) -> Cutout:
+        """Return what unknown k of a star shares with a point round the star."""
+        scene, weighed = self._scene, []
+        for cutouts, precision in zip(self._cutouts, precisions, strict=True):
+            values = cutouts[s].values[k] * precision[cutouts[s].window(scene.image_grid)]
+            weighed.append(cutouts[s]._replace(values=values))
         common = self._model.adjoint_of_cutouts(weighed)
-        place = on_sky(scene.stars, scene.oversample)[self._owners[k]]
-        return _cut_round(common, place, half, scene.grid), (score, flat)
+        return _cut_round(common, on_sky(scene.stars, scene.oversample)[s], half, scene.grid)
 
-    def _gram(self, near: Sequence[int], precisions: Sequence[Array]) -> Array:
-        """Return the information of some unknowns, of stars near each other."""
-        grid, gram = self._scene.image_grid, np.zeros((len(near), len(near)))
-        for j, precision in enumerate(precisions):
-            # Stars are not in the images of other epochs.
-            lit = [i for i, k in enumerate(near) if self._scene.shown[self._owners[k], j]]
-            if not lit:
-                continue
-            cutouts = [self._images[near[i]][j] for i in lit]
-            first, shape = _window_of(cutouts, grid)
-            laid = np.array([each.add_to(np.zeros(shape), first, grid) for each in cutouts])
-            laid *= np.sqrt(precision[window(*first, shape, grid)])
-            rows = laid.reshape(len(lit), -1)
-            gram[np.ix_(lit, lit)] += rows @ rows.T  # of which BLAS computes one half
-        return gram
+    def _gram(self, precisions: Sequence[Array]) -> BandMatrix:
+        """Return the information of the unknowns: all stars for each in turn."""
+        each = zip(self._images, precisions, strict=True)
+        return reduce(add, (images.information(values.ravel()) for images, values in each))
 
     def squares(
         self, precisions: Sequence[Array], edges: Array, errors: Array
@@ -208,15 +201,10 @@ def _wider(cutout: Cutout, width: float) -> Cutout:
     return cutout._replace(values=blurred)
 
 
-def _tiles(grid: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
-    for top in range(0, grid[0], side):
-        for left in range(0, grid[1], side):
-            yield slice(top, min(top + side, grid[0])), slice(left, min(left + side, grid[1]))
-
-
-def _shape(window: tuple[slice, slice]) -> tuple[int, int]:
-    rows, columns = (side.stop - side.start for side in window)
-    return rows, columns
+def _tiles(grid: tuple[int, int], side: int) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """Yield the first pixel and the shape of each."""
+    for y, x in product(range(0, grid[0], side), range(0, grid[1], side)):
+        yield (y, x), (min(side, grid[0] - y), min(side, grid[1] - x))
 
 
 def _cut_round(cutout: Cutout, place: Array, half: int, grid: tuple[int, int]) -> Cutout:
@@ -225,17 +213,3 @@ def _cut_round(cutout: Cutout, place: Array, half: int, grid: tuple[int, int]) -
     height, width = (min(2 * half + 1, n) for n in grid)
     first = y - height // 2, x - width // 2
     return Cutout(cutout.add_to(np.zeros((height, width)), first, grid), *first)
-
-
-def _window_of(
-    cutouts: Sequence[Cutout], grid: tuple[int, int]
-) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return first pixel and shape of a window of the periodic grid that cutouts lie in."""
-    n, half = np.array(grid), np.array(grid) // 2
-    middle = np.array(cutouts[0][1:])
-    starts = (np.array([each[1:] for each in cutouts]) - middle + half) % n - half
-    ends = starts + [each.values.shape for each in cutouts]
-    size = ends.max(axis=0) - starts.min(axis=0)
-    first = np.where(size < n, middle + starts.min(axis=0), 0).tolist()
-    shape = np.minimum(size, n).tolist()
-    return (first[0], first[1]), (shape[0], shape[1])
