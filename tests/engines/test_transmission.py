@@ -132,3 +132,16 @@ def test_one_map_serves_all_images_and_takes_no_more_memory():
     scene = Scene(given, STARS)
     assert scene.transmission.shape == (3, *GRID)
     assert scene.transmission.strides[0] == 0
+
+
+def test_a_psf_of_its_own_holds_the_share_of_its_star():
+    """Its sum is what the mask lets through, so it is not dimmed again."""
+    own = {"star_psfs": 0.3 * make_smooth_psfs(1, (9, 9)), "star_places": [(13, 11)]}
+    own["star_psfs"] /= make_smooth_psfs(1, (9, 9)).sum()
+    sky, stars = np.full((32, 48), 3.0), [(13, 11), (30, 20)]
+    dimmed = Scene(scene_of(sky, np.full((2, 32, 48), 0.5), **own), stars)
+    clear = Scene(scene_of(sky, np.ones((2, 32, 48)), **own), stars)
+    for j in range(2):
+        np.testing.assert_array_equal(dimmed.star_image(j, 0), clear.star_image(j, 0))
+        assert dimmed.star_image(j, 0).sum() == pytest.approx(0.3)
+        np.testing.assert_allclose(2.0 * dimmed.star_image(j, 1), clear.star_image(j, 1))
