@@ -115,6 +115,8 @@ class Camera(LinearMap):
         With the images and the PSFs.
     j : int
         Which image.
+    is_kept : bool
+        Whether it serves more than once, so that the spectrum of the PSF is held.
 
     Attributes
     ----------
@@ -133,7 +135,8 @@ class Camera(LinearMap):
 
     _workers = -1
 
-    def __init__(self, scene: Scene, j: int) -> None:
+    def __init__(self, scene: Scene, j: int, is_kept: bool = True) -> None:
+        self._is_kept = is_kept
         self._scene, self._j, self._oversample = scene, j, scene.oversample
         self.grid = self._grid = self.key = scene.grid
         self.psf, self.image_grid = scene.psf_cutout(j), scene.image_grid
@@ -148,6 +151,9 @@ class Camera(LinearMap):
 
     @cached_property
     def _otf(self) -> Spectrum:  # type: ignore[override]
+        return self._make_otf()
+
+    def _make_otf(self) -> Spectrum:
         return self._transform(self._scene.psf(self._j), ...)
 
     def seen(self, spectrum: Spectrum) -> Array:
@@ -156,7 +162,12 @@ class Camera(LinearMap):
 
     def convolved(self, spectrum: Spectrum) -> Array:
         """Return the image before its pixels sample it, of the shape of the sky."""
-        sky = self._pixels(self._otf * spectrum)
+        if self._is_kept:
+            product = self._otf * spectrum
+        else:
+            product = self._make_otf()
+            product *= spectrum
+        sky = self._pixels(product)
         return sky if self.rotation is None else self.rotation.forward(sky)
 
     def in_frame(self, sky: Array) -> Spectrum:

@@ -179,7 +179,7 @@ def _ranges_of(box: Box) -> Ranges:
 def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[Array]:
     """Yield the m_j, as `Model.images` returns them; nothing but one of them is held."""
     background = scene.background()
-    cameras = (Camera(scene, j) for j in range(scene.n_images))
+    cameras = (Camera(scene, j, is_kept=False) for j in range(scene.n_images))
     for j, image in enumerate(images_of(cameras, extended)):
         _illuminate(image, background[j], scene.star_field.light(j, star_fluxes))
         yield image
