@@ -33,7 +33,7 @@ from lnocl.solvers.psf_fit import step
 # A mend is taken where it leaves less than this share of kappa, or nothing to doubt, and a misfit
 # that is less by so many of its standard deviations.
 MENDED, GONE = 0.5, 2.0
-# None is taken that leaves a star less than this share of its flux.
+# None is taken that leaves a star less than this share of its flux, or so little to judge by.
 FADED = 0.5
 # Wings without noise are to leave less than this share.
 CLEANED = 0.99
@@ -71,6 +71,8 @@ class _State:
         before, after = self.misfit, other.misfit
         if (_of_stars(other) < FADED * _of_stars(self)).any():
             return False  # a sharper PSF, and the star's light in the extended source
+        if after.expected < FADED * before.expected:
+            return False  # stars that dominate nowhere show no misfit
         is_less = before.significance - after.significance > GONE
         return is_less and (not after.is_doubtful or after.kappa < MENDED * before.kappa)
 

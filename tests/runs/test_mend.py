@@ -103,8 +103,9 @@ def test_noise_that_is_given_too_large_hides_no_wrong_psf():
     assert fluxes == pytest.approx(1.0, abs=0.08)
 
 
-def state(kappa, flux):
-    misfit = PsfMisfit(np.array([1.0 + 100.0 * kappa**2]), 1.0, 1.0, 100.0, np.zeros(1))
+def state(kappa, flux, seen=1.0):
+    squares = np.array([seen + 100.0 * kappa**2])
+    misfit = PsfMisfit(squares, seen, 1.0, 100.0, np.zeros(1))
     fluxes, scene = np.array([1e4, flux]), SimpleNamespace(n_stars=2)
     estimate = SimpleNamespace(misfit=misfit, star_fluxes=fluxes, scene=scene)
     return _State(PSF, estimate, False)
@@ -114,6 +115,12 @@ def test_a_sharper_psf_that_takes_the_star_away_is_refused():
     before = state(0.2, 1e4)
     assert before.is_mended_by(state(0.02, 0.6e4))
     assert not before.is_mended_by(state(0.02, 0.4e4))
+
+
+def test_psfs_that_leave_no_star_to_judge_by_are_refused():
+    before = state(0.2, 1e4)
+    assert before.is_mended_by(state(0.02, 0.9e4, seen=0.6))
+    assert not before.is_mended_by(state(0.0, 0.9e4, seen=0.4))
     assert not before.is_mended_by(state(0.19, 1e4))
 
 
