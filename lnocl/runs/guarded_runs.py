@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
-from lnocl.errors import DivergedError
+from lnocl.errors import DivergedError, InputError
 from lnocl.process import ignored_notes, ignored_warnings
 from lnocl.runs.halos import hold_halos, settle_halos
 from lnocl.runs.run import Run
@@ -254,8 +254,8 @@ def find_window(
     """Return the observation cut to the window that holds most stars.
 
     Candidates lie round the middle of all stars and round each star, inside the images. All images
-    are cut to the same rows and columns. Those that are turned stay whole where no window holds a
-    star in each of them.
+    are cut to the same rows and columns. They stay whole where no window holds a star in each of
+    those that are turned, or where it would hold nothing of a halo, or no good pixel.
 
     Returns
     -------
@@ -275,11 +275,12 @@ def find_window(
         places = [observation.places(j, stars) for j in range(observation.n_images)]
     counts = [_count_in_windows(each, firsts, observation.shape, side) for each in places]
     in_all = np.min(counts, axis=0)
-    first = firsts[int(np.argmax(in_all))]
-    if not in_all.any():
-        first, size = np.zeros(2, int), np.array(observation.shape[::-1])
-    x, y = (range(int(at), int(at + n)) for at, n in zip(first, size, strict=True))
-    cut = observation.window(y, x)
+    first, cut = np.zeros(2, int), observation
+    if in_all.any():
+        best = firsts[int(np.argmax(in_all))]
+        x, y = (range(int(at), int(at + n)) for at, n in zip(best, size, strict=True))
+        with suppress(InputError):  # of a window without good pixels, or one that a halo is not in
+            first, cut = best, observation.window(y, x)
     return cut, first, cut.shows(stars - first)
 
 

@@ -227,6 +227,18 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
     np.testing.assert_array_equal(first, (0, 0))
 
 
+@pytest.mark.parametrize("name", ["halos", "mask"])
+def test_images_stay_whole_where_a_window_holds_no_halo_or_no_good_pixel(name):
+    far = np.zeros((100, 120))
+    far[:9, :9] = 1.0
+    given = {"halos": {"halos": [far]}, "mask": {"mask": far == 0}}[name]
+    observation = lnocl.Observation(np.ones((1, 100, 120)), np.ones((5, 5)), **given)
+    cut, first, held = guarded_runs.find_window(np.array([(108.4, 84.0)]), observation, 32)
+    assert cut.shape == (100, 120)
+    np.testing.assert_array_equal(first, (0, 0))
+    assert held.all()
+
+
 @pytest.mark.parametrize(
     ("n", "oversample", "psf_shape", "side"),
     [
