@@ -13,10 +13,10 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.deconvolution import reconstruct
 from lnocl.errors import InputError, LnoclWarning, counted, warn
 from lnocl.parallel import Parallel, check_parallel, work
 from lnocl.process import ignored_warnings, recorded_warnings
+from lnocl.reconstruction import reconstruct
 from lnocl.residuals import StarResiduals
 from lnocl.result import Result, make_result
 from lnocl.result.verdict import warn_of_faults
@@ -31,7 +31,8 @@ from lnocl.scene.counts import mean_exposure, means
 from lnocl.scene.grid import length_for, psf_shape
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import recommend_pad
-from lnocl.scene.scene import EDGE, Scene
+from lnocl.scene.scaled_penalty import EDGE
+from lnocl.scene.scene import Scene
 
 # The side of a tile in those of the PSFs, where these vary: docs/validation/tiles.md.
 SIDES = 5
