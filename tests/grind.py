@@ -10,6 +10,8 @@ import sys
 import warnings
 from types import SimpleNamespace
 
+import kernel_comparison as comparison
+import kernel_harness as harness
 import numpy as np
 import pyopencl as cl
 from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
@@ -19,7 +21,6 @@ from lnocl.errors import MisfitWarning
 from lnocl.opencl import launch, layout, program
 from lnocl.opencl.device import choose
 from lnocl.opencl.tuning import Tuning
-from lnocl.verify import comparison, harness
 
 DTYPES = {"s": np.float32, "d": np.float64}
 

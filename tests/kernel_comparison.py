@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
+from kernel_harness import KernelHarness, Windows, rounded
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl import reference
 from lnocl.errors import DeviceError
 from lnocl.opencl.layout import reversed_order
-from lnocl.verify.harness import KernelHarness, Windows, rounded
 
 # What a kernel made, and what its twin made of the same.
 Pairs = Iterator[tuple[NDArray, NDArray]]
@@ -32,7 +32,7 @@ ALLOWED = {np.float32: 1e-6, np.float64: 3.7e-15}
 
 
 def kernels_of(scene: Mapping[str, Any]) -> list[str]:
-    """Return the kernels that a program for a scene has, one of `lnocl.verify.harness.SCENES`."""
+    """Return the kernels that a program for a scene has, one of `kernel_harness.SCENES`."""
     parts = {"smooth": "has_smoothing", **dict.fromkeys(SHEARED, "has_turns")}
     return [name for name in KERNELS if name not in parts or scene.get(parts[name])]
 
@@ -45,7 +45,7 @@ def deviation(harness: KernelHarness, given: SimpleNamespace, kernel: str) -> fl
     harness : KernelHarness
         With the kernels and the device.
     given : SimpleNamespace
-        What `lnocl.verify.harness.inputs` returned for it.
+        What `kernel_harness.inputs` returned for it.
     kernel : str
         One of `KERNELS`.
 
