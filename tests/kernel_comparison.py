@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl import reference
 from lnocl.errors import DeviceError
 from lnocl.opencl.layout import reversed_order
+from lnocl.opencl.shears import Shears
 
 # What a kernel made, and what its twin made of the same.
 Pairs = Iterator[tuple[NDArray, NDArray]]
@@ -284,11 +285,17 @@ def _put_columns(harness: KernelHarness, given: SimpleNamespace) -> dict[str, cl
     }
 
 
+def _taken_up(shears: Shears, image: NDArray) -> NDArray:
+    """Return an image whose rows lie rotated as it is: the inverse of `Shears.lay`."""
+    columns = (np.arange(image.shape[-1]) + shears.roll[:, None]) % image.shape[-1]
+    return image[..., np.arange(len(columns))[:, None], columns]
+
+
 def _run_ratio_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     # Those of the kernel lie with their rows rotated, so the twin has them turned back.
     lying = {"images": given.images, "weights": given.weights, "background": given.background}
     own = {
-        name: np.array([s.take_up(each) for s, each in zip(given.shears, arrays, strict=True)])
+        name: np.array([_taken_up(s, each) for s, each in zip(given.shears, arrays, strict=True)])
         for name, arrays in {**lying, "stars": given.star_images.swapaxes(0, 1)}.items()
     }
     back, objective, star_sums = _twin(
