@@ -216,7 +216,6 @@ def judge_stars(estimate: Estimate) -> list[StarResiduals]:
         The models are made in windows round its stars alone.
     """
     found, scene = [], estimate.scene
-    background = [np.broadcast_to(each, scene.image_grid) for each in scene.background()]
     width = min(fwhm(psf) for psf in scene.observation.psfs) if scene.n_stars else 0.0
     psfs = [seen_psfs(scene.observation, each) for each in scene.observation.star_psfs]
     psfs += [seen_psfs(scene.observation)] if scene.n_stars else []  # the last, of all others
@@ -226,7 +225,7 @@ def judge_stars(estimate: Estimate) -> list[StarResiduals]:
     for s, (position, on_pixel, flux, shown) in enumerate(stars):
         core, wings = Fit(), Fit()
         for j in np.flatnonzero(shown).tolist():
-            fits = _fits_at(estimate, background[j], j, psfs[scene.owned[s]][j], position)
+            fits = _fits_at(estimate, j, psfs[scene.owned[s]][j], position)
             core, wings = core.plus(fits[0]), wings.plus(fits[1])
         halo, light = _halo(estimate.observed_sky, on_pixel, width)
         shown_flux = float(flux) * scene.share_shown(s)
@@ -235,13 +234,11 @@ def judge_stars(estimate: Estimate) -> list[StarResiduals]:
     return found
 
 
-def _fits_at(
-    estimate: Estimate, background: Array, j: int, psf: Array, position: Array
-) -> tuple[Fit, Fit]:
+def _fits_at(estimate: Estimate, j: int, psf: Array, position: Array) -> tuple[Fit, Fit]:
     """Return the fit in the core and in the wings of a star in one image, whose PSF is given."""
     from astropy.nddata import NoOverlapError, overlap_slices
 
-    from lnocl.scene.forward_model import add_to_window  # which loads scipy
+    from lnocl.scene.view import View, Window  # which load scipy
 
     scene, observation = estimate.scene, estimate.scene.observation
     y, x = np.nonzero(psf > WINGS * psf.max())
@@ -261,9 +258,10 @@ def _fits_at(
         there, of_psf = overlap_slices(observation.shape, bright.shape, middle)
     except NoOverlapError:  # the star is in other images alone
         return Fit(), Fit()
-    model = np.array(background[there])
-    add_to_window(model, estimate, j, (there[0].start, there[1].start))
-    np.maximum(model, 0.0, out=model)
+    rows, columns = there
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    window = Window(rows.start, columns.start, shape)
+    model = np.maximum(View(scene, j, window).model(estimate), 0.0)
     model = scene.in_electrons(model, j, there)
     values = residuals(observation.images[j][there], observation.mask[j][there], model)
     share = bright[of_psf] / psf.max()

@@ -13,10 +13,10 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.deconvolution import reconstruct
 from lnocl.errors import InputError, LnoclWarning, counted, warn
 from lnocl.parallel import Parallel, check_parallel, work
 from lnocl.process import ignored_warnings, recorded_warnings
+from lnocl.reconstruction import reconstruct
 from lnocl.residuals import StarResiduals
 from lnocl.result import Result, make_result
 from lnocl.result.verdict import warn_of_faults
@@ -32,7 +32,8 @@ from lnocl.scene.geometry import Box
 from lnocl.scene.grid import length_for, psf_shape
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import recommend_pad
-from lnocl.scene.scene import EDGE, Scene
+from lnocl.scene.scaled_penalty import EDGE
+from lnocl.scene.scene import Scene
 from lnocl.scene.transforms import part as part_of
 
 # The side of a tile in those of the PSFs, where these vary: docs/validation/tiles.md.

@@ -19,6 +19,7 @@ FLOORS = [
     {"runs"},
     {"significance", "checkpoint"},
     {"result"},
+    {"reconstruction"},
     {"deconvolution"},
     {"tiles"},
     {"__init__"},

@@ -19,7 +19,7 @@ from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.detector import on_sky
 from lnocl.scene.forward_model import Model
 from lnocl.scene.shifting import Cutout, window
-from lnocl.scene.stars import FAINT, Order, StarImages, along_sky
+from lnocl.scene.stars import FAINT, Order, StarImages
 
 # Stars and sources share nothing farther apart than so many resolutions.
 APART = 4.0
@@ -68,15 +68,12 @@ class KnownStars:
 
     def _cutouts_in(self, j: int, moves: bool) -> list[Cutout]:
         """Return what the unknowns of each star add to an image, shape (1 or 3, h, w) each."""
-        scene, field = self._scene, self._scene.star_field
-        found = []
+        scene, found = self._scene, []
         for s in range(scene.n_stars):
             star = scene.star_cutout(j, s)
             star = star._replace(values=star.values[None])
             if moves:
-                moved = field.psfs[j][s].with_slopes(*field.places[j][s])
-                star = along_sky(moved, scene.observation.turns[j])
-                star = star._replace(values=star.values * scene.shown[s, j])
+                star = scene.star_field.with_slopes(j, s)
             found.append(star.trimmed(FAINT * float(abs(star.values).max())))
         return found
 

@@ -56,7 +56,7 @@ def point_flux(
     at = at[np.isfinite(variances(near.fit.information)[at])]
     if not len(at):
         return 0.0, np.inf
-    change, _ = near.fit.solve(np.zeros(len(near.fit.information)))
+    change, _ = near.fit.solve()
     values, weights = fluxes[n] + change[at] * scene.unit, 1.0 / near.fit.variances(at)
     mean = float((weights * values).sum() / weights.sum())
     return mean, float(weights.sum() ** -0.5) * scene.unit

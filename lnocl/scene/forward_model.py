@@ -20,7 +20,6 @@ from lnocl.scene.camera import (
     is_flat,
     ranges,
 )
-from lnocl.scene.estimate import Estimate
 from lnocl.scene.grid import psf_shape
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import MARGIN, Cutout
@@ -183,27 +182,6 @@ def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[
     for j, image in enumerate(images_of(cameras, extended)):
         _illuminate(image, background[j], scene.star_field.light(j, star_fluxes))
         yield image
-
-
-def add_to_window(image: Array, estimate: Estimate, j: int, first: tuple[int, int]) -> None:
-    """Add sky, stars and halos, scaled, to an image of a window of the images' grid.
-
-    Parameters
-    ----------
-    image : ndarray of float64, shape (h, w)
-        What is there already, such as the background, scaled.
-    estimate : Estimate
-        What is modelled, and how bright it is.
-    j : int
-        Which image.
-    first : tuple of int
-        Row and column of the first pixel of the window.
-    """
-    scene, sky, fluxes = estimate.scene, estimate.sky, estimate.fluxes
-    image += Camera(scene, j).part(sky, ranges(first, image.shape)) / scene.unit
-    cutouts = scene.star_field.cutouts[j]
-    for s in scene.star_field.reaching(j, first, image.shape):
-        cutouts[s].add_to(image, first, scene.image_grid, fluxes[s])
 
 
 def _illuminate(image: Array, background: Array | float, starlight: Array) -> None:

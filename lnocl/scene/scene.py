@@ -11,31 +11,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.errors import InputError, counted, warn
+from lnocl.errors import InputError
 from lnocl.scene.arrays import Array, numbers
-from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.counts import mean_exposure
 from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
-from lnocl.scene.grid import grid_of, psf_shape
+from lnocl.scene.first_estimate import RoughFit, first_estimate, level_beside, rough_fit
+from lnocl.scene.grid import grid_of
 from lnocl.scene.halos import halo_cutouts
 from lnocl.scene.observation import Observation
-from lnocl.scene.penalty import MAX_WEIGHT, Penalty
+from lnocl.scene.penalty import Penalty
 from lnocl.scene.psf_field import Psfs
 from lnocl.scene.rotation import Rotation, turned_psf
+from lnocl.scene.scaled_penalty import scaled
+from lnocl.scene.scene_check import warn_of_scene
 from lnocl.scene.shifting import Cutout, MovablePsf
 from lnocl.scene.star_psfs import StarPsfs, owned
+from lnocl.scene.star_weights import OBSERVED_SHARE, warn_of_lost_stars, weigh_stars
 from lnocl.scene.stars import Covered, StarField, check_positions, covered_box
-
-# Below this share of its maximum the total weight of a pixel of the extended source is taken as
-# "not observed" (the threshold of Bertero & Boccacci 2005, A&A 437, 369, for boundary effects).
-OBSERVED_SHARE = 0.01
-
-# A PSF that rings by more than this share of its peak, moved by half a pixel, is warned of.
-# Gaussians do not ring where they are centred on a pixel; sharp ones do where they are not.
-MAX_RINGING = 0.01
-# Five times the PSF's side wide, a tile of a field that grows by half varied by 0.1
-# (docs/validation/tiles.md).
-MAX_VARIATION = 0.2
 
 # The one division guard: where the model is not above this (images have unit mean) the ratio is
 # taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
@@ -45,12 +37,6 @@ MIN_MODEL = 2.0**-64
 HELD = 1e30
 
 NO_PENALTY = Penalty()
-
-# A start may be so many times as bright as the images, beside so many times the noise of their sum,
-# as the floor of an estimate is.
-BRIGHTER, FLOOR = 3.0, 30.0
-# delta of the edge-preserving term, in means of a flat extended source: docs/validation/sgp.md.
-EDGE = 3.0
 
 
 class Scene:
@@ -164,9 +150,6 @@ class Scene:
         self.image_grid = grid_of(observation, pad)
         ny, nx = self.image_grid
         self.grid = self.oversample * ny, self.oversample * nx
-        self._warn_of_large_psf()
-        self._warn_of_varying_psfs()
-        self._warn_of_wrapped_offsets()
         # A power of two just above the mean; 1 where that is 0.
         n_good = int(np.count_nonzero(~observation.mask))
         # Bad pixels hold 0.
@@ -196,7 +179,7 @@ class Scene:
         self.star_weights, is_observed = self._weigh_stars(self._field, self.owned)
         self._leave_out_stars(~is_observed[: len(positions)])
         self.holds_halos = False
-        self._warn_of_ringing()
+        warn_of_scene(self, self._psfs, max_shift > 0 and self.n_stars > 0)
         self._penalise(penalty)
 
     def _shown(self, n: int) -> NDArray[np.bool_]:
@@ -252,30 +235,14 @@ class Scene:
 
     def _penalise(self, penalty: Penalty) -> None:
         self.penalty = penalty
-        longer = 1.0 if penalty.exposure is None else penalty.exposure / self.mean_exposure
-        self.mu = self._scaled("mu", penalty.mu, self.scale * longer**2)
-        self.smoothing = self._scaled("smoothing", penalty.smoothing, longer)
-        self.smoothing_map = self._smoothing_map(penalty)
-        self.edge = self._edge(penalty) if self.is_smoothed else 0.0
-        self.star_prior = penalty.stars and penalty.stars.scaled(self.unit, self.scale)
+        self.mu, self.smoothing, self.smoothing_map, self.edge, self.star_prior = scaled(
+            penalty, self
+        )
 
     @property
     def is_smoothed(self) -> bool:
         """Whether the extended source has an edge-preserving term."""
         return self.smoothing > 0 or self.smoothing_map is not None
-
-    def _smoothing_map(self, penalty: Penalty) -> Array | None:
-        """Return the weight of the edge-preserving term on the grid, scaled, where it is a map."""
-        if penalty.near_stars is None:
-            return None
-        ny, nx = self.observation.sky_shape
-        total = np.full(self.grid, self.smoothing)
-        total[:ny, :nx] += penalty.near_stars
-        return total
-
-    def _edge(self, penalty: Penalty) -> float:
-        """Return delta of the edge-preserving term, scaled."""
-        return EDGE * self._rough_fit[1] if penalty.edge is None else penalty.edge / self.unit
 
     def penalised(self, penalty: Penalty) -> Scene:
         """Return this scene with another penalty."""
@@ -298,15 +265,6 @@ class Scene:
         vars(other).pop("_psfs_of_sky", None)
         other._field = other._place_stars(self.stars)
         return other
-
-    def _scaled(self, name: str, weight: float, factor: float) -> float:
-        """Return a weight of the penalty, scaled; refuse one that is too large for float32."""
-        if weight * factor > MAX_WEIGHT:
-            raise InputError(
-                f"`{name}` {weight:g} is too large for images of about {self.scale:g} electrons "
-                f"per pixel; the most that means anything there is {MAX_WEIGHT / factor:g}"
-            )
-        return float(weight) * factor if weight else 0.0  # the factor may be infinite
 
     def _sky_unit(self, mean_exposure: float) -> float:
         """Return the unit of the sky; refuse one in which its flux is no number, or lost."""
@@ -442,7 +400,7 @@ class Scene:
     def holding(self, fluxes: Array, penalty: Penalty) -> Scene:
         """Return this scene with its halos held, and the start that fluxes, scaled, leave."""
         other = copy(self)
-        other._rough_fit = fluxes, self._level_beside(fluxes)
+        other.rough_fit = RoughFit(fluxes, level_beside(self, fluxes))
         other.star_weights = np.append(self.star_weights[: self.n_stars], [HELD] * self.n_halos)
         other.holds_halos = True
         other._penalise(penalty)
@@ -604,147 +562,17 @@ class Scene:
             Either has the wrong shape, a negative, masked or non-finite value; counts of the start
             that are no number.
         """
-        if star_fluxes is None:
-            fluxes = self._rough_fit[0].copy()
-        else:
-            shape = (self.n_stars,)
-            given = numbers("initial_star_fluxes", star_fluxes)
-            if given.shape == shape:
-                given[~self.is_shown[: self.n_stars]] = 0.0
-            fluxes = _check_start("initial_star_fluxes", given, shape) / self.unit
-            fluxes = np.append(fluxes, self._rough_fit[0][self.n_stars :])
-        if extended is None:
-            level = self._rough_fit[1]
-            self._refuse_if_too_bright(level * math.prod(self.grid) + float(fluxes.sum()))
-            return np.full(self.grid, level), fluxes
-        given = _check_start("initial_extended", extended, self.observation.sky_shape) / self.unit
-        given = self._in_their_unit(given)
-        self._refuse_if_too_bright(float(given.sum() + fluxes.sum()))
-        return _lay(given, self.grid, fill=given.mean()), fluxes
-
-    def _in_their_unit(self, extended: Array) -> Array:
-        """Return an extended source to begin with, as bright as images if far brighter.
-
-        Iterations do not find back from one that is: pixels fall to 0, and stay there.
-        """
-        counts = excess = exposures = 0.0
-        for j, (image, background) in enumerate(zip(self.images(), self.background(), strict=True)):
-            weights = np.ones(self.image_grid) if self.weights is None else self.weights[j]
-            counts += float((weights * image).sum())
-            excess += float((weights * (image - background)).sum())
-            exposures += float(self.seen_areas[j] * self.gains[j] * weights.sum())
-        noise = math.sqrt(counts / self.scale)
-        most = (BRIGHTER * max(excess, 0.0) + FLOOR * noise) / exposures
-        with np.errstate(over="ignore"):
-            mean = float(extended.mean())
-        if mean <= most:
-            return extended
-        level = self._rough_fit[1]
-        warn(
-            f"`initial_extended` has {mean / level:.2g} times the light of the images, as in "
-            "another unit, and was divided by that; it is in electrons per pixel, per second with "
-            "exposures"
-        )
-        shape = extended / extended.max()
-        return np.asarray(shape * (level / shape.mean()))
-
-    def _refuse_if_too_bright(self, light: float) -> None:
-        """Refuse a start whose counts, in electrons, no number holds."""
-        most = self.weights.max() if self.weights is not None else 1.0
-        if not math.isfinite(light * float(most) * float(self.gains.max()) * self.scale):
-            raise InputError(
-                "what the images show in their shortest exposure is more, in the longest, than a "
-                "number holds: divide images and background by a constant"
-            )
+        return first_estimate(self, extended, star_fluxes)
 
     @property
     def level(self) -> float:
         """The mean of the extended source, electrons per pixel of it, by linear least squares."""
-        return self._rough_fit[1] * self.unit
+        return self.rough_fit.level * self.unit
 
     @cached_property
-    def _rough_fit(self) -> tuple[Array, float]:
-        """Star fluxes and the level of a flat extended source, by linear least squares.
-
-        Halos stand in for the level: what a flat one has in common with the sky goes to the halo.
-        """
-        total, n_observed, n_seen = 0.0, 0, 0.0  # pixels of images, and of the sky
-        normal: BandMatrix | None = None
-        moment, levels = np.zeros(self.n_fluxes), []
-        background = self.background()
-        for j, excess in enumerate(self.images()):
-            excess -= background[j]
-            observed = np.ones(excess.shape, bool) if self.weights is None else self.weights[j] > 0
-            excess[~observed] = 0.0
-            light, n_there = float(excess.sum()), int(np.count_nonzero(observed))
-            total, n_observed = total + light, n_observed + n_there
-            n_seen += self.seen_areas[j] * n_there
-            if not (self.n_fluxes and n_there):
-                continue
-            covered = self._field.covered(j)
-            stars, weights = self._field.images(j, covered), observed[covered].astype(np.float64)
-            sums = stars.products(weights)[0]
-            information = stars.information(weights)
-            normal = information if normal is None else normal + information
-            levels.append(sums / np.sqrt(n_there))
-            level = 0.0 if self.n_halos else light / n_there
-            moment += stars.products(weights * (excess[covered] - level))[0]
-        mean = total / n_observed
-        # A star or a sky that starts at zero stays there, so each keeps a small share.
-        least = max(1e-3 * mean, float(np.finfo(np.float32).eps))
-        if normal is None:
-            best = moment
-        elif self.n_halos:
-            best = normal.solve(moment)
-        else:
-            best = _solve_beside(normal, np.array(levels).T, moment)
-        fluxes = np.maximum(best, least * math.prod(self.image_grid) / 100)
-        fluxes[~self.is_shown] = 0.0
-        level = (total - float(fluxes @ self.star_weights)) / n_seen
-        return fluxes, max(level, least * n_observed / n_seen)
-
-    def _level_beside(self, fluxes: Array) -> float:
-        """Return the level of a flat extended source beside stars and halos of these fluxes."""
-        total, n_observed, n_seen = 0.0, 0, 0.0
-        for j, (image, background) in enumerate(zip(self.images(), self.background(), strict=True)):
-            observed = np.ones(image.shape, bool) if self.weights is None else self.weights[j] > 0
-            n_there = int(np.count_nonzero(observed))
-            total += float((image - background)[observed].sum())
-            n_observed, n_seen = n_observed + n_there, n_seen + self.seen_areas[j] * n_there
-        least = max(1e-3 * total, n_observed * float(np.finfo(np.float32).eps))
-        return max(total - float(fluxes @ self.star_weights), least) / n_seen
-
-    def _weigh_stars(
-        self, field: StarField, owners: NDArray[np.intp]
-    ) -> tuple[Array, NDArray[np.bool_]]:
-        """Return ``sum_j <P_js, w_j>`` for each star, and whether any image observed it.
-
-        An image did where `OBSERVED_SHARE` of the star's light falls on its good pixels, however
-        short the exposure: it may be the only one that is not saturated. A sum that negative pixels
-        of a PSF make negative counts as 0. PSFs of their own show a share of the light.
-        """
-        has_own = np.append(owners >= 0, np.zeros(len(field) - len(owners), bool))
-        if self.weights is None:
-            light = field.shown.T.astype(np.float64)
-            if self.n_epochs > 1:  # else a star is in all images, of mean exposure 1
-                light[:, : len(field.positions)] *= self.gains[:, None]
-            # Samples of an effective PSF a pixel apart may sum to another number.
-            is_summed = has_own | (self.oversample > 1 and self.observation.effective_psfs)
-            for s in np.flatnonzero(is_summed):
-                light[:, s] = [cutouts[s].values.sum() for cutouts in field.cutouts]
-            return light.sum(axis=0), np.ones(len(field), bool)
-        total, is_observed = np.zeros(len(field)), np.zeros(len(field), bool)
-        for j, weights in enumerate(self.weights):
-            windows = [
-                (cutout, weights[cutout.window(self.image_grid)]) for cutout in field.cutouts[j]
-            ]
-            light = np.array([float((cutout.values * w).sum()) for cutout, w in windows])
-            on_good = np.array([float((cutout.values * (w > 0)).sum()) for cutout, w in windows])
-            total += np.maximum(light, 0.0)
-            whole = np.full(len(field), self.gains[j])
-            whole[has_own] *= self._own.shares[owners[owners >= 0], j]
-            is_observed |= (on_good >= OBSERVED_SHARE * whole) & (light > 0)
-        return total, is_observed
+    def rough_fit(self) -> RoughFit:
+        """Fluxes and the level of a flat extended source by linear least squares, scaled."""
+        return rough_fit(self)
 
     def _leave_out_stars(self, is_lost: NDArray[np.bool_]) -> None:
         """Hold stars at no flux, and show them in no image, where no good pixel has their light."""
@@ -753,26 +581,12 @@ class Scene:
         self.shown[: len(is_lost)][is_lost] = False
         self.star_weights[: len(is_lost)][is_lost] = HELD
         self._field = self._place_stars(self.stars)
-        of_epochs = is_lost.reshape(-1, self.n_epochs)
-        is_dark = np.asarray(of_epochs.all(axis=1))
-        stars = self.places
-        if n_dark := int(is_dark.sum()):
-            x, y = stars[is_dark][0]
-            others = f", and so do {counted(n_dark - 1, 'other')}" if n_dark > 1 else ""
-            or_dark = "" if self.transmission is None else " or nothing is transmitted"
-            warn(
-                f"the star at ({x:g}, {y:g}) lies where all images are masked{or_dark}{others}: it "
-                "is left out, and its flux is NaN"
-            )
-        of_epochs = of_epochs & ~is_dark[:, None]
-        if n_lost := int(of_epochs.sum()):
-            s, epoch = np.argwhere(of_epochs)[0].tolist()
-            x, y = stars[s]
-            others = f", as {counted(n_lost - 1, 'other')} in their epochs" if n_lost > 1 else ""
-            warn(
-                f"the star at ({x:g}, {y:g}) is on no good pixel of epoch {epoch}: its flux there "
-                f"is NaN{others}"
-            )
+        warn_of_lost_stars(self, is_lost)
+
+    def _weigh_stars(
+        self, field: StarField, owners: NDArray[np.intp]
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        return weigh_stars(self, field, owners, self._own.shares)
 
     def _weigh(self, relative: Array | None) -> NDArray[Any] | None:
         """Return the weights for relative exposures, where they are a map."""
@@ -789,63 +603,6 @@ class Scene:
     def _on_grid(self, array: NDArray, fill: float = 0.0) -> NDArray:
         return _lay(array, self.image_grid, fill)
 
-    def _warn_of_wrapped_offsets(self) -> None:
-        if self.observation.is_turned:  # the grid holds all that is turned
-            return
-        offsets = np.ceil(abs(self.observation.offsets).max(axis=0)).astype(int)[::-1]
-        room = np.subtract(self.image_grid, self.observation.shape)
-        if (offsets > room).any():
-            warn(
-                f"the images are shifted by up to {offsets.max()} pixels, and what leaves one edge "
-                f"comes in at the opposite one: give `pad` {offsets.max()} or more"
-            )
-
-    def _warn_of_ringing(self) -> None:
-        """Warn of PSFs that are moved between pixels and are sharper than pixels can hold."""
-        for j, offset in enumerate(self.observation.offsets):
-            q = self.oversample
-            places = self.observation.places(j, self.stars)
-            moved = np.concatenate([[q * offset], on_sky(places, q)])
-            if self.observation.effective_psfs:
-                moved -= (q - 1) / 2.0
-            may_move = self._max_shift > 0 and self.n_stars > 0
-            if not (may_move or self.rotations) and (moved == np.round(moved)).all():
-                continue
-            psf, moved_psf = self.observation.psfs[j], self._psfs[j].fine.at(0.5, 0.5).values
-            dark = min(psf.min(), 0.0) - moved_psf.min() / self.gains[j]
-            if dark > MAX_RINGING * psf.max():
-                warn(
-                    f"`psfs[{j}]` is sharper than its pixels can hold: moved between pixels it "
-                    f"rings by up to {dark / psf.max():.1%} of its peak, at whole pixels not"
-                )
-
-    def _warn_of_varying_psfs(self) -> None:
-        observation = self.observation
-        for j, field in enumerate(observation.psf_fields):
-            variation = field.variation(observation.psfs[j], observation.shape)
-            if variation > MAX_VARIATION:
-                warn(
-                    f"`psfs[{j}]` varies over the image by {variation:.0%}, and what is not a star "
-                    "is reconstructed with that of the middle: take tiles, by "
-                    "lnocl.deconvolve_tiles, or a smaller tile"
-                )
-
-    def _warn_of_large_psf(self) -> None:
-        shape = psf_shape(self.observation)
-        if any(k > n for k, n in zip(shape, self.grid, strict=True)):
-            warn(
-                f"the psf {shape} is larger than the grid {self.grid}: its wings wrap "
-                "round; crop it, or give `pad` to enlarge the grid"
-            )
-
-
-def _solve_beside(normal: BandMatrix, levels: Array, moment: Array) -> Array:
-    """Return ``(F - U U^T)^-1 m``: the stars beside the level of each image (Woodbury)."""
-    with_levels = normal.solve(levels)
-    left = np.eye(levels.shape[1]) - levels.T @ with_levels
-    alone = normal.solve(moment)
-    return alone + with_levels @ (np.linalg.pinv(left, hermitian=True) @ (levels.T @ alone))
-
 
 def _lay(array: NDArray, grid: tuple[int, int], fill: float = 0.0) -> NDArray:
     """Return an array at the origin of a grid."""
@@ -857,12 +614,3 @@ def _lay(array: NDArray, grid: tuple[int, int], fill: float = 0.0) -> NDArray:
         laid.fill(fill)
     laid[..., :ny, :nx] = array
     return laid
-
-
-def _check_start(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = numbers(name, values)
-    if array.shape != shape:
-        raise InputError(f"`{name}` has shape {array.shape}; it must have {shape}")
-    if not (np.isfinite(array).all() and (array >= 0).all()):
-        raise InputError(f"`{name}` must be finite and not negative")
-    return array

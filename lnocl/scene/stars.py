@@ -251,6 +251,7 @@ class StarField:
         self.positions, self.shown, self._fixed = positions, shown, fixed
         self.psfs, self._grid = psfs, grid
         self._scales = observation.scales if observation.is_turned else None
+        self._turns = observation.turns
         self.places = [observation.places(j, positions) for j in range(len(psfs))]
 
     def __len__(self) -> int:
@@ -272,6 +273,11 @@ class StarField:
         if not self._fixed:
             return stars
         return [[*of_stars, *others] for of_stars, others in zip(stars, self._fixed, strict=True)]
+
+    def with_slopes(self, j: int, s: int) -> Cutout:
+        """Return P_js, and its derivatives along the sky's x and y, (3, h, w)."""
+        star = along_sky(self.psfs[j][s].with_slopes(*self.places[j][s]), self._turns[j])
+        return star._replace(values=self.shown[s, j] * star.values)
 
     @cached_property
     def cores(self) -> list[list[Cutout]]:

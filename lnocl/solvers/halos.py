@@ -29,10 +29,12 @@ from lnocl.scene.apertures import FWHM
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
-from lnocl.scene.scene import MIN_MODEL, Scene
+from lnocl.scene.scene import Scene
 from lnocl.scene.texture import Texture, hidden_radii, resolution
+from lnocl.scene.view import View
 from lnocl.solvers.fluxes import precision, variances
-from lnocl.solvers.least_squares import LeastSquares, LinearImage, SourceError
+from lnocl.solvers.least_squares import LeastSquares, SourceError
+from lnocl.solvers.sources import Sources
 
 # Conjugate gradients end at this share of the gradient, or after so many steps. The error of a
 # variance is of second order in it.
@@ -69,42 +71,36 @@ class _Joint:
         is_lit: NDArray[np.bool_] | None = None,
     ) -> None:
         scene, extended = estimate.scene, estimate.extended
-        models = list(estimate.models())
-        totals = [np.maximum(mean, MIN_MODEL) for mean in models]
+        models, views = list(estimate.models()), [View(scene, j) for j in range(scene.n_images)]
         precisions = [
-            precision(scene, total, weights)
-            for total, weights in zip(totals, model.weights, strict=True)
+            precision(scene, mean, view.weights) for mean, view in zip(models, views, strict=True)
         ]
         fitted = np.append(_like_halos(scene, precisions), np.arange(scene.n_stars, scene.n_fluxes))
-        self.first = len(fitted) - scene.n_halos
+        sources = Sources(estimate, fitted, moves=False)
         expected = extended if is_lit is None else np.where(is_lit, extended, 0.0)
         width = resolution(scene)
         texture = Texture(expected, scene.shown_stars, width, hidden_radii(scene, width))
         if is_lit is not None:  # nor are stars taken to be on light that is not significant
             texture.amplitude[~is_lit] = 0.0
         source = SourceError(model.forward, model.adjoint, texture.amplitude, texture.width)
-        images = []
-        unexpected = model.forward(extended - expected)
-        arrays = zip(scene.images(), totals, precisions, unexpected, strict=True)
-        for j, (counts, total, of_counts, less) in enumerate(arrays):
-            shown = np.flatnonzero(scene.shown[fitted, j])
-            slopes = np.array([scene.star_image(j, s).ravel() for s in fitted[shown]])
-            images.append(LinearImage(slopes, shown, counts - total + less, of_counts))
         # A level that is not known is a halo that is flat, which the prior holds.
         errors = scene.observation.background_error / scene.scale
-        for k, j in enumerate(np.flatnonzero(errors).tolist()):
-            image, flat = images[j], scene.per_exposure(np.ones(scene.image_grid), 0.0, j)
-            images[j] = image._replace(
-                slopes=np.append(image.slopes, flat.reshape(1, -1), axis=0),
-                unknowns=np.append(image.unknowns, len(fitted) + k),
-            )
-        prior = np.append(np.zeros(len(fitted)), errors[errors > 0] ** -2.0)
-        self.halos = slice(self.first, len(fitted))
+        levels = sources.n + np.cumsum(errors > 0) - 1
+        images = []
+        unexpected = model.forward(extended - expected)
+        for view, mean, less in zip(views, models, unexpected, strict=True):
+            image = sources.linear(view, mean)
+            image = image._replace(left=image.left + less)
+            free = [view.levels[0]] if errors[view.j] else []
+            images.append(image.beside(free, levels[[view.j]]))
+        prior = np.append(np.zeros(sources.n), errors[errors > 0] ** -2.0)
+        self.first = sources.n - scene.n_halos
+        self.halos = slice(self.first, sources.n)
         self.fit = LeastSquares(images, [source], prior, N_STEPS, FINISHED)
 
     def change(self) -> Array:
         """Return the changes of the halos to where they are least, scaled."""
-        return self.fit.solve(np.zeros(len(self.fit.information)))[0][self.halos]
+        return self.fit.solve()[0][self.halos]
 
 
 def _like_halos(scene: Scene, precisions: list[Array]) -> NDArray[np.int_]:

@@ -53,6 +53,13 @@ class LinearImage(NamedTuple):
     left: Array
     precision: Array
 
+    def beside(self, slopes: list[Array], unknowns: NDArray[np.int_]) -> LinearImage:
+        """Return the image with more unknowns, and the derivatives with respect to these."""
+        if not slopes:
+            return self
+        each = np.append(self.slopes, np.reshape(slopes, (len(slopes), -1)), axis=0)
+        return self._replace(slopes=each, unknowns=np.append(self.unknowns, unknowns))
+
 
 class Field(Protocol):
     """A random field of independent standard normal values, and its linear effect on the images.
@@ -196,13 +203,13 @@ class LeastSquares:
         # Stars that nothing tells apart leave it singular.
         self._factor = scipy.linalg.cho_factor(scaled + ROUNDING * np.eye(len(prior)))
 
-    def solve(self, at: Array) -> tuple[Array, list[Array]]:
+    def solve(self, at: Array | None = None) -> tuple[Array, list[Array]]:
         """Return the changes of the parameters and of the fields that minimise the sum.
 
         Parameters
         ----------
-        at : ndarray of float64, shape (k,)
-            The current values of the parameters, which the prior draws towards 0.
+        at : ndarray of float64, shape (k,), optional
+            The current values of the parameters, which the prior draws towards 0; by default 0.
 
         Returns
         -------
@@ -211,6 +218,7 @@ class LeastSquares:
         fields : list of ndarray of float64
             To add to `at` of each field.
         """
+        at = np.zeros(len(self._prior)) if at is None else at
         change, x = self._solve(self._prior @ at)
         return change, self._each(x)
 

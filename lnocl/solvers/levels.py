@@ -41,6 +41,7 @@ from lnocl.scene.forward_model import Model
 from lnocl.scene.observation import Observation
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.texture import resolution
+from lnocl.scene.view import View, planes
 from lnocl.solvers.halos import without
 
 # Smoothed over so many resolutions, the extended source is lit where it is so many times the noise
@@ -137,8 +138,7 @@ class Levels:
 
     def _shapes(self, j: int) -> Array:
         """Return what the levels of image j are the amounts of, on its grid, shape (3, ny, nx)."""
-        shapes = _planes_on(self._scene.observation, self._scene.image_grid)
-        return self._scene.per_exposure(shapes, 0.0, j)
+        return View(self._scene, j).levels
 
     def variance(self, factors: Sequence[Array]) -> float:
         """Return what levels add to the variance of a sum of counts, scaled; it may be negative.
@@ -186,33 +186,19 @@ def fit_levels(estimate: Estimate) -> Estimate:
     return Estimate(other, sky, estimate.star_fluxes)
 
 
-def planes(observation: Observation, y: NDArray, x: NDArray) -> Array:
-    """Return one, and what rises by one across an image along x and y, at rows y and columns x.
-
-    y and x have the shapes (h, 1) and (w,); the result has (3, h, w).
-    """
-    across = [each / max(n - 1, 1) - 0.5 for each, n in zip((y, x), observation.shape, strict=True)]
-    ones = np.ones((len(y), len(x)))
-    return np.array([ones, across[1] * ones, across[0] * ones])
-
-
-def _planes_on(observation: Observation, grid: tuple[int, int]) -> Array:
-    return planes(observation, np.arange(grid[0])[:, None], np.arange(grid[1]))
-
-
 def with_levels(observation: Observation, change: Array) -> Observation:
     """Return an observation with other levels of its background, which stays 0 or more."""
     background = observation.background
     each = background if background.ndim == 3 else background[:, None, None]
-    added = np.einsum("ji,iyx->jyx", change, _planes_on(observation, observation.shape))
+    rows, columns = (np.arange(n) for n in observation.shape)
+    added = np.einsum("ji,iyx->jyx", change, planes(observation, rows[:, None], columns))
     return observation.replace(background=np.maximum(each + added, 0.0))
 
 
 def lights(scene: Scene, change: Array) -> Iterator[Array]:
     """Yield the change of the model of each image by other levels, scaled, on the grid."""
-    shapes = _planes_on(scene.observation, scene.image_grid)
     for j, each in enumerate(change / scene.scale):
-        yield scene.per_exposure(np.einsum("i,iyx->yx", each, shapes), 0.0, j)
+        yield np.einsum("i,iyx->yx", each, View(scene, j).levels)
 
 
 def _depths(scene: Scene) -> Array:

@@ -54,7 +54,7 @@ def marginal(estimate: Estimate) -> Estimate:
         is_free = np.isfinite(variances(near.fit.information)[at]) & (star_fluxes[star] > 0)
         if not is_free.any():
             continue
-        change, (x, _) = near.fit.solve(np.zeros(near.n_held))
+        change, (x, _) = near.fit.solve()
         moved = np.maximum(star_fluxes[star] + change[at] * scene.unit, 0.0)
         fluxes[star] = np.where(is_free, moved, star_fluxes[star])
         there = near.places(scene)

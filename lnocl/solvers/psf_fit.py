@@ -15,7 +15,7 @@ f is held instead, it takes up a part of what is wrong with the PSFs, and eta la
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -28,9 +28,10 @@ from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
 from lnocl.scene.psf_pixels import PsfPixels
-from lnocl.scene.scene import MIN_MODEL
-from lnocl.solvers.fluxes import MAX_FADING, precision
+from lnocl.scene.view import View
+from lnocl.solvers.fluxes import MAX_FADING
 from lnocl.solvers.least_squares import Field, LeastSquares, LinearImage, SourceError
+from lnocl.solvers.sources import Sources
 
 # The error of the extended source is correlated over this, pixels of the images, and as large as it
 # is smoothed over that.
@@ -68,21 +69,23 @@ def step(
     scene, extended, fluxes = estimate.scene, estimate.extended, estimate.fluxes
     model, values = Model(scene), parameters.values
     images = _linearise(estimate, families, values, model, moves)
-    n, n_psf, places = len(fluxes), values.size, scene.places
-    at, prior = np.zeros((2, n_psf + n + (places.size if moves else 0)))
-    at[:n_psf], prior[:n_psf] = values.ravel(), np.tile(families.prior**-2.0, len(values))
+    n, places = len(fluxes), scene.places
+    of_stars = np.zeros(n + (places.size if moves else 0))
+    at = np.append(of_stars, values)
+    prior = np.append(of_stars, np.tile(families.prior**-2.0, len(values)))
     fields: list[Field] = [_source_error(model, extended)]
     if families.pixels is not None:
         fields.append(_PixelErrors(model, families.pixels, extended, fluxes, parameters.pixels))
     change, changes = _fit(images, fields, prior).solve(at)
-    longest = (abs(change[:n_psf].reshape(values.shape)) / families.prior).max(initial=0.0)
+    longest = (abs(change[len(of_stars) :].reshape(values.shape)) / families.prior).max(initial=0.0)
     change *= MAX_STEP / max(longest, MAX_STEP)
-    to = np.maximum(fluxes + change[n_psf : n_psf + n], MAX_FADING * fluxes)
-    moved = change[n_psf + n :].reshape(-1, len(places)).T.clip(-MAX_MOVE, MAX_MOVE)
+    of_stars, of_psfs = np.split(change, [len(of_stars)])
+    to = np.maximum(fluxes + of_stars[:n], MAX_FADING * fluxes)
+    moved = of_stars[n:].reshape(-1, len(places)).T.clip(-MAX_MOVE, MAX_MOVE)
     pixels = parameters.pixels if families.pixels is None else changes[1]
-    of_psfs = PsfParameters(change[:n_psf].reshape(values.shape), pixels)
     to = Estimate.of_scaled(scene, extended, to).star_fluxes
-    return PsfStep(of_psfs, to, places + moved if moves else places)
+    changed = PsfParameters(of_psfs.reshape(values.shape), pixels)
+    return PsfStep(changed, to, places + moved if moves else places)
 
 
 def settle(estimate: Estimate, model: Model, share: float) -> Estimate:
@@ -104,7 +107,7 @@ def settle(estimate: Estimate, model: Model, share: float) -> Estimate:
     held = PsfFamilies((), scene.observation)
     images = _linearise(estimate, held, held.first().values, model, False)
     error = _source_error(model, share * extended)
-    change, (x, *_) = _fit(images, [error], np.zeros(len(fluxes))).solve(np.zeros(len(fluxes)))
+    change, (x, *_) = _fit(images, [error], np.zeros(len(fluxes))).solve()
     return Estimate.of_scaled(scene, extended + error.of(x), fluxes + change)
 
 
@@ -120,52 +123,41 @@ def _source_error(model: Model, extended: Array) -> SourceError:
 def _linearise(
     estimate: Estimate, families: PsfFamilies, values: Array, model: Model, moves: bool
 ) -> list[LinearImage]:
-    """Return the images near the estimate: slopes in PSFs, all fluxes, perhaps all x, and all y.
-
-    The PSF of an image changes light as the image has it, before its pixels sample that. Halos and
-    stars with PSFs of their own are as they are given.
-    """
-    scene, extended, fluxes = estimate.scene, estimate.extended, estimate.fluxes
-    p, k, n, q = scene.n_images, len(families.prior), len(fluxes), scene.oversample
-    images = []
-    for j, (counts, weights, diffuse) in enumerate(
-        zip(scene.images(), model.weights, model.convolved(extended), strict=True)
-    ):
-        lit, others = (
-            np.flatnonzero(scene.shown[:, j] & each)
-            for each in (scene.through_psfs, ~scene.through_psfs)
-        )
-        stars = [scene.star_on_sky(j, s).on_grid(scene.grid) for s in lit.tolist()]
-        fixed = [scene.star_image(j, s) for s in others.tolist()]
-        light = diffuse + sum(c * star for c, star in zip(fluxes[lit], stars, strict=True))
-        still = model.background[j] + sum(
-            c * light for c, light in zip(fluxes[others], fixed, strict=True)
-        )
-        total = np.maximum(sampled(light, q) + still, MIN_MODEL)
-        factors, modes = families.slopes(j, scene.grid, values[j])
-        whole = sky = scipy.fft.rfft2(light)
-        if modes or scene.rotations:
-            sky = _sky(model, j, extended, fluxes)
-        if scene.rotations:  # else slopes would ring by edges beyond the pixels that are used
-            whole = spectrum(scene.observation.psfs[j], scene.grid) * sky
-        changes = [*(factor * whole for factor in factors), *(mode * sky for mode in modes)]
-        slopes = [*(scipy.fft.irfft2(each, scene.grid) for each in changes), *stars]
-        unknowns = [np.arange(j * k, (j + 1) * k), p * k + lit]
-        if moves:
-            turn = q * scene.observation.turns[j]
-            slopes += _star_slopes(stars, fluxes[lit], turn)
-            x, y = p * k + n + np.arange(scene.places.size).reshape(2, -1)
-            unknowns += [x[lit // scene.n_epochs], y[lit // scene.n_epochs]]
-        slopes = [*(sampled(slope, q) for slope in slopes), *fixed]
-        images.append(
-            LinearImage(
-                np.array(slopes).reshape(len(slopes), -1),
-                np.concatenate([*unknowns, p * k + others]),
-                counts - total,
-                precision(scene, total, weights),
-            )
-        )
+    """Return the images near the estimate: all its sources, and then parameters of PSFs."""
+    scene, extended = estimate.scene, estimate.extended
+    sources = Sources(estimate, np.arange(scene.n_fluxes), moves)
+    k, q, images = len(families.prior), scene.oversample, list[LinearImage]()
+    for j, diffuse in enumerate(model.convolved(extended)):
+        view, light = View(scene, j), scene.star_field.light(j, estimate.fluxes)
+        image = sources.linear(view, sampled(diffuse, q) + light + view.background)
+        slopes = _psf_slopes(estimate, families, values[j], model, j, diffuse) if k else []
+        images.append(image.beside(slopes, sources.n + np.arange(j * k, (j + 1) * k)))
     return images
+
+
+def _psf_slopes(
+    estimate: Estimate, families: PsfFamilies, values: Array, model: Model, j: int, diffuse: Array
+) -> list[Array]:
+    """Return the derivatives of the model of an image with respect to the parameters of its PSF.
+
+    The PSF changes light as the image has it, before its pixels sample that. Halos and stars with
+    PSFs of their own are as they are given. `diffuse` is the convolved extended source before
+    pixels sample it.
+    """
+    scene, fluxes = estimate.scene, estimate.fluxes
+    factors, modes = families.slopes(j, scene.grid, values)
+    if scene.rotations:  # else slopes would ring by edges beyond the pixels that are used
+        sky = _sky(model, j, estimate.extended, fluxes)
+        whole = spectrum(scene.observation.psfs[j], scene.grid) * sky
+    else:
+        light = diffuse.copy()
+        for s in np.flatnonzero(scene.shown[:, j] & scene.through_psfs).tolist():
+            star = scene.star_on_sky(j, s)
+            light[star.window(scene.grid)] += fluxes[s] * star.values
+        whole = scipy.fft.rfft2(light)
+        sky = _sky(model, j, estimate.extended, fluxes) if modes else whole
+    changes = [*(factor * whole for factor in factors), *(mode * sky for mode in modes)]
+    return [sampled(scipy.fft.irfft2(each, scene.grid), scene.oversample) for each in changes]
 
 
 def _sky(model: Model, j: int, extended: Array, fluxes: Array) -> Spectrum:
@@ -174,37 +166,13 @@ def _sky(model: Model, j: int, extended: Array, fluxes: Array) -> Spectrum:
     It is in the frame of the image.
     """
     scene = model.scene
-    u, v = _frequencies(scene.grid)
+    u, v = np.fft.rfftfreq(scene.grid[1])[None, :], np.fft.fftfreq(scene.grid[0])[:, None]
     places, shares = scene.star_field.places[j], scene.transmitted(scene.stars)[j]
     sky = scene.areas[j] / scene.oversample**2 * model.cameras[j].in_frame(extended)
     for s in np.flatnonzero(scene.shown[:, j] & scene.through_psfs):
         x, y = on_sky(places[s], scene.oversample)
         sky = sky + shares[s] * fluxes[s] * np.exp(-2j * np.pi * (u * x + v * y))
     return np.asarray(sky * (scene.gains[j] * pixel_spectrum(v, u, scene.observation)))
-
-
-def _star_slopes(stars: Sequence[Array], fluxes: Array, turn: Array) -> list[Array]:
-    """Return the derivatives of star images along the sky's x, of all, and its y, of all.
-
-    A step along the sky is one by `turn`, shape (2, 2), in the pixels of these.
-    """
-    slopes = []
-    for along in turn.T:
-        factor = (
-            -2j
-            * np.pi
-            * sum(
-                step * each for step, each in zip(along, _frequencies(stars[0].shape), strict=True)
-            )
-        )
-        for c, star in zip(fluxes, stars, strict=True):
-            slopes.append(c * scipy.fft.irfft2(factor * scipy.fft.rfft2(star), star.shape))
-    return slopes
-
-
-def _frequencies(grid: tuple[int, ...]) -> tuple[Any, Any]:
-    """Return the frequencies along x and y of a real transform."""
-    return np.fft.rfftfreq(grid[1])[None, :], np.fft.fftfreq(grid[0])[:, None]
 
 
 class _PixelErrors:

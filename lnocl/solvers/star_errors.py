@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.scene import Scene
 from lnocl.solvers.fluxes import variances
 from lnocl.solvers.halos import halo_errors
 from lnocl.solvers.levels import Levels
@@ -70,23 +69,19 @@ def standard_errors(
     for first in range(0, scene.n_stars, n_epochs):  # which lies there in all epochs
         near = NearStar(around, first, finished)
         there = range(first, first + n_epochs)
-        errors[first : first + n_epochs, :k] = _errors_of(
-            near, np.isin(near.held, there), scene, levels
-        )
+        errors[first : first + n_epochs, :k] = _errors_of(near, np.isin(near.held, there), levels)
     errors[:, 0] *= scene.unit
     return errors
 
 
-def _errors_of(
-    near: NearStar, wanted: NDArray[np.bool_], scene: Scene, levels: Levels | None
-) -> Array:
+def _errors_of(near: NearStar, wanted: NDArray[np.bool_], levels: Levels | None) -> Array:
     """Return the errors of stars that are fitted, of their fluxes and perhaps x and y."""
-    fit, k = near.fit, len(near.fit.information)
+    fit = near.fit
     unknowns = near.unknowns[wanted]
     is_determined = np.isfinite(variances(fit.information))
     if not is_determined.any():
         return np.full(unknowns.shape, np.nan)
-    change, _ = fit.solve(np.zeros(k))
+    change, _ = fit.solve()
     errors = np.full(unknowns.shape, np.nan)
     known = is_determined[unknowns]
     at, again = np.unique(unknowns[known], return_inverse=True)
@@ -94,7 +89,7 @@ def _errors_of(
         found = fit.variances(at)
     else:
         rows = (fit.row(i) for i in at.tolist())
-        shares = [(each, near.level_shares(scene, by_residuals)) for each, by_residuals in rows]
+        shares = [(each, near.level_shares(by_residuals)) for each, by_residuals in rows]
         found = np.array([each + levels.variance_of(share) for each, share in shares])
     errors[known] = np.sqrt(found + change[at] ** 2)[again]
     return errors

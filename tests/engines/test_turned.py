@@ -16,10 +16,11 @@ import lnocl
 from lnocl.engines.opencl import OpenCLEngine
 from lnocl.opencl.tuning import Tuning
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model, add_to_window, model_images
+from lnocl.scene.forward_model import Model, model_images
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.scene import Scene
 from lnocl.scene.stars import MAX_SHIFT
+from lnocl.scene.view import View, Window
 from lnocl.solvers.marginal import marginal
 from lnocl.solvers.near_star import NearStar, Surroundings
 from lnocl.solvers.positions import StarFit, Stars
@@ -307,8 +308,8 @@ def test_windows_over_an_edge(scale):
     sky = np.random.default_rng(0).random(scene.grid)
     image = list(model_images(scene, sky, np.zeros(0)))[1]
     for first in ((0, 0), (-8, -8)):
-        window = np.zeros((20, 20))
-        add_to_window(window, Estimate(scene, sky * scene.unit, np.zeros(0)), 1, first)
+        view = View(scene, 1, Window(*first, (20, 20)))
+        window = view.model(Estimate(scene, sky * scene.unit, np.zeros(0)))
         rows, columns = (slice(max(-at, 0), None) for at in first)
         expected = image[: 20 + min(first[0], 0), : 20 + min(first[1], 0)]
         assert worst(window[rows, columns], expected) <= 2e-3

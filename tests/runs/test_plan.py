@@ -8,7 +8,7 @@ import pytest
 from astropy.io import fits
 
 import lnocl
-from lnocl import deconvolution
+from lnocl import reconstruction
 from lnocl.errors import InputError
 from lnocl.runs import halos, psf_refinement
 from lnocl.runs.outcome import Mended
@@ -74,8 +74,8 @@ def test_a_run_takes_the_steps_of_its_plan(name, monkeypatch):
     watch(PSFS, psf_refinement, "mend")
     watch(LEVELS, halos, "settle_levels")
     watch(HALOS, halos, "settle_halos")
-    watch(PRIOR, deconvolution, "told_prior")
-    watch(CHOICE, deconvolution, "HeldOutCounts")
+    watch(PRIOR, reconstruction, "told_prior")
+    watch(CHOICE, reconstruction, "HeldOutCounts")
     result = lnocl.deconvolve(make(), stars, n_iter=99, engine="numpy", **options)
     called |= {STARS} if result._outcome.is_marginal else set()
     assert called == expected

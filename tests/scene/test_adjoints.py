@@ -17,6 +17,7 @@ from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.scene import Scene
+from lnocl.scene.view import View
 from lnocl.solvers import near_star
 from lnocl.solvers.near_star import NearStar, Surroundings
 from lnocl.solvers.psf_fit import _PixelErrors
@@ -218,7 +219,7 @@ def test_the_sky_round_a_star(kind, monkeypatch):
     images, of_ones = map(Model(scene).forward, (laid, np.ones(scene.grid)))
     responses = np.broadcast_to(near._responses(around), y.shape)
     for j, found in enumerate(source.images_of(x)):
-        there = near_star._in_image(scene, j, near.window)
+        there = View.round(scene, j, near.window).window
         expected = images[j][there.of(scene.image_grid)]
         ny, nx = expected.shape
         is_seen = weights[j, :ny, :nx]

@@ -13,11 +13,11 @@ from lnocl.runs.start import Setup, make_start
 from lnocl.scene import shifting
 from lnocl.scene import stars as star_images
 from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import add_to_window
 from lnocl.scene.penalty import Penalty
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import Order, StarImages, check_positions, order_of
+from lnocl.scene.view import View, Window
 
 # One is alone, two are neighbours, one wraps round two edges; or all of the grid is covered.
 FIELDS = {
@@ -146,9 +146,9 @@ def test_light_of_a_window_is_that_of_the_stars_that_reach_it(monkeypatch):
     scene = Scene(observation, stars, pad=0)
     laid, add_to = [], Cutout.add_to
     monkeypatch.setattr(Cutout, "add_to", lambda *args: laid.append(args) or add_to(*args))
-    first, image = (10, 90), np.zeros((40, 50))
     fluxes = rng.uniform(1.0, 2.0, 60)
-    add_to_window(image, Estimate(scene, np.zeros(scene.grid), fluxes), 0, first)
+    view = View(scene, 0, Window(10, 90, (40, 50)))
+    image = view.model(Estimate(scene, np.zeros(scene.grid), fluxes))
     whole = scene.star_field.light(0, fluxes / scene.unit)
     expected = whole[10:50, 90:140]
     np.testing.assert_allclose(image, expected, rtol=1e-12, atol=1e-15)

@@ -63,12 +63,13 @@ def test_slopes_are_the_derivatives_of_the_models(known):
     images = psf_fit._linearise(
         Estimate.of_scaled(scene, sky, fluxes), family, start.values, Model(scene), True
     )
-    unknowns = np.concatenate([start.values.ravel(), np.zeros(n + 4)])
+    unknowns = np.concatenate([np.zeros(n + 4), start.values.ravel()])
 
     def models(unknowns):
-        psfs = family.psfs(start._replace(values=unknowns[: P * k].reshape(P, k)))
-        moved = a_scene(psfs, STARS + unknowns[P * k + n :].reshape(2, 2).T, **known)
-        return Model(moved).images(sky, fluxes + unknowns[P * k : P * k + n])[:, :N, :N]
+        amounts, moves, values = np.split(unknowns, [n, n + 4])
+        psfs = family.psfs(start._replace(values=values.reshape(P, k)))
+        moved = a_scene(psfs, STARS + moves.reshape(2, 2).T, **known)
+        return Model(moved).images(sky, fluxes + amounts)[:, :N, :N]
 
     for which in range(len(unknowns)):
         up, down = unknowns.copy(), unknowns.copy()
@@ -129,12 +130,12 @@ def test_slopes_and_pixels_of_images_with_frames_and_psfs_of_their_own(known):
     images = psf_fit._linearise(estimate, family, start.values, Model(scene), True)
 
     def models(unknowns, pixels=start.pixels):
-        values, moves = np.split(unknowns, [P * k])
+        moves, values = np.split(unknowns, [4])
         psfs = family.psfs_over_images(PsfParameters(values.reshape(P, k), pixels))
         moved = wide_scene(psfs, STARS + moves.reshape(2, 2).T, **known)
         return Model(moved).images(sky, fluxes)[:, :N, :N]
 
-    at = np.append(np.arange(P * k), P * k + 2 + np.arange(4))
+    at = 2 + np.arange(4 + P * k)
     for which, step in zip(at, h * np.eye(len(at)), strict=True):
         change = (models(step) - models(-step)) / (2 * h)
         for j, image in enumerate(images):
@@ -174,10 +175,10 @@ def test_the_step_is_that_of_the_whole_least_squares(known, moves, names, monkey
     scene = a_scene(**known)
     family, model = families(scene, names), Model(scene)
     sky, fluxes = SKY / 10.0, FLUXES / 100.0
-    at = np.zeros(P * len(family.prior) + 2 * (3 if moves else 1))
-    at[0] = 0.2
-    prior = np.zeros(len(at))
-    prior[: P * len(family.prior)] = np.tile(family.prior**-2.0, P)
+    n = 2 * (3 if moves else 1)
+    at = np.append(np.zeros(n), np.zeros(P * len(family.prior)))
+    at[n : n + 1] = 0.2
+    prior = np.append(np.zeros(n), np.tile(family.prior**-2.0, P))
     estimate = Estimate.of_scaled(scene, sky, fluxes)
     images = psf_fit._linearise(estimate, family, family.first().values, model, moves)
     fields = [psf_fit._source_error(model, sky)]

@@ -8,6 +8,7 @@ from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.scene import Scene
 from lnocl.scene.texture import Texture, resolution
+from lnocl.scene.view import View, Window
 from lnocl.solvers import least_squares, near_star
 from lnocl.solvers.star_errors import standard_errors
 
@@ -180,11 +181,12 @@ def test_windows_hold_what_the_grid_does(known):
     """Beyond padded images too, and where the window wraps round."""
     counts = RNG.poisson(20.0, (2, N, N))
     scene = Scene(lnocl.Observation(counts, PSFS, background=3.0, **known), STARS, pad=4)
-    window = near_star.Window(-5, 40, (32, 40))
+    window = Window(-5, 40, (32, 40))
     there = window.of(scene.grid)
     background = scene.background()
     for j, image in enumerate(scene.images()):
-        found = near_star._observed(scene, j, window)
+        view = View(scene, j, window)
+        found = view.counts, view.background, view.weights
         weights = np.ones(scene.grid) if scene.weights is None else scene.weights[j]
         level = np.broadcast_to(background[j], scene.grid)
         for values, expected in zip(found, (image, level, weights), strict=True):
