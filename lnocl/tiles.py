@@ -262,7 +262,8 @@ def deconvolve_tiles(
     progress : bool, optional
         Show progress, as `lnocl.deconvolve` does.
     **options
-        Others of `lnocl.deconvolve`: solver, precision, engine, device, pad, refine_positions.
+        Others of `lnocl.deconvolve`: solver, precision, engine, device, pad, refine_positions,
+        refine_psfs.
 
     Returns
     -------
@@ -367,7 +368,7 @@ def _ending(prepared: Prepared, choice: Result) -> Prepared:
     return replace(prepared, stop=None)
 
 
-ALLOWED = {"solver", "precision", "engine", "device", "pad", "refine_positions"}
+ALLOWED = {"solver", "precision", "engine", "device", "pad", "refine_positions", "refine_psfs"}
 
 
 def _check_options(options: dict[str, Any]) -> None:
@@ -573,16 +574,21 @@ class _Mosaic:
         there = self._sky[:, first_y : first_y + len(sky), first_x : first_x + sky.shape[1]]
         there += weights * sky, weights
         self._stars[found.numbers] = found.stars
-        for j, (box, model) in enumerate(zip(tile.boxes, found.models, strict=True)):
+        self.add_models(tile, found.models)
+        nothing = np.zeros(0)
+        result = replace(found.result, extended=nothing)
+        self.found.append(found._replace(result=result, models=nothing))
+
+    def add_models(self, tile: _Tile, models: Array) -> None:
+        """Take the pixels of images that show the core of a tile from the models of its window."""
+        y, x = tile.spans
+        for j, (box, model) in enumerate(zip(tile.boxes, models, strict=True)):
             pairs = zip(box, self._models[j].shape, strict=True)
             seen_y, seen_x = (np.arange(max(at.start, 0), min(at.stop, n)) for at, n in pairs)
             at_x, at_y = self.observation.geometry.on_sky(j, seen_x, seen_y[:, None])
             is_own = np.nonzero(y.holds(at_y) & x.holds(at_x))
             at_y, at_x = seen_y[is_own[0]], seen_x[is_own[1]]
             self._models[j, at_y, at_x] = model[at_y - box[0].start, at_x - box[1].start]
-        nothing = np.zeros(0)
-        result = replace(found.result, extended=nothing)
-        self.found.append(found._replace(result=result, models=nothing))
 
     def result(self, chosen: Result | None) -> TiledResult:
         """Return it all, with the choice that was made for all tiles."""

@@ -589,7 +589,6 @@ def test_stdpsf_files_are_read(tmp_path, monkeypatch):
     ("more", "message"),
     [
         (["--checkpoint", "c.fits"], "--checkpoint is not for tiles; leave it out"),
-        (["--refine-psfs", "jitter"], "--refine-psfs is not for tiles; leave it out"),
         (["--tile", "20"], "--tile must be a whole number, "),
         (["--oversample", "2"], "give --effective-psfs"),
     ],
