@@ -26,13 +26,15 @@ from lnocl.runs.plan import Plan
 from lnocl.runs.plan import plan as make_plan
 from lnocl.runs.preparation import Prepared, prepare
 from lnocl.runs.progress import Progress
-from lnocl.scene.arrays import Array, whole
+from lnocl.scene.arrays import Array, together, whole
 from lnocl.scene.counts import mean_exposure, means
+from lnocl.scene.geometry import Box
 from lnocl.scene.grid import length_for, psf_shape
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.scaled_penalty import EDGE
 from lnocl.scene.scene import Scene
+from lnocl.scene.transforms import part as part_of
 
 # The side of a tile in those of the PSFs, where these vary: docs/validation/tiles.md.
 SIDES = 5
@@ -62,8 +64,9 @@ class TiledResult(Result):
     Attributes
     ----------
     tiles : ndarray, fields ``x``, ``y``, ``width``, ``height``, ``n_iter``, ``objective``
-        A row for each tile: the pixels of the images that it stands for, without its margins; its
-        iterations; and its last objective, margins included.
+        A row for each tile: the pixels of an image without offset that it stands for, without its
+        margins; its iterations; and its last objective, margins included. Where images reach
+        beyond the sky's frame tiles do.
 
     See Also
     --------
@@ -87,7 +90,7 @@ class TiledResult(Result):
 
 
 class _Span(NamedTuple):
-    """A tile along one axis, in pixels of the images.
+    """A tile along one axis, in pixels of an image without offset.
 
     Attributes
     ----------
@@ -95,21 +98,27 @@ class _Span(NamedTuple):
         What it stands for.
     window : range
         What it sees: the core and its margins.
-    size : int
-        Of the images.
+    sky : range
+        What all tiles stand for.
     margin : int
         Pixels round the core that are seen, at least.
     """
 
     core: range
     window: range
-    size: int
+    sky: range
     margin: int
 
-    @property
-    def seen(self) -> slice:
-        """The window as an index."""
-        return slice(self.window.start, self.window.stop)
+    def holds(self, places: Array) -> NDArray[np.bool_]:
+        """Return which places lie in the core, or beyond the sky next to it."""
+        nearest = np.clip(np.floor(places + 0.5), self.sky.start, self.sky.stop - 1)
+        return np.asarray((nearest >= self.core.start) & (nearest < self.core.stop))
+
+    def own(self, n: int, oversample: int) -> slice:
+        """Return where in the window the core lies, of a frame of n pixels, each `oversample`."""
+        ends = (min(max(end, 0), n) for end in (self.core.start, self.core.stop))
+        first, last = (oversample * (end - self.window.start) for end in ends)
+        return slice(first, last)
 
     def weights(self, oversample: int) -> Array:
         """Return the weights of the window's pixels, which fall across half of each margin.
@@ -118,9 +127,9 @@ class _Span(NamedTuple):
         """
         at = (np.arange(oversample * len(self.window)) + 0.5) / oversample + self.window.start
         weights = np.ones_like(at)
-        if self.core.start > 0:
+        if self.core.start > self.sky.start:
             weights *= np.clip(0.5 + (at - self.core.start) / self.margin, 0.0, 1.0)
-        if self.core.stop < self.size:
+        if self.core.stop < self.sky.stop:
             weights *= np.clip(0.5 + (self.core.stop - at) / self.margin, 0.0, 1.0)
         return weights
 
@@ -132,21 +141,27 @@ class _Tile(NamedTuple):
     ----------
     spans : tuple of _Span
         Along y and x.
+    boxes : list of tuple of range
+        Rows and columns of each image that are seen.
     observation : Observation
         What is in its window.
     stars : ndarray of float64, shape (k, 2)
         Positions in the window.
     own, numbers : ndarray of int
         Which of them lie in its core, and which those are of all stars.
+    core : tuple of slice
+        The pixels in the window of the extended source that it stands for.
     near_stars : ndarray of float64 or None
         As of `lnocl.scene.penalty.Penalty`, in its window.
     """
 
     spans: tuple[_Span, _Span]
+    boxes: list[Box]
     observation: Observation
     stars: Array
     own: NDArray[np.intp]
     numbers: NDArray[np.intp]
+    core: tuple[slice, slice]
     near_stars: Array | None
 
     def without_unseen_neighbours(self) -> _Tile:
@@ -167,12 +182,16 @@ class _Found(NamedTuple):
     ----------
     result : Result
         Without what it would be computed from.
+    row : tuple
+        Of the table of tiles.
     models : ndarray of float64
-        Of the images in its core.
+        Of the images in its window.
     flux : tuple of float
         Of the extended source there, and its standard error, electrons.
+    numbers : ndarray of int, shape (k,)
+        Which of all stars in each epoch are its own.
     stars : ndarray of float64, shape (k, 6)
-        Positions in the window, fluxes, and their errors, of its own stars.
+        Positions, fluxes, and their errors, of these.
     at_stars : list of StarResiduals
         How well the model fits at these.
     messages : list of str
@@ -180,8 +199,10 @@ class _Found(NamedTuple):
     """
 
     result: Result
+    row: tuple[Any, ...]
     models: Array
     flux: tuple[float, float]
+    numbers: NDArray[np.intp]
     stars: Array
     at_stars: list[StarResiduals]
     messages: list[str]
@@ -202,10 +223,11 @@ def deconvolve_tiles(
 ) -> TiledResult:
     """Reconstruct the sky tile by tile: large images, or PSFs that vary over the field.
 
-    Each tile is a run of its own on a window of the images. The window is its part and margins of
-    half a PSF and the largest offset. So no source that lights the part is left out. Its PSFs are
-    those of the middle of its part, ``K = sum_i w_i K_i`` of a `lnocl.PsfField`; each star has that
-    of its own place. The extended sources are blended across half of the margins.
+    Each tile is a run of its own on a window of the sky, which is its part and margins of half a
+    PSF. So no source that lights the part is left out. Each image is cut to the box that shows this
+    window, wherever it is shifted, turned or scaled to. Its PSFs are those of the middle of its
+    part, ``K = sum_i w_i K_i`` of a `lnocl.PsfField`; each star has that of its own place. The
+    extended sources are blended across half of the margins.
 
     PSFs that are the same all over the images are judged once, as by `lnocl.deconvolve`: all tiles
     have those that were found, and star fluxes are marginal where they fit.
@@ -223,7 +245,8 @@ def deconvolve_tiles(
         Positions in pixels of an image without offset, as for `lnocl.deconvolve`.
     tile : int, optional
         Side of the grid that a tile is computed on, with its margins and pad, pixels of the images.
-        By default about five times that of the PSFs where these vary, else 2048.
+        By default about five times that of the PSFs where these vary, else 2048. Where images are
+        turned by an angle the grid is larger, by ``1 + sin 2 angle`` or more.
     parallel : bool, int or "current-scheduler", optional
         Where the tiles are computed (`lnocl.parallel.check_parallel`). False: one after the other
         in this process. True or a number: in as many processes as cores, or in that many.
@@ -239,7 +262,8 @@ def deconvolve_tiles(
     progress : bool, optional
         Show progress, as `lnocl.deconvolve` does.
     **options
-        Others of `lnocl.deconvolve`: solver, precision, engine, device, pad, refine_positions.
+        Others of `lnocl.deconvolve`: solver, precision, engine, device, pad, refine_positions,
+        refine_psfs.
 
     Returns
     -------
@@ -249,7 +273,8 @@ def deconvolve_tiles(
     Raises
     ------
     InputError
-        As `lnocl.deconvolve`; a tile has no room for its margins; an option is not for tiles.
+        As `lnocl.deconvolve`; a tile has no room for its margins; an option is not for tiles; the
+        observation has halos.
     LnoclError
         Dask is missing; the workers are lost.
     DeviceError
@@ -265,6 +290,9 @@ def deconvolve_tiles(
     Tiles and one run of the whole agree where the steps of a pixel depend on its neighbours alone.
     That is so with "sgm", and with "sgp" when it has converged. Before that the steps of "sgp"
     differ from tile to tile, by less than the noise (:doc:`/validation/tiles`).
+
+    Halos are refused. What a part of a halo has in common with a smooth sky no tile can tell, so
+    that its amount takes the least squares of all pixels together.
 
     References
     ----------
@@ -285,22 +313,24 @@ def deconvolve_tiles(
     """
     check_parallel(parallel)
     check_observation(observation)
-    _refuse_turned(observation)
+    if len(observation.halos):
+        raise InputError(
+            "a tile cannot tell the `halos` in it from a smooth sky, as whole images can; take "
+            "deconvolve for the whole, or leave `halos` out"
+        )
     _check_options(options)
     pad = options.pop("pad", "auto")
     given = {"mu": mu, "smoothing": smoothing, "n_iter": n_iter, "stop": stop, **options}
     plan = make_plan(observation, stars, **given)
     positions = plan.setup.stars
-    tile_pad = _pad(observation, pad)
-    tiles = _lay(observation, tile, tile_pad)
+    is_auto = isinstance(pad, str) and pad == "auto"
+    tile_pad = recommend_pad(observation) if is_auto else whole("pad", pad, 0, ", or auto")
+    tiles = _lay(plan.setup.observation, tile, tile_pad)
     plan = replace(plan, setup=replace(plan.setup, pad=pad), in_tiles=True)
     prepared = prepare(plan, progress)
     observation, near_stars = prepared.setup.observation, prepared.penalties[0].near_stars
-    observed = [
-        _cut(observation, positions, near_stars, (y, x))
-        for y, x in tiles
-        if not observation.mask[:, y.seen, x.seen].all()
-    ]
+    cut = (_cut(observation, positions, near_stars, spans) for spans in tiles)
+    observed = [*filter(None, cut)]
     _refuse_unowned(positions, observed)
     if len(tiles) > 1:
         common = {"exposure": mean_exposure(observation)}
@@ -315,7 +345,7 @@ def deconvolve_tiles(
     if isinstance(prepared.stop, str):
         chosen = _choose(observed, parallel, replace(prepared, fits=False))
         prepared = _ending(prepared, chosen)
-    mosaic = _Mosaic(observation, positions, plan)
+    mosaic = _Mosaic(observation, positions, plan, tiles[0])
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
         closing(work(partial(partial, _solve, prepared), observed, parallel)) as answers,
@@ -323,7 +353,7 @@ def deconvolve_tiles(
         for each, found in zip(observed, answers, strict=True):
             mosaic.add(each, found)
             bar.update()
-    _warn_of_tiles(mosaic.messages)
+    _warn_of_tiles([message for each in mosaic.found for message in each.messages])
     result = mosaic.result(chosen)
     warn_of_faults(result, progress)
     return result
@@ -338,7 +368,7 @@ def _ending(prepared: Prepared, choice: Result) -> Prepared:
     return replace(prepared, stop=None)
 
 
-ALLOWED = {"solver", "precision", "engine", "device", "pad", "refine_positions"}
+ALLOWED = {"solver", "precision", "engine", "device", "pad", "refine_positions", "refine_psfs"}
 
 
 def _check_options(options: dict[str, Any]) -> None:
@@ -348,63 +378,42 @@ def _check_options(options: dict[str, Any]) -> None:
         )
 
 
-def _pad(observation: Observation, pad: Any) -> int:
-    """Return the pad of all tiles: light runs over the edges of some, wherever they are cut."""
-    if isinstance(pad, str) and pad == "auto":
-        return max(recommend_pad(observation), int(np.ceil(abs(observation.offsets).max())))
-    return whole("pad", pad, 0, ", or auto")
-
-
-def _refuse_turned(observation: Observation) -> None:
-    if len(observation.halos):
-        raise InputError(
-            "the amounts of `halos` are those in whole images, which tiles do not see; take "
-            "deconvolve for the whole, or leave `halos` out"
-        )
-    if len(observation.transmission):
-        raise InputError(
-            "tiles take no `transmission` yet; take deconvolve for the whole, or leave it out"
-        )
-    if observation.is_mapped or observation.n_epochs > 1:
-        raise InputError(
-            "tiles are of images of one epoch that are not turned against the sky; take deconvolve "
-            "for the whole"
-        )
-
-
 def _lay(observation: Observation, tile: int | None, pad: int) -> list[tuple[_Span, _Span]]:
-    """Return the tiles of the images along y and x, row by row."""
-    sides = [-(-k // observation.oversample) for k in psf_shape(observation)]
-    # An image that is shifted shows the core of a tile beside it.
-    shifts = np.ceil(abs(observation.offsets).max(axis=0)).astype(int).tolist()[::-1]
-    margins = [max(k // 2, 1) + shift for k, shift in zip(sides, shifts, strict=True)]
+    """Return the tiles of all that the images show along y and x, row by row."""
+    # Of square PSFs that are turned the corners reach farther.
+    turns = abs(observation.turns) * observation.scales[:, None, None]
+    sides = np.ceil((turns @ psf_shape(observation)[::-1]).max(axis=0) / observation.oversample)
+    margins = [max(int(k) // 2, 1) for k in sides[::-1]]
     if tile is None:
-        tile = length_for(SIDES * max(sides)) if observation.psf_fields else LARGE_TILE
+        tile = length_for(SIDES * int(max(sides))) if observation.psf_fields else LARGE_TILE
     least = 2 * (max(margins) + pad) + 16
     tile = whole(
         "tile",
         tile,
         least,
-        f", for margins of half a PSF and the offsets, {max(margins)} pixels, and a pad of {pad} "
-        "on each side",
+        f", for margins of half a PSF, {max(margins)} pixels, and a pad of {pad} on each side",
     )
-    rows, columns = (
-        _divide(size, tile - 2 * pad, margin)
-        for size, margin in zip(observation.shape, margins, strict=True)
-    )
+    geometry, window = observation.geometry, tile - 2 * pad
+    sky = geometry.covered([observation.good_box(j) for j in range(observation.n_images)])
+    if all(len(at) <= window for at in sky):  # the images as they are
+        windows = map(range, geometry.frame)
+        y, x = (_Span(at, seen, at, n) for at, seen, n in zip(sky, windows, margins, strict=True))
+        return [(y, x)]
+    rows, columns = (_divide(at, window, n) for at, n in zip(sky, margins, strict=True))
     return list(itertools.product(rows, columns))
 
 
-def _divide(size: int, window: int, margin: int) -> list[_Span]:
+def _divide(sky: range, window: int, margin: int) -> list[_Span]:
     """Return tiles along an axis; their windows are of one size, so that programs serve all."""
-    n = 1 if size <= window else math.ceil(size / (window - 2 * margin))
-    window = min(window, size)
-    edges = np.round(np.linspace(0, size, n + 1)).astype(int).tolist()
+    n = 1 if len(sky) <= window else math.ceil(len(sky) / (window - 2 * margin))
+    window = min(window, len(sky))
+    edges = np.round(np.linspace(sky.start, sky.stop, n + 1)).astype(int).tolist()
     first = [
-        min(max((a + b - window) // 2, 0), size - window) for a, b in itertools.pairwise(edges)
+        min(max((a + b - window) // 2, sky.start), sky.stop - window)
+        for a, b in itertools.pairwise(edges)
     ]
     return [
-        _Span(range(a, b), range(at, at + window), size, margin)
+        _Span(range(a, b), range(at, at + window), sky, margin)
         for (a, b), at in zip(itertools.pairwise(edges), first, strict=True)
     ]
 
@@ -414,20 +423,30 @@ def _cut(
     positions: Array,
     near_stars: Array | None,
     spans: tuple[_Span, _Span],
-) -> _Tile:
-    rows, columns = (span.window for span in spans)
+) -> _Tile | None:
+    """Return a tile, or None where nothing was observed."""
+    q, (rows, columns) = observation.oversample, (span.window for span in spans)
+    if all(span.core == span.sky for span in spans):  # one tile has the images as they are
+        ny, nx = observation.shape
+        part, boxes = observation, [(range(ny), range(nx))] * observation.n_images
+    else:
+        boxes = observation.geometry.windows(rows, columns)
+        y, x = ((each.core.start + each.core.stop - 1) / 2.0 - each.window.start for each in spans)
+        try:
+            part = observation.window(rows, columns, (x, y), boxes)
+        except InputError:  # no image has a good pixel there, or the sky is behind 0
+            return None
     moved = positions - (columns.start, rows.start)
-    y, x = ((each.core.start + each.core.stop - 1) / 2.0 - each.window.start for each in spans)
-    part = observation.window(rows, columns, (x, y))
     is_seen = part.shows(moved)
-    is_own = _are_own(positions, spans) & is_seen
+    in_spans = [each.holds(at) for each, at in zip(spans, positions.T[::-1], strict=True)]
+    is_own = np.all([is_seen, *in_spans], axis=0)
     own = np.flatnonzero(is_own[is_seen])
+    ny, nx = observation.geometry.frame
+    core = spans[0].own(ny, q), spans[1].own(nx, q)
     if near_stars is not None:
-        q = observation.oversample
-        near_stars = near_stars[
-            q * rows.start : q * rows.stop, q * columns.start : q * columns.stop
-        ].copy()
-    return _Tile(spans, part, moved[is_seen], own, np.flatnonzero(is_own), near_stars)
+        down, along = (range(q * at.start, q * at.stop) for at in (rows, columns))
+        near_stars = part_of(near_stars, down, along).copy()
+    return _Tile(spans, boxes, part, moved[is_seen], own, np.flatnonzero(is_own), core, near_stars)
 
 
 def _refuse_unowned(positions: Array, tiles: Sequence[_Tile]) -> None:
@@ -438,15 +457,6 @@ def _refuse_unowned(positions: Array, tiles: Sequence[_Tile]) -> None:
             f"the star at ({x:g}, {y:g}) lies in a tile that all images mask; leave it out or mend "
             "the mask"
         )
-
-
-def _are_own(positions: Array, spans: tuple[_Span, _Span]) -> NDArray[np.bool_]:
-    """Return which positions lie in the core of a tile, or outside the images next to it."""
-    are_own = np.ones(len(positions), bool)
-    for at, span in zip(positions.T[::-1], spans, strict=True):
-        nearest = np.clip(np.floor(at + 0.5), 0, span.size - 1)
-        are_own &= (nearest >= span.core.start) & (nearest < span.core.stop)
-    return are_own
 
 
 def _choose(tiles: Sequence[_Tile], parallel: Parallel, prepared: Prepared) -> Result:
@@ -493,20 +503,19 @@ def _solve(prepared: Prepared, tile: _Tile) -> _Found:
         except InputError as error:
             raise InputError(f"{begins}: {error.message}") from error
         errors = outcome.star_errors()
-    result, q = make_result(outcome), tile.observation.oversample
-    rows, columns = (
-        slice(span.core.start - span.window.start, span.core.stop - span.window.start)
-        for span in tile.spans
-    )
+    result, (y, x), at_stars = make_result(outcome), tile.spans, outcome.star_residuals()
     within = np.zeros(result.extended.shape)
-    within[q * rows.start : q * rows.stop, q * columns.start : q * columns.stop] = 1.0
-    at_stars = result.star_residuals()
+    within[tile.core] = 1.0
+    own, numbers = (_in_epochs(each, tile.observation) for each in (tile.own, tile.numbers))
+    positions = result.star_positions + np.array([x.window.start, y.window.start])
     return _Found(
         _alone(result),
-        result.models()[:, rows, columns],
+        (x.core.start, y.core.start, len(x.core), len(y.core), *result.history[-1]),
+        np.array(list(outcome.models())),
         Light(outcome.estimate).flux(within, errors[0]),
-        np.column_stack([result.star_positions, result.star_fluxes, *errors])[tile.own],
-        [at_stars[s] for s in tile.own],
+        numbers,
+        np.column_stack([positions, result.star_fluxes, *errors])[own],
+        [at_stars[s] for s in own],
         [
             f"{begins}: {getattr(each.message, 'message', each.message)}"
             for each in recorded
@@ -521,17 +530,22 @@ def _light(tile: _Tile) -> float:
     Bright stars mislead the choice, most of all where PSFs are not quite right: both halves of the
     counts share their residuals.
     """
-    observation, q = tile.observation, tile.observation.oversample
-    level = observation.background
-    level = level if level.ndim == 3 else level[:, None, None]
-    light = np.where(observation.mask, 0.0, observation.images - level)
-    reach = max(psf_shape(observation)) / (2.0 * q)
+    observation = tile.observation
+    images, level = together(observation.images, observation.background)
+    light = np.where(observation.mask, 0.0, images - level)
+    reach = max(psf_shape(observation)) / (2.0 * observation.oversample)
     rows, columns = (np.arange(n) for n in observation.shape)
-    for image, offset in zip(light, observation.offsets, strict=True):
-        for x, y in tile.stars + offset:
+    for j, image in enumerate(light):
+        for x, y in observation.places(j, tile.stars):
             near = np.ix_(abs(rows - y) <= reach, abs(columns - x) <= reach)
             image[near] = 0.0
     return float(light.sum())
+
+
+def _in_epochs(numbers: NDArray[np.intp], observation: Observation) -> NDArray[np.intp]:
+    """Return the numbers of stars in each epoch, star by star."""
+    n = observation.n_epochs
+    return (n * numbers[:, None] + np.arange(n)).ravel()
 
 
 class _Mosaic:
@@ -539,59 +553,63 @@ class _Mosaic:
 
     may_free_pixels = False
 
-    def __init__(self, observation: Observation, positions: Array, plan: Plan) -> None:
-        self.plan, n_stars = tuple(str(plan).splitlines()), len(positions)
-        self.observation, self.given_positions = observation, positions
-        self._extended = np.zeros(observation.sky_shape)
-        self._weight = np.zeros(observation.sky_shape)
+    def __init__(
+        self, observation: Observation, positions: Array, plan: Plan, spans: tuple[_Span, _Span]
+    ) -> None:
+        self.plan, n_epochs = tuple(str(plan).splitlines()), observation.n_epochs
+        self.observation = observation
+        self.given_positions = np.repeat(positions, n_epochs, axis=0)
+        # The sky times weights, and these.
+        shape = [observation.oversample * len(each.sky) for each in spans]
+        self._first, self._sky = [each.sky.start for each in spans], np.zeros((2, *shape))
         self._models = np.zeros(observation.images.shape)
-        self._stars = np.full((n_stars, 6), np.nan)
-        self._at_stars: list[StarResiduals | None] = [None] * n_stars
-        self._tiles: list[tuple[Any, ...]] = []
-        self._results: list[Result] = []
-        self._fluxes: list[tuple[float, float]] = []
-        self.messages: list[str] = []
+        self._stars = np.zeros((len(self.given_positions), 6))
+        self.found: list[_Found] = []
 
     def add(self, tile: _Tile, found: _Found) -> None:
         """Add what a tile has found."""
-        q = self.observation.oversample
-        y, x = tile.spans
+        (y, x), q, sky = tile.spans, self.observation.oversample, found.result.extended
         weights = np.multiply.outer(y.weights(q), x.weights(q))
-        there = tuple(slice(q * s.window.start, q * s.window.stop) for s in tile.spans)
-        self._extended[there] += weights * found.result.extended
-        self._weight[there] += weights
-        self._models[:, y.core.start : y.core.stop, x.core.start : x.core.stop] = found.models
-        last = found.result.history[-1]
-        self._tiles.append((x.core.start, y.core.start, len(x.core), len(y.core), *last))
-        self.messages += found.messages
-        self._stars[tile.numbers] = found.stars
-        self._stars[tile.numbers, :2] += x.window.start, y.window.start
-        for s, at_star in zip(tile.numbers, found.at_stars, strict=True):
-            self._at_stars[s] = at_star
-        self._results.append(replace(found.result, extended=np.zeros(0)))
-        self._fluxes.append(found.flux)
+        first_y, first_x = (q * (at.window.start - at.sky.start) for at in tile.spans)
+        there = self._sky[:, first_y : first_y + len(sky), first_x : first_x + sky.shape[1]]
+        there += weights * sky, weights
+        self._stars[found.numbers] = found.stars
+        self.add_models(tile, found.models)
+        nothing = np.zeros(0)
+        result = replace(found.result, extended=nothing)
+        self.found.append(found._replace(result=result, models=nothing))
+
+    def add_models(self, tile: _Tile, models: Array) -> None:
+        """Take the pixels of images that show the core of a tile from the models of its window."""
+        y, x = tile.spans
+        for j, (box, model) in enumerate(zip(tile.boxes, models, strict=True)):
+            pairs = zip(box, self._models[j].shape, strict=True)
+            seen_y, seen_x = (np.arange(max(at.start, 0), min(at.stop, n)) for at, n in pairs)
+            at_x, at_y = self.observation.geometry.on_sky(j, seen_x, seen_y[:, None])
+            is_own = np.nonzero(y.holds(at_y) & x.holds(at_x))
+            at_y, at_x = seen_y[is_own[0]], seen_x[is_own[1]]
+            self._models[j, at_y, at_x] = model[at_y - box[0].start, at_x - box[1].start]
 
     def result(self, chosen: Result | None) -> TiledResult:
         """Return it all, with the choice that was made for all tiles."""
-        longest = max(self._results, key=lambda each: each.n_iter)
-        history = longest.history.copy()
-        history["objective"] = 0.0
-        for each in self._results:
-            objective = each.history["objective"]
-            history["objective"][: len(objective)] += objective
-            history["objective"][len(objective) :] += objective[-1]
-        extended = np.divide(
-            self._extended, self._weight, out=self._extended, where=self._weight > 0
+        results = [each.result for each in self.found]
+        longest = max(results, key=lambda each: each.n_iter)
+        history, (ny, nx) = longest.history.copy(), self.observation.sky_shape
+        objectives = (each.history["objective"] for each in results)
+        history["objective"] = sum(
+            np.pad(each, (0, len(history) - len(each)), "edge") for each in objectives
         )
+        y, x = (-self.observation.oversample * each for each in self._first)
+        sky, weight = self._sky[:, y : y + ny, x : x + nx]
         choice = chosen or longest
         same = {name: getattr(choice, name) for name in ("n_iter", "stop_reason", "held_out")}
         found = {
-            "extended": extended,
+            "extended": np.divide(sky, weight, out=np.zeros((ny, nx)), where=weight > 0),
             "star_fluxes": self._stars[:, 2],
             "star_positions": self._stars[:, :2],
             "history": history,
             "_findings": self,
-            "tiles": np.array(self._tiles, TILE_DTYPE),
+            "tiles": np.array([each.row for each in self.found], TILE_DTYPE),
         }
         return TiledResult(**vars(longest) | same | found)
 
@@ -609,16 +627,19 @@ class _Mosaic:
 
     def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
         """Return the light of the extended source and its standard error, electrons."""
-        fluxes, errors = zip(*self._fluxes, strict=True)
+        fluxes, errors = zip(*(each.flux for each in self.found), strict=True)
         # The level of an image is wrong in all its tiles alike.
         exposure = means(self.observation.exposure, self.observation.mask)
+        exposure = exposure * self.observation.scales**2
         error = float(np.linalg.norm(self.observation.background_error)) / float(exposure.sum())
-        n_pixels = self.observation.images[0].size
+        n_pixels = math.prod(self.observation.geometry.frame)
         return sum(fluxes), math.hypot(*errors, n_pixels * error)
 
     def star_residuals(self) -> list[StarResiduals]:
         """Return how well the model fits at each star."""
-        return cast(list[StarResiduals], self._at_stars)
+        pairs = ((each.numbers.tolist(), each.at_stars) for each in self.found)
+        at_stars = {s: at for each in pairs for s, at in zip(*each, strict=True)}
+        return [at_stars[s] for s in range(len(at_stars))]
 
 
 def _warn_of_tiles(messages: Sequence[str]) -> None:

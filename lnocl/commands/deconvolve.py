@@ -71,8 +71,8 @@ def _solve_tiles(
     """Run tile by tile; refuse what is for one run alone."""
     from lnocl.tiles import deconvolve_tiles
 
-    for name in ("checkpoint", "resume", "refine_psfs"):
-        if parameters.pop(name, PARAMETERS[name]) not in (PARAMETERS[name], []):
+    for name in ("checkpoint", "resume"):
+        if parameters.pop(name, None) is not None:
             raise InputError(f"`{name}` is not for tiles; leave it out")
     return deconvolve_tiles(
         observation, tile=arguments.tile, parallel=arguments.parallel, **parameters

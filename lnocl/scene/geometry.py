@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from lnocl.scene.transforms import (
     check_transforms,
     enlarged,
     followed,
+    part,
     rotation,
     scale_of,
     undone,
@@ -120,13 +122,65 @@ class Geometry:
         size = np.array(self.shape[::-1])
         return np.asarray(np.any(np.all((places >= -0.5) & (places < size - 0.5), axis=2), axis=1))
 
-    def window(self, rows: range, columns: range) -> Geometry:
-        """Return that of images cut to some rows and columns, as is the sky."""
-        shape = len(rows), len(columns)
-        moved = (self.turns - np.eye(2)) @ (columns.start, rows.start)
-        offsets = self.offsets + moved
-        other = replace(self, offsets=offsets, maps=_maps(self.turns, offsets), shape=shape)
-        return other if self.orientations else replace(other, frame=shape, given_shape=shape)
+    def on_sky(self, j: int, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the places of the sky, x and y, that are at these of image j."""
+        (a, b), (c, d) = np.linalg.inv(self.turns[j])
+        dx, dy = x - self.offsets[j, 0], y - self.offsets[j, 1]
+        return a * dx + b * dy, c * dx + d * dy
+
+    def corners(self, j: int, box: Box) -> Array:
+        """Return the places of the sky, shape (4, 2), of the corners of a box of image j."""
+        rows, columns = box
+        x, y = np.meshgrid((columns[0], columns[-1]), (rows[0], rows[-1]))
+        return np.stack(self.on_sky(j, x.ravel(), y.ravel()), axis=1)
+
+    def covered(self, boxes: Sequence[Box]) -> Box:
+        """Return the rows and columns of the sky that its frame has, or boxes of the images."""
+        sky = np.concatenate([self.corners(j, box) for j, box in enumerate(boxes)])[:, ::-1]
+        low, high = np.floor(sky.min(axis=0) + 0.5), np.floor(sky.max(axis=0) + 0.5)
+        ends = zip(low.astype(int).tolist(), high.astype(int).tolist(), self.frame, strict=True)
+        rows, columns = (range(min(a, 0), max(b + 1, n)) for a, b, n in ends)
+        return rows, columns
+
+    def windows(self, rows: range, columns: range) -> list[Box]:
+        """Return the rows and columns of each image that show these of the sky.
+
+        Their number is that of an image of the sky's box in any place, so that programs serve all.
+        """
+        sky, boxes = (columns, rows), []
+        middle = np.array([(at.start + at.stop - 1) / 2.0 for at in sky])
+        for j, turn in enumerate(self.turns):
+            size = abs(turn) @ [len(at) for at in sky]
+            first = np.ceil(self.places(j, middle) - size / 2.0).astype(int).tolist()
+            x, y = (range(a, a + math.ceil(n)) for a, n in zip(first, size, strict=True))
+            boxes.append((y, x))
+        return boxes
+
+    def window(self, rows: range, columns: range, boxes: Sequence[Box]) -> Geometry:
+        """Return that of a sky that is cut to rows and columns, and images that are to boxes.
+
+        Images are of one shape, which holds all of them and the sky. They are upright ones.
+        """
+        first, frame = np.array([columns.start, rows.start]), (len(rows), len(columns))
+        corners = np.array([(x.start, y.start) for y, x in boxes])
+        moved = (self.turns - np.eye(2)) @ first + (first - corners)
+        offsets, maps = self.offsets + moved, _maps(self.turns, self.offsets + moved)
+        shapes = [frame, *((len(y), len(x)) for y, x in boxes)]
+        ny, nx = np.max(shapes, axis=0).tolist()
+        return Geometry(maps, self.turns, offsets, (ny, nx), frame, (ny, nx))
+
+    def cut(
+        self, values: NDArray[Any], boxes: Sequence[Box], fill: float, axis: int
+    ) -> NDArray[Any]:
+        """Return the boxes of arrays, one for each image along an axis, in the shape of images.
+
+        Boxes that are one, and have this shape, are views.
+        """
+        if set(boxes) == {boxes[0]} and self.shape == (len(boxes[0][0]), len(boxes[0][1])):
+            return part(values, *boxes[0], fill)
+        pairs = zip(np.moveaxis(values, axis, 0), boxes, strict=True)
+        each = [enlarged(part(array, *box, fill), self.shape, fill) for array, box in pairs]
+        return np.stack(each, axis)
 
     def upright(self) -> Geometry:
         """Return that of images without quarter turns and flips; itself where there are none."""

@@ -87,10 +87,9 @@ def extent(observation: Observation) -> tuple[int, int]:
     """
     height, width = observation.sky_shape
     corners, needed = [np.array([(0.0, 0.0), (width - 1.0, height - 1.0)])], np.zeros(2)
-    for j, (turn, shift) in enumerate(zip(observation.turns, observation.offsets, strict=True)):
-        rows, columns = observation.good_box(j)
-        ends = [(x, y) for x in (columns[0], columns[-1]) for y in (rows[0], rows[-1])]
-        corners.append(np.linalg.solve(turn, (np.array(ends) - shift).T).T)
+    for j, turn in enumerate(observation.turns):
+        rows, columns = box = observation.good_box(j)
+        corners.append(observation.geometry.corners(j, box))
         scale, slope = observation.scales[j], abs(math.tan(math.atan2(turn[1, 0], turn[0, 0]) / 2))
         sheared = scale * (len(columns) + slope * len(rows))
         taps = TAPS * (1.0 if scale == 1.0 else 1.0 + scale)

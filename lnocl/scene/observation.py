@@ -16,7 +16,7 @@ from lnocl.scene.arrays import Array, together
 from lnocl.scene.containers import variances
 from lnocl.scene.counts import refuse_overflow, without_negative
 from lnocl.scene.fields import FIELDS, hold, in_one_shape, noise_beyond_counts, refuse_all_bad
-from lnocl.scene.geometry import MOVES, Geometry, good_box
+from lnocl.scene.geometry import MOVES, Box, Geometry, good_box
 from lnocl.scene.halos import refuse_dark
 from lnocl.scene.psf_field import PsfField, Psfs
 from lnocl.scene.psfs import PsfCentre, at_middle, normalised, own
@@ -503,30 +503,46 @@ class Observation:
             )
 
     def window(
-        self, rows: range, columns: range, middle: tuple[float, float] | None = None
+        self,
+        rows: range,
+        columns: range,
+        middle: tuple[float, float] | None = None,
+        boxes: Sequence[Box] | None = None,
     ) -> Observation:
-        """Return the observation cut to some rows and columns; positions begin at their corner.
+        """Return the observation of some rows and columns of the sky, which positions begin in.
 
+        Images, upright ones, are cut to the same rows and columns, or each to its own of `boxes`.
         PSFs that vary are those of a place (x, y) there, by default of its middle.
         """
+        boxes = boxes or [(rows, columns)] * self.n_images
+        geometry = self.geometry.window(rows, columns, boxes)
         changes: dict[str, Any] = {
-            "geometry": self.geometry.window(rows, columns),
+            "geometry": geometry,
             "star_places": self.star_places - (columns.start, rows.start),
+            "transmission": self.transmission_of(rows, columns),
         }
         for name, field in FIELDS.items():
             if field.axes == "pixels" and (values := getattr(self, name)).ndim > 2:
-                changes[name] = values[..., rows.start : rows.stop, columns.start : columns.stop]
-        q = self.oversample
-        there = (slice(q * at.start, q * at.stop) for at in (rows, columns))
-        changes["transmission"] = self.transmission[:, *there]
+                changes[name] = geometry.cut(values, boxes, field.beyond, field.of_images)
         if self.psf_fields:
-            fields = tuple(field.moved(-columns.start, -rows.start) for field in self.psf_fields)
-            x, y = middle or ((len(columns) - 1) / 2.0, (len(rows) - 1) / 2.0)
-            changes |= {"psf_fields": fields, "psfs": np.array([each.at(x, y) for each in fields])}
+            pairs = zip(self.psf_fields, boxes, strict=True)
+            fields = tuple(field.moved(-x.start, -y.start) for field, (y, x) in pairs)
+            place = np.array(middle or ((len(columns) - 1) / 2.0, (len(rows) - 1) / 2.0))
+            psfs = [each.at(*geometry.places(j, place)) for j, each in enumerate(fields)]
+            changes |= {"psf_fields": fields, "psfs": np.array(psfs)}
         other = self._with(changes)
         refuse_all_bad(other.mask)
         refuse_dark(other.halos, other.mask)
         return other._closed()
+
+    def transmission_of(self, rows: range, columns: range) -> Array:
+        """Return that of rows and columns of the sky; beyond its frame that of the nearest."""
+        given, q = self.transmission, self.oversample
+        if not len(given):
+            return given
+        axes = zip((rows, columns), given.shape[1:], strict=True)
+        y, x = (np.arange(q * at.start, q * at.stop).clip(0, n - 1) for at, n in axes)
+        return np.broadcast_to(own(given)[:, y[:, None], x], (len(given), len(y), len(x)))
 
     def _with(self, changes: dict[str, Any]) -> Observation:
         """Return a copy with other attributes, which may still change."""

@@ -269,8 +269,21 @@ def enlarged(
     array: NDArray[Any], shape: tuple[int, int], fill: float = 0.0, is_centred: bool = False
 ) -> NDArray[Any]:
     """Return an array with rows and columns added at its end, or about its centre ``n // 2``."""
+    sizes = zip(shape, array.shape[-2:], strict=True)
+    before = [n // 2 - k // 2 if is_centred else 0 for n, k in sizes]
+    rows, columns = (range(-at, n - at) for n, at in zip(shape, before, strict=True))
+    return part(array, rows, columns, fill)
+
+
+def part(array: NDArray[Any], rows: range, columns: range, fill: float = 0.0) -> NDArray[Any]:
+    """Return rows and columns of an array, its last axes; beyond its ends they hold a value."""
+    inside: list[slice] = []
     widths = [(0, 0)] * (array.ndim - 2)
-    for n, k in zip(shape, array.shape[-2:], strict=True):
-        at = n // 2 - k // 2 if is_centred else 0
-        widths.append((at, n - k - at))
-    return np.pad(array, widths, constant_values=fill) if np.any(widths) else array
+    for n, at in zip(array.shape[-2:], (rows, columns), strict=True):
+        first, last = (min(max(end, 0), n) for end in (at.start, at.stop))
+        before = min(max(-at.start, 0), len(at))
+        inside.append(slice(first, last))
+        widths.append((before, len(at) - before - (last - first)))
+    y, x = inside
+    held = array[..., y, x]
+    return np.pad(held, widths, constant_values=fill) if np.any(widths) else held

@@ -82,7 +82,7 @@ def test_errors_of_halos_by_replicas(command, capsys):
 WRONG = {
     "--halo small.fits": "small.fits has the shape (1, 4, 5) and the images (3, 48, 48)",
     "--halo nothing.fits": "nothing.fits",
-    "--halo halos.fits --tile 40": "whole images, which tiles do not see",
+    "--halo halos.fits --tile 40": "a tile cannot tell the --halo in it from a smooth sky",
 }
 
 

@@ -287,6 +287,3 @@ def test_replicas_name_star_and_epoch():
 def test_what_is_refused():
     with pytest.raises(lnocl.LnoclError, match=r"epochs`? has shape"):
         observation(epochs=[1, 2])
-    same_places = lnocl.Observation(np.ones((2, 16, 16)), np.ones((3, 3)), epochs=[0, 1])
-    with pytest.raises(lnocl.LnoclError, match="tiles are of images of one epoch"):
-        lnocl.deconvolve_tiles(same_places, [(8, 8)], stop=None, n_iter=1, engine="numpy")

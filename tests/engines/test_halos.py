@@ -273,7 +273,7 @@ def test_what_is_refused(message):
 
 def test_what_is_not_taken_beside_halos():
     given = observation()
-    with pytest.raises(lnocl.InputError, match="whole images, which tiles do not see"):
+    with pytest.raises(lnocl.InputError, match="a tile cannot tell the halos"):
         lnocl.deconvolve_tiles(given, [STAR], engine="numpy")
     with pytest.raises(lnocl.InputError, match="is 0 on all good pixels"):
         given.replace(mask=np.arange(P)[:, None, None] == np.zeros((P, N, N)))

@@ -468,8 +468,6 @@ def test_all_goes_wrong_in_one_line():
         with pytest.raises(lnocl.LnoclError) as caught:
             paper(observation(**changes), STARS, n_iter=1, engine="numpy")
         assert caught.value.message.startswith(message)
-    with pytest.raises(lnocl.LnoclError, match="tiles are of images of one epoch"):
-        lnocl.deconvolve_tiles(observation(), stop=None, n_iter=1, engine="numpy")
     with pytest.raises(lnocl.LnoclError, match=r"angles.* must be finite"):
         lnocl.rotations([np.inf], (0, 0))
     with pytest.raises(lnocl.LnoclError, match="of shape"):

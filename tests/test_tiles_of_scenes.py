@@ -1,0 +1,167 @@
+"""Tiles of every kind of scene: against the whole, and against the sky that was simulated.
+
+Sources and PSFs are Gaussians, each PSF with a ghost beside it, so that images are known between
+the pixels of the sky too.
+"""
+
+import numpy as np
+import pytest
+from turned_scenes import COVARIANCES, gaussian, psf
+
+import lnocl
+from lnocl import tiles
+from lnocl.scene.estimate import Estimate
+from lnocl.scene.scene import Scene
+
+SHAPE = NY, NX = 40, 56
+STARS = np.array([(14.3, 11.8), (36.6, 27.2), (44.8, 13.4)])
+FLUXES = np.array([3e4, 5e4, 2e4])
+# How much brighter they are in the second epoch.
+RISES = np.array([1.5, 1.0, 2.0])
+# Flux, place and covariance of the sources.
+SOURCES = [(4e4, (28, 18), [[9, 3], [3, 6]]), (2e4, (12, 28), [[5, 0], [0, 8]])]
+SOURCES += [(1.5e4, (46, 29), [[16, -4], [-4, 7]])]
+EXPOSURE = np.array([1.0, 2.5, 0.6])
+PSF_COVARIANCES = [0.7 * each for each in COVARIANCES]
+# A transmission is less by a Gaussian of this depth, place and covariance.
+DEPTH, HIDDEN, WIDTH = 0.8, np.array([31.0, 23.0]), np.diag([20.0, 12.0])
+
+OFFSETS = {"offsets": [(0, 0), (4.4, -3.3), (-6.0, 5.0)]}
+EPOCHS = {"epochs": ["1 Jan", "2 Feb", "1 Jan"]}
+BEHIND = {"transmission": True}
+TURNED = {"transforms": lnocl.rotations([0.0, 17.0, -75.0], (27.0, 20.0))}
+SCALED = {"transforms": TURNED["transforms"].copy()}
+SCALED["transforms"][2] = [[0.6, 0.1, -2.2], [-0.1, 0.6, 5.1]]
+KINDS = {
+    "epochs": EPOCHS,
+    "transmission": BEHIND,
+    "offsets": OFFSETS,
+    "offsets, epochs, transmission": OFFSETS | EPOCHS | BEHIND,
+    "turned": TURNED,
+    "scaled": SCALED,
+    "turned, epochs, transmission": TURNED | EPOCHS | BEHIND,
+}
+
+
+def shares(x, y):
+    """Return the transmission at places of the sky."""
+    peak = 2 * np.pi * np.sqrt(np.linalg.det(WIDTH))
+    return 1.0 - DEPTH * peak * gaussian(x - HIDDEN[0], y - HIDDEN[1], WIDTH)
+
+
+def hidden(flux, place, covariance):
+    """Return what of a source a transmission takes away, which is a Gaussian too."""
+    inverse, of_mask = np.linalg.inv(covariance), np.linalg.inv(WIDTH)
+    both = np.linalg.inv(inverse + of_mask)
+    share = shares(*HIDDEN) - 1.0  # at most
+    share *= gaussian(*(np.array(place) - HIDDEN), np.array(covariance) + WIDTH)
+    share *= 2 * np.pi * np.sqrt(np.linalg.det(WIDTH))
+    return share * flux, both @ (inverse @ place + of_mask @ HIDDEN), both
+
+
+def make_sky(y, x):
+    """Return the extended source at places of the sky."""
+    return sum(flux * gaussian(x - cx, y - cy, np.array(c)) for flux, (cx, cy), c in SOURCES)
+
+
+def make_means(j, maps, fluxes, transmission):
+    """Return what image j has of sky and stars for an exposure of 1, without background."""
+    y, x = np.indices(SHAPE)
+    turn, shift = maps[j, :, :2], maps[j, :, 2]
+    behind = [hidden(*each) for each in SOURCES] if transmission else []
+    stars = fluxes * shares(*STARS.T) if transmission else fluxes
+    points = [(flux, place, np.zeros((2, 2))) for flux, place in zip(stars, STARS, strict=True)]
+    image = np.zeros(SHAPE)
+    for flux, place, covariance in (*SOURCES, *behind, *points):
+        at = turn @ place + shift
+        seen = turn @ covariance @ turn.T + PSF_COVARIANCES[j]
+        image += flux * psf(x - at[0], y - at[1], seen)
+    return image
+
+
+def observe(kind, seed=0, side=13):
+    """Return counts of a scene, their means, and the fluxes of its stars, in each epoch."""
+    given = dict(KINDS.get(kind, {}))
+    maps = np.array(given.get("transforms", [np.eye(2, 3)] * 3))
+    if "offsets" in given:
+        maps[:, :, 2] = given["offsets"]
+    has_epochs, has_mask = "epochs" in given, given.pop("transmission", False)
+    of_images = [FLUXES * RISES if j == 1 and has_epochs else FLUXES for j in range(3)]
+    means = [
+        EXPOSURE[j] * make_means(j, maps, fluxes, has_mask) + 5.0
+        for j, fluxes in enumerate(of_images)
+    ]
+    counts = np.random.default_rng(seed).poisson(means)
+    if has_mask:
+        given["transmission"] = shares(*np.indices(SHAPE)[::-1])
+    y, x = np.indices((side, side)) - side // 2
+    psfs = [psf(x, y, each) for each in PSF_COVARIANCES]
+    observation = lnocl.Observation(counts, psfs, background=5.0, exposure=EXPOSURE, **given)
+    return observation, np.array(means), np.transpose(of_images[: 1 + has_epochs]).ravel()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cores_of_tiles_are_the_images_that_were_simulated(kind):
+    """Each pixel is in the core of one tile, which models it by its own part of the sky.
+
+    Stars err by 5e-4 of their peak between pixels, and by three times as much behind a transmission,
+    which is taken to be linear between these.
+    """
+    observation, means, fluxes = observe(kind, side=19)
+    upright = observation.upright()
+    laid = tiles._lay(upright, 80 if kind == "scaled" else 56, 5)
+    mosaic = tiles._Mosaic(upright, STARS, "", laid[0])
+    assert len(laid) > 1
+    for tile in filter(None, (tiles._cut(upright, STARS, None, spans) for spans in laid)):
+        scene = Scene(tile.observation, tile.stars, pad=5)
+        rows, columns = (span.window for span in tile.spans)
+        sky = np.zeros(scene.grid)
+        sky[: len(rows), : len(columns)] = make_sky(*np.ix_(rows, columns))
+        seen = abs(tile.stars[:, None] + (columns[0], rows[0]) - STARS).sum(axis=2).argmin(axis=1)
+        estimate = Estimate(scene, sky, fluxes.reshape(3, -1)[seen].ravel())
+        models = [scene.in_electrons(each, j) for j, each in enumerate(estimate.models())]
+        mosaic.add_models(tile, np.array(models))
+    models = upright.as_given(np.array(list(mosaic.models())))
+    error = abs(models - means) / EXPOSURE[:, None, None]
+    assert error.max() < (2e-3 if "transmission" in kind else 6e-4) * means[0].max()
+
+
+RUN = {"engine": "numpy", "stop": None, "smoothing": 0.02}
+
+
+def test_stars_of_tiles_have_a_flux_in_each_epoch():
+    observation, _, _ = observe("epochs")
+    run = RUN | {"n_iter": 10}
+    whole = lnocl.deconvolve(observation, STARS, **run)
+    found = lnocl.deconvolve_tiles(observation, STARS[::-1], tile=56, pad=4, **run)
+    assert len(found.tiles) > 1
+    backwards = [4, 5, 2, 3, 0, 1]
+    np.testing.assert_allclose(found.star_positions, whole.star_positions[backwards], rtol=1e-14)
+    assert found.to_table()["epoch"].tolist() == [0, 1] * 3
+    off = (found.star_fluxes - whole.star_fluxes[backwards]) / whole.star_flux_errors[backwards]
+    assert abs(off).max() < 0.5
+    early, late = found.star_fluxes.reshape(-1, 2).T
+    np.testing.assert_allclose(late / early, RISES[::-1], rtol=0.02)
+    assert len(found.star_residuals()) == 6
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("kind", KINDS)
+def test_tiles_are_the_whole_and_the_sky_that_was_simulated(kind):
+    observation, _, fluxes = observe(kind)
+    run = RUN | {"n_iter": 120}
+    tile = {"scaled": 72}.get(kind, 56 if "turned" in kind else 46)
+    whole = lnocl.deconvolve(observation, STARS, **run)
+    found = lnocl.deconvolve_tiles(observation, STARS, tile=tile, pad=4, **run)
+    assert len(found.tiles) > 1
+    difference = abs(found.extended - whole.extended)
+    assert difference.max() < 4e-3 * whole.extended.max()
+    np.testing.assert_allclose(found.star_fluxes, whole.star_fluxes, rtol=2e-4)
+    np.testing.assert_allclose(found.star_flux_errors, whole.star_flux_errors, rtol=0.02)
+    sky = make_sky(*np.indices(SHAPE))
+    errors = [np.linalg.norm(each.extended - sky) for each in (whole, found)]
+    assert errors[1] == pytest.approx(errors[0], rel=0.01)
+    for each in (whole, found):
+        assert (abs(each.star_fluxes - fluxes) < 3 * each.star_flux_errors).all()
+        assert abs(each.extended_flux[0] - sky.sum()) < 3 * each.extended_flux[1]
+    assert found.fit().rms == pytest.approx(whole.fit().rms, rel=0.01)
