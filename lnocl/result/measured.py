@@ -293,7 +293,9 @@ class Measured:
 
         Each place of the sky is tested for a source, under the model without it: stars, background
         and a smooth level. What noise, PSF errors and the extended source could be is allowed for
-        (`lnocl.significance`). It takes about as long as a few iterations on the host.
+        (`lnocl.significance`). It takes about as long as a few iterations on the host; where PSFs
+        vary over the field, as long for each of its nodes. Fluxes and limits are those before a
+        `transmission`.
 
         Parameters
         ----------
@@ -312,7 +314,7 @@ class Measured:
         ------
         InputError
             - A width or number of false alarms is out of range.
-            - The result is of tiles, or of PSFs that vary over the field.
+            - The result is of tiles.
             - Nowhere do the images tell such a source from stars, level and edges.
 
         Examples

@@ -204,11 +204,9 @@ class Scene:
         given = self.observation.transmission
         if not len(given):
             return None
-        beyond = [(0, n - k) for n, k in zip(self.grid, given.shape[1:], strict=True)]
-        if given.strides[0] or not any(map(any, beyond)):
-            return np.pad(given, [(0, 0), *beyond], mode="edge")
-        one = np.pad(given[0], beyond, mode="edge")
-        return np.broadcast_to(one, (self.n_images, *self.grid))
+        rows, columns = map(_nearest, self.grid, given.shape[1:])
+        each = given if given.strides[0] else given[:1]
+        return np.broadcast_to(each[:, rows[:, None], columns], (self.n_images, *self.grid))
 
     def transmitted(self, positions: Array) -> Array:
         """Return the share of the light of points, (n, 2), that each image gets; shape (p, n)."""
@@ -614,3 +612,9 @@ def _lay(array: NDArray, grid: tuple[int, int], fill: float = 0.0) -> NDArray:
         laid.fill(fill)
     laid[..., :ny, :nx] = array
     return laid
+
+
+def _nearest(n: int, k: int) -> NDArray[np.int_]:
+    """Return which of the first k of n pixels is nearest to each, round the end."""
+    at = np.arange(n)
+    return np.where(at < (n + k + 1) // 2, np.minimum(at, k - 1), 0)
