@@ -200,6 +200,18 @@ def test_a_window_of_a_camera(kind, place):
             assert abs(window.forward(x) - expected).max() <= allowed * abs(expected).max()
 
 
+def test_windows_of_one_camera_that_end_alike():
+    """Which hold as much of the PSF, up to the same lag, but from another one on."""
+    camera, (rows, columns) = Camera(a_scene("apart"), 1), (range(2, 18), range(5, 21))
+    sky = np.zeros(camera.grid)
+    sky[np.ix_(rows, columns)] = x = abs(noise(16, 16))
+    whole = camera.forward(sky)
+    for first in (3, 4):
+        seen = range(first, 14), range(first + 3, 17)
+        found = camera.window(seen, (rows, columns)).forward(x)
+        np.testing.assert_allclose(found, whole[np.ix_(*seen)], rtol=1e-12)
+
+
 @every_kind
 def test_the_sky_round_a_star(kind, monkeypatch):
     """Its adjoint, and its images against those of the whole sky."""
