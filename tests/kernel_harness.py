@@ -354,7 +354,7 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         star_weights=own(rng.uniform(1.0, 2.0, n)),
         star_corrections=own(rng.uniform(0.9, 1.1, n)),
         extended=own(rng.random((1, ny, nx))),
-        correction_spectra=own(np.fft.rfft(rng.uniform(-0.1, 2.0, (1, ny, nx)), axis=-1) / nx),
+        correction_spectra=own(np.fft.rfft(rng.uniform(-4.0, 8.0, (1, ny, nx)), axis=-1) / nx),
         inverse_weight=(
             own(np.where(rng.random((1, ny, nx)) > 0.2, rng.random((1, ny, nx)), 0.0))
             if has_weights
