@@ -104,8 +104,8 @@ def observe(kind, seed=0, side=13):
 def test_cores_of_tiles_are_the_images_that_were_simulated(kind):
     """Each pixel is in the core of one tile, which models it by its own part of the sky.
 
-    Stars err by 5e-4 of their peak between pixels, and by three times as much behind a transmission,
-    which is taken to be linear between these.
+    Stars err by 5e-4 of their peak between pixels, and by three times as much behind a
+    transmission, which is taken to be linear between these.
     """
     observation, means, fluxes = observe(kind, side=19)
     upright = observation.upright()
