@@ -123,6 +123,8 @@ def test_flat_and_shared_images(kind):
     flat = np.broadcast_to(2.0, model.grid)
     expected = model.forward(x + flat) - model.forward(x)
     np.testing.assert_allclose(model.forward(flat)[inside], expected[inside], rtol=allowed)
+    of_ones = [np.broadcast_to(each.of_ones(), model.shape[1:]) for each in model.cameras]
+    np.testing.assert_allclose(2.0 * np.array(of_ones)[inside], expected[inside], rtol=allowed)
     ny, nx = model.shape[1:]
     # Samples of an effective PSF a pixel apart may sum to another number.
     ones = [] if kind == "effective" else [np.broadcast_to(1.3, (ny, nx))]
