@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 
-from lnocl.commands import messages, options
+from lnocl.commands import options
 from lnocl.commands.declared import BACKGROUND, DEVICE, READ_NOISE
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
@@ -40,11 +41,11 @@ OPTIONS = [
         "-o", "--output", metavar="STEM", help="write the table to STEM.ecsv, a plot to STEM.png"
     ),
     options.OVERWRITE.but(help="replace these files"),
-    options.QUIET.but(help="show no progress"),
+    options.QUIET.but(dest="no_progress", help="show no progress"),
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> Iterator[str]:
     from lnocl.io.calibration import Calibration
     from lnocl.io.frames import read_frames
     from lnocl.opencl import device
@@ -65,9 +66,8 @@ def _run(arguments: argparse.Namespace) -> None:
         case = bench.Case(read.observation, stars, [*images, *psfs])
     else:
         case = bench.simulated_case(256 if size is None else size)
-    lines = bench.run(case, n_iter, accuracy, spec, stem, arguments.overwrite, not arguments.quiet)
-    for line in lines:
-        messages.say([line])
+    is_shown = not arguments.no_progress
+    return bench.run(case, n_iter, accuracy, spec, stem, arguments.overwrite, is_shown)
 
 
 COMMAND = Command(

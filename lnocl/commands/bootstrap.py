@@ -77,22 +77,18 @@ def add_errors(
     return _summarise(found, parts, frames)
 
 
-def check_earlier(path: str, seed: int, parts: Sequence[Part]) -> None:
-    """Refuse replicas in a file of another seed, or of regions that are not given.
+def check_seed(path: str, seed: int) -> None:
+    """Refuse replicas in a file of another seed, before a run is made again.
 
     Raises
     ------
-    InputError
-        The file has such replicas.
+    FileError, InputError
+        As `read_replicas`; or there are such.
     """
     from lnocl.io.fitserrors import read_replicas
 
     held = read_replicas(path)
-    if held is None:
-        return
-    given = tuple(each.name.strip() for each in parts)
-    others = [name for name in held.names if not _OF_STARS.fullmatch(name)]
-    if held.seed != seed or not all(name.startswith(given) for name in others):
+    if held is not None and held.seed != seed:
         raise _of_others(path, held)
 
 

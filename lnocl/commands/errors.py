@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from lnocl.commands import bootstrap, messages, options
+from lnocl.commands import bootstrap, options
 from lnocl.commands.again import Again
 from lnocl.commands.declared import parameter
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.errors import note
+from lnocl.process import ignored_notes
 from lnocl.result import Result
 
 if TYPE_CHECKING:
@@ -41,22 +42,20 @@ OPTIONS = [
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> list[str]:
     from lnocl.parallel import check_parallel
     from lnocl.runs.bootstrap import check_number
 
     check_parallel(arguments.parallel)
     check_number(arguments.bootstrap, arguments.seed)
     again = Again.read(arguments.result, arguments.quiet)
-    with messages.shown_log(arguments.quiet, COMMAND.flags()):
-        parts = _parts(arguments, again.frames)
-        if not arguments.overwrite:  # before the run is made again, where it is
-            bootstrap.check_earlier(arguments.result, arguments.seed, parts)
+    parts = _parts(arguments, again.frames)
+    if not arguments.overwrite:
+        bootstrap.check_seed(arguments.result, arguments.seed)
     outcome = again.outcome()
-    with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
+    with ignored_notes():
         lines = bootstrap.add_errors(arguments, outcome, again, parts)
-    if not arguments.quiet:
-        messages.say([*lines, f"added to {arguments.result}"])
+    return [*lines, f"added to {arguments.result}"]
 
 
 def _parts(arguments: argparse.Namespace, frames: Frames) -> list[Part]:

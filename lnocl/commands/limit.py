@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lnocl.commands import detect, messages, options
+from lnocl.commands import detect, options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.errors import warn
+from lnocl.process import ignored_notes
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -48,7 +49,7 @@ OPTIONS = [
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> list[str]:
     from lnocl.io.fitsadd import add_parts
     from lnocl.significance import check_injections
 
@@ -63,9 +64,9 @@ def _run(arguments: argparse.Namespace) -> None:
     cards = detect.cards(found, frames.unit)
     add_parts(again.saved, {"LIMITS": table, **maps}, cards, frames.unit)
     lines = _told(found, table, maps["LIMIT50"], frames.unit)
-    with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
+    with ignored_notes():
         lines += _checked(found, arguments)
-    detect.finish(arguments, found, table, "limits", lines, curves)
+    return detect.finish(arguments, found, table, "limits", lines, curves)
 
 
 def _told(found: Significance, table: QTable, limit: np.ndarray, unit: str) -> list[str]:

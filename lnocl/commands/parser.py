@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, NoReturn
 
-from lnocl.commands.messages import in_shell
+from lnocl.commands.messages import in_shell, shown_log
 from lnocl.commands.options import Options
 from lnocl.errors import InputError
 from lnocl.io.names import file_of
@@ -24,15 +24,25 @@ class Command(NamedTuple):
     options : Options
         Its arguments, by the headings of its help; those under no heading have an empty one.
     run : callable
-        Runs it with the parsed arguments.
+        Runs it with the parsed arguments, and yields the lines that it says.
     epilog : str
         The last paragraph of its help.
     """
 
     summary: str
     options: Options
-    run: Callable[[argparse.Namespace], None]
+    run: Callable[[argparse.Namespace], Iterable[str]]
     epilog: str = ""
+
+    def carry_out(self, arguments: argparse.Namespace) -> Iterator[str]:
+        """Run it, and yield the lines that it says, and show notes, unless it is to be quiet.
+
+        One that cannot be told to be quiet shows no notes.
+        """
+        with shown_log(getattr(arguments, "quiet", True), self.flags()):
+            for line in self.run(arguments):
+                if not getattr(arguments, "quiet", False):
+                    yield line
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add its options to its parser."""
