@@ -37,10 +37,6 @@ OPTIONS = [
         help="pixels along each side of the demo's scene (default: 256)",
     ),
     DEVICE,
-    option(
-        "-o", "--output", metavar="STEM", help="write the table to STEM.ecsv, a plot to STEM.png"
-    ),
-    options.OVERWRITE.but(help="replace these files"),
     options.QUIET.but(dest="no_progress", help="show no progress"),
 ]
 
@@ -56,18 +52,17 @@ def _run(arguments: argparse.Namespace) -> Iterator[str]:
         raise InputError("images need their PSFs: give --psf")
     if images and size is not None:
         raise InputError("--size is of the demo's scene, and images are given; leave one out")
-    n_iter, accuracy, stem = arguments.n_iter, arguments.accuracy, arguments.output
-    bench.check(n_iter, accuracy, stem, arguments.overwrite)
+    n_iter, accuracy = arguments.n_iter, arguments.accuracy
+    bench.check(n_iter, accuracy)
     spec = device.spec_of(device.choose(arguments.device).device)
     if images:
         levels = arguments.background or [0.0], arguments.read_noise or [0.0]
         read = read_frames(images, psfs, Calibration(*levels))
         stars = options.star_places(arguments.stars, None, read.header, images[0])
-        case = bench.Case(read.observation, stars, [*images, *psfs])
+        case = bench.Case(read.observation, stars)
     else:
         case = bench.simulated_case(256 if size is None else size)
-    is_shown = not arguments.no_progress
-    return bench.run(case, n_iter, accuracy, spec, stem, arguments.overwrite, is_shown)
+    return bench.run(case, n_iter, accuracy, spec, not arguments.no_progress)
 
 
 COMMAND = Command(
