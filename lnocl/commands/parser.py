@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 from lnocl.commands.messages import in_shell, shown_log
-from lnocl.commands.options import Options
+from lnocl.commands.options import Option, Options
 from lnocl.errors import InputError
 from lnocl.io.names import file_of
 
@@ -47,8 +47,8 @@ class Command(NamedTuple):
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add its options to its parser."""
         parser.epilog = self.epilog
-        needed = (each for options in self.options.values() for each in options if each.is_needed)
-        parser.usage = " ".join(["%(prog)s", *(each.usage() for each in needed), "[options]"])
+        needed = [each.usage() for each in self.all_options() if each.is_needed]
+        parser.usage = " ".join(["%(prog)s", *needed, "[options]"])
         flags = self.flags()
         for heading, options in self.options.items():
             group = parser.add_argument_group(heading) if heading else parser
@@ -64,23 +64,22 @@ class Command(NamedTuple):
         InputError
             There is one.
         """
-        for options in self.options.values():
-            for each in options:
-                each.refuse_ignored(vars(arguments))
+        for each in self.all_options():
+            each.refuse_ignored(vars(arguments))
 
     def inputs(self, arguments: argparse.Namespace) -> list[str]:
         """Return the names in its arguments that may be those of files to read."""
         values = vars(arguments)
-        return [
-            file_of(path)
-            for options in self.options.values()
-            for each in options
-            for path in each.inputs(values[each.name])
-        ]
+        found = (path for each in self.all_options() for path in each.inputs(values[each.name]))
+        return [*map(file_of, found)]
+
+    def all_options(self) -> list[Option]:
+        """Return its arguments, whatever their headings."""
+        return [each for group in self.options.values() for each in group]
 
     def flags(self) -> dict[str, str]:
         """Return the flag of each parameter that an option, or a kind of its values, stands for."""
-        options = [each for group in self.options.values() for each in group]
+        options = self.all_options()
         kinds = {
             parameter: f"{each.flags[-1]} {kind}"
             for each in options
