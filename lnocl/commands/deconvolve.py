@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lnocl.commands import checkpoints, messages, options, pictures, record
@@ -79,7 +79,7 @@ def _solve_tiles(
     )
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> Iterator[str]:
     from lnocl.io import atomic
     from lnocl.parallel import check_parallel
 
@@ -88,7 +88,6 @@ def _run(arguments: argparse.Namespace) -> None:
     checkpoints.check(arguments)
     check_parallel(arguments.parallel)
     with (
-        messages.shown_log(arguments.quiet, COMMAND.flags()),
         messages.recorded_warnings(COMMAND.flags()) as warned,
         checkpoints.Interrupts() as interrupts,
     ):
@@ -105,8 +104,7 @@ def _run(arguments: argparse.Namespace) -> None:
             from lnocl.plotting.result import draw_result
 
             lines.append(pictures.draw(arguments, draw_result(view_of(result))))
-        if not arguments.quiet:
-            messages.say(lines)
+        yield from lines
     interrupts.explain(arguments, result)
 
 
