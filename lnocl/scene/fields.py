@@ -27,7 +27,7 @@ from lnocl.scene.geometry import read_geometry
 from lnocl.scene.halos import read_halos
 from lnocl.scene.psfs import read_ideal_psfs, read_pixels, read_psfs
 from lnocl.scene.star_psfs import read_star_places, read_star_psfs
-from lnocl.scene.transforms import of_one_shape, refuse_other_shapes
+from lnocl.scene.transforms import of_one_shape, refuse_other_shapes, shapes_of
 from lnocl.scene.uncertainties import is_uncertainty, without_source
 
 if TYPE_CHECKING:
@@ -282,9 +282,17 @@ def in_one_shape(given: dict[str, Any], shapes: Sequence[tuple[int, int]]) -> di
     """Return images of several shapes, and their maps, with bad pixels added to smaller ones."""
     found = {}
     for name, field in FIELDS.items():
-        if field.axes == "pixels" and field.of_images == 0:
-            refuse_other_shapes(name, given[name], shapes)
-            found[name] = of_one_shape(given[name], field.beyond)
+        if field.axes == "pixels":
+            value = given[name]
+            are_many = field.of_images > 0 and isinstance(value, (list, tuple))
+            are_many &= not shapes_of(value)
+            each = value if are_many else [value]
+            for maps in each:
+                # A halo of one shape may be that of all images.
+                if field.of_images == 0 or len(set(shapes_of(maps))) > 1:
+                    refuse_other_shapes(name, maps, shapes)
+            stacks = [of_one_shape(maps, field.beyond) for maps in each]
+            found[name] = stacks if are_many else stacks[0]
     return found
 
 

@@ -179,11 +179,10 @@ class PsfFamilies:
 
     def without_common_shift(self, parameters: PsfParameters) -> tuple[PsfParameters, Array]:
         """Return parameters without what a shift of the sky does alike, and that shift, (x, y)."""
-        common: Array = np.zeros(2)
-        values = parameters.values
+        common, values = np.zeros(2), parameters.values
         if "shift" in self._names:
             shifts, turns = values[:, :2], self._turns
-            common = np.linalg.lstsq(turns.reshape(-1, 2), shifts.ravel())[0]
+            common[:] = np.linalg.lstsq(turns.reshape(-1, 2), shifts.ravel())[0]
             values = np.hstack([shifts - turns @ common, values[:, 2:]])
         return parameters._replace(values=values), common
 
