@@ -280,20 +280,16 @@ FIELDS = {
 
 def in_one_shape(given: dict[str, Any], shapes: Sequence[tuple[int, int]]) -> dict[str, Any]:
     """Return images of several shapes, and their maps, with bad pixels added to smaller ones."""
-    found = {}
-    for name, field in FIELDS.items():
-        if field.axes == "pixels":
-            value = given[name]
-            are_many = field.of_images > 0 and isinstance(value, (list, tuple))
-            are_many &= not shapes_of(value)
-            each = value if are_many else [value]
-            for maps in each:
-                # A halo of one shape may be that of all images.
-                if field.of_images == 0 or len(set(shapes_of(maps))) > 1:
-                    refuse_other_shapes(name, maps, shapes)
-            stacks = [of_one_shape(maps, field.beyond) for maps in each]
-            found[name] = stacks if are_many else stacks[0]
-    return found
+
+    def laid(name: str, field: Field, maps: Any) -> Any:
+        if field.of_images and isinstance(maps, (list, tuple)) and not shapes_of(maps):
+            return [laid(name, field, each) for each in maps]
+        if not field.of_images or len(set(shapes_of(maps))) > 1:  # else a halo of all images
+            refuse_other_shapes(name, maps, shapes)
+        return of_one_shape(maps, field.beyond)
+
+    fields = FIELDS.items()
+    return {k: laid(k, field, given[k]) for k, field in fields if field.axes == "pixels"}
 
 
 def hold(
