@@ -330,5 +330,5 @@ def test_halos_of_images_of_several_shapes_have_their_shapes(n):
     for halo, given in zip(found, halos, strict=True):
         np.testing.assert_allclose(halo[1, :9, :11], given[1] / given[1].sum())
         assert halo[1].sum() == pytest.approx(1.0)
-    with pytest.raises(lnocl.InputError, match="halo 1 has shape .*; give each map"):
+    with pytest.raises(lnocl.InputError, match=r"halo 1 has shape .*; give each map"):
         lnocl.Observation(images, halos=[halos[0][0], halos[0][1][:5]], **known)

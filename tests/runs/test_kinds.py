@@ -2,6 +2,7 @@
 
 import warnings
 from functools import cache
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -22,6 +23,7 @@ KINDS = [
     *("transmission + epochs", "finer sky + halos", "PSF field + halos", "star PSFs + epochs"),
 ]
 BRIGHT, FAINT = map(tuple, STARS.tolist())
+ROOT = Path(__file__).parents[2]
 SHORT = {"n_iter": 12, "stop": None, "smoothing": 0.3}
 
 
@@ -150,6 +152,14 @@ DONE = {
 }
 
 
+def test_the_page_of_what_goes_together_has_the_table():
+    lines = (ROOT / "docs/guide/together.md").read_text().splitlines()
+    rows = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")]
+    header, _, *rows = rows[: len(KINDS) + 2]
+    assert header == ["scene", *DONE]
+    assert rows == [[kind, *["yes"] * len(DONE)] for kind in KINDS]
+
+
 @pytest.fixture(scope="module")
 def worker():
     from distributed import Client, LocalCluster
@@ -159,9 +169,15 @@ def worker():
         yield
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("what", DONE)
-@pytest.mark.parametrize("kind", KINDS)
+# Of four kinds in which PSFs were judged last.
+FAST = {("PSF field + halos", "PSFs mended"), ("star PSFs + epochs", "PSFs mended")}
+CELLS = [
+    pytest.param(*cell, marks=[] if cell in FAST else pytest.mark.exhaustive)
+    for cell in product(KINDS, DONE)
+]
+
+
+@pytest.mark.parametrize(("kind", "what"), CELLS)
 def test_every_kind_of_scene_goes_with_everything_that_is_done(kind, what, request):
     if what == "parallel":
         request.getfixturevalue("worker")
