@@ -28,6 +28,7 @@ from lnocl.scene.shifting import Cutout, MovablePsf
 from lnocl.scene.star_psfs import StarPsfs, owned
 from lnocl.scene.star_weights import OBSERVED_SHARE, warn_of_lost_stars, weigh_stars
 from lnocl.scene.stars import Covered, StarField, check_positions, covered_box
+from lnocl.scene.transforms import enlarged
 
 # The one division guard: where the model is not above this (images have unit mean) the ratio is
 # taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
@@ -162,7 +163,9 @@ class Scene:
         self.gains = np.ones(self.n_images) if has_map else relative
         self._psfs = movable_psfs(self.scaled_psfs(), observation, self.image_grid)
         self.areas = (self.oversample * observation.scales) ** 2
-        self.transmission = self._transmission()
+        rows, columns = map(range, self.image_grid)
+        shares = observation.transmission_of(rows, columns)
+        self.transmission = shares if len(shares) else None
         self.seen_areas = self.areas.copy()
         if self.transmission is not None:
             self.seen_areas *= observation.transmission.mean(axis=(1, 2))
@@ -199,16 +202,6 @@ class Scene:
             Rotation(angles[j], shift, self.grid, observation.good_box(j), scales[j])
             for j, shift in enumerate(observation.offsets)
         ]
-
-    def _transmission(self) -> Array | None:
-        given = self.observation.transmission
-        if not len(given):
-            return None
-        beyond = [(0, n - k) for n, k in zip(self.grid, given.shape[1:], strict=True)]
-        if given.strides[0] or not any(map(any, beyond)):
-            return np.pad(given, [(0, 0), *beyond], mode="edge")
-        one = np.pad(given[0], beyond, mode="edge")
-        return np.broadcast_to(one, (self.n_images, *self.grid))
 
     def transmitted(self, positions: Array) -> Array:
         """Return the share of the light of points, (n, 2), that each image gets; shape (p, n)."""
@@ -601,16 +594,4 @@ class Scene:
         return self._on_grid(observed)
 
     def _on_grid(self, array: NDArray, fill: float = 0.0) -> NDArray:
-        return _lay(array, self.image_grid, fill)
-
-
-def _lay(array: NDArray, grid: tuple[int, int], fill: float = 0.0) -> NDArray:
-    """Return an array at the origin of a grid."""
-    ny, nx = array.shape[-2:]
-    if grid == (ny, nx):
-        return array
-    laid = np.zeros((*array.shape[:-2], *grid), array.dtype)
-    if fill:
-        laid.fill(fill)
-    laid[..., :ny, :nx] = array
-    return laid
+        return enlarged(array, self.image_grid, fill)
