@@ -1,7 +1,7 @@
 """False alarms and points in images that differ in depth, PSF and scale.
 
-    python benchmarks/mixes.py [--mixes faint depths bars scales coarse] [--fields N] [--alarms A]
-        [--first SEED] [--processes P] [--output STEM]
+    python benchmarks/mixes.py [--mixes faint depths bars scales coarse dimmed field] [--fields N]
+        [--alarms A] [--first SEED] [--processes P] [--output STEM]
 
 The sky has 80 x 80 pixels; PSFs are two Gaussians without symmetry. Means are formulae, and exact.
 
@@ -11,6 +11,9 @@ bars    four PSFs of 2 x 5 pixels, turned by 45 degrees each, exposures of 1 to 
 scales  a PSF of 2.5 pixels, and an image turned by 20 degrees, 30 times as deep, whose pixels are
         2.8 times as large, with a PSF of 2 of its own pixels
 coarse  the same with pixels 5.6 times as large
+dimmed  a PSF of 3 pixels behind a transmission that falls to 0.3 to the right, with a hole of 6
+        pixels radius, in which no point is put; half of the sky is behind it
+field   two images whose PSFs vary from 2.6 to 3.4 and from 3.6 to 3.2 pixels, left to right
 
 The first table is of fields that hold nothing: the stated number of alarms a field, that found and
 its standard error. For the second a point is put in at random, of 9 standard deviations with the
@@ -26,15 +29,19 @@ import warnings
 
 import numpy as np
 from astropy.table import Table
+from scipy.signal import fftconvolve
 
 N, SIGMA = 80, 1.0 / np.sqrt(8.0 * np.log(2.0))  # of a FWHM of 1
 MIDDLE = np.full(2, (N - 1) / 2.0)
 SIGNAL, INSIDE = 9.0, 15.0
-MIXES = "faint", "depths", "bars", "scales", "coarse"
+MIXES = "faint", "depths", "bars", "scales", "coarse", "dimmed", "field"
+HOLE, HIDDEN = (30.0, 44.0), 6.0
 
 
 class Camera:
     """An image: its PSF, its map from the sky, exposure, background and read noise."""
+
+    end, behind = None, 0.0  # a camera of the PSFs at the right edge; sky behind a transmission
 
     def __init__(self, fwhm, exposure, sky, read=0.0, *, long=1.0, tilt=0.0, scale=1.0, turn=0.0):
         self.exposure, self.read, self.scale = exposure, read, scale
@@ -63,7 +70,24 @@ class Camera:
         """Return what a point of one electron at a place of the sky adds."""
         x, y = self.linear @ place + self.shift
         rows, columns = np.indices((self.side, self.side))
-        return self.exposure * self.light(columns - x, rows - y)
+        light = self.light(columns - x, rows - y)
+        if self.end:
+            there = self.end.light(columns - x, rows - y)
+            light += place[0] / (N - 1) * (there - light)
+        return self.exposure * (self.share(*place) if self.behind else 1.0) * light
+
+    def share(self, x, y):
+        """Return the transmission at a place of the sky."""
+        is_open = np.hypot(x - HOLE[0], y - HOLE[1]) > HIDDEN
+        return is_open * (1.0 - 0.7 * x / (N - 1))
+
+    def sky(self):
+        """Return the counts of the sky beside the background."""
+        if not self.behind:
+            return np.zeros((self.side, self.side))
+        rows, columns = np.mgrid[-20 : N + 20, -20 : N + 20]
+        seen = self.share(columns.clip(0, N - 1), rows)
+        return self.behind * fftconvolve(seen, self.psf(), "same")[20:-20, 20:-20]
 
     @property
     def variance(self):
@@ -86,6 +110,17 @@ def cameras(mix):
         return [Camera(2.2, 1.0, 20.0, 3.0), Camera(3.0, 3.0, 40.0), Camera(4.5, 20.0, 20.0, 5.0)]
     if mix == "bars":
         return [Camera(2.0, 2.0**k, 20.0, 3.0, long=2.5, tilt=k * np.pi / 4) for k in range(4)]
+    if mix == "dimmed":
+        camera = Camera(3.0, 1.0, 20.0)
+        camera.behind = 20.0
+        return [camera]
+    if mix == "field":
+        ends = [(2.6, 3.4), (3.6, 3.2)]
+        seen = [Camera(left, 1.0 + k, 20.0) for k, (left, _) in enumerate(ends)]
+        for camera, (_, right) in zip(seen, ends, strict=True):
+            camera.half, camera.end = 11, Camera(right, 1.0, 20.0)
+            camera.end.half = 11
+        return seen
     scale = 2.8 if mix == "scales" else 5.6
     return [Camera(2.5, 1.0, 20.0), Camera(2.0, 30.0, 20.0, scale=scale, turn=np.radians(20.0))]
 
@@ -97,11 +132,17 @@ def significance(images, seen, alarms):
     known = {}
     if any(each.scale != 1.0 for each in seen):
         known["transforms"] = np.array([np.column_stack([c.linear, c.shift]) for c in seen])
+    psfs = [each.psf() for each in seen]
+    if seen[0].end:
+        edges = [(0.0, 0.0), (N - 1.0, 0.0)]
+        psfs = [lnocl.PsfField([each.psf(), each.end.psf()], edges) for each in seen]
+    if seen[0].behind:
+        known["transmission"] = seen[0].share(*np.indices((N, N))[::-1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lnocl.LnoclWarning)
         observation = lnocl.Observation(
             images,
-            [each.psf() for each in seen],
+            psfs,
             background=[each.background for each in seen],
             read_noise=[each.read for each in seen],
             exposure=[each.exposure for each in seen],
@@ -122,13 +163,16 @@ def measure(job):
     """Return the alarms of a field without and with a point, and what is found of the point."""
     mix, alarms, seed = job
     rng, seen = np.random.default_rng(seed), cameras(mix)
-    dark = [np.zeros((each.side, each.side)) for each in seen]
+    dark = [each.sky() for each in seen]
     wrong = len(significance(list(expose(seen, rng, dark)), seen, alarms).detections)
     place = MIDDLE + rng.uniform(-INSIDE, INSIDE, 2)
+    while mix == "dimmed" and np.hypot(*(place - HOLE)) < HIDDEN + 3.0:
+        place = MIDDLE + rng.uniform(-INSIDE, INSIDE, 2)
     points = [each.point(place) for each in seen]
-    information = sum((p**2).sum() / c.variance for p, c in zip(points, seen, strict=True))
+    terms = zip(points, seen, dark, strict=True)
+    information = sum((p**2 / (c.variance + sky)).sum() for p, c, sky in terms)
     flux = SIGNAL / np.sqrt(information)
-    images = list(expose(seen, rng, [flux * each for each in points]))
+    images = list(expose(seen, rng, [d + flux * p for d, p in zip(dark, points, strict=True)]))
     found = significance(images, seen, 0.01).detections
     away = np.hypot(found["x"].value - place[0], found["y"].value - place[1])
     near = found[away < 2.0 * max(each.width for each in seen)]

@@ -48,11 +48,6 @@ POINT_SOURCE, EXTENDED = "point", "extended"
 
 def null_of(outcome: Outcome) -> Null:
     """Return the model of a reconstruction without sources beside its stars."""
-    if outcome.scene.transmission is not None:
-        raise InputError(
-            "sources are not tested behind a `transmission` yet; leave it out, or take the fluxes "
-            "and errors of stars placed where they may be"
-        )
     refinement = outcome.psf_refinement
     errors = np.zeros(1), np.zeros(0)
     if refinement is not None and refinement.psf_error:
@@ -390,11 +385,6 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
     """Return the sources beside the stars of a reconstruction, `lnocl.Result.significance`."""
     check_search(width, false_alarms)
     observation = outcome.observation
-    if observation.psf_fields:
-        raise InputError(
-            "sources are tested with one PSF for each image, and these vary over the field: "
-            "deconvolve a cut-out with the PSF of its middle"
-        )
     null = null_of(outcome)
     found = ScoreMap(null, width * observation.oversample)
     ny, nx = observation.sky_shape

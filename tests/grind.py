@@ -10,16 +10,17 @@ import sys
 import warnings
 from types import SimpleNamespace
 
+import kernel_comparison as comparison
+import kernel_harness as harness
 import numpy as np
 import pyopencl as cl
 from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
 from scenes import Recipe, worst
 
 from lnocl.errors import MisfitWarning
-from lnocl.opencl import launch, layout, program
+from lnocl.opencl import launch, program
 from lnocl.opencl.device import choose
 from lnocl.opencl.tuning import Tuning
-from lnocl.verify import comparison, harness
 
 DTYPES = {"s": np.float32, "d": np.float64}
 
@@ -66,7 +67,7 @@ CASES = {
 DEVICE_OPTIONS = {"group, global scratch": ["--compute-units", "1"]}
 
 
-class Layout(layout.Layout):
+class Layout(harness.SpectraLayout):
     """Leaves the padding of spectra out, which no kernel may read."""
 
     def pack_columns(self, columns):

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from kernel_comparison import ALLOWED, deviation, kernels_of
+from kernel_harness import THREE_IMAGES, TURNED, TWICE_AS_FINE, KernelHarness, inputs
 from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
 
 from lnocl.opencl import sources
 from lnocl.opencl.device import choose, context_of
 from lnocl.opencl.tuning import Tuning
-from lnocl.verify.comparison import ALLOWED, deviation, kernels_of
-from lnocl.verify.harness import THREE_IMAGES, TURNED, TWICE_AS_FINE, KernelHarness, inputs
 
 
 def of_gpu(*grid, oversample=1, dtype=np.float32):

@@ -1,6 +1,6 @@
-"""The scenes that kernels are tested with: those of the self-test, and others."""
+"""The scenes that kernels are tested with."""
 
-from lnocl.verify import harness
+import kernel_harness as harness
 
 FOUR_TIMES_AS_FINE = "sky four times as fine, exposure map, mu"
 SCENES = harness.SCENES | {

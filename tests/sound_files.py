@@ -14,7 +14,7 @@ from scenes import make_psfs
 from wcs_headers import PHYSICAL, SIP
 
 from lnocl import checkpoint
-from lnocl.io import fitsread, fitswrite, saved_results, sky
+from lnocl.io import fitsread, fitswrite, saved_results, sky, star_files
 from lnocl.io.calibration import Calibration
 from lnocl.io.frames import read_frames
 from lnocl.simulation import load_target
@@ -122,7 +122,7 @@ def read_observation(sound, damaged, name):
 
 
 def read_stars(sound, damaged, name):
-    sky.read_stars(damaged, fits.Header(SIP), "a.fits")
+    star_files.read_stars(damaged, fits.Header(SIP), "a.fits")
 
 
 def read_scene(sound, damaged, name):

@@ -13,11 +13,11 @@ import pytest
 from test_layers import MODULES, PACKAGE, imports
 
 # Lines of code of the package and of its core, rounded up to tens; less code lowers them.
-BUDGET = {"package": 24_000, "core": 11_060}
+BUDGET = {"package": 23_450, "core": 11_050}
 CORE = "scene", "engines", "opencl", "reference", "solvers", "runs"
 # What the core is not to know, nor the rooms round it.
 OUTSIDE = "astropy.io", "matplotlib", "dask", "distributed"
-ROOMS_OUTSIDE = {"io", "plotting", "commands", "detection", "psf", "simulation", "verify"}
+ROOMS_OUTSIDE = {"io", "plotting", "commands", "detection", "psf", "simulation"}
 ROOMS_OUTSIDE |= {"studies", "result"}
 SKIPPED = {
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE),

@@ -23,11 +23,11 @@ FLOORS = [
     {"deconvolution"},
     {"tiles"},
     {"__init__"},
-    {"verify", "studies"},
+    {"studies"},
     {"commands"},
     {"__main__"},
 ]
-KNOWS_OPENCL = {"opencl", "verify", "engines.opencl"}
+KNOWS_OPENCL = {"opencl", "engines.opencl"}
 PACKAGE = Path(lnocl.__file__).parent
 MODULES = sorted(
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in PACKAGE.glob("**/*.py")
@@ -90,5 +90,5 @@ def test_only_cameras_and_kernels_see_the_sky_through_a_response():
     sees = {
         m for m in MODULES if response.search((PACKAGE / f"{m.replace('.', '/')}.py").read_text())
     }
-    of_kernels = {m for m in sees if m.split(".")[0] in ("engines", "opencl", "verify")}
+    of_kernels = {m for m in sees if m.split(".")[0] in ("engines", "opencl")}
     assert sees - of_kernels == {"scene.camera", "scene.rotation", "scene.scene"}

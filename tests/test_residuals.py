@@ -249,7 +249,7 @@ def test_flat_parts_of_the_sky_take_no_memory_for_sharp_sources():
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("place", [(-9.0, 5.0), (4.0, 30.0), (-1.7, 3.0)])
 def test_a_star_beyond_the_sky_has_no_halo(place):
-    """Where images are turned they show more than the sky's frame; rings without pixels are none."""
+    """Turned images show more than the sky's frame; rings without pixels hold no light."""
     halo, light = _halo(np.ones((12, 14)), np.array(place), 2.5)
     assert halo == 0.0
     assert np.isfinite(light)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pyopencl as cl
+from kernel_harness import SpectraLayout
 from numpy.typing import NDArray
 
 from lnocl.opencl.launch import READ_WRITE, Launch, Launcher
-from lnocl.opencl.layout import Layout, reversed_order
+from lnocl.opencl.layout import reversed_order
 from lnocl.opencl.program import Program
 from lnocl.opencl.tuning import Tuning
 
@@ -35,7 +36,7 @@ class Transform:
         tuning: Tuning | None = None,
     ) -> None:
         self.program = Program(context, grid, np.dtype(dtype), tuning)
-        self.layout = Layout(self.program)
+        self.layout = SpectraLayout(self.program)
         self.launcher = Launcher(self.program)
         self._pixels = cl.Buffer(context, READ_WRITE, self.layout.pixels_bytes)
         self._spectra = cl.Buffer(context, READ_WRITE, self.layout.spectra_bytes)
@@ -91,7 +92,7 @@ class Transform:
         return self.layout.unpack_columns(packed)
 
 
-def half_spectrum(layout: Layout, columns: NDArray) -> NDArray[np.complex128]:
+def half_spectrum(layout: SpectraLayout, columns: NDArray) -> NDArray[np.complex128]:
     """Return the half spectrum (Ny, Nx // 2 + 1) of real pixels from their kept columns.
 
     Column 0 holds ``A + i B`` with A and B the Hermitian spectra of columns 0 and Nx / 2;
@@ -102,5 +103,5 @@ def half_spectrum(layout: Layout, columns: NDArray) -> NDArray[np.complex128]:
     spectrum = np.empty((ny, nx // 2 + 1), np.complex128)
     spectrum[:, 0] = (columns[:, 0] + opposite[:, 0]) / 2
     spectrum[:, -1] = (columns[:, 0] - opposite[:, 0]) / 2j
-    spectrum[:, layout._kept] = np.where(layout._conjugated, opposite[:, 1:], columns[:, 1:])
+    spectrum[:, layout.kept] = np.where(layout.conjugated, opposite[:, 1:], columns[:, 1:])
     return spectrum

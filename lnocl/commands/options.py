@@ -273,18 +273,20 @@ def star_places(
     Raises
     ------
     FileError, InputError
-        As `sky.to_pixels` and `sky.read_stars`; positions on the sky of an image without WCS.
+        As `sky.to_pixels` and `star_files.read_stars`; places on the sky for an image without WCS.
     """
     texts = [each for each in positions if isinstance(each, str)]
-    if texts or table:
-        from lnocl.io import sky
     found = iter(())
     if texts:
+        from lnocl.io import sky
+
         wcs = sky.celestial_wcs(header, image)
         found = iter(sky.to_pixels(sky.parse_sky(texts), wcs, image).tolist())
     places = [next(found) if isinstance(each, str) else each for each in positions]
     if table:
-        places += sky.read_stars(table, header, image).tolist()
+        from lnocl.io.star_files import read_stars
+
+        places += read_stars(table, header, image).tolist()
     return [(x, y) for x, y in places]
 
 

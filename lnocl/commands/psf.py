@@ -82,8 +82,9 @@ OPTIONS = [
         "--mask",
         metavar="FILE",
         checksum="MSUM",
-        help="FITS file of the frame's shape, not 0 where a pixel is bad; bad pixels are "
-        "interpolated, and so are those that are NaN in the frame",
+        help="FITS file of the frame's shape, not 0 where a pixel is bad, or dq or wht, extensions "
+        "of FRAME, as in lnocl deconvolve; bad pixels are interpolated, and so are those that are "
+        "NaN in the frame",
     ),
     SATURATION.but(help="pixels of this value and above, in the unit of the frame, are bad too"),
     option(
@@ -127,6 +128,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     from lnocl import psf
     from lnocl.io import fitsread
+    from lnocl.io.masks import mask_of
 
     sha256: dict[str, list[str]] = {}
     mask = None
@@ -135,7 +137,7 @@ def _run(arguments: argparse.Namespace) -> None:
         frame, sha256["frames"], background = stack.data[0], stack.sha256, arguments.background
         positions = _positions(arguments, stack.header)
         if arguments.mask is not None:
-            mask, sha256["mask"] = _read_mask(arguments.mask, arguments.frames[0], frame.shape)
+            mask, sha256["mask"] = mask_of(arguments.frames[0], arguments.mask)
         if len(arguments.frames) > 1:
             frame, positions, sha256["frames"] = _joined(arguments)
             background = 0.0
@@ -314,28 +316,6 @@ def _report(arguments: argparse.Namespace) -> None:
 def _squeezed(images: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return a cube, or the one image in it."""
     return np.array(images) if len(images) > 1 else images[0]
-
-
-def _read_mask(
-    path: str, frame_path: str, shape: tuple[int, ...]
-) -> tuple[NDArray[np.bool_], list[str]]:
-    """Return where a mask is not 0, NaN included, and the file's checksum in a list."""
-    from lnocl.io import fitsread
-
-    stack = fitsread.read_single(path)
-    values = stack.data[0]
-    if values.shape != shape:
-        raise InputError(
-            f"the mask {path} has the shape {values.shape} and {frame_path} {shape}; they must be "
-            "the same"
-        )
-    bad = values != 0
-    if bad.all():
-        raise InputError(
-            f"the mask {path} leaves no good pixel: it is 0 nowhere; give one that is 0 where the "
-            "frame is good"
-        )
-    return bad, stack.sha256
 
 
 def _lines(stars: Sequence[StarPsf], angles: Sequence[float]) -> list[str]:

@@ -6,13 +6,13 @@ import argparse
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lnocl.commands import messages, options, pictures
 from lnocl.commands.declared import SATURATION
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
-from lnocl.errors import InputError, counted
+from lnocl.errors import counted
+from lnocl.scene.arrays import Mask
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -90,28 +90,12 @@ def _run(arguments: argparse.Namespace) -> None:
         messages.say(lines)
 
 
-def _mask(arguments: argparse.Namespace) -> NDArray[np.bool_] | None:
+def _mask(arguments: argparse.Namespace) -> Mask | None:
     """Return which pixels are bad, by a file or an extension of the image; None without either."""
-    from lnocl.io import fitsread, flags, missions
+    from lnocl.io import fitsread, masks, missions
 
-    contents = fitsread.read_contents(arguments.image)
-    word = arguments.mask or missions.mask_word(contents)
-    if not word:
-        return None
-    extension, colon, good_bits = word.partition(":")
-    if extension not in ("dq", "wht"):
-        return fitsread.read_single(word).data[0] != 0
-    values = fitsread.read_extension(arguments.image, extension.upper())
-    if values is None:
-        raise InputError(
-            f"{arguments.image} has no extension {extension.upper()}; give `mask` as a file, or "
-            "leave it out"
-        )
-    if extension == "wht":
-        return values == 0
-    if not colon:
-        good_bits = flags.good_bits_of(*map(contents.value, ("TELESCOP", "INSTRUME", "DETECTOR")))
-    return flags.bad_pixels(values, good_bits, arguments.image)
+    word = arguments.mask or missions.mask_word(fitsread.read_contents(arguments.image))
+    return masks.mask_of(arguments.image, word)[0] if word else None
 
 
 def _told(stars: Table, n_extended: int, n_sharp: int) -> list[str]:

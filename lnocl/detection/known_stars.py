@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from functools import reduce
 from itertools import product
 from operator import add
@@ -66,6 +67,12 @@ class KnownStars:
             StarImages(everywhere, [[each] for each in cutouts], order) for cutouts in self._cutouts
         ]
 
+    def beside(self, model: Model) -> KnownStars:
+        """Return them with sources that are seen as another model has them."""
+        other = copy(self)
+        other._model = model
+        return other
+
     def _cutouts_in(self, j: int, moves: bool) -> list[Cutout]:
         """Return what the unknowns of each star add to an image, shape (1 or 3, h, w) each."""
         scene, found = self._scene, []
@@ -100,11 +107,11 @@ class KnownStars:
         if not n:
             return found
         gram, moments = self._gram(precisions), np.zeros((2, len(self._cutouts[0][0].values) * n))
-        for images, total, *each in zip(
-            self._images, self._model.sums, residuals, precisions, strict=True
+        for images, ones, residual, precision in zip(
+            self._images, self._model.of_ones, residuals, precisions, strict=True
         ):
-            score, flat = (images.products(values.ravel()).ravel() for values in each)
-            moments += score, total * flat
+            both = residual, precision * ones
+            moments += [images.products(values.ravel()).ravel() for values in both]
         common = [
             _wider(self._with_source(*divmod(k, n), precisions, half), width)
             for k in range(moments.shape[1])
@@ -164,7 +171,8 @@ class KnownStars:
         """Return the ring, so many pixels wide, round the star that lights each place most."""
         scene = self._scene
         brightest, ring = np.zeros(scene.grid), np.zeros(scene.grid, int)
-        for s, flux in enumerate(self._fluxes):
+        fluxes = self._fluxes * scene.transmitted(scene.stars).mean(axis=0)
+        for s, flux in enumerate(fluxes):
             cutout = scene.psf_on_sky(0, s)
             there = cutout.window(scene.grid)
             distance = _distance(cutout, on_sky(scene.stars[s], scene.oversample))

@@ -25,7 +25,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from copy import copy
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -58,6 +60,17 @@ SOME_LEVEL = 0.1
 LEFT, LEFT_BY_LEVEL, SEEN = 0.5, 0.2, 0.05
 # Width of rings round stars, resolutions.
 RING = 1.0
+# What the PSF of a place enters, and places alone.
+OF_PLACES = (
+    "values",
+    "score",
+    "information",
+    "variance",
+    "skewness",
+    "of_psfs",
+    "starlit",
+    "curvature",
+)
 
 
 class Score(NamedTuple):
@@ -180,7 +193,9 @@ class Null:
         self.stars = KnownStars(self._model, fluxes[: scene.n_stars], moves)
         self._starlight = list(self._model.starlight(fluxes))
         self._sky = estimate.extended
-        self.is_structured = np.zeros(scene.grid, bool)
+        self.is_structured = self._is_dark = np.zeros(scene.grid, bool)
+        if scene.transmission is not None:
+            self._is_dark = (scene.transmission == 0).all(axis=0)
         self.rings = self.stars.rings(RING * self.resolution)
         self._model_sky()
         self.is_structured = self._find_structure()
@@ -190,14 +205,15 @@ class Null:
     def _model_sky(self) -> None:
         """Model the sky by its level, and what is structured apart from it."""
         structured = self.is_structured
-        smooth = _level(self._sky, ~structured, SMOOTHED * self.resolution)
+        smooth = _level(self._sky, ~(structured | self._is_dark), SMOOTHED * self.resolution)
         structure = np.where(structured, np.maximum(self._sky - smooth, 0.0), 0.0)
         means, light = self._means(smooth), self._model.forward(structure)
         first = self._linearise(means, self._variances(smooth + structure), light)
         # The level as the counts have it: the estimate may hold less or more.
         excess = self._adjoint(first.residuals) - self._adjoint(first.apart)
         excess, response = map(self._mean_in_disc, (excess, self._flat_response(first)))
-        excess = np.divide(excess, response, out=np.zeros_like(excess), where=response > 0)
+        has_level = response > FAR * response.max()
+        excess = np.divide(excess, response, out=np.zeros_like(excess), where=has_level)
         level = np.maximum(smooth + self._mean_in_disc(excess, LARGER), self._one_count())
         self._linear = self._linearise(means, self._variances(level + structure), light)
         # Whether there is anything is asked of counts of the level alone.
@@ -215,7 +231,8 @@ class Null:
 
     def _one_count(self) -> float:
         """Return the level of one count in the disc, about the most where there are no counts."""
-        seen = float((self._model.sums / self.scene.areas).sum())
+        areas, seen_areas = self.scene.areas, self.scene.seen_areas
+        seen = float((self._model.sums / areas * (seen_areas / areas)).sum())
         return 1.0 / (self.scene.scale * seen * np.count_nonzero(self._disc(LARGER)))
 
     def _means(self, level: Array) -> list[Array]:
@@ -245,10 +262,16 @@ class Null:
         total = self._model.adjoint(images)
         return _blurred(total, width) if width else total
 
-    def _powers(self, images: Sequence[Array], power: int, width: float = 0.0) -> Iterator[Array]:
-        """Yield ``<P_jx^power, x_j>`` at each place x of the grid for each image x_j, 0 or more."""
+    def _powers(
+        self, images: Sequence[Array], power: int, width: float = 0.0, of_share: int | None = None
+    ) -> Iterator[Array]:
+        """Yield ``<P_jx^power, x_j>`` at each place x of the grid for each image x_j, 0 or more.
+
+        The transmission there is in it to the same power, or another.
+        """
+        of_share = power if of_share is None else of_share
         for j, (camera, image) in enumerate(zip(self._model.cameras, images, strict=True)):
-            yield camera.squares(image, self.kernel(j, width) ** power)
+            yield camera.squares(image, self.kernel(j, width) ** power, of_share)
 
     def _sum_of_powers(self, images: Sequence[Array], power: int, width: float = 0.0) -> Array:
         """Return ``sum_j <P_jx^power, x_j>`` at each place x, not below 0 by rounding."""
@@ -260,8 +283,8 @@ class Null:
         return _blurred(response, width) if width else response
 
     def _flat_response(self, linear: _Linear, width: float = 0.0) -> Array:
-        sums = self._model.sums
-        flat = [each * total for each, total in zip(linear.precisions, sums, strict=True)]
+        of_ones = self._model.of_ones
+        flat = [each * ones for each, ones in zip(linear.precisions, of_ones, strict=True)]
         return self._adjoint(flat, width=width)
 
     def _mean_in_disc(self, sky: Array, larger: float = 1.0) -> Array:
@@ -276,8 +299,45 @@ class Null:
     def score(self, width: float = 0.0) -> Score:
         """Return the score of a Gaussian source of this full width at half maximum, pixels.
 
-        A width of 0 is a point.
+        A width of 0 is a point. Where PSFs vary over the field it is that of the PSFs at each node
+        of the field, each with the share that it has of the PSF at a place.
         """
+        found = self._score_seen(width)
+        if not self.scene.observation.psf_fields:
+            return found
+        shares, parts = zip(
+            *((share, at._score_seen(width)) for share, at in self._at_nodes()), strict=True
+        )
+
+        def mixed(name: str) -> Array:
+            terms = zip(shares, (getattr(part, name) for part in parts), strict=True)
+            return np.asarray(sum(np.where(share, value, 0.0) * share for share, value in terms))
+
+        of_places: dict[str, Any] = {name: mixed(name) for name in OF_PLACES}
+        found = found._replace(**of_places)
+        return found._replace(is_tested=np.isfinite(found.variance))
+
+    def _at_nodes(self) -> Iterator[tuple[Array, Null]]:
+        """Yield the share of each node of the PSFs at each place, and the same null there."""
+        scene, observation = self.scene, self.scene.observation
+        q, fields = scene.oversample, observation.psf_fields
+        axes = []
+        for k, n in enumerate(scene.grid[::-1]):
+            nodes = np.unique(np.concatenate([field.nodes[k] for field in fields]))
+            places, ones = (np.arange(n) - (q - 1) / 2.0) / q, np.eye(len(nodes))
+            axes.append(
+                [(x, np.interp(places, nodes, one)) for x, one in zip(nodes, ones, strict=True)]
+            )
+        for (x, along), (y, down) in product(*axes):
+            share, place = np.outer(down, along), np.array([x, y])
+            if share.any():
+                at = copy(self)
+                psfs = [field.at(*observation.places(j, place)) for j, field in enumerate(fields)]
+                at._model = Model(scene.seen_through(np.array(psfs)))
+                at.stars = self.stars.beside(at._model)
+                yield share, at
+
+    def _score_seen(self, width: float) -> Score:
         found = self._score(self._linear, width)
         if not self.is_structured.any():
             return found
@@ -365,7 +425,7 @@ class Null:
             float(p.sum()) / max(float(w.sum()), 1.0) * w
             for p, w in zip(linear.precisions, self._model.weights, strict=True)
         ]
-        seen = self._sum_of_powers(depths, 2, width)
+        seen = np.asarray(sum(self._powers(depths, 2, width, of_share=1)))
         return np.asarray(seen > SEEN * seen.max())
 
     def _is_inside(self) -> NDArray[np.bool_]:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from lnocl.engines.needs import (
+    buffer_sizes,
+    cross_sizes,
+    has_background_map,
+    host_bytes,
+    scaling_sizes,
+)
 from lnocl.opencl.device import choose, context_of, describe, tell
 from lnocl.opencl.faults import guarded
 from lnocl.opencl.launch import Launch, Launcher
 from lnocl.opencl.layout import Layout
-from lnocl.opencl.memory import Memory, Transfer, announce, held_bytes, refuse_if_too_large
+from lnocl.opencl.memory import Memory, Transfer, announce, refuse_if_too_large
 from lnocl.opencl.program import Program
 from lnocl.opencl.transmitted import TransmittedSky
 from lnocl.opencl.tuning import Tuning, describe_tuning
@@ -33,10 +39,6 @@ ITERATIONS_AHEAD = 4
 FETCH_EVERY = 64
 # Share of the objective that single precision may round a step's fall by: 8e-7 and less were seen.
 ROUNDING = 3e-7
-# Bytes, half of those that PoCL's compiler takes in a first run: later ones find its kernels.
-COMPILER = 40 * 2**20
-# Estimates of both halves of the counts that are held (`lnocl.runs.halves`).
-SNAPSHOTS = 22
 
 
 @guarded
@@ -86,7 +88,7 @@ class OpenCLEngine:
         choice = choose(device)
         tell(choice)
         chosen = choice.device
-        self.name, self._device_type = describe(chosen), chosen.type
+        self.name = describe(chosen)
         self.scene, self.scaling = scene, scaling
         self.program = Program(
             context_of(chosen),
@@ -99,7 +101,7 @@ class OpenCLEngine:
             has_smoothing_map=scene.smoothing_map is not None,
             has_weights=scene.weights is not None,
             has_exposure_map=scene.has_exposure_map,
-            has_background_map=self._has_background_map,
+            has_background_map=has_background_map(scene),
             has_turns=bool(scene.rotations),
             min_model=MIN_MODEL,
         )
@@ -114,18 +116,25 @@ class OpenCLEngine:
             scene.shown,
         )
         self._cross = self._cross_windows()
-        sizes = self._sizes(n_iter)
+        sizes = buffer_sizes(scene, self.program, self.layout, self._stars, n_iter)
+        if self._turned:
+            sizes |= self._turned.sizes()
+        if scaling is not None:
+            sizes |= scaling_sizes(scene, self.program, self.layout, self._cross)
         self.bytes_needed = refuse_if_too_large(
             chosen,
             {**sizes, "scratch and roots": Launcher.bytes_needed(self.program)},
             1 if half is None else 2,
         )
-        tuned = describe_tuning(chosen, self.program.dtype, self.program.tuning)
-        if half is None:
-            announce(chosen, self.bytes_needed, self._host_bytes(), tuned)
-        elif half == 0:
-            host_bytes = self._host_bytes() + self._bytes_of_halves()
-            announce(chosen, 2 * self.bytes_needed, host_bytes, tuned)
+        if half != 1:
+            dtype, halves = self.program.dtype, half == 0
+            of_device = self.bytes_needed if chosen.type & cl.device_type.CPU else 0
+            announce(
+                chosen,
+                (1 + halves) * self.bytes_needed,
+                host_bytes(scene, scaling, of_device, dtype.itemsize, halves),
+                describe_tuning(chosen, dtype, self.program.tuning),
+            )
         self._launcher = Launcher(self.program)
         self._queue = self._launcher.queue
         self._memory = Memory(self._queue, self.layout, scene.scale)
@@ -146,98 +155,15 @@ class OpenCLEngine:
         return self._n_objectives > self._n_restored + 1
 
     @property
-    def _has_background_map(self) -> bool:
-        return self.scene.has_exposure_map or self.scene.observation.background.ndim == 3
-
-    @property
     def _observed_blocks(self) -> int:
         """Blocks of row pairs of the images' grid that hold rows of the images."""
         return -(-self.scene.observation.shape[0] // (2 * self.program.tuning.block))
-
-    def _host_bytes(self) -> int:
-        """Return about how many bytes the process takes on the host, besides the device's.
-
-        It holds most of them by now: libraries, the observation and the stars. To come are the
-        compiler and the answer, and at the end, when the device holds nothing more, the models
-        and residuals of an image; with a scaling, the factor of the information.
-        """
-        held, most = held_bytes()
-        of_device = self.bytes_needed if self._device_type & cl.device_type.CPU else 0
-        frame = math.prod(self.scene.grid) * np.dtype(np.float64).itemsize
-        to_come = COMPILER + max(2 * frame, 6 * frame - of_device)
-        if self._turned and self.scaling is None:  # else the host has made its model before
-            to_come += (self.scene.n_images + 2) * frame
-        if self.scaling is not None:
-            to_come += 2 * self.scaling.star_information.band.nbytes
-        return max(held + to_come, most - of_device)
-
-    def _bytes_of_halves(self) -> int:
-        """Return about how many bytes halves take on the host besides: counts and snapshots."""
-        counts = 2 * self.scene.observation.images.nbytes
-        return counts + 2 * SNAPSHOTS * math.prod(self.scene.grid) * self.program.dtype.itemsize
 
     def _cross_windows(self) -> StarWindows:
         cutouts = self.scaling.cross_information if self.scaling is not None else []
         return StarWindows(
             self.layout, [[covered_box([cutout], self.scene.grid)] for cutout in cutouts], 1
         )
-
-    def _sizes(self, n_iter: int) -> dict[str, int]:
-        """Return the bytes of each buffer, by the name that the kernels have for it."""
-        scene, program, layout = self.scene, self.program, self.layout
-        p, n, item = scene.n_images, scene.n_fluxes, program.dtype.itemsize
-        pixels, image, pair = layout.pixels_bytes, layout.images.pixels_bytes, 2 * item
-        sizes = {
-            "images": p * image,
-            "otfs": p * pixels,
-            "otf_edges": p * program.grid[0] * pair,
-            "spectra": p * layout.spectra_bytes,
-            "extended": pixels,
-            "inverse_weight": pixels if scene.weights is not None else item,
-            "background": p * (image if self._has_background_map else item),
-            "exposure": p * image if scene.has_exposure_map else item,
-            "star_images": max(p * self._stars.bytes, item),
-            "star_corners": max(n * p, 1) * 8,
-            "star_near": self._stars.near.nbytes,
-            "star_fluxes": max(n, 1) * item,
-            "star_weights": max(n, 1) * item,
-            "star_corrections": max(n, 1) * item,
-            "star_totals": max(n, 1) * pair,
-            "star_sums": max(p * self._stars.n_blocks_of_all, 1) * pair,
-            "ratio_sums": program.image_row_blocks * p * pair,
-            "data_term": pair,
-            "square_sums": program.row_blocks * pair,
-            "slope": pixels if scene.is_smoothed else item,
-            "curvature": pixels if scene.is_smoothed else item,
-            "smoothing_map": pixels if scene.smoothing_map is not None else item,
-            "smooth_sums": program.row_blocks * pair,
-            "objectives": (n_iter + 1) * pair,
-            "row_phases": item,
-            "transmission": p * pixels if scene.transmission is not None else item,
-            "transmitted": pixels if scene.transmission is not None else item,
-        }
-        if self._turned:
-            sizes |= self._turned.sizes()
-        if self.scaling is None:
-            return sizes
-        return {
-            **sizes,
-            "previous": pixels,
-            "gradient": pixels,
-            "shift": pixels,
-            "change_sums": program.row_blocks * 2 * pair,
-            "step_sums": program.row_blocks * pair,
-            **self._cross_sizes(),
-        }
-
-    def _cross_sizes(self) -> dict[str, int]:
-        item = self.program.dtype.itemsize
-        return {
-            "cross_information": max(self._cross.bytes, item),
-            "cross_corners": max(self.scene.n_fluxes, 1) * 8,
-            "cross_near": self._cross.near.nbytes,
-            "coupling_sums": max(self._cross.n_blocks_of_all, 1) * 2 * item,
-        }
 
     def _bind(self, name: str, **others: object) -> Launch:
         scene = self.scene
@@ -329,7 +255,7 @@ class OpenCLEngine:
         """Measure steps with this from now on."""
         self.scaling = scaling
         self._cross = self._cross_windows()
-        self._memory.allocate(**self._cross_sizes())
+        self._memory.allocate(**cross_sizes(self.scene, self.program, self._cross))
         self._upload_scaling(scaling)
 
     def _upload_scaling(self, scaling: Scaling) -> None:

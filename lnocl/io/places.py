@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -9,14 +10,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from astropy.io import fits
 
-from lnocl.errors import InputError, counted, note, warn
+from lnocl.errors import FileError, InputError, counted, note, warn
 from lnocl.io import sky
+from lnocl.io.fitsfile import open_fits, open_regular
 from lnocl.io.fitsread import Stack, keyword_number, read_keyword
 from lnocl.scene.arrays import Array
+from lnocl.scene.quantities import in_unit
 from lnocl.scene.transforms import rotations, scale_of
+from lnocl.scene.units import parse
 
 if TYPE_CHECKING:
     from lnocl.io.calibration import Calibration, Word
+
+# Most that is read of a file of angles.
+MAX_BYTES = 2**27
 
 
 class Places(NamedTuple):
@@ -89,7 +96,7 @@ def _field_rotation(
     words, (p, ny, nx) = calibration.angle, stack.data.shape
     sha256 = list[str]()
     if len(words) == 1 and isinstance(words[0], str) and os.path.isfile(words[0]):
-        angles, checksum = sky.read_angles(words[0])
+        angles, checksum = read_angles(words[0])
         sha256.append(checksum)
     else:
         if len(words) not in (1, p):
@@ -104,6 +111,41 @@ def _field_rotation(
     centre = calibration.centre or (nx // 2, ny // 2)
     # Field rotation turns north, and the sky with it, away from the y axis.
     return rotations(-angles, centre), sha256
+
+
+def read_angles(path: str) -> tuple[Array, str]:
+    """Return the angles in a file, one for each image, and its SHA-256 checksum.
+
+    Parameters
+    ----------
+    path : str
+        FITS, with an image of one dimension, in the angle of its BUNIT or else in degrees; or text
+        with a number a line.
+
+    Raises
+    ------
+    FileError
+        The file cannot be read, or holds something else.
+    """
+    try:
+        with open_regular(path) as stream:
+            content = stream.read(MAX_BYTES)
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path} cannot be read: {getattr(error, 'strerror', error)}") from error
+    if content.startswith(b"SIMPLE"):
+        with open_fits(path) as file:
+            images = [hdu for hdu in file.hdus() if len(getattr(hdu, "shape", ()) or ()) == 1]
+            values = np.array(images[0].data, np.float64) if images else np.zeros(0)
+            if unit := parse(str(images[0].header.get("BUNIT", ""))) if images else None:
+                values = in_unit("angle", values * unit, "deg")
+    else:
+        try:
+            values = np.array(content.decode("ascii").split(), np.float64)
+        except ValueError as error:
+            raise FileError(f"{path} must hold numbers alone, an angle a line") from error
+    if not (values.size and np.isfinite(values).all()):
+        raise FileError(f"{path} must hold a finite angle for each image")
+    return values, hashlib.sha256(content).hexdigest()
 
 
 def _angle(stack: Stack, paths: Sequence[str], j: int, word: Word) -> float:

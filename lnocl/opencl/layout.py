@@ -110,6 +110,9 @@ class Layout(PixelLayout):
     ----------
     images : PixelLayout
         Of the images.
+    kept, conjugated : ndarray, shape (Nx / 2 - 1,)
+        Which column of a half spectrum lies in each column but the first, and whether its
+        conjugate does.
 
     Notes
     -----
@@ -126,8 +129,8 @@ class Layout(PixelLayout):
         high_bit = 1 << np.frexp(column)[1] - 1
         shift = np.minimum(high_bit, nx // odd_part(nx) // 2)
         wavenumber = reversed_order(nx)[column + shift]
-        self._conjugated = wavenumber > nx // 2
-        self._kept = np.where(self._conjugated, nx - wavenumber, wavenumber)
+        self.conjugated = wavenumber > nx // 2
+        self.kept = np.where(self.conjugated, nx - wavenumber, wavenumber)
 
     @property
     def columns_shape(self) -> tuple[int, int, int, int]:
@@ -141,59 +144,12 @@ class Layout(PixelLayout):
         """Bytes of one array of spectra."""
         return int(np.prod(self.spectra_shape)) * self.dtype.itemsize
 
-    def pack_spectra(self, row_spectra: NDArray) -> NDArray:
-        """Return row spectra (rows, Nx // 2 + 1) in the kernels' order and precision.
-
-        Column 0 gets the real parts of columns 0 and Nx / 2, as row spectra of real pixels have
-        no others.
-        """
-        ny, nx = len(row_spectra), self.grid[1]
-        kept = np.empty((ny, nx // 2), np.complex128)
-        kept[:, 0] = row_spectra[:, 0].real + 1j * row_spectra[:, -1].real
-        kept[:, 1:] = row_spectra[:, self._kept]
-        kept[:, 1:][:, self._conjugated] = kept[:, 1:][:, self._conjugated].conj()
-        return self.pack_columns(kept)
-
-    def unpack_spectra(self, packed: NDArray, ny: int | None = None) -> NDArray[np.complex128]:
-        """Return the row spectra (ny, Nx // 2 + 1) of an array in the kernels' order."""
-        ny, nx = ny or self.grid[0], self.grid[1]
-        kept = self.unpack_columns(packed, ny)
-        row_spectra = np.empty((ny, nx // 2 + 1), np.complex128)
-        row_spectra[:, 0], row_spectra[:, -1] = kept[:, 0].real, kept[:, 0].imag
-        columns = kept[:, 1:]
-        row_spectra[:, self._kept] = np.where(self._conjugated, columns.conj(), columns)
-        return row_spectra
-
-    def columns_of(self, spectrum: NDArray) -> NDArray[np.complex128]:
-        """Return the columns (Ny, Nx / 2) that are kept of a half spectrum of real pixels."""
-        ny, nx = self.grid
-        columns = np.empty((ny, nx // 2), np.complex128)
-        columns[:, 0] = spectrum[:, 0] + 1j * spectrum[:, -1]
-        kept = spectrum[:, self._kept]
-        columns[:, 1:] = np.where(self._conjugated, kept[-np.arange(ny)].conj(), kept)
-        return columns
-
     def pack_phases(self, rotation: Rotation) -> NDArray:
         """Return the phases of the first shear of an image, as `convolve_columns` has them."""
         nx, block = self.grid[1], self.spectra_shape[-1]
-        kept = np.append(nx // 2, self._kept)  # column 0 takes the phase of Nx / 2
-        signs = np.append(1.0, np.where(self._conjugated, -1.0, 1.0))
+        kept = np.append(nx // 2, self.kept)  # column 0 takes the phase of Nx / 2
+        signs = np.append(1.0, np.where(self.conjugated, -1.0, 1.0))
         frequency = signs * np.fft.rfftfreq(nx)[kept]
         phases = np.concatenate(rotation.phase_tables(frequency))
         blocks = phases.reshape(len(phases), -1, block).transpose(1, 0, 2)
         return np.stack([blocks.real, blocks.imag], axis=2).astype(self.dtype)
-
-    def pack_columns(self, columns: NDArray) -> NDArray:
-        """Return complex columns (rows, Nx / 2) in the kernels' order, as they are."""
-        column_blocks, _, _, block = self.spectra_shape
-        ny = len(columns)
-        packed = np.zeros(self.spectra_shape, self.dtype)
-        blocks = columns.reshape(ny, column_blocks, block).transpose(1, 0, 2)
-        packed[:, :ny, 0], packed[:, :ny, 1] = blocks.real, blocks.imag
-        return packed
-
-    def unpack_columns(self, packed: NDArray, ny: int | None = None) -> NDArray[np.complex128]:
-        """Return the complex columns (ny, Nx / 2) of an array in the kernels' order."""
-        ny, nx = ny or self.grid[0], self.grid[1]
-        parts = packed[:, :ny].astype(np.float64)
-        return (parts[:, :, 0] + 1j * parts[:, :, 1]).transpose(1, 0, 2).reshape(ny, nx // 2)

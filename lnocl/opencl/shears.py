@@ -51,12 +51,5 @@ class Shears:
 
     def lay(self, image: NDArray) -> Array:
         """Return an image on the grid with its rows rotated."""
-        return self._rolled(image, -1)
-
-    def take_up(self, image: NDArray) -> Array:
-        """Return the inverse of `lay`."""
-        return self._rolled(image, 1)
-
-    def _rolled(self, image: NDArray, sign: int) -> Array:
-        columns = np.arange(image.shape[-1]) + sign * self.roll[:, None]
-        return np.asarray(image[..., np.arange(len(columns))[:, None], columns % image.shape[-1]])
+        columns = (np.arange(image.shape[-1]) - self.roll[:, None]) % image.shape[-1]
+        return np.asarray(image[..., np.arange(len(columns))[:, None], columns])

@@ -193,7 +193,7 @@ class Camera(LinearMap):
         """Return what the image has of a point at the origin, shape (Ny, Nx)."""
         return self._scene.point_response(self._j)
 
-    def squares(self, image: Array, elements: Array | None = None) -> Array:
+    def squares(self, image: Array, elements: Array | None = None, power: int = 2) -> Array:
         """Return ``(A_j^2)^T x``, with the squares of the elements of A_j, for x not below 0.
 
         Shears and their weights are made for what pixels hold, and would ring: pixels of an image
@@ -205,11 +205,13 @@ class Camera(LinearMap):
             x.
         elements : ndarray of float64, shape (Ny, Nx), optional
             What to take instead of the squares of `point`.
+        power : int, optional
+            That of the transmission, beside such elements.
         """
         elements = self.point() ** 2 if elements is None else elements
         spectra = (self._transform(each, ...) for each in (self._shared_out(image), elements))
         back = self._pixels(next(spectra) * next(spectra).conj())
-        return back if self.transmission is None else self.transmission**2 * back
+        return back if self.transmission is None else self.transmission**power * back
 
     def _shared_out(self, image: Array) -> Array:
         """Return the pixels of an image where they lie on the sky's grid."""

@@ -117,6 +117,11 @@ class PsfField:
         cell = self._psfs[j : j + len(v), i : i + len(u)]
         return np.asarray(np.tensordot(weights, cell, axes=2))
 
+    @property
+    def nodes(self) -> tuple[Array, Array]:
+        """The x of its columns and the y of its rows, ascending."""
+        return self._x, self._y
+
     def numbers(self) -> Array:
         """Return all numbers that it holds, for a checksum."""
         return np.concatenate([self._psfs.ravel(), self._x, self._y])

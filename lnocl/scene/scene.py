@@ -163,9 +163,7 @@ class Scene:
         self.gains = np.ones(self.n_images) if has_map else relative
         self._psfs = movable_psfs(self.scaled_psfs(), observation, self.image_grid)
         self.areas = (self.oversample * observation.scales) ** 2
-        rows, columns = map(range, self.image_grid)
-        shares = observation.transmission_of(rows, columns)
-        self.transmission = shares if len(shares) else None
+        self.transmission = self._transmission()
         self.seen_areas = self.areas.copy()
         if self.transmission is not None:
             self.seen_areas *= observation.transmission.mean(axis=(1, 2))
@@ -202,6 +200,14 @@ class Scene:
             Rotation(angles[j], shift, self.grid, observation.good_box(j), scales[j])
             for j, shift in enumerate(observation.offsets)
         ]
+
+    def _transmission(self) -> Array | None:
+        given = self.observation.transmission
+        if not len(given):
+            return None
+        rows, columns = map(_nearest, self.grid, given.shape[1:])
+        each = given if given.strides[0] else given[:1]
+        return np.broadcast_to(each[:, rows[:, None], columns], (self.n_images, *self.grid))
 
     def transmitted(self, positions: Array) -> Array:
         """Return the share of the light of points, (n, 2), that each image gets; shape (p, n)."""
@@ -595,3 +601,9 @@ class Scene:
 
     def _on_grid(self, array: NDArray, fill: float = 0.0) -> NDArray:
         return enlarged(array, self.image_grid, fill)
+
+
+def _nearest(n: int, k: int) -> NDArray[np.int_]:
+    """Return which of the first k of n pixels is nearest to each, round the end."""
+    at = np.arange(n)
+    return np.where(at < (n + k + 1) // 2, np.minimum(at, k - 1), 0)

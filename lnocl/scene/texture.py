@@ -161,7 +161,7 @@ def _depths(scene: Scene) -> Array:
         counts = image[~mask]
         if counts.size:
             variance = float(np.median(counts)) or max(float(counts.mean()), 1.0 / counts.size)
-            each = float(exposures[j][~mask].mean()) * scene.areas[j]
+            each = float(exposures[j][~mask].mean()) * scene.seen_areas[j]
             depths[j] = counts.size * each**2 / variance
     return depths / depths.sum()
 

@@ -1,1 +1,1 @@
-"""The demo, the benchmark of speed against accuracy, and pictures of files."""
+"""The demo, the benchmark of speed against accuracy, the self-test, and pictures of files."""

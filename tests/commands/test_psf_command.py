@@ -438,10 +438,9 @@ REFUSED = {
     "mask missing": ({}, ["--mask", "no.fits"], 1, "no.fits cannot be opened"),
     "mask shape": (
         {}, ["--mask", "oblong.fits"], 2,
-        "the mask oblong.fits has the shape (70, 61) and star.fits (61, 70); they must be the same",
+        "--mask oblong.fits has the shape (70, 61) and its image (61, 70); give one that fits",
     ),
-    "masks": ({}, ["--mask", "masks.fits"], 2, "masks.fits holds 2 images; give a file with one"),
-    "mask of all": ({}, ["--mask", "none.fits"], 2, "the mask none.fits leaves no good pixel"),
+    "masks": ({}, ["--mask", "masks.fits"], 2, "--mask masks.fits has the shape (2, 61, 70)"),
     "saturation": ({}, ["--saturation", "-1"], 2, "--saturation must be positive; -1 was given"),
     "saturation nan": ({}, ["--saturation", "nan"], 2, "'nan' is not a finite number"),
     "background": ({}, ["--background", "sky"], 2, "--background is 'sky'; give a number or"),

@@ -124,7 +124,7 @@ def test_where_there_is_no_star_it_says_what_to_do(capsys):
         (["image.fits", "-o", "there.csv"], 1, "the output there.csv exists"),
         (["no.fits", "-o", "a.csv"], 1, "no.fits cannot be opened"),
         (["image.fits", "-o", "a.csv", "--threshold", "0"], 2, "--threshold must be more than 0"),
-        (["image.fits", "-o", "a.csv", "--mask", "psf.fits"], 2, "--mask has shape"),
+        (["image.fits", "-o", "a.csv", "--mask", "psf.fits"], 2, "--mask psf.fits has the shape"),
         (["image.fits", "-o", "a.csv", "--plot", "a.jpg"], 2, "a name ending in .png"),
         (["cube.fits", "-o", "a.csv"], 2, "cube.fits holds 2 images"),
     ],

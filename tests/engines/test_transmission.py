@@ -36,8 +36,10 @@ def shares():
 def split_gradient(n_iter, given):
     """Return extended source and star fluxes of the paper's iteration on the matrix."""
     maps = turned_scenes.transforms()
-    beyond = [(0, 0), *((0, n - k) for n, k in zip(GRID, (NY, NX), strict=True))]
-    dimmed = np.pad(shares(), beyond, mode="edge").reshape(3, 1, -1)
+    before = [(n - k) // 2 for n, k in zip(GRID, (NY, NX), strict=True)]
+    beyond = [(0, 0), *((m, n - k - m) for n, k, m in zip(GRID, (NY, NX), before, strict=True))]
+    dimmed = np.roll(np.pad(shares(), beyond, mode="edge"), np.negative(before), (1, 2))
+    dimmed = dimmed.reshape(3, 1, -1)
     sky = turned_scenes.matrix(maps).reshape(3, NY * NX, -1) * dimmed
     stars = turned_scenes.star_columns(maps).reshape(3, NY * NX, 2)
     stars = stars * np.array([share(j, *STARS.T) for j in range(3)])[:, None]
@@ -118,11 +120,13 @@ def test_a_window_has_its_part_of_the_transmission():
     assert fine.window(range(2, 6), range(0, 8)).transmission.shape == (1, 8, 16)
 
 
-def test_what_knows_no_transmission_is_refused():
-    level = lnocl.Observation(np.ones((16, 16)), np.ones((3, 3)), transmission=np.ones((16, 16)))
-    result = paper(level, n_iter=2, engine="numpy")
-    with pytest.raises(lnocl.InputError, match="sources are not tested behind a transmission"):
-        result.significance()
+def test_beyond_each_edge_a_transmission_is_that_of_the_edge():
+    """What lies left of the frame is at the end of the grid."""
+    shares = np.indices((32, 32))[1] / 32.0
+    given = lnocl.Observation(np.ones((32, 32)), np.ones((3, 3)), transmission=shares)
+    found = Scene(given, (), pad=9).transmission[0]
+    np.testing.assert_array_equal(found[:, [-1, -4]], 0.0)
+    np.testing.assert_array_equal(found[:, 32:36], 31 / 32)
 
 
 def test_one_map_serves_all_images_and_takes_no_more_memory():

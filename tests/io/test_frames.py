@@ -400,8 +400,8 @@ class TestMask:
             "2.fits: the image is HDU 1 (SCI)",
             "image 0: 1 pixel masked by the mask",
             "image 1: 1 pixel masked by the mask",
-            "1.fits: 1 pixel has the flag 4 of DQ",
-            "2.fits: 1 pixel has the flag 4096 of DQ",
+            "1.fits: 1 pixel with the flag 4 of DQ",
+            "2.fits: 1 pixel with the flag 4096 of DQ",
             "image 0: 0 pixels masked by the extension DQ",
             "image 1: 1 pixel masked by the extension DQ",
         ]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from wcs_headers import PLAIN, SIP_TERMS
 
 from lnocl.errors import FileError, InputError, LnoclWarning
-from lnocl.io import sky
+from lnocl.io import places, sky, star_files
 from lnocl.io.headers import make_wcs
 
 SHAPE = (16, 12)
@@ -183,7 +183,7 @@ ICRS = WCS(header()).pixel_to_world(*POSITIONS.T)
 
 
 def stars(path, given=None):
-    return sky.read_stars(path, header() if given is None else given, "a.fits")
+    return star_files.read_stars(path, header() if given is None else given, "a.fits")
 
 
 def save(path, text):
@@ -430,7 +430,7 @@ def test_angles_of_a_file_are_in_its_unit(tmp_path):
     path = str(tmp_path / "angles.fits")
     for unit, expected in (("rad", np.degrees([0.5, -1.0])), ("deg", [0.5, -1.0])):
         fits.writeto(path, np.array([0.5, -1.0]), fits.Header({"BUNIT": unit}), overwrite=True)
-        np.testing.assert_allclose(sky.read_angles(path)[0], expected, rtol=1e-14)
+        np.testing.assert_allclose(places.read_angles(path)[0], expected, rtol=1e-14)
     fits.writeto(path, np.array([0.5, -1.0]), fits.Header({"BUNIT": "pix"}), overwrite=True)
     with pytest.raises(InputError, match="angle must be in degrees, not in pix"):
-        sky.read_angles(path)
+        places.read_angles(path)

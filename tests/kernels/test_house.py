@@ -6,10 +6,10 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from kernel_cases import FOLDER, harness_of, kernels_in
+from kernel_comparison import KERNELS
 
 from lnocl import reference
 from lnocl.errors import DeviceError
-from lnocl.verify.comparison import KERNELS
 
 FILES = sorted(path.stem for path in FOLDER.glob("*.cl") if kernels_in(path.name))
 

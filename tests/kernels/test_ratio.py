@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from kernel_cases import agree_with_twins, harness_of, in_each_precision
+from kernel_harness import rounded
 
 from lnocl import reference
 from lnocl.opencl.windows import stars_near
 from lnocl.scene.scene import MIN_MODEL
-from lnocl.verify.harness import rounded
 
 test_kernels_agree_with_their_twins = agree_with_twins("ratio.cl")
 

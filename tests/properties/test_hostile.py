@@ -27,7 +27,7 @@ from sound_files import (
 from wcs_headers import SIP
 
 from lnocl.errors import FileError, InputError, LnoclWarning
-from lnocl.io import fitsread, fitswrite, packed, saved_results, sky
+from lnocl.io import fitsread, fitswrite, packed, saved_results, sky, star_files
 from lnocl.process import ignored_warnings
 
 BLOCK = 2880
@@ -129,11 +129,11 @@ def rows_in_fits():
     lambda: b"x,y\n1,2" + b" " * 2**23,
 ], ids=["lines", "of old Macs", "FITS", "one line"])  # fmt: skip
 def test_a_table_of_stars_does_not_unpack_without_end(tmp_path, monkeypatch, make):
-    monkeypatch.setattr(sky, "MAX_MEBIBYTES", 8)
+    monkeypatch.setattr(star_files, "MAX_MEBIBYTES", 8)
     path = tmp_path / "stars.csv.gz"
     path.write_bytes(gzip.compress(make(), 1))
     with pytest.raises(FileError) as caught:
-        sky.read_stars(str(path), fits.Header(SIP), "a.fits")
+        star_files.read_stars(str(path), fits.Header(SIP), "a.fits")
     assert str(caught.value) == (
         f"{path} is too large for a table of stars: at most 1000000 rows and, but for FITS, 8 "
         "MiB are read; cut it to the stars of the image"
@@ -217,7 +217,7 @@ def test_no_table_has_another_file_read(tmp_path, monkeypatch):
     start, end = text.index("<STREAM"), text.index("</STREAM>")
     path.write_text(f"{text[:start]}<STREAM href='file:///etc/passwd'>{text[end:]}")
     with pytest.raises(FileError, match=r"has its rows elsewhere, at file:///etc/passwd; give"):
-        sky.read_stars(str(path), fits.Header(), "a.fits")
+        star_files.read_stars(str(path), fits.Header(), "a.fits")
 
 
 def test_damage_to_a_compressed_file_beyond_the_image_is_seen(sound, tmp_path):

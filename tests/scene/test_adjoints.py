@@ -8,19 +8,21 @@ from functools import cache
 
 import numpy as np
 import pytest
+import scipy.ndimage
 import turned_scenes
 from scenes import make_psfs, make_smooth_psfs
 
 import lnocl
-from lnocl.scene.camera import Camera
+from lnocl.scene.camera import Camera, sampled
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
+from lnocl.scene.psf_families import spectrum
 from lnocl.scene.psf_pixels import PsfPixels
 from lnocl.scene.scene import Scene
 from lnocl.scene.view import View
 from lnocl.solvers import near_star
 from lnocl.solvers.near_star import NearStar, Surroundings
-from lnocl.solvers.psf_fit import _PixelErrors
+from lnocl.solvers.psf_fit import _PixelErrors, _sky
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:the images are shifted"),
@@ -201,6 +203,18 @@ def test_a_window_of_a_camera(kind, place):
             assert abs(window.forward(x) - expected).max() <= allowed * abs(expected).max()
 
 
+def test_windows_of_one_camera_that_end_alike():
+    """Which hold as much of the PSF, up to the same lag, but from another one on."""
+    camera, (rows, columns) = Camera(a_scene("apart"), 1), (range(2, 18), range(5, 21))
+    sky = np.zeros(camera.grid)
+    sky[np.ix_(rows, columns)] = x = abs(noise(16, 16))
+    whole = camera.forward(sky)
+    for first in (3, 4):
+        seen = range(first, 14), range(first + 3, 17)
+        found = camera.window(seen, (rows, columns)).forward(x)
+        np.testing.assert_allclose(found, whole[np.ix_(*seen)], rtol=1e-12)
+
+
 @every_kind
 def test_the_sky_round_a_star(kind, monkeypatch):
     """Its adjoint, and its images against those of the whole sky."""
@@ -240,3 +254,21 @@ def test_errors_of_the_pixels_of_psfs(kind):
     errors = _PixelErrors(Model(scene), pixels, sky, np.array([40.0, 7.0]), np.zeros(psfs.shape))
     x, y = noise(*psfs.shape), noise(P, *scene.image_grid, seed=4)
     assert_adjoint(lambda x: list(errors.forward(x)), errors.adjoint, x, y)
+
+
+@pytest.mark.parametrize(
+    ("kind", "allowed"),
+    [("moved", 3e-3), ("finer", 2e-4), ("dimmed, finer", 2e-4), ("turned", 2e-2)],
+)
+def test_what_the_psfs_of_a_fit_are_convolved_with(kind, allowed):
+    """Through the PSFs as they were given it is the model, but for how these are shifted."""
+    scene = a_scene(kind)
+    model, fluxes = Model(scene), np.array([400.0, 70.0])
+    sky = scipy.ndimage.gaussian_filter(abs(noise(*scene.grid, seed=5)), 2.0, mode="wrap")
+    models = Estimate.of_scaled(scene, sky, fluxes).models()
+    for j, (image, background) in enumerate(zip(models, model.background, strict=True)):
+        otf = spectrum(scene.observation.psfs[j], scene.grid)
+        found = np.fft.irfft2(otf * _sky(model, j, sky, fluxes), scene.grid)
+        expected = image - background
+        difference = abs(sampled(found, scene.oversample) - expected)
+        assert difference.max() <= allowed * expected.max()

@@ -13,12 +13,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from kernel_cases import of_gpu
+from kernel_harness import THREE_IMAGES, TURNED
 from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
 
 from lnocl.opencl import program
 from lnocl.opencl.device import choose, context_of
 from lnocl.opencl.sources import source
-from lnocl.verify.harness import THREE_IMAGES, TURNED
 
 pytestmark = [pytest.mark.system]
 

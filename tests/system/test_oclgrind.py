@@ -18,10 +18,9 @@ import tempfile
 from pathlib import Path
 
 import grind
+import kernel_comparison as comparison
 import pytest
 from kernel_scenes import SCENES
-
-from lnocl.verify import comparison
 
 HERE = Path(__file__).parents[1]
 DEFINITION = re.compile(r"\b(?:KERNEL|(?:__)?kernel)\s+void\s+(\w+)")

@@ -62,6 +62,57 @@ SCENES: dict[str, dict[str, Any]] = {
 CANARY = np.frombuffer(b"\xa5" * 64, np.uint8)
 
 
+class SpectraLayout(Layout):
+    """Converts spectra too between their natural order and that of the kernels."""
+
+    def pack_spectra(self, row_spectra: NDArray) -> NDArray:
+        """Return row spectra (rows, Nx // 2 + 1) in the kernels' order and precision.
+
+        Column 0 gets the real parts of columns 0 and Nx / 2, as row spectra of real pixels have
+        no others.
+        """
+        ny, nx = len(row_spectra), self.grid[1]
+        kept = np.empty((ny, nx // 2), np.complex128)
+        kept[:, 0] = row_spectra[:, 0].real + 1j * row_spectra[:, -1].real
+        kept[:, 1:] = row_spectra[:, self.kept]
+        kept[:, 1:][:, self.conjugated] = kept[:, 1:][:, self.conjugated].conj()
+        return self.pack_columns(kept)
+
+    def unpack_spectra(self, packed: NDArray, ny: int | None = None) -> NDArray[np.complex128]:
+        """Return the row spectra (ny, Nx // 2 + 1) of an array in the kernels' order."""
+        ny, nx = ny or self.grid[0], self.grid[1]
+        kept = self.unpack_columns(packed, ny)
+        row_spectra = np.empty((ny, nx // 2 + 1), np.complex128)
+        row_spectra[:, 0], row_spectra[:, -1] = kept[:, 0].real, kept[:, 0].imag
+        columns = kept[:, 1:]
+        row_spectra[:, self.kept] = np.where(self.conjugated, columns.conj(), columns)
+        return row_spectra
+
+    def columns_of(self, spectrum: NDArray) -> NDArray[np.complex128]:
+        """Return the columns (Ny, Nx / 2) that are kept of a half spectrum of real pixels."""
+        ny, nx = self.grid
+        columns = np.empty((ny, nx // 2), np.complex128)
+        columns[:, 0] = spectrum[:, 0] + 1j * spectrum[:, -1]
+        kept = spectrum[:, self.kept]
+        columns[:, 1:] = np.where(self.conjugated, kept[-np.arange(ny)].conj(), kept)
+        return columns
+
+    def pack_columns(self, columns: NDArray) -> NDArray:
+        """Return complex columns (rows, Nx / 2) in the kernels' order, as they are."""
+        column_blocks, _, _, block = self.spectra_shape
+        ny = len(columns)
+        packed = np.zeros(self.spectra_shape, self.dtype)
+        blocks = columns.reshape(ny, column_blocks, block).transpose(1, 0, 2)
+        packed[:, :ny, 0], packed[:, :ny, 1] = blocks.real, blocks.imag
+        return packed
+
+    def unpack_columns(self, packed: NDArray, ny: int | None = None) -> NDArray[np.complex128]:
+        """Return the complex columns (ny, Nx / 2) of an array in the kernels' order."""
+        ny, nx = ny or self.grid[0], self.grid[1]
+        parts = packed[:, :ny].astype(np.float64)
+        return (parts[:, :, 0] + 1j * parts[:, :, 1]).transpose(1, 0, 2).reshape(ny, nx // 2)
+
+
 class Windows:
     """The windows of stars: see kernels/stars.cl.
 
@@ -125,7 +176,7 @@ class KernelHarness:
         self.n_images, self.n_stars = scene.get("n_images", 1), scene.get("n_stars", 0)
         parts = {name: has for name, has in scene.items() if name not in ("n_images", "n_stars")}
         self.program = Program(context, grid, np.dtype(dtype), tuning, min_model=MIN_MODEL, **parts)
-        self.layout, self.launcher = Layout(self.program), Launcher(self.program)
+        self.layout, self.launcher = SpectraLayout(self.program), Launcher(self.program)
         self.dtype, self.grid, self.scene = self.program.dtype, grid, scene
         self.image_grid = self.program.image_grid
         self._buffers: list[cl.Buffer] = []
@@ -303,7 +354,7 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         star_weights=own(rng.uniform(1.0, 2.0, n)),
         star_corrections=own(rng.uniform(0.9, 1.1, n)),
         extended=own(rng.random((1, ny, nx))),
-        correction_spectra=own(np.fft.rfft(rng.uniform(-0.1, 2.0, (1, ny, nx)), axis=-1) / nx),
+        correction_spectra=own(np.fft.rfft(rng.uniform(-4.0, 8.0, (1, ny, nx)), axis=-1) / nx),
         inverse_weight=(
             own(np.where(rng.random((1, ny, nx)) > 0.2, rng.random((1, ny, nx)), 0.0))
             if has_weights

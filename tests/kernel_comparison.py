@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
+from kernel_harness import KernelHarness, Windows, rounded
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl import reference
 from lnocl.errors import DeviceError
 from lnocl.opencl.layout import reversed_order
-from lnocl.verify.harness import KernelHarness, Windows, rounded
+from lnocl.opencl.shears import Shears
 
 # What a kernel made, and what its twin made of the same.
 Pairs = Iterator[tuple[NDArray, NDArray]]
@@ -32,7 +33,7 @@ ALLOWED = {np.float32: 1e-6, np.float64: 3.7e-15}
 
 
 def kernels_of(scene: Mapping[str, Any]) -> list[str]:
-    """Return the kernels that a program for a scene has, one of `lnocl.verify.harness.SCENES`."""
+    """Return the kernels that a program for a scene has, one of `kernel_harness.SCENES`."""
     parts = {"smooth": "has_smoothing", **dict.fromkeys(SHEARED, "has_turns")}
     return [name for name in KERNELS if name not in parts or scene.get(parts[name])]
 
@@ -45,7 +46,7 @@ def deviation(harness: KernelHarness, given: SimpleNamespace, kernel: str) -> fl
     harness : KernelHarness
         With the kernels and the device.
     given : SimpleNamespace
-        What `lnocl.verify.harness.inputs` returned for it.
+        What `kernel_harness.inputs` returned for it.
     kernel : str
         One of `KERNELS`.
 
@@ -284,11 +285,17 @@ def _put_columns(harness: KernelHarness, given: SimpleNamespace) -> dict[str, cl
     }
 
 
+def _taken_up(shears: Shears, image: NDArray) -> NDArray:
+    """Return an image whose rows lie rotated as it is: the inverse of `Shears.lay`."""
+    columns = (np.arange(image.shape[-1]) + shears.roll[:, None]) % image.shape[-1]
+    return image[..., np.arange(len(columns))[:, None], columns]
+
+
 def _run_ratio_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     # Those of the kernel lie with their rows rotated, so the twin has them turned back.
     lying = {"images": given.images, "weights": given.weights, "background": given.background}
     own = {
-        name: np.array([s.take_up(each) for s, each in zip(given.shears, arrays, strict=True)])
+        name: np.array([_taken_up(s, each) for s, each in zip(given.shears, arrays, strict=True)])
         for name, arrays in {**lying, "stars": given.star_images.swapaxes(0, 1)}.items()
     }
     back, objective, star_sums = _twin(

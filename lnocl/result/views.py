@@ -1,0 +1,43 @@
+"""What the picture of a result shows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lnocl.plotting.light_curves import light_curves
+from lnocl.plotting.result import ResultView
+from lnocl.runs.outcome import mean_over_epochs
+
+if TYPE_CHECKING:
+    from lnocl.result import Result
+
+
+def view_of(result: Result) -> ResultView:
+    """Return the arrays and texts of the picture of a result."""
+    observation = result._observation
+    models = result.models()
+    return ResultView(
+        extended=result.extended,
+        # Once each, whatever epochs there are.
+        stars=[(x, y) for x, y in result.star_positions[:: observation.n_epochs].tolist()],
+        star_fluxes=mean_over_epochs(result.star_fluxes, observation.n_epochs),
+        n_iter=result.n_iter,
+        history={name: result.history[name] for name in result.history.dtype.names or ()},
+        held_out={name: result.held_out[name] for name in result.held_out.dtype.names or ()},
+        images=observation.as_given(np.where(observation.mask, np.nan, observation.images)),
+        models=models,
+        residuals=result._residuals(models),
+        offsets=observation.transforms[:, :, 2],
+        turns=observation.transforms[:, :, :2] if observation.is_mapped else None,
+        doubtful=None if result.psf_refinement is None else result.doubtful,
+        unit=result._unit,
+        oversample=observation.oversample,
+        light_curves=light_curves(
+            result.star_fluxes,
+            result.star_flux_errors,
+            np.tile(np.arange(observation.n_epochs), len(result.star_fluxes)),
+            result._unit,
+        ),
+    )
