@@ -9,6 +9,8 @@
   3 x 3 grid of PSFs, and one PSF for all; errors, jumps across seams, seconds in turn.
 - ``whole``: tiles beside the whole, 2048 x 2048, one PSF, for solvers and numbers of iterations.
 - ``frame``: 8192 x 8192 in tiles: device memory and seconds.
+- ``kinds``: tiles beside the whole, 192 x 192, for shifted and turned images, larger pixels, epochs
+  and a transmission; both against the sky and the stars that were simulated.
 """
 
 import argparse
@@ -277,7 +279,121 @@ def frame():
         )
 
 
-PARTS = {each.__name__: each for each in (operators, field, whole, frame)}
+def gaussian(dx, dy, covariance):
+    """Return a Gaussian of unit flux at these distances from its middle."""
+    (a, b), (_, c) = np.linalg.inv(covariance)
+    exponent = a * dx**2 + 2 * b * dx * dy + c * dy**2
+    return np.exp(-0.5 * exponent) / (2 * np.pi * np.sqrt(np.linalg.det(covariance)))
+
+
+def lopsided(dx, dy, covariance):
+    """Return a Gaussian with a ghost beside it."""
+    ghost = gaussian(dx - 1.4, dy + 0.9, covariance)
+    return 0.75 * gaussian(dx, dy, covariance) + 0.25 * ghost
+
+
+SIZE = 192
+PSF_COVARIANCES = [[[1.8, 0.4], [0.4, 1.2]], [[1.3, 0], [0, 1.7]], [[1.4, -0.3], [-0.3, 1.5]]]
+TURNED = lnocl.rotations([0.0, 17.0, -75.0], (96.0, 90.0))
+SCALED = np.concatenate([TURNED[:2], [[[0.6, 0.1, -6.0], [-0.1, 0.6, 36.0]]]])
+KINDS = {
+    "as they are": {},
+    "shifted by up to 23 pixels": {"offsets": [(0, 0), (14.4, -23.3), (-20.0, 9.5)]},
+    "turned by 0, 17 and -75 degrees": {"transforms": TURNED},
+    "turned, and pixels 1.64 as large": {"transforms": SCALED},
+    "two epochs": {"epochs": [0, 1, 0]},
+    "behind a transmission": {"transmission": True},
+    "turned, epochs, transmission": {"transforms": TURNED, "epochs": [0, 1, 0]}
+    | {"transmission": True},
+}
+
+
+def see_sources(sources, turn, shift, psf):
+    """Return the image of Gaussian sources: flux, place and covariance of each."""
+    y, x = np.indices((SIZE, SIZE))
+    image = np.zeros((SIZE, SIZE))
+    for flux, place, covariance in sources:
+        at, wide = turn @ place + shift, turn @ covariance @ turn.T + psf
+        reach = int(6 * np.sqrt(wide.max())) + 4
+        first, last = (np.clip(np.round(at).astype(int) + n, 0, SIZE) for n in (-reach, reach))
+        there = np.s_[first[1] : last[1], first[0] : last[0]]
+        image[there] += flux * lopsided(x[there] - at[0], y[there] - at[1], wide)
+    return image
+
+
+def behind(sources, mask):
+    """Return Gaussian sources less what a Gaussian mask hides of each, which is one too."""
+    depth, middle, width = mask
+    parts = []
+    for flux, place, covariance in sources:
+        share = depth * 2 * np.pi * np.sqrt(np.linalg.det(width))
+        share *= gaussian(*(place - middle), covariance + width)
+        if covariance.any():
+            inverses = np.linalg.inv(covariance), np.linalg.inv(width)
+            both = np.linalg.inv(sum(inverses))
+            at = both @ (inverses[0] @ place + inverses[1] @ middle)
+            parts += [(flux, place, covariance), (-share * flux, at, both)]
+        else:
+            parts.append(((1.0 - share) * flux, place, covariance))
+    return parts
+
+
+def kinds():
+    """Compare tiles with the whole in several kinds of scenes, and both with the truth."""
+    y, x = np.indices((SIZE, SIZE))
+    mask = 0.8, np.array([90.0, 100.0]), np.diag([150.0, 90.0])
+    for name, given in KINDS.items():
+        rng, given = np.random.default_rng(3), dict(given)
+        has_mask, epochs = given.pop("transmission", False), given.get("epochs", [0, 0, 0])
+        sources = []
+        for _ in range(25):
+            a, b, c = rng.uniform((4, 4, -3), (30, 30, 3))
+            flux, place = 10 ** rng.uniform(3.5, 5), rng.uniform(20, SIZE - 20, 2)
+            sources.append((flux, place, np.array([[a, c], [c, b]])))
+        stars = rng.uniform(10, SIZE - 10, (15, 2))
+        fluxes = 10.0 ** rng.uniform(3.7, 5.0, (2, 15))
+        maps = np.array(given.get("transforms", [np.eye(2, 3)] * 3))
+        if "offsets" in given:
+            maps[:, :, 2] = given["offsets"]
+        counts = []
+        for j in range(3):
+            pairs = zip(fluxes[epochs[j]], stars, strict=True)
+            seen = sources + [(flux, at, np.zeros((2, 2))) for flux, at in pairs]
+            seen = behind(seen, mask) if has_mask else seen
+            mean = see_sources(seen, maps[j, :, :2], maps[j, :, 2], PSF_COVARIANCES[j])
+            counts.append(rng.poisson(mean + 5.0))
+        if has_mask:
+            peak = 2 * np.pi * np.sqrt(np.linalg.det(mask[2]))
+            hidden = gaussian(x - mask[1][0], y - mask[1][1], mask[2])
+            given["transmission"] = 1.0 - mask[0] * peak * hidden
+        v, u = np.mgrid[-8:9, -8:9]
+        psfs = [lopsided(u, v, np.array(each)) for each in PSF_COVARIANCES]
+        observation = lnocl.Observation(np.array(counts), psfs, background=5.0, **given)
+        sky = sum(flux * gaussian(x - at[0], y - at[1], c) for flux, at, c in sources)
+        truth = fluxes[: max(epochs) + 1].T.ravel()
+        run = {"n_iter": 200, "smoothing": 0.02, "stop": None}
+        seconds, results = [], []
+        for solve in (lnocl.deconvolve, lambda *a, **k: lnocl.deconvolve_tiles(*a, tile=112, **k)):
+            begun = time.perf_counter()
+            results.append(solve(observation, stars, **run))
+            results[-1].star_flux_errors  # noqa: B018
+            seconds.append(time.perf_counter() - begun)
+        one, tiles = results
+        peak = np.percentile(one.extended, 99.9)
+        off = abs(tiles.star_fluxes - one.star_fluxes) / one.star_flux_errors
+        pulls = [(each.star_fluxes - truth) / each.star_flux_errors for each in results]
+        errors = [restoration_error(each.extended, sky) for each in results]
+        print(
+            f"{name}: {len(tiles.tiles)} tiles; largest difference over the peak "
+            f"{abs(tiles.extended - one.extended).max() / peak:.1e}; star fluxes, in errors, "
+            f"{off.max():.3f}; rms of (flux - truth) / error {np.std(pulls[1]):.2f} and "
+            f"{np.std(pulls[0]):.2f}; errors {errors[1]:.4f} and {errors[0]:.4f}; "
+            f"{seconds[1]:.0f} and {seconds[0]:.0f} s",
+            flush=True,
+        )
+
+
+PARTS = {each.__name__: each for each in (operators, field, whole, frame, kinds)}
 
 
 def main():

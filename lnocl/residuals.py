@@ -294,6 +294,7 @@ def _halo(extended: Array, position: Array, width: float) -> tuple[float, float]
     sums = np.bincount(index, window[inside], minlength=n * SECTORS).reshape(n, SECTORS)
     means = np.divide(sums, counts, out=np.full(sums.shape, np.inf), where=counts > 0)
     lower = np.sort(means, axis=1)[np.arange(n), (counts > 0).sum(axis=1) // 4]
-    falling = np.minimum.accumulate(lower)
-    halo = ((falling - falling[-1]) * counts.sum(axis=1)).sum()
+    held = counts.sum(axis=1)
+    falling = np.minimum.accumulate(lower[held > 0])  # none round a star beyond the sky
+    halo = ((falling - falling[-1:]) * held[held > 0]).sum()
     return float(halo), float(sums.sum())

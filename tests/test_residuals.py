@@ -7,7 +7,7 @@ import pytest
 from scenes import Recipe, make_smooth_psfs, paper
 
 import lnocl
-from lnocl.residuals import CORE, WINGS, Fit, judge, judge_stars, residuals, sharp_sources
+from lnocl.residuals import CORE, WINGS, Fit, _halo, judge, judge_stars, residuals, sharp_sources
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
 from lnocl.scene.shifting import place
@@ -244,3 +244,12 @@ def test_flat_parts_of_the_sky_take_no_memory_for_sharp_sources():
     tracemalloc.stop()
     np.testing.assert_allclose(found[:, :2], [(100, 200)])
     assert peak < 6 * sky.nbytes
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("place", [(-9.0, 5.0), (4.0, 30.0), (-1.7, 3.0)])
+def test_a_star_beyond_the_sky_has_no_halo(place):
+    """Turned images show more than the sky's frame; rings without pixels hold no light."""
+    halo, light = _halo(np.ones((12, 14)), np.array(place), 2.5)
+    assert halo == 0.0
+    assert np.isfinite(light)

@@ -330,6 +330,16 @@ def test_stars_of_tiles_are_those_of_one_run_though_their_psf_is_wrong(narrow):
     np.testing.assert_allclose(result.star_flux_errors, whole.star_flux_errors, rtol=0.06)
 
 
+@pytest.mark.exhaustive
+def test_families_that_are_named_are_fitted_before_tiles_are_cut(narrow):
+    observation, stars, *_ = narrow
+    run = {**JUDGED, "refine_psfs": ["jitter"], "smoothing": 0.01}
+    whole = lnocl.deconvolve(observation, stars, **run)
+    found = lnocl.deconvolve_tiles(observation, stars, tile=44, **run)
+    assert found.psf_refinement.parameters == whole.psf_refinement.parameters
+    np.testing.assert_array_equal(found.psfs, whole.psfs)
+
+
 @pytest.mark.parametrize("is_wrong", [True, pytest.param(False, marks=pytest.mark.exhaustive)])
 def test_one_tile_is_judged_as_the_whole_is(is_wrong, narrow):
     observation, stars, _, whole = narrow

@@ -36,6 +36,7 @@ from lnocl.scene.psf_field import Psfs, mapped
 from lnocl.scene.psf_misfit import PsfMisfit, measure_misfit, smoothing_near_stars
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import Scene
+from lnocl.scene.transforms import enlarged
 from lnocl.solvers.psf_fit import settle
 
 # PSFs are judged in a window of this side, pixels of the images; in a half or a quarter of it where
@@ -209,26 +210,18 @@ class GuardedRuns:
 
     def cut(self, psfs: Array) -> Array:
         """Return the middle of PSFs, at most as large as the window."""
-        return psfs[:, *self._shown(psfs)]
+        most = self._side * self.observation.oversample
+        ky, kx = (min(n, most) for n in psfs.shape[1:])
+        return enlarged(psfs, (ky, kx), is_centred=True)
 
     def completed(self, psfs: Psfs, changes: Sequence[Array]) -> Psfs:
         """Return PSFs of unit sum, with what is added to the middle of those of each image."""
 
         def complete(j: int, stack: Array) -> Array:
-            whole = stack.copy()
-            whole[:, *self._shown(stack)] += changes[j]
+            whole = stack + enlarged(changes[j], stack.shape[1:], is_centred=True)
             return np.asarray(whole / whole.sum(axis=(1, 2), keepdims=True))
 
         return mapped(psfs, complete)
-
-    def _shown(self, psfs: Array) -> tuple[slice, slice]:
-        """Return the slices of the middle of PSFs that `cut` keeps."""
-        most = self._side * self.observation.oversample
-        y, x = (
-            slice(n // 2 - min(n, most) // 2, n // 2 - min(n, most) // 2 + min(n, most))
-            for n in psfs.shape[1:]
-        )
-        return y, x
 
 
 def inside(stars: Array, observation: Observation) -> Array:

@@ -218,8 +218,7 @@ class Camera(LinearMap):
         if self.rotation is None:
             return spread(image, self._oversample)
         y, x = np.nonzero(image)
-        turn, offset = self.place
-        places = np.linalg.solve(turn, (np.stack([x, y], axis=1) - offset).T)[::-1]
+        places = np.array(self._scene.observation.geometry.on_sky(self._j, x, y))[::-1]
         first = np.floor(places).astype(int)
         sky = np.zeros(math.prod(self.grid))
         for step in np.ndindex(2, 2):

@@ -24,6 +24,7 @@ from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.rings import Rings
 from lnocl.scene.scene import MIN_MODEL
+from lnocl.scene.transforms import enlarged
 
 # Pixels count where stars give more than this share of the model: below it, what does not fit is
 # more likely the structure of the sky.
@@ -181,8 +182,7 @@ def smoothing_near_stars(
         background = np.broadcast_to(model.background[j], light.shape)
         total = np.maximum(np.maximum(counts, light + background), MIN_MODEL)
         number = Rings((ny, nx), scene.star_field.places[j]).number
-        kappa = np.zeros(light.shape)
-        kappa[:ny, :nx] = in_rings[np.minimum(number, len(in_rings) - 1)]
+        kappa = enlarged(in_rings[np.minimum(number, len(in_rings) - 1)], light.shape)
         share = (light / total).clip(0.0)
         relative = model.weights[j] * kappa * share
         variance += model.cameras[j].squares(relative**2)

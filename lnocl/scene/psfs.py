@@ -14,7 +14,7 @@ from lnocl.scene.cores import centre, off_centre, peak
 from lnocl.scene.psf_field import PsfField, read_fields
 from lnocl.scene.quantities import bare
 from lnocl.scene.shifting import place
-from lnocl.scene.transforms import about_centre
+from lnocl.scene.transforms import enlarged
 
 if TYPE_CHECKING:
     from lnocl.scene.fields import Field
@@ -140,7 +140,7 @@ def normalised(psfs: Array, psf_centre: str, shapes: Sequence[tuple[int, int]] =
         tell(f"{words}: {100 * share:.2g} % of the light of a PSF at most")
     if psf_centre == "fit":
         for psf, shape in zip(each, shapes or [each.shape[1:]] * len(each), strict=True):
-            inner = about_centre(psf, shape)
+            inner = enlarged(psf, shape, is_centred=True)
             inner[:] = _centred(inner)
     elif psf_centre == "check":
         _refuse_off_centre(each)

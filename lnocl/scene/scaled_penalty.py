@@ -10,6 +10,7 @@ from lnocl.errors import InputError
 from lnocl.scene.arrays import Array
 from lnocl.scene.penalty import MAX_WEIGHT, Penalty
 from lnocl.scene.star_prior import StarPrior
+from lnocl.scene.transforms import enlarged
 
 if TYPE_CHECKING:
     from lnocl.scene.scene import Scene
@@ -54,10 +55,7 @@ def _smoothing_map(penalty: Penalty, smoothing: float, scene: Scene) -> Array | 
     """Return the weight of the edge-preserving term on the grid, where it is a map."""
     if penalty.near_stars is None:
         return None
-    ny, nx = scene.observation.sky_shape
-    total = np.full(scene.grid, smoothing)
-    total[:ny, :nx] += penalty.near_stars
-    return total
+    return np.asarray(smoothing + enlarged(penalty.near_stars, scene.grid))
 
 
 def _scaled(name: str, weight: float, factor: float, scene: Scene) -> float:

@@ -28,6 +28,7 @@ from lnocl.scene.shifting import Cutout, MovablePsf
 from lnocl.scene.star_psfs import StarPsfs, owned
 from lnocl.scene.star_weights import OBSERVED_SHARE, warn_of_lost_stars, weigh_stars
 from lnocl.scene.stars import Covered, StarField, check_positions, covered_box
+from lnocl.scene.transforms import enlarged
 
 # The one division guard: where the model is not above this (images have unit mean) the ratio is
 # taken as 0. It keeps g / m inside the range of float32 and is far below any modelled light.
@@ -599,19 +600,7 @@ class Scene:
         return self._on_grid(observed)
 
     def _on_grid(self, array: NDArray, fill: float = 0.0) -> NDArray:
-        return _lay(array, self.image_grid, fill)
-
-
-def _lay(array: NDArray, grid: tuple[int, int], fill: float = 0.0) -> NDArray:
-    """Return an array at the origin of a grid."""
-    ny, nx = array.shape[-2:]
-    if grid == (ny, nx):
-        return array
-    laid = np.zeros((*array.shape[:-2], *grid), array.dtype)
-    if fill:
-        laid.fill(fill)
-    laid[..., :ny, :nx] = array
-    return laid
+        return enlarged(array, self.image_grid, fill)
 
 
 def _nearest(n: int, k: int) -> NDArray[np.int_]:

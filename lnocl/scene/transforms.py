@@ -249,12 +249,6 @@ def of_one_shape(values: Any, fill: float = 0.0, about_centre: bool = False) -> 
     return stack if stack.mask.any() else stack.data
 
 
-def about_centre(array: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
-    """Return a view of what `of_one_shape` has enlarged from this shape about its centre."""
-    y, x = (n // 2 - k // 2 for n, k in zip(array.shape, shape, strict=True))
-    return array[y : y + shape[0], x : x + shape[1]]
-
-
 def refuse_other_shapes(name: str, values: Any, shapes: Sequence[tuple[int, int]]) -> None:
     """Refuse maps in a list that have not the shapes of their images."""
     for j, (found, shape) in enumerate(zip(shapes_of(values), shapes, strict=False)):
@@ -268,7 +262,10 @@ def refuse_other_shapes(name: str, values: Any, shapes: Sequence[tuple[int, int]
 def enlarged(
     array: NDArray[Any], shape: tuple[int, int], fill: float = 0.0, is_centred: bool = False
 ) -> NDArray[Any]:
-    """Return an array with rows and columns added at its end, or about its centre ``n // 2``."""
+    """Return an array with rows and columns added at its end, or about its centre ``n // 2``.
+
+    Where it is to be smaller, it is a view of its part.
+    """
     sizes = zip(shape, array.shape[-2:], strict=True)
     before = [n // 2 - k // 2 if is_centred else 0 for n, k in sizes]
     rows, columns = (range(-at, n - at) for n, at in zip(shape, before, strict=True))

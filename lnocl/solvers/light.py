@@ -26,6 +26,7 @@ from lnocl.scene.camera import images_of, is_flat
 from lnocl.scene.detector import on_sky
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
+from lnocl.scene.transforms import enlarged
 from lnocl.solvers.levels import Levels
 
 
@@ -113,10 +114,7 @@ class Light:
         It is ``w_j A_j (q / sum_i A_i^T w_i) / A_j 1``, as the sum of `sky` is, turned round, that
         of q f less the light of f in the counts, and more the counts.
         """
-        (ny, nx), scene = shares.shape, self._scene
-        laid = np.zeros(scene.grid)
-        laid[:ny, :nx] = shares
-        laid *= self._per_weight
+        laid = enlarged(shares, self._scene.grid) * self._per_weight
         for weights, seen, ones in zip(
             self._map.weights, images_of(self._map.cameras, laid), self._map.of_ones, strict=True
         ):
