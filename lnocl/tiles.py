@@ -284,7 +284,8 @@ def deconvolve_tiles(
     """
     check_parallel(parallel)
     check_observation(observation)
-    _refuse_turned(observation)
+    if reason := for_the_whole(observation):
+        raise InputError(reason)
     _check_options(options)
     pad = options.pop("pad", "auto")
     given = {"mu": mu, "smoothing": smoothing, "n_iter": n_iter, "stop": stop, **options}
@@ -354,21 +355,21 @@ def _pad(observation: Observation, pad: Any) -> int:
     return whole("pad", pad, 0, ", or auto")
 
 
-def _refuse_turned(observation: Observation) -> None:
+def for_the_whole(observation: Observation) -> str | None:
+    """Return why an observation is not for tiles, and what to do; None where it is."""
     if len(observation.halos):
-        raise InputError(
+        return (
             "the amounts of `halos` are those in whole images, which tiles do not see; take "
             "deconvolve for the whole, or leave `halos` out"
         )
     if len(observation.transmission):
-        raise InputError(
-            "tiles take no `transmission` yet; take deconvolve for the whole, or leave it out"
-        )
+        return "tiles take no `transmission` yet; take deconvolve for the whole, or leave it out"
     if observation.is_mapped or observation.n_epochs > 1:
-        raise InputError(
+        return (
             "tiles are of images of one epoch that are not turned against the sky; take deconvolve "
             "for the whole"
         )
+    return None
 
 
 def _lay(observation: Observation, tile: int | None, pad: int) -> list[tuple[_Span, _Span]]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from lnocl.errors import InputError, counted, warn
 from lnocl.scene.arrays import Array, numbers
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.counts import mean_exposure
-from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
+from lnocl.scene.detector import DetectorPsf, effective_psfs, movable_psfs, on_sky
 from lnocl.scene.grid import grid_of, psf_shape
 from lnocl.scene.halos import halo_cutouts
 from lnocl.scene.observation import Observation
@@ -177,15 +177,14 @@ class Scene:
         self.unit = self._sky_unit(self.mean_exposure)
         relative = exposure / self.mean_exposure
         self.gains = np.ones(self.n_images) if has_map else relative
-        self._psfs = movable_psfs(self.scaled_psfs(), observation, self.image_grid)
+        self._psfs = self._movable(self.scaled_psfs())
         self.areas = (self.oversample * observation.scales) ** 2
         self.transmission = self._transmission()
         self.seen_areas = self.areas.copy()
         if self.transmission is not None:
             self.seen_areas *= observation.transmission.mean(axis=(1, 2))
         self.rotations = self._rotations()
-        movable = partial(movable_psfs, observation=observation, grid=self.image_grid)
-        self._own = StarPsfs(observation, self.gains, movable, self.grid)
+        self._own = StarPsfs(observation, self.gains, self._movable, self.grid)
         self.weights = self._weigh(relative if has_map else None)
         self._halos = (
             halo_cutouts(observation.halos, self.weights, has_map, self.image_grid)
@@ -210,12 +209,12 @@ class Scene:
         observation = self.observation
         if not observation.is_turned:
             return []
-        angles = np.arctan2(observation.turns[:, 1, 0], observation.turns[:, 0, 0]).tolist()
-        scales = observation.scales.tolist()
-        return [
-            Rotation(angles[j], shift, self.grid, observation.good_box(j), scales[j])
-            for j, shift in enumerate(observation.offsets)
-        ]
+        rotations = []
+        for j, scale in enumerate(observation.scales.tolist()):
+            turn, shift, box = observation.on_fine_pixels(j)
+            angle = float(np.arctan2(turn[1, 0], turn[0, 0]))
+            rotations.append(Rotation(angle, shift, self.grid, box, scale))
+        return rotations
 
     def _transmission(self) -> Array | None:
         given = self.observation.transmission
@@ -239,16 +238,27 @@ class Scene:
 
     def psfs_of_sky(self) -> list[Array]:
         """Return the PSFs as the sky sees them, of unit sum: turned back, on the sky's pixels."""
+        return self._turned_back(list(self.observation.psfs))
+
+    def _turned_back(self, psfs: list[Array]) -> list[Array]:
         if not self.rotations:
-            return list(self.observation.psfs)
-        psfs = zip(self.observation.psfs, self.rotations, strict=True)
-        return [turned_psf(psf, rotation.angle, rotation.scale) for psf, rotation in psfs]
+            return psfs
+        pairs = zip(psfs, self.rotations, strict=True)
+        return [turned_psf(psf, rotation.angle, rotation.scale) for psf, rotation in pairs]
 
     @cached_property
     def _psfs_of_sky(self) -> list[MovablePsf]:
         """Those, times the relative exposure of their image where that is a number."""
-        psfs = zip(self.gains, self.psfs_of_sky(), strict=True)
-        return [MovablePsf(gain * psf, self.grid) for gain, psf in psfs]
+        return self._movable_on_sky(self.psfs_of_sky())
+
+    @cached_property
+    def _responses_of_sky(self) -> list[MovablePsf]:
+        """The same with the pixels of the images."""
+        return self._movable_on_sky(self._turned_back(effective_psfs(self.observation)))
+
+    def _movable_on_sky(self, psfs: Sequence[Array]) -> list[MovablePsf]:
+        pairs = zip(self.gains, psfs, strict=True)
+        return [MovablePsf(gain * psf, self.grid) for gain, psf in pairs]
 
     def _penalise(self, penalty: Penalty) -> None:
         self.penalty = penalty
@@ -294,8 +304,9 @@ class Scene:
         """Return this scene with other PSFs, as they are."""
         other = copy(self)
         other.observation = self.observation.replace(psfs=psfs)
-        other._psfs = movable_psfs(other.scaled_psfs(), other.observation, self.image_grid)
-        vars(other).pop("_psfs_of_sky", None)
+        other._psfs = other._movable(other.scaled_psfs())
+        for name in ("_psfs_of_sky", "_responses_of_sky"):
+            vars(other).pop(name, None)
         other._field = other._place_stars(self.stars)
         return other
 
@@ -364,17 +375,16 @@ class Scene:
         observation, fields = self.observation, self.observation.psf_fields
         if not fields and part is None and self.transmission is None:
             return [[psf] * len(positions) for psf in self._psfs]
-        movable = partial(movable_psfs, observation=observation, grid=self.image_grid)
         if not fields and self.transmission is None:
-            parts = movable([psf[part] for psf in self.scaled_psfs()])
+            parts = self._movable([psf[part] for psf in self.scaled_psfs()])
             return [[psf] * len(positions) for psf in parts]
         shares = self.gains[:, None] * self.transmitted(positions)
         psfs = [
-            [field.at(*place) for place in positions + offset]
-            for field, offset in zip(fields, observation.offsets, strict=bool(fields))
+            [field.at(*place) for place in observation.places(j, positions)]
+            for j, field in enumerate(fields)
         ] or [[psf] * len(positions) for psf in observation.psfs]
         return [
-            movable([share * psf[part or ...] for share, psf in zip(*each, strict=True)])
+            self._movable([share * psf[part or ...] for share, psf in zip(*each, strict=True)])
             for each in zip(shares, psfs, strict=True)
         ]
 
@@ -519,10 +529,7 @@ class Scene:
 
         Where images are turned `psf` has what their weights need besides; its squares mean nothing.
         """
-        if not self.rotations:
-            return self.psf(j)
-        cutout = self._psfs_of_sky[j].at(0.0, 0.0)
-        return float(self.areas[j]) * cutout.on_grid(self.grid)
+        return self.psf_cutout(j).on_grid(self.grid)
 
     def psf_cutout(self, j: int) -> Cutout:
         """Return the response of image j where it is not 0, the sky moved by the offset.
@@ -532,7 +539,7 @@ class Scene:
         image that is turned it is the PSF turned back, as bright as the image's pixels are large.
         """
         if self.rotations:
-            cutout = self._psfs_of_sky[j].at(0.0, 0.0)
+            cutout = self._responses_of_sky[j].at(0.0, 0.0)
             return cutout._replace(values=self.areas[j] * cutout.values)
         return self._psfs[j].response(*self.observation.offsets[j])
 
@@ -567,6 +574,9 @@ class Scene:
     def star_field(self) -> StarField:
         """The stars where they are now."""
         return self._field
+
+    def _movable(self, psfs: Iterable[Array]) -> list[MovablePsf | DetectorPsf]:
+        return movable_psfs(psfs, self.observation, self.image_grid)
 
     def scaled_psfs(self) -> list[Array]:
         """Return the PSFs times the relative exposure of their image, where that is a number."""
@@ -824,10 +834,11 @@ class Scene:
         for j, field in enumerate(observation.psf_fields):
             variation = field.variation(observation.psfs[j], observation.shape)
             if variation > MAX_VARIATION:
+                remedy = ": take tiles, by lnocl.deconvolve_tiles, or a smaller tile"
                 warn(
                     f"`psfs[{j}]` varies over the image by {variation:.0%}, and what is not a star "
-                    "is reconstructed with that of the middle: take tiles, by "
-                    "lnocl.deconvolve_tiles, or a smaller tile"
+                    "is reconstructed with that of the middle"
+                    + ("" if observation.is_mapped else remedy)
                 )
 
     def _warn_of_large_psf(self) -> None:

@@ -93,6 +93,17 @@ def scene(kind):
         case "oversampled":
             psfs = [psf(4.0, 2)]
             known |= {"oversample": 2, "effective_psfs": True}
+        case "turned oversampled":
+            images, psfs = [light(), light(5.0, moved=turned)], [psf(4.0, 2), psf(5.0, 2)]
+            known["transforms"] = lnocl.rotations([0.0, ANGLE], (CENTRE, CENTRE))
+            known["mask"] = np.array([core(), core(*turned(STARS[0]))])
+            known |= {"oversample": 2, "effective_psfs": True}
+        case "turned PSF field":
+            ends = [(0, 0), (N - 1, 0)]
+            images = [light(), light(5.0, moved=turned)]
+            psfs = [lnocl.PsfField([psf(w), psf(w)], ends) for w in (4.0, 5.0)]
+            known["transforms"] = lnocl.rotations([0.0, ANGLE], (CENTRE, CENTRE))
+            known["mask"] = np.array([core(), core(*turned(STARS[0]))])
         case "PSF field":
             psfs = lnocl.PsfField([psf(), psf()], [(0, 0), (N - 1, 0)])
         case "own PSF":
@@ -109,7 +120,8 @@ def scene(kind):
 
 KINDS = [
     "plain", "depths", "exposures", "exposure map", "offsets", "epochs", "halos", "turned",
-    "oversampled", "PSF field", "own PSF", "one masked", "background measured",
+    "oversampled", "turned oversampled", "PSF field", "turned PSF field", "own PSF",
+    "one masked", "background measured",
 ]  # fmt: skip
 
 
@@ -209,6 +221,7 @@ DONE = [
 ]
 # What does not go together yet, and the message that says so.
 REFUSED = {
+    ("turned PSF field", are_detected): "sources are tested with one PSF for each image",
     ("PSF field", are_detected): "sources are tested with one PSF for each image",
 }
 
