@@ -37,7 +37,7 @@ def pixel_spectrum(v: NDArray[Any], u: NDArray[Any], observation: Observation) -
     return np.asarray(along * across)
 
 
-def effective_psfs(observation: Observation) -> list[Array]:
+def psfs_with_pixels(observation: Observation) -> list[Array]:
     """Return the PSFs as pixels of the images see points of a finer sky; their sums stay."""
     q = observation.oversample
     if q == 1 or observation.effective_psfs:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from copy import copy
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,7 @@ from lnocl.errors import InputError, counted, warn
 from lnocl.scene.arrays import Array, numbers
 from lnocl.scene.band_matrix import BandMatrix
 from lnocl.scene.counts import mean_exposure
-from lnocl.scene.detector import DetectorPsf, effective_psfs, movable_psfs, on_sky
+from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky, psfs_with_pixels
 from lnocl.scene.grid import grid_of, psf_shape
 from lnocl.scene.halos import halo_cutouts
 from lnocl.scene.observation import Observation
@@ -236,11 +236,12 @@ class Scene:
         shares = (map_coordinates(t, at, order=1, mode="nearest") for t in self.transmission)
         return np.array(list(shares))
 
-    def psfs_of_sky(self) -> list[Array]:
-        """Return the PSFs as the sky sees them, of unit sum: turned back, on the sky's pixels."""
-        return self._turned_back(list(self.observation.psfs))
+    def psfs_of_sky(self, with_pixels: bool = False) -> list[Array]:
+        """Return the PSFs as the sky sees them, of unit sum: turned back, on the sky's pixels.
 
-    def _turned_back(self, psfs: list[Array]) -> list[Array]:
+        They may have the pixels of the images besides.
+        """
+        psfs = psfs_with_pixels(self.observation) if with_pixels else list(self.observation.psfs)
         if not self.rotations:
             return psfs
         pairs = zip(psfs, self.rotations, strict=True)
@@ -249,16 +250,12 @@ class Scene:
     @cached_property
     def _psfs_of_sky(self) -> list[MovablePsf]:
         """Those, times the relative exposure of their image where that is a number."""
-        return self._movable_on_sky(self.psfs_of_sky())
+        return [MovablePsf(psf, self.grid) for psf in self.scaled_psfs(self.psfs_of_sky())]
 
     @cached_property
     def _responses_of_sky(self) -> list[MovablePsf]:
         """The same with the pixels of the images."""
-        return self._movable_on_sky(self._turned_back(effective_psfs(self.observation)))
-
-    def _movable_on_sky(self, psfs: Sequence[Array]) -> list[MovablePsf]:
-        pairs = zip(self.gains, psfs, strict=True)
-        return [MovablePsf(gain * psf, self.grid) for gain, psf in pairs]
+        return [MovablePsf(psf, self.grid) for psf in self.scaled_psfs(self.psfs_of_sky(True))]
 
     def _penalise(self, penalty: Penalty) -> None:
         self.penalty = penalty
@@ -578,10 +575,10 @@ class Scene:
     def _movable(self, psfs: Iterable[Array]) -> list[MovablePsf | DetectorPsf]:
         return movable_psfs(psfs, self.observation, self.image_grid)
 
-    def scaled_psfs(self) -> list[Array]:
-        """Return the PSFs times the relative exposure of their image, where that is a number."""
-        psfs = zip(self.gains, self.observation.psfs, strict=True)
-        return [psf if gain == 1.0 else gain * psf for gain, psf in psfs]
+    def scaled_psfs(self, psfs: Iterable[Array] | None = None) -> list[Array]:
+        """Return PSFs times the relative exposure of their image, where that is a number."""
+        pairs = zip(self.gains, self.observation.psfs if psfs is None else psfs, strict=True)
+        return [psf if gain == 1.0 else gain * psf for gain, psf in pairs]
 
     def star_box(self, j: int, s: int) -> Covered:
         """Return the rows and columns of the images' grid that star s may light in image j."""

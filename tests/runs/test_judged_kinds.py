@@ -38,9 +38,14 @@ def light(flux, moved=lambda place: place):
 def observe(kind):
     """Return an observation with PSFs of sigma 1.5 pixels instead of 1.65, stars and fluxes."""
     fluxes, images, psfs, known = [4e5], [light(4e5)], gaussian(U, V, GIVEN), {}
-    if kind == "turned":
+    if kind.startswith("turned"):
         images.append(light(4e5, turned))
         known["transforms"] = lnocl.rotations([0.0, ANGLE], (CENTRE, CENTRE))
+    if kind == "turned, finer":
+        psfs = gaussian(*(np.indices((61, 61))[::-1] / 2 - 15.0), GIVEN)
+        known |= {"oversample": 2, "effective_psfs": True}
+    if kind == "turned field":  # which stays as it is along the way of the star
+        psfs = [lnocl.PsfField([psfs, psfs], [(0, 0), (N - 1, 0)])] * 2
     if kind == "epochs":
         fluxes = [4e5, 2e5]
         images.append(light(2e5))
@@ -65,7 +70,10 @@ def observe(kind):
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param("turned", marks=pytest.mark.exhaustive),
+        *(
+            pytest.param(kind, marks=pytest.mark.exhaustive)
+            for kind in ("turned", "turned, finer", "turned field")
+        ),
         *("epochs", "halos", "a field", "a star's own"),
     ],
 )
