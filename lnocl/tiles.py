@@ -313,11 +313,8 @@ def deconvolve_tiles(
     """
     check_parallel(parallel)
     check_observation(observation)
-    if len(observation.halos):
-        raise InputError(
-            "a tile cannot tell the `halos` in it from a smooth sky, as whole images can; take "
-            "deconvolve for the whole, or leave `halos` out"
-        )
+    if reason := for_the_whole(observation):
+        raise InputError(reason)
     _check_options(options)
     pad = options.pop("pad", "auto")
     given = {"mu": mu, "smoothing": smoothing, "n_iter": n_iter, "stop": stop, **options}
@@ -376,6 +373,16 @@ def _check_options(options: dict[str, Any]) -> None:
         raise InputError(
             f"{unknown[0]} is no option of tiles; leave it out, or take deconvolve for the whole"
         )
+
+
+def for_the_whole(observation: Observation) -> str | None:
+    """Return why an observation is not for tiles, and what to do; None where it is."""
+    if len(observation.halos):
+        return (
+            "a tile cannot tell the `halos` in it from a smooth sky, as whole images can; take "
+            "deconvolve for the whole, or leave `halos` out"
+        )
+    return None
 
 
 def _lay(observation: Observation, tile: int | None, pad: int) -> list[tuple[_Span, _Span]]:

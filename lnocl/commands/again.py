@@ -76,7 +76,7 @@ class Again:
             raise FileError(
                 f"{folder}, where {path} was made, is not there: deconvolve again"
             ) from error
-        if run.tile is not None or frames.observation.psf_fields:
+        if deconvolve.in_tiles(run, frames.observation):
             raise InputError(
                 f"{path} was made in tiles, and this is of one run: deconvolve a cut-out without "
                 "tiles"

@@ -56,13 +56,21 @@ def solve(
     # Each process that makes replicas or tiles takes a device of its own, unless one was named.
     parameters = _parameters({**given, "device": arguments.device})
     parameters["progress"] = not arguments.quiet
-    if arguments.tile is None and not frames.observation.psf_fields:
+    if not in_tiles(arguments, frames.observation):
         if arguments.parallel:
             raise InputError(
                 "`parallel` does nothing without tiles: give `tile` too, or leave it out"
             )
         return deconvolve(frames.observation, **parameters, callback=callback)
     return _solve_tiles(arguments, frames.observation, parameters)
+
+
+def in_tiles(arguments: argparse.Namespace, observation: Observation) -> bool:
+    """Return whether a run is tile by tile, as is asked for, or as PSFs that vary may be."""
+    from lnocl.tiles import for_the_whole
+
+    varies = bool(observation.psf_fields)
+    return arguments.tile is not None or (varies and for_the_whole(observation) is None)
 
 
 def _solve_tiles(

@@ -19,6 +19,7 @@ KINDS = [
     *("turned", "scaled", "finer sky", "epochs", "halos", "PSF field", "transmission"),
     *("star PSFs", "level"),
     *("turned + epochs", "turned + halos", "turned + transmission", "turned + star PSFs"),
+    *("turned + finer sky", "turned + PSF field"),
     *("scaled + epochs", "several shapes + halos", "epochs + halos", "epochs + PSF field"),
     *("transmission + epochs", "finer sky + halos", "PSF field + halos", "star PSFs + epochs"),
 ]
