@@ -66,7 +66,7 @@ def place_in(to_image, place):
 
 
 def psf_in(words, j, place, x, y, xx):
-    """Return the PSF of image j at a place of the sky."""
+    """Return the PSF of image j at a place in it."""
     xx = xx + 0.3 * j * ("plain" in words)
     if "PSF field" not in words:
         return psf(x, y, xx)
@@ -99,7 +99,7 @@ def light(words, j, to_image, fluxes):
     for place, flux in sources:
         dx, dy = place_in(to_image, place)
         share = transmission(*place) if "transmission" in words else 1.0
-        image += flux * share * psf_in(words, j, place, X - dx, Y - dy, TRUE)
+        image += flux * share * psf_in(words, j, (dx, dy), X - dx, Y - dy, TRUE)
     return image
 
 
