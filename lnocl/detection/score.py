@@ -231,8 +231,7 @@ class Null:
 
     def _one_count(self) -> float:
         """Return the level of one count in the disc, about the most where there are no counts."""
-        areas, seen_areas = self.scene.areas, self.scene.seen_areas
-        seen = float((self._model.sums / areas * (seen_areas / areas)).sum())
+        seen = float((self._model.sums * self.scene.seen_areas / self.scene.areas**2).sum())
         return 1.0 / (self.scene.scale * seen * np.count_nonzero(self._disc(LARGER)))
 
     def _means(self, level: Array) -> list[Array]:

@@ -165,7 +165,7 @@ def test_the_page_of_what_goes_together_has_the_table():
 def worker():
     from distributed import Client, LocalCluster
 
-    one = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    one = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
     with LocalCluster(**one) as cluster, Client(cluster):
         yield
 
