@@ -193,6 +193,8 @@ def test_bad_pixels_and_a_finer_sky():
     assert np.isnan(found.signal_to_noise[:, 100:]).all()
     [source] = near(found.detections, 20.2, 40.6, 1.0)
     assert abs(source["flux"].value - 900) < 3 * source["flux_error"].value
+    for axis, at in (("x", 20.2), ("y", 40.6)):
+        assert abs(source[axis].value - at) < 0.2
 
 
 def test_turned_images_find_what_is_in_all(result):

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from commandline import one_complaint
 import lnocl
 from lnocl.commands import cli, errors
 from lnocl.commands.again import Again
+from lnocl.errors import InputError
 from lnocl.plotting.profiles import draw_bands
 
 pytest.importorskip("regions", reason="regions is not installed")
@@ -397,3 +399,13 @@ def test_killed_errors_go_on_bit_for_bit(words, monkeypatch):
     assert n >= 2
     assert cli.main(options) == 0
     same_errors(held(), expected)
+
+
+def test_another_flux_of_a_star_is_another_run():
+    sky = np.ones((4, 5))
+    saved = SimpleNamespace(path="a.fits", extended=sky, star_fluxes=np.array([7.0]))
+    again = Again(saved, SimpleNamespace(electrons=2.0), None, None)
+    found = {"observation": SimpleNamespace(sky_shape=(4, 5)), "sky": 2.0 * sky}
+    again._refuse_another(SimpleNamespace(fluxes_of_stars=np.array([14.0]), **found))
+    with pytest.raises(InputError, match="gives another result now"):
+        again._refuse_another(SimpleNamespace(fluxes_of_stars=np.array([14.1]), **found))

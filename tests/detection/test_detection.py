@@ -11,7 +11,7 @@ from lnocl.detection import search
 from lnocl.errors import InputError, LnoclError, LnoclWarning
 
 pytest.importorskip("photutils", reason="photutils is not installed")
-from lnocl.detection import find_stars
+from lnocl.detection import find_stars, stars
 
 SHAPE = (96, 110)
 Y, X = np.indices(SHAPE)
@@ -300,3 +300,11 @@ def test_without_photutils_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "photutils.background", None)
     with pytest.raises(LnoclError, match=r"pip install photutils$"):
         find_stars(make_image())
+
+
+def test_the_sharpest_psf_is_a_gaussian_of_its_width_in_pixels():
+    """Summed at a hundred points a pixel."""
+    x = np.linspace(-3.495, 3.495, 700)
+    profile = np.exp(-4.0 * np.log(2.0) * (x / stars.SHARPEST) ** 2).reshape(7, 100).sum(axis=1)
+    expected = np.outer(profile, profile) / profile.sum() ** 2
+    np.testing.assert_allclose(stars._sharpest_psf(), expected, rtol=1e-3)

@@ -16,6 +16,7 @@ from lnocl.commands import cli
 from lnocl.commands.deconvolve_options import ALL_OPTIONS
 from lnocl.io.saved_results import read_result
 from lnocl.result import view_of
+from lnocl.result.file import write_file
 from lnocl.studies.figures import view_of as view_of_file
 
 NY, NX, LEVEL = 40, 36, 12.0
@@ -114,6 +115,20 @@ def cards(header):
     """Return values and comments, but for those of the time."""
     left_out = "DATE", "CHECKSUM", "DATASUM", "HISTORY"
     return {c.keyword: (c.value, c.comment) for c in header.cards if c.keyword not in left_out}
+
+
+def test_all_light_is_in_the_unit_of_the_file():
+    image, psf = fits.getdata("image3.fits"), fits.getdata("psf3.fits")
+    observation = lnocl.Observation(image, psf, background=LEVEL, psf_centre="given")
+    result = lnocl.deconvolve(observation, STARS, **OPTIONS)
+    write_file(result, "adu.fits", None, True, unit=("adu", 4.0), has_cubes=False)
+    with fits.open("adu.fits") as hdus:
+        header, stars = hdus[0].header, hdus["STARS"].data
+        np.testing.assert_allclose(4.0 * hdus[0].data, result.extended, rtol=1e-6)
+    found = header["EXTFLUX"], header["EXTERROR"]
+    np.testing.assert_allclose(found, np.divide(result.extended_flux, 4.0), rtol=1e-9)
+    np.testing.assert_allclose(4.0 * stars["flux"], result.star_fluxes, rtol=1e-9)
+    np.testing.assert_allclose(4.0 * stars["flux_error"], result.star_flux_errors, rtol=1e-9)
 
 
 def test_python_and_the_shell_write_the_same(case):
