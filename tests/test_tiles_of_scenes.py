@@ -9,7 +9,7 @@ import pytest
 from turned_scenes import COVARIANCES, gaussian, psf
 
 import lnocl
-from lnocl import tiles
+from lnocl import tiles, tiling
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
 
@@ -112,10 +112,10 @@ def test_cores_of_tiles_are_the_images_that_were_simulated(kind):
     """
     observation, means, fluxes = observe(kind, side=19)
     upright = observation.upright()
-    laid = tiles._lay(upright, 80 if kind == "scaled" else 56, 5)
+    laid = tiling.lay(upright, 80 if kind == "scaled" else 56, 5)
     mosaic = tiles._Mosaic(upright, STARS, "", laid[0])
     assert len(laid) > 1
-    for tile in filter(None, (tiles._cut(upright, STARS, None, spans) for spans in laid)):
+    for tile in filter(None, (tiling.cut(upright, STARS, None, spans) for spans in laid)):
         scene = Scene(tile.observation, tile.stars, pad=5)
         rows, columns = (span.window for span in tile.spans)
         sky = np.zeros(scene.grid)
